@@ -19,7 +19,10 @@
     scripts/bench.py scene_methods  the scene's score compared with published ones, on the same recordings
     scripts/bench.py scene_sharpen  boards and scene in one estimate: simulated rooms, recordings
     scripts/bench.py witness     the scene beside the boards: good results refused, wrong ones found
+    scripts/bench.py outputs     every output read by other programs: where they draw the same points
+    scripts/bench.py lidars      other LiDARs, simulated: boards found, errors, time of a scan's search
     scripts/bench.py growth      calibrate after detection as sessions grow: time and memory
+    scripts/bench.py fleet       500 sessions of 60 robots; lost workers, broken sessions, a million rows, S3
     scripts/bench.py speed       detection, Algorithm 1, the command line
 
 Simulated boards are kept, as long as neither simulator nor detectors change; random choices are seeded. Run
@@ -50,7 +53,10 @@ PARTS = {
     "scene_methods": 0,
     "scene_sharpen": 100,
     "witness": 20,
+    "outputs": 0,
+    "lidars": 0,
     "growth": 0,
+    "fleet": 0,
     "speed": 0,
 }
 
@@ -71,12 +77,12 @@ def main() -> None:
         "--output",
         type=Path,
         default=Path("build/paper"),
-        help="folder of `paper`, and of what `uncertainty` and `growth` keep",
+        help="folder of `paper`, and of what `uncertainty`, `lidars`, `growth` and `fleet` keep",
     )
     parser.add_argument(
         "--captures",
         type=int,
-        help="of a session of `uncertainty` (default 30), `goes_on` (20), `usable` (5)",
+        help="of a session of `uncertainty` (default 30), `goes_on` and `lidars` (20), `usable` (5)",
     )
     parser.add_argument("--first-seed", type=int, default=0, help="of `goes_on` and `usable` (default 0)")
     parser.add_argument(
@@ -115,15 +121,19 @@ def main() -> None:
         bench(seeds, min(arguments.splits, 10), arguments.only)
     elif arguments.part == "witness":
         bench(arguments.seeds or PARTS["witness"], arguments.only)
+    elif arguments.part == "lidars":
+        bench(arguments.captures or 20, arguments.output, arguments.only)
     elif arguments.part == "growth":
         bench(arguments.output)
+    elif arguments.part == "fleet":
+        bench(arguments.output, arguments.only)
     elif arguments.part == "corruptions":
         bench(arguments.only)
     elif arguments.part == "live":
         bench(arguments.seconds or 60.0)
     elif arguments.part == "offline":
         bench(arguments.seconds or 15.0)
-    elif arguments.part in ("speed", "drift_inputs"):
+    elif arguments.part in ("speed", "drift_inputs", "outputs"):
         bench()
     else:
         bench(arguments.seeds or PARTS[arguments.part])

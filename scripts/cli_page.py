@@ -26,6 +26,8 @@ Every verb with its options, as `lce-rig VERB --help` prints them. Results go to
 | 5 | recording, sensor or missing dependency |
 | 6 | not enough data |
 | 7 | result refused |
+| 8 | `deploy`: the target was not reached or written; the earlier files are in place |
+| 9 | `deploy`: the new files are in place; the command after them failed |
 | {EXIT_BUG} | a bug in lce-rig |
 | {EXIT_INTERRUPTED} | interrupted (Ctrl-C) |
 

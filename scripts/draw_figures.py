@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Draw the pictures of docs/images/ that show a rig, with lce-rig itself, on simulated rigs.
 
-draw_figures.py [NAME...]   only these; the two screens need Chromium and `pip install '.[docs]'`
+draw_figures.py [NAME...]   only these; report and screens need Chromium and `pip install '.[docs]'`
 """
 
 import sys
@@ -68,6 +68,18 @@ def _frames() -> None:
         _save(frames.draw_frames(session / "calibration" / "rlfs.urdf"), "frames.png")
 
 
+def _report() -> None:
+    from figures.report import draw_report
+
+    with tempfile.TemporaryDirectory() as folder:
+        session = Path(folder, "session")
+        assert run(["simulate", str(session), "--rig", "rlfs", "--captures", "16", "--seed", "3"]) == 0
+        assert run(["calibrate", str(session)]) == 0
+        Path(folder, "browser").mkdir()
+        drawn = draw_report(session / "calibration" / "report.html", Path(folder, "browser"))
+    cv2.imwrite(str(FOLDER / "report.png"), drawn, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
 def _screens() -> None:
     from figures.screens import draw_screens
 
@@ -82,6 +94,7 @@ FIGURES: dict[str, Callable[[], None]] = {
     "debug": _debug,
     "events": _events,
     "frames": _frames,
+    "report": _report,
     "screens": _screens,
 }
 

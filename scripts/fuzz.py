@@ -4,6 +4,7 @@
     scripts/fuzz.py readers --n 3000            every reader of files, damaged files of each kind
     scripts/fuzz.py bombs                       small files that ask for much, by the command line
     scripts/fuzz.py result-kills --n 200        `calibrate`, `verify`, `intrinsics`, killed
+    scripts/fuzz.py deploy-kills --n 200        `deploy`, killed, into a folder and over ssh
     scripts/fuzz.py kills --n 200               `collect`, killed while it captures
     scripts/fuzz.py preview --n 2000            hostile clients of the preview page
     scripts/fuzz.py interrupts --n 100          Ctrl-C at any moment
@@ -45,6 +46,7 @@ TARGETS = {
     "readers": Target("fuzzing.readers:fuzz_readers", 3_000, "damaged files of each kind, for each reader"),
     "bombs": Target("fuzzing.bombs:fuzz_bombs", 1, "small files that ask for much; each n times"),
     "result-kills": Target("fuzzing.result_kills:fuzz_result_kills", 200, "verbs killed about their results"),
+    "deploy-kills": Target("fuzzing.deploy_kills:fuzz_deploy_kills", 200, "deployments, killed"),
     "kills": Target("fuzzing.kills:fuzz_kills", 200, "a live collection, killed"),
     "preview": Target("fuzzing.preview:fuzz_preview", 2_000, "hostile clients of the preview page"),
     "interrupts": Target("fuzzing.interrupts:fuzz_interrupts", 100, "Ctrl-C at any moment"),

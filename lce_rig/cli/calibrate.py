@@ -14,6 +14,7 @@ from lce_rig.cli.options import (
     cameras_option,
     event_image_option,
     require_sensors,
+    robot_option,
     split_names,
 )
 from lce_rig.core.errors import NotEnoughDataError
@@ -218,8 +219,16 @@ if TYPE_CHECKING:
     help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged "
     "[default of several sessions: union].",
 )
+@robot_option
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
+@click.option(
+    "--registry",
+    metavar="DIR",
+    help="Note where the result differs from the robot's earlier ones or from its siblings', by this "
+    "registry of `lce-rig fleet run`.",
+)
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
+@click.option("--no-report", is_flag=True, help="Do not write report.html.")
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(0), help="Set the seed of the random subsets."
 )
@@ -239,17 +248,20 @@ def calibrate(
     event_image: Any,
     use_scene: bool,
     name: str | None,
+    robot: str | None,
+    registry: str | None,
     as_json: bool,
     force: bool,
+    no_report: bool,
     method: Any,
     seed: int,
     n_draws: int,
 ) -> None:
     """Estimate the extrinsics between the LiDAR and each camera of SESSION (default: session/).
 
-    Writes SESSION/calibration/ in one step: result.json, extrinsics.yaml, URDF, camera_info and static
-    transforms. The earlier result moves to SESSION/calibration/previous/. A run without a result leaves it
-    unchanged.
+    Writes SESSION/calibration/ in one step: result.json, report.html (the result explained, with drawings),
+    extrinsics.yaml, URDF, camera_info and static transforms. The earlier result moves to
+    SESSION/calibration/previous/. A run without a result leaves it unchanged.
 
     Several SESSIONs of one rig whose sensors were not moved in between give one result from all captures. It
     goes into results/union/ of the first; nothing else changes. Each session is calibrated alone before, and
@@ -263,12 +275,16 @@ def calibrate(
     from lce_rig.export.reference import read_reference
     from lce_rig.pipeline.result_files import OVERLAYS, UNION, new_result_parts
     from lce_rig.pipeline.union import require_unit
+    from lce_rig.session.provenance import provenance_of
 
     paths = sessions or (Path("session"),)
     name = UNION if name is None and len(paths) > 1 else name
     new_result_parts(name)
     opened = [lce.Session.open(path) for path in paths]
     require_unit(opened)
+    for each in opened:
+        each.rig = each.rig.of_robot(robot)
+    provenance_of(opened)
     first, rig = opened[0], opened[0].rig
     require_sensors("camera", cameras, rig.cameras)
     options = lce.CalibrateOptions(method, n_draws, seed)
@@ -299,11 +315,17 @@ def calibrate(
                 use_scene=use_scene,
                 progress=progress,
             )
+        if registry is not None:
+            from lce_rig.fleet.registry import Registry
+            from lce_rig.fleet.siblings import with_registry
+            from lce_rig.fleet.storage import Storage
+
+            result = with_registry(result, Registry(Storage.at(registry)))
         for shortage in result.shortages:
             show.warn(str(not_enough(shortage)))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} has no T_cam_lidar for these sensors")
-        written = result.write(name=name, force=force)
+        written = result.write(name=name, force=force, report=not no_report)
     if written.had_overlays:
         with show.progress_bar("drawing") as progress:
             lce.verify(first, result, detections[0], name=name, event_image=event_image).write(
@@ -317,7 +339,14 @@ def calibrate(
             show.print_lines(_lines(calibration))
         for calibration in result.pairs:
             show.print_lines(camera_lines(calibration, result.pairs))
-        show.note("written: " + ", ".join(f.name for f in written.files) + f" in {written.files[0].parent}")
+        folder = written.files[0].parent
+        names = ", ".join(str(file.relative_to(folder)) for file in written.files)
+        show.note(f"written: {names} in {folder}")
+    if written.report is not None:
+        show.note(f"report: {written.report}")
+    for finding in written.findings:
+        if finding.severity != "note":
+            show.warn(sentence(finding))
     _tell_earlier(written)
     seen = {pair.camera for own in detections for pair in own.pairs}
     _exit(result.pairs, wanted, seen, are_printed=not as_json)

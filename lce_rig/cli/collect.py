@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, require_sensors
+from lce_rig.cli.options import FiniteRange, require_sensors, robot_option
 from lce_rig.words import sentence
 
 
@@ -25,6 +25,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 @click.option(
     "--rig", "rig_name", required=True, metavar="NAME|FILE", help="Set the rig profile: a name or a file."
 )
+@robot_option
 @click.argument("session", type=click.Path(path_type=Path), default="session")
 @click.option(
     "--from",
@@ -106,6 +107,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     help="Live: capture after the board has stood still for S seconds  [default: 1.5]",
 )
 @click.option("--plain", is_flag=True, help="Live: print lines on stderr instead of the full-screen view.")
+@click.option("--silent", is_flag=True, help="Live: ring no bell at captures and refused ones.")
 @click.option(
     "--preview",
     is_flag=False,
@@ -123,6 +125,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 @click.option("--seed", type=click.IntRange(0), help="Set the seed of the simulated rig  [default: 0]")
 def collect(
     rig_name: str,
+    robot: str | None,
     session: Path,
     paths: tuple[Path, ...],
     pair: Any,
@@ -149,11 +152,13 @@ def collect(
     recordings, such as --from lidar.bag --from events.aedat4, are joined: each adds a sensor to those before
     it. Run the command again to continue; existing captures are not repeated.
     """
+    from lce_rig.rig import load_rig
+
     if not paths:
         _refuse_options(_OF_RECORDINGS, "applies to recordings only", "Add --from, or omit this option.")
         from lce_rig.cli.collect_live import LiveArguments, run_live
 
-        run_live(rig_name, session, LiveArguments(**live))
+        run_live(load_rig(rig_name).of_robot(robot), session, LiveArguments(**live))
         return
     from lce_rig.cli.simulate import require_kind
 
@@ -163,10 +168,9 @@ def collect(
     from lce_rig.pipeline.collect_recordings import fill_session
     from lce_rig.recordings import open_recordings
     from lce_rig.recordings.protocol import PairedRecording, SourceOptions
-    from lce_rig.rig import load_rig
     from lce_rig.session import Session
 
-    rig = load_rig(rig_name)
+    rig = load_rig(rig_name).of_robot(robot)
     require_kind(session, None)
     sensors = zip(
         _one_for_each(paths, "--camera", cameras, rig.cameras),

@@ -7,9 +7,21 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import session_argument, split_names
+from lce_rig.words import sentence
 
 if TYPE_CHECKING:
     from lce_rig.export.robot_tree import JointChange
+
+
+def _list_formats(context: click.Context, _param: click.Parameter, is_asked: bool) -> None:
+    """Print the formats with their files and end."""
+    if is_asked and not context.resilient_parsing:
+        from lce_rig.export import EXPORTS
+
+        for name, each in EXPORTS.items():
+            show.say(f"{name + (' *' if each.is_usual else ''):<16} {each.about}")
+        show.note("* unless others are named with --formats or as `exports` in the profile")
+        context.exit()
 
 
 @click.command()
@@ -19,8 +31,23 @@ if TYPE_CHECKING:
     "--formats",
     callback=split_names,
     metavar="LIST",
-    help="Write only these formats, separated by commas: extrinsics, urdf, camera_info, static_tf, kalibr, "
-    "autoware [default: all].",
+    help="Write only these formats, separated by commas [default: the profile's `exports`, else those marked "
+    "in --list].",
+)
+@click.option(
+    "--list",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_list_formats,
+    help="List the formats and their files, and end.",
+)
+@click.option(
+    "--tree",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Fit the files into the robot's tree of frames: its URDF, or a recording with /tf_static (ROS 1, "
+    "ROS 2, mcap).",
 )
 @click.option(
     "--into",
@@ -41,15 +68,16 @@ def export(
     session: Path,
     name: str | None,
     formats: list[str] | None,
+    tree: Path | None,
     into: Path | None,
     output: Path | None,
     force: bool,
 ) -> None:
     """Write the result of SESSION (default: session/) for other programs.
 
-    `calibrate` has written all formats into SESSION/calibration/ already. With --into the sensor that is
-    nearest to the root of the robot's tree stays where it is. Each other one keeps its parent, and the origin
-    of its joint changes; one that the robot lacks is added. The rest of the file stays as it is.
+    `calibrate` has written the usual formats into SESSION/calibration/ already. With --tree or --into the
+    sensor that is nearest to the root of the robot's tree stays where it is. Each other one keeps its parent,
+    and its pose there changes; one that the robot lacks is added. The rest of a URDF stays as it is.
     """
     from datetime import datetime
 
@@ -57,18 +85,26 @@ def export(
     from lce_rig.core.errors import UsageError
     from lce_rig.pipeline.result_files import RESULT, result_parts
 
-    if (into is None) == (output is None) or (into is not None and formats is not None):
+    if (into is None) == (output is None) or (into is not None and (formats or tree) is not None):
         raise UsageError(
             "where to is not clear",
-            "Give --output FOLDER (and --formats) for files, or --into URDF for the robot's own.",
+            "Give --output FOLDER (and --formats, --tree) for files, or --into URDF for the robot's own.",
         )
     opened = lce.Session.open(session)
     pairs = lce.read_result(opened.path.joinpath(*result_parts(name), RESULT)).pairs
     if output is not None:
+        from lce_rig.export import export_formats
+        from lce_rig.export.robot_tree import read_robot
+
+        robot = None if tree is None else read_robot(tree)
         output.mkdir(parents=True, exist_ok=True)
-        files = lce.export(pairs, opened.rig, output, formats=formats, is_forced=force)
-        for file in files:
+        exported = export_formats(
+            pairs, opened.rig, output, formats=formats, is_forced=force, session=opened, robot=robot
+        )
+        for file in exported.files:
             show.say(str(file))
+        for finding in exported.findings:
+            (show.note if finding.severity == "note" else show.warn)(sentence(finding))
         return
     from lce_rig.export import require_usable
     from lce_rig.export.robot_urdf import write_into_urdf

@@ -29,17 +29,21 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "intrinsics": ("lce_rig.cli.intrinsics", "Estimate the cameras' intrinsics from a session."),
     "lidar-intrinsics": ("lce_rig.cli.lidar_intrinsics", "Estimate a LiDAR's constant errors from sessions."),
     "verify": ("lce_rig.cli.verify", "Project the point clouds into the images and print residuals."),
+    "view": ("lce_rig.cli.view", "Show the coloured cloud and the cameras in 3D."),
     "drift": ("lce_rig.cli.drift", "Check without a board whether extrinsics still hold."),
     "results": ("lce_rig.cli.results", "List the results of a session with figures and verdicts."),
     "export": ("lce_rig.cli.export", "Write a result for other programs, or into a robot's URDF."),
+    "deploy": ("lce_rig.cli.deploy", "Put a result on a robot, ask what is there, or go back."),
     "repeat": ("lce_rig.cli.repeat", "Compare the calibrations of sessions, or the results of one."),
+    "fleet": ("lce_rig.cli.fleet", "Calibrate the sessions of many robots; keep and query results."),
 }
 EXIT_BUG = 70
 
 EPILOG = """\b
 Exit codes: 0 done · 1 other error · 2 usage · 3 rig profile · 4 session ·
 5 recording, sensor or missing dependency · 6 not enough data ·
-7 result refused · 70 bug in lce-rig · 130 interrupted
+7 result refused · 8 target not reached or written, earlier files in place ·
+9 command after a deployment failed, new files in place · 70 bug in lce-rig · 130 interrupted
 """
 
 

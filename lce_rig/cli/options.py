@@ -36,6 +36,10 @@ rig_option = click.option(
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
 
+robot_option = click.option(
+    "--robot", metavar="NAME", help="Name the robot that carries the rig; the result says so."
+)
+
 cameras_option = click.option(
     "--camera", "cameras", multiple=True, metavar="NAME", help="Use only this camera; repeatable."
 )
@@ -61,4 +65,11 @@ event_image_option = click.option(
     type=EVENT_IMAGES,
     help="Reconstruct images from events with the network, or as sums of polarities (map) "
     "[default: the profile's, else network].",
+)
+
+registry_option = click.option(
+    "--registry",
+    required=True,
+    metavar="DIR",
+    help="Set the folder of results: a path, or an address such as s3://bucket/registry.",
 )

@@ -83,8 +83,12 @@ def print_table(table: Any) -> None:
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[Progress]:
+def progress_bar(title: str, *, has_rate: bool = False) -> Iterator[Progress]:
     """Show a progress bar on stderr; nothing if stderr is not a terminal.
+
+    Args:
+        title: what is counted.
+        has_rate: whether to show how many are done per second, too.
 
     Yields:
         A callback (done, total).
@@ -93,16 +97,22 @@ def progress_bar(title: str) -> Iterator[Progress]:
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
-    columns = (
+    columns = [
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
+        *([TextColumn("{task.fields[rate]}")] if has_rate else []),
         TimeRemainingColumn(compact=True),
-    )
+    ]
     console = Console(stderr=True)
     with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(title, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        task = bar.add_task(title, total=None, rate="")
+
+        def report(done: int, total: int) -> None:
+            speed = bar.tasks[0].speed
+            bar.update(task, completed=done, total=total, rate=f"{speed:.2g}/s" if speed else "")
+
+        yield report
 
 
 def escape(text: str) -> str:

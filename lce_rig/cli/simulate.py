@@ -179,20 +179,17 @@ def _options(rig: "Rig", motion: Any, choices: dict[str, Any]) -> "SimulationOpt
         option = of_motion[0].replace("_", "-")
         raise UsageError(f"--{option} applies to a moving board only", "Add --motion moving.")
     options = SimulationOptions.for_rig(rig.name, motion)
-    hand, lidar = options.hand, options.lidar
+    hand = options.hand
     if choices["speed"] is not None:
         slow, fast = choices["speed"]
         if slow > fast:
             raise UsageError(f"--speed {slow:g} {fast:g}: MIN exceeds MAX", "Give MIN first.")
         hand = replace(hand, speed_mps=(slow, fast), carry_mps=fast)
-    if choices["range_sigma"] is not None:
-        lidar = replace(lidar, range_sigma_m=choices["range_sigma"])
-    if choices["range_offset"] is not None:
-        lidar = replace(lidar, range_offset_m=choices["range_offset"])
     return replace(
         options,
         hand=hand,
-        lidar=lidar,
+        range_sigma_m=choices["range_sigma"],
+        range_offset_m=choices["range_offset"],
         noise_level=choices["noise_level"],
         mounting_seed=choices["mounting"],
         has_decoy_plate=choices["decoy"],

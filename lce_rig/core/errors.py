@@ -72,6 +72,18 @@ class ResultRefusedError(LceRigError):
     exit_code = 7
 
 
+class TargetError(LceRigError):
+    """A target of a deployment that cannot be reached or written; it holds a whole set of files."""
+
+    exit_code = 8
+
+
+class CommandError(LceRigError):
+    """The command after a deployment failed; the new files are in place."""
+
+    exit_code = 9
+
+
 @contextmanager
 def reading(path: Path, kind: type[LceRigError], hint: str = "") -> Iterator[None]:
     """Turn what prevents a block from reading a file into an error of one kind that names the file.
@@ -92,4 +104,5 @@ def reading(path: Path, kind: type[LceRigError], hint: str = "") -> Iterator[Non
 def join_shortages(errors: Sequence[NotEnoughDataError]) -> NotEnoughDataError:
     """Make one error of at least one: the first, with the others in its hint."""
     first, *others = errors
-    return NotEnoughDataError(first.what, "\n".join([first.hint, *map(str, others)]).strip())
+    hint = "\n".join([first.hint, *map(str, others)]).strip()
+    return NotEnoughDataError(first.what, hint, first.finding)

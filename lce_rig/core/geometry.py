@@ -165,6 +165,24 @@ def sigma_sizes(cov: Array) -> tuple[float, float]:
     return float(np.degrees(np.sqrt(rotation))), float(np.sqrt(translation))
 
 
+def largest_sizes(cov: Array) -> tuple[float, float]:
+    """Compute what rotation (deg) and translation (m) of a tangent exceed with a probability of 5 % only.
+
+    The squared size, of mean tr C and variance 2 tr C^2, is taken as g chi2 with h degrees of freedom,
+    g = tr C^2 / tr C, h = tr(C)^2 / tr C^2 (Satterthwaite).
+
+    Args:
+        cov: (6 + k, 6 + k), the tangent first.
+    """
+    from scipy.special import chdtri
+
+    sizes = []
+    for part in (cov[3:6, 3:6], cov[:3, :3]):
+        total, squares = np.trace(part), np.trace(part @ part)
+        sizes.append(np.sqrt(squares / total * chdtri(total**2 / squares, 0.05)))
+    return float(np.degrees(sizes[0])), float(sizes[1])
+
+
 def fit_plane(points: NDArray[Any]) -> tuple[Array, float]:
     """Fit n.p + d = 0 by least squares, n towards the origin of the points' frame (d >= 0).
 

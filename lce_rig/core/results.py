@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Literal, cast
+from typing import Literal, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -443,11 +443,35 @@ class SceneShare:
     n_directions: int
 
 
+class Extrinsics(Protocol):
+    """What other evidence needs of extrinsics that boards gave, judged or not; fields as of `Calibration`."""
+
+    @property
+    def camera(self) -> str:
+        """Name of the camera."""
+
+    @property
+    def lidar(self) -> str:
+        """Name of the LiDAR."""
+
+    @property
+    def T_cam_lidar(self) -> Array:
+        """(4, 4)."""
+
+    @property
+    def cov(self) -> Array:
+        """(6, 6)."""
+
+    @property
+    def cov_shared(self) -> Array:
+        """(6, 6)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
 
-    result.json keeps all of it but the last four attributes, which are empty if it is read back.
+    result.json keeps all of it but the last six attributes, which are empty if it is read back.
 
     Attributes:
         channels: of the camera, names.
@@ -473,6 +497,9 @@ class Calibration:
         held_out_m: rms residual of captures where they were not fitted; NaN if no method knows it.
         residuals: of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
+        lens_error, lens_error_sigma: errors of the profile's intrinsics as the boards see them, given less
+            seen: focal length (relative), principal point x and y (px), distortion (px in the image's
+            corner); their standard deviations.
     """
 
     camera: str
@@ -504,6 +531,8 @@ class Calibration:
     held_out_m: float = float("nan")
     residuals: tuple[CaptureResidual, ...] = ()
     observations: Mapping[str, Observation] = field(default_factory=dict)
+    lens_error: tuple[float, ...] = ()
+    lens_error_sigma: tuple[float, ...] = ()
 
     @property
     def channel(self) -> str:

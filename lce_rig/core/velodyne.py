@@ -1,10 +1,15 @@
-"""VLP-16 packets: their layout, their timing, and the names in their factory bytes.
+"""Velodyne packets: their layout, their timing, and the names in their factory bytes.
 
 References:
-    VLP-16 User Manual, Velodyne 63-9243 Rev. D, chapters 6 and 9, appendix E.
+    VLP-16 User Manual, Velodyne 63-9243 Rev. D, chapters 6 and 9, appendix E; HDL-32E User's Manual 63-9113,
+    VLP-32C User Manual 63-9325.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
+
+from lce_rig.core.data_sheets import find_data_sheet
 
 DATA_PORT = 2368
 POSITION_PORT = 8308
@@ -38,6 +43,39 @@ PRODUCTS = {
     0xA1: "VLS-128",
 }
 
+
+@dataclass(frozen=True)
+class Product:
+    """A model whose packets are read.
+
+    Attributes:
+        code: its factory byte.
+        name: the maker's.
+        block_ns: from the first firing of a block to that of the next, with one return.
+    """
+
+    code: int
+    name: str
+    block_ns: int
+
+    def packet_ns(self, is_dual: bool) -> int:
+        """Return the time from the first firing of a packet to the first firing of the next."""
+        return N_BLOCKS * self.block_ns // (2 if is_dual else 1)
+
+
+#: A block holds 32 returns: two sequences of 16 lasers, or one of 32.
+READ = tuple(
+    Product(code, PRODUCTS[code], block_ns)
+    for code, block_ns in ((VLP16, BLOCK_NS), (0x24, BLOCK_NS), (0x21, 46_080), (0x28, SEQUENCE_NS))
+)
+
+
+def product_of(model: str) -> Product | None:
+    """Find whose packets a model sends; None where they are not read."""
+    sheet = find_data_sheet(model)
+    return next((each for each in READ if sheet is not None and each.name == sheet.name), None)
+
+
 _RETURN = np.dtype([("range", "<u2"), ("reflectivity", "u1")])
 DATA_BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("returns", _RETURN, (2 * N_LASERS,))])
 #: `us` counts from the full hour to the first firing; even blocks of dual packets hold last returns.
@@ -56,8 +94,3 @@ POSITION_PACKET = np.dtype(
         "itemsize": POSITION_BYTES,
     }
 )
-
-
-def packet_ns(is_dual: bool) -> int:
-    """Return the time from the first firing of a packet to the first firing of the next."""
-    return N_BLOCKS * BLOCK_NS // (2 if is_dual else 1)

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image, Scan
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.events.search import find_in_reconstruction
 from lce_rig.detect.image.search import find_image_board, region_around
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import find_lidar_boards, track_lidar_board
+from lce_rig.detect.lidar.search import find_lidar_boards, look_for_board, track_lidar_board
 from lce_rig.detect.limits_met import gate_image_board, gate_lidar_boards
 from lce_rig.rig import Rig
 
@@ -164,6 +165,21 @@ class BoardFinder:
         found = [each for each in tracked if isinstance(each, LidarBoard)]
         lost = [each for each in tracked if isinstance(each, Refusal)]
         return self._compared(found or lost[0], scan)
+
+    def look_for(self, scan: Scan, T_lidar_board: Array) -> LidarBoard | Refusal:
+        """Find the board in a scan about a predicted pose (4, 4)."""
+        lidar, limits = self.rig.lidars[scan.sensor], self.rig.quality
+        found = look_for_board(
+            scan,
+            self.board,
+            T_lidar_board,
+            min_range_m=lidar.min_range_m,
+            min_rings=limits.min_rings,
+            max_rms_m=limits.max_thickness_m,
+            beam=self._beam(scan.sensor),
+        )
+        usable = self._compared(found if isinstance(found, Refusal) else [found], scan).usable
+        return usable if isinstance(usable, Refusal) else usable[0]
 
     def _beam(self, lidar: str) -> Beam:
         settings = self.rig.lidars[lidar]

@@ -3,21 +3,21 @@
 from importlib import import_module
 from typing import Any
 
+from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import DriverSettings, Rig
-from lce_rig.rig.sensors import CAMERA_DRIVERS, LIDAR_DRIVERS, VLP16_MODELS
+from lce_rig.rig.sensors import CAMERA_DRIVERS, LIDAR_DRIVERS
 
 LIVE = {
     "vlp16": "lce_rig.devices.vlp16.driver:Vlp16Source",
     "v4l2": "lce_rig.devices.v4l2.driver:V4l2Source",
     "command": "lce_rig.devices.pipe.driver:ImagePipeSource",
     "davis": "lce_rig.devices.davis.driver:DavisSource",
+    "ros2": "lce_rig.devices.ros2.driver:Ros2Source",
     "sync_board": "lce_rig.devices.sync_board.driver:SyncBoard",
 }
 """Source by type of driver."""
-
-_TYPE_BY_MODEL = {**dict.fromkeys(VLP16_MODELS, "vlp16"), "DAVIS": "davis"}
 
 
 def open_live(rig: Rig) -> list[LiveSource]:
@@ -78,7 +78,9 @@ def edge_cameras(rig: Rig) -> list[str]:
 
 
 def _by_model(model: str) -> str | None:
-    return next((kind for begin, kind in _TYPE_BY_MODEL.items() if model.upper().startswith(begin)), None)
+    if velodyne.product_of(model) is not None:
+        return "vlp16"
+    return "davis" if model.upper().startswith("DAVIS") else None
 
 
 def _source(kind: str, *arguments: Any) -> LiveSource:

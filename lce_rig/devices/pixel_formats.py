@@ -4,6 +4,7 @@ References:
     https://docs.kernel.org/userspace-api/media/v4l/pixfmt.html
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,12 +25,19 @@ class PixelFormat:
         bits: of a value; above 8 it lies in two bytes, little end first.
         conversion: name of OpenCV's conversion to BGR; "" where none is needed.
         n_chroma_planes: planes of quarter size behind the first: 2 apart, 1 with both in turn; 0 without.
+        is_split: whether a device hands each plane over in memory of its own.
     """
 
     n_channels: int
     bits: int = 8
     conversion: str = ""
     n_chroma_planes: int = 0
+    is_split: bool = False
+
+    @property
+    def n_memory_planes(self) -> int:
+        """How many pieces of memory an image lies in."""
+        return 1 + self.n_chroma_planes if self.is_split else 1
 
     @property
     def is_compressed(self) -> bool:
@@ -49,6 +57,10 @@ FORMATS = {
     "NV21": PixelFormat(1, 8, "COLOR_YUV2BGR_NV21", 1),
     "YU12": PixelFormat(1, 8, "COLOR_YUV2BGR_I420", 2),
     "YV12": PixelFormat(1, 8, "COLOR_YUV2BGR_YV12", 2),
+    "NM12": PixelFormat(1, 8, "COLOR_YUV2BGR_NV12", 1, is_split=True),
+    "NM21": PixelFormat(1, 8, "COLOR_YUV2BGR_NV21", 1, is_split=True),
+    "YM12": PixelFormat(1, 8, "COLOR_YUV2BGR_I420", 2, is_split=True),
+    "YM21": PixelFormat(1, 8, "COLOR_YUV2BGR_YV12", 2, is_split=True),
     "BGR3": PixelFormat(3),
     "RGB3": PixelFormat(3, 8, "COLOR_RGB2BGR"),
     "BGR4": PixelFormat(4, 8, "COLOR_BGRA2BGR"),
@@ -120,6 +132,21 @@ class PixelDecoder:
         if self._form.n_chroma_planes:
             return self._stride * height + self._chroma_stride * (height // 2) * self._form.n_chroma_planes
         return self._stride * (height - 1) + self._row
+
+    def join(self, planes: Sequence[bytes]) -> bytes:
+        """Join the planes of an image, each without what its memory holds behind it.
+
+        Raises:
+            ValueError: a plane is torn or missing.
+        """
+        if not self._form.is_split:
+            return planes[0]
+        height = self._size[1]
+        n_bytes = [self._stride * height] + [self._chroma_stride * (height // 2)] * self._form.n_chroma_planes
+        sizes = [len(plane) for plane in planes]
+        if len(sizes) != len(n_bytes) or any(size < n for size, n in zip(sizes, n_bytes, strict=True)):
+            raise ValueError(f"planes of {sizes} bytes came, of {n_bytes} bytes were expected")
+        return b"".join(plane[:n] for plane, n in zip(planes, n_bytes, strict=True))
 
     def decode(self, data: bytes | bytearray | memoryview) -> Pixels:
         """Decode one image.

@@ -41,6 +41,7 @@ class SourceStatus:
         problems: what is wrong now.
         figures: further counts and measurements by name, for people and logs.
         device: what answers: its model, serial number and firmware as far as it tells them.
+        serial: its serial number; "" where it tells none, or none yet.
         rates_hz: what a device of several streams, or with a rotor, measures: by "scans", "frames", "events".
         n_packets: data packets received; None of a sensor that sends none.
         n_lost_by_line: of a sync board: pulses lost, by line.
@@ -55,6 +56,7 @@ class SourceStatus:
     problems: tuple[Finding, ...] = ()
     figures: Mapping[str, float] = field(default_factory=dict)
     device: str = ""
+    serial: str = ""
     rates_hz: Mapping[str, float] = field(default_factory=dict)
     n_packets: int | None = None
     n_lost_by_line: Mapping[str, int] = field(default_factory=dict)

@@ -125,7 +125,7 @@ def check_socket_buffer(rig: Rig, folder: Path) -> Check | None:
         port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WANTED_BUFFER_BYTES)
         # Linux doubles what was asked for, for its own accounts, and reports the double.
         granted_bytes = port.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-    buffer_s = granted_bytes / PACKET_COST_BYTES * velodyne.packet_ns(False) * 1e-9
+    buffer_s = granted_bytes / PACKET_COST_BYTES * velodyne.READ[0].packet_ns(False) * 1e-9
     figures = {
         "buffer_s": buffer_s,
         "granted_kib": granted_bytes >> 11,

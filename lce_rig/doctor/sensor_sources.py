@@ -9,6 +9,7 @@ from lce_rig.rig.sync_settings import BOARD
 # What to add for each driver that needs the address of its sensor.
 _LINES = {
     "v4l2": "driver: {type: v4l2, device: /dev/video0}",
+    "ros2": "driver: {type: ros2}",
     "command": "driver: {type: command, command: [PROGRAM, ARGUMENT, ...]}",
 }
 

@@ -1,38 +1,124 @@
 """Write results as files for other programs; each is read back and checked."""
 
+import math
+import shutil
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import TYPE_CHECKING
 
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, reading
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import difference, tangent_sizes
 from lce_rig.core.results import Calibration
 from lce_rig.export.frames import require_known
+from lce_rig.export.job import ExportJob
+from lce_rig.export.robot_tree import RobotTree
 from lce_rig.rig import Rig
 from lce_rig.words import sentence
 
-Exporter = Callable[[Sequence[Calibration], Rig, Path], list[Path]]
+if TYPE_CHECKING:
+    from lce_rig.session import Session
 
-# Format -> module and function, imported when used.
-EXPORTS: dict[str, str] = {
-    "extrinsics": "lce_rig.export.extrinsics:export_extrinsics",
-    "urdf": "lce_rig.export.urdf:export_urdf",
-    "camera_info": "lce_rig.export.camera_info:export_camera_info",
-    "static_tf": "lce_rig.export.static_tf:export_static_tf",
-    "kalibr": "lce_rig.export.kalibr:export_kalibr",
-    "autoware": "lce_rig.export.autoware:export_autoware",
+Exporter = Callable[[ExportJob], list[Path]]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A form of output.
+
+    Attributes:
+        home: module and function, imported when used.
+        about: its files and what they are for, one line.
+        is_usual: whether it is written unless others are named.
+    """
+
+    home: str
+    about: str
+    is_usual: bool = False
+
+
+def _usual(home: str, about: str) -> Format:
+    return Format(home, about, is_usual=True)
+
+
+EXPORTS: dict[str, Format] = {
+    "extrinsics": _usual(
+        "lce_rig.export.extrinsics:export_extrinsics",
+        "extrinsics.yaml: pose, inverse, example point, covariance",
+    ),
+    "urdf": _usual("lce_rig.export.urdf:export_urdf", "RIG.urdf: for robot_state_publisher"),
+    "camera_info": _usual(
+        "lce_rig.export.camera_info:export_camera_info", "camera_info_CAMERA.yaml: for ROS camera drivers"
+    ),
+    "static_tf": _usual(
+        "lce_rig.export.static_tf:export_static_tf",
+        "static_transforms.txt: static_transform_publisher lines, ROS 1 and 2",
+    ),
+    "ros2_launch": Format(
+        "lce_rig.export.ros2_launch:export_ros2_launch", "RIG.launch.py: a ROS 2 launch file"
+    ),
+    "tf_static_bag": Format(
+        "lce_rig.export.ros_bag:export_tf_static_bag", "tf_static/: a ROS 2 bag with latched /tf_static"
+    ),
+    "kalibr": _usual("lce_rig.export.kalibr:export_kalibr", "camchain_LIDAR.yaml: Kalibr's camera chain"),
+    "autoware": _usual(
+        "lce_rig.export.autoware:export_autoware",
+        "sensor_kit_calibration.yaml, sensors_calibration.yaml: Autoware's individual_params",
+    ),
+    "fast_livo2": Format(
+        "lce_rig.export.fast_livo2:export_fast_livo2",
+        "fast_livo2_CAMERA.yaml (Rcl, Pcl), fast_livo2_camera_CAMERA.yaml: FAST-LIVO2",
+    ),
+    "koide3": Format(
+        "lce_rig.export.koide3:export_koide3", "calib_CAMERA.json: direct_visual_lidar_calibration"
+    ),
+    "opencv": Format("lce_rig.export.opencv:export_opencv", "opencv_CAMERA.yaml: for cv::FileStorage"),
+    "isaac": Format(
+        "lce_rig.export.isaac:export_isaac", "isaac_calibration.urdf: Isaac ROS; needs base_link"
+    ),
+    "mcap": Format(
+        "lce_rig.export.session_bag:export_mcap",
+        "RIG_session/: the session for Foxglove and RViz, with projected clouds",
+    ),
+    "ply": Format(
+        "lce_rig.export.coloured_cloud:export_ply", "coloured_CAMERA.ply: coloured points of all captures"
+    ),
+    "ply_captures": Format(
+        "lce_rig.export.coloured_cloud:export_ply_captures", "coloured_CAMERA_CAPTURE.ply: of each capture"
+    ),
 }
 
 
+@dataclass(frozen=True)
+class Exported:
+    """What was written.
+
+    Attributes:
+        files: in the order of the formats; those of a bag lie in a folder of their own.
+        findings: what is left out or in another form, and why.
+    """
+
+    files: tuple[Path, ...]
+    findings: tuple[Finding, ...]
+
+
 def load_exporter(name: str) -> Exporter:
-    """Import the function (calibrations, rig, folder) -> paths of a format.
+    """Import the function of a format, from `ExportJob` to the files written.
 
     Raises:
         UsageError: no such format.
     """
     if name not in EXPORTS:
         raise UsageError(f"no export format is called {name}", f"Choose one of: {', '.join(EXPORTS)}")
-    exporter: Exporter = resolve_name(EXPORTS[name])
+    exporter: Exporter = resolve_name(EXPORTS[name].home)
     return exporter
+
+
+def usual_formats(rig: Rig) -> tuple[str, ...]:
+    """List the formats that are written unless others are named: the profile's `exports`, else the usual."""
+    return tuple(rig.exports) or tuple(name for name, each in EXPORTS.items() if each.is_usual)
 
 
 def export(
@@ -42,8 +128,27 @@ def export(
     *,
     formats: Iterable[str] | None = None,
     is_forced: bool = False,
+    session: "Session | None" = None,
+    robot: RobotTree | None = None,
 ) -> list[Path]:
-    """Write all formats (or those named) into a folder, each read back and checked by probe points.
+    """Write formats into a folder, each read back and checked; see `export_formats`, which also says more."""
+    exported = export_formats(
+        calibrations, rig, folder, formats=formats, is_forced=is_forced, session=session, robot=robot
+    )
+    return list(exported.files)
+
+
+def export_formats(
+    calibrations: Sequence[Calibration],
+    rig: Rig,
+    folder: Path | str,
+    *,
+    formats: Iterable[str] | None = None,
+    is_forced: bool = False,
+    session: "Session | None" = None,
+    robot: RobotTree | None = None,
+) -> Exported:
+    """Write formats into a folder, each read back and checked by probe points.
 
     Exports of an earlier run are removed first, even if this one is refused, so that they are not mistaken
     for this result.
@@ -52,31 +157,49 @@ def export(
         calibrations: what to write, one for each camera channel and LiDAR.
         rig: the profile the calibrations belong to.
         folder: usually the session's `calibration/`.
-        formats: keys of EXPORTS; all by default.
+        formats: keys of EXPORTS; by default the profile's `exports`, else the usual ones.
         is_forced: write failed calibrations too; every file then says so.
-
-    Returns:
-        The files written, in the order of the formats.
+        session: with images and scans, for formats that show them.
+        robot: its own tree of frames, into which the outputs are to fit.
 
     Raises:
         LceRigError: a calibration names sensors that the rig does not have.
+        SessionError: the sensors do not fit into the robot's tree.
         ResultRefusedError: a verdict is "fail"; nothing is written.
         LceRigError: a file reads back differently; it and all others are removed again.
     """
     folder = Path(folder)
     for calibration in calibrations:
         require_known(calibration, rig)
-    exporters = [load_exporter(name) for name in (EXPORTS if formats is None else formats)]
+    exporters = [load_exporter(name) for name in (usual_formats(rig) if formats is None else formats)]
     remove_exports(folder)
     require_usable(calibrations, is_forced=is_forced)
+    job = ExportJob(calibrations, rig, folder, robot, session, _unused_mount(rig, robot))
     paths: list[Path] = []
     try:
         for exporter in exporters:
-            paths += exporter(calibrations, rig, folder)
+            paths += exporter(job)
     except BaseException:
         remove_exports(folder)
         raise
-    return paths
+    return Exported(tuple(paths), tuple(job.findings))
+
+
+def _unused_mount(rig: Rig, robot: RobotTree | None) -> list[Finding]:
+    """Say where the robot's own tree has another pose than the profile's mount."""
+    if rig.mount is None or robot is None or rig.mount.of not in robot.above:
+        return []
+    joint = robot.above[rig.mount.of]
+    angle_rad, distance_m = tangent_sizes(difference(joint.T_parent_child, rig.mount.to_matrix()))
+    if joint.parent != rig.mount.parent or (angle_rad < 1e-6 and distance_m < 1e-6):
+        return []
+    figures: dict[str, Figure] = {
+        "source": robot.source,
+        "frame": rig.mount.of,
+        "angle_deg": math.degrees(angle_rad),
+        "distance_m": distance_m,
+    }
+    return [Finding("export.mount_unused", "note", figures=figures)]
 
 
 def require_usable(calibrations: Sequence[Calibration], *, is_forced: bool = False) -> None:
@@ -101,20 +224,35 @@ def remove_exports(folder: Path) -> None:
     for path in sorted(folder.glob("*")):
         if is_export(path):
             try:
-                path.unlink()
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
             except OSError as error:
                 raise SessionError(
                     f"{path}: an earlier export cannot be removed: {error.strerror}"
                 ) from error
 
 
+_SUFFIXES = (".yaml", ".urdf", ".txt", ".json", ".py", ".ply")
+_SIGN = b", written by lce-rig "
+_MOST_METADATA_BYTES = 1 << 20
+
+
 def is_export(path: Path) -> bool:
-    """Return whether a file is an export that lce-rig wrote, by its first lines.
+    """Return whether lce-rig wrote a file, by its first lines, or a bag, by its metadata.
 
     Raises:
         SessionError: it cannot be read.
     """
-    if path.suffix not in (".yaml", ".urdf", ".txt") or not path.is_file() or path.is_symlink():
+    if path.is_symlink():
         return False
+    if path.is_dir():
+        metadata = path / "metadata.yaml"
+        return metadata.is_file() and _SIGN in _begin(metadata, _MOST_METADATA_BYTES)
+    return path.suffix in _SUFFIXES and path.is_file() and _SIGN in _begin(path, 300)
+
+
+def _begin(path: Path, n_bytes: int) -> bytes:
     with reading(path, SessionError), path.open("rb") as file:
-        return b", written by lce-rig " in file.read(300)
+        return b" ".join(file.read(n_bytes).split())  # YAML breaks long lines

@@ -9,24 +9,22 @@ import numpy as np
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError, ProfileError
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
-from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, numbers, quoted, reads_back
-from lce_rig.export.frames import choose_channels
+from lce_rig.export.job import ExportJob
 from lce_rig.export.probes import check_projection
-from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 
 
-def export_camera_info(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> list[Path]:
+def export_camera_info(job: ExportJob) -> list[Path]:
     """Write a file for each calibrated camera and check it by reading it back.
 
     Raises:
         LceRigError: a file projects differently from the rig's camera.
     """
-    chosen = {calibration.camera: calibration for calibration in choose_channels(calibrations, rig)}
+    rig = job.rig
     paths = []
-    for name, calibration in chosen.items():
-        path = folder / f"camera_info_{name}.yaml"
+    for name, calibration in {each.camera: each for each in job.chosen}.items():
+        path = job.folder / f"camera_info_{name}.yaml"
         intrinsics = rig.cameras[name].to_intrinsics()
         lines = header("camera_info", rig, [calibration], of_one_camera=True)
         write_atomically(path, camera_info_text(name, intrinsics, lines))

@@ -19,6 +19,7 @@ from lce_rig.export.files import (
     rows,
     texts,
 )
+from lce_rig.export.job import ExportJob
 from lce_rig.export.probes import TOLERANCE, check_pose
 from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
 from lce_rig.rig import Rig
@@ -28,17 +29,18 @@ from lce_rig.words import sentence
 FILE_NAME = "extrinsics.yaml"
 
 
-def export_extrinsics(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> list[Path]:
+def export_extrinsics(job: ExportJob) -> list[Path]:
     """Write extrinsics.yaml and check it by reading it back.
 
     Raises:
         LceRigError: the file reads back differently.
     """
+    rig, calibrations = job.rig, job.calibrations
     lines = [f"# {line}" for line in header("extrinsics", rig, calibrations)]
     lines += ["format_version: 1", f"rig: {quoted(rig.name)}", f"made_by: {quoted(MADE_BY)}", "pairs:"]
     for calibration in calibrations:
         lines += _pair(calibration, rig)
-    path = folder / FILE_NAME
+    path = job.folder / FILE_NAME
     write_atomically(path, "\n".join(lines) + "\n")
     _check(path, calibrations, rig)
     return [path]

@@ -1,12 +1,13 @@
-"""The tree of frames for URDF and static transforms, and the check that it is a tree."""
+"""Frames and fixed joints, and the check that they make a tree."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.geometry import Array, invert, pose
+from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
 
@@ -25,75 +26,33 @@ class Joint:
     Attributes:
         T_parent_child: (4, 4), the child's pose in the parent's frame.
         is_optical: whether it is the rotation from a camera's body to its optical frame.
+        is_given: whether the robot's own tree has it like this already.
     """
 
     parent: str
     child: str
     T_parent_child: Array
     is_optical: bool = False
+    is_given: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTree:
-    """Frames under one root, joints listed parents first."""
+    """Frames under one root.
+
+    Attributes:
+        joints: parents first.
+        pairs: (camera, LiDAR) of the calibrations that the joints express; others close a loop.
+    """
 
     root: str
     joints: tuple[Joint, ...]
+    pairs: frozenset[tuple[str, str]]
 
     @property
     def frames(self) -> tuple[str, ...]:
         """All frames, the root first."""
         return (self.root, *(joint.child for joint in self.joints))
-
-
-def build_trees(calibrations: Sequence[Calibration], rig: Rig) -> list[FrameTree]:
-    """Connect all calibrated sensors to the rig's root frame; unconnected ones form other trees.
-
-    The tree that holds the sensor of the profile's `mount` hangs from the robot's frame.
-    Each camera has one pose; of several channels the one from `choose_channels` is used.
-
-    Raises:
-        LceRigError: a calibration names a sensor that the rig does not have.
-    """
-    chosen = choose_channels(calibrations, rig)
-    bodies = {name: lidar.frame for name, lidar in rig.lidars.items()}
-    bodies |= {name: camera.frame for name, camera in rig.cameras.items()}
-    used = [name for name in bodies if any(name in (c.camera, c.lidar) for c in chosen)]
-    used.sort(key=lambda name: bodies[name] != rig.root_frame)
-    optical = {camera.frame: camera.optical_frame for camera in rig.cameras.values()}
-    trees: list[FrameTree] = []
-    placed: set[str] = set()
-    for name in used:
-        if name not in placed:
-            joints = _grow(name, chosen, bodies, placed)
-            frames = [bodies[name], *(joint.child for joint in joints)]
-            joints += [Joint(f, optical[f], T_BODY_OPTICAL, is_optical=True) for f in frames if f in optical]
-            root = bodies[name]
-            if rig.mount is not None and rig.mount.of == root:
-                joints.insert(0, Joint(rig.mount.parent, root, rig.mount.to_matrix()))
-                root = rig.mount.parent
-            trees.append(FrameTree(root, tuple(joints)))
-    return trees
-
-
-def _grow(root: str, chosen: list[Calibration], bodies: dict[str, str], placed: set[str]) -> list[Joint]:
-    """Walk breadth first from one sensor to all that calibrations connect it with."""
-    joints: list[Joint] = []
-    placed.add(root)
-    queue = [root]
-    while queue:
-        here = queue.pop(0)
-        for calibration in chosen:
-            T_lidar_camera = invert(calibration.T_cam_lidar) @ invert(T_BODY_OPTICAL)
-            for parent, child, T in (
-                (calibration.lidar, calibration.camera, T_lidar_camera),
-                (calibration.camera, calibration.lidar, invert(T_lidar_camera)),
-            ):
-                if parent == here and child not in placed:
-                    joints.append(Joint(bodies[parent], bodies[child], T))
-                    placed.add(child)
-                    queue.append(child)
-    return joints
 
 
 def choose_channels(calibrations: Sequence[Calibration], rig: Rig) -> list[Calibration]:
@@ -128,15 +87,21 @@ def require_known(calibration: Calibration, rig: Rig) -> None:
         raise LceRigError(what, "Use the profile that the session was made with.")
 
 
-def check_tree(links: Sequence[str], joints: Iterable[tuple[str, str]]) -> None:
-    """Check that links and (parent, child) joints make one tree, which no available URDF parser does.
+def check_tree(links: Sequence[str], joints: Iterable[tuple[str, str]], *, has_one_root: bool = True) -> None:
+    """Check that links and (parent, child) joints make a tree, which no available URDF parser does.
+
+    Args:
+        links: names.
+        joints: between them.
+        has_one_root: whether it has to be one tree; else several, as static transforms make where others
+            change while the robot drives.
 
     Raises:
         LceRigError: no link, a name twice, an unknown link, two parents, several roots, or a loop.
     """
     if not links:
         raise LceRigError("no links")
-    twice = sorted({link for link in links if list(links).count(link) > 1})
+    twice = sorted(link for link, count in Counter(links).items() if count > 1)
     if twice:
         raise LceRigError(f"link {twice[0]} is defined twice")
     parents: dict[str, str] = {}
@@ -148,7 +113,7 @@ def check_tree(links: Sequence[str], joints: Iterable[tuple[str, str]]) -> None:
             raise LceRigError(f"link {child} has two parents, {parents[child]} and {parent}")
         parents[child] = parent
     roots = [link for link in links if link not in parents]
-    if len(roots) > 1:
+    if has_one_root and len(roots) > 1:
         raise LceRigError(f"several roots: {', '.join(roots)}")
     for link in links:
         seen = [link]

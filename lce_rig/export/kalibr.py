@@ -9,52 +9,47 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, numbers, quoted, reads_back, rows
-from lce_rig.export.frames import choose_channels
+from lce_rig.export.job import ExportJob
+from lce_rig.export.lens import FittedLens, lens_for, lens_lines
 from lce_rig.export.probes import check_projection
 from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 
 
-def export_kalibr(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> list[Path]:
-    """Write camchain_LIDAR.yaml for each LiDAR whose cameras Kalibr's models describe, and read it back.
+def export_kalibr(job: ExportJob) -> list[Path]:
+    """Write camchain_LIDAR.yaml for each LiDAR and read it back.
 
-    Kalibr supports four radtan coefficients; cameras with k3 or more are skipped.
+    Kalibr has four radtan coefficients; a camera with more gets the four that fit best.
 
     Raises:
         LceRigError: a file reads back differently.
     """
-    chosen = choose_channels(calibrations, rig)
+    lenses = {name: lens_for(job, "kalibr", name, 4) for name in dict.fromkeys(c.camera for c in job.chosen)}
     paths = []
-    for lidar in rig.lidars:
-        chain = [
-            c for c in chosen if c.lidar == lidar and _is_expressible(rig.cameras[c.camera].to_intrinsics())
-        ]
+    for lidar in job.rig.lidars:
+        chain = [c for c in job.chosen if c.lidar == lidar]
         if chain:
-            path = folder / f"camchain_{lidar}.yaml"
-            write_atomically(path, _text(chain, rig))
-            _check(path, chain, rig)
+            path = job.folder / f"camchain_{lidar}.yaml"
+            write_atomically(path, _text(chain, lenses, job.rig))
+            _check(path, chain, lenses, job.rig)
             paths.append(path)
     return paths
 
 
-def _is_expressible(intrinsics: Intrinsics) -> bool:
-    return intrinsics.model == "equidistant" or not any(intrinsics.distortion[4:])
-
-
-def _text(chain: Sequence[Calibration], rig: Rig) -> str:
+def _text(chain: Sequence[Calibration], lenses: dict[str, FittedLens], rig: Rig) -> str:
     lines = [f"# {line}" for line in header("Kalibr camchain", rig, chain)]
     lines += ["# T_cam_lidar, which Kalibr ignores, takes points from the LiDAR to the camera"]
     before: Calibration | None = None
     for index, calibration in enumerate(chain):
-        intrinsics = rig.cameras[calibration.camera].to_intrinsics()
-        coefficients = (*intrinsics.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
+        lens = lenses[calibration.camera]
+        intrinsics = lens.intrinsics
         model = "equidistant" if intrinsics.model == "equidistant" else "radtan"
         topic = (
             rig.cameras[calibration.camera].channels[calibration.channels[0]].topic
             or f"/{calibration.camera}"
         )
         camera_matrix = (intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px)
-        lines += [f"cam{index}:"]
+        lines += [*(f"# cam{index}: {line}" for line in lens_lines(lens)), f"cam{index}:"]
         if before is not None:
             lines += ["  T_cn_cnm1:", *rows(calibration.T_cam_lidar @ invert(before.T_cam_lidar), "    ")]
         lines += [
@@ -62,7 +57,7 @@ def _text(chain: Sequence[Calibration], rig: Rig) -> str:
             *rows(calibration.T_cam_lidar, "    "),
             f"  cam_overlaps: [{', '.join(str(i) for i in range(len(chain)) if i != index)}]",
             "  camera_model: pinhole",
-            f"  distortion_coeffs: {numbers(coefficients)}",
+            f"  distortion_coeffs: {numbers(intrinsics.distortion)}",
             f"  distortion_model: {model}",
             f"  intrinsics: {numbers(camera_matrix)}",
             f"  resolution: [{intrinsics.width_px}, {intrinsics.height_px}]",
@@ -73,7 +68,7 @@ def _text(chain: Sequence[Calibration], rig: Rig) -> str:
 
 
 @reads_back
-def _check(path: Path, chain: Sequence[Calibration], rig: Rig) -> None:
+def _check(path: Path, chain: Sequence[Calibration], lenses: dict[str, FittedLens], rig: Rig) -> None:
     import yaml
 
     data = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -87,5 +82,6 @@ def _check(path: Path, chain: Sequence[Calibration], rig: Rig) -> None:
         fx, fy, cx, cy = (float(value) for value in block["intrinsics"])
         width, height = block["resolution"]
         read = Intrinsics(fx, fy, cx, cy, width, height, model=model, distortion=distortion)
+        wanted = lenses[calibration.camera].intrinsics
         for what, T in (("T_cam_lidar", np.array(block["T_cam_lidar"])), ("the chain", T_chained)):
-            check_projection(path, f"cam{index}: {what}", T, read, calibration, rig)
+            check_projection(path, f"cam{index}: {what}", T, read, calibration, rig, wanted)

@@ -27,6 +27,7 @@ from lce_rig.core.results import (
 from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
 from lce_rig.export.files import MADE_BY
 from lce_rig.session.durable import write_atomically
+from lce_rig.session.provenance import Provenance
 from lce_rig.words import as_json, is_renderable, refusal_as_json, sentence
 
 # The schema of result.json; reading is strict.
@@ -60,6 +61,7 @@ _Row6 = Annotated[list[_Figure], Field(min_length=6, max_length=6)]
 _Pose = Annotated[list[_Row4], Field(min_length=4, max_length=4), AfterValidator(_check_pose)]
 _Cov = Annotated[list[_Row6], Field(min_length=6, max_length=6), AfterValidator(_check_cov)]
 _NotNegative = Annotated[float, Field(ge=0, le=1e100)]
+_Text = Annotated[str, Field(max_length=1000)]
 _Count = Annotated[int, Field(ge=0, le=10**9)]
 
 
@@ -264,12 +266,22 @@ class PairRecord(_SavedRecord):
         return self
 
 
+class ProvenanceRecord(_SavedRecord):
+    """Where the result comes from; absent in files of earlier versions."""
+
+    robot: _Text = ""
+    serials: dict[str, _Text] = Field(default_factory=dict)
+    date: Annotated[str, Field(pattern=r"^([0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z)?$")] = ""
+    session_sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")] = ""
+
+
 class ResultRecord(_SavedRecord):
     """The whole file."""
 
     format_version: Literal[1]
     rig: str
     made_by: str
+    provenance: ProvenanceRecord = ProvenanceRecord()
     inputs_sha256: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
     sessions: dict[str, str] = Field(default_factory=dict)
     pairs: list[PairRecord]
@@ -296,6 +308,7 @@ class SavedResult:
         pairs: one for each camera and LiDAR.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.
         sessions: of an estimate from several, by name: their paths from the one that holds the result.
+        provenance: robot, sensors and date; empty in files of earlier versions.
     """
 
     rig: str
@@ -303,6 +316,7 @@ class SavedResult:
     pairs: tuple[Calibration, ...]
     inputs_sha256: Mapping[str, str]
     sessions: Mapping[str, str] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
 
 
 def to_json_dict(
@@ -310,6 +324,7 @@ def to_json_dict(
     calibrations: Sequence[Calibration],
     inputs_sha256: Mapping[str, str] | None = None,
     sessions: Mapping[str, str] | None = None,
+    provenance: Provenance | None = None,
 ) -> dict[str, Any]:
     """Build the content of result.json from plain types, keys in a fixed order.
 
@@ -320,6 +335,7 @@ def to_json_dict(
         calibrations: one for each camera and LiDAR.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.
         sessions: of an estimate from several, as in `SavedResult`; one session is not named.
+        provenance: robot, sensors and date; None leaves them out.
 
     Raises:
         ResultRefusedError: a pose or covariance is not finite.
@@ -329,10 +345,15 @@ def to_json_dict(
         "format_version": FORMAT_VERSION,
         "rig": rig_name,
         "made_by": MADE_BY,
+        **({"provenance": _provenance(provenance)} if provenance else {}),
         "inputs_sha256": dict(sorted((inputs_sha256 or {}).items())),
         **({"sessions": dict(sessions)} if sessions else {}),
         "pairs": pairs,
     }
+
+
+def _provenance(provenance: Provenance) -> dict[str, Any]:
+    return {**vars(provenance), "serials": dict(sorted(provenance.serials.items()))}
 
 
 def _pair(calibration: Calibration) -> dict[str, Any]:
@@ -445,7 +466,14 @@ def read_result(path: Path | str) -> SavedResult:
         )
         raise SessionError(what, "Run `lce-rig calibrate SESSION` again.") from error
     calibrations = tuple(_calibration(pair) for pair in record.pairs)
-    return SavedResult(record.rig, record.made_by, calibrations, record.inputs_sha256, record.sessions)
+    return SavedResult(
+        record.rig,
+        record.made_by,
+        calibrations,
+        record.inputs_sha256,
+        record.sessions,
+        Provenance(**record.provenance.model_dump()),
+    )
 
 
 def _calibration(pair: PairRecord) -> Calibration:

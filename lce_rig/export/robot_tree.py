@@ -1,14 +1,21 @@
-"""A robot's own tree of frames, and what has to change in it for calibrations to hold."""
+"""A robot's own tree of frames, and what has to change in it for calibrations to hold.
 
-from collections.abc import Mapping, Sequence
+The tree comes from the profile's `mount`, from the robot's URDF, or from the static transforms of a
+recording. Without any of them the sensors make a tree of their own. All outputs with frames are made from
+`build_trees`.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from lce_rig.core.errors import SessionError
+from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.geometry import Array, difference, invert, tangent_sizes
 from lce_rig.core.results import Calibration
-from lce_rig.export.frames import T_BODY_OPTICAL, Joint, choose_channels
+from lce_rig.export.frames import T_BODY_OPTICAL, FrameTree, Joint, check_tree, choose_channels
+from lce_rig.export.probes import check_pose
 from lce_rig.rig import Rig
 
 
@@ -43,13 +50,48 @@ class RobotTree:
     frames: frozenset[str]
     above: Mapping[str, RobotJoint]
 
+    @classmethod
+    def of_joints(
+        cls,
+        source: str,
+        joints: Iterable[tuple[str, RobotJoint]],
+        links: Iterable[str] | None = None,
+        *,
+        has_one_root: bool = True,
+    ) -> "RobotTree":
+        """Build the tree of (child, joint) pairs.
+
+        Args:
+            source: for messages.
+            joints: each frame with the joint above it.
+            links: the frames, where the source lists them.
+            has_one_root: as for `check_tree`.
+
+        Raises:
+            SessionError: it is not a tree.
+        """
+        joints = list(joints)
+        named = dict.fromkeys(frame for child, joint in joints for frame in (joint.parent, child))
+        frames = list(named if links is None else links)
+        try:
+            pairs = [(joint.parent, child) for child, joint in joints]
+            check_tree(frames, pairs, has_one_root=has_one_root)
+        except LceRigError as error:
+            raise SessionError(f"{source}: not a tree of frames: {error.what}") from error
+        return cls(source, frozenset(frames), dict(joints))
+
     def chain(self, frame: str) -> list[str]:
         """List a frame and those above it, up to the root."""
         frames = [frame]
         while frames[-1] in self.above:
             frames.append(self.above[frames[-1]].parent)
-            if frames[-1] in frames[:-1]:
-                raise SessionError(f"{self.source}: the frames above {frame} form a loop")
+        return frames
+
+    def fixed_chain(self, frame: str) -> list[str]:
+        """List a frame and those above it that it never moves against."""
+        frames = [frame]
+        while (joint := self.above.get(frames[-1])) is not None and joint.is_fixed:
+            frames.append(joint.parent)
         return frames
 
     def find_pose(self, frame_a: str, frame_b: str) -> Array:
@@ -81,7 +123,8 @@ class RobotTree:
         """Set the pose of a frame in its parent, or add the frame."""
         old = self.above.get(joint.child)
         new = RobotJoint(joint.parent, joint.T_parent_child, name=old.name if old else "")
-        return replace(self, frames=self.frames | {joint.child}, above={**self.above, joint.child: new})
+        frames = self.frames | {joint.parent, joint.child}
+        return replace(self, frames=frames, above={**self.above, joint.child: new})
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,58 +153,172 @@ class JointChange:
         return float(np.degrees(angle_rad)), distance_m
 
 
-def fit_tree(
-    tree: RobotTree, calibrations: Sequence[Calibration], rig: Rig
-) -> tuple[RobotTree, list[JointChange]]:
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A robot's tree in which calibrated sensors lie as the calibrations say.
+
+    Attributes:
+        tree: of the robot.
+        changes: in it, parents first.
+        groups: frames of sensors that calibrations connect, the one that stays first.
+        pairs: (camera, LiDAR) of the calibrations that joints express; others close a loop.
+    """
+
+    tree: RobotTree
+    changes: tuple[JointChange, ...]
+    groups: tuple[tuple[str, ...], ...]
+    pairs: frozenset[tuple[str, str]]
+
+
+def read_robot(path: Path) -> RobotTree:
+    """Read a robot's tree from its URDF, or from the static transforms of a recording.
+
+    Raises:
+        SessionError: the file cannot be read, or its frames are not a tree.
+        SourceError: the recording cannot be read or has no static transforms; or a package is missing.
+    """
+    if path.suffix.lower() in (".urdf", ".xml", ".xacro"):
+        from lce_rig.export.robot_urdf import read_robot_urdf
+
+        return read_robot_urdf(path)
+    from lce_rig.export.robot_bag import read_robot_bag
+
+    return read_robot_bag(path)
+
+
+def fit_tree(robot: RobotTree | None, calibrations: Sequence[Calibration], rig: Rig) -> Fit:
     """Change the joints of a robot's tree so that calibrated sensors lie as the calibrations say.
 
-    The sensor nearest to the root stays. Each other one that the robot has keeps its parent, and only its
-    joint's pose changes; one that it lacks is added below the sensor it was calibrated with. An optical frame
-    that the robot has stays as it is below its body.
+    Of the sensors that calibrations connect, the one nearest to the root stays. Each other one that the
+    robot has keeps its parent, and only its joint's pose changes; one that it lacks is added below the sensor
+    it was calibrated with. An optical frame that the robot has stays as it is below its body. The profile's
+    `mount` adds its sensor to a robot that lacks it.
 
     Args:
-        tree: of the robot.
+        robot: its own tree; None for one of the sensors alone, under `mount` where the profile has one.
         calibrations: of the rig's sensors; one each of a camera and LiDAR is used.
         rig: the profile, which names the frames.
-
-    Returns:
-        The new tree and its changes, parents first.
 
     Raises:
         SessionError: the robot has none of a calibration's frames, or a joint between two of them moves, or
             a frame would get two parents.
     """
     chosen = choose_channels(calibrations, rig)
+    tree, changes = _mounted(robot, rig)
     bodies = {name: lidar.frame for name, lidar in rig.lidars.items()}
     bodies |= {name: camera.frame for name, camera in rig.cameras.items()}
-    names = [name for name in bodies if any(name in (c.camera, c.lidar) for c in chosen)]
-    placed = _anchors(tree, [bodies[name] for name in names])
-    changes: list[JointChange] = []
-    is_open = True
-    while is_open:
-        is_open = False
-        for calibration in chosen:
+    groups: list[tuple[str, ...]] = []
+    pairs: set[tuple[str, str]] = set()
+    for names in _connected(chosen, bodies):
+        frames = [bodies[name] for name in names]
+        if robot is None and not tree.frames.intersection(frames):
+            root = rig.root_frame if rig.root_frame in frames else frames[0]
+            tree = replace(tree, frames=tree.frames | {root})
+        placed = [_anchor(tree, frames)]
+        for anchor in placed:  # which grows
+            for calibration in chosen:
+                lidar = rig.lidars[calibration.lidar].frame
+                camera = rig.cameras[calibration.camera].frame
+                if anchor in (lidar, camera) and not {lidar, camera} <= set(placed):
+                    tree, found = _placed(tree, calibration, rig, anchor)
+                    changes += found
+                    placed.append(camera if anchor == lidar else lidar)
+                    pairs.add((calibration.camera, calibration.lidar))
+        groups.append(tuple(placed))
+    return Fit(tree, tuple(changes), tuple(groups), frozenset(pairs))
+
+
+def build_trees(
+    calibrations: Sequence[Calibration], rig: Rig, robot: RobotTree | None = None
+) -> list[FrameTree]:
+    """Connect all calibrated sensors to the robot's root, or to the rig's; unconnected ones form other trees.
+
+    A tree holds the sensors, their optical frames and all that lies between them and the topmost frame that
+    they never move against.
+
+    Raises:
+        LceRigError: a calibration names a sensor that the rig does not have.
+        SessionError: they do not fit into the robot's tree, see `fit_tree`.
+    """
+    fit = fit_tree(robot, calibrations, rig)
+    optical = {camera.frame: camera.optical_frame for camera in rig.cameras.values()}
+    cameras = {name: camera.frame for name, camera in rig.cameras.items()}
+    changed = {change.joint.child for change in fit.changes if change.is_real}
+    joints: dict[str, dict[str, Joint]] = {}
+    for group in fit.groups:
+        for frame in (*group, *(optical[body] for body in group if body in optical)):
+            *below, root = fit.tree.fixed_chain(frame)
+            for child in reversed(below):
+                joint = fit.tree.above[child]
+                is_optical = optical.get(joint.parent) == child and np.allclose(
+                    joint.T_parent_child, T_BODY_OPTICAL, atol=1e-9
+                )
+                made = Joint(joint.parent, child, joint.T_parent_child, is_optical, child not in changed)
+                joints.setdefault(root, {}).setdefault(child, made)
+    return [
+        FrameTree(root, tuple(own.values()), frozenset(p for p in fit.pairs if cameras[p[0]] in {root, *own}))
+        for root, own in joints.items()
+    ]
+
+
+def check_frames(
+    path: Path,
+    what: str,
+    tree: RobotTree,
+    trees: Sequence[FrameTree],
+    calibrations: Sequence[Calibration],
+    rig: Rig,
+) -> None:
+    """Check by the probe points that a tree read back from a file says what the calibrations say.
+
+    Raises:
+        LceRigError: a point lands more than 1e-6 m or px elsewhere.
+    """
+    expressed = frozenset[tuple[str, str]]().union(*(each.pairs for each in trees))
+    for calibration in calibrations:
+        if (calibration.camera, calibration.lidar) in expressed:
+            optical = rig.cameras[calibration.camera].optical_frame
             lidar = rig.lidars[calibration.lidar].frame
-            camera = rig.cameras[calibration.camera]
-            if (lidar in placed) == (camera.frame in placed):
-                continue
-            tree, optical = _with_optical(tree, camera.frame, camera.optical_frame)
-            T_lidar_body = invert(calibration.T_cam_lidar) @ invert(optical.T_parent_child)
-            if lidar in placed:
-                found = _place(tree, lidar, camera.frame, T_lidar_body)
-            else:
-                found = _place(tree, camera.frame, lidar, invert(T_lidar_body))
-            changes += [JointChange(found, _pose_before(tree, found.child))]
-            tree = tree.with_joint(found)
-            if camera.optical_frame not in tree.frames:
-                changes.append(JointChange(optical, None))
-                tree = tree.with_joint(optical)
-            placed |= {lidar, camera.frame}
-            is_open = True
-    return tree, changes
+            T_cam_lidar = tree.find_pose(optical, lidar)
+            check_pose(path, f"{what}the chain {lidar} to {optical}", T_cam_lidar, calibration, rig)
 
 
-def _anchors(tree: RobotTree, frames: Sequence[str]) -> set[str]:
+def _mounted(robot: RobotTree | None, rig: Rig) -> tuple[RobotTree, list[JointChange]]:
+    """Add the profile's mount to a robot that lacks the sensor."""
+    tree = RobotTree("the profile", frozenset(), {}) if robot is None else robot
+    mount = rig.mount
+    if mount is None:
+        return tree, []
+    if mount.of in tree.frames:
+        above = tree.above.get(mount.of)
+        if above is None or above.parent != mount.parent:
+            parent = "none" if above is None else above.parent
+            raise SessionError(
+                f"{tree.source}: the parent of {mount.of} is {parent}, and {mount.parent} by the profile",
+                "A frame has one parent: correct one of them.",
+            )
+        return tree, []
+    if robot is not None and mount.parent not in tree.frames:
+        raise SessionError(
+            f"{tree.source} has no frame {mount.parent}, below which the profile mounts {mount.of}",
+            "Name a frame of the robot as `mount.parent` in the profile.",
+        )
+    joint = Joint(mount.parent, mount.of, mount.to_matrix())
+    return tree.with_joint(joint), [JointChange(joint, None)]
+
+
+def _connected(chosen: Sequence[Calibration], bodies: Mapping[str, str]) -> list[list[str]]:
+    """Group the sensors that calibrations connect, in the order of the rig."""
+    groups: list[set[str]] = []
+    for calibration in chosen:
+        joined = {calibration.camera, calibration.lidar}
+        touching = [group for group in groups if group & joined]
+        groups = [group for group in groups if not group & joined] + [joined.union(*touching)]
+    ordered = [[name for name in bodies if name in group] for group in groups]
+    return sorted(ordered, key=lambda names: list(bodies).index(names[0]))
+
+
+def _anchor(tree: RobotTree, frames: Sequence[str]) -> str:
     """Choose the frame that stays: of those that the robot has, the one nearest to its root."""
     known = [frame for frame in frames if frame in tree.frames]
     if not known:
@@ -169,24 +326,39 @@ def _anchors(tree: RobotTree, frames: Sequence[str]) -> set[str]:
             f"{tree.source} has none of the sensors' frames: {', '.join(frames)}",
             "Name the robot's frames in the profile (`frame` of each sensor), or set `mount` there.",
         )
-    return {min(known, key=lambda frame: len(tree.chain(frame)))}
+    return min(known, key=lambda frame: len(tree.chain(frame)))
 
 
-def _pose_before(tree: RobotTree, frame: str) -> Array | None:
-    joint = tree.above.get(frame)
-    return None if joint is None else joint.T_parent_child
+def _placed(
+    tree: RobotTree, calibration: Calibration, rig: Rig, anchor: str
+) -> tuple[RobotTree, list[JointChange]]:
+    """Put the other sensor of a calibration where it belongs, beside the one that is placed."""
+    lidar, camera = rig.lidars[calibration.lidar].frame, rig.cameras[calibration.camera]
+    optical = _optical(tree, camera.frame, camera.optical_frame)
+    T_lidar_body = invert(calibration.T_cam_lidar) @ invert(optical.T_parent_child)
+    if anchor == lidar:
+        found = _place(tree, lidar, camera.frame, T_lidar_body)
+    else:
+        found = _place(tree, camera.frame, lidar, invert(T_lidar_body))
+    above = tree.above.get(found.child)
+    changes = [JointChange(found, None if above is None else above.T_parent_child)]
+    tree = tree.with_joint(found)
+    if camera.optical_frame not in tree.frames:
+        changes.append(JointChange(optical, None))
+        tree = tree.with_joint(optical)
+    return tree, changes
 
 
-def _with_optical(tree: RobotTree, body: str, optical: str) -> tuple[RobotTree, Joint]:
+def _optical(tree: RobotTree, body: str, optical: str) -> Joint:
     """Find the joint of a camera's optical frame: the robot's own, or the standard rotation."""
     if optical not in tree.frames:
-        return tree, Joint(body, optical, T_BODY_OPTICAL, is_optical=True)
+        return Joint(body, optical, T_BODY_OPTICAL, is_optical=True)
     if body not in tree.frames or body not in tree.chain(optical):
         raise SessionError(
             f"{tree.source}: {optical} is not below {body}",
             f"Name the frame above {optical} as this camera's `frame` in the profile.",
         )
-    return tree, Joint(body, optical, tree.find_pose(body, optical), is_optical=True)
+    return Joint(body, optical, tree.find_pose(body, optical), is_optical=True)
 
 
 def _place(tree: RobotTree, anchor: str, child: str, T_anchor_child: Array) -> Joint:

@@ -54,13 +54,11 @@ def _parse(path: Path, text: bytes) -> RobotTree:
     except Exception as error:  # yourdfpy and lxml raise whatever they meet
         said = " ".join(str(error).split())[:160]
         raise SessionError(f"{path} is not a URDF: {said}") from error
-    above = {}
+    joints = []
     for name, joint in robot.joint_map.items():
-        if joint.child in above:
-            raise SessionError(f"{path}: link {joint.child} has two parents")
         T = np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
-        above[joint.child] = RobotJoint(joint.parent, T, joint.type == "fixed", name)
-    return RobotTree(str(path), frozenset(robot.link_map), above)
+        joints.append((joint.child, RobotJoint(joint.parent, T, joint.type == "fixed", name)))
+    return RobotTree.of_joints(str(path), joints, robot.link_map)
 
 
 def _text(path: Path) -> bytes:
@@ -100,7 +98,7 @@ def write_into_urdf(path: Path, calibrations: Sequence[Calibration], rig: Rig, n
     """
     before = _text(path)
     tree = _parse(path, before)
-    changes = [change for change in fit_tree(tree, calibrations, rig)[1] if change.is_real]
+    changes = [change for change in fit_tree(tree, calibrations, rig).changes if change.is_real]
     if not changes:
         return UrdfUpdate(path, None, ())
     after = _edited(before, changes, tree)

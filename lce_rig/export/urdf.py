@@ -1,6 +1,5 @@
 """URDF: LiDAR, camera body and optical frame as links, the calibration as fixed joints."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
@@ -8,31 +7,37 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.geometry import Array, invert, pose
-from lce_rig.core.results import Calibration
+from lce_rig.core.geometry import pose
 from lce_rig.export.files import header, number, reads_back
-from lce_rig.export.frames import RPY_BODY_OPTICAL, FrameTree, Joint, build_trees, check_tree, choose_channels
-from lce_rig.export.probes import check_pose
+from lce_rig.export.frames import RPY_BODY_OPTICAL, FrameTree, Joint
+from lce_rig.export.job import ExportJob
+from lce_rig.export.robot_tree import RobotJoint, RobotTree, check_frames
 from lce_rig.export.rotations import rotation_from_rpy, rpy
-from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 
 
-def export_urdf(calibrations: Sequence[Calibration], rig: Rig, folder: Path) -> list[Path]:
+def export_urdf(job: ExportJob) -> list[Path]:
     """Write RIG.urdf, and RIG-ROOT.urdf for sensors not connected with the base, and read them back.
 
     Raises:
         LceRigError: a file is not a tree or reads back differently.
     """
-    chosen = choose_channels(calibrations, rig)
     paths = []
-    for index, tree in enumerate(build_trees(calibrations, rig)):
+    for index, tree in enumerate(job.trees):
         suffix = f"-{tree.root.replace('/', '_')}" if index else ""
-        path = folder / f"{rig.name}{suffix}.urdf"
-        write_atomically(path, _text(tree, header("URDF", rig, chosen), rig.name))
-        _check(path, tree, chosen, rig)
-        paths.append(path)
+        paths.append(write_urdf(job.folder / f"{job.rig.name}{suffix}.urdf", tree, job))
     return paths
+
+
+def write_urdf(path: Path, tree: FrameTree, job: ExportJob) -> Path:
+    """Write a tree as a URDF and check it by reading it back.
+
+    Raises:
+        LceRigError: the file is not a tree or reads back differently.
+    """
+    write_atomically(path, _text(tree, header("URDF", job.rig, job.chosen), job.rig.name))
+    _check(path, tree, job)
+    return path
 
 
 def _text(tree: FrameTree, head: list[str], name: str) -> str:
@@ -66,8 +71,8 @@ def origin(joint: Joint) -> str:
 
 
 @reads_back
-def read_urdf(path: Path) -> dict[str, Array]:
-    """Read the pose T_root_link (4, 4) of each link from a URDF of fixed joints.
+def read_urdf(path: Path) -> RobotTree:
+    """Read a URDF of fixed joints.
 
     Raises:
         LceRigError: not XML, or not one tree.
@@ -77,41 +82,19 @@ def read_urdf(path: Path) -> dict[str, Array]:
     except ElementTree.ParseError as error:
         raise LceRigError(f"{path}: not XML: {error}") from error
     links = [link.attrib["name"] for link in robot.findall("link")]
-    steps: dict[str, tuple[str, Array]] = {}
-    pairs = []
+    joints = []
     for joint in robot.findall("joint"):
         parent, child = (joint.find(end).attrib["link"] for end in ("parent", "child"))  # type: ignore[union-attr]
         origin = joint.find("origin")
         text = {} if origin is None else origin.attrib
         xyz, angles = (np.array(text.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
-        pairs.append((parent, child))
-        steps[child] = parent, pose(rotation_from_rpy(angles), xyz)
-    try:
-        check_tree(links, pairs)
-    except LceRigError as error:
-        raise LceRigError(f"{path}: not one tree: {error.what}") from error
-    return {link: _from_root(link, steps) for link in links}
-
-
-def _from_root(link: str, steps: dict[str, tuple[str, Array]]) -> Array:
-    T = np.eye(4)
-    while link in steps:
-        link, T_parent_child = steps[link]
-        T = T_parent_child @ T
-    return T
+        joints.append((child, RobotJoint(parent, pose(rotation_from_rpy(angles), xyz))))
+    return RobotTree.of_joints(str(path), joints, links)
 
 
 @reads_back
-def _check(path: Path, tree: FrameTree, chosen: Sequence[Calibration], rig: Rig) -> None:
-    poses = read_urdf(path)
-    if set(poses) != set(tree.frames):
-        raise LceRigError(f"{path}: links {sorted(poses)} read back, {sorted(tree.frames)} written")
-    joined = {frozenset((joint.parent, joint.child)) for joint in tree.joints}
-    for calibration in chosen:
-        camera, lidar = rig.cameras[calibration.camera], rig.lidars[calibration.lidar]
-        # The tree omits a pair that closes a loop; the file does not mention it.
-        if frozenset((camera.frame, lidar.frame)) in joined:
-            T_cam_lidar = invert(poses[camera.optical_frame]) @ poses[lidar.frame]
-            check_pose(
-                path, f"the chain {lidar.frame} to {camera.optical_frame}", T_cam_lidar, calibration, rig
-            )
+def _check(path: Path, tree: FrameTree, job: ExportJob) -> None:
+    read = read_urdf(path)
+    if read.frames != set(tree.frames):
+        raise LceRigError(f"{path}: links {sorted(read.frames)} read back, {sorted(tree.frames)} written")
+    check_frames(path, "", read, [tree], job.chosen, job.rig)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, pose
-from lce_rig.core.results import LidarBoard, Observation, Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation, Refusal
 from lce_rig.extrinsics.options import CaptureCandidates
 from lce_rig.solvers.registration import rotation_from_directions
 
@@ -101,8 +101,8 @@ def find_consensus(candidates: Sequence[CaptureCandidates], board: Board) -> Con
     return Consensus(pose(R_best, t_best), observations, refused, n_alternative)
 
 
-def _camera_poses(item: CaptureCandidates) -> list[Array]:
-    image = item.image
+def camera_poses(image: ImageBoard) -> list[Array]:
+    """List the poses (4, 4) of the board that an image leaves open."""
     if image.T_cam_board_alternative is None or image.chi2_gap > _MAX_CHI2_GAP:
         return [image.T_cam_board]
     return [image.T_cam_board, image.T_cam_board_alternative]
@@ -112,10 +112,10 @@ def _list_pairs(candidates: Sequence[CaptureCandidates]) -> _Pairs:
     index = [
         (k, p, c)
         for k, item in enumerate(candidates)
-        for p in range(len(_camera_poses(item)))
+        for p in range(len(camera_poses(item.image)))
         for c in range(len(item.lidar))
     ]
-    T_cam = np.array([_camera_poses(candidates[k])[p] for k, p, _ in index]).reshape(-1, 4, 4)
+    T_cam = np.array([camera_poses(candidates[k].image)[p] for k, p, _ in index]).reshape(-1, 4, 4)
     lidars = [candidates[k].lidar[c] for k, _, c in index]
     columns = np.array(index, dtype=np.intp).reshape(-1, 3)
     return _Pairs(
@@ -214,7 +214,7 @@ def _refine(pairs: _Pairs, R: Array, t: Array, n_captures: int) -> tuple[Array, 
 
 
 def _observation(item: CaptureCandidates, pairs: _Pairs, index: int) -> Observation:
-    T_cam_board = _camera_poses(item)[pairs.pose[index]]
+    T_cam_board = camera_poses(item.image)[pairs.pose[index]]
     image = item.image if pairs.pose[index] == 0 else replace(item.image, T_cam_board=T_cam_board)
     return Observation(item.capture, image, item.lidar[pairs.candidate[index]], item.session)
 

@@ -167,7 +167,7 @@ def vary(observations: Sequence[Observation], board: Board, known: Tolerances) -
             for o, T in zip(observations, moved, strict=True)
         ]
         if source == "board_bow":
-            seen = [replace(o, lidar=_bent(o.lidar, axis, step, board)) for o in seen]
+            seen = [replace(o, lidar=bend(o.lidar, axis, step, board)) for o in seen]
         found.append(Variant(source, step, seen, board))
     wider, higher = (
         replace(board, width_m=board.width_m + _STEP),
@@ -197,11 +197,11 @@ def _image_errors(
     for axis in range(2):
         yield "pattern_offset", axis, _STEP, still_px, still_m + _STEP * np.eye(3)[axis]
     for axis in range(2):
-        yield "board_bow", axis, _STEP, still_px, _bow(corners, axis, _STEP, board)
+        yield "board_bow", axis, _STEP, still_px, bow(corners, axis, _STEP, board)
 
 
-def _bow(points_board: Array, axis: int, height_m: float, board: Board) -> Array:
-    """Shift points (M, 3) along the board's normal onto a parabola, highest in the middle."""
+def bow(points_board: Array, axis: int, height_m: float, board: Board) -> Array:
+    """Compute shifts (M, 3) of points along the board's normal onto a parabola, highest in the middle."""
     half = (board.width_m, board.height_m)[axis] / 2
     shifts = np.zeros_like(points_board)
     shifts[:, 2] = height_m * (1 - (points_board[:, axis] / half) ** 2)
@@ -225,13 +225,20 @@ def _pose_moves(poses: Array, board: Board, lens: Intrinsics, shifts_px: Array, 
     return np.asarray((symmetric_inverse(H) @ np.einsum("fmai,fma->fi", J, shifts)[..., None])[..., 0])
 
 
-def _bent(lidar: LidarBoard, axis: int, height_m: float, board: Board) -> LidarBoard:
-    """Bend the plate that a scan shows: its points move along their rays, and the plane is fitted again."""
+def bend(lidar: LidarBoard, axis: int, height_m: float, board: Board) -> LidarBoard:
+    """Bend the plate that a scan shows: its points move along their rays, and the plane is fitted again.
+
+    Args:
+        lidar: a flat plate.
+        axis: 0 along the width, 1 along the height.
+        height_m: of the middle over the ends.
+        board: the plate's size.
+    """
     T_board_lidar = invert(lidar.T_lidar_board)
     normal = lidar.plane[:3]
 
     def onto(points: Array) -> Array:
-        height = _bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
+        height = bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
         rays = points / np.linalg.norm(points, axis=1, keepdims=True)
         along = rays @ normal
         # A ray that grazes the board would move its point far along it.
@@ -239,7 +246,7 @@ def _bent(lidar: LidarBoard, axis: int, height_m: float, board: Board) -> LidarB
 
     points = np.asarray(lidar.points, dtype=np.float64)
     centred = points - points.mean(axis=0)
-    height = _bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
+    height = bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
     # The plane z = a + b . p fitted to the heights tilts by b and rises by a.
     inside = centred - (centred @ normal)[:, None] * normal
     slope = np.linalg.lstsq(inside, height - height.mean(), rcond=1e-6)[0]

@@ -15,7 +15,7 @@ import numpy as np
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import invert, sigma_sizes, tangent_sizes
+from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal, SceneShare
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
@@ -91,6 +91,26 @@ class _Solved:
     share: SceneShare | None = None
 
     @property
+    def camera(self) -> str:
+        return self.sensors.camera
+
+    @property
+    def lidar(self) -> str:
+        return self.sensors.lidar
+
+    @property
+    def T_cam_lidar(self) -> Array:
+        return self.estimate.T_cam_lidar
+
+    @property
+    def cov(self) -> Array:
+        return self.validation.cov
+
+    @property
+    def cov_shared(self) -> Array:
+        return self.validation.cov_shared
+
+    @property
     def is_still(self) -> bool:
         """Whether boards stood still, so that images need no motion compensation."""
         return all(channel.time_offset_s is None for channel in self.estimate.channels)
@@ -142,7 +162,7 @@ def calibrate(
         cameras=cameras,
         channels=channels,
         reference=reference,
-        scene=partial(sharpen, session, detections) if use_scene else None,
+        scene=partial(sharpen, [session], [detections]) if use_scene else None,
         progress=progress,
     )
     heard = [with_opinion(pair, hear_scene(session, detections, by_boards(pair))) for pair in pairs]
@@ -190,10 +210,9 @@ def calibrate_detections(
         raise _nothing_solved(shortages, cameras)
     links = list(_links(rig, alone))
     solved = _solve_together(rig, detections, alone, links)
-    calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
     if scene is not None:
-        solved = [_with_scene(rig, each, scene(own)) for each, own in zip(solved, calibrations, strict=True)]
-        calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
+        solved = [_with_scene(rig, each, scene(each)) for each in solved]
+    calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
     return [_compared(calibration, reference) for calibration in calibrations], shortages
 
 
@@ -308,9 +327,9 @@ def _solve_together(
     """
     solved = list(alone)
     for group in _groups(len(alone), links):
-        settings = alone[group[0]].sensors.settings
-        if settings.method == "ml":
-            own = {alone[k].sensors.camera: alone[k].estimate for k in group}
+        if alone[group[0]].sensors.settings.method == "ml":
+            own = {alone[k].camera: alone[k].estimate for k in group}
+            settings = {alone[k].camera: alone[k].sensors.settings for k in group}
             together = calibrate_together(own, rig.board.to_board(), settings)
             for k in group:
                 solved[k] = _part_of(together, rig, detections, alone[k])
@@ -352,10 +371,7 @@ def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
     if share.state != "used":
         return replace(solved, share=share)
     estimate = fuse(solved.estimate, share, rig.board.to_board())
-    # Of an error of the boards' extrinsics, P' P^-1 is left.
-    left = np.linalg.solve(share.cov_boards, share.cov).T
-    cov_shared = left @ solved.validation.cov_shared @ left.T
-    validation = replace(solved.validation, cov=share.cov, cov_shared=cov_shared)
+    validation = replace(solved.validation, cov=share.cov)
     return _Solved(solved.sensors, estimate, validation, share=share)
 
 
@@ -414,6 +430,7 @@ def _judged(
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
     verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, others)
     lens = rig.cameras[camera].to_intrinsics()
+    lens_error, lens_error_sigma = _lens_error(validation)
     return Calibration(
         camera=camera,
         channels=tuple(channel.channel for channel in estimate.channels),
@@ -441,7 +458,17 @@ def _judged(
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,
+        lens_error=lens_error,
+        lens_error_sigma=lens_error_sigma,
     )
+
+
+def _lens_error(validation: Validation) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Give the errors of the profile's intrinsics as the boards see them, and their standard deviations."""
+    check = validation.intrinsics
+    if check is None or check.errors is None or check.errors_cov is None:
+        return (), ()
+    return check.errors, tuple(np.sqrt(np.diag(np.array(check.errors_cov))).tolist())
 
 
 def _diagnostics(estimate: CalibrationEstimate, validation: Validation) -> Diagnostics:

@@ -11,12 +11,13 @@ import numpy as np
 from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.core.results import Calibration
-from lce_rig.export.result import read_result
+from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
 from lce_rig.session import Session
 from lce_rig.session.identity import DifferingKey, differing_keys
+from lce_rig.session.session import CAPTURES
 from lce_rig.validation.repeatability import Repeatability, compare_calibrations
 from lce_rig.words import describe, recommend
 
@@ -72,7 +73,7 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
             f"{session.path} has no two results to compare",
             f"{listed} Add one: lce-rig calibrate {session.path} --name NAME, or name a second session.",
         )
-    results = {name: _read_calibrations(session, stored[name].folder) for name in chosen}
+    results = {name: list(_read(session, stored[name].folder).pairs) for name in chosen}
     comparisons, lonely = compare_sensors(results, are_independent=False)
     _require_some(comparisons, results, "results")
     outdated = [Finding("results.outdated", "warning", name) for name in chosen if stored[name].is_outdated]
@@ -91,8 +92,8 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
 
     Raises:
         UsageError: fewer than two sessions, or one given twice.
-        SessionError: sessions of different rigs, a result of another rig, captures in two sessions, or no
-            camera and LiDAR in two of them.
+        SessionError: sessions of different rigs, a result of another rig, captures in two sessions or behind
+            two results, or no camera and LiDAR in two of them.
         NotEnoughDataError: a session holds too few captures to be calibrated; it is named.
     """
     paths = [Path(folder) for folder in folders]
@@ -102,17 +103,22 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
     require_one_rig(sessions)
     require_independent(sessions)
     results: dict[str, list[Calibration]] = {}
+    captures: dict[str, frozenset[str]] = {}
     calibrated: list[str] = []
     troubles: list[Finding] = []
     for done, (label, session) in enumerate(sessions.items(), start=1):
         where = session.path.joinpath(*result_parts(name))
         if (where / RESULT).exists() or name not in (None, CURRENT):
-            results[label] = _read_calibrations(session, where)
+            saved = _read(session, where)
+            results[label] = list(saved.pairs)
+            captures[label] = frozenset(sha for path, sha in saved.inputs_sha256.items() if _is_capture(path))
         else:
             results[label], own_troubles = _calibrate(label, session)
+            captures[label] = _manifests(session)
             calibrated.append(label)
             troubles += own_troubles
         progress(done, len(sessions))
+    _require_apart(captures)
     rig = next(iter(sessions.values())).rig.name
     comparisons, lonely = compare_sensors(results)
     _require_some(comparisons, results, "sessions")
@@ -195,6 +201,31 @@ def require_independent(sessions: Mapping[str, Session]) -> None:
             )
 
 
+def _is_capture(path: str) -> bool:
+    """Return whether an input of a result, of one session or of several, is a capture."""
+    return CAPTURES in path.split("/")
+
+
+def _manifests(session: Session) -> frozenset[str]:
+    found = set()
+    for capture in session.captures:
+        with suppress(SessionError):
+            found.add(capture.manifest_sha256)
+    return frozenset(found)
+
+
+def _require_apart(captures: Mapping[str, frozenset[str]]) -> None:
+    """Refuse results made from the same captures, as that of several sessions contains each of them."""
+    for one, other in combinations(captures, 2):
+        n_shared = len(captures[one] & captures[other])
+        if n_shared:
+            raise SessionError(
+                f"the results of {one} and {other} share {n_shared} captures: they are not independent",
+                "A result of several sessions contains the captures of each. Compare results of one session "
+                "each (without --name), or of sessions that it does not contain.",
+            )
+
+
 def _other_boards(sessions: dict[str, Session]) -> list[Finding]:
     (first_name, first), *others = sessions.items()
     return [
@@ -235,7 +266,7 @@ def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
     return f"{name}: {sensors or 'its result holds no sensors'}"
 
 
-def _read_calibrations(session: Session, folder: Path) -> list[Calibration]:
+def _read(session: Session, folder: Path) -> SavedResult:
     path = folder / RESULT
     saved = read_result(path)
     if saved.rig != session.rig.name:
@@ -249,7 +280,7 @@ def _read_calibrations(session: Session, folder: Path) -> list[Calibration]:
                 f"{path}: the covariance of {calibration.camera} and {calibration.lidar} has no inverse",
                 "Run `lce-rig calibrate` again.",
             )
-    return list(saved.pairs)
+    return saved
 
 
 def compare_sensors(

@@ -1,7 +1,7 @@
 """Find the board in every image, every scan and all raw events of a session, once."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,10 +12,12 @@ import numpy as np
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError, SessionError
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.events.search import EventImage, EventSighting, find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.pipeline.matching import expected_poses
 from lce_rig.rig import ReconstructionSettings, Rig
 from lce_rig.session import Capture, Session, check_capture
 
@@ -36,6 +38,9 @@ def detect(
     n_threads: int = 2,
 ) -> Detections:
     """Find the board in all samples of a session, or read earlier detections from the cache.
+
+    Where most captures agree on extrinsics, scans of the others are searched again about the place where
+    their image has the board.
 
     Images are reconstructed from a capture's raw events for the time at which the LiDAR saw the board.
 
@@ -69,7 +74,21 @@ def detect(
         ):
             for (capture, camera, channel), image in _counted(jobs, seen, progress, n_before, total):
                 images.setdefault((camera, channel), {})[capture.name] = image
-    return Detections(images, lidars)
+        detections = Detections(images, lidars)
+        again = [
+            (each.capture, lidar, poses)
+            for lidar, expected in expected_poses(session.rig, detections).items()
+            for each in held
+            if (poses := expected.get(each.capture.name)) is not None
+        ]
+        looked = pool.map(lambda job: finder.look(*job), again)
+        for (capture, lidar, _), found in zip(again, looked, strict=True):
+            before = lidars[lidar][capture.name]
+            if not isinstance(found, Refusal):
+                lidars[lidar][capture.name] = [*found, *(before if isinstance(before, list) else [])]
+            elif isinstance(before, Refusal) and before.stage == "lidar":
+                lidars[lidar][capture.name] = found
+    return detections
 
 
 def event_picture(
@@ -163,6 +182,19 @@ class _Finder:
             return self._boards.scan(capture.scan(lidar))
 
         found: LidarDetection = self._remembered(self._digest, capture, lidar, list, find)
+        return found
+
+    def look(self, capture: Capture, lidar: str, poses: Sequence[Array]) -> LidarDetection:
+        """Find the board in a scan about one of the predicted poses T_lidar_board (4, 4)."""
+
+        def find() -> LidarDetection:
+            scan = capture.scan(lidar)
+            found = [self._boards.look_for(scan, pose) for pose in poses]
+            boards = [each for each in found if not isinstance(each, Refusal)]
+            return boards[:1] or next(each for each in found if isinstance(each, Refusal))
+
+        where = hashlib.sha256(np.round(np.stack(poses), 3).tobytes()).hexdigest()[:12]
+        found: LidarDetection = self._remembered(self._digest, capture, f"{lidar}.at-{where}", list, find)
         return found
 
     def events(

@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
-from lce_rig.detect.detection import Pair
+from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.files import MADE_BY
-from lce_rig.extrinsics import CalibrateOptions, EstimateSettings
-from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
+from lce_rig.extrinsics import CalibrateOptions, CalibrationEstimate, EstimateSettings, calibrate_channels
 from lce_rig.extrinsics.likelihood.lidar_errors import LidarErrors, estimate_lidar
-from lce_rig.extrinsics.methods import agree
+from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.intrinsics_files import profile_text
 from lce_rig.pipeline.matching import candidates_of
@@ -25,19 +24,24 @@ _FEWEST_CAPTURES = 8
 
 
 def measure_lidar(
-    sessions: Sequence[Session], lidar: str | None = None, *, progress: Progress = silent
+    sessions: Sequence[Session],
+    lidar: str | None = None,
+    *,
+    found: Sequence[Detections] | None = None,
+    progress: Progress = silent,
 ) -> LidarErrors:
     """Estimate the constant errors of a LiDAR from sessions of still boards seen by it and a frame camera.
 
     Args:
         sessions: at least one; the extrinsics may differ between them, the LiDAR and the board do not.
         lidar: its name in the profiles; None for the only one.
+        found: detections of each session; None detects the board first.
         progress: called with (done, total) while a session is read.
 
     Raises:
         UsageError: sessions of different boards or LiDARs.
         NotEnoughDataError: too few captures that agree.
-        ResultRefusedError: the captures do not determine the lasers' ranges.
+        ResultRefusedError: a session's boards moved; the captures do not determine the lasers' ranges.
     """
     rig = sessions[0].rig
     name = lidar or next(iter(rig.lidars))
@@ -53,13 +57,15 @@ def measure_lidar(
     board, settings = rig.board.to_board(), rig.lidars[name]
     options = EstimateSettings.of(CalibrateOptions(n_draws=0), settings)
     used, starts = [], []
-    for session in sessions:
-        detections = detect(session, progress=progress)
+    for k, session in enumerate(sessions):
+        detections = detect(session, progress=progress) if found is None else found[k]
         for pair in detections.pairs:
-            if pair.lidar != name or not _is_still(session, pair):
+            if pair.lidar != name or not _has_frames(session, pair):
                 continue
             candidates, _ = candidates_of(detections, pair)
-            estimate = calibrate_by_algorithm_1(agree(candidates, board).observations, board, options)
+            clocks = clocks_of(session.rig, pair.camera, pair.lidar)
+            estimate = calibrate_channels({pair.channel: candidates}, board, options, clocks)
+            _require_still(session, estimate)
             used.append([estimate.observations[capture] for capture in estimate.used])
             starts.append(estimate.T_cam_lidar)
     n_captures = sum(map(len, used))
@@ -79,8 +85,23 @@ def measure_lidar(
     return errors
 
 
-def _is_still(session: Session, pair: Pair) -> bool:
+def _has_frames(session: Session, pair: Pair) -> bool:
     return session.rig.cameras[pair.camera].channels[pair.channel].kind == "frames"
+
+
+def _require_still(session: Session, estimate: CalibrationEstimate) -> None:
+    """Refuse boards that moved between image and scan: the lens and the lasers would absorb the motion."""
+    if any(channel.time_offset_s is not None for channel in estimate.channels):
+        what = f"{session.path}: the board moved while it was captured"
+    else:
+        rms_m, limit_m = estimate.diagnostics.fit_plane_rms_m, session.rig.verdict.max_plane_misfit_m
+        if rms_m <= limit_m:
+            return
+        what = (
+            f"{session.path}: camera and LiDAR board planes differ by {1e3 * rms_m:.0f} mm rms "
+            f"(still boards: under {1e3 * limit_m:.0f} mm)"
+        )
+    raise ResultRefusedError(what, "Give sessions whose board stood still, on a stand. Leave this one out.")
 
 
 def save_lidar(session: Session, lidar: str | None, errors: LidarErrors, path: Path) -> None:

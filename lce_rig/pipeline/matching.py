@@ -1,9 +1,12 @@
 """Which captures show the board to both sensors, and in which the sensors agree on its place."""
 
+from collections.abc import Mapping
+
+from lce_rig.core.geometry import Array, invert
 from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.extrinsics import CaptureCandidates
-from lce_rig.extrinsics.consensus import find_consensus
+from lce_rig.extrinsics.consensus import camera_poses, find_consensus
 from lce_rig.rig import Rig
 
 
@@ -42,3 +45,30 @@ def match_sensors(
         refused |= consensus.refused if consensus else {item.capture: nowhere for item in candidates}
         chosen = {each.capture: each.lidar for each in consensus.observations} if consensus else {}
     return dict(sorted(refused.items())), chosen
+
+
+#: So many captures must agree on extrinsics, and more than half of them, before others are looked at again.
+_LEAST_AGREEING = 5
+
+
+def expected_poses(rig: Rig, detections: Detections) -> Mapping[str, Mapping[str, list[Array]]]:
+    """Predict where the board is in scans that show it nowhere, or elsewhere than the images.
+
+    Returns:
+        By LiDAR and capture the poses T_lidar_board (4, 4) that the image leaves open.
+    """
+    expected: dict[str, dict[str, list[Array]]] = {}
+    for pair in detections.pairs:
+        candidates, _ = candidates_of(detections, pair)
+        consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None
+        n_agreeing = len(consensus.observations) if consensus else 0
+        if consensus is None or n_agreeing < max(_LEAST_AGREEING, len(candidates) / 2):
+            continue
+        agreeing = {each.capture for each in consensus.observations}
+        T_lidar_cam = invert(consensus.T_cam_lidar)
+        for name in detections.captures(pair):
+            image, _ = detections.of(pair, name)
+            if name not in agreeing and not isinstance(image, Refusal):
+                poses = [T_lidar_cam @ T_cam_board for T_cam_board in camera_poses(image)]
+                expected.setdefault(pair.lidar, {}).setdefault(name, poses)
+    return expected

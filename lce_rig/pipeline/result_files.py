@@ -12,9 +12,11 @@ from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, U
 from lce_rig.core.findings import Finding
 from lce_rig.core.limits import read_file
 from lce_rig.core.results import Calibration
+from lce_rig.pipeline.report_file import REPORT, report_text
 from lce_rig.session import Session
 from lce_rig.session.capture import SAFE_NAME
 from lce_rig.session.capture_files import MANIFEST
+from lce_rig.session.provenance import Provenance, provenance_of
 from lce_rig.session.replacing import check_folder, copy_over
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
 
@@ -57,11 +59,20 @@ class Result:
                 return pair
         raise NotEnoughDataError(f"no extrinsic of camera {camera}", "Collect more captures.")
 
+    @property
+    def provenance(self) -> Provenance:
+        """Where the result comes from: robot, sensors, date.
+
+        Raises:
+            SessionError: captures are of different robots, or of different units of a sensor.
+        """
+        return provenance_of([*self.sessions.values()] or [self.session])
+
     def document(self) -> dict[str, Any]:
         """Build the content of result.json from plain types.
 
         Raises:
-            SessionError: a capture that was used is missing.
+            SessionError: a capture that was used is missing, or `provenance` raises it.
             ResultRefusedError: a pose or covariance is not finite.
         """
         return _document(self.session, self.pairs, self.sessions)
@@ -73,9 +84,14 @@ class Result:
         return layout(self.document())
 
     def write(
-        self, folder: Path | str | None = None, *, name: str | None = None, force: bool = False
+        self,
+        folder: Path | str | None = None,
+        *,
+        name: str | None = None,
+        force: bool = False,
+        report: bool = True,
     ) -> "WrittenResults":
-        """Write result.json and, unless a verdict is fail, all exports.
+        """Write result.json, the report and, unless a verdict is fail, all exports.
 
         Args:
             folder: None, or the session's calibration/: the files there are replaced in one step, and the
@@ -83,6 +99,7 @@ class Result:
                 Several sessions' result goes into results/union/ of the first instead.
             name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched.
             force: export failed results too; each file then says so.
+            report: write report.html, too; an earlier one does not stay beside another result.
 
         Raises:
             SessionError: a capture that was used is missing, or the disk is full.
@@ -91,9 +108,16 @@ class Result:
         own = self.session.path / CALIBRATION
         if folder is None or Path(folder).resolve() == own.resolve():
             name = UNION if self.sessions and name is None else name
-            return write_results(self.session, self.pairs, force=force, name=name, sessions=self.sessions)
-        names = _write_files(Path(folder), self.session, self.pairs, self.sessions, force=force)
-        return WrittenResults(tuple(Path(folder) / name for name in names), None, False, (), False)
+            return write_results(
+                self.session, self.pairs, force=force, name=name, sessions=self.sessions, report=report
+            )
+        folder = Path(folder)
+        names, lacking = _write_files(
+            folder, self.session, self.pairs, self.sessions, force=force, report=report
+        )
+        files = tuple(folder / name for name in names)
+        page = _report_in(folder, report)
+        return WrittenResults(files, None, False, (), False, findings=lacking, report=page)
 
 
 @dataclass(frozen=True)
@@ -107,6 +131,8 @@ class WrittenResults:
         only_previous: cameras and LiDARs with a usable result there and no result in this run.
         is_same: whether this result is identical byte for byte to the earlier one.
         had_overlays: whether overlays of the earlier result moved to `previous`, and this one has none.
+        findings: what exports leave out or put differently, and why.
+        report: the page; None if it was not asked for.
     """
 
     files: tuple[Path, ...]
@@ -115,6 +141,8 @@ class WrittenResults:
     only_previous: tuple[str, ...]
     is_same: bool
     had_overlays: bool = False
+    findings: tuple[Finding, ...] = ()
+    report: Path | None = None
 
 
 def result_parts(name: str | None) -> tuple[str, ...]:
@@ -153,8 +181,9 @@ def write_results(
     force: bool,
     name: str | None = None,
     sessions: Mapping[str, Session] | None = None,
+    report: bool = True,
 ) -> WrittenResults:
-    """Write result.json and, unless a verdict is fail, all exports, replacing an earlier run's.
+    """Write result.json, the report and, unless a verdict is fail, all exports, replacing an earlier run's.
 
     All files of a run appear together. Those of the earlier run move to calibration/previous/, except that
     neither a failed run nor one without a camera's only usable result replaces a usable run there. If the
@@ -167,6 +196,7 @@ def write_results(
         force: export failed results too.
         name: writes results/NAME/ instead of calibration/.
         sessions: of an estimate from several, as in `Result`.
+        report: write report.html, too.
 
     Raises:
         UsageError: the name is not valid.
@@ -186,7 +216,9 @@ def write_results(
         had_overlays = has_drawn and not (draft / OVERLAYS).is_dir()
 
     with session.replacing(*parts, finish=finish) as draft:
-        names = _write_files(draft, session, calibrations, sessions or {}, force=force)
+        names, lacking = _write_files(
+            draft, session, calibrations, sessions or {}, force=force, report=report
+        )
     previous = folder / PREVIOUS
     return WrittenResults(
         tuple(folder / name for name in names),
@@ -195,7 +227,13 @@ def write_results(
         tuple(sorted(_usable(previous) - {f"{c.camera} and {c.lidar}" for c in calibrations})),
         is_same,
         had_overlays,
+        lacking,
+        _report_in(folder, report),
     )
+
+
+def _report_in(folder: Path, is_written: bool) -> Path | None:
+    return folder / REPORT if is_written else None
 
 
 def _write_files(
@@ -205,18 +243,31 @@ def _write_files(
     sessions: Mapping[str, Session],
     *,
     force: bool,
-) -> list[str]:
-    """Write result.json and the exports of usable results; return the files' names."""
-    from lce_rig.export import export, remove_exports
+    report: bool,
+) -> tuple[list[str], tuple[Finding, ...]]:
+    """Write result.json, the report and the exports of usable results.
+
+    Returns:
+        The files' names without the report's, and what exports lack.
+    """
+    from lce_rig.export import export_formats, remove_exports
     from lce_rig.export.result import layout
     from lce_rig.session.durable import write_atomically
 
     usable = [c for c in calibrations if force or c.verdict != "fail"]
-    write_atomically(folder / RESULT, layout(_document(session, calibrations, sessions)))
+    document = _document(session, calibrations, sessions)
+    text = layout(document)
+    write_atomically(folder / RESULT, text)
+    # Also in a folder whose files are replaced one by one, no report stays beside another result.
+    (folder / REPORT).unlink(missing_ok=True)
+    if report:
+        page = report_text(session, calibrations, sessions, document, text, OVERLAYS)
+        write_atomically(folder / REPORT, page)
     if not usable:
         remove_exports(folder)
-        return [RESULT]
-    return [RESULT, *(path.name for path in export(usable, session.rig, folder, is_forced=force))]
+        return [RESULT], ()
+    exported = export_formats(usable, session.rig, folder, is_forced=force, session=session)
+    return [RESULT, *(str(path.relative_to(folder)) for path in exported.files)], exported.findings
 
 
 def _document(
@@ -227,7 +278,13 @@ def _document(
 
     own = session.path.resolve()
     paths = {name: os.path.relpath(each.path.resolve(), own) for name, each in sessions.items()}
-    return to_json_dict(session.rig.name, calibrations, inputs_sha256(session, calibrations, sessions), paths)
+    return to_json_dict(
+        session.rig.name,
+        calibrations,
+        inputs_sha256(session, calibrations, sessions),
+        paths,
+        provenance_of([*sessions.values()] or [session]),
+    )
 
 
 def inputs_sha256(
@@ -466,7 +523,7 @@ def _keep_earlier_results(earlier: Path, draft: Path) -> bool:
 def _is_of_a_result(path: Path) -> bool:
     from lce_rig.export import is_export
 
-    return path.name in (RESULT, OVERLAYS) or is_export(path)
+    return path.name in (RESULT, REPORT, OVERLAYS) or is_export(path)
 
 
 def _content(path: Path) -> bytes | None:

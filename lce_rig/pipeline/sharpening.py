@@ -8,8 +8,8 @@ import numpy as np
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import difference, tangent_sizes
-from lce_rig.core.results import Calibration, SceneShare
+from lce_rig.core.geometry import Array, difference, tangent_sizes
+from lce_rig.core.results import Calibration, Extrinsics, SceneShare
 from lce_rig.detect.detection import Detections
 from lce_rig.extrinsics import CalibrationEstimate
 from lce_rig.extrinsics.metrics import capture_residual, summarise
@@ -23,63 +23,77 @@ from lce_rig.validation.weighing import reason
 _KNOWN_SHARE = 0.02  # of the boards' variance that the scene must remove in a direction to have a say in it
 _CHANCE = 0.01  # of a scene that agrees with the boards to be refused
 
-Sharpen = Callable[[Calibration], SceneShare]
-"""Asks the scene of a session about extrinsics that its boards gave."""
+Sharpen = Callable[[Extrinsics], SceneShare]
+"""Asks the scene about extrinsics that boards gave."""
 
 
-def sharpen(session: Session, detections: Detections, calibration: Calibration) -> SceneShare:
-    """Add what the edges of a session's scene tell to extrinsics that its boards gave.
+def sharpen(sessions: Sequence[Session], found: Sequence[Detections], by_boards: Extrinsics) -> SceneShare:
+    """Add what the edges of the scene tell to extrinsics that boards gave.
 
     Args:
-        session: of the captures; damaged ones are skipped.
-        detections: of the session: edges at the board and its holder are left out.
-        calibration: by the boards alone.
+        sessions: of the captures; damaged ones are skipped.
+        found: detections of each: edges at the board and its holder are left out.
+        by_boards: the extrinsics by the boards alone.
     """
-    lens = session.rig.cameras[calibration.camera].to_intrinsics()
-    return share_of(scene_views(session, detections, calibration, MAX_CAPTURES), lens, calibration)
+    lens = sessions[0].rig.cameras[by_boards.camera].to_intrinsics()
+    n_most = MAX_CAPTURES // len(sessions)
+    views = [
+        view
+        for session, detections in zip(sessions, found, strict=True)
+        for view in without_movers(scene_views(session, detections, by_boards, n_most))
+    ]
+    return share_of(views, lens, by_boards)
 
 
-def share_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneShare:
+def share_of(views: Sequence[SceneView], lens: Intrinsics, by_boards: Extrinsics) -> SceneShare:
     """Estimate extrinsics from boards and scene, and test whether the two agree.
 
-    The change d from the boards' extrinsics has the covariance P - P', with P that of the boards and P' that
-    of both: d^T (P - P')^-1 d, over the directions in which the scene knows anything, is chi-squared.
-
-    What moves before a standing rig is left out, such as whoever holds the board.
+    Errors of the profile's lens and board (C) move all extrinsics found with it: the scene does not reduce
+    them. With P = C + Q the covariance of the boards' extrinsics, Q is the prior, Q' the covariance of both
+    that results, and C + Q' is what is claimed. The scene may not share all of C: with G = 1 - Q' Q^-1 the
+    change d = G (scene - boards) has at most the covariance D = Q - Q' + G C G^T. d^T D^-1 d, over the
+    directions in which the scene knows anything, is chi-squared.
 
     Args:
-        views: of the scene, without the board.
+        views: of the scene, without the board and without what moves before a standing rig.
         lens: of the camera.
-        calibration: by the boards alone.
+        by_boards: the extrinsics by the boards alone.
     """
     from scipy.stats import chi2
 
-    views = without_movers(views)
-    T_boards, cov_boards = calibration.T_cam_lidar, calibration.cov
-    found = estimate(views, lens, T_boards, (T_boards, cov_boards))
+    T_boards, cov_boards = by_boards.T_cam_lidar, by_boards.cov
+    own = cov_boards - by_boards.cov_shared
+    found = estimate(views, lens, T_boards, (T_boards, own))
     change = difference(found.T_cam_lidar, T_boards)
-    root = np.linalg.cholesky(cov_boards)
-    whitened = np.linalg.solve(root, np.linalg.solve(root, cov_boards - found.cov).T)
-    removed, directions = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    root = np.asarray(np.linalg.cholesky(own), dtype=np.float64)
+    gain = np.eye(6) - np.linalg.solve(own, found.cov).T
+    expected = own - found.cov + gain @ by_boards.cov_shared @ gain.T
+    removed, directions = np.linalg.eigh(_whitened(own - found.cov, root))
     is_known = removed > _KNOWN_SHARE
-    along = directions.T @ np.linalg.solve(root, change)
-    surprise = float(np.sum(along[is_known] ** 2 / removed[is_known]))
+    seen = directions[:, is_known].T
+    along = seen @ np.linalg.solve(root, change)
     n_known = int(np.count_nonzero(is_known))
+    surprise = float(along @ np.linalg.solve(seen @ _whitened(expected, root) @ seen.T, along))
     is_surprising = n_known > 0 and surprise > chi2.ppf(1 - _CHANCE, n_known)
-    expected = np.sqrt(np.maximum(np.diag(cov_boards - found.cov), 0.0))
     return SceneShare(
         state="contradicts" if is_surprising else "used" if n_known else "unknown",
         n_captures=len(views),
         n_edges=sum(len(view.edges) for view in views),
         T_cam_lidar=found.T_cam_lidar,
-        cov=found.cov,
+        cov=found.cov + by_boards.cov_shared,
         T_cam_lidar_boards=T_boards,
         cov_boards=cov_boards,
         change=change,
-        change_sigma=expected,
+        change_sigma=np.sqrt(np.maximum(np.diag(expected), 0.0)),
         surprise=surprise,
         n_directions=n_known,
     )
+
+
+def _whitened(cov: Array, root: Array) -> Array:
+    """Express a covariance (6, 6) in units of L L^T, with L = `root`."""
+    scaled = np.linalg.solve(root, np.linalg.solve(root, cov).T)
+    return np.asarray(0.5 * (scaled + scaled.T), dtype=np.float64)
 
 
 def fuse(by_boards: CalibrationEstimate, share: SceneShare, board: Board) -> CalibrationEstimate:

@@ -8,6 +8,7 @@ estimate of all captures they are common unknowns, and their part of the covaria
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
@@ -22,6 +23,7 @@ from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.pipeline.comparison import compare_sensors, require_independent, require_one_rig, session_names
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.result_files import Result
+from lce_rig.pipeline.sharpening import by_boards, sharpen
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys
@@ -55,7 +57,7 @@ def calibrate(
         cameras: the cameras to calibrate, as if the session held no others; None for all.
         channels: the cameras' channels to use; None for all that the session holds.
         reference: extrinsics to report errors against; they never enter the estimate or the verdict.
-        use_scene: estimate from the edges of the scene too; of one session only.
+        use_scene: estimate each frame camera from the edges of the scene, too.
         progress: called with (done, total) for each camera and LiDAR in turn.
 
     Raises:
@@ -63,7 +65,7 @@ def calibrate(
             named. Of several sessions, one has too few to tell whether its sensors were moved.
         ResultRefusedError: sessions disagree: the sensors were moved in between.
         SessionError: sessions are not of one rig, board and intrinsics, or share captures.
-        UsageError: no capture holds one of the channels; a session is given twice, or several with the scene.
+        UsageError: no capture holds one of the channels; a session is given twice.
     """
     if isinstance(session, Session) or len(session) == 1:
         return calibrate_one(
@@ -75,10 +77,6 @@ def calibrate(
             reference=reference,
             use_scene=use_scene,
             progress=progress,
-        )
-    if use_scene:
-        raise UsageError(
-            "the scene of several sessions is not used", "Omit --use-scene, or give one session."
         )
     named = require_unit(session)
     given = [detect(each) for each in session] if detections is None else detections
@@ -94,11 +92,12 @@ def calibrate(
         cameras=cameras,
         channels=channels,
         reference=reference,
+        scene=partial(sharpen, session, given) if use_scene else None,
         progress=progress,
     )
     agreements = {(each.camera, each.lidar): (each.finding,) for each in comparisons}
     told = [replace(c, findings=(*c.findings, *agreements.get((c.camera, c.lidar), ()))) for c in pairs]
-    heard = [with_opinion(c, _hear(named, found, c)) for c in told]
+    heard = [with_opinion(c, _hear(named, found, by_boards(c))) for c in told]
     return Result(session[0], tuple(heard), tuple(shortages), named)
 
 

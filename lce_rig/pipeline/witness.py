@@ -7,7 +7,7 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SessionError
-from lce_rig.core.results import Calibration
+from lce_rig.core.results import Calibration, Extrinsics
 from lce_rig.core.scene_opinion import AxisOpinion, OpinionState, SceneOpinion
 from lce_rig.detect.detection import Detections
 from lce_rig.scene.alignment import SceneView
@@ -40,18 +40,19 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
 
 
 def scene_views(
-    session: Session, detections: Detections, calibration: Calibration, n_most: int
+    session: Session, detections: Detections, extrinsics: Extrinsics, n_most: int
 ) -> list[SceneView]:
     """Find the edges of the scene in captures of a session, spread over it, without those at the board.
 
     Args:
-        session, detections, calibration: as of `hear_scene`.
+        session, detections: as of `hear_scene`.
+        extrinsics: as of `hear_scene`.
         n_most: captures.
     """
-    c = calibration
+    c = extrinsics
     channel = session.rig.cameras[c.camera].first_channel("frames") or ""
     boards = detections.images.get((c.camera, channel), {})
-    names = sorted(boards.keys() & detections.lidars[c.lidar].keys())
+    names = sorted(boards.keys() & detections.lidars.get(c.lidar, {}).keys())
     views = []
     for name in evenly(names, n_most):
         with suppress(SessionError):

@@ -8,7 +8,7 @@ from lce_rig.core.data import Sample, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.recordings.merging import merge_by_time
 from lce_rig.recordings.overlap import check_overlap
-from lce_rig.recordings.protocol import ContinuousRecording, Recording, Span
+from lce_rig.recordings.protocol import ContinuousRecording, Recording, Span, serials_of
 from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import stream_of
 
@@ -57,6 +57,7 @@ class JoinedRecording:
         key: fingerprint of all, in whatever order they were given.
         n_samples: images and scans of all.
         streams: each from the first recording that holds it.
+        serials: serial numbers by sensor, as far as a part tells them.
     """
 
     def __init__(self, parts: Sequence[ContinuousRecording], rig: Rig) -> None:
@@ -64,6 +65,7 @@ class JoinedRecording:
         self.notes: list[str] = [note for part in parts for note in part.notes]
         self.key = hashlib.sha256(" ".join(sorted(part.key for part in parts)).encode()).hexdigest()
         self.n_samples = sum(part.n_samples for part in parts)
+        self.serials = {name: serial for part in parts for name, serial in serials_of(part).items()}
         self._parts = parts
         self._rig = rig
         self._owner: dict[Stream, ContinuousRecording] = {}

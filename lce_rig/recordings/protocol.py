@@ -104,3 +104,11 @@ class ContinuousRecording(Recording, Protocol):
     def samples(self) -> Iterator[Sample]:
         """Yield what the sensors saw, in order of time; events in packets."""
         ...
+
+
+def serials_of(recording: Recording) -> dict[str, str]:
+    """Give the serial numbers of sensors that a recording tells, by sensor; most tell none.
+
+    A reader that knows them has an attribute `serials`.
+    """
+    return dict(getattr(recording, "serials", {}))

@@ -7,10 +7,10 @@ from typing import Literal
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data_sheets import TYPICAL, VLP_16, find_data_sheet
 from lce_rig.rig.document import read_document
 from lce_rig.rig.editing import is_plain
 from lce_rig.rig.loading import rig_from_document
-from lce_rig.rig.sensors import VLP16_MODELS
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,18 @@ class LidarDraft:
         topic: in bags.
         rate_hz: scans per second; None for the default.
         sees: what is known of it beside, as a comment, such as "64 rings in the recording".
+        elevations_deg: of the rings, lowest first, as measured; empty where they are the model's or unknown.
+        columns: firings of each ring per revolution, as measured; None where they are the model's or unknown.
     """
 
     name: str = "lidar"
-    model: str = "VLP-16"
+    model: str = VLP_16.name
     frame: str | None = None
     topic: str | None = None
     rate_hz: float | None = None
     sees: str = ""
+    elevations_deg: Sequence[float] = ()
+    columns: int | None = None
 
 
 @dataclass(frozen=True)
@@ -118,7 +122,7 @@ def _lidar(lidar: LidarDraft) -> list[str]:
         f"    frame: {lidar.frame or f'{lidar.name}_link'}",
         *([f"    topic: {lidar.topic}"] if lidar.topic else []),
         *([f"    rate_hz: {lidar.rate_hz:g}"] if lidar.rate_hz else []),
-        *(_VLP16_DEFAULTS if not lidar.model.upper().startswith(VLP16_MODELS) else []),
+        *_beams(lidar),
         "    timestamps:",
         "      clock: host                 # device, host or utc",
         "      reference: first_firing     # or last_firing, as some drivers timestamp",
@@ -126,12 +130,25 @@ def _lidar(lidar: LidarDraft) -> list[str]:
     ]
 
 
-_VLP16_DEFAULTS = [
-    "    laser_bias_sigma_m: 0.008     # these four are of a VLP-16: enter your LiDAR's",
-    "    range_offset_sigma_m: 0.005",
-    "    beam_aperture_m: 0.0127",
-    "    beam_divergence_rad: 0.003",
-]
+def _beams(lidar: LidarDraft) -> list[str]:
+    """Give the beams as measured and, of an unknown model, what is typical to be replaced."""
+    lines = []
+    if lidar.elevations_deg:
+        values = [f"{each:.2f}" for each in lidar.elevations_deg]
+        rows = [", ".join(values[k : k + 12]) for k in range(0, len(values), 12)]
+        lines += ["    elevations_deg: [               # of the rings, as recorded"]
+        lines += [f"      {row}," for row in rows] + ["    ]"]
+    if lidar.columns is not None:
+        lines.append(f"    columns: {lidar.columns}")
+    if find_data_sheet(lidar.model) is None:
+        lines += [
+            f"    laser_bias_sigma_m: {TYPICAL.laser_bias_sigma_m}     # these four are typical: enter your "
+            "LiDAR's",
+            f"    range_offset_sigma_m: {TYPICAL.range_offset_sigma_m}",
+            f"    beam_aperture_m: {TYPICAL.aperture_m}",
+            f"    beam_divergence_rad: {TYPICAL.divergence_rad[0]}",
+        ]
+    return lines
 
 
 def _camera(camera: CameraDraft) -> list[str]:

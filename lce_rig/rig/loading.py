@@ -92,12 +92,12 @@ def _unknown_key(path: KeyPath) -> _InvalidKey:
     valid = valid_keys(path[:-1])
     # A missing unit is the most likely error: for difflib, fx is as close to fy_px as to fx_px.
     nearest = [name for name in valid if name.startswith(f"{key}_")]
+    elsewhere = [block for block, name in all_keys() if name == key]
+    if elsewhere and not nearest:
+        return _InvalidKey(path, f"unknown key here; move it to {elsewhere[0] or 'the top level'}")
     nearest = nearest or difflib.get_close_matches(key, valid, n=1)
     if nearest:
         return _InvalidKey(path, f"unknown key; the nearest is {nearest[0]}", (*path[:-1], nearest[0]))
-    elsewhere = [block for block, name in all_keys() if name == key]
-    if elsewhere:
-        return _InvalidKey(path, f"unknown key here; move it to {elsewhere[0] or 'the top level'}")
     return _InvalidKey(path, f"unknown key; choose one of: {', '.join(valid)}")
 
 

@@ -4,8 +4,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from lce_rig.core import velodyne
+from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.mount import Mount
@@ -13,15 +15,32 @@ from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.rig.sensors import (
     CAMERA_DRIVERS,
     LIDAR_DRIVERS,
-    VLP16_MODELS,
     CameraSettings,
     LidarSettings,
 )
-from lce_rig.rig.settings import FrameName, Name, RigName, Settings, Text, problem
+from lce_rig.rig.settings import FrameName, Name, RigName, RobotName, Settings, Text, problem
 from lce_rig.rig.sync_settings import SyncSettings
+from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
-_MOST_SENSORS = 64
+_MOST_SENSORS, _MOST_TARGETS = 64, 256
+OutputFormat = Literal[
+    "extrinsics",
+    "urdf",
+    "camera_info",
+    "static_tf",
+    "ros2_launch",
+    "tf_static_bag",
+    "kalibr",
+    "autoware",
+    "fast_livo2",
+    "koide3",
+    "opencv",
+    "isaac",
+    "mcap",
+    "ply",
+    "ply_captures",
+]
 
 
 class Rig(Settings):
@@ -31,25 +50,33 @@ class Rig(Settings):
         format_version: version of this schema.
         name: name of the rig; a session belongs to one rig by name.
         description: one line for `lce-rig rigs`.
+        robot: name of the robot that carries this very rig; results name it.
         base_frame: a LiDAR's or camera's frame, root of the URDF; by default that of `mount`, or the first
             LiDAR's.
         mount: the pose of one sensor on the robot; the root is then a frame of the robot.
+        exports: formats that `calibrate` and `export` write; empty for the usual ones.
         lidars: settings by the LiDAR's name.
         cameras: settings by the camera's name.
         nominal_extrinsics: the CAD model's values, a sanity check only.
+        targets: where `lce-rig deploy` writes results, by name.
         sync: the board that makes the pulse per second and triggers cameras; None without one.
     """
 
     format_version: Literal[1]
     name: RigName
     description: Text = ""
+    robot: RobotName | None = None
     base_frame: FrameName | None = None
     mount: Mount | None = None
+    exports: tuple[OutputFormat, ...] = ()
     board: BoardSettings
     lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
     cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
     nominal_extrinsics: tuple[NominalExtrinsic, ...] = ()
     sync: SyncSettings | None = None
+    targets: Annotated[dict[RobotName, TargetSettings], Field(max_length=_MOST_TARGETS)] = Field(
+        default_factory=dict
+    )
     quality: QualitySettings = QualitySettings()
     calibration: CalibrationSettings = CalibrationSettings()
     verdict: VerdictSettings = VerdictSettings()
@@ -75,6 +102,27 @@ class Rig(Settings):
                 what = f"differs from mount.of, {self.mount.of}, which would give it two parents; remove it"
                 raise problem(what, "base_frame")
         return self
+
+    def of_robot(self, name: str | None) -> "Rig":
+        """Name the robot that carries this very rig; None leaves it as it is.
+
+        Raises:
+            UsageError: the profile names another one, or it cannot be a name.
+        """
+        if name is None or name == self.robot:
+            return self
+        if self.robot is not None:
+            raise UsageError(
+                f"this is a rig of robot {self.robot}, not of {name}",
+                f"Omit --robot {name}, or use that robot's profile or session.",
+            )
+        try:
+            TypeAdapter(RobotName).validate_python(name)
+        except ValidationError:
+            raise UsageError(
+                f"{name!r} cannot name a robot", "Use letters, digits, dots, dashes and underscores."
+            ) from None
+        return self.model_copy(update={"robot": name})
 
     @property
     def root_frame(self) -> str:
@@ -120,7 +168,8 @@ class Rig(Settings):
     def located(self, folder: Path) -> "Rig":
         """Make the paths in a profile absolute; relative ones start at the folder its file lies in."""
         cameras = {name: camera.located(folder) for name, camera in self.cameras.items()}
-        return self.model_copy(update={"cameras": cameras})
+        targets = {name: target.located(folder) for name, target in self.targets.items()}
+        return self.model_copy(update={"cameras": cameras, "targets": targets})
 
     def warnings(self) -> tuple[Finding, ...]:
         """List valid but probably unintended settings; the subject is the key."""
@@ -144,12 +193,11 @@ class Rig(Settings):
     def _unknown(self) -> Iterator[Finding]:
         """List drivers that do not exist, and models for which nothing but recordings works."""
         for name, lidar in self.lidars.items():
-            is_vlp16 = lidar.model.upper().startswith(VLP16_MODELS)
-            if not is_vlp16:
+            if lidar.data_sheet() is None:
                 yield Finding(
                     "profile.unknown_model", "warning", f"lidars.{name}.model", {"value": lidar.model}
                 )
-            if lidar.driver.type == "vlp16" and not is_vlp16:
+            if lidar.driver.type == "vlp16" and velodyne.product_of(lidar.model) is None:
                 figures = {"value": lidar.driver.type, "model": lidar.model}
                 yield Finding("profile.other_driver", "warning", f"lidars.{name}.driver.type", figures)
             yield from _unknown_driver(f"lidars.{name}.driver.type", lidar.driver.type, LIDAR_DRIVERS)

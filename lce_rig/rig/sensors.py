@@ -1,11 +1,13 @@
 """The sensors' blocks of a profile: LiDARs, cameras, their channels, drivers and clocks."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data_sheets import TYPICAL, VLP_16, DataSheet, find_data_sheet
 from lce_rig.core.limits import MAX_PIXELS
 from lce_rig.rig.reconstruction import ReconstructionSettings
 from lce_rig.rig.settings import (
@@ -21,12 +23,11 @@ from lce_rig.rig.settings import (
     problem,
 )
 
-LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16",), ("v4l2", "command", "davis")
+LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16", "ros2"), ("v4l2", "command", "davis", "ros2")
 """Values of `driver.type`."""
-VLP16_MODELS = ("VLP-16", "VLP16", "PUCK")
-"""How the names of the models begin whose beams and packets are known."""
 # Beyond this the figure is in millimetres, or the sensor is broken.
 RangeError = Annotated[float, Field(ge=0, le=0.2)]
+Elevation = Annotated[float, Field(ge=-90, le=90)]
 Coefficient = Annotated[float, Field(ge=-1000, le=1000)]
 _COUNTS = {"radtan": ((0, 4, 5, 8), "4, 5 or 8 (or none)"), "equidistant": ((4,), "4")}
 
@@ -128,14 +129,17 @@ class LidarIntrinsicsSettings(Settings):
 
 
 class LidarSettings(Settings):
-    """One spinning LiDAR.
+    """One spinning LiDAR; where the profile is silent, the figures are those of the model's data sheet.
 
     Attributes:
-        model: maker's name of the model.
+        model: maker's name of the model, or "other".
+        serial: serial number of this very unit, if the device does not tell it.
         frame: frame of its points, x forward, y left, z up.
         topic: topic of its point clouds in bags.
         min_range_m: nearer returns are ignored.
         max_range_m: farther returns are ignored.
+        elevations_deg: of the rings, lowest first, where they differ from the model's.
+        columns: firings of each ring per revolution, where they differ from the model's.
         beam_aperture_m: width of the light beam where it leaves the sensor; 0 for an ideal one.
         beam_divergence_rad: full angle by which the beam widens.
         laser_bias_sigma_m: standard deviation of the lasers' constant range errors about their mean.
@@ -143,22 +147,50 @@ class LidarSettings(Settings):
         intrinsics: measured constant errors; None if there are none.
     """
 
-    model: Text = "VLP-16"
+    model: Text = VLP_16.name
+    serial: Text | None = None
     frame: FrameName = "lidar_link"
     topic: TopicName | None = None
     rate_hz: Rate = 10.0
-    min_range_m: NotNegative = 0.4
-    max_range_m: Positive = 100.0
-    beam_aperture_m: NotNegative = 0.0127
-    beam_divergence_rad: NotNegative = 0.003
-    laser_bias_sigma_m: RangeError = 0.008
-    range_offset_sigma_m: RangeError = 0.005
+    elevations_deg: Annotated[tuple[Elevation, ...], Field(min_length=2, max_length=1024)] | None = None
+    columns: Annotated[int, Field(ge=16, le=65536)] | None = None
+    min_range_m: NotNegative
+    max_range_m: Positive
+    beam_aperture_m: NotNegative
+    beam_divergence_rad: NotNegative
+    laser_bias_sigma_m: RangeError
+    range_offset_sigma_m: RangeError
     intrinsics: LidarIntrinsicsSettings | None = None
     timestamps: TimestampSettings = TimestampSettings(reference="first_firing")
     driver: DriverSettings = DriverSettings()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _follows_its_data_sheet(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        model = given.get("model", VLP_16.name)
+        sheet = (find_data_sheet(model) if isinstance(model, str) else None) or TYPICAL
+        return {
+            "min_range_m": sheet.range_m[0],
+            "max_range_m": sheet.range_m[1],
+            "beam_aperture_m": sheet.aperture_m,
+            "beam_divergence_rad": sheet.divergence_rad[0],
+            "laser_bias_sigma_m": sheet.laser_bias_sigma_m,
+            "range_offset_sigma_m": sheet.range_offset_sigma_m,
+        } | given
+
+    def data_sheet(self) -> DataSheet | None:
+        """Give the model's data sheet, with the profile's own beams; None where beams are not known."""
+        sheet = find_data_sheet(self.model)
+        if sheet is None and self.elevations_deg is None:
+            return None
+        return (sheet or TYPICAL).with_rings(self.elevations_deg, self.columns)
+
     @model_validator(mode="after")
     def _is_consistent(self) -> "LidarSettings":
+        if self.elevations_deg is not None and not np.all(np.diff(self.elevations_deg) > 0):
+            raise problem("the elevations do not rise", "elevations_deg")
         if self.min_range_m >= self.max_range_m:
             raise problem(
                 f"{self.min_range_m:g} m is not below max_range_m {self.max_range_m:g} m", "min_range_m"
@@ -239,12 +271,14 @@ class CameraSettings(Settings):
 
     Attributes:
         model: maker's name of the model.
+        serial: serial number of this very unit, if the device does not tell it.
         frame: the camera's body frame, x forward, y left, z up.
         optical_frame: frame of its optics, x right, y down, z forward.
         resolution_px: (width, height) of the images.
     """
 
     model: Text = ""
+    serial: Text | None = None
     frame: FrameName = "camera_link"
     optical_frame: FrameName = "camera_optical_frame"
     resolution_px: tuple[Annotated[int, Field(ge=16, le=65535)], Annotated[int, Field(ge=16, le=65535)]]

@@ -7,6 +7,7 @@ from pydantic_core import PydanticCustomError
 
 _NAME = r"^[a-z][a-z0-9_]*$"
 _RIG_NAME = r"^[a-z0-9][a-z0-9_-]*$"
+_ROBOT = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 _FRAME = r"^[A-Za-z][A-Za-z0-9_/-]*$"
 _TOPIC = r"^/?[A-Za-z][A-Za-z0-9_/]*$"
 
@@ -14,11 +15,13 @@ _TOPIC = r"^/?[A-Za-z][A-Za-z0-9_/]*$"
 PATTERNS = {
     _NAME: "a name has lower-case letters, digits and _ and begins with a letter",
     _RIG_NAME: "a rig's name has lower-case letters, digits, - and _",
+    _ROBOT: "a robot's name has letters, digits, ., - and _ and begins with a letter or digit",
     _FRAME: "a frame has letters, digits, _, - and / and begins with a letter",
     _TOPIC: "a topic has letters, digits, _ and /",
 }
 
 Name = Annotated[str, Field(pattern=_NAME, max_length=64)]
+RobotName = Annotated[str, Field(pattern=_ROBOT, max_length=64)]
 RigName = Annotated[str, Field(pattern=_RIG_NAME, max_length=64)]
 FrameName = Annotated[str, Field(pattern=_FRAME, max_length=128)]
 TopicName = Annotated[str, Field(pattern=_TOPIC, max_length=256)]

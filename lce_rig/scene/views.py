@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, transform
-from lce_rig.core.results import Calibration, ImageBoard, Refusal
+from lce_rig.core.results import Extrinsics, ImageBoard, Refusal
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.rig import Rig
@@ -23,37 +23,37 @@ _BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
 _EVENTS_NEAR_RAD = 0.06  # as far as the score is searched
 
 
-def build_view(rig: Rig, calibration: Calibration, name: str, image: Image | Events, scan: Scan) -> SceneView:
+def build_view(rig: Rig, extrinsics: Extrinsics, name: str, image: Image | Events, scan: Scan) -> SceneView:
     """Find the edges of one capture's scan, and of its image or of events about the scan."""
-    lidar, lens = rig.lidars[calibration.lidar], rig.cameras[calibration.camera].to_intrinsics()
+    lidar, lens = rig.lidars[extrinsics.lidar], rig.cameras[extrinsics.camera].to_intrinsics()
     edges = find_depth_edges(scan, Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad))
     if isinstance(image, Image):
         return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
     field = build_event_field(image, lens.fx_px)
     # Edges without events about them stand still before a standing rig: they say nothing.
-    pixels, _ = lens.project(transform(calibration.T_cam_lidar, edges.points))
+    pixels, _ = lens.project(transform(extrinsics.T_cam_lidar, edges.points))
     return SceneView(name, edges.select(field.has_edges_near(pixels, _EVENTS_NEAR_RAD * lens.fx_px)), field)
 
 
 def without_board(
-    view: SceneView, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
+    view: SceneView, found: ImageBoard | Refusal, rig: Rig, extrinsics: Extrinsics
 ) -> SceneView:
     """Leave out the edges at and near the board, if the image shows one."""
     return replace(
-        view, edges=view.edges.select(is_apart_from_board(view.edges.points, found, rig, calibration))
+        view, edges=view.edges.select(is_apart_from_board(view.edges.points, found, rig, extrinsics))
     )
 
 
 def is_apart_from_board(
-    points: Array, found: ImageBoard | Refusal, rig: Rig, calibration: Calibration
+    points: Array, found: ImageBoard | Refusal, rig: Rig, extrinsics: Extrinsics
 ) -> NDArray[np.bool_]:
     """Find which points (N, 3) of the LiDAR's frame lie apart from the board in an image; all without one."""
     if isinstance(found, Refusal):
         return np.ones(len(points), dtype=np.bool_)
-    lens = rig.cameras[calibration.camera].to_intrinsics()
+    lens = rig.cameras[extrinsics.camera].to_intrinsics()
     outline = outline_px(found.T_cam_board, rig.board.to_board(), lens)
     hull = cv2.convexHull(outline[np.isfinite(outline).all(axis=1)].astype(np.float32))
-    pixels, _ = lens.project(transform(calibration.T_cam_lidar, points))
+    pixels, _ = lens.project(transform(extrinsics.T_cam_lidar, points))
     margin_px = _BOARD_MARGIN_RAD * lens.fx_px
     return np.array([cv2.pointPolygonTest(hull, p, True) < -margin_px for p in pixels.tolist()], dtype=bool)
 

@@ -125,6 +125,8 @@ def parse_manifest(document: Any) -> Manifest:
         raise ValueError(f"{describe(key)[1:-1] + ': ' if key else ''}{what}{given}") from None
 
 
+SERIALS = "serials"
+"""The key of `meta` with the serial numbers of the sensors."""
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
 _SOME_ENTRY = TypeVar("_SOME_ENTRY", bound=Entry)
 # Maximum time of a firing after the scan's first.
@@ -160,6 +162,29 @@ class Capture:
     def file_hashes(self) -> frozenset[str]:
         """SHA-256 of every image, scan and stretch of events in it."""
         return frozenset(entry.sha256 for entry in self._manifest.files)
+
+    @property
+    def contents(self) -> list[dict[str, Any]]:
+        """What samples it holds: sensor, timestamps and SHA-256 of each file, in a fixed order."""
+        return sorted(
+            (entry.model_dump(exclude={"file", "bytes"}) for entry in self._manifest.files),
+            key=lambda entry: str(entry["sha256"]),
+        )
+
+    @property
+    def times_ns(self) -> list[int]:
+        """When its samples arrived, on this computer's clock; their own timestamps where that is unknown."""
+        files = self._manifest.files
+        arrivals = [entry.host_ns for entry in files if entry.host_ns is not None]
+        stamps = [e.last_ns if isinstance(e, EventsEntry) else e.stamp_ns for e in files]
+        return arrivals or [stamp for stamp in stamps if stamp is not None]
+
+    @property
+    def serials(self) -> dict[str, str]:
+        """Serial numbers by sensor, as far as the devices told them when it was taken."""
+        told = self._manifest.meta.get(SERIALS)
+        found = told.items() if isinstance(told, dict) else ()
+        return {name: serial for name, serial in found if isinstance(serial, str) and serial}
 
     @property
     def manifest_sha256(self) -> str:

@@ -15,8 +15,11 @@ from lce_rig.rig import Rig, dump_rig
 
 FORMAT_VERSION = 1
 _MAY_DIFFER = re.compile(
-    r"description|nominal_extrinsics|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
+    r"description|nominal_extrinsics|exports|targets\..*|(lidars|cameras)\.[^.]+\.driver(\..*)?|sync\.(device|baud)"
 ).fullmatch
+# Known later than the first capture, perhaps; another one is another rig.
+_IS_IDENTITY = re.compile(r"robot|(lidars|cameras)\.[^.]+\.serial").fullmatch
+_ABSENT = "absent"
 MARKER = "session.json"
 
 
@@ -77,16 +80,32 @@ class DifferingKey:
 def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
     """List the keys in which two profiles differ, with both values.
 
-    The description, the nominal extrinsics and the addresses of attached sensors (such as /dev/video2) may
-    differ, as no capture depends on them.
+    The description, the nominal extrinsics, targets of `deploy` and the addresses of attached sensors may
+    differ, as no capture depends on them. The robot and serial numbers may be absent in either.
     """
     a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))
     paths = sorted(path for path in a.keys() | b.keys() if a.get(path) != b.get(path))
-    return [
-        DifferingKey(path, a.get(path, "absent"), b.get(path, "absent"))
-        for path in paths
-        if not _MAY_DIFFER(".".join(path))
-    ]
+    found = [DifferingKey(path, a.get(path, _ABSENT), b.get(path, _ABSENT)) for path in paths]
+    return [key for key in found if not _may_differ(key)]
+
+
+def _may_differ(key: DifferingKey) -> bool:
+    name = ".".join(key.path)
+    return bool(_MAY_DIFFER(name)) or (bool(_IS_IDENTITY(name)) and _ABSENT in (key.theirs, key.ours))
+
+
+def keep_identity(earlier: Rig, rig: Rig) -> Rig:
+    """Give a profile the robot and the serial numbers that an earlier one of the same rig states."""
+    lidars = {
+        name: each.model_copy(update={"serial": each.serial or earlier.lidars[name].serial})
+        for name, each in rig.lidars.items()
+    }
+    cameras = {
+        name: each.model_copy(update={"serial": each.serial or earlier.cameras[name].serial})
+        for name, each in rig.cameras.items()
+    }
+    kept = {"robot": rig.robot or earlier.robot, "lidars": lidars, "cameras": cameras}
+    return rig.model_copy(update=kept)
 
 
 def _flatten(value: Any, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:

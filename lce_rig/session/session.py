@@ -28,7 +28,14 @@ from lce_rig.session import cache
 from lce_rig.session.capture import SAFE_NAME, Capture
 from lce_rig.session.capture_files import content_hash, write_capture
 from lce_rig.session.durable import WriterLock, append_line, flush_folder, own_path, replace_file
-from lce_rig.session.identity import MARKER, check_marker, differing_keys, marker_of, read_marker
+from lce_rig.session.identity import (
+    MARKER,
+    check_marker,
+    differing_keys,
+    keep_identity,
+    marker_of,
+    read_marker,
+)
 from lce_rig.session.membership import check_samples, event_channel
 from lce_rig.session.replacing import recover, replacing
 
@@ -63,6 +70,8 @@ def read_entries(path: Path) -> list[dict[str, Any]]:
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
 CAPTURES, REJECTED, DETECTIONS, DRAFT_PREFIX = "captures", "rejected", "detections", ".new-"
+CAPTURED = "captured"
+"""The journal's event of a capture."""
 CALIBRATION, RESULTS, INTRINSICS, DEBUG = "calibration", "results", "intrinsics", "debug"
 _WRITTEN = (JOURNAL, LOCK, CAPTURES, REJECTED, DETECTIONS, CALIBRATION, RESULTS, INTRINSICS, DEBUG)
 
@@ -170,7 +179,7 @@ class Session:
                 f"{path} is a session of rig {session.rig.name!r}, not of this rig {rig.name!r}: {shown}",
                 "Collect into another folder, or use the profile in the session (its rig.yaml).",
             )
-        session._adopt(rig)
+        session._adopt(keep_identity(session.rig, rig))
         return session
 
     def __enter__(self) -> "Session":
@@ -186,7 +195,7 @@ class Session:
             self._lock = None
 
     def _adopt(self, rig: Rig) -> None:
-        """Adopt what may differ in the profile: the addresses of attached sensors."""
+        """Adopt what may differ in the profile: addresses of attached sensors, the robot, serial numbers."""
         if rig == self.rig:
             return
         try:
@@ -316,7 +325,7 @@ class Session:
                 raise SessionError(f"capture {name} cannot be stored: {error}") from error
             raise _not_writable(folder, error, len(captures)) from error
         contents.setdefault(Capture(folder).content_sha256, name)
-        self.journal("captured", capture=name)
+        self.journal(CAPTURED, capture=name)
         return name
 
     @property

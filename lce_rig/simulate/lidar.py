@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Scan
+from lce_rig.core.data_sheets import DataSheet
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.options import LidarNoise
 from lce_rig.simulate.scene import Hits, Scene, join_rows, put_rows
@@ -143,7 +144,6 @@ def _mix(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> 
 _THRESHOLD = 0.04
 #: ... up to this range; beyond it the threshold grows with the square of the range.
 _FULL_RANGE_M = 30.0
-_RANGE_STEP_M = 0.002
 _AZIMUTH_STEP_RAD = np.radians(0.01)
 # 16 sequences of a VLP-16 take 0.9 ms: a board at 0.3 m/s is seen within 0.14 mm of where it is.
 _FIRINGS_PER_INSTANT = 256
@@ -153,13 +153,15 @@ _MARGIN_RAD, _NEAREST_M = 0.04, 0.5
 
 @dataclass(frozen=True, eq=False)
 class LidarModel:
-    """The geometry and timing of a spinning LiDAR.
+    """The geometry and timing of a spinning LiDAR at one rate.
 
     Attributes:
         name: of the model.
         elevations_rad: (L,) of each laser, in firing order.
-        vertical_offsets_m: (L,) height of each laser's optical centre, in firing order.
-        firing_ns: time between two lasers of a sequence.
+        azimuths_rad: (L,) of each laser from the rotor's.
+        vertical_offsets_m: (L,) height of each laser's optical centre.
+        origin_radius_m: distance of the optical centres from the axis, along the rotor's direction.
+        starts_ns: (L,) when each laser fires after the first of its sequence.
         sequence_ns: time between two sequences.
         period_ns: of one revolution.
         cut_azimuth_rad: where a scan begins; the rotor turns clockwise as seen from above.
@@ -167,11 +169,28 @@ class LidarModel:
 
     name: str
     elevations_rad: Array
+    azimuths_rad: Array
     vertical_offsets_m: Array
-    firing_ns: int
+    origin_radius_m: float
+    starts_ns: NDArray[np.int64]
     sequence_ns: int
     period_ns: int
     cut_azimuth_rad: float = np.pi
+
+    @classmethod
+    def of(cls, sheet: DataSheet, rate_hz: float) -> "LidarModel":
+        """Build the model of a data sheet at a rate."""
+        n, period_ns = sheet.n_rings, round(1e9 / rate_hz)
+        return cls(
+            name=sheet.name,
+            elevations_rad=np.radians(sheet.elevations_deg),
+            azimuths_rad=np.radians(sheet.azimuths_deg or n * (0.0,)),
+            vertical_offsets_m=1e-3 * np.array(sheet.heights_mm or n * (0.0,)),
+            origin_radius_m=sheet.origin_radius_m,
+            starts_ns=np.arange(n, dtype=np.int64) // sheet.n_at_once * sheet.firing_ns,
+            sequence_ns=sheet.sequence_ns or period_ns // (sheet.columns or 1),
+            period_ns=period_ns,
+        )
 
     @property
     def rings(self) -> NDArray[np.int16]:
@@ -182,27 +201,6 @@ class LidarModel:
     def step_rad(self) -> float:
         """Turn of the rotor from one sequence to the next."""
         return 2 * np.pi * self.sequence_ns / self.period_ns
-
-
-# VLP-16 User Manual 63-9243 Rev D, table 9-1: elevations and vertical corrections by laser id; 600 rpm.
-VLP16 = LidarModel(
-    name="vlp16",
-    elevations_rad=np.radians([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15]),
-    vertical_offsets_m=1e-3
-    * np.array([11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2]),
-    firing_ns=2_304,
-    sequence_ns=55_296,
-    period_ns=100_000_000,
-)
-# All lasers fire at once, 1024 times a revolution; elevations of an OS1-64 recording, 0.67 deg apart.
-OS1_64 = LidarModel(
-    name="os1-64",
-    elevations_rad=np.radians(np.linspace(21.4, -20.8, 64)),
-    vertical_offsets_m=np.zeros(64),
-    firing_ns=0,
-    sequence_ns=97_656,
-    period_ns=100_000_000,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +368,7 @@ def _measure(
     range_m += noise.weak_bias_m * np.clip(1.0 - intensity / 30.0, 0.0, 1.0)
     range_m += noise.range_sigma_m * rng.standard_normal(len(range_m))
     if noise.is_quantised:
-        return np.rint(range_m / _RANGE_STEP_M) * _RANGE_STEP_M, np.rint(intensity)
+        return np.rint(range_m / noise.range_step_m) * noise.range_step_m, np.rint(intensity)
     return range_m, intensity
 
 
@@ -380,6 +378,10 @@ def _beams(
     """Find where beams (N,) begin and where they go, (N, 3) each, world; of one pose, or one each."""
     origins = np.zeros((len(laser), 3))
     origins[:, 2] = model.vertical_offsets_m[laser]
+    if model.origin_radius_m:
+        rotor_rad = azimuth_rad - model.azimuths_rad[laser]
+        origins[:, 0] = model.origin_radius_m * np.cos(rotor_rad)
+        origins[:, 1] = model.origin_radius_m * np.sin(rotor_rad)
     elevation_rad = model.elevations_rad[laser]
     level = np.cos(elevation_rad)
     directions = np.stack(
@@ -397,10 +399,12 @@ def _firings(
     n_sequences = int(model.period_ns // model.sequence_ns)
     laser = np.tile(np.arange(n_lasers), n_sequences)
     sequence = np.repeat(np.arange(n_sequences), n_lasers)
-    offset_ns = (sequence * model.sequence_ns + laser * model.firing_ns).astype(np.int64)
+    offset_ns = (sequence * model.sequence_ns + model.starts_ns[laser]).astype(np.int64)
     # The rotor is not synchronised with the firings: each scan begins anywhere within one step.
     start_rad = model.cut_azimuth_rad - model.step_rad * rng.uniform()
     azimuth_rad = start_rad - 2 * np.pi * offset_ns / model.period_ns
+    if model.azimuths_rad.any():
+        azimuth_rad = azimuth_rad + model.azimuths_rad[laser]
     return laser, offset_ns, azimuth_rad
 
 

@@ -155,7 +155,7 @@ class LiveScene:
 
     def _take_scan(self, lidar: str, stamp_ns: int) -> Scan:
         stage = self.stage
-        model, noise = stage.models[lidar], stage.options.lidar_noise
+        model, noise = stage.models[lidar], stage.noise[lidar]
         if lidar not in self._sweeps:
             T_world_lidar = stage.T_world_sensor[lidar]
             rooms = self._rooms.setdefault(lidar, [])

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from lce_rig.core.data_sheets import VLP_16, DataSheet
+
 #: Range noise of the paper's simulated sets, levels 1..10, m.
 PAPER_RANGE_SIGMA_M = (0.0, 0.008, 0.016, 0.024, 0.032, 0.040, 0.048, 0.060, 0.080, 0.100)
 
@@ -12,7 +14,7 @@ Motion = Literal["still", "moving"]
 
 @dataclass(frozen=True)
 class LidarNoise:
-    """Errors of a spinning LiDAR.
+    """Errors of a spinning LiDAR; the defaults are those of a VLP-16.
 
     Attributes:
         range_sigma_m: white noise of each range.
@@ -27,21 +29,35 @@ class LidarNoise:
         exit_size_m: size of the beam where it leaves the sensor, horizontal and vertical.
         pulse_m: surfaces nearer to each other than this blend into one return.
         dropout: probability that a return is lost.
-        is_quantised: whether ranges come in steps of 2 mm and azimuths in steps of 0.01 deg.
+        range_step_m: resolution of ranges.
+        is_quantised: whether ranges come in such steps and azimuths in steps of 0.01 deg.
     """
 
-    range_sigma_m: float = 0.010
+    range_sigma_m: float = VLP_16.range_sigma_m
     range_offset_m: float = 0.0
-    laser_sigma_m: float = 0.008
+    laser_sigma_m: float = VLP_16.laser_bias_sigma_m
     dark_bias_m: float = 0.001
     weak_bias_m: float = 0.010
     rim_spread_rad: float = 0.0
-    edge_growth_m: float = 0.004
-    divergence_rad: tuple[float, float] = (0.0030, 0.0015)
-    exit_size_m: tuple[float, float] = (0.010, 0.010)
+    edge_growth_m: float = VLP_16.rim_m
+    divergence_rad: tuple[float, float] = VLP_16.divergence_rad
+    exit_size_m: tuple[float, float] = VLP_16.exit_m
     pulse_m: float = 0.5
     dropout: float = 0.002
+    range_step_m: float = VLP_16.range_step_m
     is_quantised: bool = True
+
+    @classmethod
+    def of(cls, sheet: DataSheet) -> "LidarNoise":
+        """Take the errors from a data sheet; how ranges depend on brightness is a VLP-16's for all models."""
+        return cls(
+            range_sigma_m=sheet.range_sigma_m,
+            laser_sigma_m=sheet.laser_bias_sigma_m,
+            edge_growth_m=sheet.rim_m,
+            divergence_rad=sheet.divergence_rad,
+            exit_size_m=sheet.exit_m,
+            range_step_m=sheet.range_step_m,
+        )
 
     @classmethod
     def none(cls) -> "LidarNoise":
@@ -157,8 +173,10 @@ class SimulationOptions:
     Attributes:
         carrier: what carries the board.
         noise_level: 1..10, the paper's simulated sets: the range noise of `PAPER_RANGE_SIGMA_M` and noise on
-            points near the board's rim instead of `lidar.range_sigma_m`; None for `lidar` unchanged.
-        lidar, camera: the sensors' errors.
+            points near the board's rim instead of the LiDAR's own; None for that.
+        lidar: errors of all LiDARs; None for those of each one's data sheet.
+        range_sigma_m, range_offset_m: replace those of every LiDAR; None for `lidar` unchanged.
+        camera: the cameras' errors.
         distance_m: range of the board's distance from the camera; where the LiDAR would see less than four
             fifths of the plate, no board is placed (a diamond of 1 m nearer than about 1.4 m).
         tilt_deg: largest tilt of the board out of the direction to the camera.
@@ -184,7 +202,9 @@ class SimulationOptions:
 
     carrier: Carrier = "stand"
     noise_level: int | None = None
-    lidar: LidarNoise = field(default_factory=LidarNoise)
+    lidar: LidarNoise | None = None
+    range_sigma_m: float | None = None
+    range_offset_m: float | None = None
     camera: CameraNoise = field(default_factory=CameraNoise)
     distance_m: tuple[float, float] = (1.2, 4.0)
     tilt_deg: float = 40.0
@@ -213,14 +233,18 @@ class SimulationOptions:
         if not 0 < self.distance_m[0] <= self.distance_m[1]:
             raise ValueError(f"distance_m must be (near, far) with 0 < near <= far, not {self.distance_m}")
 
-    @property
-    def lidar_noise(self) -> LidarNoise:
-        """The LiDAR's errors with `noise_level` applied."""
+    def noise_of(self, sheet: DataSheet) -> LidarNoise:
+        """Give the errors of a LiDAR, with the options that change them applied."""
+        noise = self.lidar or LidarNoise.of(sheet)
+        if self.range_sigma_m is not None:
+            noise = replace(noise, range_sigma_m=self.range_sigma_m)
+        if self.range_offset_m is not None:
+            noise = replace(noise, range_offset_m=self.range_offset_m)
         if self.noise_level is None:
-            return self.lidar
+            return noise
         sigma_m = PAPER_RANGE_SIGMA_M[self.noise_level - 1]
         # The paper's simulator spreads points at the rim by 0.003 rad times the range, whatever the level.
-        quiet = replace(self.lidar, laser_sigma_m=0.0, dark_bias_m=0.0, weak_bias_m=0.0, edge_growth_m=0.0)
+        quiet = replace(noise, laser_sigma_m=0.0, dark_bias_m=0.0, weak_bias_m=0.0, edge_growth_m=0.0)
         return replace(quiet, range_sigma_m=sigma_m, rim_spread_rad=0.0015)
 
     @classmethod

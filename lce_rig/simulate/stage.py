@@ -1,24 +1,23 @@
 """The constants of a simulated session: the room, the sensors' true poses and their own errors."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
+from lce_rig.core.data_sheets import DATA_SHEETS, DataSheet
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, invert, perturb, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
 from lce_rig.simulate.event_camera import EventPixels, draw_pixels
-from lce_rig.simulate.lidar import OS1_64, VLP16, LidarModel, Sweep, measure_sweep
-from lce_rig.simulate.options import SimulationOptions
+from lce_rig.simulate.lidar import LidarModel, Sweep, measure_sweep
+from lce_rig.simulate.options import LidarNoise, SimulationOptions
 from lce_rig.simulate.poses import CameraView, place_board
 from lce_rig.simulate.room import Room, build_room
-
-LIDAR_MODELS = {"vlp16": VLP16, "os164": OS1_64}
 
 # Independent streams of random numbers, so that more captures or another camera change nothing else.
 # Streams of a session are [seed, OF_SESSION, stream, ...], those of a capture [seed, index, stream, ...].
@@ -43,6 +42,7 @@ class Stage:
         T_world_sensor: (4, 4) of each camera and LiDAR.
         backdrops: what each simulated camera sees of the room.
         models: of each LiDAR.
+        noise: its errors.
         laser_bias_m: (L,) range offset of each laser of each LiDAR.
         pixels: those of each camera with a channel of events.
         views: pairs of sensors that the board is placed for in turn.
@@ -56,6 +56,7 @@ class Stage:
     T_world_sensor: Mapping[str, Array]
     backdrops: Mapping[str, Backdrop]
     models: Mapping[str, LidarModel]
+    noise: Mapping[str, LidarNoise]
     laser_bias_m: Mapping[str, Array]
     pixels: Mapping[str, EventPixels]
     views: list[CameraView]
@@ -75,7 +76,7 @@ class Stage:
         return measure_sweep(
             sweep,
             self.models[lidar],
-            self.options.lidar_noise,
+            self.noise[lidar],
             rng,
             laser_bias_m=self.laser_bias_m[lidar],
             sensor=lidar,
@@ -142,10 +143,12 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
         is_furnished=options.is_furnished,
     )
     lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
-    models = {name: _lidar_model(rig, name) for name in rig.lidars}
+    sheets = {name: _data_sheet(rig, name) for name in rig.lidars}
+    models = {name: LidarModel.of(sheet, rig.lidars[name].rate_hz) for name, sheet in sheets.items()}
+    noise = {name: options.noise_of(sheet) for name, sheet in sheets.items()}
     mounted = _mounting_seed(seed, options)
     bias = {
-        name: _laser_bias(models[name], np.random.default_rng([mounted, OF_SESSION, LASERS, k]), options)
+        name: _laser_bias(models[name], np.random.default_rng([mounted, OF_SESSION, LASERS, k]), noise[name])
         for k, name in enumerate(rig.lidars)
     }
     pixels = {
@@ -164,7 +167,9 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     ]
     backdrops = {name: build_backdrop(room, T_world_sensor[name], lenses[name]) for name in cameras}
     board = rig.board.to_board()
-    return Stage(rig, seed, options, board, room, T_world_sensor, backdrops, models, bias, pixels, views)
+    return Stage(
+        rig, seed, options, board, room, T_world_sensor, backdrops, models, noise, bias, pixels, views
+    )
 
 
 def _mounting_seed(seed: int, options: SimulationOptions) -> int:
@@ -210,16 +215,15 @@ def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, 
     return T_base
 
 
-def _lidar_model(rig: Rig, lidar: str) -> LidarModel:
-    given, rate_hz = rig.lidars[lidar].model, rig.lidars[lidar].rate_hz
-    model = LIDAR_MODELS.get("".join(c for c in given.lower() if c.isalnum()))
-    if model is None:
-        known = ", ".join(m.name for m in LIDAR_MODELS.values())
-        raise ProfileError(f"lidars.{lidar}.model: {given} cannot be simulated", f"Known models: {known}.")
-    return replace(model, period_ns=round(1e9 / rate_hz))
+def _data_sheet(rig: Rig, lidar: str) -> DataSheet:
+    sheet = rig.lidars[lidar].data_sheet()
+    if sheet is None:
+        hint = f"Known: {', '.join(each.name for each in DATA_SHEETS)}. For others, set elevations_deg."
+        raise ProfileError(f"lidars.{lidar}.model: {rig.lidars[lidar].model} cannot be simulated", hint)
+    return sheet
 
 
-def _laser_bias(model: LidarModel, rng: np.random.Generator, options: SimulationOptions) -> Array:
+def _laser_bias(model: LidarModel, rng: np.random.Generator, noise: LidarNoise) -> Array:
     """Draw each laser's offset; their mean is `LidarNoise.range_offset_m` and nothing else."""
-    bias = options.lidar_noise.laser_sigma_m * rng.standard_normal(len(model.elevations_rad))
+    bias = noise.laser_sigma_m * rng.standard_normal(len(model.elevations_rad))
     return np.asarray(bias - bias.mean())

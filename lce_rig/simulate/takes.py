@@ -40,7 +40,7 @@ def take_scan(
     """Take a scan that begins at a time of the rig's clock; of a moving board where `board_at` is given."""
     rng = stage.rng(*_numbered(stream, SCAN, list(stage.models).index(lidar)))
     T_world_lidar, model = stage.T_world_sensor[lidar], stage.models[lidar]
-    sweep = sweep_scene(scene, T_world_lidar, model, stage.options.lidar_noise, rng, stamp_ns, board_at)
+    sweep = sweep_scene(scene, T_world_lidar, model, stage.noise[lidar], rng, stamp_ns, board_at)
     return stage.measure(lidar, sweep, rng, stamp_ns)
 
 

@@ -4,6 +4,8 @@ A point p = R q + t in the camera frame moves with the extrinsics by [I, -(p - t
 rotation moves it about the LiDAR's origin.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
@@ -16,29 +18,36 @@ _INWARDS = np.linspace(0.0, 1.0, 41)[:-1]
 _STEP_M = 1e-4
 
 
-def point_uncertainties(T_cam_lidar: Array, cov: Array, lens: Intrinsics) -> tuple[PointUncertainty, ...]:
+def point_uncertainties(
+    T_cam_lidar: Array, cov: Array, lens: Intrinsics, distances_m: Sequence[float] = DISTANCES_M
+) -> tuple[PointUncertainty, ...]:
     """Propagate a covariance to points in the middle and in the corners of the image.
 
     Args:
         T_cam_lidar: (4, 4).
         cov: (6, 6) tangent (translation m, rotation rad).
         lens: of the camera.
+        distances_m: of the points.
 
     Returns:
-        One for each of `DISTANCES_M`, with the worst of the four corners.
+        One for each distance, with the worst of the four corners.
     """
-    middle = np.array([[(lens.width_px - 1) / 2, (lens.height_px - 1) / 2]])
-    rays = lens.unproject(np.concatenate([middle, _corners(lens, middle[0])]))
+    rays = lens.unproject(np.concatenate([[_middle(lens)], outermost_pixels(lens)]))
     found = []
-    for distance_m in DISTANCES_M:
+    for distance_m in distances_m:
         sigmas = [_sigmas(distance_m * ray, T_cam_lidar[:3, 3], cov, lens) for ray in rays]
         corner_px, corner_m = np.max(sigmas[1:], axis=0)
         found.append(PointUncertainty(distance_m, *sigmas[0], float(corner_px), float(corner_m)))
     return tuple(found)
 
 
-def _corners(lens: Intrinsics, middle: Array) -> Array:
-    """Find the image's corners (4, 2), or where the lens ends on the way to them."""
+def _middle(lens: Intrinsics) -> Array:
+    return np.array([(lens.width_px - 1) / 2, (lens.height_px - 1) / 2])
+
+
+def outermost_pixels(lens: Intrinsics) -> Array:
+    """Find the image's corners (4, 2), or where the lens ends on the way to them from the middle."""
+    middle = _middle(lens)
     w, h = lens.width_px - 1.0, lens.height_px - 1.0
     corners = []
     for corner in np.array([[0, 0], [w, 0], [0, h], [w, h]]):

@@ -7,7 +7,7 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Figure, Finding, ranked
-from lce_rig.core.geometry import rotation_angle, sigma_sizes, tangent_sizes
+from lce_rig.core.geometry import Array, largest_sizes, rotation_angle, sigma_sizes, tangent_sizes
 from lce_rig.core.results import Calibration, Metrics
 from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.extrinsics.estimate import CalibrationEstimate
@@ -71,7 +71,16 @@ def judge(
     if examination.remark is not None:
         findings.append(examination.remark)
     findings += uncertainty_notes(examination.contributions, examination.known_better, rig.calibration)
-    return verdict_of(findings), ranked(findings)
+    return _verdict(findings, examination.cov)
+
+
+def _verdict(findings: Sequence[Finding], cov: Array) -> tuple[Verdict, tuple[Finding, ...]]:
+    """Draw the verdict; where it is marginal, a note says how wrong the extrinsics may be."""
+    verdict, others = verdict_of(findings), [f for f in findings if f.code != "verdict.may_be_off"]
+    if verdict != "marginal":
+        return verdict, ranked(others)
+    figures: dict[str, Figure] = dict(zip(("rotation_deg", "translation_m"), largest_sizes(cov), strict=True))
+    return verdict, ranked([Finding("verdict.may_be_off", "note", figures=figures), *others])
 
 
 def with_opinion(calibration: Calibration, opinion: SceneOpinion) -> Calibration:
@@ -81,8 +90,9 @@ def with_opinion(calibration: Calibration, opinion: SceneOpinion) -> Calibration
         calibration: judged by its boards.
         opinion: of the scene without the board.
     """
-    findings = ranked([*calibration.findings, *scene_findings(opinion, calibration)])
-    return replace(calibration, scene=opinion, findings=findings, verdict=verdict_of(findings))
+    told = [*calibration.findings, *scene_findings(opinion, calibration)]
+    verdict, findings = _verdict(told, calibration.cov)
+    return replace(calibration, scene=opinion, findings=findings, verdict=verdict)
 
 
 def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str = "") -> list[Finding]:

@@ -39,6 +39,11 @@ def _lost(finding: Finding) -> str:
     return f"lost near its last place: {describe(_cause(finding))}"
 
 
+def _not_there(finding: Finding) -> str:
+    """Not where images and other captures have it, for the code in {cause}, with its figures."""
+    return f"not where the image and the other captures have it: {describe(_cause(finding))}"
+
+
 def _find_again(finding: Finding) -> str:
     """The action of that code."""
     return recommend(_cause(finding))
@@ -250,6 +255,11 @@ PHRASES: dict[str, Phrase] = {
         "hold the board clear of other things, where more of the LiDAR's rings meet it",
     ),
     "lidar.lost": Phrase(_lost, _find_again),
+    "lidar.not_where_expected": Phrase(_not_there, _find_again),
+    "lidar.nothing_where_expected": Phrase(
+        "no plate of the board's size at the {distance_m:.1f} m where image and other captures have it",
+        "move the board clear of other things",
+    ),
     "lidar.turned_away": Phrase(
         "the only plate near the board's last place is rotated by over {max_turn_deg:.0f} deg",
         "move more slowly",

@@ -289,11 +289,12 @@ _PROFILE: Mapping[str, Phrase] = {
     ),
     "profile.unknown_model": Phrase(
         "{subject}: the beams of {value} are not known: recordings can be calibrated, live guidance and "
-        "simulation need a VLP-16",
-        "enter your LiDAR's noise and limits (docs/rig-profiles.md: for another LiDAR than a VLP-16)",
+        "simulation need elevations_deg and columns",
+        "enter them and your LiDAR's noise (docs/rig-profiles.md: LiDAR models), or make a new profile with "
+        "`lce-rig rigs new --lidar other --from RECORDING`",
     ),
     "profile.other_driver": Phrase(
-        "{subject}: {value} reads a VLP-16, and the model is {model}",
+        "{subject}: {value} reads Velodynes, and the model is {model}",
         "remove the driver block, or correct the model",
     ),
     "profile.unknown_driver": Phrase("{subject}: there is no driver {value}", "choose one of: {known}"),

@@ -145,6 +145,9 @@ _STREAM: Mapping[str, Phrase] = {
         "check the camera's cable and `dmesg | tail`",
         {"command": "check the command"},
     ),
+    "stream.messages_skipped": Phrase(
+        "{n} messages damaged, repeated or late", "record a bag: `lce-rig collect --from` names the cause"
+    ),
     "stream.damaged_lines": Phrase(
         "{n} of {n_lines} messages damaged",
         "check cable, ground and sync.baud, and that nothing else reads the port",
@@ -214,6 +217,7 @@ _LIDAR_CLOCK: Mapping[str, Phrase] = {
 }
 _CAMERA_CLOCK: Mapping[str, Phrase] = {
     "clock.arrival": Phrase("arrival at this computer, later than the exposure by an unknown time"),
+    "clock.header": Phrase("headers of the ROS 2 messages, {delay_ms:.3g} ms before their arrival"),
     "clock.simulated": Phrase("simulated"),
     "clock.mid_exposure": Phrase(_mid_exposure),
     "clock.davis": Phrase(_davis),
@@ -321,7 +325,10 @@ _PULSES: Mapping[str, Phrase] = {
     ),
 }
 _SETTINGS: Mapping[str, Phrase] = {
-    "settings.other_model": Phrase("the LiDAR is a {model}, not a VLP-16: its packets are not read"),
+    "settings.other_model": Phrase(
+        "the LiDAR is a {model}, the profile says {expected}: its packets are not read",
+        "correct the model in the profile",
+    ),
     "settings.motor_off": Phrase("the motor is off", "switch it on (rpm 600)"),
     "settings.laser_off": Phrase("the laser is off", "switch it on"),
     "settings.rotor_rate": Phrase(

@@ -216,6 +216,15 @@ def _largest_cause(finding: Finding) -> str:
     )
 
 
+def _may_be_off(finding: Finding) -> str:
+    """With 95 % probability each, errors are smaller than {rotation_deg} and {translation_m}."""
+    off_deg, off_mm = finding.figure("rotation_deg"), 1000 * finding.figure("translation_m")
+    return (
+        f"with 95 % probability each, the rotation is off by less than {off_deg:.2f} deg and the translation "
+        f"by less than {off_mm:.0f} mm"
+    )
+
+
 def _known_better(finding: Finding) -> str:
     """The session's boards determine {source} to {error_sigma}, the profile to {profile_sigma}: {error}."""
     source = str(finding.figures["source"])
@@ -431,6 +440,7 @@ PHRASES: dict[str, Phrase] = {
     "verdict.widened": Phrase(_widened),
     "verdict.largest_cause": Phrase(_largest_cause, "", _MEASURE),
     "verdict.known_better": Phrase(_known_better),
+    "verdict.may_be_off": Phrase(_may_be_off),
     "verdict.scene": Phrase(
         _scene,
         f"check the intrinsics, squares and plate. {_LOOK}",

@@ -15,7 +15,10 @@ from lce_rig.core.findings import Figure, Finding
 if TYPE_CHECKING:
     from lce_rig.core.results import Refusal
 
-FAMILIES = ("detection", "drivers", "doctor", "extrinsics", "guidance", "recordings", "scene_drift")
+FAMILIES = (
+    *("detection", "drivers", "doctor", "exports", "extrinsics", "guidance", "recordings", "scene_drift"),
+    *("fleet", "deployment"),
+)
 """Modules of this package with a table PHRASES of their own."""
 
 Template = str | Callable[[Finding], str]

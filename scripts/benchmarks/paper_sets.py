@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.kept import kept_folder
+from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, invert
 from lce_rig.detect.detection import ImageDetection, LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.finder import BoardFinder
@@ -111,10 +112,10 @@ class _Maker:
         scene = Scene(stage.room.raycaster, (), stage.board, T_world_board, self._options.print_reflectivity)
         image = take_image(stage, CAMERA, scene, 0, (index, IMAGE))
         model = stage.models[LIDAR]
-        sweep = sweep_scene(scene, T_world_lidar, model, self._options.lidar_noise, stage.rng(index, SCAN))
+        sweep = sweep_scene(scene, T_world_lidar, model, stage.noise[LIDAR], stage.rng(index, SCAN))
         scans = {}
         for level in LEVELS:
-            noise = replace(self._options, noise_level=level).lidar_noise
+            noise = replace(self._options, noise_level=level).noise_of(VLP_16)
             scan = measure_sweep(sweep, model, noise, stage.rng(index, SCAN, level), sensor=LIDAR)
             scans[level] = BoardFinder(self.rig).scan(scan)
         normal = (invert(T_world_lidar) @ T_world_board)[:3, 2]

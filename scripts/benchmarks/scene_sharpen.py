@@ -19,6 +19,7 @@ from lce_rig.pipeline.sharpening import share_of
 from lce_rig.pipeline.witness import scene_views
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.views import without_movers
 from lce_rig.session import Session
 
 _SIZES = {"rlfs": (3, 5, 10), "rles": (3, 5, 10), "os1_64": (11,)}
@@ -88,14 +89,14 @@ def _trials(name: str, seed: int, folder: Path) -> dict[str, _Trial]:
     every = room.calibrate(room.names)
     views = scene_views(room.session, room.detections, every, len(room.names))
     trials = {
-        str(size): _Trial.of(share_of(views[:size], room.lens, calibration), room.T_cam_lidar)
+        str(size): _Trial.of(share_of(without_movers(views[:size]), room.lens, calibration), room.T_cam_lidar)
         for size, calibration in _calibrated(room, _SIZES[name])
     }
     for kind, (sigma_deg, sigma_m) in _DRAWN.items():
         cov = np.diag([sigma_m] * 3 + [np.radians(sigma_deg)] * 3) ** 2
         off = np.random.default_rng([seed, 5]).multivariate_normal(np.zeros(6), cov)
-        boards = replace(every, T_cam_lidar=perturb(room.T_cam_lidar, off), cov=cov)
-        trials[kind] = _Trial.of(share_of(views[:5], room.lens, boards), room.T_cam_lidar)
+        boards = replace(every, T_cam_lidar=perturb(room.T_cam_lidar, off), cov=cov, cov_shared=0 * cov)
+        trials[kind] = _Trial.of(share_of(without_movers(views[:5]), room.lens, boards), room.T_cam_lidar)
     return trials
 
 
@@ -140,7 +141,7 @@ def _bench_recording(recorded: RecordedSet, n_splits: int) -> None:
         (every,), _ = pipeline.calibrate_detections(rig, detections)
         lens = rig.cameras[every.camera].to_intrinsics()
         views = scene_views(session, detections, every, 60)
-        whole = share_of(views, lens, every)
+        whole = share_of(without_movers(views), lens, every)
         print(f"\n{recorded.name}: all {len(views)} captures\n")
         print_head("boards alone claim", "with scene", "moved by", "surprise", "directions", "state")
         figures = (_sizes(np.array(sigma_sizes(cov))) for cov in (whole.cov_boards, whole.cov))
@@ -164,7 +165,7 @@ def _print_choices(
         except NotEnoughDataError:
             print_row(k, "boards nearly parallel", "", "", "", "")
             continue
-        share = share_of([views[index] for index in sorted(chosen)], lens, calibration)
+        share = share_of(without_movers([views[index] for index in sorted(chosen)]), lens, calibration)
         T = share.T_cam_lidar if share.state == "used" else calibration.T_cam_lidar
         cov = share.cov if share.state == "used" else calibration.cov
         before, after = (

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.kept import kept_folder
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
@@ -83,12 +84,27 @@ def still_session(
 
 
 def draw_corners(
-    rig: Rig, T_cam_board: Array, sigma_px: float, rng: np.random.Generator
+    rig: Rig,
+    T_cam_board: Array,
+    sigma_px: float,
+    rng: np.random.Generator,
+    true_lens: Intrinsics | None = None,
+    true_corners: Array | None = None,
 ) -> ImageBoard | None:
-    """Draw a board's corners with noise and solve for its pose."""
+    """Draw a board's corners with noise and solve for its pose as the profile says.
+
+    Args:
+        rig: the profile.
+        T_cam_board: (4, 4) the truth.
+        sigma_px: noise of each coordinate.
+        rng: draws it.
+        true_lens: where it is another than the profile's.
+        true_corners: (M, 3) of the board, where they are others than the profile's.
+    """
     lens = next(iter(rig.cameras.values())).to_intrinsics()
     corners = rig.board.to_board().corners()
-    pixels, _ = lens.project(transform(T_cam_board, corners))
+    seen = corners if true_corners is None else true_corners
+    pixels, _ = (true_lens or lens).project(transform(T_cam_board, seen))
     pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
     solved = solve_planar_pose(pixels, corners, lens)
     return None if solved is None else board_from_pose(pixels, solved)

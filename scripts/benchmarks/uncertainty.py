@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
+from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, difference, invert
 from lce_rig.extrinsics import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.extrinsics.likelihood.image_terms import stack_images
@@ -48,7 +49,7 @@ class Case:
     def options(self) -> SimulationOptions:
         """Choose the simulator's options."""
         options = SimulationOptions.for_rig(self.rig)
-        lidar = replace(options.lidar, range_offset_m=self.range_offset_m)
+        lidar = LidarNoise(range_offset_m=self.range_offset_m)
         if self.edge_growth_m is not None:
             lidar = replace(lidar, edge_growth_m=self.edge_growth_m)
         return replace(options, lidar=lidar)
@@ -123,7 +124,7 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
         for seed in range(n_seeds)
     ]
     at_truth = [_at_truth(rig, session) for session in sessions]
-    levels = _true_levels(case.options().lidar_noise, [terms.edges for terms in at_truth])
+    levels = _true_levels(case.options().noise_of(VLP_16), [terms.edges for terms in at_truth])
     priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=EDGE_SHIFT_SIGMA_M)
     for session, terms in zip(sessions, at_truth, strict=True):
         estimate = fit_extrinsic(session.candidates, board, options)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -268,17 +267,50 @@ def _truth(folder: Path) -> None:
     require_kind(folder / "s", 0)
 
 
-def _export(module: str, file: str, *, has_trees: bool = False) -> Callable[[Path], None]:
-    """Read an export back as its writer does, which compares it with the result."""
+def _job(folder: Path) -> Any:
+    from lce_rig.export.job import ExportJob
 
-    def read(folder: Path) -> None:
-        from lce_rig.export.frames import build_trees
+    return ExportJob([sessions.calibration()], small_rig(), folder)
 
-        calibrations, rig = [sessions.calibration()], small_rig()
-        trees = [build_trees(calibrations, rig)] if has_trees else []
-        import_module(f"lce_rig.export.{module}")._check(folder / file, *trees, calibrations, rig)
 
-    return read
+def _extrinsics(folder: Path) -> None:
+    from lce_rig.export.extrinsics import _check
+
+    job = _job(folder)
+    _check(folder / "extrinsics.yaml", job.calibrations, job.rig)
+
+
+def _kalibr(folder: Path) -> None:
+    from lce_rig.export.kalibr import _check
+    from lce_rig.export.lens import lens_for
+
+    job = _job(folder)
+    lenses = {c.camera: lens_for(job, "kalibr", c.camera, 4) for c in job.chosen}
+    _check(folder / "camchain_lidar.yaml", job.chosen, lenses, job.rig)
+
+
+def _autoware(folder: Path) -> None:
+    from lce_rig.export.autoware import KIT, KIT_FILE, read_block
+
+    for T in read_block(folder / KIT_FILE, KIT).values():
+        sanity.require(T.shape == (4, 4), "a pose of another shape")
+
+
+def _launch(folder: Path) -> None:
+    from lce_rig.export.ros2_launch import read_ros2_launch
+
+    for _, joint in read_ros2_launch(folder / "fuzz.launch.py"):
+        sanity.require(joint.T_parent_child.shape == (4, 4), "a pose of another shape")
+
+
+def _koide3(folder: Path) -> None:
+    from lce_rig.export.koide3 import _check
+    from lce_rig.export.lens import lens_for
+
+    job = _job(folder)
+    (calibration,) = job.chosen
+    lens = lens_for(job, "koide3", calibration.camera, 5)
+    _check(folder / f"calib_{job.name_of(calibration)}.json", calibration, lens, job)
 
 
 def _camera_info(folder: Path) -> None:
@@ -290,16 +322,16 @@ def _camera_info(folder: Path) -> None:
 def _urdf(folder: Path) -> None:
     from lce_rig.export.urdf import read_urdf
 
-    for T in read_urdf(folder / "fuzz.urdf").values():
-        sanity.require(T.shape == (4, 4), "a pose of another shape")
+    for joint in read_urdf(folder / "fuzz.urdf").above.values():
+        sanity.require(joint.T_parent_child.shape == (4, 4), "a pose of another shape")
 
 
 def _static_tf(folder: Path) -> None:
     from lce_rig.export.static_tf import read_static_tf
 
-    for poses in read_static_tf(folder / "static_transforms.txt").values():
-        for T in poses.values():
-            sanity.require(T.shape == (4, 4), "a pose of another shape")
+    for joints in read_static_tf(folder / "static_transforms.txt").values():
+        for _, joint in joints:
+            sanity.require(joint.T_parent_child.shape == (4, 4), "a pose of another shape")
 
 
 def _network(folder: Path) -> None:
@@ -423,18 +455,11 @@ READERS: dict[str, Reader] = {
     "result.json": Reader(sessions.result, _result, layers=(JSON,)),
     "reference": Reader(sessions.reference, _reference, layers=(JSON,)),
     "camera_info": Reader(sessions.exports, _camera_info, "camera_info_*.yaml", (TEXT,)),
-    "extrinsics": Reader(
-        sessions.exports, _export("extrinsics", "extrinsics.yaml"), "extrinsics.yaml", (TEXT,)
-    ),
-    "kalibr": Reader(
-        sessions.exports, _export("kalibr", "camchain_lidar.yaml"), "camchain_lidar.yaml", (TEXT,)
-    ),
-    "autoware": Reader(
-        sessions.exports,
-        _export("autoware", "sensor_kit_calibration.yaml", has_trees=True),
-        "sensor_kit_calibration.yaml",
-        (TEXT,),
-    ),
+    "extrinsics": Reader(sessions.exports, _extrinsics, "extrinsics.yaml", (TEXT,)),
+    "kalibr": Reader(sessions.exports, _kalibr, "camchain_lidar.yaml", (TEXT,)),
+    "autoware": Reader(sessions.exports, _autoware, "sensor_kit_calibration.yaml", (TEXT,)),
+    "ros2_launch": Reader(sessions.exports, _launch, "*.launch.py", (TEXT,)),
+    "koide3": Reader(sessions.exports, _koide3, "calib_*.json", (JSON,)),
     "urdf": Reader(sessions.exports, _urdf, "*.urdf", (TEXT,)),
     "static_tf": Reader(sessions.exports, _static_tf, "static_transforms.txt", (TEXT,)),
     "network": _recordings(sessions.network, read=_network),

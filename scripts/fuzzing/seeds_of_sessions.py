@@ -165,7 +165,8 @@ def exports(_samples: Samples) -> list[Files]:
     from lce_rig.export import export
 
     with tempfile.TemporaryDirectory() as folder:
-        export([calibration()], small_rig(), Path(folder))
+        usual = ("extrinsics", "urdf", "camera_info", "static_tf", "kalibr", "autoware")
+        export([calibration()], small_rig(), Path(folder), formats=(*usual, "ros2_launch", "koide3"))
         return [files_in(Path(folder))]
 
 

@@ -22,7 +22,7 @@ Mutation = Callable[[bytearray, np.random.Generator], bytes]
 _N_PACKETS = 226
 _START_NS = 1_700_000_000_000_000_000
 _DELAY_NS = 1_500_000
-_PACKET_NS = velodyne.packet_ns(is_dual=False)
+_PACKET_NS = velodyne.READ[0].packet_ns(is_dual=False)
 _RETURN_SHARE = 0.15
 # What the checks let pass, as it does not matter: 0.2 deg where several packets before were lost, and 0.1 ms
 # of a packet's time, twice where it is also the one that tells the host's time.

@@ -8,11 +8,14 @@ from numpy.typing import NDArray
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
+from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array
-from lce_rig.simulate.lidar import VLP16, LidarModel
+from lce_rig.simulate.lidar import LidarModel
 
 #: A revolution of whole blocks, 10.0025 Hz: scans follow each other without a gap, as a real rotor's do.
-STREAMED_VLP16 = replace(VLP16, name="vlp16 of whole blocks", period_ns=904 * velodyne.BLOCK_NS)
+STREAMED_VLP16 = replace(
+    LidarModel.of(VLP_16, 10.0), name="VLP-16 of whole blocks", period_ns=904 * velodyne.BLOCK_NS
+)
 # Between one packet in five and one in fourteen is a position packet, depending on the firmware.
 _DATA_PER_POSITION = 14
 # A GPS sends its sentence for a pulse a while after that pulse.
@@ -156,7 +159,7 @@ class Vlp16Packets:
     def _pop(self) -> list[SensorPacket]:
         """Take one data packet, and the position packet that follows it now and then."""
         start_ns = int(self._starts_ns[0])
-        sent_ns = start_ns + velodyne.packet_ns(self._is_dual)
+        sent_ns = start_ns + velodyne.READ[0].packet_ns(self._is_dual)
         data = np.zeros((), velodyne.DATA_PACKET)
         data["blocks"], data["us"] = self._blocks[: velodyne.N_BLOCKS], self._count_us(start_ns)
         data["mode"], data["product"] = self._mode, velodyne.VLP16

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from lce_rig.core.data import Image
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import perturb
 from lce_rig.core.results import Calibration, Certificate, Metrics
-from lce_rig.export.result import write_result
+from lce_rig.export.result import read_result, write_result
+from lce_rig.pipeline.result_files import write_results
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
 
@@ -113,6 +115,20 @@ def test_a_picture_in_two_sessions_makes_them_one_whatever_lies_beside_it(lce_ri
     outcome = lce_rig("repeat", a, b)
     assert outcome.code == 4
     assert "monday and tuesday share 1 captures" in outcome.err
+
+
+def test_results_that_contain_the_same_session_are_not_compared(lce_rig, made):
+    paths = {name: made(name, [0] * 6) for name in ("monday", "tuesday", "wednesday")}
+    opened = {name: Session.open(path) for name, path in paths.items()}
+    for name in ("monday", "wednesday"):
+        (own,) = read_result(paths[name] / "calibration" / "result.json").pairs
+        both = {name: opened[name], "tuesday": opened["tuesday"]}
+        union = replace(own, captures_used=(f"{name}/000000", "tuesday/000000"))
+        write_results(opened[name], [union], force=False, name="union", sessions=both)
+    outcome = lce_rig("repeat", paths["monday"], paths["wednesday"], "--name", "union")
+    assert outcome.code == 4
+    assert "monday and wednesday share 1 captures" in outcome.err
+    assert lce_rig("repeat", paths["monday"], paths["wednesday"]).code == 0
 
 
 def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(lce_rig, made):

@@ -58,6 +58,18 @@ def test_the_same_session_gives_the_same_bytes(lce_rig, calibrated):
     assert (calibrated / "calibration" / "result.json").read_bytes() == first
 
 
+def test_the_result_names_its_robot_sensors_and_date(lce_rig, session):
+    words = ("calibrate", session, "--robot", "kestrel", "--name", "named")
+    assert lce_rig(*words).code == 0
+    path = session / "results" / "named" / "result.json"
+    origin = read(path)["provenance"]
+    # The simulation's first capture is of 14 November 2023, 22:13:20, with 4 s to the next.
+    assert (origin["robot"], origin["serials"], origin["date"][:16]) == ("kestrel", {}, "2023-11-14T22:14")
+    first = path.read_bytes()
+    assert lce_rig(*words).code == 0 and path.read_bytes() == first
+    assert lce_rig("calibrate", session, "--robot", "../kestrel").code == 2
+
+
 def test_the_result_names_its_inputs_by_hashes_that_other_tools_check(lce_rig, session):
     printed = json.loads(lce_rig("calibrate", session, "--json").out)
     document = read(session / "calibration" / "result.json")

@@ -1,11 +1,12 @@
 """Following the board from scan to scan."""
 
 import numpy as np
+import pytest
 from scans import BOARD, board_plate, cast, person, place, room
 
 from lce_rig.core.results import LidarBoard, Refusal
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import find_lidar_boards, track_lidar_board
+from lce_rig.detect.lidar.search import find_lidar_boards, look_for_board, track_lidar_board
 
 BEAM = Beam(0.0, 0.0)
 
@@ -49,3 +50,31 @@ def test_board_held_still_is_measured_as_well_as_by_the_full_search():
         for errors, board in ((found_deg, full), (tracked_deg, tracked)):
             errors.append(np.degrees(np.linalg.norm(np.cross(board.plane[:3], T[:3, 2]))))
     assert np.sqrt(np.mean(np.square(tracked_deg))) < 1.1 * np.sqrt(np.mean(np.square(found_deg)))
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.05])
+def test_a_board_is_found_about_the_pose_that_an_image_predicts(off_m):
+    T = place(2.6, 60, 20, 15)
+    T_predicted = T.copy()
+    T_predicted[:3, 3] += off_m * T[:3, 0]
+    found = look_for_board(view(T), BOARD, T_predicted, beam=BEAM)
+    assert isinstance(found, LidarBoard)
+    assert np.linalg.norm(found.T_lidar_board[:3, 3] - T[:3, 3]) < 0.02
+
+
+def test_what_is_no_board_is_none_where_one_is_predicted_either():
+    T = place(2.6, 60, 20, 15)
+    # On a wall, in the air, and where a plate of another size stands.
+    for shapes in (room(5.4), room(13.0), [board_plate(T, scale=1.4), *room(13.0)]):
+        refusal = look_for_board(cast(shapes, sigma_m=0.008), BOARD, T, beam=BEAM)
+        assert isinstance(refusal, Refusal)
+        assert refusal.code in ("lidar.not_where_expected", "lidar.nothing_where_expected")
+    # A board elsewhere is not taken for the one predicted.
+    refusal = look_for_board(view(place(2.6, 66, 20, 15)), BOARD, T, beam=BEAM)
+    assert isinstance(refusal, Refusal)
+
+
+def test_a_prediction_of_a_scan_without_returns_is_refused():
+    empty = view(place(2.6, 60)).select(np.zeros(0, dtype=np.intp))
+    refusal = look_for_board(empty, BOARD, place(2.6, 60), beam=BEAM)
+    assert isinstance(refusal, Refusal) and refusal.code == "lidar.no_returns"

@@ -81,7 +81,9 @@ A_NOTE = Finding("clock.trigger_input_off", "warning")
 
 
 def playing(path: Path, device: str = "DAVIS346_00000499") -> Any:
-    return lambda sensor, settings: OpenedCamera(dv.io.MonoCameraRecording(str(path)), device, (A_NOTE,))
+    return lambda sensor, settings: OpenedCamera(
+        dv.io.MonoCameraRecording(str(path)), device, (A_NOTE,), "00000499"
+    )
 
 
 def play(path: Path, settings: CameraSettings) -> tuple[list[LiveSample], DavisSource]:
@@ -112,6 +114,7 @@ def test_all_that_dv_processing_wrote_comes_out(recording: Path) -> None:
     assert {(part.sensor, part.width_px, part.height_px) for part in events} == {("davis", 346, 260)}
     figures = source.status().figures
     assert (figures["n_events"], figures["n_frames"], figures["n_pulses"]) == (4000, 7, 8)
+    assert source.status().serial == "00000499"
 
 
 def test_frames_are_stamped_in_the_middle_of_their_exposure(recording: Path) -> None:

@@ -57,8 +57,8 @@ def test_an_unknown_driver_or_one_of_another_kind_is_named() -> None:
 
 
 def test_a_lidar_of_an_unknown_model_is_not_guessed() -> None:
-    with pytest.raises(SourceError, match="no driver goes with model 'HDL-32E'"):
-        driver_type("lidar", "lidar", "HDL-32E", DriverSettings())
+    with pytest.raises(SourceError, match="no driver goes with model 'XY-32'"):
+        driver_type("lidar", "lidar", "XY-32", DriverSettings())
     assert driver_type("lidar", "lidar", "Puck LITE", DriverSettings()) == "vlp16"
 
 

@@ -13,6 +13,7 @@ import pytest
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.v4l2 import abi
 from lce_rig.devices.v4l2.driver import V4l2Source
+from lce_rig.devices.v4l2.video_device import serial_number
 from lce_rig.rig import CameraSettings, load_rig
 from tests.notes import has_note
 
@@ -81,6 +82,9 @@ STRUCTURES = {
     "v4l2_fmtdesc": abi.FormatDescription,
     "v4l2_frmsizeenum": abi.FrameSize,
     "v4l2_pix_format": abi.PixFormat,
+    "v4l2_plane_pix_format": abi.PlaneFormat,
+    "v4l2_pix_format_mplane": abi.PlanesFormat,
+    "v4l2_plane": abi.Plane,
     "v4l2_format": abi.Format,
     "v4l2_streamparm": abi.CaptureParameters,
     "v4l2_requestbuffers": abi.BufferRequest,
@@ -91,6 +95,9 @@ STRUCTURES = {
     "v4l2_ext_controls": abi.V4l2Controls,
 }
 NUMBERS = {
+    "V4L2_BUF_TYPE_VIDEO_CAPTURE": abi.VIDEO_CAPTURE,
+    "V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE": abi.VIDEO_CAPTURE_MPLANE,
+    "VIDEO_MAX_PLANES": abi.MAX_PLANES,
     "VIDIOC_QUERYCAP": abi.QUERY_CAPABILITY,
     "VIDIOC_ENUM_FMT": abi.ENUMERATE_FORMATS,
     "VIDIOC_S_FMT": abi.SET_FORMAT,
@@ -125,6 +132,10 @@ OFFSETS = {
     "v4l2_buffer, sequence": abi.Buffer.sequence.offset,
     "v4l2_buffer, m": abi.Buffer.m.offset,
     "v4l2_buffer, length": abi.Buffer.length.offset,
+    "v4l2_pix_format_mplane, plane_fmt": abi.PlanesFormat.plane_fmt.offset,
+    "v4l2_pix_format_mplane, num_planes": abi.PlanesFormat.num_planes.offset,
+    "v4l2_plane, m": abi.Plane.m.offset,
+    "v4l2_plane, data_offset": abi.Plane.data_offset.offset,
     "v4l2_format, fmt": abi.Format.fmt.offset,
     "v4l2_streamparm, parm.capture.timeperframe": abi.CaptureParameters.numerator.offset,
     "v4l2_query_ext_ctrl, minimum": abi.ControlQuery.minimum.offset,
@@ -156,3 +167,18 @@ def test_structures_and_numbers_are_those_of_the_kernels_header(tmp_path: Path) 
 def test_buffers_lie_as_on_64_bit() -> None:
     assert (sizeof(abi.Buffer), sizeof(abi.Format)) == (88, 208)
     assert re.fullmatch("0xc0585611", hex(abi.DEQUEUE_BUFFER))
+
+
+def test_the_serial_number_is_that_of_the_usb_device_behind_a_camera(tmp_path: Path) -> None:
+    # As the kernel lists a webcam and a camera of a CSI port.
+    interface = tmp_path / "devices" / "usb1" / "1-4" / "1-4:1.0"
+    interface.mkdir(parents=True)
+    (interface.parent / "idVendor").write_text("046d\n")
+    (interface.parent / "serial").write_text("2FE3A1B0\n")
+    (tmp_path / "devices" / "usb1" / "serial").write_text("0000:00:14.0\n")  # of the hub
+    (tmp_path / "devices" / "csi").mkdir()
+    for name, device in (("video0", interface), ("video2", tmp_path / "devices" / "csi")):
+        (tmp_path / "class" / name).mkdir(parents=True)
+        (tmp_path / "class" / name / "device").symlink_to(device)
+    found = {name: serial_number(name, tmp_path / "class") for name in ("video0", "video2", "video9")}
+    assert found == {"video0": "2FE3A1B0", "video2": "", "video9": ""}

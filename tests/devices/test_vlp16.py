@@ -24,6 +24,7 @@ from lce_rig.recordings.velodyne.pcap import PcapRecording
 from lce_rig.recordings.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.rig.sensors import DriverSettings
+from tests.devices.test_vlp16_web import PAGES, serving
 from tests.recordings.vlp16_room import PERIOD_NS, T0_NS, packets_of, push, room_scans, settings
 
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"
@@ -160,6 +161,18 @@ def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(li
     for scan in scans:
         # The last packet of a scan ends after it; the sender is up to 2 ms early.
         assert int(scan.host_ns or 0) - int(scan.stamp_ns or 0) >= PERIOD_NS - 2_000_000
+
+
+def test_the_serial_number_is_asked_of_the_web_page_beside_the_packets(lidar: LidarSettings) -> None:
+    with serving(PAGES) as (_, web), streaming(lidar, Room(3), web_port=web.port) as source:
+        take(source, 1)
+        wait_for(lambda: source.status().serial == PAGES["info"]["serial"])
+    with (
+        serving({"info": b"<html>a camera</html>"}) as (_, web),
+        streaming(lidar, Room(5), web_port=web.port) as source,
+    ):
+        take(source, 4)
+        assert source.status().serial == ""
 
 
 def test_a_dual_return_sensor_is_read_at_twice_the_rate(lidar: LidarSettings) -> None:

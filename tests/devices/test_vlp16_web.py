@@ -159,7 +159,10 @@ def test_an_address_where_nothing_answers_is_an_error_with_what_to_check() -> No
 
 
 WRONG: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "settings.other_model": ({"info": {"model": "HDL-32E"}}, {"model": "HDL-32E"}),
+    "settings.other_model": (
+        {"info": {"model": "HDL-32E", "expected": "VLP-16"}},
+        {"model": "HDL-32E", "expected": "VLP-16"},
+    ),
     "settings.motor_off": ({"status": {"motor": {"state": "Off"}}}, {}),
     "settings.laser_off": ({"status": {"laser": {"state": "Disabled"}}, "settings": {"laser": "Off"}}, {}),
     "settings.rotor_rate": (

@@ -17,10 +17,13 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.core.results import Calibration
-from lce_rig.export import EXPORTS, export, load_exporter
+from lce_rig.export import EXPORTS, export, export_formats, load_exporter
 from lce_rig.export.camera_info import read_camera_info
-from lce_rig.export.frames import T_BODY_OPTICAL, build_trees, check_tree
+from lce_rig.export.frames import T_BODY_OPTICAL, check_tree
+from lce_rig.export.job import ExportJob
+from lce_rig.export.lens import fit_coefficients
 from lce_rig.export.probes import check_pose, probe_points
+from lce_rig.export.robot_tree import build_trees
 from lce_rig.export.urdf import read_urdf
 from lce_rig.rig import Rig
 from tests.export.conftest import reason
@@ -159,12 +162,12 @@ def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(
     calibrations = [make(random_pose(i), camera=c, lidar=lidar) for i, (c, lidar) in enumerate(pairs)]
     paths = export(calibrations, rig, tmp_path)
     assert [path.name for path in paths if path.suffix == ".urdf"] == ["trio.urdf"]
-    poses = read_urdf(tmp_path / "trio.urdf")
-    assert next(iter(poses)) == (base or "velodyne")
-    assert len(poses) == 8
+    read = read_urdf(tmp_path / "trio.urdf")
+    assert read.chain("fish_optical")[-1] == (base or "velodyne")
+    assert len(read.frames) == 8
     for calibration in calibrations:
         camera, lidar = rig.cameras[calibration.camera], rig.lidars[calibration.lidar]
-        T_cam_lidar = invert(poses[camera.optical_frame]) @ poses[lidar.frame]
+        T_cam_lidar = read.find_pose(camera.optical_frame, lidar.frame)
         np.testing.assert_allclose(T_cam_lidar, calibration.T_cam_lidar, atol=1e-12)
 
 
@@ -234,10 +237,11 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
     rles: Rig, make: Make, tmp_path: Path
 ) -> None:
     failed = make(verdict="fail", findings=(reason("sigma -- 80 mm\nand more"),))
-    paths = export([failed], rles, tmp_path, is_forced=True)
-    assert len(paths) == len(EXPORTS)
+    paths = export([failed], rles, tmp_path, formats=EXPORTS, is_forced=True)
     for path in paths:
-        head = path.read_text(encoding="utf-8")[:500]
+        if path.suffix == ".mcap":
+            path = path.with_name("metadata.yaml")
+        head = path.read_text(encoding="utf-8")
         assert "davis/frames and lidar" in head and "fail, standard deviation" in head
         assert "NOT FOR USE" in head and "the calibration of davis/frames and lidar failed" in head
     assert read_urdf(tmp_path / "rles.urdf")
@@ -245,8 +249,10 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
 
 
 def test_the_same_result_gives_the_same_bytes(rles: Rig, make: Make, tmp_path: Path) -> None:
-    first = {path.name: path.read_bytes() for path in export([make()], rles, tmp_path / "a")}
-    second = {path.name: path.read_bytes() for path in export([make()], rles, tmp_path / "b")}
+    first = {path.name: path.read_bytes() for path in export([make()], rles, tmp_path / "a", formats=EXPORTS)}
+    second = {
+        path.name: path.read_bytes() for path in export([make()], rles, tmp_path / "b", formats=EXPORTS)
+    }
     assert first == second
 
 
@@ -260,7 +266,11 @@ def test_a_pose_read_back_wrong_by_a_hair_is_noticed(rles: Rig, make: Make, move
         check_pose(Path("x.yaml"), "T", perturb(calibration.T_cam_lidar, np.array(moved)), calibration, rles)
 
 
-@pytest.mark.parametrize("name", sorted(EXPORTS))
+# A bag holds no digits, a PLY those of the session; isaac's file is written as the URDF is.
+TEXTS = sorted(set(EXPORTS) - {"isaac", "tf_static_bag", "mcap", "ply", "ply_captures"})
+
+
+@pytest.mark.parametrize("name", TEXTS)
 def test_digits_lost_on_the_way_to_the_file_are_noticed(
     name: str, rles: Rig, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,7 +282,7 @@ def test_digits_lost_on_the_way_to_the_file_are_noticed(
 
     monkeypatch.setattr(module, "write_atomically", write_rounded)
     with pytest.raises(LceRigError):
-        exporter([make()], rles, tmp_path)
+        exporter(ExportJob([make()], rles, tmp_path))
 
 
 def test_a_result_of_another_rig_is_refused(rles: Rig, make: Make, tmp_path: Path) -> None:
@@ -292,21 +302,60 @@ def test_kalibrs_chain_leads_from_each_camera_to_the_next(
 ) -> None:
     names = ("davis", "left", "fish")
     calibrations = [make(random_pose(i), camera=name, lidar="front") for i, name in enumerate(names)]
-    (path,) = export(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"])
-    chain = yaml.safe_load(path.read_text(encoding="utf-8"))
-    # Kalibr's radtan ends at p2: the camera with eight coefficients cannot be said in it.
-    assert list(chain) == ["cam0", "cam1"]
-    assert chain["cam1"]["distortion_model"] == "equidistant"
-    davis, fish = calibrations[0].T_cam_lidar, calibrations[2].T_cam_lidar
-    np.testing.assert_allclose(chain["cam1"]["T_cn_cnm1"], fish @ np.linalg.inv(davis), atol=1e-12)
+    exported = export_formats(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"])
+    chain = yaml.safe_load(exported.files[0].read_text(encoding="utf-8"))
+    assert [block["distortion_model"] for block in chain.values()] == ["radtan", "radtan", "equidistant"]
+    for index in (1, 2):
+        T_cn_cnm1 = calibrations[index].T_cam_lidar @ np.linalg.inv(calibrations[index - 1].T_cam_lidar)
+        np.testing.assert_allclose(chain[f"cam{index}"]["T_cn_cnm1"], T_cn_cnm1, atol=1e-12)
+    # Kalibr's radtan ends at p2: the camera with eight coefficients gets four others, and that is told.
+    (finding,) = exported.findings
+    assert (finding.code, finding.subject) == ("export.lens_fitted", "left")
+    assert f"{finding.figure('max_px'):.3g} px at most" in exported.files[0].read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("n_coefficients", [4, 5])
+def test_a_lens_with_fewer_coefficients_is_as_near_as_is_said(
+    three_sensor_rig: Rig, n_coefficients: int
+) -> None:
+    true = three_sensor_rig.cameras["left"].to_intrinsics()
+    lens = fit_coefficients(true, n_coefficients)
+    assert len(lens.intrinsics.distortion) == n_coefficients
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(0, [true.width_px - 1, true.height_px - 1], (2000, 2))
+    drawn, is_seen = lens.intrinsics.project(true.unproject(pixels))
+    off_px = np.linalg.norm(drawn - pixels, axis=1)
+    assert is_seen.all() and off_px.max() < 1.05 * lens.max_px < 1.0
+    assert 0.5 * lens.rms_px < np.sqrt(np.mean(off_px**2)) < 1.2 * lens.rms_px
+    # No other start finds a better one: the true camera matrix alone is worse.
+    kept = replace(true, distortion=true.distortion[:n_coefficients])
+    assert (
+        np.sqrt(np.mean(np.sum((kept.project(true.unproject(pixels))[0] - pixels) ** 2, axis=1)))
+        > lens.rms_px
+    )
+
+
+def test_a_lens_that_fits_is_left_as_it_is(three_sensor_rig: Rig) -> None:
+    for name in ("davis", "fish"):
+        true = three_sensor_rig.cameras[name].to_intrinsics()
+        lens = fit_coefficients(true, 4)
+        assert lens.max_px == 0
+        points = np.array([[0.1, 0.2, 1.0], [-0.2, 0.1, 2.0]])
+        np.testing.assert_array_equal(lens.intrinsics.project(points)[0], true.project(points)[0])
 
 
 def test_autowares_file_gives_bodies_in_the_kits_frame(rles: Rig, make: Make, tmp_path: Path) -> None:
     calibration = make()
     (path,) = export([calibration], rles, tmp_path, formats=["autoware"])
-    block = yaml.safe_load(path.read_text(encoding="utf-8"))["velodyne"]["davis_link"]
+    kit = yaml.safe_load(path.read_text(encoding="utf-8"))["sensor_kit_base_link"]
+    assert list(kit) == ["velodyne_base_link", "davis/camera_link"]
+    assert set(kit["velodyne_base_link"].values()) == {0.0}  # the kit's own place
+    block = kit["davis/camera_link"]
     assert list(block) == ["x", "y", "z", "roll", "pitch", "yaw"]
     x, y, z, *angles = block.values()
     body = pose(Rotation.from_euler("xyz", angles).as_matrix(), np.array([x, y, z]))
     optical_of_body = pose(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix(), np.zeros(3))
-    np.testing.assert_allclose(body @ optical_of_body @ calibration.T_cam_lidar, np.eye(4), atol=1e-12)
+    # Velodyne's description puts the points' origin above the base of the housing.
+    centre = pose(np.eye(3), np.array([0.0, 0.0, 0.0377]))
+    T_cam_lidar = np.linalg.inv(body @ optical_of_body) @ centre
+    np.testing.assert_allclose(T_cam_lidar, calibration.T_cam_lidar, atol=1e-12)

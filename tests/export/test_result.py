@@ -20,6 +20,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.core.results import Calibration, Certificate, Metrics, PointUncertainty
 from lce_rig.export.result import layout, read_result, result_text, to_json_dict, write_result
+from lce_rig.session.provenance import Provenance
 from tests.export.conftest import reason
 
 Make = Callable[..., Calibration]
@@ -78,6 +79,20 @@ def test_hashes_of_inputs_are_read_back_and_what_is_no_hash_is_refused(make: Mak
     path.write_text(path.read_text().replace("0f" * 32, "0f"))
     with pytest.raises(SessionError, match=r"inputs_sha256\.rig\.yaml"):
         read_result(path)
+
+
+def test_provenance_is_read_back_and_files_without_it_stay_readable(make: Make, tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    origin = Provenance("kestrel", {"lidar": "AG1", "cam": "7"}, "2026-11-20T10:22:03Z", "0f" * 32)
+    path.write_text(layout(to_json_dict("rles", [make()], provenance=origin)))
+    assert read_result(path).provenance == origin
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps(document | {"provenance": {"date": "yesterday"}}))
+    with pytest.raises(SessionError, match=r"provenance\.date"):
+        read_result(path)
+    del document["provenance"]
+    path.write_text(json.dumps(document))
+    assert read_result(path).provenance == Provenance()
 
 
 def test_a_result_of_an_earlier_version_holds_no_hashes(make: Make, tmp_path: Path) -> None:

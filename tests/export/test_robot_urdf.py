@@ -9,10 +9,9 @@ import pytest
 from yourdfpy import URDF
 
 from lce_rig.core.errors import SessionError
-from lce_rig.core.geometry import Array, exp_so3, invert, pose
+from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.core.results import Calibration
 from lce_rig.export import export
-from lce_rig.export.frames import T_BODY_OPTICAL
 from lce_rig.export.robot_tree import fit_tree
 from lce_rig.export.robot_urdf import read_robot_urdf, write_into_urdf
 from lce_rig.export.urdf import read_urdf
@@ -116,22 +115,20 @@ def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(
     calibrations = [make(T, camera=c, lidar=lidar) for T, (c, lidar) in zip(poses, pairs, strict=True)]
     path = tmp_path / "cart.urdf"
     path.write_text(HEAD + BASE + MAST + CAMERA.format(kind="fixed") + "</robot>")
-    tree, changes = fit_tree(read_robot_urdf(path), calibrations, three_sensor_rig)
-    assert [change.before is None for change in changes].count(False) == 1
+    fit = fit_tree(read_robot_urdf(path), calibrations, three_sensor_rig)
+    assert [change.before is None for change in fit.changes].count(False) == 1
     for calibration, T in zip(calibrations, poses, strict=True):
         optical = three_sensor_rig.cameras[calibration.camera].optical_frame
         lidar = three_sensor_rig.lidars[calibration.lidar].frame
-        np.testing.assert_allclose(tree.find_pose(optical, lidar), T, atol=1e-12)
+        np.testing.assert_allclose(fit.tree.find_pose(optical, lidar), T, atol=1e-12)
 
 
 def test_with_a_mount_all_outputs_hang_from_the_robots_frame(rles: Rig, make: Make, tmp_path: Path) -> None:
     mount = Mount(parent="base_link", of="davis_link", xyz_m=(0.1, 0.2, 0.3), rpy_deg=(10.0, 20.0, 30.0))
     rig = rles.model_copy(update={"mount": mount})
     export([make()], rig, tmp_path)
-    poses = read_urdf(tmp_path / f"{rig.name}.urdf")
-    assert next(iter(poses)) == "base_link"
-    np.testing.assert_allclose(poses["davis_link"], mount.to_matrix())
-    np.testing.assert_allclose(
-        invert(poses["davis_link"] @ T_BODY_OPTICAL) @ poses["velodyne"], make().T_cam_lidar
-    )
+    read = read_urdf(tmp_path / f"{rig.name}.urdf")
+    assert read.chain("velodyne")[-1] == "base_link"
+    np.testing.assert_allclose(read.find_pose("base_link", "davis_link"), mount.to_matrix())
+    np.testing.assert_allclose(read.find_pose("davis_optical_frame", "velodyne"), make().T_cam_lidar)
     assert "base_link davis_link" in (tmp_path / "static_transforms.txt").read_text()

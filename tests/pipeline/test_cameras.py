@@ -205,10 +205,10 @@ def test_the_result_file_holds_it_and_gives_it_back(together, by_paper, tmp_path
 
 def test_exports_put_both_cameras_where_they_are(together, tmp_path):
     export(list(together.values()), RIG, tmp_path, is_forced=False)
-    links = read_urdf(tmp_path / "two_cameras.urdf")
-    T = invert(links["right_optical_frame"]) @ links["left_optical_frame"]
+    read = read_urdf(tmp_path / "two_cameras.urdf")
+    T = read.find_pose("right_optical_frame", "left_optical_frame")
     assert np.allclose(T, together[RIGHT].other_cameras[0].T_cam_other, atol=1e-9)
-    assert links.keys() >= {"velodyne", "left_link", "right_link"}
+    assert read.frames >= {"velodyne", "left_link", "right_link"}
 
 
 def test_the_report_states_each_two_cameras_once(together, by_paper):

@@ -8,7 +8,8 @@ import pytest
 
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError
 from lce_rig.export.result import read_result
-from lce_rig.pipeline.result_files import Result, is_usable, keep_earlier, result_content, write_results
+from lce_rig.pipeline import result_files
+from lce_rig.pipeline.result_files import Result, is_usable, keep_earlier, result_content
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from tests.export.conftest import calibration, reason, some_pose
@@ -16,6 +17,11 @@ from tests.export.conftest import calibration, reason, some_pose
 GOOD = calibration(captures_used=())
 OTHER = calibration(some_pose((1.2, -1.3, 1.0)), captures_used=())
 FAILED = calibration(verdict="fail", findings=(reason("too few"),), captures_used=())
+
+
+def write_results(session, calibrations, *, report=False, **options):
+    """Most of these tests need no page, which takes longer than all other files."""
+    return result_files.write_results(session, calibrations, report=report, **options)
 
 
 @pytest.fixture
@@ -204,7 +210,7 @@ def test_a_result_in_a_folder_elsewhere_leaves_the_session_as_it_is(session, tmp
     for pair, has_exports in ((GOOD, True), (FAILED, False)):
         written = Result(session, (pair,)).write(tmp_path / "elsewhere")
         assert (len(written.files) > 1) == has_exports
-        assert names(tmp_path / "elsewhere") == {path.name for path in written.files}
+        assert names(tmp_path / "elsewhere") == {*(path.name for path in written.files), "report.html"}
     assert not (session.path / "calibration").exists()
     in_session = result.write(str(session.path / "calibration"))
     assert result_content(session) == result.text().encode()
@@ -216,3 +222,20 @@ def test_the_extrinsic_of_a_camera_is_given_by_its_name(session):
     assert result.of(GOOD.camera) is result.of(GOOD.camera, GOOD.lidar) is GOOD
     with pytest.raises(NotEnoughDataError):
         result.of("another")
+
+
+def test_the_report_stays_with_its_result(session, folder):
+    first = write_results(session, [GOOD], force=False, report=True)
+    assert first.report == folder / "report.html"
+    page = first.report.read_bytes()
+    write_results(session, [OTHER], force=False, report=True)
+    assert (folder / "previous" / "report.html").read_bytes() == page != first.report.read_bytes()
+    without = write_results(session, [OTHER], force=False)
+    assert without.report is None and not first.report.exists()
+
+
+def test_the_report_of_a_result_elsewhere_does_not_outlive_it(session, tmp_path):
+    Result(session, (GOOD,)).write(tmp_path)
+    assert (tmp_path / "report.html").exists()
+    Result(session, (OTHER,)).write(tmp_path, report=False)
+    assert not (tmp_path / "report.html").exists()

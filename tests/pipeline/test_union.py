@@ -129,3 +129,11 @@ def test_targets_and_texts_of_the_profiles_may_differ(make):
     assert as_named_in(other, result.pairs, result.sessions, {})[0].captures_used == ()
     with pytest.raises(SessionError, match="000000"):
         inputs_sha256(result.session, result.pairs, result.sessions)
+
+
+def test_sessions_without_a_scene_keep_the_result_of_the_boards(make):
+    sessions, found = [make("monday"), make("tuesday")], [seen(12, 0), seen(12, 1)]
+    (by_boards,) = lce.calibrate(sessions, found, options=FAST).pairs
+    (both,) = lce.calibrate(sessions, found, options=FAST, use_scene=True).pairs
+    assert (both.scene_share.state, both.scene_share.n_captures) == ("unknown", 0)
+    np.testing.assert_array_equal(both.cov, by_boards.cov)

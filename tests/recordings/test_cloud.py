@@ -143,3 +143,41 @@ def test_coordinates_that_are_no_metres_are_refused_with_a_question(room, factor
     for axis in "xyz":
         far[axis] *= 20
     assert len(to_scan(far, "lidar", FIRST, "here").scan.points) == len(room)
+
+
+def rosette(n: int = 20_000) -> np.ndarray:
+    """Points of a scanner whose four lines sweep the room in no rings, as a Livox does."""
+    rng = np.random.default_rng(1)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, n), np.radians(rng.uniform(-7, 52, n))
+    distance = rng.uniform(2.0, 8.0, n)
+    cloud = np.zeros(n, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("line", "u1")])
+    cloud["x"] = distance * np.cos(elevation) * np.cos(azimuth)
+    cloud["y"] = distance * np.cos(elevation) * np.sin(azimuth)
+    cloud["z"] = distance * np.sin(elevation)
+    cloud["line"] = np.arange(n) % 4
+    return cloud
+
+
+def test_lines_that_are_no_rings_are_refused_with_cause_and_advice():
+    with pytest.raises(SourceError, match="field 'line' numbers no rings") as caught:
+        to_scan(rosette(), "lidar", FIRST, "livox")
+    assert "Livox" in caught.value.hint
+
+
+def test_rings_in_a_tilted_frame_stay_rings(room):
+    tilt = np.radians(10.0)
+    x, z = room["x"].copy(), room["z"].copy()
+    room["x"], room["z"] = np.cos(tilt) * x + np.sin(tilt) * z, np.cos(tilt) * z - np.sin(tilt) * x
+    assert len(np.unique(to_scan(room, "lidar", FIRST, "tilted").scan.ring)) == 16
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan])
+def test_an_organised_cloud_keeps_its_returns_only(room, nothing):
+    organised = np.zeros(2 * len(room), room.dtype)
+    organised[::2] = room
+    for axis in "xyz":
+        organised[axis][1::2] = nothing
+    whole, sparse = to_scan(room, "lidar", FIRST, "room"), to_scan(organised, "lidar", FIRST, "organised")
+    assert np.array_equal(sparse.scan.points, whole.scan.points)
+    assert np.array_equal(sparse.scan.ring, whole.scan.ring)
+    assert sparse.n_not_finite + sparse.n_zero_range - whole.n_zero_range == len(room)

@@ -12,7 +12,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.event_file import encode_events
 from lce_rig.recordings import SourceOptions, open_recording
 from lce_rig.recordings.events.aedat4_writer import Aedat4Writer, write_aedat4
-from lce_rig.recordings.protocol import ContinuousRecording
+from lce_rig.recordings.protocol import ContinuousRecording, serials_of
 from lce_rig.rig import Rig, load_rig
 from tests.notes import has_note
 from tests.recordings.events import encoders
@@ -123,6 +123,17 @@ def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path: Path, rig: Rig, na
     span = recording.streams[EVENT_STREAM]
     assert span is not None
     assert [stamp + shift_us * 1000 for stamp in span] == [int(EVENTS.t_ns[0]), int(EVENTS.t_ns[-1])]
+
+
+def test_serial_numbers_in_heads_of_files_are_told(tmp_path: Path, rig: Rig) -> None:
+    with Aedat4Writer(tmp_path / "a.aedat4", (346, 260), "DAVIS346_00000499") as writer:
+        writer.write(EVENTS)
+    local = [(t - T0_US, x, y, p) for t, x, y, p in listed(EVENTS)]
+    head = b"% evt 3.0\n% geometry 346x260\n% serial_number 00050423\n% end\n"
+    (tmp_path / "b.raw").write_bytes(head + encoders.evt3(local))
+    write_aedat4(tmp_path / "c.aedat4", [EVENTS])
+    found = [serials_of(opened(tmp_path / name, rig)) for name in ("a.aedat4", "b.raw", "c.aedat4")]
+    assert found == [{"davis": "00000499"}, {"davis": "00050423"}, {}]
 
 
 def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path: Path, rig: Rig) -> None:

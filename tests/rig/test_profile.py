@@ -283,7 +283,7 @@ def test_what_a_copied_camera_shares_with_the_first_is_a_warning() -> None:
 
 
 def test_a_driver_or_model_that_nothing_knows_is_named_with_its_key() -> None:
-    text = RLFS.replace("model: VLP-16", "model: OS1-64").replace("type: v4l2", "type: webcam")
+    text = RLFS.replace("model: VLP-16", "model: XY-64").replace("type: v4l2", "type: webcam")
     found = {(each.code, each.subject) for each in parse_rig(text).warnings()}
     assert found == {
         ("profile.unknown_model", "lidars.lidar.model"),

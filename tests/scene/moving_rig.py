@@ -51,7 +51,7 @@ class MovingRig:
             empty,
             np.eye(4),
             stage.models[lidar],
-            stage.options.lidar_noise,
+            stage.noise["lidar"],
             rng,
             stamp_ns,
             lidar_at=lambda t_ns: self.sensor_at(lidar, t_ns),

@@ -12,6 +12,7 @@ from lce_rig.export.result import read_result, write_result
 from lce_rig.pipeline.sharpening import share_of
 from lce_rig.pipeline.witness import scene_views
 from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.views import without_movers
 from lce_rig.session import Session
 
 from .conftest import Seen, deployed
@@ -19,14 +20,15 @@ from .conftest import Seen, deployed
 WEAK = np.diag([0.01, 0.03, 0.02, *np.radians([0.3, 0.5, 0.3])]) ** 2
 
 
-def boards_alone(seen: Seen, tangent: Array, cov: Array) -> Calibration:
-    """A board result that is off by a tangent and claims a covariance."""
-    return replace(deployed(perturb(seen.truth.T_cam_lidar, tangent)), cov=cov)
+def boards_alone(seen: Seen, tangent: Array, cov: Array, shared: Array | None = None) -> Calibration:
+    """A board result that is off by a tangent and claims a covariance, some of it by lens and print."""
+    off = deployed(perturb(seen.truth.T_cam_lidar, tangent))
+    return replace(off, cov=cov, cov_shared=0 * cov if shared is None else shared)
 
 
 def share(seen: Seen, calibration: Calibration, views: list[SceneView] | None = None) -> SceneShare:
     lens = seen.rig.cameras["cam"].to_intrinsics()
-    return share_of(seen.views if views is None else views, lens, calibration)
+    return share_of(without_movers(seen.views if views is None else views), lens, calibration)
 
 
 def yaw_error_deg(seen: Seen, T: Array) -> float:
@@ -54,6 +56,16 @@ def test_a_scene_that_contradicts_the_boards_is_not_used(seen: Seen) -> None:
     off = np.array([0.0, 0.0, 0.0, 0.0, np.radians(1.5), 0.0])
     found = share(seen, boards_alone(seen, off, np.diag([0.005] * 3 + [np.radians(0.15)] * 3) ** 2))
     assert found.state == "contradicts" and found.surprise > 10
+
+
+def test_the_scene_does_not_reduce_errors_of_lens_and_print(seen: Seen) -> None:
+    shared = np.diag([0.004, 0.004, 0.004, *np.radians([0.3, 0.3, 0.3])]) ** 2
+    off = np.array([0.0, 0.0, 0.0, 0.0, np.radians(0.7), 0.0])
+    whole, split = (share(seen, boards_alone(seen, off, WEAK + shared, part)) for part in (None, shared))
+    assert np.linalg.eigvalsh(split.cov - shared).min() > 0
+    assert split.cov[4, 4] > whole.cov[4, 4]
+    # What it may share with the boards is not counted against the scene.
+    assert split.surprise < share(seen, boards_alone(seen, off, WEAK)).surprise
 
 
 def test_without_edges_the_boards_decide(seen: Seen) -> None:

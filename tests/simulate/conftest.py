@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image, Scan
+from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
@@ -19,6 +20,7 @@ from lce_rig.simulate.options import CameraNoise, LidarNoise
 from lce_rig.simulate.room import Room, build_room
 from lce_rig.simulate.scene import Scene
 
+VLP16 = LidarModel.of(VLP_16, 10.0)
 FACING_LIDAR = np.array(
     [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
 )  # x right, y up, print towards -x

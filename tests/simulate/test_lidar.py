@@ -7,15 +7,15 @@ import pytest
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
+from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.carriers import build_carrier
-from lce_rig.simulate.lidar import VLP16
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M, LidarNoise, SimulationOptions
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import PLATE, Raycaster, Scene, Surface
 from lce_rig.simulate.shapes import merge, rectangle
 
-from .conftest import board_before_lidar, simulate_scan
+from .conftest import VLP16, board_before_lidar, simulate_scan
 
 EXACT = LidarNoise.none()
 BEAM = replace(EXACT, divergence_rad=LidarNoise().divergence_rad, exit_size_m=LidarNoise().exit_size_m)
@@ -211,7 +211,7 @@ def test_only_returns_between_the_range_limits_are_reported(scene: Scene, T_worl
 @pytest.mark.parametrize("level", [1, 4, 10])
 def test_noise_levels_are_the_papers(level: int, board: Board, T_world_lidar: Array) -> None:
     scene = Scene(Raycaster(()), [], board, board_before_lidar(2.5))
-    noise = SimulationOptions(noise_level=level).lidar_noise
+    noise = SimulationOptions(noise_level=level).noise_of(VLP_16)
     scan = scan_of(scene, T_world_lidar, replace(noise, dropout=0.0))
     xyz = in_board(scene, T_world_lidar, scan)
     inner = np.all(np.abs(xyz[:, :2]) < [0.3, 0.2], axis=1)

@@ -8,14 +8,14 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, pose, rotation_angle
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.image_rendering import expose, render_radiance
-from lce_rig.simulate.lidar import VLP16, sweep_again, sweep_scene
+from lce_rig.simulate.lidar import sweep_again, sweep_scene
 from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.options import LidarNoise, SimulationOptions
 from lce_rig.simulate.room import Room
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.trajectory import between
 
-from .conftest import board_before_lidar, make_rig
+from .conftest import VLP16, board_before_lidar, make_rig
 
 FAR_BELOW = pose(np.eye(3), np.array([0.0, 0.0, -1e6]))
 

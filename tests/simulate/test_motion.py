@@ -6,12 +6,11 @@ import pytest
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, difference, exp_so3, invert, pose, rotation_angle
-from lce_rig.simulate.lidar import VLP16
 from lce_rig.simulate.options import HandMotion, LidarNoise
 from lce_rig.simulate.scene import Raycaster, Scene
 from lce_rig.simulate.trajectory import Trajectory, carry_board, hold_board, sway_board
 
-from .conftest import board_before_lidar, simulate_scan
+from .conftest import VLP16, board_before_lidar, simulate_scan
 
 ANCHOR_NS = 1_700_000_000_050_000_000
 BEFORE_NS = ANCHOR_NS + 1_000_000 * np.arange(-1000, 201, 5)

@@ -5,10 +5,9 @@ import pytest
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, pose
-from lce_rig.simulate.lidar import VLP16
 from lce_rig.simulate.poses import CameraView, count_rings, seen_share
 
-from .conftest import LENSES, board_before_lidar
+from .conftest import LENSES, VLP16, board_before_lidar
 
 
 @pytest.fixture

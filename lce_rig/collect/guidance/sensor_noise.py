@@ -6,16 +6,15 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data_sheets import DATA_SHEETS
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, transform
 from lce_rig.rig import QualitySettings, Rig
-from lce_rig.simulate.lidar import VLP16
 
 #: How many captures' residuals the assumed errors are worth.
 PRIOR_CAPTURES = 5
 #: Rms distance of a board's points from its middle line: what a tilt moves them by.
 BOARD_LEVER_M = 0.2
-_BEAMS = {"vlp16": VLP16}
 
 
 @dataclass(frozen=True)
@@ -113,23 +112,25 @@ def model_sensors(rig: Rig, camera: str, lidar: str) -> SensorModel:
         ProfileError: the beams of the LiDAR's model are not known.
     """
     settings = rig.lidars[lidar]
-    beams = _BEAMS.get("".join(c for c in settings.model.lower() if c.isalnum()))
-    if beams is None:
-        known = ", ".join(each.name for each in _BEAMS.values())
+    sheet = settings.data_sheet()
+    if sheet is None:
+        known = ", ".join(each.name for each in DATA_SHEETS)
         raise ProfileError(
             f"lidars.{lidar}.model: no guidance for {settings.model}, its beams are not known",
-            f"collect without guidance, or use one of {known}",
+            f"set elevations_deg, collect without guidance, or use one of {known}",
         )
     return SensorModel(
         board=rig.board.to_board(),
         lens=rig.cameras[camera].to_intrinsics(),
-        elevations_rad=np.sort(beams.elevations_rad),
-        azimuth_step_rad=2 * np.pi * beams.sequence_ns * 1e-9 * settings.rate_hz,
+        elevations_rad=sheet.rings_rad,
+        azimuth_step_rad=sheet.step_rad(settings.rate_hz),
         limits=rig.quality,
         target_sigma_rad=float(np.radians(rig.calibration.target_sigma_deg)),
         target_sigma_m=rig.calibration.target_sigma_m,
         errors=ErrorModel(
-            laser_bias_m=settings.laser_bias_sigma_m, range_offset_m=settings.range_offset_sigma_m
+            range_m=sheet.range_sigma_m,
+            laser_bias_m=settings.laser_bias_sigma_m,
+            range_offset_m=settings.range_offset_sigma_m,
         ),
     )
 

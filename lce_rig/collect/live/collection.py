@@ -36,6 +36,7 @@ from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.rig import Rig
 from lce_rig.session import Session
+from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock
 from lce_rig.timing.scan_pairing import Frame
 from lce_rig.timing.sync import pair_times
@@ -328,6 +329,9 @@ class _Loop:
             "pairs": pairs,
             "still_boards_only": verdict.requires_still_boards,
         }
+        statuses = self._sensors.statuses()
+        serials = {name: status.serial for name, status in statuses.items() if status.serial}
+        meta |= {SERIALS: serials} if serials else {}
         self._keeper.keep(Task(moment, frame.images, gate.events_of(moment), meta, time.monotonic()))
         name = f"{self._number:06d}"
         self._number += 1

@@ -18,9 +18,16 @@ from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.detect.image.search import compare_size
 from lce_rig.recordings.joining import join_recordings, require_sensors
-from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording, PairFiles, Recording
+from lce_rig.recordings.protocol import (
+    ContinuousRecording,
+    PairedRecording,
+    PairFiles,
+    Recording,
+    serials_of,
+)
 from lce_rig.rig import Rig
 from lce_rig.session import Session
+from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time
 from lce_rig.words import describe
 
@@ -267,7 +274,7 @@ class _Collector:
             if self._is_enough():
                 self.note(["stopped early: the session has as many captures as wanted"])
                 break
-            self._take_moment(recording.key, moment, search.kept_images(moment), known)
+            self._take_moment(recording, moment, search.kept_images(moment), known)
         self.report.counts.update(search.losses)
         if torn:
             raise torn[0]
@@ -310,11 +317,15 @@ class _Collector:
         return self._store(key, files.label, pair.images, pair.scans, {})
 
     def _take_moment(
-        self, recording_key: str, moment: CaptureMoment, images: Sequence[Image], known: Placements
+        self,
+        recording: ContinuousRecording,
+        moment: CaptureMoment,
+        images: Sequence[Image],
+        known: Placements,
     ) -> None:
         frame, boards = moment.detection.frame, moment.detection.images
         stamps = [scan.stamp_ns for scan in frame.scans] + [image.stamp_ns for image in images]
-        key = f"{recording_key}:{'/'.join(str(stamp) for stamp in stamps)}"
+        key = f"{recording.key}:{'/'.join(str(stamp) for stamp in stamps)}"
         label = f"at {stamps[0]} ns"
         if key in self._names_by_key:
             self._count_known(label, self._names_by_key[key])
@@ -325,7 +336,8 @@ class _Collector:
         self._note_sizes(images)
         self._stored.note(frame.events)
         events = [cut.events for cut in frame.events]
-        figures = {**moment.figures, **board_figures(boards)}
+        serials = serials_of(recording)
+        figures = {**moment.figures, **board_figures(boards), **({SERIALS: serials} if serials else {})}
         self._store(key, label, images, frame.scans, figures, events)
         known.add(self._names_by_key.get(key, label), boards)
 

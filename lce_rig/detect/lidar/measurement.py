@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
+from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import LidarBoard, LidarQuality
 from lce_rig.detect.lidar.segments import MAX_STEPS, Indices, OrderedScan
@@ -173,15 +174,15 @@ Distance = TypeVar("Distance", float, Array)
 
 @dataclass(frozen=True)
 class Beam:
-    """The light spot of a LiDAR: half of it reaches over an edge before the board's return is lost.
+    """The light spot of a LiDAR, a VLP-16's by default: half of it reaches over an edge of the board.
 
     Attributes:
         aperture_m: width of the beam where it leaves the sensor.
         divergence_rad: full angle by which it widens.
     """
 
-    aperture_m: float = 0.0127
-    divergence_rad: float = 0.003
+    aperture_m: float = VLP_16.aperture_m
+    divergence_rad: float = VLP_16.divergence_rad[0]
 
     def half_width_m(self, distance_m: Distance) -> Distance:
         """Compute half the width of the spot at a distance, or at each of several."""

@@ -10,7 +10,8 @@ from lce_rig.core.geometry import Array
 from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD, Indices, OrderedScan, Segments
 from lce_rig.detect.lidar.template import Placement, plane_axes, register_ends
 
-MAX_PAIRS = 600
+MAX_PAIRS = 400
+CELL = 0.5  # of the board's diagonal: where there are more pairs, those of one cell count as alike
 N_ROUNDS = 2
 MAX_JOINT = 4  # returns between two segments of one chord: noise, a hand's edge, a dropped firing
 
@@ -121,17 +122,34 @@ def _neighbours(segments: Segments, diagonal_m: float, is_any_size: bool) -> tup
     is_seed &= np.abs(along_beam) < np.sin(MAX_INCIDENCE_RAD) * distance
     seed = np.flatnonzero(is_seed)
     ring, centre, direction = segments.ring[seed], segments.centre[seed], segments.direction[seed]
-    ring_gap = ring[None] - ring[:, None]
-    # Few pairs are on neighbouring rings: everything else is computed for them only.
-    first, second = np.nonzero(ring_gap == 1)
+    # Few pairs are on neighbouring rings: everything else is computed for them only. Segments come by ring.
+    begin, end = np.searchsorted(ring, ring + 1), np.searchsorted(ring, ring + 1, side="right")
+    first = np.repeat(np.arange(len(ring)), end - begin)
+    second = np.arange(len(first)) + (begin - np.cumsum(end - begin) + (end - begin))[first]
     away = centre[second] - centre[first]
     reach = segments.length_m[seed]
     is_near = np.einsum("ij,ij->i", away, away) < (0.6 * diagonal_m) ** 2
     is_near &= np.abs(np.einsum("ij,ij->i", direction[first], direction[second])) > 0.95
     is_near &= np.abs(np.einsum("ij,ij->i", direction[first], away)) < 0.4 * (reach[first] + reach[second])
     first, second = seed[first[is_near]], seed[second[is_near]]
-    best = np.argsort(-segments.count[first] - segments.count[second], kind="stable")[:MAX_PAIRS]
+    best = np.argsort(-segments.count[first] - segments.count[second], kind="stable")
+    if len(best) > MAX_PAIRS:
+        best = best[_spread_out(segments.centre[first[best]], CELL * diagonal_m)]
     return first[best], second[best]
+
+
+def _spread_out(centres: Array, cell_m: float) -> Indices:
+    """Choose MAX_PAIRS of pairs at centres (P, 3), best first, so that no place crowds out the others.
+
+    Dense rings lay hundreds of pairs on every wall and floor, all of which grow to the same few planes: each
+    cell of space gives its best pair before any gives its second.
+    """
+    cell = np.unique(np.floor(centres / cell_m), axis=0, return_inverse=True)[1].ravel()
+    order = np.argsort(cell, kind="stable")
+    starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    rank = np.empty(len(cell), dtype=np.intp)
+    rank[order] = np.arange(len(cell)) - np.repeat(starts, np.diff(np.append(starts, len(cell))))
+    return np.sort(np.argsort(rank, kind="stable")[:MAX_PAIRS])
 
 
 def _sums(segments: Segments) -> Array:

@@ -335,7 +335,7 @@ def track_lidar_board(
     References:
         LCE-Calib, "Checkerboard Tracking".
     """
-    nearby = scan.select(_near(scan, board, previous, margin_m))
+    nearby = scan.select(_near(scan, board, previous.T_lidar_board, margin_m))
     limits = Limits(STANDARD.template_m, max_rms_m, min_rings)
     still = _measure_again(nearby, board, previous, min_range_m, limits, beam)
     if still is not None:
@@ -357,9 +357,84 @@ def track_lidar_board(
     return Refusal("lidar.turned_away", figures={"max_turn_deg": float(np.degrees(np.arccos(MAX_TURN)))})
 
 
-def _near(scan: Scan, board: Board, previous: LidarBoard, margin_m: float) -> Indices:
-    """List the returns in a box about the board's last place."""
-    T = previous.T_lidar_board
+# Look where the board must be.
+
+LOOK_MARGIN_M, LOOK_TURN = 0.25, np.cos(np.radians(15.0))
+
+
+def look_for_board(
+    scan: Scan,
+    board: Board,
+    T_lidar_board: Array,
+    *,
+    min_range_m: float = 0.4,
+    min_rings: int = STANDARD.min_rings,
+    max_rms_m: float = STANDARD.rms_m,
+    beam: Beam | None = None,
+) -> LidarBoard | Refusal:
+    """Find the board about a predicted pose, such as an image and extrinsics give.
+
+    The outline is registered from that pose, where the search starts from segments; a plate is judged alike.
+
+    Args:
+        scan: one revolution.
+        board: the outer size is what is looked for.
+        T_lidar_board: (4, 4) predicted.
+        min_range_m: nearer returns are ignored.
+        min_rings: fewest rings on the board.
+        max_rms_m: largest rms distance of the board's returns from its plane, without noise.
+        beam: light spot of the LiDAR; that of a VLP-16 if None.
+
+    Returns:
+        The board, or why none is there.
+    """
+    ordered = order_scan(scan, min_range_m)
+    if len(ordered.index) == 0:
+        return no_returns(len(scan.points), min_range_m)
+    limits = Limits(STANDARD.template_m, max_rms_m, min_rings).widened(ordered.sigma_m)
+    normal, centre = T_lidar_board[:3, 2], T_lidar_board[:3, 3]
+    plane = np.append(normal, -normal @ centre) * (-1.0 if normal @ centre > 0 else 1.0)
+    at_once = measure_plate(
+        ordered, scan, board, plane, centre, _placed(board, plane, T_lidar_board), limits, beam
+    )
+    if isinstance(at_once, LidarBoard) and _is_at(at_once, plane, centre):
+        return at_once
+    nearby = scan.select(_near(scan, board, T_lidar_board, LOOK_MARGIN_M))
+    found = find_lidar_boards(
+        nearby,
+        board,
+        min_range_m=min_range_m,
+        max_range_m=np.inf,
+        min_rings=min_rings,
+        max_rms_m=max_rms_m,
+        beam=beam,
+    )
+    if not isinstance(found, Refusal):
+        return next((each for each in found if _is_at(each, plane, centre)), _not_there(centre))
+    cause = at_once if isinstance(at_once, Refusal) else found
+    return Refusal("lidar.not_where_expected", figures={**cause.figures, "cause": cause.code})
+
+
+def _not_there(centre: Array) -> Refusal:
+    return Refusal("lidar.nothing_where_expected", figures={"distance_m": float(np.linalg.norm(centre))})
+
+
+def _is_at(found: LidarBoard, plane: Array, centre: Array) -> bool:
+    """Return whether a board lies where it was predicted."""
+    away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - centre))
+    return away_m < LOOK_MARGIN_M and float(found.plane[:3] @ plane[:3]) > LOOK_TURN
+
+
+def _placed(board: Board, plane: Array, T_lidar_board: Array) -> Placement:
+    """Place the outline in its own plane at a pose."""
+    width_axis = plane_axes(plane[:3]).T @ T_lidar_board[:3, 0]
+    half_m = (board.width_m / 2, board.height_m / 2)
+    return Placement(0.0, 0.0, float(np.arctan2(width_axis[1], width_axis[0])), half_m)
+
+
+def _near(scan: Scan, board: Board, T_lidar_board: Array, margin_m: float) -> Indices:
+    """List the returns in a box about the board's place."""
+    T = T_lidar_board
     half = np.array([board.width_m / 2, board.height_m / 2, 0.0]) + margin_m
     rotation, centre = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
     # A sphere first: it is the cheaper test, and few returns pass it.
@@ -382,9 +457,7 @@ def _measure_again(
     ordered = order_scan(nearby, min_range_m)
     if len(ordered.index) == 0:
         return None
-    width_axis = plane_axes(previous.plane[:3]).T @ T[:3, 0]
-    half_m = (board.width_m / 2, board.height_m / 2)
-    start = Placement(0.0, 0.0, float(np.arctan2(width_axis[1], width_axis[0])), half_m)
+    start = _placed(board, previous.plane, T)
     limits = replace(limits, template_m=min(limits.template_m, previous.quality.template_m + WORSE_M))
     measured = measure_plate(
         ordered, nearby, board, previous.plane, T[:3, 3], start, limits.widened(ordered.sigma_m), beam

@@ -134,7 +134,7 @@ class DavisSource(LiveSource):
         self._samples = DavisSamples(sensor, settings)
         self._polls: list[Callable[[int], list[LiveSample]]] = []
         self._notes: tuple[Finding, ...] = ()
-        self._device = ""
+        self._device = self._serial = ""
         self._n_imu = 0
         self._rates = {"events": RateMeter(), "frames": RateMeter(), "pulses": RateMeter()}
         self._delays_ns: deque[int] = deque(maxlen=100)
@@ -148,7 +148,7 @@ class DavisSource(LiveSource):
         opened = self._open_camera(self.sensor, self._settings)
         self._input: Any = opened.input
         self._notes = opened.notes
-        self._device = opened.device
+        self._device, self._serial = opened.device, opened.serial
         self._polls = self._find_streams()
 
     def close(self) -> None:
@@ -174,6 +174,7 @@ class DavisSource(LiveSource):
             problems=tuple(self._problems()),
             figures=figures,
             device=self._device,
+            serial=self._serial,
             rates_hz={kind: self._rates[kind].rate_hz for kind in ("events", "frames")},
         )
 

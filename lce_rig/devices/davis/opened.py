@@ -37,11 +37,13 @@ class OpenedCamera:
         input: dv-processing's object; its getNext* are asked.
         device: its model and serial number, and its firmware where it tells.
         notes: what it does otherwise than asked.
+        serial: its serial number.
     """
 
     input: Any
     device: str
     notes: tuple[Finding, ...] = ()
+    serial: str = ""
 
 
 def open_davis(sensor: str, settings: CameraSettings) -> OpenedCamera:
@@ -69,7 +71,9 @@ def open_davis(sensor: str, settings: CameraSettings) -> OpenedCamera:
         what = f"camera {sensor!r}: {camera.getCameraName()} cannot be set up: {_first_line(error)}"
         raise SourceError(what, _CHECK) from None
     firmware = f", firmware {camera.getFirmwareVersion()}" if is_new else ""
-    return OpenedCamera(camera, camera.getCameraName() + firmware, tuple(notes))
+    # The name is the model and the serial number, such as DAVIS346_00000499.
+    name = str(camera.getCameraName())
+    return OpenedCamera(camera, name + firmware, tuple(notes), name.rpartition("_")[2])
 
 
 def _open_new(dv: Any, sensor: str, wanted: str) -> Any:

@@ -2,6 +2,7 @@
 
 import time
 from contextlib import ExitStack
+from pathlib import Path
 
 from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
@@ -11,7 +12,7 @@ from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
 from lce_rig.devices.v4l2.controls import apply_controls, list_controls, read_exposure_us
 from lce_rig.devices.v4l2.kernel_clock import FrameTiming, Mark, StampClock, frame_timing, stamped_moment
-from lce_rig.devices.v4l2.video_device import RawFrame, VideoDevice, video_devices
+from lce_rig.devices.v4l2.video_device import Layout, RawFrame, VideoDevice, serial_number, video_devices
 from lce_rig.rig import CameraSettings
 
 # Two buffers drop images as soon as the computer stalls for one; eight ride out a quarter of a second.
@@ -47,7 +48,7 @@ class V4l2Source(LiveSource):
         self._n_lost = 0
         self._n_damaged = 0
         self._notes: list[Finding] = []
-        self._device_in_words = ""
+        self._device_in_words = self._serial = ""
         self._mark: Mark = "start_of_frame"
         self._timing = FrameTiming(settings.resolution_px[1], None)
 
@@ -86,6 +87,7 @@ class V4l2Source(LiveSource):
             problems=tuple(self._problems()),
             figures=figures,
             device=self._device_in_words,
+            serial=self._serial,
         )
 
     def _open_device(self, stack: ExitStack) -> None:
@@ -98,6 +100,7 @@ class V4l2Source(LiveSource):
         self._last_sequence = None
         self._device = VideoDevice(driver.device, self.sensor)
         stack.callback(self._device.close)
+        self._serial = serial_number(Path(driver.device).resolve().name)
         self._decoder = self._set_up_pictures()
         self._device_in_words = (
             f"{self._device.card} at {self._device.path} ({self._device.driver}, {self._device.bus}), "
@@ -146,7 +149,28 @@ class V4l2Source(LiveSource):
                 f"{where} sends {layout.code.strip()}, not {code.strip()} as it was asked for",
                 f"Set driver.pixel_format to {layout.code.strip()}.",
             )
-        return PixelDecoder(code, width, height, layout.stride)
+        self._check_planes(where, layout)
+        return PixelDecoder(code, width, height, layout.strides[0])
+
+    def _check_planes(self, where: str, layout: Layout) -> None:
+        """Make sure that the device lays the planes of an image out as their pixel format has them.
+
+        Raises:
+            SourceError: it does not.
+        """
+        form = FORMATS[layout.code]
+        share = max(
+            form.n_chroma_planes, 1
+        )  # Rows of two chroma planes are half as long, that of one as long.
+        expected = [layout.strides[0]] + [layout.strides[0] // share] * (form.n_memory_planes - 1)
+        if list(layout.strides) != expected:
+            strides = ", ".join(map(str, layout.strides))
+            raise SourceError(
+                f"{where} lays {layout.code.strip()} out in planes with rows of {strides} bytes, "
+                "which is not read here",
+                "Set driver.pixel_format to another of its formats, or read it through a pipe "
+                "(driver.type command, with gst-launch-1.0 v4l2src).",
+            )
 
     def read(self) -> list[LiveSample]:
         """Give what came; see `LiveSource`."""
@@ -171,7 +195,7 @@ class V4l2Source(LiveSource):
             self._n_damaged += 1
             return None
         try:
-            pixels = self._decoder.decode(frame.data)
+            pixels = self._decoder.decode(self._decoder.join(frame.planes))
         except ValueError:
             self._n_damaged += 1
             return None

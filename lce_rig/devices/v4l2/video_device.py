@@ -4,6 +4,7 @@ import errno
 import os
 import select
 import stat
+from contextlib import suppress
 from ctypes import Structure, c_int32
 from dataclasses import dataclass
 from fcntl import ioctl
@@ -24,13 +25,13 @@ class Layout:
     Attributes:
         code: four characters of the pixel format.
         width, height: px.
-        stride: bytes from row to row; 0 for compressed images.
+        strides: bytes from row to row, of each plane that lies in memory of its own; 0 for compressed images.
     """
 
     code: str
     width: int
     height: int
-    stride: int
+    strides: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +39,13 @@ class RawFrame:
     """One image as the kernel hands it over.
 
     Attributes:
-        data: its bytes.
+        planes: its bytes, of each plane that lies in memory of its own.
         stamp_ns: on the driver's clock.
         sequence: running number; gaps are lost images.
         flags: the kernel's, see `v4l2_abi`.
     """
 
-    data: bytes
+    planes: tuple[bytes, ...]
     stamp_ns: int
     sequence: int
     flags: int
@@ -69,7 +70,9 @@ class VideoDevice:
     def __init__(self, path: str, sensor: str) -> None:
         self.path = path
         self._sensor = sensor
-        self._buffers: list[mmap] = []
+        self._buffers: list[tuple[mmap, ...]] = []
+        self._n_planes = 1
+        self._kind = abi.VIDEO_CAPTURE
         self._fd = self._open()
         try:
             self._check_capabilities()
@@ -103,7 +106,7 @@ class VideoDevice:
     def formats(self) -> list[str]:
         """List the pixel formats it offers, in its own order."""
         codes = []
-        ask = abi.FormatDescription(type=abi.VIDEO_CAPTURE)
+        ask = abi.FormatDescription(type=self._kind)
         while self.grants(abi.ENUMERATE_FORMATS, ask):
             codes.append(ask.pixelformat.decode("ascii", "replace").ljust(4))
             ask.index += 1
@@ -126,20 +129,25 @@ class VideoDevice:
         Raises:
             SourceError: another program streams from it.
         """
-        ask = abi.Format(type=abi.VIDEO_CAPTURE)
-        ask.fmt.pix.width, ask.fmt.pix.height = width, height
-        ask.fmt.pix.pixelformat, ask.fmt.pix.field = code.encode(), abi.FIELD_NONE
+        ask = abi.Format(type=self._kind)
+        pix = ask.fmt.pix_mp if self._has_planes else ask.fmt.pix
+        pix.width, pix.height = width, height
+        pix.pixelformat, pix.field = code.encode(), abi.FIELD_NONE
         try:
             self.ioctl(abi.SET_FORMAT, ask)
         except OSError as error:
             raise self._explain(error, "does not take an image format") from None
-        pix = ask.fmt.pix
+        if self._has_planes:
+            self._n_planes = min(max(pix.num_planes, 1), abi.MAX_PLANES)
+            strides = tuple(plane.bytesperline for plane in pix.plane_fmt[: self._n_planes])
+        else:
+            strides = (pix.bytesperline,)
         given = pix.pixelformat.decode("ascii", "replace").ljust(4)
-        return Layout(given, pix.width, pix.height, pix.bytesperline)
+        return Layout(given, pix.width, pix.height, strides)
 
     def set_rate(self, rate_hz: float) -> float | None:
         """Ask for images a second; gives what they will be, None where the device does not say."""
-        ask = abi.CaptureParameters(type=abi.VIDEO_CAPTURE, numerator=1000, denominator=round(1000 * rate_hz))
+        ask = abi.CaptureParameters(type=self._kind, numerator=1000, denominator=round(1000 * rate_hz))
         if not self.grants(abi.SET_PARAMETERS, ask) or not ask.numerator:
             return None
         return float(ask.denominator / ask.numerator)
@@ -150,17 +158,15 @@ class VideoDevice:
         Raises:
             SourceError: another program streams from it, or the device fails.
         """
-        request = abi.BufferRequest(count=n_buffers, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        request = abi.BufferRequest(count=n_buffers, type=self._kind, memory=abi.MEMORY_MMAP)
         try:
             self.ioctl(abi.REQUEST_BUFFERS, request)
             for index in range(request.count):
                 buffer = self._buffer(index)
                 self.ioctl(abi.QUERY_BUFFER, buffer)
-                self._buffers.append(
-                    mmap(self._fd, buffer.length, MAP_SHARED, PROT_READ | PROT_WRITE, offset=buffer.m.offset)
-                )
+                self._buffers.append(self._map(buffer))
                 self.ioctl(abi.QUEUE_BUFFER, buffer)
-            self.ioctl(abi.STREAM_ON, c_int32(abi.VIDEO_CAPTURE))
+            self.ioctl(abi.STREAM_ON, c_int32(self._kind))
         except OSError as error:
             raise self._explain(error, "does not start") from None
         return int(request.count)
@@ -168,10 +174,11 @@ class VideoDevice:
     def stop(self) -> None:
         """Stop and give the buffers back; never raises."""
         # A device that was pulled out answers nothing any more.
-        self.grants(abi.STREAM_OFF, c_int32(abi.VIDEO_CAPTURE))
+        self.grants(abi.STREAM_OFF, c_int32(self._kind))
         while self._buffers:
-            self._buffers.pop().close()
-        request = abi.BufferRequest(count=0, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+            for plane in self._buffers.pop():
+                plane.close()
+        request = abi.BufferRequest(count=0, type=self._kind, memory=abi.MEMORY_MMAP)
         self.grants(abi.REQUEST_BUFFERS, request)
 
     def read(self, timeout_s: float) -> RawFrame | None:
@@ -194,17 +201,47 @@ class VideoDevice:
             if error.errno == errno.EIO and Path(self.path).exists():
                 raise
             raise self._explain(error, "stopped") from None
-        data = self._buffers[buffer.index][: buffer.bytesused or buffer.length]
+        planes = self._copy(buffer)
         stamp_ns = buffer.timestamp.seconds * _S_NS + buffer.timestamp.microseconds * _US_NS
-        frame = RawFrame(data, stamp_ns, buffer.sequence, buffer.flags)
+        frame = RawFrame(planes, stamp_ns, buffer.sequence, buffer.flags)
         try:
             self.ioctl(abi.QUEUE_BUFFER, self._buffer(buffer.index))
         except OSError as error:
             raise self._explain(error, "stopped") from None
         return frame
 
+    @property
+    def _has_planes(self) -> bool:
+        return self._kind == abi.VIDEO_CAPTURE_MPLANE
+
     def _buffer(self, index: int) -> abi.Buffer:
-        return abi.Buffer(index=index, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        buffer = abi.Buffer(index=index, type=self._kind, memory=abi.MEMORY_MMAP)
+        if self._has_planes:
+            buffer.m.planes = (abi.Plane * abi.MAX_PLANES)()  # The pointer keeps them alive.
+            buffer.length = self._n_planes
+        return buffer
+
+    def _map(self, buffer: abi.Buffer) -> tuple[mmap, ...]:
+        """Map the memory of a buffer, plane by plane."""
+        if self._has_planes:
+            places = [(plane.length, plane.m.mem_offset) for plane in buffer.m.planes[: self._n_planes]]
+        else:
+            places = [(buffer.length, buffer.m.offset)]
+        return tuple(
+            mmap(self._fd, length, MAP_SHARED, PROT_READ | PROT_WRITE, offset=offset)
+            for length, offset in places
+        )
+
+    def _copy(self, buffer: abi.Buffer) -> tuple[bytes, ...]:
+        """Copy the image in a buffer that the kernel has just handed over."""
+        memory = self._buffers[buffer.index]
+        if not self._has_planes:
+            return (memory[0][: buffer.bytesused or buffer.length],)
+        filled = buffer.m.planes[: self._n_planes]
+        return tuple(
+            mapped[plane.data_offset : plane.bytesused or plane.length]
+            for mapped, plane in zip(memory, filled, strict=True)
+        )
 
     def _open(self) -> int:
         try:
@@ -226,11 +263,10 @@ class VideoDevice:
         self.bus = said.bus_info.decode("utf-8", "replace")
         able = said.device_caps if said.capabilities & abi.CAP_DEVICE_CAPS else said.capabilities
         where = f"camera {self._sensor!r}: {self.path} ({self.card})"
-        if able & abi.CAP_VIDEO_CAPTURE_MPLANE and not able & abi.CAP_VIDEO_CAPTURE:
-            hint = "Read it through a pipe: driver.type command, with gst-launch-1.0 v4l2src ... ! fdsink."
-            raise SourceError(f"{where} delivers images in several planes, which is not read here", hint)
-        if not able & abi.CAP_VIDEO_CAPTURE or not able & abi.CAP_STREAMING:
+        if not able & (abi.CAP_VIDEO_CAPTURE | abi.CAP_VIDEO_CAPTURE_MPLANE) or not able & abi.CAP_STREAMING:
             raise SourceError(f"{where} delivers no images; it is another end of some device", _attached())
+        # Image processors of many boards (Rockchip, Qualcomm, NXP) deliver planes only.
+        self._kind = abi.VIDEO_CAPTURE if able & abi.CAP_VIDEO_CAPTURE else abi.VIDEO_CAPTURE_MPLANE
 
     def _explain(self, error: OSError, what: str) -> SourceError:
         """Say what a failure of the device means and what to check."""
@@ -257,6 +293,25 @@ def video_devices() -> list[str]:
         name = Path("/sys/class/video4linux") / path.name / "name"
         found.append(f"{path} ({name.read_text().strip()})" if name.exists() else str(path))
     return found
+
+
+def serial_number(name: str, system: Path = Path("/sys/class/video4linux")) -> str:
+    """Give the serial number of the USB device behind a video device; "" where the kernel knows none.
+
+    Args:
+        name: of the video device: "video0".
+        system: where the kernel lists video devices.
+    """
+    try:
+        device = (system / name / "device").resolve(strict=True)
+    except (OSError, RuntimeError):
+        return ""
+    # The interface of a USB device lies in the device's folder, whose `serial` is its own.
+    for folder in (device, device.parent):
+        if (folder / "idVendor").exists() and (folder / "serial").exists():
+            with suppress(OSError, UnicodeDecodeError):
+                return (folder / "serial").read_text().strip()
+    return ""
 
 
 def _attached() -> str:

@@ -4,6 +4,7 @@ import select
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -37,6 +38,7 @@ class Reception:
 
     Attributes:
         address: whose packets are taken; "" before the first.
+        serial: the sensor's serial number, by its web page; "" until that has answered.
         n_overflowed: datagrams that the kernel dropped because they were not taken in time.
         granted_bytes: receive buffer of a port.
         strangers: datagrams of other senders, by IP address; the first few.
@@ -44,6 +46,7 @@ class Reception:
     """
 
     address: str = ""
+    serial: str = ""
     n_overflowed: int = 0
     granted_bytes: int = 0
     strangers: Counter[str] = field(default_factory=Counter)
@@ -89,7 +92,8 @@ def to_status(
         clock=ClockState(state, stream.clock.is_utc, None if ahead_ns is None else ahead_ns * 1e-9),
         problems=tuple(problems),
         figures=figures,
-        device=f"{velodyne.PRODUCTS[velodyne.VLP16]} at {reception.address}" if reception.address else "",
+        device=f"{stream.product.name} at {reception.address}" if reception.address else "",
+        serial=reception.serial,
         rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
         n_packets=stream.n_data,
     )
@@ -106,7 +110,7 @@ def _find_problems(settings: LidarSettings, stream: Vlp16Stream, reception: Rece
     if reception.n_overflowed:
         overflow = {"n": reception.n_overflowed, "buffer_kib": buffer_kib}
         problems.append(Finding("stream.computer_too_slow", "warning", figures=overflow))
-    packets_per_s = 1e9 / velodyne.packet_ns(stream.mode == velodyne.DUAL)
+    packets_per_s = 1e9 / stream.product.packet_ns(stream.mode == velodyne.DUAL)
     buffer_s = reception.granted_bytes / PACKET_COST_BYTES / packets_per_s
     if 0 < buffer_s < _MIN_BUFFER_S:
         figures = {"buffer_s": buffer_s, "buffer_kib": buffer_kib}
@@ -145,9 +149,10 @@ def explain_silence(
     what = f"{sensor}: {none}data packets{whose} on UDP port {port} {began} (for {silence_s:g} s)"
     others = stream.other_models.most_common(1)
     if others:
+        wanted = stream.product.name
         return SourceError(
-            f"{sensor}: the packets on UDP port {port} come from a {others[0][0]}, not a VLP-16",
-            "Only the VLP-16 (Puck, Puck LITE) is read: check driver.address.",
+            f"{sensor}: the packets on UDP port {port} come from a {others[0][0]}, not a {wanted}",
+            f"Set the model of {sensor!r} in the profile, or check driver.address.",
         )
     flaws = stream.flaws()
     if flaws:
@@ -259,6 +264,15 @@ class Vlp16Source(LiveSource):
             self._early = self.read()
             if not self._stream.n_data and time.monotonic() > until_s:
                 raise self.explain_silence(has_sent=False)
+        # Packets hold no serial number, and must not wait until a web page has answered.
+        threading.Thread(target=self._ask_serial, args=(self._reception,), daemon=True).start()
+
+    def _ask_serial(self, reception: Reception) -> None:
+        """Ask the web page once for the serial number; it is left empty where nothing answers."""
+        address = self._settings.driver.address or reception.address
+        if address:
+            with suppress(SourceError):
+                reception.serial = VelodyneWeb(address, self._web_port, _WEB_TIMEOUT_S).read_serial()
 
     def read(self) -> list[Scan]:
         """Take the packets that came, and give the scans that they complete.

@@ -64,10 +64,12 @@ class VelodyneWeb:
 
     Attributes:
         url: its root.
+        port: of the server.
     """
 
     def __init__(self, address: str, port: int = 80, timeout_s: float = _TIMEOUT_S) -> None:
         self.url = f"http://{address}" + (f":{port}" if port != 80 else "")
+        self.port = port
         self._timeout_s = timeout_s
 
     def read(self) -> WebReport:
@@ -83,6 +85,14 @@ class VelodyneWeb:
         except SourceError:  # Not every firmware has them.
             diagnostics = {}
         return to_report(info, status, settings, diagnostics)
+
+    def read_serial(self) -> str:
+        """Read the serial number alone; "" where the page does not tell it.
+
+        Raises:
+            SourceError: nothing answers, or what answers is no Velodyne.
+        """
+        return _text(self._get("info"), "serial")
 
     def _get(self, page: str) -> dict[str, Any]:
         body = self._request(f"/cgi/{page}.json")
@@ -140,8 +150,11 @@ def to_report(
 def find_problems(report: WebReport, settings: LidarSettings) -> list[Finding]:
     """Find what on the web page keeps the profile's scans from coming."""
     problems = []
-    if report.model and velodyne.PRODUCTS[velodyne.VLP16] not in report.model.upper().replace(" ", "-"):
-        problems.append(Finding("settings.other_model", "warning", figures={"model": report.model}))
+    product = velodyne.product_of(settings.model)
+    reported = velodyne.product_of(report.model.replace(" ", "-")) or velodyne.product_of(report.model)
+    if report.model and reported != product:
+        models = {"model": report.model, "expected": settings.model}
+        problems.append(Finding("settings.other_model", "warning", figures=models))
     if report.is_motor_on is False:
         problems.append(Finding("settings.motor_off", "warning"))
     if report.is_laser_on is False:

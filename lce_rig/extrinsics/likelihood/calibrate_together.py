@@ -40,7 +40,7 @@ class TogetherEstimate:
 
 
 def calibrate_together(
-    alone: Mapping[str, CalibrationEstimate], board: Board, options: EstimateSettings
+    alone: Mapping[str, CalibrationEstimate], board: Board, options: Mapping[str, EstimateSettings]
 ) -> TogetherEstimate:
     """Estimate the extrinsics of cameras that share scans of one LiDAR in one likelihood.
 
@@ -50,7 +50,7 @@ def calibrate_together(
     Args:
         alone: by camera, its estimate by the joint likelihood without the others; boards stood still.
         board: its specification.
-        options: with priors of the LiDAR's range errors.
+        options: by camera, with the tolerances of its lens; priors of the LiDAR are the same for all.
     """
     # The order of cameras must not change the last digit.
     names = tuple(sorted(alone))
@@ -58,7 +58,8 @@ def calibrate_together(
     starts = [_without(alone[name], conflicts) for name in names]
     used = [[start.observations[capture] for capture in start.used] for start in starts]
     labelled = _label_scans(used)
-    priors, usual = what_is_known(options)
+    priors, usual = what_is_known(options[names[0]])
+    priors = replace(priors, scale=tuple(_scale_of(options[name]) for name in names))
     T_start = [start.T_cam_lidar for start in starts]
     joint = refine(labelled, board, T_start, priors, usual, pose_ratios=_pose_ratios(starts))
     order = {name: k for k, name in enumerate(sorted({o.capture for own in labelled for o in own}))}
@@ -70,7 +71,7 @@ def calibrate_together(
         cov, inflation = inflate(joint, placement, k, n_seen)
         scales.append(np.full(6, np.sqrt(inflation)))
         figures = add_figures(start.diagnostics, joint, k, inflation)
-        estimate = describe(joint, k, cov, start, used[k], board, options, figures)
+        estimate = describe(joint, k, cov, start, used[k], board, options[name], figures)
         estimates[name] = replace(
             estimate,
             method=start.method,
@@ -82,6 +83,12 @@ def calibrate_together(
     scale = np.concatenate(scales)
     cov = scale[:, None] * (J @ (joint.cov_scatter + joint.cov_constants) @ J.T) * scale
     return TogetherEstimate(names, estimates, cov)
+
+
+def _scale_of(options: EstimateSettings) -> float:
+    scale = what_is_known(options)[0].scale
+    assert isinstance(scale, float)
+    return scale
 
 
 def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> CalibrationEstimate:

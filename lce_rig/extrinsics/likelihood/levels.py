@@ -95,7 +95,7 @@ class Priors:
         bow_m: height of the plate's middle over its ends, along its width and its height.
         azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
         known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
-        scale: relative error of the camera's distances, from squares or focal length.
+        scale: relative error of each camera's distances, from squares or focal length; one figure for all.
         profile_is_claimed: whether the covariance contains the errors of scale and bow. It must not where the
             effects of lens and board are added to it (`tolerances`).
     """
@@ -112,7 +112,7 @@ class Priors:
     azimuth_rad: float = 4e-4
     elevation_rad: float = 2e-4
     known: KnownLidar | None = None
-    scale: float = 0.001
+    scale: float | tuple[float, ...] = 0.001
     profile_is_claimed: bool = True
 
     @property

@@ -493,7 +493,7 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, 
     L, C = terms.n_rings, len(terms.images)
     prior, mean = np.zeros((len(terms.constants), len(terms.constants))), np.zeros(len(terms.constants))
     scale = scale_places(C)
-    prior[scale, scale] = 1 / priors.scale**2
+    prior[scale, scale] = 1 / np.square(priors.scale)
     ring = PER_CAMERA * C + np.arange(L)
     log_volume = 0.0
     of_lasers = (

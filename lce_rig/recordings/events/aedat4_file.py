@@ -30,6 +30,7 @@ _MIN_PACKET_BYTES = 8
 _SEARCH_BYTES = 1 << 24
 _SEARCH_STEP_BYTES = 1 << 16
 _Content = TypeVar("_Content")
+_SOURCE = re.compile("(?:DAVIS|DV)[A-Za-z0-9]*_([A-Za-z0-9]{1,64})")
 _STREAM_NUMBER = re.compile("[0-9]{1,9}")
 
 
@@ -84,6 +85,13 @@ class Aedat4File:
         self.notes: list[str] = []
         if self.header.end is None:
             self.notes.append(f"{path.name}: was never closed; read up to its end")
+
+    @property
+    def serial(self) -> str:
+        """The camera's serial number, where a stream's source is named like DAVIS346_00000499, else ""."""
+        sources = (attributes.get("source", "") for _, attributes in self.header.streams.values())
+        named = (_SOURCE.fullmatch(source) for source in sources)
+        return next((match[1] for match in named if match), "")
 
     def first_stream(self, kind: str) -> int | None:
         """Name the first stream of a type, "EVTS" or "FRME"; None where there is none. Others are noted."""

@@ -9,12 +9,15 @@ from lce_rig.recordings.events import open_events
 from lce_rig.recordings.events.aedat4 import decode_frame
 from lce_rig.recordings.events.aedat4_file import Aedat4File
 from lce_rig.recordings.events.choice import CameraEvents
+from lce_rig.recordings.events.prophesee_raw import PropheseeEvents
 from lce_rig.recordings.events.stream import NoEventsError, damage, worded
 from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.recordings.merging import merge_by_time
 from lce_rig.recordings.protocol import SourceOptions, Span
 from lce_rig.recordings.sensor_choice import choose_event_camera
 from lce_rig.rig import Rig
+
+_MAX_SERIAL = 64
 
 
 class EventCameraFile:
@@ -26,6 +29,7 @@ class EventCameraFile:
         key: fingerprint of the file.
         n_samples: number of frames.
         streams: the camera's events and, where the file and the profile have them, its frames.
+        serials: the camera's serial number, where the file tells it.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
@@ -48,6 +52,8 @@ class EventCameraFile:
             length_s = (self._events.span_ns[1] - self._events.span_ns[0]) * 1e-9
             self.notes.append(f"{path.name}: {length_s:.1f} s of {self._camera}.{channel}")
         self.key = fingerprint([path])
+        serial = _told_serial(path)
+        self.serials = {self._camera: serial} if serial else {}
 
     def samples(self) -> Iterator[Sample]:
         """Yield packets of events, and frames, in order of time.
@@ -111,6 +117,14 @@ class EventCameraFile:
                 continue
             last_ns = frame.mid_exposure_ns
             yield Image(self._camera, self._channel, last_ns, frame.pixels)
+
+
+def _told_serial(path: Path) -> str:
+    """Read the camera's serial number from the head of a file that was opened before; "" without one."""
+    readers: dict[str, type[Aedat4File | PropheseeEvents]] = {".aedat4": Aedat4File, ".raw": PropheseeEvents}
+    reader = readers.get(path.suffix.lower())
+    told = "" if reader is None else reader(path).serial
+    return told if told.isalnum() and len(told) <= _MAX_SERIAL else ""
 
 
 def _meaning(exposure_ns: int) -> str:

@@ -121,6 +121,7 @@ class PropheseeEvents:
         with open_recorded(path) as file:
             header = _read_header(path, file)
             self._begin = file.tell()
+        self.serial = header.get("serial_number", "")
         self._version = _version(path, header)
         order = _field(header, "endianness")
         self._is_swapped = self._version == "21" and (

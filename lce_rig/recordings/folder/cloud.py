@@ -135,6 +135,12 @@ _FARTHEST_MEDIAN = 3.0
 SWEEP_S = (0.02, 1.5)
 _LATEST = 1e19
 _MOST_RINGS = 1024
+# A spinning laser stays within this, even seen from a frame that is tilted by 10 deg; a rosette does not.
+_MOST_THICKNESS_DEG, _N_DIRECTIONS = 1.0, 36
+_NO_RINGS_HINT = (
+    "Only spinning LiDARs can be calibrated: Livox and others that scan in no rings cannot. Of a spinning "
+    "one, give the point cloud with its ring field, in the LiDAR's own frame."
+)
 NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 
@@ -243,13 +249,12 @@ def _ring(
     ids, ring_of_point = _distinct(values)
     is_constant = len(cloud) > 100 and len(ids) == 1
     if name is None or is_constant or not np.isfinite(values).all() or len(ids) > _MOST_RINGS:
-        try:
-            ring = rings_from_elevation(points)
-        except SourceError as error:
-            raise SourceError(f"{where}: {error.what}", error.hint) from None
-        notes.append("no ring field: rings inferred from elevation angles")
-        return ring
+        return _inferred(points, where, "no ring field", notes)
     elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0].astype(np.float64), points[:, 1]))
+    thickness_deg = _ring_thickness_deg(ring_of_point, elevation, points)
+    if thickness_deg > _MOST_THICKNESS_DEG:
+        cause = f"field {name!r} numbers no rings: its points scatter by {thickness_deg:.1f} deg in elevation"
+        return _inferred(points, where, cause, notes)
     mean = np.bincount(ring_of_point, elevation) / np.bincount(ring_of_point)
     rank = np.argsort(np.argsort(mean, kind="stable"), kind="stable")
     is_whole = ids[0] >= 0 and ids[-1] < 2**15 and bool((ids == np.rint(ids)).all())
@@ -257,6 +262,36 @@ def _ring(
         return values.astype(np.int16)
     notes.append(f"field {name!r} does not count rings from the lowest: renumbered by elevation")
     return rank[ring_of_point].astype(np.int16)
+
+
+def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: list[str]) -> NDArray[np.int16]:
+    """Number the rings by elevation, because of a cause; say both in the error where there are none."""
+    try:
+        ring = rings_from_elevation(points)
+    except SourceError as error:
+        raise SourceError(f"{where}: {cause}, {error.what}", _NO_RINGS_HINT) from None
+    notes.append(f"{cause}: rings inferred from elevation angles")
+    return ring
+
+
+def _ring_thickness_deg(
+    ring: NDArray[np.intp], elevation: NDArray[np.float64], points: NDArray[np.float32]
+) -> float:
+    """Compute the scatter of elevation of one ring in one direction: the median standard deviation, deg.
+
+    Directions are told apart because a cloud in another frame may be tilted; the median because near
+    returns show where in the sensor a beam begins.
+    """
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    cell = ring * _N_DIRECTIONS + ((azimuth / (2 * np.pi) + 0.5) * (_N_DIRECTIONS - 1)).astype(np.intp)
+    count = np.bincount(cell)
+    is_full = count >= 5
+    if not is_full.any():
+        return 0.0
+    n = count[is_full]
+    mean = np.bincount(cell, elevation)[is_full] / n
+    square = np.bincount(cell, elevation * elevation)[is_full] / n
+    return float(np.degrees(np.median(np.sqrt(np.maximum(square - mean * mean, 0.0)))))
 
 
 def _distinct(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:

@@ -16,13 +16,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+_VELODYNE_MESSAGES = {
+    "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
+    "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
+}
+
 
 @cache
 def typestore(is_ros1: bool) -> Any:
-    """Load rosbags' message definitions of ROS 1 or ROS 2."""
-    from rosbags.typesys import Stores, get_typestore
+    """Load rosbags' message definitions of ROS 1 or ROS 2, and those of tf and Velodyne packets."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+        if name not in store.types:
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", name))
+    for name, text in _VELODYNE_MESSAGES.items():
+        store.register(get_types_from_msg(text, name))
+    return store
 
 
 _SIZES = {"B": 1, "I": 4, "i": 4, "Q": 8}

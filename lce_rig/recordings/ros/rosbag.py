@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,10 @@ from lce_rig.recordings.ros.bag_file import BagFile, list_topics
 from lce_rig.recordings.ros.event_messages import BagEvents
 from lce_rig.recordings.ros.message_fields import MessageReader, read_header, typestore
 from lce_rig.recordings.ros.storage import RawMessage
-from lce_rig.recordings.ros.topics import CLOUD_TYPES, Target, choose_topics
-from lce_rig.rig import Rig
+from lce_rig.recordings.ros.topics import CLOUD_TYPES, PACKET_TYPES, Target, choose_topics
+from lce_rig.recordings.velodyne.points import OFFSETS_NOTE
+from lce_rig.recordings.velodyne.stream import Vlp16Stream
+from lce_rig.rig import CameraSettings, LidarSettings, Rig
 
 # sensor_msgs/Image and CompressedImage as grey or BGR images.
 #
@@ -191,14 +192,119 @@ CLOCK_JUMP_NS = 1_000_000_000
 _N_PROBED = 500
 
 
-@dataclass
-class _BagStream:
-    """The messages of one topic so far."""
+class TopicDecoder:
+    """Makes the images or scans of one topic from its messages, of a bag or live.
 
-    last_ns: int | None = None
-    n_yielded: int = 0
-    losses: Losses = field(default_factory=Losses)
-    notes: set[str] = field(default_factory=set)
+    Args:
+        target: the sensor it belongs to.
+        settings: that sensor's block of the profile.
+
+    Attributes:
+        n_yielded: samples so far.
+        losses: what was skipped.
+        notes: what was assumed, in words.
+        hint: what to do about the last message that could not be decoded.
+    """
+
+    def __init__(self, target: Target, settings: CameraSettings | LidarSettings) -> None:
+        self.n_yielded = 0
+        self.losses = Losses()
+        self.notes: set[str] = set()
+        self._target, self._settings = target, settings
+        self._last_ns: int | None = None
+        self._packets: Vlp16Stream | None = None
+        self._waiting: list[Scan] = []
+        self.hint = ""
+
+    def decode(self, message: RawMessage) -> Image | Scan | None:
+        """Decode one message; None, and counted, where it is damaged, sent twice or late."""
+        try:
+            content = deserialize(message)
+            if message.msgtype in PACKET_TYPES:
+                self._take_packets(content)
+                return self._oldest()
+            stamp_ns = _header_stamp_ns(content)
+            if stamp_ns == 0:
+                self.notes.add("headers have no timestamps; the time of receipt is used")
+                stamp_ns = message.log_ns
+            sample = self._to_sample(message, content, stamp_ns)
+        except (SourceError, ValueError) as error:
+            cause = error.what if isinstance(error, SourceError) else str(error)
+            self.hint = (error.hint or "") if isinstance(error, SourceError) else ""
+            self.losses.add(damage("recording.not_decoded", cause))
+            return None
+        if not self._is_in_order(sample.stamp_ns):
+            return None
+        self.n_yielded += 1
+        return sample
+
+    def finish(self) -> Iterator[Scan]:
+        """Yield the scans that wait: a revolution of packets may end with the recording."""
+        last = self._packets.finish() if self._packets else None
+        self._waiting += [] if last is None else [last]
+        while (scan := self._oldest()) is not None:
+            yield scan
+
+    def account(self) -> list[str]:
+        """Say what was assumed and skipped, in words."""
+        lines = sorted(self.notes) + worded(self.losses)
+        return lines if self._packets is None else lines + self._packets.account()
+
+    def _take_packets(self, content: Any) -> None:
+        """Assemble the packets of a message; a scan ends where the rotor passes the cut, not the message."""
+        assert isinstance(self._settings, LidarSettings)  # as packets have no camera
+        if self._packets is None:
+            self._packets = Vlp16Stream(self._target.sensor, self._settings)
+            self.notes |= {OFFSETS_NOTE, "scans are assembled from packets"}
+        for packet in content.packets:
+            host_ns = int(packet.stamp.sec * 10**9 + packet.stamp.nanosec)
+            scan = self._packets.push_data(np.asarray(packet.data).tobytes(), host_ns)
+            self._waiting += [] if scan is None else [scan]
+        others = self._packets.other_models.most_common(1)
+        if others and not self._packets.n_data:
+            what = f"its packets are of a {others[0][0]}, not of a {self._packets.product.name}"
+            raise SourceError(what, f"Set the model of {self._target.sensor!r} in the profile.")
+
+    def _oldest(self) -> Scan | None:
+        while self._waiting:
+            scan = self._waiting.pop(0)
+            if self._is_in_order(scan.stamp_ns):
+                self.n_yielded += 1
+                return scan
+        return None
+
+    def _to_sample(self, message: RawMessage, content: Any, stamp_ns: int) -> Image | Scan:
+        sensor, channel = self._target.sensor, self._target.channel
+        if isinstance(self._settings, CameraSettings):
+            assert channel is not None  # as every topic of a camera has
+            is_compressed = message.msgtype.endswith("CompressedImage")
+            pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
+            if self._settings.channels[channel].timestamps.reference == "start":
+                self.notes.add(
+                    "messages have no exposure time; timestamps of its start are used as its middle"
+                )
+            return Image(sensor, channel, stamp_ns, pixels, message.log_ns)
+        cloud = decode_pointcloud2(content)
+        reading = to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns)
+        self.notes.update(reading.notes)
+        n_without_return = reading.n_not_finite + reading.n_zero_range
+        self.losses.add(damage("recording.points_without_return"), n_without_return)
+        return reading.scan
+
+    def _is_in_order(self, stamp_ns: int | None) -> bool:
+        """Return whether a timestamp is later than its predecessor; count it where it is not."""
+        if stamp_ns is None or self._last_ns is None or stamp_ns > self._last_ns:
+            self._last_ns = stamp_ns
+            return True
+        if stamp_ns == self._last_ns:
+            self.losses.add(damage("recording.sent_twice"))
+            return False
+        if self._last_ns - stamp_ns < CLOCK_JUMP_NS:
+            self.losses.add(damage("recording.out_of_order"))
+            return False
+        self.losses.add(damage("recording.clock_set_back"))
+        self._last_ns = stamp_ns
+        return True
 
 
 class BagRecording:
@@ -256,22 +362,28 @@ class BagRecording:
                 self.notes += [note for note in events.notes if note not in self.notes]
 
     def _messages(self) -> Iterator[Sample]:
-        streams = {topic: _BagStream() for topic in self._targets}
+        decoders = {
+            topic: TopicDecoder(target, self._settings(target)) for topic, target in self._targets.items()
+        }
         try:
             for message in self._bag.messages(self._targets.keys()):
-                stream = streams[message.topic]
-                sample = self._decode(message, stream)
-                if sample is not None and _is_in_order(sample, stream):
-                    stream.n_yielded += 1
+                sample = decoders[message.topic].decode(message)
+                if sample is not None:
                     yield sample
+            for decoder in decoders.values():
+                yield from decoder.finish()
         finally:
-            self._summarise(streams)
-        for topic, stream in streams.items():
-            found = {each.code: each for each in stream.losses.findings()}
-            if stream.n_yielded == 0 and found:
+            self._summarise(decoders)
+        for topic, decoder in decoders.items():
+            found = {each.code: each for each in decoder.losses.findings()}
+            if decoder.n_yielded == 0 and found:
                 failed = found.get("recording.not_decoded")
                 cause = failed.figures["where"] if failed else "its timestamps do not increase"
-                raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}")
+                raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}", decoder.hint)
+
+    def _settings(self, target: Target) -> CameraSettings | LidarSettings:
+        is_lidar = target.channel is None
+        return self._rig.lidars[target.sensor] if is_lidar else self._rig.cameras[target.sensor]
 
     def _open_events(self) -> dict[Stream, CameraEvents]:
         """Take the topics of raw events out of the others and open them.
@@ -323,45 +435,9 @@ class BagRecording:
             pass  # Reported once everything before the damage has been read.
         return found
 
-    def _decode(self, message: RawMessage, stream: _BagStream) -> Image | Scan | None:
-        target = self._targets[message.topic]
-        try:
-            content = deserialize(message)
-            stamp_ns = _header_stamp_ns(content)
-            if stamp_ns == 0:
-                stream.notes.add("headers have no timestamps; the time of receipt is used")
-                stamp_ns = message.log_ns
-            return self._to_sample(message, content, target, stamp_ns, stream)
-        except (SourceError, ValueError) as error:
-            cause = error.what if isinstance(error, SourceError) else str(error)
-            stream.losses.add(damage("recording.not_decoded", cause))
-            return None
-
-    def _to_sample(
-        self, message: RawMessage, content: Any, target: Target, stamp_ns: int, stream: _BagStream
-    ) -> Image | Scan:
-        if target.channel is not None:
-            is_compressed = message.msgtype.endswith("CompressedImage")
-            pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
-            channel = self._rig.cameras[target.sensor].channels[target.channel]
-            if channel.timestamps.reference == "start":
-                stream.notes.add(
-                    "messages have no exposure time; timestamps of its start are used as its middle"
-                )
-            return Image(target.sensor, target.channel, stamp_ns, pixels, message.log_ns)
-        settings = self._rig.lidars[target.sensor]
-        cloud = decode_pointcloud2(content)
-        reading = to_scan(cloud, target.sensor, settings, message.topic, stamp_ns, message.log_ns)
-        stream.notes.update(reading.notes)
-        stream.losses.add(
-            damage("recording.points_without_return"), reading.n_not_finite + reading.n_zero_range
-        )
-        return reading.scan
-
-    def _summarise(self, streams: dict[str, _BagStream]) -> None:
-        for topic, stream in streams.items():
-            lines = sorted(stream.notes) + worded(stream.losses)
-            self.notes += [f"{topic}: {line}" for line in lines]
+    def _summarise(self, decoders: dict[str, TopicDecoder]) -> None:
+        for topic, decoder in decoders.items():
+            self.notes += [f"{topic}: {line}" for line in decoder.account()]
 
 
 def _header_stamp_ns(content: Any) -> int:
@@ -381,20 +457,3 @@ def deserialize(message: RawMessage) -> Any:
         return store.deserialize_cdr(message.data, msgtype)
     except Exception as error:  # A damaged message fails in any way: struct, assert, unicode, index.
         raise ValueError(f"a message is damaged: {str(error) or type(error).__name__}") from None
-
-
-def _is_in_order(sample: Image | Scan, stream: _BagStream) -> bool:
-    """Return whether a sample's timestamp is later than its predecessor's; count it where it is not."""
-    stamp_ns = sample.stamp_ns
-    if stamp_ns is None or stream.last_ns is None or stamp_ns > stream.last_ns:
-        stream.last_ns = stamp_ns
-        return True
-    if stamp_ns == stream.last_ns:
-        stream.losses.add(damage("recording.sent_twice"))
-        return False
-    if stream.last_ns - stamp_ns < CLOCK_JUMP_NS:
-        stream.losses.add(damage("recording.out_of_order"))
-        return False
-    stream.losses.add(damage("recording.clock_set_back"))
-    stream.last_ns = stamp_ns
-    return True

@@ -1,11 +1,12 @@
 """What a bag holds of cameras and LiDARs: what a rig's profile has to say of them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SourceError
@@ -19,7 +20,7 @@ from lce_rig.recordings.ros.rosbag import (
     deserialize,
 )
 from lce_rig.recordings.ros.storage import RawMessage
-from lce_rig.recordings.ros.topics import CLOUD_TYPES, IMAGE_TYPES
+from lce_rig.recordings.ros.topics import CLOUD_TYPES, IMAGE_TYPES, PACKET_TYPES
 
 _INFO = "sensor_msgs/CameraInfo"
 # Drivers start within this many messages of each other.
@@ -40,6 +41,7 @@ class SensorTopic:
         n_rings: number of rings of a scan; None where points have none.
         intrinsics: by the camera_info topic in the same namespace; None where there is no usable one.
         note: why there is no usable one, "" where there is one or no topic.
+        cloud: the first point cloud of a topic of scans; None where it has packets.
     """
 
     topic: str
@@ -51,6 +53,7 @@ class SensorTopic:
     n_rings: int | None = None
     intrinsics: Intrinsics | None = None
     note: str = ""
+    cloud: NDArray[Any] | None = field(default=None, compare=False, repr=False)
 
     @property
     def namespace(self) -> str:
@@ -73,6 +76,8 @@ def survey_bag(path: Path) -> list[SensorTopic]:
     kinds = {topic: _kind(msgtype) for topic, (msgtype, n) in bag.topics.items() if n > 0}
     wanted = {topic for topic, kind in kinds.items() if kind is not None}
     wanted = {topic for topic in wanted if topic.removesuffix("/compressed") not in wanted - {topic}}
+    if any(bag.topics[topic][0] in CLOUD_TYPES for topic in wanted):
+        wanted = {topic for topic in wanted if bag.topics[topic][0] not in PACKET_TYPES}
     infos = {topic for topic, (msgtype, n) in bag.topics.items() if msgtype == _INFO and n > 0}
     first = _first_messages(bag, wanted | infos)
     found = []
@@ -91,7 +96,7 @@ def survey_bag(path: Path) -> list[SensorTopic]:
 
 
 def _kind(msgtype: str) -> Literal["scans", "frames", "events"] | None:
-    if msgtype in CLOUD_TYPES:
+    if msgtype in CLOUD_TYPES | PACKET_TYPES:
         return "scans"
     if msgtype in IMAGE_TYPES:
         return "frames"
@@ -131,17 +136,19 @@ def _probe(found: SensorTopic, message: RawMessage) -> SensorTopic | None:
             is_compressed = message.msgtype.endswith("CompressedImage")
             pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
             return replace(found, size_px=(pixels.shape[1], pixels.shape[0]))
-        return replace(found, n_rings=_count_rings(content))
+        if message.msgtype in PACKET_TYPES:
+            return found
+        cloud = decode_pointcloud2(content)
+        return replace(found, n_rings=_count_rings(cloud, int(content.height)), cloud=cloud)
     except (SourceError, ValueError):
         return None
 
 
-def _count_rings(content: Any) -> int | None:
-    cloud = decode_pointcloud2(content)
+def _count_rings(cloud: NDArray[Any], height: int) -> int | None:
     for name in ("ring", "channel"):
         if name in (cloud.dtype.names or ()) and len(cloud):
             return len(np.unique(cloud[name]))
-    return int(content.height) if content.height > 1 else None
+    return height if height > 1 else None
 
 
 def _with_lens(found: SensorTopic, first: dict[str, RawMessage], infos: set[str]) -> SensorTopic:

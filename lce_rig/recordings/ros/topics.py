@@ -13,6 +13,7 @@ from lce_rig.recordings.ros.event_messages import EVENT_TYPES
 from lce_rig.rig import Rig
 
 CLOUD_TYPES = frozenset({"sensor_msgs/PointCloud2"})
+PACKET_TYPES = frozenset({"velodyne_msgs/VelodyneScan"})
 IMAGE_TYPES = frozenset({"sensor_msgs/Image", "sensor_msgs/CompressedImage"})
 Topics: TypeAlias = Mapping[str, tuple[str, int]]
 """(Message type, number of messages) by topic."""
@@ -34,7 +35,7 @@ class Target:
     def types(self) -> frozenset[str]:
         """Message types that this sensor's data come as."""
         if self.channel is None:
-            return CLOUD_TYPES
+            return CLOUD_TYPES | PACKET_TYPES
         return IMAGE_TYPES | EVENT_TYPES if self.has_events else IMAGE_TYPES
 
     def stream(self, msgtype: str) -> Stream:
@@ -141,7 +142,9 @@ def _add_only_candidates(
         target, wanted_topic = next(
             (t, name) for t, name in _targets(rig) if (t.channel is not None) == is_camera
         )
-        fitting = _fitting(topics, target.types)
+        # Packets are read where a driver's point clouds of them were not recorded.
+        clouds = _fitting(topics, target.types & CLOUD_TYPES)
+        fitting = clouds or _fitting(topics, target.types)
         if wanted_topic is None and len(fitting) == 1:
             chosen[fitting[0]] = target
             notes.append(f"{path.name}: {target} from {fitting[0]}, the only topic with {what}s")

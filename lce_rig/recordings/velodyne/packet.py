@@ -1,4 +1,4 @@
-"""Checked packets of a VLP-16: UDP delivers anything sent to the port."""
+"""Checked packets of a Velodyne: UDP delivers anything sent to the port."""
 
 import re
 import struct
@@ -14,7 +14,7 @@ from lce_rig.core import velodyne
 _MAX_UNEVEN_STEPS = 6
 _MAX_UNEVEN_SHARE = 0.15
 # 240 rpm to 1260 rpm; the sensor turns at 300 to 1200.
-_BLOCK_STEPS = (16, 84)
+_ROTOR_HZ = (4.0, 21.0)
 # Flag and azimuth of each block, then time, mode and product.
 _HEADS = struct.Struct("<" + "HH96x" * velodyne.N_BLOCKS + "IBB")
 _FLAGS = [velodyne.BLOCK_FLAG] * velodyne.N_BLOCKS
@@ -24,7 +24,7 @@ _RMC = re.compile(
 
 
 class BadPacketError(ValueError):
-    """A payload that is not a packet of a VLP-16.
+    """A payload that is not a packet of the LiDAR.
 
     Attributes:
         code: what is wrong, one of a few: they are counted by it, and must not grow with what anybody sends.
@@ -51,6 +51,7 @@ class DataPacket:
         host_ns: arrival at the host; 0 where unknown.
         us: time of the first firing past the hour, on the sensor's counter.
         mode: of velodyne.RETURN_MODES.
+        product: whose packet it is.
         azimuth: (12,) int64 of each block, 0.01 deg clockwise from the lidar frame's x axis.
         fields: () of velodyne.DATA_PACKET.
     """
@@ -58,6 +59,7 @@ class DataPacket:
     host_ns: int
     us: int
     mode: int
+    product: velodyne.Product
     azimuth: NDArray[np.int64]
     fields: NDArray[np.void]
 
@@ -71,7 +73,12 @@ class DataPacket:
         """Rotor speed over this packet, in 0.01 deg per ns."""
         n_blocks_turned = velodyne.N_BLOCKS // 2 - 1 if self.is_dual else velodyne.N_BLOCKS - 1
         turned = (self.azimuth[-1] - self.azimuth[0]) % velodyne.AZIMUTH_STEPS
-        return float(turned) / (n_blocks_turned * velodyne.BLOCK_NS)
+        return float(turned) / (n_blocks_turned * self.product.block_ns)
+
+    @property
+    def packet_ns(self) -> int:
+        """Time from its first firing to that of the next packet."""
+        return self.product.packet_ns(self.is_dual)
 
 
 @dataclass(frozen=True)
@@ -95,11 +102,18 @@ class PositionPacket:
     is_fix: bool
 
 
-def read_data_packet(payload: bytes | memoryview, host_ns: int) -> DataPacket:
+def read_data_packet(
+    payload: bytes | memoryview, host_ns: int, wanted: velodyne.Product = velodyne.READ[0]
+) -> DataPacket:
     """Check a payload in every way its layout allows.
 
     Ranges and reflectivities can have any value; everything else is bound: flags, azimuths that rise evenly,
     pairs of equal azimuth in dual mode and only there, the factory bytes and a time within the hour.
+
+    Args:
+        payload: of the UDP packet.
+        host_ns: its arrival; 0 where unknown.
+        wanted: the model; a VLP-16 by default.
 
     Raises:
         OtherModelError: it is a sound packet of another model.
@@ -116,17 +130,17 @@ def read_data_packet(payload: bytes | memoryview, host_ns: int) -> DataPacket:
         raise BadPacketError("packet.time_beyond_hour")
     if max(azimuth) >= velodyne.AZIMUTH_STEPS:
         raise BadPacketError("packet.azimuth_beyond_360")
-    if product != velodyne.VLP16 and product in velodyne.PRODUCTS and mode in velodyne.RETURN_MODES:
+    if product != wanted.code and product in velodyne.PRODUCTS and mode in velodyne.RETURN_MODES:
         raise OtherModelError(velodyne.PRODUCTS[product])
-    if product != velodyne.VLP16 or mode not in velodyne.RETURN_MODES:
+    if product != wanted.code or mode not in velodyne.RETURN_MODES:
         raise BadPacketError("packet.unknown_factory_bytes")
-    if not _is_even(azimuth, mode == velodyne.DUAL):
+    if not _is_even(azimuth, mode == velodyne.DUAL, wanted.block_ns):
         raise BadPacketError("packet.uneven_azimuths")
     fields = np.frombuffer(payload, velodyne.DATA_PACKET)[0]
-    return DataPacket(host_ns, us, mode, np.array(azimuth, np.int64), fields)
+    return DataPacket(host_ns, us, mode, wanted, np.array(azimuth, np.int64), fields)
 
 
-def _is_even(azimuth: list[int], is_dual: bool) -> bool:
+def _is_even(azimuth: list[int], is_dual: bool, block_ns: int) -> bool:
     """Return whether 12 blocks advance as those of a turning rotor."""
     steps = [(b - a) % velodyne.AZIMUTH_STEPS for a, b in pairwise(azimuth)]
     if is_dual:
@@ -134,7 +148,8 @@ def _is_even(azimuth: list[int], is_dual: bool) -> bool:
             return False
         steps = steps[1::2]
     middle = sorted(steps)[len(steps) // 2]
-    if not _BLOCK_STEPS[0] <= middle <= _BLOCK_STEPS[1]:
+    rotor_hz = middle / (velodyne.AZIMUTH_STEPS * block_ns * 1e-9)
+    if not _ROTOR_HZ[0] <= rotor_hz <= _ROTOR_HZ[1]:
         return False
     return max(middle - min(steps), max(steps) - middle) <= max_uneven_steps(middle)
 

@@ -72,7 +72,7 @@ class PacketOrder:
 
     def _accept(self, packet: DataPacket, step_ns: int, place: Place) -> Place:
         if step_ns:
-            spacing_ns = velodyne.packet_ns(packet.is_dual)
+            spacing_ns = packet.packet_ns
             self._losses.add(_LOST, round(step_ns / spacing_ns) - 1)
         weight = _SPEED_WEIGHT if step_ns else 1.0
         self._steps_per_ns += weight * (packet.steps_per_ns - self._steps_per_ns)
@@ -88,7 +88,7 @@ class PacketOrder:
     def _packets_ahead(self, before: DataPacket, after: DataPacket) -> int:
         """Count the packets from one to another; 0 where the second does not follow the first."""
         step_ns = _gap_ns(before, after)
-        spacing_ns = velodyne.packet_ns(after.is_dual)
+        spacing_ns = after.packet_ns
         n_ahead = round(step_ns / spacing_ns)
         if before.mode != after.mode or n_ahead < 1:
             return 0
@@ -101,8 +101,8 @@ class PacketOrder:
     def _has_turned(self, before: DataPacket, after: DataPacket, step_ns: int) -> bool:
         """Return whether the rotor turned as it should from the one's last block to the other's first."""
         half = velodyne.AZIMUTH_STEPS // 2
-        steps_per_block = self._steps_per_ns * velodyne.BLOCK_NS
-        expected = self._steps_per_ns * (step_ns - velodyne.packet_ns(before.is_dual)) + steps_per_block
+        steps_per_block = self._steps_per_ns * after.product.block_ns
+        expected = self._steps_per_ns * (step_ns - before.packet_ns) + steps_per_block
         turned = after.azimuth[0] - before.azimuth[-1]
         off = (turned - expected + half) % velodyne.AZIMUTH_STEPS - half
         allowed = max_uneven_steps(steps_per_block) + _MAX_OFF_SHARE * (expected - steps_per_block)

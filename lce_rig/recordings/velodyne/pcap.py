@@ -208,7 +208,7 @@ class _Survey:
     """The contents of a recording's start.
 
     Attributes:
-        senders: data packets of VLP-16s by IP address.
+        senders: data packets of the LiDAR by IP address.
         others: data packets of other models by name.
         refused: packets of the right length that are not data packets, by the code of what is wrong.
         ports: all UDP packets by the port they were sent to.
@@ -223,7 +223,7 @@ class _Survey:
 
 
 class PcapRecording:
-    """The scans of one VLP-16 in a pcap or pcapng file.
+    """The scans of one Velodyne in a pcap or pcapng file.
 
     Attributes:
         path: the file.
@@ -245,6 +245,7 @@ class PcapRecording:
         self._file = PcapFile(path)
         self._lidar = choose_lidar(rig, options, self.notes)
         self._settings: LidarSettings = rig.lidars[self._lidar]
+        self._product = Vlp16Stream(self._lidar, self._settings).product
         survey = self._survey()
         self._address = self._choose(survey)
         self.key = fingerprint([path])
@@ -252,7 +253,7 @@ class PcapRecording:
             Stream(self._lidar, "", "scans"): self._span_ns() if options.is_part else None
         }
         n_packets = survey.senders[self._address] * path.stat().st_size / max(survey.n_bytes, 1)
-        sweep_s = n_packets * velodyne.packet_ns(is_dual=False) * 1e-9
+        sweep_s = n_packets * self._product.packet_ns(is_dual=False) * 1e-9
         self.n_samples = max(1, round(sweep_s * self._settings.rate_hz))
 
     def samples(self) -> Iterator[Scan]:
@@ -275,7 +276,7 @@ class PcapRecording:
         finally:
             self._summarise(stream)
         if stream.n_scans == 0:
-            said = "; ".join(_account(stream)) or f"{stream.n_data} packets are less than a revolution"
+            said = "; ".join(stream.account()) or f"{stream.n_data} packets are less than a revolution"
             raise SourceError(f"{self.path}: no whole revolution in it: {said}", "Record at least 1 s.")
 
     def _survey(self) -> _Survey:
@@ -284,7 +285,7 @@ class PcapRecording:
             survey.ports[datagram.port] += 1
             if len(datagram.payload) == velodyne.DATA_BYTES:
                 try:
-                    read_data_packet(datagram.payload, datagram.host_ns)
+                    read_data_packet(datagram.payload, datagram.host_ns, self._product)
                     survey.senders[datagram.source] += 1
                 except OtherModelError as error:
                     survey.others[error.model] += 1
@@ -311,21 +312,22 @@ class PcapRecording:
             return str(wanted)
         if len(survey.senders) == 1:
             address = next(iter(survey.senders))
-            self.notes.append(f"{self.path.name}: packets of {address}, the only VLP-16 in it")
+            self.notes.append(f"{self.path.name}: packets of {address}, the only {self._product.name} in it")
             return address
         if survey.senders:
             there = ", ".join(sorted(survey.senders))
             hint = f"Set driver.address of {self._lidar!r} in the profile to one of them."
-            raise SourceError(
-                f"{self.path}: packets of several VLP-16s, none of them {wanted}: {there}", hint
-            )
+            raise SourceError(f"{self.path}: packets of several LiDARs, none of them {wanted}: {there}", hint)
         if survey.others:
             models = ", ".join(f"{n} of {model}" for model, n in survey.others.most_common())
+            read = ", ".join(each.name for each in velodyne.READ)
             raise SourceError(
-                f"{self.path}: holds packets of another LiDAR ({models}), not of a VLP-16",
-                "Only VLP-16 packets (Puck, Puck LITE) are read. Record another LiDAR's scans in a bag.",
+                f"{self.path}: holds packets of another LiDAR ({models}), not of a {self._product.name}",
+                f"Set model of {self._lidar!r} in the profile; read are {read}. Record others in a bag.",
             )
-        raise SourceError(f"{self.path}: holds no packets of a VLP-16: {self._what_is_there(survey)}")
+        raise SourceError(
+            f"{self.path}: holds no packets of a {self._product.name}: {self._what_is_there(survey)}"
+        )
 
     def _what_is_there(self, survey: _Survey) -> str:
         wrong = survey.refused + self._file.flaws
@@ -339,7 +341,7 @@ class PcapRecording:
     def _summarise(self, stream: Vlp16Stream) -> None:
         lines = [OFFSETS_NOTE, *([DUAL_NOTE] if stream.mode == velodyne.DUAL else [])]
         lines.append(describe(stream.clock.state()))
-        lines += _account(stream)
+        lines += stream.account()
         lines += [describe(_flaw(code, n)) for code, n in sorted(self._file.flaws.items())]
         lines += [self._file.damage] if self._file.damage else []
         notes = [f"{self.path.name}: {line}" for line in lines]
@@ -353,12 +355,6 @@ def _push(stream: Vlp16Stream, datagram: Datagram) -> Scan | None:
     if len(datagram.payload) == velodyne.DATA_BYTES:
         return stream.push_data(datagram.payload, datagram.host_ns)
     return None
-
-
-def _account(stream: Vlp16Stream) -> list[str]:
-    """Say what was lost or skipped, in words."""
-    lost = [each for each in stream.losses.findings() if not each.subject]
-    return [describe(each) for each in lost + stream.flaws()]
 
 
 def _flaw(code: str, n: int) -> Finding:

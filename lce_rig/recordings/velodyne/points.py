@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
 
+_MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "VLP-32C": "VLP32C"}
 #: What a recording made elsewhere may lack.
-OFFSETS_NOTE = "points include the lasers' vertical offsets (up to 11 mm), which ROS 1 drivers omit"
+OFFSETS_NOTE = "points include the lasers' vertical offsets (VLP-16: up to 11 mm), which ROS 1 drivers omit"
 DUAL_NOTE = "dual returns: of each firing the brighter one is kept"
 
 
@@ -37,13 +39,15 @@ class PointBatch:
 
 
 class Vlp16Decoder:
-    """Decodes packets of a VLP-16 that were checked before.
+    """Decodes packets of one model, a VLP-16 by default, that were checked before.
 
     Raises:
         SourceError: velodyne-decoder is not installed.
     """
 
-    def __init__(self, min_range_m: float, max_range_m: float) -> None:
+    def __init__(
+        self, min_range_m: float, max_range_m: float, product: velodyne.Product = velodyne.READ[0]
+    ) -> None:
         try:
             import velodyne_decoder  # type: ignore[import-untyped]
         except ImportError:
@@ -52,7 +56,7 @@ class Vlp16Decoder:
             ) from None
         self._library: Any = velodyne_decoder
         config = velodyne_decoder.Config(
-            model=velodyne_decoder.Model.VLP16,
+            model=getattr(velodyne_decoder.Model, _MODELS[product.name]),
             min_range=min_range_m,
             max_range=max_range_m,
             timestamp_first_packet=True,

@@ -1,4 +1,4 @@
-"""From a stream of VLP-16 packets, live or recorded, to scans of one revolution each."""
+"""From a stream of Velodyne packets, live or recorded, to scans of one revolution each."""
 
 from collections import Counter, deque
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ import numpy as np
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
+from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.losses import Losses
 from lce_rig.recordings.velodyne.driver_controls import read_controls
@@ -22,6 +23,7 @@ from lce_rig.recordings.velodyne.packet_order import PacketOrder, Place
 from lce_rig.recordings.velodyne.points import Vlp16Decoder, keep_brighter
 from lce_rig.rig import LidarSettings
 from lce_rig.timing.clock import resolve_hour
+from lce_rig.words import describe
 
 # The check of a VLP-16's time, and the timestamps of its scans if it fails.
 #
@@ -73,7 +75,7 @@ class VelodyneClock:
         self._last_us, self._last_elapsed_ns = packet.us, elapsed_ns
         if not packet.host_ns:
             return
-        delay_ns = packet.host_ns - velodyne.packet_ns(packet.is_dual) - elapsed_ns
+        delay_ns = packet.host_ns - packet.packet_ns - elapsed_ns
         window = elapsed_ns // _WINDOW_NS
         if self._delays_ns and self._delays_ns[-1][0] == window:
             delay_ns = min(delay_ns, self._delays_ns.pop()[1])
@@ -176,7 +178,7 @@ class _Piece:
     def start_ns(self) -> int:
         """Counter at the first firing of the first block."""
         n_before = int(self.blocks.start) // (2 if self.packet.is_dual else 1)
-        return self.elapsed_ns + velodyne.BLOCK_NS * n_before
+        return self.elapsed_ns + self.packet.product.block_ns * n_before
 
 
 class Vlp16Stream:
@@ -186,13 +188,15 @@ class Vlp16Stream:
         n_data, n_position: data and position packets that passed the checks.
         n_scans: revolutions handed on.
         losses: packets and revolutions lost or skipped, and steps of the sensor's clock.
+        product: the model whose packets are taken.
         other_models: data packets of other models, by name.
         clock: what scans are timestamped with.
         mode: return mode of the packet that came last, of velodyne.RETURN_MODES; 0 before the first.
         rotor_hz: speed of the rotor as it was last; 0 before the first packet.
 
     Raises:
-        SourceError: velodyne-decoder is not installed, or `driver.controls` cannot be meant.
+        SourceError: velodyne-decoder is not installed, the model's packets are not read, or `driver.controls`
+            cannot be meant.
     """
 
     def __init__(self, sensor: str, settings: LidarSettings) -> None:
@@ -202,9 +206,16 @@ class Vlp16Stream:
         self.clock = VelodyneClock(settings.timestamps.clock != "host")
         self.mode = 0
         self.rotor_hz = 0.0
+        product = velodyne.product_of(settings.model)
+        if product is None:
+            known = ", ".join(each.name for each in velodyne.READ)
+            raise SourceError(
+                f"lidars.{sensor}.model: packets of {settings.model} are not read", f"Read: {known}."
+            )
+        self.product = product
         self._sensor = sensor
         self._order = PacketOrder(self.losses)
-        self._decoder = Vlp16Decoder(settings.min_range_m, settings.max_range_m)
+        self._decoder = Vlp16Decoder(settings.min_range_m, settings.max_range_m, self.product)
         # The sensor counts clockwise.
         cut_rad = -read_controls(sensor, settings).cut_azimuth_rad
         self._cut = round(cut_rad / velodyne.AZIMUTH_STEP_RAD) % velodyne.AZIMUTH_STEPS
@@ -219,6 +230,11 @@ class Vlp16Stream:
             for each in self.losses.findings()
             if each.subject
         ]
+
+    def account(self) -> list[str]:
+        """Say what was lost or skipped, in words."""
+        lost = [each for each in self.losses.findings() if not each.subject]
+        return [describe(each) for each in lost + self.flaws()]
 
     def push_position(self, payload: bytes | memoryview, host_ns: int) -> None:
         """Take a position packet; a bad one is counted."""
@@ -238,7 +254,7 @@ class Vlp16Stream:
             host_ns: its arrival; 0 where unknown.
         """
         try:
-            packet = read_data_packet(payload, host_ns)
+            packet = read_data_packet(payload, host_ns, self.product)
         except BadPacketError as error:
             self.losses.add(Finding(error.code, "warning", "data"))
             if isinstance(error, OtherModelError):
@@ -262,7 +278,7 @@ class Vlp16Stream:
             return None
         last = self._pieces[-1]
         to_go = velodyne.AZIMUTH_STEPS - self._past_cut(int(last.packet.azimuth[-1]))
-        if to_go <= 2 * last.packet.steps_per_ns * velodyne.BLOCK_NS:
+        if to_go <= 2 * last.packet.steps_per_ns * self.product.block_ns:
             return self._close()
         self._pieces, self._is_from_cut = [], False
         self.losses.add(_PARTIAL)
@@ -277,7 +293,7 @@ class Vlp16Stream:
             scan = self._close()
             self._is_from_cut = True
         elif not self._pieces:
-            self._is_from_cut = bool(past_cut[0] <= packet.steps_per_ns * velodyne.BLOCK_NS)
+            self._is_from_cut = bool(past_cut[0] <= packet.steps_per_ns * self.product.block_ns)
         if len(drops) == 0:
             self._pieces.append(_Piece(packet, elapsed_ns, slice(0, velodyne.N_BLOCKS)))
             return scan
@@ -306,7 +322,9 @@ class Vlp16Stream:
             return None
         n_blocks = sum(piece.blocks.stop - piece.blocks.start for piece in pieces)
         packet = pieces[-1].packet
-        n_wanted = velodyne.AZIMUTH_STEPS / (packet.steps_per_ns * velodyne.BLOCK_NS) * (1 + packet.is_dual)
+        n_wanted = (
+            velodyne.AZIMUTH_STEPS / (packet.steps_per_ns * self.product.block_ns) * (1 + packet.is_dual)
+        )
         if n_blocks < _MIN_COVERAGE * n_wanted:
             self.losses.add(_THIN)
             return None

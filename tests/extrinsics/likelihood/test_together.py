@@ -12,6 +12,7 @@ from lce_rig.extrinsics.likelihood.calibrate_together import calibrate_together
 from lce_rig.extrinsics.relative_pose import relative_pose
 from lce_rig.residuals.placements import group_placements, group_shared_placements
 from tests.extrinsics.boards import BOARD, simulate
+from tests.extrinsics.test_tolerances import KNOWN
 from tests.extrinsics.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, only, simulate_two
 
 ML = EstimateSettings(method="ml", n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
@@ -20,6 +21,11 @@ FEW = 6
 
 def alone(session):
     return {name: fit_extrinsic(captures, BOARD, ML) for name, captures in session.items()}
+
+
+def every(cameras):
+    """The same settings for each camera."""
+    return dict.fromkeys(cameras, ML)
 
 
 def few_on_the_right(n, seed):
@@ -31,7 +37,7 @@ def few_on_the_right(n, seed):
 def run(sessions):
     """Estimate each session by camera and together."""
     each = [alone(session) for session in sessions]
-    return [(own, calibrate_together(own, BOARD, ML)) for own in each]
+    return [(own, calibrate_together(own, BOARD, every(own))) for own in each]
 
 
 def sizes(errors):
@@ -86,7 +92,7 @@ def test_blocks_of_the_joint_covariance_are_those_of_the_estimates(runs):
 
 def test_the_order_of_cameras_does_not_matter(runs):
     own, together = runs[0]
-    turned = calibrate_together(dict(reversed(own.items())), BOARD, ML)
+    turned = calibrate_together(dict(reversed(own.items())), BOARD, every(own))
     assert turned.cameras == together.cameras
     assert np.array_equal(turned.cov, together.cov)
     for name in together.cameras:
@@ -99,7 +105,8 @@ def test_the_same_cameras_under_other_names_give_the_same(runs):
     """Names decide the order inside: that it does not matter there either holds to the search's tolerance."""
     own, together = runs[0]
     names = {LEFT: "z", RIGHT: "a"}
-    renamed = calibrate_together({names[name]: estimate for name, estimate in own.items()}, BOARD, ML)
+    other = {names[name]: estimate for name, estimate in own.items()}
+    renamed = calibrate_together(other, BOARD, every(other))
     for name in (LEFT, RIGHT):
         first, second = together.estimates[name], renamed.estimates[names[name]]
         apart = difference(first.T_cam_lidar, second.T_cam_lidar)
@@ -107,12 +114,22 @@ def test_the_same_cameras_under_other_names_give_the_same(runs):
         assert np.allclose(np.diag(first.cov), np.diag(second.cov), rtol=0.05)
 
 
+def test_each_cameras_scale_has_the_prior_of_its_own_lens(runs):
+    own, _ = runs[0]
+    exact = replace(ML, tolerances=replace(KNOWN, focal_length=0.0, square_size=0.0))
+    loose = replace(ML, tolerances=KNOWN)
+    for name, other in ((LEFT, RIGHT), (RIGHT, LEFT)):
+        together = calibrate_together(own, BOARD, {name: exact, other: loose})
+        off = {each: abs(1 - together.estimates[each].diagnostics.camera_scale) for each in own}
+        assert off[name] < 1e-6 < 0.1 * off[other]
+
+
 def test_captures_whose_scan_the_cameras_use_differently_are_left_out(runs):
     own, _ = runs[0]
     seen = dict(own[RIGHT].observations)
     lidar = seen["000002"].lidar
     seen["000002"] = replace(seen["000002"], lidar=replace(lidar, points=lidar.points + 0.001))
-    together = calibrate_together({**own, RIGHT: replace(own[RIGHT], observations=seen)}, BOARD, ML)
+    together = calibrate_together({**own, RIGHT: replace(own[RIGHT], observations=seen)}, BOARD, every(own))
     for estimate in together.estimates.values():
         assert "000002" not in estimate.used
         assert len(estimate.residuals) == len(estimate.used)

@@ -1,0 +1,219 @@
+"""`lce-rig deploy`: put a result on a robot, ask what is there, or go back."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lce_rig.cli import show
+from lce_rig.cli.options import json_option, session_argument
+
+if TYPE_CHECKING:
+    from lce_rig.deploy.changes import SensorChange
+    from lce_rig.deploy.deployment import Deployed, Plan
+    from lce_rig.deploy.releases import ReleaseRecord, Standing
+    from lce_rig.rig import Rig
+    from lce_rig.rig.target_settings import TargetSettings
+
+
+@click.command()
+@session_argument
+@click.option("--target", "target_name", required=True, metavar="NAME", help="Name the target.")
+@click.option(
+    "--targets",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Read targets from this file [default: deploy.yaml beside SESSION, and the session's profile].",
+)
+@click.option("--name", metavar="NAME", help="Deploy this result of SESSION (see `lce-rig results`).")
+@click.option("--dry-run", is_flag=True, help="Print what would change; change nothing.")
+@click.option("--status", is_flag=True, help="Print what is at the target; change nothing.")
+@click.option("--rollback", is_flag=True, help="Restore the files that were there before.")
+@click.option("--release", metavar="NAME", help="With --rollback: restore this release (see --status).")
+@click.option("--force", is_flag=True, help="Deploy against objections; requires --reason.")
+@click.option("--reason", default="", metavar="TEXT", help="Say why; it is written down at the target.")
+@json_option
+def deploy(
+    session: Path,
+    target_name: str,
+    targets: Path | None,
+    name: str | None,
+    dry_run: bool,
+    status: bool,
+    rollback: bool,
+    release: str | None,
+    force: bool,
+    reason: str,
+    as_json: bool,
+) -> None:
+    """Put the result of SESSION (default: session/) on a robot, all files at once.
+
+    A target is a folder on this computer or USER@HOST:PATH, reached by OpenSSH without a question. Robot
+    software reads PATH/current/. The files are written aside and read back, then one rename makes them
+    current; whatever interrupts it, the robot has the earlier set or the new one. Earlier sets are kept.
+
+    Refused with exit code 7: a failed result, another robot's name or serial numbers, captures older than
+    those deployed. Exits with 8 if the target was not reached or written and holds the earlier set, and with
+    9 if the command after it failed and the new set is in place.
+    """
+    from lce_rig.core.errors import UsageError
+    from lce_rig.deploy import deployment
+
+    if sum((dry_run, status, rollback)) > 1:
+        raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
+    if release is not None and not rollback:
+        raise UsageError("--release applies to --rollback only", "Add --rollback.")
+    if force and not reason.strip():
+        raise UsageError("--force requires a reason", "Add --reason TEXT; it is written down at the target.")
+    if reason and not (force or rollback):
+        raise UsageError("--reason applies to --force and --rollback only", "Add one of them, or omit it.")
+    if status or rollback:
+        target = _target(target_name, targets, session, None)
+        if status:
+            _tell_standing(deployment.standing(target), target, as_json=as_json)
+        else:
+            _tell_done(deployment.rollback(target, release, reason=reason), target, as_json=as_json)
+        return
+    import lce_rig as lce
+    from lce_rig.pipeline.result_files import result_parts
+
+    opened = lce.Session.open(session)
+    target = _target(target_name, targets, session, opened.rig)
+    result = opened.path.joinpath(*result_parts(name))
+    if dry_run:
+        _tell_plan(deployment.plan(result, opened.rig, target, session=opened), target, as_json=as_json)
+        return
+    if target.run is not None:
+        show.note(f"afterwards there: {target.run}")
+    done = deployment.deploy(result, opened.rig, target, session=opened, reason=reason.strip())
+    _tell_done(done, target, as_json=as_json)
+
+
+def _target(name: str, file: Path | None, session: Path, rig: "Rig | None") -> "TargetSettings":
+    """Find the target; its session is opened for its profile only if there is no file."""
+    import lce_rig as lce
+    from lce_rig.deploy.targets import find_target
+
+    if rig is None and file is None and (session / "session.json").exists():
+        rig = lce.Session.open(session).rig
+    return find_target(name, file, session, rig)
+
+
+def _tell_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None:
+    from lce_rig.words import as_json as finding_as_json
+    from lce_rig.words import describe
+
+    if as_json:
+        show.print_json(
+            {
+                "format_version": 1,
+                "to": target.to,
+                "current": _release(plan.state.current),
+                "new": plan.record.model_dump(),
+                "changed": dict(plan.changed),
+                "changed_there": dict(plan.changed_there),
+                "sensors": [_sensor(change) for change in plan.sensors],
+                "objections": [finding_as_json(each) for each in plan.objections],
+                "diff": list(plan.text),
+            }
+        )
+        return
+    current = plan.state.current
+    show.say(f"{target.to}: {'nothing deployed yet' if current is None else _told(current)}")
+    for change in plan.sensors:
+        show.say(f"  {change.camera} and {change.lidar}: {_moved(change)}")
+    _tell_changed_there(plan.changed_there)
+    if plan.is_in_place:
+        show.say("nothing to change: these very files are in place")
+    for line in plan.text:
+        click.echo(line)
+    for each in plan.objections:
+        show.warn(f"would be refused: {describe(each)}")
+
+
+def _moved(change: "SensorChange") -> str:
+    if change.moved is None:
+        return "new" if change.is_new else "removed"
+    angle_deg, distance_m = change.moved
+    return f"moves by {angle_deg:.3f} deg, {1000 * distance_m:.1f} mm"
+
+
+def _sensor(change: "SensorChange") -> dict[str, Any]:
+    angle_deg, distance_m = (None, None) if change.moved is None else change.moved
+    return {
+        "camera": change.camera,
+        "lidar": change.lidar,
+        "is_new": change.is_new,
+        "rotation_deg": angle_deg,
+        "translation_m": distance_m,
+    }
+
+
+def _tell_standing(found: "Standing", target: "TargetSettings", *, as_json: bool) -> None:
+    state = found.state
+    if as_json:
+        show.print_json(
+            {
+                "format_version": 1,
+                "to": target.to,
+                "current": _release(state.current),
+                "changed_there": dict(found.changed),
+                "is_pending": state.is_pending,
+                "releases": [_release(each) for each in state.releases],
+            }
+        )
+        return
+    if state.current is None:
+        show.say(f"{target.to}: nothing deployed yet")
+        return
+    show.say(f"{target.to}: {_told(state.current)}")
+    table = show.plain_table("", "release", "deployed", "by", "robot", "captures of")
+    for each in state.releases:
+        mark = " *" if each.name == state.current.name else ""
+        cells = (f"{each.name}{mark}", each.time, each.by, each.robot or "-", each.date[:10] or "-")
+        table.add_row(*map(show.escape, cells))
+    show.print_table(table)
+    _tell_changed_there(found.changed)
+    for each in state.releases:
+        if each.reason:
+            show.note(f"{each.name} was forced: {each.reason}")
+    if state.is_pending:
+        show.warn("the command after the deployment has not succeeded; the same deployment runs it again")
+
+
+def _tell_changed_there(changed: "Any") -> None:
+    if changed:
+        told = ", ".join(f"{file} {how}" for file, how in changed.items())
+        show.warn(f"not as it was deployed: {told}")
+
+
+def _told(release: "ReleaseRecord") -> str:
+    verdicts = ", ".join(f"{pair} {verdict}" for pair, verdict in release.verdicts.items())
+    robot = f"robot {release.robot}, " if release.robot else ""
+    dated = f"captures of {release.date}, " if release.date else ""
+    return f"{release.name} ({robot}{dated}{verdicts})"
+
+
+def _release(release: "ReleaseRecord | None") -> dict[str, Any] | None:
+    return None if release is None else release.model_dump() | {"set_sha256": release.set_sha256}
+
+
+def _tell_done(done: "Deployed", target: "TargetSettings", *, as_json: bool) -> None:
+    if as_json:
+        show.print_json(
+            {
+                "format_version": 1,
+                "to": target.to,
+                "current": _release(done.release),
+                "replaces": done.replaces,
+                "is_new": done.is_new,
+                "output": done.output,
+            }
+        )
+        return
+    state = "in place" if done.is_new else "in place already"
+    show.say(f"{target.to}: {_told(done.release)} {state}")
+    if done.is_new and done.replaces == done.release.replaces != "":
+        show.note(f"replaces {done.replaces}; `--rollback` restores it")
+    if done.output:
+        show.say(done.output.rstrip())

@@ -1,0 +1,240 @@
+"""`lce-rig fleet`: run the sessions of many robots, and ask questions of their results."""
+
+import json
+import math
+import os
+import sys
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lce_rig.cli import show
+from lce_rig.cli.fleet_lidar import lidar
+from lce_rig.cli.fleet_report import report
+from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
+
+if TYPE_CHECKING:
+    from lce_rig.fleet.run import FleetRun
+
+# Ctrl-C: sessions end at once, workers and the table take their time.
+_GRACE_S = 20.0
+_SHOWN = (
+    "robot",
+    "date",
+    "camera",
+    "lidar",
+    "status",
+    "cause",
+    "verdict",
+    "n_used",
+    "sigma_rotation_deg",
+    "sigma_translation_m",
+)
+_MOST_SHOWN = 1000
+
+
+@click.group()
+def fleet() -> None:
+    """Calibrate the sessions of many robots and keep their results in one registry.
+
+    Requires `pip install 'lce-rig[fleet]'`. docs/fleets.md describes the registry and its table.
+    """
+
+
+fleet.add_command(report)
+fleet.add_command(lidar)
+
+
+@fleet.command()
+@click.argument("root", metavar="ROOT")
+@registry_option
+@click.option(
+    "--manifest",
+    metavar="FILE",
+    help="Read robots, profiles, collectors and sites from this file "
+    "[default: ROOT/fleet.yaml or ROOT/fleet.csv, if there is one].",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="Set the number of worker processes on this computer [default: one per core].",
+)
+@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a running Dask scheduler, tcp://...")
+@click.option(
+    "--time-limit",
+    default=600.0,
+    show_default=True,
+    type=FiniteRange(1, 1e6),
+    metavar="S",
+    help="End a session after this time.",
+)
+@click.option(
+    "--memory-limit",
+    default=4000.0,
+    show_default=True,
+    type=FiniteRange(400, 1e6),
+    metavar="MB",
+    help="End a session that needs more memory; also the limit of each worker.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["ml", "paper"]),
+    default="paper",
+    show_default=True,
+    help="Estimate as `lce-rig calibrate` does with this method.",
+)
+@click.option(
+    "--pictures",
+    type=click.Choice(["all", "sheets", "none"]),
+    default="sheets",
+    show_default=True,
+    help="Keep the overlays of all captures, their contact sheets only, or draw none.",
+)
+@click.option("--retry", is_flag=True, help="Run sessions without a result again.")
+@json_option
+def run(
+    root: str,
+    registry: str,
+    manifest: str | None,
+    workers: int | None,
+    scheduler: str | None,
+    time_limit: float,
+    memory_limit: float,
+    method: Any,
+    pictures: Any,
+    retry: bool,
+    as_json: bool,
+) -> None:
+    """Calibrate all sessions below ROOT, a path or an address such as s3://bucket/sessions.
+
+    Each session is one task of a Dask cluster: detect, calibrate, verify, write. Results that the registry
+    holds already, of the same captures, profile and version, are kept. Run it again after an interrupt to
+    continue. A session that fails, takes too long, crashes or needs too much memory is recorded with the
+    cause and stops no other. Nothing below ROOT is written.
+    """
+    from lce_rig.core.interrupts import patience
+    from lce_rig.fleet.jobs import find_jobs
+    from lce_rig.fleet.run import cluster, run_fleet
+    from lce_rig.fleet.storage import Storage
+    from lce_rig.fleet.work import Settings
+
+    place = Storage.at(registry)
+    jobs = find_jobs(Storage.at(root), None if manifest is None else Storage.at(manifest))
+    settings = Settings(place.url, method, time_limit, memory_limit, retry, pictures)
+    n_workers = workers or len(os.sched_getaffinity(0))
+    show.note(f"{show.counted(len(jobs), 'session')} in {root}")
+    with patience(_GRACE_S), cluster(n_workers, memory_limit, scheduler) as client:
+        show.note(f"Dask dashboard: {client.dashboard_link}")
+        with show.progress_bar("sessions", has_rate=True) as progress:
+            done = run_fleet(jobs, settings, client, progress=progress)
+    if as_json:
+        show.print_json(_document(done))
+    else:
+        _print_summary(done, place.url)
+
+
+def _document(done: "FleetRun") -> dict[str, Any]:
+    return {
+        "format_version": 1,
+        "n_run": done.n_new,
+        "n_held": done.n_held,
+        "statuses": dict(sorted(done.statuses.items())),
+        "causes": dict(done.causes.most_common()),
+        "n_rows": len(done.table),
+    }
+
+
+def _print_summary(done: "FleetRun", registry: str) -> None:
+    statuses = ", ".join(f"{status} {n}" for status, n in done.statuses.most_common())
+    show.say(f"{show.counted(done.n_new, 'session')} run, {done.n_held} held already: {statuses}")
+    for cause, n in done.causes.most_common():
+        show.say(f"  {n} x {cause}")
+    show.say(f"{registry}: {show.counted(len(done.table), 'row')} in the table")
+
+
+@fleet.command()
+@registry_option
+@click.option(
+    "--where",
+    default="",
+    metavar="CONDITION",
+    help="Choose rows by a condition in SQL, such as \"verdict = 'fail' and date > '2026-01-01'\".",
+)
+@click.option(
+    "--columns",
+    callback=split_names,
+    metavar="NAME[,NAME]",
+    help="Choose columns [default: all with --csv and --json, else the most important].",
+)
+@click.option("--csv", "as_csv", is_flag=True, help="Print comma-separated values.")
+@json_option
+@click.option("--rebuild", is_flag=True, help="Write the table again from the folders of all results first.")
+def table(
+    registry: str, where: str, columns: list[str] | None, as_csv: bool, as_json: bool, rebuild: bool
+) -> None:
+    """Print rows of the registry's table."""
+    from lce_rig.core.errors import UsageError
+    from lce_rig.fleet.query import query
+    from lce_rig.fleet.registry import Registry
+    from lce_rig.fleet.storage import Storage
+
+    if as_csv and as_json:
+        raise UsageError("--csv and --json exclude each other", "Choose one.")
+    opened: Registry = Registry(Storage.at(registry))
+    if rebuild:
+        opened.consolidate(rebuild=True)
+    chosen = query(opened, where, columns or (None if as_csv or as_json else _SHOWN))
+    if as_csv:
+        _print_csv(chosen)
+    elif as_json:
+        _print_json(chosen)
+    else:
+        _print_table(chosen)
+
+
+def _print_csv(chosen: Any) -> None:
+    """Print CSV; lists are JSON in a cell."""
+    import csv
+
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(chosen.column_names)
+    for batch in chosen.to_batches(max_chunksize=10_000):
+        for row in batch.to_pylist():
+            writer.writerow([json.dumps(v) if isinstance(v, list) else v for v in row.values()])
+
+
+def _print_json(chosen: Any) -> None:
+    """Print {"rows": [...]}, a row a line."""
+    sys.stdout.write('{"format_version": 1, "rows": [')
+    end = "\n"
+    for batch in chosen.to_batches(max_chunksize=10_000):
+        for row in batch.to_pylist():
+            sys.stdout.write(end + json.dumps(row, allow_nan=False))
+            end = ",\n"
+    sys.stdout.write("\n]}\n")
+
+
+def _print_table(chosen: Any) -> None:
+    rows = chosen.slice(0, _MOST_SHOWN).to_pylist()
+    shown = show.plain_table("", *chosen.column_names)
+    for row in rows:
+        shown.add_row(*(_cell(value) for value in row.values()))
+    show.print_table(shown)
+    if len(chosen) > len(rows):
+        show.note(f"{len(rows)} of {len(chosen)} rows; add --where, --csv or --json")
+    else:
+        show.note(show.counted(len(chosen), "row"))
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, list):
+        return show.escape(" ".join(map(str, value)))
+    if isinstance(value, float):
+        return f"{value:.4g}" if math.isfinite(value) else "-"
+    return show.escape(str(value))
+
+
+__all__ = ["fleet"]

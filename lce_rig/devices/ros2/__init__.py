@@ -1,0 +1,1 @@
+"""Sensors whose drivers publish ROS 2 topics."""

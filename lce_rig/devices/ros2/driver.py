@@ -1,0 +1,173 @@
+"""A sensor that another driver publishes as a ROS 2 topic; its timestamps are those of the headers."""
+
+import re
+import time
+from contextlib import ExitStack
+from types import ModuleType
+from typing import Any
+
+from lce_rig.core.data import LiveSample
+from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.devices.protocol import ClockState, SourceStatus
+from lce_rig.devices.reading import LiveSource
+from lce_rig.recordings.ros.rosbag import TopicDecoder
+from lce_rig.recordings.ros.storage import RawMessage
+from lce_rig.recordings.ros.topics import Target
+from lce_rig.rig import CameraSettings, LidarSettings
+
+_N_SLOTS = 16
+_WAIT_S = 0.25
+# Nodes find each other within a second on one computer, within a few on a network.
+_DISCOVERY_S = 5.0
+_DISCOVERY_STEP_S = 0.1
+
+
+class Ros2Source(LiveSource):
+    """A topic of sensor_msgs/Image, CompressedImage or PointCloud2; see `LiveSource`.
+
+    Messages arrive serialised and are decoded as those of a bag are. The topic is the profile's for bags.
+    Timestamps are those of the headers, which are as good as the publishing driver makes them.
+
+    Args:
+        sensor: its name in the profile.
+        settings: its block of the profile.
+        silence_s: so long without a message is an error.
+    """
+
+    def __init__(self, sensor: str, settings: CameraSettings | LidarSettings, silence_s: float = 5.0) -> None:
+        if isinstance(settings, CameraSettings):
+            channel = settings.first_channel("frames") or next(iter(settings.channels))
+            named, who = settings.channels[channel].topic, f"camera {sensor!r}"
+            self._target = Target(sensor, channel)
+        else:
+            named, who = settings.topic, f"LiDAR {sensor!r}"
+            self._target = Target(sensor, None)
+        self._topic = f"/{named.lstrip('/')}" if named else ""
+        hint = f"Does its driver publish? `ros2 topic hz {self._topic}`."
+        super().__init__(sensor, who, _N_SLOTS, silence_s, hint)
+        self._settings = settings
+        self._stack = ExitStack()
+        self._waiting: list[tuple[int, bytes]] = []
+        self._decoder = TopicDecoder(self._target, settings)
+        self._msgtype = ""
+        self._delay_ms: float | None = None
+
+    def open(self) -> None:
+        """Join the ROS graph and subscribe.
+
+        Raises:
+            SourceError: rclpy cannot be imported, the profile names no topic, or nothing publishes it.
+        """
+        if not self._topic:
+            block = "cameras" if self._target.channel is not None else "lidars"
+            hint = f"Set topic in {block}.{self.sensor}; `ros2 topic list -t` lists what is published."
+            raise SourceError(f"{self._who}: the profile names no topic", hint)
+        rclpy = _import_rclpy(self._who)
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.qos import qos_profile_sensor_data
+
+        with ExitStack() as stack:
+            context = rclpy.Context()
+            # With a context of its own, rclpy leaves Ctrl-C to this program.
+            rclpy.init(context=context)
+            stack.callback(rclpy.try_shutdown, context=context)
+            node = rclpy.create_node(_node_name(self.sensor), context=context)
+            stack.callback(node.destroy_node)
+            self._executor = SingleThreadedExecutor(context=context)
+            self._executor.add_node(node)
+            stack.callback(self._executor.shutdown)
+            self._msgtype = self._find_type(node)
+            kind = _message_class(self._msgtype)
+            node.create_subscription(kind, self._topic, self._receive, qos_profile_sensor_data, raw=True)
+            self._waiting.clear()
+            self._stack = stack.pop_all()
+
+    def close(self) -> None:
+        """Leave the ROS graph."""
+        self._stack.close()
+
+    def read(self) -> list[LiveSample]:
+        """Give what came; see `LiveSource`."""
+        self._executor.spin_once(timeout_sec=_WAIT_S)
+        came, self._waiting = self._waiting, []
+        samples: list[LiveSample] = []
+        for host_ns, data in came:
+            message = RawMessage(self._topic, self._msgtype, "cdr", host_ns, data)
+            sample = self._decoder.decode(message)
+            if sample is not None and sample.stamp_ns is not None:
+                self._delay_ms = (host_ns - sample.stamp_ns) * 1e-6
+                samples.append(sample)
+        return samples
+
+    def describe(self) -> SourceStatus:
+        """Say how the topic does."""
+        n_lost = sum(
+            int(str(found.figures["n"]))
+            for found in self._decoder.losses.findings()
+            if found.code != "recording.points_without_return"
+        )
+        clock = None
+        if self._delay_ms is not None:
+            figures: dict[str, Figure] = {"delay_ms": self._delay_ms}
+            clock = ClockState(Finding("clock.header", "note", figures=figures))
+        skipping = Finding("stream.messages_skipped", "warning", figures={"n": n_lost})
+        problems = (skipping,) if n_lost else ()
+        device = f"{self._topic} ({self._msgtype})" if self._msgtype else self._topic
+        return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, problems=problems, device=device)
+
+    def _receive(self, data: bytes) -> None:
+        self._waiting.append((time.time_ns(), bytes(data)))
+
+    def _find_type(self, node: Any) -> str:
+        """Wait until the topic is published, and name its type without ROS 2's "/msg".
+
+        Raises:
+            SourceError: it is not, or is of another type.
+        """
+        until_s = time.monotonic() + _DISCOVERY_S
+        while True:
+            types: dict[str, list[str]] = {
+                name: [each.replace("/msg/", "/") for each in kinds]
+                for name, kinds in node.get_topic_names_and_types()
+            }
+            if self._topic in types or time.monotonic() > until_s or self.is_stopping:
+                break
+            time.sleep(_DISCOVERY_STEP_S)
+        fitting = [each for each in types.get(self._topic, ()) if each in self._target.types]
+        if fitting:
+            return fitting[0]
+        others = sorted(name for name, kinds in types.items() if self._target.types & set(kinds))
+        listing = (
+            f"Topics of its type: {', '.join(others)}." if others else "No topic of its type is published."
+        )
+        hint = f"{listing} Check ROS_DOMAIN_ID, and `ros2 topic list -t`."
+        if self._topic in types:
+            wanted = " or ".join(sorted(self._target.types))
+            raise SourceError(
+                f"{self._who}: {self._topic} is {', '.join(types[self._topic])}, not {wanted}", hint
+            )
+        raise SourceError(f"{self._who}: nothing publishes {self._topic}", hint)
+
+
+def _node_name(sensor: str) -> str:
+    """Name a node; ROS 2 allows letters, digits and underscores of ASCII."""
+    return "lce_rig_" + re.sub(r"[^A-Za-z0-9_]", "_", sensor)
+
+
+def _import_rclpy(who: str) -> ModuleType:
+    try:
+        import rclpy
+    except ImportError:
+        raise SourceError(
+            f"{who}: driver.type ros2 needs rclpy, which cannot be imported",
+            "Source ROS 2 first (source /opt/ros/humble/setup.bash) and use its Python; pip has no rclpy.",
+        ) from None
+    module: ModuleType = rclpy
+    return module
+
+
+def _message_class(msgtype: str) -> Any:
+    from sensor_msgs import msg
+
+    return getattr(msg, msgtype.partition("/")[2])

@@ -1,0 +1,145 @@
+"""The point clouds of a session with the colours of the camera, as PLY files.
+
+References:
+    http://paulbourke.net/dataformats/ply
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import LceRigError
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array, transform
+from lce_rig.core.results import Calibration
+from lce_rig.export.files import header, reads_back
+from lce_rig.export.job import ExportJob
+from lce_rig.session.capture import Capture
+from lce_rig.session.durable import write_atomically
+
+_FIELDS = [
+    *(("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")),
+    *(("intensity", "<f4"), ("capture", "<i4")),
+]
+_POINT = np.dtype(_FIELDS)
+# Cells in which the camera's view is compared with the LiDAR's are at least this large.
+_SMALLEST_CELL_PX = 4.0
+_PLY_TYPES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
+
+
+def export_ply(job: ExportJob) -> list[Path]:
+    """Write coloured_CAMERA.ply with the points of all captures that the camera sees, and read it back.
+
+    Points are in the LiDAR's frame; the clouds of captures coincide if the rig stood still.
+
+    Raises:
+        LceRigError: a file reads back differently.
+        SessionError: a capture is damaged, or the disk is full.
+    """
+    return _write(job, "ply", is_split=False)
+
+
+def export_ply_captures(job: ExportJob) -> list[Path]:
+    """Write coloured_CAMERA_CAPTURE.ply of each capture, for a rig that was moved; raises as `export_ply`."""
+    return _write(job, "ply_captures", is_split=True)
+
+
+def _write(job: ExportJob, name: str, *, is_split: bool) -> list[Path]:
+    if job.session is None:
+        job.findings.append(Finding("export.no_session", "warning", figures={"format": name}))
+        return []
+    paths = []
+    for calibration in job.chosen:
+        clouds = {
+            capture.name: cloud
+            for capture in job.session.captures
+            if (cloud := _coloured(capture, calibration, job)) is not None
+        }
+        if not clouds:
+            job.findings.append(Finding("export.no_images", "warning", calibration.camera, {"format": name}))
+            continue
+        stem = f"coloured_{job.name_of(calibration)}"
+        parts = {f"{stem}_{capture}": cloud for capture, cloud in clouds.items()}
+        for file, points in parts.items() if is_split else [(stem, np.concatenate([*clouds.values()]))]:
+            path = job.folder / f"{file}.ply"
+            write_atomically(path, _head(points, calibration, job) + points.tobytes())
+            _check(path, points)
+            paths.append(path)
+    return paths
+
+
+def _coloured(capture: Capture, calibration: Calibration, job: ExportJob) -> NDArray[np.void] | None:
+    """Give the points of a capture that lie in the camera's image their colours; None without an image."""
+    channels = [channel for camera, channel in capture.image_keys if camera == calibration.camera]
+    channels.sort(key=lambda channel: channel not in calibration.channels)
+    if not channels or calibration.lidar not in capture.lidars:
+        return None
+    image = capture.image(calibration.camera, channels[0])
+    return colour_points(image, capture.scan(calibration.lidar), calibration, job, int(capture.name))
+
+
+def colour_points(
+    image: Image, scan: Scan, calibration: Calibration, job: ExportJob, number: int
+) -> NDArray[np.void]:
+    """Take the colour of the nearest pixel for each point (N,) that the camera sees; others are left out."""
+    intrinsics = job.rig.cameras[calibration.camera].to_intrinsics()
+    points_camera = transform(calibration.T_cam_lidar, np.asarray(scan.points, np.float64))
+    pixels, _ = intrinsics.project(points_camera)
+    is_seen = intrinsics.is_inside(pixels)
+    cell_px = max(_SMALLEST_CELL_PX, _ring_step_rad(scan) * intrinsics.fx_px)
+    baseline_m = float(np.linalg.norm(calibration.T_cam_lidar[:3, 3]))
+    is_seen[is_seen] = ~_is_hidden(
+        pixels[is_seen], points_camera[is_seen, 2], cell_px, baseline_m * intrinsics.fx_px
+    )
+    at = np.round(pixels[is_seen]).astype(int)
+    colours = image.pixels if image.pixels.ndim == 3 else np.repeat(image.pixels[:, :, None], 3, axis=2)
+    points = np.empty(int(is_seen.sum()), _POINT)
+    for axis, name in enumerate("xyz"):
+        points[name] = scan.points[is_seen, axis]
+    for place, name in enumerate(("blue", "green", "red")):
+        points[name] = colours[at[:, 1], at[:, 0], place]
+    points["intensity"], points["capture"] = scan.intensity[is_seen], number
+    return points
+
+
+def _ring_step_rad(scan: Scan) -> float:
+    """Estimate the angle between neighbouring rings, rad: the median step of their elevations."""
+    points = np.asarray(scan.points, np.float64)
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    rings = [np.median(elevation[scan.ring == ring]) for ring in np.unique(scan.ring)]
+    return float(np.median(np.diff(np.sort(rings)))) if len(rings) > 1 else 0.0
+
+
+def _is_hidden(pixels: Array, depth_m: Array, cell_px: float, baseline_m_px: float) -> NDArray[np.bool_]:
+    """Find the points behind nearer ones that the LiDAR looks past and the camera does not.
+
+    In a cell of the image as large as the gap between rings, the point at depth d shifts against the nearest
+    one, at d0, by baseline * f * (1 / d0 - 1 / d) between the views of camera and LiDAR. Below half a cell
+    both are parts of what both sensors see.
+    """
+    cells = np.floor(pixels / cell_px).astype(int)
+    _, place = np.unique(cells, axis=0, return_inverse=True)
+    inverse = 1 / np.maximum(depth_m, 1e-3)
+    nearest = np.zeros(int(place.max(initial=-1)) + 1)
+    np.maximum.at(nearest, place.ravel(), inverse)
+    return np.asarray(baseline_m_px * (nearest[place.ravel()] - inverse) > cell_px / 2)
+
+
+def _head(points: NDArray[np.void], calibration: Calibration, job: ExportJob) -> bytes:
+    head = header("coloured point cloud", job.rig, [calibration], of_one_camera=True)
+    frame = job.rig.lidars[calibration.lidar].frame
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {line}" for line in (*head, f"points in frame {frame}, m")]
+    lines.append(f"element vertex {len(points)}")
+    lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in _FIELDS]
+    text = "\n".join([*lines, "end_header"]) + "\n"
+    return text.encode("ascii", "replace")
+
+
+@reads_back
+def _check(path: Path, points: NDArray[np.void]) -> None:
+    head, _, data = path.read_bytes().partition(b"end_header\n")
+    if f"element vertex {len(points)}\n".encode() not in head or data != points.tobytes():
+        raise LceRigError(f"{path}: reads back differently")

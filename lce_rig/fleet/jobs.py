@@ -1,0 +1,167 @@
+"""Find sessions and recordings below a root, with what a manifest says of them."""
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from lce_rig.core.errors import NotEnoughDataError, UsageError
+from lce_rig.core.limits import describe
+from lce_rig.fleet.storage import Storage
+from lce_rig.session.identity import MARKER
+
+MANIFESTS = ("fleet.yaml", "fleet.csv")
+_FIELDS = ("robot", "collector", "site")
+_FIELD = re.compile(r"\{(\w+)\}")
+_SAFE = re.compile(r"[^A-Za-z0-9_.-]+")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One session or recording.
+
+    Attributes:
+        source: its path or address, absolute.
+        robot: its name; "" where only the profile may tell.
+        fallback_robot: used where the profile does not tell it either.
+        rig: profile that replaces the session's, or that a recording needs; "" for the session's.
+        collector, site: who collected it, and where; "" if unknown.
+    """
+
+    source: str
+    robot: str = ""
+    fallback_robot: str = ""
+    rig: str = ""
+    collector: str = ""
+    site: str = ""
+
+
+class Entry(BaseModel):
+    """One entry of a manifest: what is known of the sessions and recordings that match a pattern."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", coerce_numbers_to_str=True)
+
+    path: str = Field(min_length=1)
+    robot: str = ""
+    rig: str = ""
+    collector: str = ""
+    site: str = ""
+
+    @property
+    def glob(self) -> str:
+        """The pattern without names of fields."""
+        return _FIELD.sub("*", self.path.rstrip("/"))
+
+    def fields_of(self, path: str) -> dict[str, str]:
+        """Read the fields that the pattern names from a path that matches it."""
+        parts = re.split(r"(\{\w+\}|\*\*/|\*\*|\*|\?)", self.path.rstrip("/"))
+        rules = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+        pattern = "".join(
+            f"(?P<{part[1:-1]}>[^/]+?)" if _FIELD.fullmatch(part) else rules.get(part, re.escape(part))
+            for part in parts
+        )
+        found = re.fullmatch(pattern, path)
+        return {} if found is None else found.groupdict()
+
+
+def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
+    """List the sessions and recordings below a folder.
+
+    A manifest, `fleet.yaml` or `fleet.csv` in the folder unless another is given, names them by patterns.
+    Without one, every session is taken, and named after its profile's robot or the first folder of its path.
+
+    Args:
+        root: where they lie.
+        manifest: the manifest.
+
+    Raises:
+        UsageError: the manifest cannot be used.
+        NotEnoughDataError: there is nothing to run.
+    """
+    if not root.exists():
+        raise UsageError(f"{root.url} does not exist", "Give the folder that the sessions lie in.")
+    named = [manifest] if manifest is not None else [root / name for name in MANIFESTS]
+    text = next(((each, content) for each in named if (content := each.read()) is not None), None)
+    if text is None and manifest is not None:
+        raise UsageError(f"{manifest.url} does not exist", "Give a manifest, fleet.yaml or fleet.csv.")
+    jobs = _all_sessions(root) if text is None else _matches(root, text[0], _entries(*text))
+    if not jobs:
+        raise NotEnoughDataError(
+            f"{root.url} holds no session" + ("" if text is None else f" that {text[0].url} names"),
+            "A session is a folder with session.json; recordings are named in a manifest (docs/fleets.md).",
+        )
+    return jobs
+
+
+def _all_sessions(root: Storage) -> list[Job]:
+    prefix = root.path.rstrip("/") + "/"
+    jobs = []
+    for folder, inner, files in root.fs.walk(root.path):
+        if MARKER in files:
+            inner.clear()
+            own = str(folder).rstrip("/").removeprefix(prefix)
+            first, slash, _ = own.partition("/")
+            jobs.append(Job(root.url_of(str(folder).rstrip("/")), fallback_robot=first if slash else ""))
+        for name in [name for name in inner if name.startswith(".")]:
+            inner.pop(name) if isinstance(inner, dict) else inner.remove(name)
+    return sorted(jobs, key=lambda job: job.source)
+
+
+def _entries(manifest: Storage, content: bytes) -> list[Entry]:
+    """Read a manifest."""
+    try:
+        text = content.decode()
+        documents: Any = (
+            [{k: v for k, v in row.items() if v} for row in csv.DictReader(io.StringIO(text))]
+            if manifest.url.endswith(".csv")
+            else (yaml.safe_load(text) or {})
+        )
+        if isinstance(documents, Mapping):
+            documents = documents["sessions"]
+        entries = [Entry.model_validate(document) for document in documents]
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(map(str, first["loc"]))
+        raise UsageError(
+            f"{manifest.url}: {key}: {first['msg']}; {describe(first['input'])} given",
+            f"Keys: {', '.join(Entry.model_fields)}.",
+        ) from None
+    except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        raise UsageError(
+            f"{manifest.url} is not a manifest: {error}", "List entries with `path` below `sessions:`."
+        ) from error
+    unknown = {name for entry in entries for name in _FIELD.findall(entry.path)} - set(_FIELDS)
+    if unknown:
+        raise UsageError(
+            f"{manifest.url}: {{{sorted(unknown)[0]}}} is not a field",
+            f"Choose one of: {', '.join(_FIELDS)}.",
+        )
+    return entries
+
+
+def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list[Job]:
+    """Find what the entries name; the first entry that matches a path counts."""
+    prefix = root.path.rstrip("/") + "/"
+    jobs: dict[str, Job] = {}
+    for entry in entries:
+        given = entry.model_dump(include=set(_FIELDS))
+        rig = entry.rig
+        if rig and "://" not in rig and not rig.startswith("/") and "." in rig:
+            rig = f"{manifest.url.rpartition('/')[0]}/{rig}"
+        for path in sorted(map(str, root.fs.glob(prefix + entry.glob))):
+            own = path.rstrip("/").removeprefix(prefix)
+            if path not in jobs and own not in MANIFESTS:
+                told = {k: v for k, v in entry.fields_of(own).items() if k in _FIELDS}
+                fields = {k: given[k] or told.get(k, "") for k in _FIELDS}
+                jobs[path] = Job(root.url_of(path.rstrip("/")), rig=rig, **fields)
+    return list(jobs.values())
+
+
+def folder_name(text: str) -> str:
+    """Make a name of a folder from any text."""
+    return _SAFE.sub("_", text).strip(".")[:80] or "unnamed"

@@ -1,0 +1,90 @@
+"""Where results are deployed to: the block `targets` of a profile or of a deploy.yaml."""
+
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from lce_rig.rig.settings import Name, RobotName, Settings, Text, problem
+
+# None of these makes ssh run a program on this computer.
+SshOption = Literal[
+    "AddressFamily",
+    "CertificateFile",
+    "Compression",
+    "ConnectTimeout",
+    "GlobalKnownHostsFile",
+    "HostKeyAlias",
+    "HostName",
+    "IdentitiesOnly",
+    "IdentityAgent",
+    "IdentityFile",
+    "Port",
+    "ProxyJump",
+    "ServerAliveCountMax",
+    "ServerAliveInterval",
+    "StrictHostKeyChecking",
+    "User",
+    "UserKnownHostsFile",
+]
+# [user@]host:path, as scp writes it. Nothing that a shell or an option could take for something else.
+_REMOTE = re.compile(
+    r"((?:[A-Za-z0-9_][A-Za-z0-9_.-]*@)?(?:[A-Za-z0-9][A-Za-z0-9_.-]*|\[[0-9A-Fa-f:.%a-z]+\])):(.*)",
+    re.DOTALL,
+)
+_REMOTE_PATH = re.compile(r"(?:~/)?[A-Za-z0-9_./][A-Za-z0-9_./+@=-]*")
+
+
+class TargetSettings(Settings):
+    """A place that robot software reads a result from.
+
+    Attributes:
+        to: a folder on this computer, or `user@host:path` by OpenSSH; robot software reads `to`/current/.
+        robot: the robot there; results of another one are refused.
+        formats: export formats; None for the profile's `exports`, else the usual ones.
+        files: further files of the result's folder, as patterns such as `report.html`.
+        run: a command to run there afterwards, by sh.
+        run_timeout_s: time that it may take.
+        ssh: options of ssh_config for the connection, such as Port and IdentityFile.
+        keep: so many releases are kept, the current one included.
+    """
+
+    to: Text
+    robot: RobotName | None = None
+    formats: Annotated[tuple[Name, ...], Field(min_length=1, max_length=64)] | None = None
+    files: Annotated[tuple[Text, ...], Field(max_length=64)] = ()
+    run: Text | None = None
+    run_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 60.0
+    ssh: Annotated[dict[SshOption, Text | int], Field(max_length=32)] = Field(default_factory=dict)
+    keep: Annotated[int, Field(ge=2, le=1000)] = 10
+
+    @model_validator(mode="after")
+    def _place_is_clear(self) -> "TargetSettings":
+        remote = _REMOTE.fullmatch(self.to)
+        if remote is not None and not _REMOTE_PATH.fullmatch(remote[2]):
+            what = f"{remote[2]!r}: a path there has letters, digits and _ . / + @ = - only"
+            raise problem(what, "to")
+        if not self.to or self.to.startswith("-") or "\0" in self.to:
+            raise problem("no folder and no user@host:path", "to")
+        if remote is None and self.ssh:
+            raise problem("belongs to a target user@host:path", "ssh")
+        return self
+
+    @property
+    def host(self) -> str | None:
+        """[user@]host; None for a folder on this computer."""
+        remote = _REMOTE.fullmatch(self.to)
+        return None if remote is None else remote[1]
+
+    @property
+    def path(self) -> str:
+        """The folder there; relative ones begin at the home of the user there."""
+        remote = _REMOTE.fullmatch(self.to)
+        return self.to if remote is None else remote[2].removeprefix("~/") or "."
+
+    def located(self, folder: Path) -> "TargetSettings":
+        """Make paths on this computer absolute; relative ones start at the file's folder."""
+        if self.host is not None:
+            return self
+        return self.model_copy(update={"to": str((folder / Path(self.to).expanduser()).absolute())})

@@ -1,0 +1,150 @@
+"""Where a result comes from: which robot, which sensors, when, and a fingerprint of its inputs."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from lce_rig.core.errors import SessionError
+from lce_rig.core.limits import read_file
+from lce_rig.rig import Rig
+from lce_rig.session.capture import Capture
+from lce_rig.session.session import CAPTURED, Session
+
+# Timestamps before 2000 count from somewhere else than 1970, most often from when the sensor was switched on.
+_FIRST_UTC_NS = 946_684_800 * 10**9
+_LAST_UTC_NS = 4_102_444_800 * 10**9
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result comes from; a field is empty where nothing tells.
+
+    Attributes:
+        robot: its name, by the profile or `--robot`.
+        serials: serial numbers by sensor, as the devices told when captures were taken, else the profile's.
+        date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": when the sensors were so mounted.
+        session_sha256: fingerprint of captures and profile, see `content_sha256`.
+    """
+
+    robot: str = ""
+    serials: Mapping[str, str] = field(default_factory=dict)
+    date: str = ""
+    session_sha256: str = ""
+
+
+def provenance_of(sessions: Sequence[Session]) -> Provenance:
+    """Gather where a result of one session, or of several together, comes from.
+
+    Raises:
+        SessionError: captures are of different robots, or of different units of a sensor.
+    """
+    robots = sorted({session.rig.robot for session in sessions if session.rig.robot})
+    if len(robots) > 1:
+        raise SessionError(
+            f"the captures are of several robots: {', '.join(robots)}", "Calibrate each robot alone."
+        )
+    dates = [date for session in sessions if (date := date_of(session))]
+    return Provenance("".join(robots), serials_of(sessions), max(dates, default=""), content_sha256(sessions))
+
+
+def serials_of(sessions: Iterable[Session]) -> dict[str, str]:
+    """Give the serial number of each sensor that told one, or whose profile states one.
+
+    Raises:
+        SessionError: two units of one sensor took the captures.
+    """
+    found: dict[str, tuple[str, str]] = {}
+    for session in sessions:
+        told = [(c.name, c.serials) for c in _readable(session.captures)]
+        for where, serials in (("the profile", stated_serials(session.rig)), *told):
+            for sensor, serial in serials.items():
+                first, known = found.setdefault(sensor, (where, serial))
+                if known != serial:
+                    raise SessionError(
+                        f"{session.path}: {sensor} has serial number {known} in {first}, {serial} in {where}",
+                        "One result requires one set of sensors: reject the captures of the other unit with "
+                        "`lce-rig captures`, or correct `serial` in rig.yaml.",
+                    )
+    return {sensor: serial for sensor, (_, serial) in sorted(found.items())}
+
+
+def stated_serials(rig: Rig) -> dict[str, str]:
+    """List the serial numbers that a profile states, by sensor."""
+    lidars = {name: lidar.serial for name, lidar in rig.lidars.items() if lidar.serial}
+    return lidars | {name: camera.serial for name, camera in rig.cameras.items() if camera.serial}
+
+
+def date_of(session: Session) -> str:
+    """Give the time of a session's last capture: of arrival, else by its timestamps if these are UTC.
+
+    Where captures tell no time, it is when they came into the session; "" where nothing tells.
+    """
+    times_ns = [time_ns for capture in _readable(session.captures) for time_ns in capture.times_ns]
+    in_utc = [time_ns for time_ns in times_ns if _FIRST_UTC_NS <= time_ns < _LAST_UTC_NS]
+    if in_utc:
+        return datetime.fromtimestamp(max(in_utc) // 10**9, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
+    noted = [entry.get("time") for entry in session.read_journal() if entry.get("event") == CAPTURED]
+    dates = []
+    for time in noted:
+        with suppress(TypeError, ValueError, OverflowError):
+            dates.append(datetime.fromisoformat(str(time)).astimezone(timezone.utc))
+    return max(dates).strftime("%Y-%m-%dT%H:%M:%SZ") if dates else ""
+
+
+def content_sha256(sessions: Iterable[Session]) -> str:
+    """Fingerprint what results are computed from: profiles, and all samples and timestamps of all captures.
+
+    It does not depend on where a session lies, on names of recordings, on the robot's name, or on how sensors
+    are reached. The order of captures counts, as random subsets are drawn by it. A capture is known by the
+    SHA-256 of its files in its manifest, which reading a capture checks.
+    """
+    digest = hashlib.sha256()
+    for session in sessions:
+        digest.update(_canonical(_profile(session.rig)))
+        for capture in session.captures:
+            try:
+                digest.update(_canonical(capture.contents))
+            except SessionError:  # Detection refuses it.
+                digest.update(b"damaged\n")
+    return digest.hexdigest()
+
+
+def _profile(rig: Rig) -> dict[str, Any]:
+    """List what a result depends on in a profile; a network is known by its content."""
+    profile = rig.model_dump(
+        mode="json", exclude_defaults=True, exclude={"description", "robot", "targets", "exports"}
+    )
+    for kind in ("lidars", "cameras"):
+        for sensor in profile[kind].values():
+            sensor.pop("driver", None)
+            sensor.pop("serial", None)
+    for key in ("device", "baud"):
+        profile.get("sync", {}).pop(key, None)
+    for camera in profile["cameras"].values():
+        for channel in camera.get("channels", {}).values():
+            settings = channel.get("reconstruction") or {}
+            if settings.get("model"):
+                settings["model"] = _file_sha256(Path(settings["model"]))
+    return profile
+
+
+def _file_sha256(path: Path) -> str:
+    with suppress(OSError, ValueError):
+        return hashlib.sha256(read_file(path)).hexdigest()
+    return "unreadable"
+
+
+def _canonical(value: Any) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+
+
+def _readable(captures: Iterable[Capture]) -> Iterable[Capture]:
+    for capture in captures:
+        with suppress(SessionError):  # A damaged capture is reported when it is read.
+            _ = capture.contents
+            yield capture

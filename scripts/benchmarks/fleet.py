@@ -1,0 +1,351 @@
+"""Fleets: hundreds of simulated sessions, lost workers and clients, broken sessions, large tables, S3."""
+
+import contextlib
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.fleet_sessions import BROKEN, TRUTH, break_sessions, make_fleet
+from benchmarks.tables import print_head, print_row
+from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.storage import Storage
+from lce_rig.fleet.table import SCHEMA, TABLE, as_table, merged, table_bytes
+
+_KILL_EVERY_S, _CLIENT_LIVES_S = 20.0, 45.0
+_FEW_ROBOTS, _FEW_SESSIONS = 10, 40
+_TABLE_ROWS = 1_000_000
+# Figures of a run, not of a session.
+_OF_A_RUN = ("duration_s", "cpu_s", "peak_memory_mb", "finished", "source")
+
+
+def bench_fleet(folder: Path, only: str = "") -> None:
+    """Print the tables of docs/benchmarks.md.
+
+    Args:
+        folder: where simulated captures, sessions and registries are kept.
+        only: one of the parts: sessions, workers, kills, broken, table, s3.
+    """
+    folder = folder.resolve()
+    parts = {
+        "sessions": bench_sessions,
+        "workers": bench_workers,
+        "kills": bench_kills,
+        "broken": bench_broken,
+        "table": bench_table,
+        "s3": bench_s3,
+    }
+    for name, part in parts.items():
+        if only in ("", name):
+            print(f"\n{name} (load of the computer before: {os.getloadavg()[0]:.1f})\n", flush=True)
+            part(folder)
+
+
+def few_sessions(folder: Path) -> Path:
+    """Write forty sessions of ten robots, unless they are there."""
+    root = folder / "few"
+    make_fleet(root, folder / "captures", _FEW_ROBOTS, _FEW_SESSIONS, 0)
+    return root
+
+
+def _command(root: str | Path, registry: str | Path, *options: str) -> list[str]:
+    run = [sys.executable, "-m", "lce_rig", "fleet", "run", str(root), "--registry", str(registry), "--json"]
+    return [*run, "--pictures", "none", *options]
+
+
+def run_cli(root: str | Path, registry: str | Path, *options: str) -> tuple[dict[str, Any], float, float]:
+    """Run the command; return its summary, the time that it took and that of processors."""
+    before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    done = subprocess.run(_command(root, registry, *options), check=True, capture_output=True, text=True)
+    took_s, after = time.monotonic() - start_s, resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    summary: dict[str, Any] = json.loads(done.stdout)
+    return summary, took_s, cpu_s
+
+
+def rows_of(registry: Path) -> list[dict[str, Any]]:
+    """Read the table of a registry as plain values."""
+    rows: list[dict[str, Any]] = Registry(Storage.at(registry)).read_table().to_pylist()
+    return rows
+
+
+def bench_sessions(folder: Path) -> None:
+    """500 sessions of 60 robots. It continues where it was stopped."""
+    root, registry = folder / "fleet", folder / "registry"
+    make_fleet(root, folder / "captures")
+    summary, took_s, cpu_s = run_cli(root, registry, "--workers", "2")
+    rows = rows_of(registry)
+    in_sessions_s = sum(row["cpu_s"] for row in rows)
+    print_head(
+        "sessions", "run now", "robots", "rows", "status", "s", "s of a core", "of it in sessions", "MB"
+    )
+    megabytes = sum(path.stat().st_size for path in registry.rglob("*") if path.is_file()) / 1e6
+    robots = len({row["robot"] for row in rows})
+    states = ", ".join(f"{key} {n}" for key, n in summary["statuses"].items())
+    n = summary["n_run"] + summary["n_held"]
+    print_row(
+        n, summary["n_run"], robots, len(rows), states, f"{took_s:.0f}", f"{cpu_s:.0f}",
+        f"{in_sessions_s:.0f}", f"{megabytes:.0f}",
+    )  # fmt: skip
+    print(f"\ntruth: {root / TRUTH}, registry: {registry}", flush=True)
+
+
+def bench_workers(folder: Path) -> None:
+    """Two workers against one on the same sessions, and what is not the sessions' own work."""
+    root = few_sessions(folder)
+    print_head("workers", "sessions", "s", "s of a core", "of it in sessions", "rest", "load before")
+    took = {}
+    for workers in (1, 2):
+        registry = folder / f"registry-{workers}"
+        shutil.rmtree(registry, ignore_errors=True)
+        load = os.getloadavg()[0]
+        summary, took[workers], cpu_s = run_cli(root, registry, "--workers", str(workers))
+        in_sessions_s = sum(row["cpu_s"] for row in rows_of(registry))
+        rest = (cpu_s - in_sessions_s) / cpu_s
+        print_row(
+            workers, summary["n_run"], f"{took[workers]:.1f}", f"{cpu_s:.1f}", f"{in_sessions_s:.1f}",
+            f"{100 * rest:.1f} %", f"{load:.1f}",
+        )  # fmt: skip
+    print(f"\ntwo workers are {took[1] / took[2]:.2f} x as fast as one", flush=True)
+
+
+def bench_kills(folder: Path) -> None:
+    """A worker is killed every 20 s, and the client after 45 s, until all is done."""
+    root, registry = few_sessions(folder), folder / "registry-kills"
+    shutil.rmtree(registry, ignore_errors=True)
+    n_workers = n_clients = 0
+    while True:
+        # A group of its own, so that workers are found, and none of anybody else.
+        client = subprocess.Popen(
+            _command(root, registry, "--workers", "2"), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
+        start_s = time.monotonic()
+        next_s = start_s + _KILL_EVERY_S
+        while client.poll() is None:
+            time.sleep(0.2)
+            if time.monotonic() > next_s:
+                next_s += _KILL_EVERY_S
+                workers = workers_of(client.pid)
+                if workers:
+                    n_workers += _kill(workers[n_workers % len(workers)])
+            if n_clients < 3 and time.monotonic() > start_s + _CLIENT_LIVES_S:
+                n_clients += _kill(client.pid)
+        output = client.communicate()[0]
+        if client.returncode == 0:
+            break
+    rows = rows_of(registry)
+    sources = [row["source"] for row in rows]
+    wanted = {str(path.parent) for path in root.glob("*/*/session.json")}
+    folders = Registry(Storage.at(registry)).folders()
+    print_head(
+        "workers killed", "clients killed", "sessions", "lost", "twice", "folders", "status of the last run"
+    )
+    print_row(
+        n_workers, n_clients, len(wanted), len(wanted - set(sources)), len(sources) - len(set(sources)),
+        len(folders), json.loads(output)["statuses"],
+    )  # fmt: skip
+
+
+def _kill(pid: int) -> int:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+        return 1
+    return 0
+
+
+def workers_of(pid: int) -> list[int]:
+    """List the worker processes of Dask that a client started."""
+    import psutil
+
+    with contextlib.suppress(psutil.Error):
+        children = psutil.Process(pid).children()
+        return sorted(child.pid for child in children if "spawn_main" in " ".join(child.cmdline()))
+    return []
+
+
+def bench_broken(folder: Path) -> None:
+    """A fifth of the sessions is broken; each must be named with its cause, the rest unharmed."""
+    sound = folder / "registry-2"
+    if not sound.exists():
+        run_cli(few_sessions(folder), sound, "--workers", "2")
+    root, registry = folder / "broken", folder / "registry-broken"
+    shutil.rmtree(root, ignore_errors=True)
+    shutil.rmtree(registry, ignore_errors=True)
+    make_fleet(root, folder / "captures", _FEW_ROBOTS, _FEW_SESSIONS, 0)
+    broken = break_sessions(root)
+    run_cli(root, registry, "--workers", "2", "--time-limit", "60", "--memory-limit", "1500")
+    rows = {row["source"]: row for row in rows_of(registry)}
+    print_head("kind", "sessions", "status", "cause")
+    for kind, (_, wanted) in BROKEN.items():
+        own = [rows[path] for path, each in broken.items() if each == kind]
+        named = sorted({f"{row['status']}: {row['cause']}" for row in own})
+        right = sum(row["status"] == wanted for row in own)
+        print_row(kind, len(own), f"{right} of {len(own)} {wanted}", ", ".join(named))
+    same = [_same_result(registry, sound, row) for path, row in rows.items() if path not in broken]
+    print(f"\nothers: {sum(same)} of {len(same)} with the same result as without broken ones", flush=True)
+
+
+def _same_result(registry: Path, sound: Path, row: dict[str, Any]) -> bool:
+    path = Path(row["folder"]) / "result.json"
+    return row["status"] == "ok" and (registry / path).read_bytes() == (sound / path).read_bytes()
+
+
+def large_table(n_rows: int) -> Any:
+    """Make a table of results as they are, drawn at random: 2000 robots, dates of five years."""
+    import pyarrow as pa
+
+    rng = np.random.default_rng(0)
+    n_kinds = 1000
+    codes = ("verdict.rotation_uncertain", "verdict.translation_uncertain", "verdict.largest_cause")
+    rows = [
+        {
+            "rig": "rlfs", "camera": "cam", "lidar": "lidar", "program": "lce-rig 0.1.0", "method": "paper",
+            "status": "ok" if rng.random() > 0.03 else "failed",
+            "verdict": str(rng.choice(["pass", "marginal", "fail"], p=[0.7, 0.25, 0.05])),
+            "findings": codes[: rng.integers(1, 4)], "severities": ("warning",),
+            "site": f"hall {rng.integers(9)}",
+        }
+        for _ in range(n_kinds)
+    ]  # fmt: skip
+    table = as_table([{"robot": "", "folder": "", **row} for row in rows]).take(
+        pa.array(rng.integers(0, n_kinds, n_rows))
+    )
+    robots = rng.integers(0, 2000, n_rows)
+    days = np.datetime64("2021-01-01T00:00:00") + rng.integers(0, 5 * 365 * 86400, n_rows)
+    dates = np.char.add(days.astype(str), "Z")
+    digests = [bytes(each).hex() for each in rng.integers(0, 256, (n_rows, 32), dtype=np.uint8)]
+    names = [f"r{robot:04d}" for robot in robots]
+    columns: dict[str, Any] = {
+        "robot": names,
+        "date": dates.tolist(),
+        "session_sha256": digests,
+        "folder": [f"{r}/{d}-{h[:12]}" for r, d, h in zip(names, dates, digests, strict=True)],
+        "source": [f"s3://sessions/{r}/{d}" for r, d in zip(names, dates, strict=True)],
+        "lidar_serial": [f"L-{name}" for name in names],
+        "camera_serial": [f"C-{name}" for name in names],
+    }
+    floats = {"T_cam_lidar": 16, "cov": 21, "cov_shared": 21}
+    for name, length in floats.items():
+        values = pa.array(rng.standard_normal(n_rows * length))
+        columns[name] = pa.FixedSizeListArray.from_arrays(values, length)
+    for name in ("sigma_rotation_deg", "sigma_translation_m", "mpe_m", "mee_m", "cpu_s", "duration_s"):
+        columns[name] = rng.random(n_rows)
+    for name, values in columns.items():
+        index = SCHEMA.get_field_index(name)
+        table = table.set_column(index, SCHEMA.field(name), pa.array(values, SCHEMA.field(name).type))
+    return merged([table])
+
+
+def bench_table(folder: Path) -> None:
+    """Write and query a table of a million rows."""
+    registry = folder / "registry-large"
+    registry.mkdir(parents=True, exist_ok=True)
+    if not (registry / TABLE).exists():
+        table = large_table(_TABLE_ROWS)
+        start_s = time.monotonic()
+        (registry / TABLE).write_bytes(table_bytes(table))
+        took_s, size = time.monotonic() - start_s, (registry / TABLE).stat().st_size
+        print(f"{_TABLE_ROWS} rows: {size / 1e6:.0f} MB, written in {took_s:.1f} s\n")
+    print_head("condition", "rows", "s", "peak MB")
+    for where in (
+        "verdict = 'fail' and date > '2026-01-01'",
+        "robot = 'r0017'",
+        "list_contains(findings, 'verdict.largest_cause') and sigma_rotation_deg > 0.999",
+    ):
+        command = [sys.executable, "-m", "lce_rig", "fleet", "table", "--registry", str(registry)]
+        with tempfile.TemporaryFile() as output:
+            start_s = time.monotonic()
+            process = subprocess.Popen([*command, "--where", where, "--csv"], stdout=output)
+            _, status, used = os.wait4(process.pid, 0)
+            took_s = time.monotonic() - start_s
+            process.returncode = status
+            output.seek(0)
+            n = sum(1 for _ in output) - 1
+        print_row(f"`{where}`", n, f"{took_s:.2f}", f"{used.ru_maxrss / 1024:.0f}")
+
+
+@contextlib.contextmanager
+def s3_server() -> Iterator[str]:
+    """Serve S3 on loopback, with a bucket `fleet`; the environment names it while the block lasts."""
+    from moto.server import ThreadedMotoServer
+    from s3fs import S3FileSystem
+
+    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    settings = {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ |= settings
+    S3FileSystem.clear_instance_cache()  # an instance keeps the address that it was made with
+    try:
+        Storage("s3://fleet").fs.mkdir("fleet")
+        yield "s3://fleet"
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+        server.stop()
+
+
+def files_of(place: Storage) -> dict[str, bytes]:
+    """Read every file of a registry but the table, without the figures that differ between runs."""
+    prefix = place.path.rstrip("/") + "/"
+    files = {}
+    for path in sorted(place.fs.find(place.path)):
+        name, data = path.removeprefix(prefix), place.fs.cat_file(path)
+        if name.endswith("fleet.json"):
+            document = json.loads(data)
+            for row in document["rows"]:
+                for key in _OF_A_RUN:
+                    row.pop(key)
+            data = json.dumps(document).encode()
+        if name != TABLE:
+            files[name] = data
+    return files
+
+
+def bench_s3(folder: Path) -> None:
+    """The same sessions and registry on a disk and in an S3 server on loopback."""
+    root, registry = folder / "few", folder / "registry-2"
+    if not registry.exists():
+        run_cli(few_sessions(folder), registry, "--workers", "2")
+    with s3_server() as bucket:
+        store = Storage(bucket)
+        store.fs.put(str(root) + "/", f"{store.path}/sessions", recursive=True)
+        summary, took_s, _ = run_cli(f"{bucket}/sessions", f"{bucket}/registry", "--workers", "2")
+        there, here = files_of(store / "registry"), files_of(Storage.at(registry))
+        columns = [name for name in SCHEMA.names if name not in _OF_A_RUN]
+        tables = [
+            table_bytes_of(Registry(place).read_table(columns))
+            for place in (store / "registry", Storage.at(registry))
+        ]
+    same = sum(there.get(name) == data for name, data in here.items())
+    print_head("sessions", "s", "files on the disk", "the same in S3", "more in S3", "tables")
+    equal = "the same" if tables[0] == tables[1] else "differ"
+    print_row(summary["n_run"], f"{took_s:.0f}", len(here), same, len(set(there) - set(here)), equal)
+
+
+def table_bytes_of(table: Any) -> bytes:
+    """Write some columns of a table as bytes that can be compared."""
+    import pyarrow as pa
+
+    buffer = pa.BufferOutputStream()
+    with pa.ipc.new_stream(buffer, table.schema) as writer:
+        writer.write_table(table.combine_chunks())
+    return bytes(buffer.getvalue())

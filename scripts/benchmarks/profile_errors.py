@@ -1,0 +1,106 @@
+"""Simulated sessions whose lens, board and ranges differ from the profile as its standard deviations say."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.still_sessions import StillSession, draw_corners
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.detect.detection import Detections
+from lce_rig.extrinsics.tolerances import Tolerances, bend, bow
+from lce_rig.rig import Rig
+from lce_rig.solvers.covariance import symmetric_inverse
+
+# A stream of random numbers of its own.
+_STREAM = 3
+
+
+def with_profile_errors(
+    rig: Rig, session: StillSession, seed: int, sigma_px: float
+) -> tuple[Rig, Detections]:
+    """Draw how wrong a profile is, and what the sensors would have seen of the same session.
+
+    The simulated plate and LiDAR stay what they are: the profile states another plate, and points move along
+    their rays by a common range offset and the plate's bow.
+
+    Args:
+        rig: that was simulated, of one camera and one LiDAR.
+        session: of it.
+        seed: of the errors.
+        sigma_px: noise of each corner's coordinates.
+
+    Returns:
+        The profile to calibrate with, and its detections.
+    """
+    rng = np.random.default_rng([seed, _STREAM])
+    (camera, settings), (lidar, of_lidar) = next(iter(rig.cameras.items())), next(iter(rig.lidars.items()))
+    known, board = Tolerances.of(settings, rig.board), rig.board.to_board()
+    lens = _draw_lens(known, rng)
+    width_m, height_m = (board.width_m, board.height_m) + known.plate_m * rng.standard_normal(2)
+    corners = replace(
+        board,
+        square_m=board.square_m * (1 + known.square_size * float(rng.standard_normal())),
+        pattern_offset_m=tuple(board.pattern_offset_m + known.pattern_offset_m * rng.standard_normal(2)),
+    ).corners()
+    bows_m = known.bow_m * rng.standard_normal(2)
+    corners = corners + sum(bow(corners, axis, height, board) for axis, height in enumerate(bows_m))
+    offset_m = of_lidar.range_offset_sigma_m * float(rng.standard_normal())
+    images: dict[str, ImageBoard] = {}
+    for name, T_cam_board in session.T_cam_board.items():
+        image = draw_corners(rig, T_cam_board, sigma_px, rng, lens, corners)
+        if image is not None:
+            images[name] = image
+    scans = {
+        item.capture: [_as_scanned(found, board, bows_m, offset_m) for found in item.lidar]
+        for item in session.candidates
+        if item.capture in images
+    }
+    plate = {"width_m": float(width_m), "height_m": float(height_m)}
+    profile = rig.model_copy(update={"board": rig.board.model_copy(update=plate)})
+    channel = next(iter(settings.channels))
+    return profile, Detections({(camera, channel): {name: images[name] for name in scans}}, {lidar: scans})
+
+
+def _draw_lens(known: Tolerances, rng: np.random.Generator) -> Intrinsics:
+    lens = known.lens
+    focal, cx_px, cy_px, corner_px = rng.standard_normal(4) * [
+        known.focal_length,
+        known.principal_point_px,
+        known.principal_point_px,
+        known.distortion_px,
+    ]
+    radius = np.hypot(lens.width_px, lens.height_px) / 2 / lens.fx_px
+    k1, *others = lens.distortion or (0.0,) * 4
+    return replace(
+        lens,
+        fx_px=lens.fx_px * (1 + focal),
+        fy_px=lens.fy_px * (1 + focal),
+        cx_px=lens.cx_px + cx_px,
+        cy_px=lens.cy_px + cy_px,
+        distortion=(k1 + corner_px / (lens.fx_px * radius**3), *others),
+    )
+
+
+def _as_scanned(lidar: LidarBoard, board: Board, bows_m: Array, offset_m: float) -> LidarBoard:
+    for axis, height_m in enumerate(bows_m):
+        lidar = bend(lidar, axis, float(height_m), board)
+    return _lengthened(lidar, offset_m)
+
+
+def _lengthened(lidar: LidarBoard, offset_m: float) -> LidarBoard:
+    """Add an offset to all ranges; the plane follows as in `systematic.shift_rings`."""
+    rays, end_rays = (
+        points / np.linalg.norm(points, axis=1, keepdims=True) for points in (lidar.points, lidar.edge_points)
+    )
+    m = -lidar.plane[:3] / lidar.plane[3]
+    jacobian = -rays / (rays @ m)[:, None] ** 2
+    m = m + offset_m * symmetric_inverse(jacobian.T @ jacobian) @ jacobian.sum(axis=0)
+    return replace(
+        lidar,
+        points=lidar.points + offset_m * rays,
+        edge_points=lidar.edge_points + offset_m * end_rays,
+        plane=np.append(-m, 1.0) / np.linalg.norm(m),
+    )

@@ -1,0 +1,25 @@
+"""view: a hint without a display, and a result that must be there."""
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _no_display(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_without_a_display_it_exits_with_5_and_names_the_option(lce_rig, calibrated):
+    outcome = lce_rig("view", calibrated)
+    assert outcome.code == 5
+    assert "--output" in outcome.err
+
+
+def test_without_a_result_it_says_which_verb_makes_one(lce_rig, session):
+    outcome = lce_rig("view", session)
+    assert outcome.code == 4
+    assert "lce-rig calibrate" in outcome.err
+
+
+def test_a_capture_that_is_not_there_is_refused(lce_rig, calibrated):
+    assert lce_rig("view", calibrated, "--capture", "999999").code == 4

@@ -1,0 +1,3 @@
+"""See `rclpy`."""
+
+qos_profile_sensor_data = "best effort"

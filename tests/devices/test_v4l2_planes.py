@@ -1,0 +1,79 @@
+"""Cameras of the kernel's video interface; a preloaded library takes the kernel's side."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+KERNEL = Path(__file__).with_name("video_kernel.c")
+READ = """
+import json, sys
+from itertools import islice
+import numpy as np
+from lce_rig.devices.v4l2.driver import V4l2Source
+from lce_rig.rig import load_rig
+
+settings = load_rig("rlfs").cameras["cam"]
+plain = {"device": "/dev/null", "controls": {}, "frame_rate_hz": None, "pixel_format": None}
+driver = settings.driver.model_copy(update=plain)
+settings = settings.model_copy(update={"driver": driver, "resolution_px": (64, 48)})
+for _ in range(2):  # opened a second time, the buffers are given back and asked for again
+    with V4l2Source("cam", settings) as source:
+        images = list(islice(source.samples(), 5))
+        status = source.status()
+print(json.dumps({
+    "pixels": [image.pixels.tolist() for image in images], "counts": [image.count for image in images],
+    "stamps_ns": [image.stamp_ns for image in images], "clock": status.clock.finding.code,
+    "device": status.device, "problems": [each.code for each in status.problems]}))
+"""
+
+
+@pytest.fixture(scope="module")
+def kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    compiler = shutil.which("cc")
+    if compiler is None or not Path("/usr/include/linux/videodev2.h").exists():
+        pytest.skip("no C compiler, or no kernel headers")
+    library = tmp_path_factory.mktemp("kernel") / "video_kernel.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, KERNEL, "-ldl"], check=True)
+    return library
+
+
+def read(kernel: Path, form: str, n_planes: int) -> subprocess.CompletedProcess[str]:
+    told = {"LD_PRELOAD": str(kernel), "VIDEO_FORMAT": form, "VIDEO_PLANES": str(n_planes)}
+    return subprocess.run(
+        [sys.executable, "-c", READ], env={**os.environ, **told}, capture_output=True, text=True, timeout=60
+    )
+
+
+@pytest.mark.parametrize(
+    ("form", "n_planes"),
+    [("NV12", 0), ("UYVY", 0), ("UYVY", 1), ("NV12", 1), ("NM12", 2), ("YM12", 3)],
+)
+def test_images_of_one_or_several_planes_come_whole(kernel: Path, form: str, n_planes: int) -> None:
+    ran = read(kernel, form, n_planes)
+    assert ran.returncode == 0, ran.stderr
+    said: dict[str, Any] = json.loads(ran.stdout)
+    assert (
+        form in said["device"]
+        and said["clock"] == "clock.mid_exposure"
+        and said["problems"] == ["clock.exposure_unknown"]
+    )
+    counts = np.array(said["counts"])
+    assert (np.diff(counts) >= 1).all() and (np.diff(said["stamps_ns"]) > 0).all()
+    for pixels, count in zip(said["pixels"], counts, strict=True):
+        # Luma of video range, no colour: grey = (Y - 16) 255 / 219.
+        luma = 20 + np.arange(64) // 2 + count
+        grey = np.clip((luma - 16.0) * 255 / 219, 0, 255)
+        assert np.array(pixels).shape == (48, 64, 3)
+        assert np.abs(np.array(pixels) - grey[None, :, None]).max() <= 2
+
+
+def test_planes_that_do_not_belong_to_the_format_are_refused(kernel: Path) -> None:
+    ran = read(kernel, "NM12", 3)  # of three planes, the third has no place in it
+    assert ran.returncode != 0 and "SourceError" in ran.stderr and "pixel_format" in ran.stderr

@@ -1,0 +1,66 @@
+"""Rows of a fleet's table, as results give them."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.fleet.table import Row
+from lce_rig.rig import Rig, load_rig
+from lce_rig.session import Session
+from lce_rig.simulate import simulate_captures
+
+
+@pytest.fixture
+def row() -> Callable[..., Row]:
+    def make(robot: str = "r1", date: str | None = "2026-01-05T10:00:00Z", **changes: object) -> Row:
+        known: dict[str, object] = {
+            "rig": "rlfs",
+            "folder": f"{robot}/{str(date)[:10]}-0123456789ab",
+            "camera": "cam",
+            "lidar": "lidar",
+            "verdict": "pass",
+            "findings": ("verdict.largest_cause",),
+            "severities": ("note",),
+            "T_cam_lidar": tuple(np.eye(4).ravel().tolist()),
+            "cov": tuple(float(k) for k in range(21)),
+            "n_used": 8,
+        }
+        return Row(robot, date=date, **(known | changes))  # type: ignore[arg-type]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def small_rig() -> Rig:
+    """Give the rig rlfs with images of half the size, which are found in half the time."""
+    rig = load_rig("rlfs")
+    camera = rig.cameras["cam"]
+    halves = {key: getattr(camera.intrinsics, key) / 2 for key in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    lens = camera.intrinsics.model_copy(update=halves)
+    small = camera.model_copy(update={"resolution_px": (640, 360), "intrinsics": lens})
+    return rig.model_copy(update={"cameras": {"cam": small}})
+
+
+@pytest.fixture(scope="session")
+def simulated(small_rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Simulate a session of eight captures."""
+    path = tmp_path_factory.mktemp("simulated") / "session"
+    with Session.create(path, small_rig) as session:
+        for capture in simulate_captures(small_rig, n_captures=8, seed=3):
+            session.add_capture(capture.images, capture.scans, {"source": "simulated"})
+    return path
+
+
+@pytest.fixture
+def fleet_root(simulated: Path, tmp_path: Path) -> Path:
+    """Lay out three sessions of two robots, of them one without result and one that cannot be read."""
+    root = tmp_path / "root"
+    for name in ("r1/monday", "r2/monday", "r2/torn"):
+        shutil.copytree(simulated, root / name)
+    for name in ("000002", "000003", "000004", "000005", "000006", "000007"):
+        shutil.rmtree(root / "r2/monday/captures" / name)
+    (root / "r2/torn/session.json").write_text('{"format_ver')
+    return root

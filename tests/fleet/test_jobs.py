@@ -1,0 +1,81 @@
+"""Sessions and recordings below a root, and what a manifest says of them."""
+
+import pytest
+
+from lce_rig.core.errors import NotEnoughDataError, UsageError
+from lce_rig.fleet.jobs import Entry, find_jobs
+from lce_rig.fleet.storage import Storage
+
+
+def lay_out(root, *sessions):
+    for name in sessions:
+        (root / name).mkdir(parents=True)
+        (root / name / "session.json").write_text("{}")
+
+
+def test_every_session_is_found_once_and_named_after_the_first_folder(tmp_path):
+    lay_out(tmp_path, "r1/2026/a", "r2/b", "c", "r1/2026/a/results/inner", ".hidden/d")
+    jobs = find_jobs(Storage.at(tmp_path))
+    found = {job.source.removeprefix(f"{tmp_path}/"): job.fallback_robot for job in jobs}
+    assert found == {"r1/2026/a": "r1", "r2/b": "r2", "c": ""}
+
+
+def test_a_manifest_names_robot_profile_and_collector_by_patterns(tmp_path):
+    lay_out(tmp_path, "hall/r1/a", "hall/r2/b", "yard/r1/c")
+    (tmp_path / "bags").mkdir()
+    (tmp_path / "bags/r7.bag").write_bytes(b"")
+    (tmp_path / "fleet.yaml").write_text(
+        "sessions:\n"
+        "  - {path: 'hall/{robot}/*', collector: Ann, site: hall 3}\n"
+        "  - {path: '{site}/r1/*', robot: r1}\n"
+        "  - {path: 'bags/{robot}.bag', rig: profiles/r.yaml}\n"
+    )
+    jobs = {job.source.removeprefix(f"{tmp_path}/"): job for job in find_jobs(Storage.at(tmp_path))}
+    assert set(jobs) == {"hall/r1/a", "hall/r2/b", "yard/r1/c", "bags/r7.bag"}
+    assert [jobs[name].robot for name in sorted(jobs)] == ["r7", "r1", "r2", "r1"]
+    assert (jobs["hall/r2/b"].collector, jobs["hall/r2/b"].site) == ("Ann", "hall 3")
+    assert jobs["yard/r1/c"].site == "yard"
+    assert jobs["bags/r7.bag"].rig == f"{tmp_path}/profiles/r.yaml"
+
+
+def test_a_table_of_comma_separated_values_serves_as_well(tmp_path):
+    lay_out(tmp_path, "a", "b")
+    (tmp_path / "fleet.csv").write_text("path,robot,rig\na,r1,\nb,r2,rlfs\n")
+    assert [(job.robot, job.rig) for job in find_jobs(Storage.at(tmp_path))] == [("r1", ""), ("r2", "rlfs")]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sessions: [{path: a, wheels: 4}]",
+        "sessions: [{robot: a}]",
+        "sessions: [{path: '{driver}/*'}]",
+        "runs: []",
+        "[",
+    ],
+)
+def test_a_manifest_that_cannot_be_used_is_refused(tmp_path, text):
+    lay_out(tmp_path, "a")
+    (tmp_path / "fleet.yaml").write_text(text)
+    with pytest.raises(UsageError):
+        find_jobs(Storage.at(tmp_path))
+
+
+def test_a_root_without_sessions_is_refused(tmp_path):
+    with pytest.raises(NotEnoughDataError):
+        find_jobs(Storage.at(tmp_path))
+    with pytest.raises(UsageError):
+        find_jobs(Storage.at(tmp_path / "absent"))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "path", "fields"),
+    [
+        ("{robot}/*", "r1/a", {"robot": "r1"}),
+        ("{robot}-{site}.bag", "r1-hall.bag", {"robot": "r1", "site": "hall"}),
+        ("**/{robot}/s", "x/y/r2/s", {"robot": "r2"}),
+        ("{robot}/*", "r1/a/b", {}),
+    ],
+)
+def test_fields_are_read_from_a_path(pattern, path, fields):
+    assert Entry(path=pattern).fields_of(path) == fields

@@ -1,0 +1,121 @@
+"""Sessions in processes of their own: whatever they do, the cause is known and the next one runs."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lce_rig.fleet.process import SessionServer
+
+# What a session does, by name; the server imports this module by its path.
+_MODULE = """
+import os, signal, time
+def done(arguments, tell):
+    tell({"robot": arguments["robot"]})
+    return [{"pid": os.getpid()}]
+def hang(arguments, tell):
+    tell({"robot": "r1"})
+    time.sleep(60)
+def eat(arguments, tell):
+    held = []
+    while True:
+        held.append(bytearray(os.urandom(1 << 20) * 20))
+        time.sleep(0.01)
+def gulp(arguments, tell):
+    return bytearray(1 << 40)
+def crash(arguments, tell):
+    os.kill(os.getpid(), signal.SIGSEGV)
+def leave(arguments, tell):
+    os._exit(3)
+def stumble(arguments, tell):
+    print("this must not come between the messages")
+    raise ZeroDivisionError("of no use")
+"""
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionServer]:
+    folder = tmp_path_factory.mktemp("sessions")
+    (folder / "acts_of_sessions.py").write_text(_MODULE)
+    before = os.environ.get("PYTHONPATH", "")
+    os.environ["PYTHONPATH"] = f"{folder}{os.pathsep}{before}"
+    server = SessionServer()
+    os.environ["PYTHONPATH"] = before
+    yield server
+    server.close()
+
+
+def act(server: SessionServer, name: str, limit_s: float = 60.0, limit_mb: float = 1000.0):
+    return server.run(f"acts_of_sessions:{name}", {"robot": "r1"}, limit_s, limit_mb)
+
+
+def test_a_session_returns_its_rows_and_what_it_cost(server):
+    first, second = act(server, "done"), act(server, "done")
+    assert first.rows and second.rows and first.rows[0]["pid"] != second.rows[0]["pid"]
+    assert first.known == {"robot": "r1"} and first.exit_code == 0 and not first.reason
+    assert first.peak_memory_mb > 10
+
+
+def test_one_that_hangs_is_ended_at_its_time_limit(server):
+    start_s = time.monotonic()
+    ended = act(server, "hang", limit_s=1.0)
+    assert (ended.rows, ended.reason, ended.known) == (None, "timed_out", {"robot": "r1"})
+    assert time.monotonic() - start_s < 20
+
+
+@pytest.mark.parametrize("way", ["eat", "gulp"])
+def test_one_that_eats_memory_is_ended_at_its_limit(server, way):
+    ended = act(server, way, limit_mb=700.0)
+    assert (ended.rows, ended.reason) == (None, "out_of_memory")
+    assert ended.peak_memory_mb < 1500
+
+
+def test_one_that_crashes_names_its_signal_or_exit_code(server):
+    assert act(server, "crash").exit_code == -signal.SIGSEGV
+    assert act(server, "leave").exit_code == 3
+
+
+def test_a_bug_is_named_by_its_last_line(server):
+    ended = act(server, "stumble")
+    assert ended.reason == "bug" and "ZeroDivisionError" in ended.detail
+
+
+def test_the_next_session_runs_after_all_of_these(server):
+    assert act(server, "done").rows
+
+
+def test_the_session_ends_with_whoever_started_it(tmp_path):
+    (tmp_path / "acts_of_sessions.py").write_text(
+        "import os, pathlib, time\n"
+        "def hang(arguments, tell):\n"
+        "    pathlib.Path(arguments['file']).write_text(str(os.getpid()))\n"
+        "    time.sleep(60)\n"
+    )
+    pid_file = tmp_path / "pid"
+    script = (
+        "from lce_rig.fleet.process import SessionServer\n"
+        f"SessionServer().run('acts_of_sessions:hang', {{'file': {str(pid_file)!r}}}, 60, 4000)\n"
+    )
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    worker = subprocess.Popen([sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": path})
+    deadline_s = time.monotonic() + 60
+    while not (pid_file.exists() and pid_file.read_text()) and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    pid = int(pid_file.read_text())
+    worker.kill()
+    worker.wait()
+    while _is_alive(pid) and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    assert not _is_alive(pid)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

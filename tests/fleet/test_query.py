@@ -1,0 +1,61 @@
+"""Rows chosen by a condition."""
+
+import pytest
+
+from lce_rig.core.errors import SessionError, UsageError
+from lce_rig.fleet.query import query
+from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.storage import Storage
+from lce_rig.fleet.table import SCHEMA, as_table
+
+
+@pytest.fixture
+def registry(tmp_path, row):
+    registry = Registry(Storage.at(tmp_path))
+    rows = [
+        row("r1", "2025-12-01", folder="r1/a", verdict="fail"),
+        row("r1", "2026-02-01", folder="r1/b", verdict="fail", findings=("verdict.a", "verdict.b")),
+        row("r2", "2026-02-01", folder="r2/c", verdict="pass"),
+        row("r3", None, folder="r3/d", verdict=None, status="timed_out"),
+    ]
+    registry.write_table(as_table(rows))
+    return registry
+
+
+@pytest.mark.parametrize(
+    ("where", "found"),
+    [
+        ("", ["r1/a", "r1/b", "r2/c", "r3/d"]),
+        ("verdict = 'fail' and date > '2026-01-01'", ["r1/b"]),
+        ("status <> 'ok' or robot like '%2'", ["r2/c", "r3/d"]),
+        ("list_contains(findings, 'verdict.b')", ["r1/b"]),
+        ("n_used > 100", []),
+    ],
+)
+def test_a_condition_chooses_rows(registry, where, found):
+    chosen = query(registry, where)
+    assert chosen["folder"].to_pylist() == found
+    assert chosen.column_names == SCHEMA.names
+    assert query(registry, where, ["folder", "robot"]).column_names == ["folder", "robot"]
+
+
+@pytest.mark.parametrize(
+    "where", ["wheels = 4", "verdict = ", "true); copy (select 1) to 'x.csv'; --", "verdict ="]
+)
+def test_a_wrong_condition_names_the_columns(registry, where, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError) as caught:
+        query(registry, where)
+    assert "sigma_rotation_deg" in caught.value.hint
+    assert not (tmp_path / "x.csv").exists()
+
+
+def test_a_wrong_column_names_those_that_there_are(registry):
+    with pytest.raises(UsageError) as caught:
+        query(registry, columns=["wheels"])
+    assert "sigma_rotation_deg" in caught.value.hint
+
+
+def test_a_registry_without_a_table_is_refused(tmp_path):
+    with pytest.raises(SessionError):
+        query(Registry(Storage.at(tmp_path)), "true")

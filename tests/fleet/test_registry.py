@@ -1,0 +1,82 @@
+"""The folders of results, and the table that follows them."""
+
+import pytest
+
+from lce_rig.core.errors import SessionError
+from lce_rig.fleet.registry import Registry, write_rows
+from lce_rig.fleet.storage import Storage
+from lce_rig.fleet.table import ROWS, TABLE
+
+
+@pytest.fixture
+def registry(tmp_path):
+    return Registry(Storage.at(tmp_path / "registry"))
+
+
+def write(registry, row, *files):
+    with registry.result(row.folder) as draft:
+        for name in files:
+            (draft / name).write_text(row.folder)
+        return write_rows(draft, [row])
+
+
+def folders(table):
+    return table["folder"].to_pylist()
+
+
+def test_results_enter_the_table_in_the_order_of_robots_and_dates(registry, row):
+    late = row("r1", "2026-02-01", folder="r1/b", source="1")
+    early = row("r1", "2026-01-01", folder="r1/a", source="2")
+    other = row("r0", "2026-03-01", folder="r0/c", source="3")
+    fresh = [document for each in (late, early, other) for document in write(registry, each)]
+    assert folders(registry.consolidate(fresh)) == ["r0/c", "r1/a", "r1/b"]
+    assert folders(registry.read_table()) == ["r0/c", "r1/a", "r1/b"]
+
+
+def test_a_table_that_is_lost_or_behind_is_written_again_from_the_folders(registry, row):
+    rows = [row("r1", folder=f"r1/{k}", source=str(k)) for k in range(3)]
+    registry.consolidate(write(registry, rows[0]))
+    for each in rows[1:]:
+        write(registry, each)  # whoever wrote these was killed before the table
+    whole = registry.consolidate()
+    assert folders(whole) == ["r1/0", "r1/1", "r1/2"]
+    (registry.place.local / TABLE).write_bytes(b"torn")
+    assert registry.consolidate().equals(whole)
+    assert registry.consolidate(rebuild=True).equals(whole)
+
+
+def test_a_result_that_is_removed_leaves_the_table(registry, row):
+    fresh = write(registry, row(folder="r1/a", source="1")) + write(registry, row(folder="r1/b", source="2"))
+    registry.consolidate(fresh)
+    registry.remove("r1/a")
+    assert folders(registry.consolidate()) == ["r1/b"]
+
+
+def test_a_later_result_of_a_source_takes_the_place_of_the_earlier(registry, row):
+    write(registry, row(folder="r1/old", source="s", finished="2026-01-01T00:00:00Z"))
+    write(registry, row(folder="r1/new", source="s", finished="2026-01-02T00:00:00Z"))
+    assert folders(registry.consolidate()) == ["r1/new"]
+    assert (registry.place / "r1").names() == ["new"]
+
+
+def test_a_folder_is_replaced_whole_and_stays_where_writing_fails(registry, row):
+    write(registry, row(folder="r1/a", n_used=1), "old.txt")
+    with pytest.raises(RuntimeError), registry.result("r1/a") as draft:
+        (draft / "half.txt").write_text("")
+        raise RuntimeError
+    assert (registry.place / "r1/a").names() == [ROWS, "old.txt"]
+    write(registry, row(folder="r1/a", n_used=2), "new.txt")
+    assert (registry.place / "r1/a").names() == [ROWS, "new.txt"]
+    assert registry.rows("r1/a")[0]["n_used"] == 2
+
+
+def test_rows_that_other_hands_damaged_count_as_missing(registry, row):
+    write(registry, row(folder="r1/a"))
+    (registry.place.local / "r1/a" / ROWS).write_text("{")
+    assert registry.rows("r1/a") == [] and not len(registry.consolidate())
+
+
+def test_a_registry_that_cannot_be_written_is_an_error(tmp_path, row):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SessionError):
+        write(Registry(Storage.at(tmp_path / "file")), row())

@@ -1,0 +1,88 @@
+"""Sessions of several robots, from their folders to the table."""
+
+import json
+import shutil
+
+import pytest
+
+from lce_rig.export.result import read_result
+from lce_rig.fleet.jobs import find_jobs
+from lce_rig.fleet.query import query
+from lce_rig.fleet.run import cluster, run_fleet, run_job
+from lce_rig.fleet.storage import Storage
+from lce_rig.fleet.table import poses
+from lce_rig.fleet.work import Settings
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module")
+def client():
+    with cluster(2, 2000.0) as client:
+        yield client
+
+
+def run(root, registry, client, **changes):
+    settings = Settings(str(registry), **changes)
+    return run_fleet(find_jobs(Storage.at(root)), settings, client), settings.opened()
+
+
+def content(folder):
+    """Read every file of a registry, without figures of time and memory, which differ between runs."""
+    files = {}
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        data = path.read_bytes()
+        if path.name == "fleet.json":
+            document = json.loads(data)
+            for row in document["rows"]:
+                for key in ("duration_s", "cpu_s", "peak_memory_mb", "finished", "source"):
+                    row.pop(key)
+            data = json.dumps(document).encode()
+        files[path.relative_to(folder).as_posix()] = data
+    return files
+
+
+def test_each_session_has_a_row_a_folder_and_a_cause_where_there_is_no_result(fleet_root, tmp_path, client):
+    before = content(fleet_root)
+    done, registry = run(fleet_root, tmp_path / "registry", client)
+    assert (done.n_new, done.n_held) == (3, 0)
+    assert done.statuses == {"ok": 1, "failed": 2}
+    assert done.causes == {"shortage.few_detected": 1, "fleet.session": 1}
+    (good,) = query(registry, "status = 'ok'").to_pylist()
+    saved = read_result(registry.place.local / good["folder"] / "result.json")
+    assert (poses(query(registry, "status = 'ok'")["T_cam_lidar"])[0] == saved.pairs[0].T_cam_lidar).all()
+    assert good["robot"] == "r1" and good["verdict"] == saved.pairs[0].verdict
+    assert good["folder"].endswith(good["session_sha256"][:12])
+    assert (registry.place.local / good["folder"] / "overlays" / "contact_sheet.png").exists()
+    assert content(fleet_root) == before, "nothing below the root is written"
+
+
+def test_what_is_done_is_not_done_again(fleet_root, tmp_path, client):
+    shutil.rmtree(fleet_root / "r2/torn")
+    place = tmp_path / "registry"
+    first, registry = run(fleet_root, place, client)
+    again, _ = run(fleet_root, place, client)
+    assert (first.n_new, again.n_new, again.n_held) == (2, 0, 2)
+    assert again.table.equals(first.table)
+    retried, _ = run(fleet_root, place, client, retry=True)
+    assert (retried.n_new, retried.n_held) == (1, 1)
+    # Another profile concerns one session, a new one is new; the rest stays.
+    profile = fleet_root / "r1/monday/rig.yaml"
+    profile.write_text(profile.read_text().replace("square_m: 0.07\n", "square_m: 0.0701\n"))
+    changed, _ = run(fleet_root, place, client)
+    assert (changed.n_new, changed.n_held) == (1, 1)
+    assert len(changed.table) == len(registry.folders()) == 2
+    other, _ = run(fleet_root, place, client, method="ml")
+    assert (other.n_new, set(other.table["method"].to_pylist())) == (2, {"ml"})
+
+
+def test_limits_end_a_session_and_no_other(fleet_root, tmp_path):
+    (job,) = [job for job in find_jobs(Storage.at(fleet_root)) if job.source.endswith("r1/monday")]
+    for limits, status in (
+        ({"time_limit_s": 0.3}, "timed_out"),
+        ({"memory_limit_mb": 60.0}, "out_of_memory"),
+    ):
+        (row,) = run_job(job, Settings(str(tmp_path / status), **limits))
+        assert (row["status"], row["cause"], row["robot"]) == (status, f"fleet.{status}", "r1")
+    (row,) = run_job(job, Settings(str(tmp_path / "registry")))
+    assert row["status"] == "ok"

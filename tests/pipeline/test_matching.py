@@ -1,0 +1,49 @@
+"""Scans are searched again where the other captures say that the board is."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+import lce_rig as lce
+from lce_rig.core.results import Refusal
+from lce_rig.detect.detection import Detections, Pair
+from lce_rig.pipeline.detect_session import detect
+from lce_rig.pipeline.matching import expected_poses, refusals_of
+from lce_rig.session import Session
+
+DATA = Path(os.environ.get("LCE_RIG_DATA", "/nonexistent"))
+RIGS = Path(__file__).parents[1] / "rigs"
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    rig = lce.load_rig(RIGS / "os1_64.yaml")
+    return lce.collect_from(rig, DATA / "os1_64", tmp_path_factory.mktemp("os1") / "session")
+
+
+@pytest.mark.dataset
+@pytest.mark.long
+def test_boards_that_walls_hide_are_found_where_their_image_has_them(
+    session: Session,
+) -> None:
+    detections = detect(session)
+    pair = Pair("cam", "frames", "lidar")
+    assert len(detections.captures(pair)) == 11
+    assert refusals_of(session.rig, detections, pair) == {}
+    # Nothing is left to be looked for.
+    assert expected_poses(session.rig, detections) == {}
+
+
+@pytest.mark.dataset
+@pytest.mark.long
+def test_nothing_is_predicted_from_few_captures_or_without_an_image(session: Session) -> None:
+    found = detect(session)
+    names = found.captures(Pair("cam", "frames", "lidar"))
+    refusal = Refusal("lidar.no_returns", figures={"n_points": 0, "min_range_m": 0.4})
+    scans = {**found.lidars["lidar"], names[0]: refusal, names[1]: refusal}
+    images = {**found.images["cam", "frames"], names[1]: Refusal("image.no_board")}
+    expected = expected_poses(session.rig, Detections({("cam", "frames"): images}, {"lidar": scans}))
+    assert set(expected["lidar"]) == {names[0]}
+    few = {name: images[name] for name in names[:5]}
+    assert expected_poses(session.rig, Detections({("cam", "frames"): few}, {"lidar": scans})) == {}

@@ -1,0 +1,113 @@
+"""Where results come from: robot, serial numbers, date, and a fingerprint that only inputs change."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lce_rig.core.errors import SessionError, UsageError
+from lce_rig.rig import Rig
+from lce_rig.session import Session
+from lce_rig.session.capture import SERIALS
+from lce_rig.session.provenance import content_sha256, provenance_of
+
+Samples = Callable[..., tuple[list[Any], list[Any]]]
+
+
+@pytest.fixture
+def fill(rig: Rig, samples: Samples) -> Callable[..., Session]:
+    """Make a session of two captures whose sensors told these serial numbers."""
+
+    def make(folder: Path, rig: Rig = rig, *told: dict[str, str], seeds: tuple[int, ...] = (1, 2)) -> Session:
+        with Session.create(folder, rig) as session:
+            for k, seed in enumerate(seeds):
+                meta = {"source": {"label": folder.name}} | ({SERIALS: told[k]} if k < len(told) else {})
+                session.add_capture(*samples(seed), meta)
+        return Session.open(folder)
+
+    return make
+
+
+def test_what_captures_tell_and_what_the_profile_states_come_together(
+    fill: Callable[..., Session], rig: Rig, tmp_path: Path
+) -> None:
+    cameras = {name: each.model_copy(update={"serial": "C7"}) for name, each in rig.cameras.items()}
+    named = rig.of_robot("kestrel").model_copy(update={"cameras": cameras})
+    found = provenance_of([fill(tmp_path / "a", named, {}, {"lidar": "AG43510116"})])
+    assert (found.robot, found.serials) == ("kestrel", {"cam": "C7", "lidar": "AG43510116"})
+    # Of the last capture's scan, 10**18 ns and its seed.
+    assert found.date == "2001-09-09T01:46:40Z"
+
+
+def test_two_units_of_one_sensor_are_no_result(
+    fill: Callable[..., Session], rig: Rig, tmp_path: Path
+) -> None:
+    with pytest.raises(SessionError, match=r"lidar has serial number A in 000000, B in 000001"):
+        provenance_of([fill(tmp_path / "a", rig, {"lidar": "A"}, {"lidar": "B"})])
+    one, other = (fill(tmp_path / s, rig, {"lidar": s}) for s in ("X", "Y"))
+    with pytest.raises(SessionError, match="serial number X"):
+        provenance_of([one, other])
+
+
+def test_the_fingerprint_changes_with_inputs_only(
+    fill: Callable[..., Session], rig: Rig, samples: Samples, tmp_path: Path
+) -> None:
+    first = fill(tmp_path / "a")
+    shutil.copytree(tmp_path / "a", tmp_path / "elsewhere")
+    lidars = {name: each.model_copy(update={"serial": "S"}) for name, each in rig.lidars.items()}
+    driver = rig.lidars["lidar"].driver.model_copy(update={"address": "10.0.0.9"})
+    moved = {"lidar": rig.lidars["lidar"].model_copy(update={"driver": driver})}
+    same = [
+        Session.open(tmp_path / "elsewhere"),
+        fill(tmp_path / "b", rig.of_robot("r1").model_copy(update={"lidars": lidars}), {"cam": "C"}),
+        fill(tmp_path / "c", rig.model_copy(update={"description": "other", "lidars": moved})),
+    ]
+    assert {content_sha256([each]) for each in same} == {content_sha256([first])}
+    board = rig.board.model_copy(update={"square_m": rig.board.square_m * 1.001})
+    other = [
+        fill(tmp_path / "d", rig.model_copy(update={"board": board})),
+        fill(tmp_path / "e", seeds=(2, 1)),
+        fill(tmp_path / "f", seeds=(1,)),
+    ]
+    hashes = [content_sha256([each]) for each in (first, *other)]
+    assert len(set(hashes)) == 4
+    assert content_sha256([first, other[0]]) not in hashes
+    with Session.open(tmp_path / "f", writable=True) as session:
+        images, scans = samples(2)
+        later = [replace(scan, stamp_ns=scan.stamp_ns + 1) for scan in scans]
+        session.add_capture(images, later, {})
+    assert content_sha256([Session.open(tmp_path / "f")]) not in hashes
+
+
+def test_a_session_without_times_has_the_date_of_its_journal(
+    rig: Rig, samples: Samples, tmp_path: Path
+) -> None:
+    with Session.create(tmp_path / "a", rig) as session:
+        images, scans = samples(1)
+        # A clock that counts from the sensor's start tells no date.
+        session.add_capture(
+            [replace(image, stamp_ns=5 * 10**9) for image in images],
+            [replace(scan, stamp_ns=5 * 10**9, host_ns=None) for scan in scans],
+            {},
+        )
+    session = Session.open(tmp_path / "a")
+    written = next(entry["time"] for entry in session.read_journal() if entry["event"] == "captured")
+    assert provenance_of([session]).date == f"{written[:19]}Z"
+    (tmp_path / "a" / "journal.jsonl").unlink()
+    assert provenance_of([session]).date == ""
+
+
+def test_a_robot_is_named_later_and_not_renamed(rig: Rig, tmp_path: Path) -> None:
+    Session.create(tmp_path / "a", rig).close()
+    Session.resume(tmp_path / "a", rig.of_robot("kestrel")).close()
+    Session.resume(tmp_path / "a", rig).close()
+    assert Session.open(tmp_path / "a").rig.robot == "kestrel"
+    with pytest.raises(SessionError, match="robot kestrel there, heron here"):
+        Session.resume(tmp_path / "a", rig.of_robot("heron"))
+    with pytest.raises(UsageError, match="not of heron"):
+        rig.of_robot("kestrel").of_robot("heron")
+    with pytest.raises(UsageError, match="cannot name a robot"):
+        rig.of_robot("../x")
