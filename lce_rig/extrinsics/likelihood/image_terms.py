@@ -104,7 +104,8 @@ def image_rows(
 
     Returns:
         (P, 6, 16): by extrinsic (6), by board pose (6), by scale, by bows (2), residual. A scale s
-        stretches what the camera measures to t_cam_board (1 + s): squares or a focal length that the profile has wrong.
+        stretches what the camera measures to t_cam_board (1 + s): squares or a focal length that the
+        profile has wrong.
     """
     Y = T_lidar_board[images.capture]
     R = T_cam_lidar[:3, :3]
