@@ -14,7 +14,6 @@ from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.recordings.ouster.packets import PROFILES, OusterMetadata, read_metadata
 from lce_rig.recordings.protocol import SourceOptions, Span
 from lce_rig.recordings.sensor_choice import choose_lidar
-from lce_rig.recordings.velodyne.datagrams import Datagram
 from lce_rig.recordings.velodyne.pcap import PcapFile
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.words import describe
@@ -39,6 +38,8 @@ class OusterStream:
         self._sensor, self._settings, self._metadata = sensor, settings, metadata
         self._layout = metadata.packet
         self._rings = np.argsort(np.argsort(metadata.altitude_rad)).astype(np.int16)
+        # A frame that never ends is damage.
+        self._most = 2 * -(-metadata.n_columns // metadata.columns_per_packet)
         self._frame: int | None = None
         self._packets: list[bytes] = []
         self._first_host_ns = 0
@@ -48,7 +49,8 @@ class OusterStream:
         fields = np.frombuffer(payload, self._layout)[0]
         is_headed = PROFILES[self._metadata.name].has_heads
         frame = int(fields["frame"]) if is_headed else int(fields["columns"]["frame"][0])
-        scan = self.finish() if self._packets and frame != self._frame else None
+        is_next = frame != self._frame or len(self._packets) >= self._most
+        scan = self.finish() if self._packets and is_next else None
         if not self._packets:
             self._first_host_ns = host_ns
         self._frame = frame
@@ -110,7 +112,7 @@ class OusterRecording:
         self._metadata = read_metadata(beside)
         self._n_bytes = self._metadata.packet.itemsize
         self.notes.append(f"{path.name}: metadata of {beside.name}, profile {self._metadata.name}")
-        self._port = self._choose_port()
+        self._sender = self._choose_sender()
         self.key = fingerprint([path, beside])
         self.streams: Mapping[Stream, Span | None] = {Stream(self._lidar, "", "scans"): None}
         n_packets = -(-self._metadata.n_columns // self._metadata.columns_per_packet)
@@ -124,7 +126,8 @@ class OusterRecording:
         """
         stream = OusterStream(self._lidar, self._settings, self._metadata)
         for datagram in self._file.datagrams():
-            if self._is_ours(datagram) and datagram.port == self._port:
+            is_ours = (datagram.source, datagram.port) == self._sender
+            if is_ours and len(datagram.payload) == self._n_bytes:
                 scan = stream.push(datagram.payload, datagram.host_ns)
                 if scan is not None:
                     yield scan
@@ -137,33 +140,31 @@ class OusterRecording:
         if stream.n_scans == 0:
             raise SourceError(f"{self.path}: no whole revolution in it", "Record at least 1 s.")
 
-    def _is_ours(self, datagram: Datagram) -> bool:
-        return len(datagram.payload) == self._n_bytes
-
-    def _choose_port(self) -> int:
-        """Choose the port whose packets have the layout's size: the profile's, else the only one.
+    def _choose_sender(self) -> tuple[str, int]:
+        """Choose whose packets have the layout's size, by address and port: the profile's, else the only one.
 
         Raises:
             SourceError: there is none, or there are several.
         """
-        ports, sizes = Counter[int](), Counter[int]()
+        senders, sizes = Counter[tuple[str, int]](), Counter[int]()
         for n, datagram in enumerate(self._file.datagrams()):
             sizes[len(datagram.payload)] += 1
-            if self._is_ours(datagram):
-                ports[datagram.port] += 1
+            if len(datagram.payload) == self._n_bytes:
+                senders[datagram.source, datagram.port] += 1
             if n >= _N_SURVEYED:
                 break
-        wanted = self._settings.driver.port
-        if wanted is not None and wanted in ports:
-            return wanted
-        if not ports:
+        if not senders:
             there = ", ".join(f"{n} of {size} bytes" for size, n in sizes.most_common(_MAX_SHOWN)) or "none"
             what = f"{self.path}: no packets of {self._n_bytes} bytes, as the metadata say; there are {there}"
             raise SourceError(what, "Give the metadata of this recording.")
-        if len(ports) > 1:
-            what = f"{self.path}: packets of several sensors, to ports {', '.join(map(str, sorted(ports)))}"
-            raise SourceError(what, f"Set driver.port of {self._lidar!r} in the profile to one of them.")
-        return next(iter(ports))
+        driver = self._settings.driver
+        wanted = [s for s in senders if driver.address in (None, s[0]) and driver.port in (None, s[1])]
+        found = wanted or list(senders)
+        if len(found) > 1:
+            there = ", ".join(f"{address} to port {port}" for address, port in sorted(found))
+            hint = f"Set driver.address and driver.port of {self._lidar!r} in the profile to one of them."
+            raise SourceError(f"{self.path}: packets of several sensors: {there}", hint)
+        return found[0]
 
 
 def _metadata_beside(path: Path) -> Path:
