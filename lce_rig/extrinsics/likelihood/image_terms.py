@@ -17,7 +17,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, difference, skew
 from lce_rig.core.results import ImageBoard
 from lce_rig.extrinsics.likelihood.levels import PoseLevels
-from lce_rig.residuals.along_rays import Indices, bow_heights
+from lce_rig.residuals.along_rays import N_BOW, Indices, bow_heights
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class StackedImages:
 
 
 def stack_images(
-    capture: Indices, images: Sequence[ImageBoard], n_repeats: Array, board: Board
+    capture: Indices, images: Sequence[ImageBoard], n_repeats: Array, board: Board | None = None
 ) -> StackedImages:
     """Stack the images of one camera.
 
@@ -61,7 +61,7 @@ def stack_images(
         images: P of them.
         n_repeats: (P,) images that show the board in the same place: they share the error Q, and count
             together as one.
-        board: its corners and size.
+        board: its corners and size; without it, no plate is bent.
     """
     T = np.array([image.T_cam_board for image in images])
     cov = np.array([image.cov for image in images])
@@ -74,7 +74,7 @@ def stack_images(
         capture,
         T,
         cov,
-        _by_bow(T, board),
+        np.zeros((len(T), 6, N_BOW)) if board is None else _by_bow(T, board),
         {name: n_repeats[:, None, None] * shape for name, shape in shapes.items()},
     )
 
