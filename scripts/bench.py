@@ -19,6 +19,7 @@
     scripts/bench.py scene_methods  the scene's score compared with published ones, on the same recordings
     scripts/bench.py scene_sharpen  boards and scene in one estimate: simulated rooms, recordings
     scripts/bench.py witness     the scene beside the boards: good results refused, wrong ones found
+    scripts/bench.py outputs     every output read by other programs: where they draw the same points
     scripts/bench.py lidars      other LiDARs, simulated: boards found, errors, time of a scan's search
     scripts/bench.py growth      calibrate after detection as sessions grow: time and memory
     scripts/bench.py fleet       500 sessions of 60 robots; lost workers, broken sessions, a million rows, S3
@@ -52,6 +53,7 @@ PARTS = {
     "scene_methods": 0,
     "scene_sharpen": 100,
     "witness": 20,
+    "outputs": 0,
     "lidars": 0,
     "growth": 0,
     "fleet": 0,
@@ -131,7 +133,7 @@ def main() -> None:
         bench(arguments.seconds or 60.0)
     elif arguments.part == "offline":
         bench(arguments.seconds or 15.0)
-    elif arguments.part in ("speed", "drift_inputs"):
+    elif arguments.part in ("speed", "drift_inputs", "outputs"):
         bench()
     else:
         bench(arguments.seeds or PARTS[arguments.part])

@@ -107,6 +107,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     help="Live: capture after the board has stood still for S seconds  [default: 1.5]",
 )
 @click.option("--plain", is_flag=True, help="Live: print lines on stderr instead of the full-screen view.")
+@click.option("--silent", is_flag=True, help="Live: ring no bell at captures and refused ones.")
 @click.option(
     "--preview",
     is_flag=False,

@@ -1,6 +1,7 @@
 """`lce-rig collect` without --from: attached sensors, or the simulated rig."""
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -43,7 +44,7 @@ class LiveArguments:
     """The options of live collection, as given.
 
     Attributes:
-        frames, timeout, keep_going, hold, plain, preview, record, simulated, seed: see --help.
+        frames, timeout, keep_going, hold, plain, silent, preview, record, simulated, seed: see --help.
     """
 
     frames: int | None
@@ -51,6 +52,7 @@ class LiveArguments:
     keep_going: bool
     hold: float | None
     plain: bool
+    silent: bool
     preview: str | None
     record: Path | None
     simulated: bool
@@ -78,7 +80,13 @@ def run_live(rig: "Rig", path: Path, given: LiveArguments) -> None:
         asked = stack.enter_context(controls())
         idle_s = _idle_s(given, asked)
         options = LiveOptions(given.frames, given.timeout, hold_s, goes_on=given.keep_going, idle_s=idle_s)
-        with open_view(is_plain=given.plain, has_keys=asked.is_interactive, links=links) as view:
+        with open_view(
+            is_plain=given.plain,
+            has_keys=asked.is_interactive,
+            links=links,
+            is_silent=given.silent,
+            wants_code=lambda: asked.wants_code,
+        ) as view:
             listeners.append(_until_gone(view.show))
             is_begun = threading.Event()
 
@@ -161,6 +169,7 @@ def _open_preview(
     if given.preview is None:
         return [], (), lambda: None
     from lce_rig.page import Preview, parse_address
+    from lce_rig.screen.live_view import qr_lines
 
     host, port = parse_address(given.preview)
     preview = Preview(host, port)
@@ -168,6 +177,9 @@ def _open_preview(
     stack.enter_context(preview)
     for url in preview.urls:
         show.note(f"preview: {url}")
+    if sys.stderr.isatty():
+        for line in qr_lines(preview.urls[0]):
+            click.secho(line, fg="bright_white", bg="black", err=True)
     return [preview.publish], preview.urls, preview.asked
 
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.fleet_deploy import deploy
+from lce_rig.cli.fleet_lidar import lidar
 from lce_rig.cli.fleet_report import report
 from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
 
@@ -41,6 +43,8 @@ def fleet() -> None:
 
 
 fleet.add_command(report)
+fleet.add_command(deploy)
+fleet.add_command(lidar)
 
 
 @fleet.command()

@@ -42,14 +42,14 @@ def report(registry: str, output: Path, csv_folder: Path | None, json_file: Path
     from lce_rig.fleet.registry import Registry
     from lce_rig.fleet.report import findings, page, write_csv, write_json
     from lce_rig.fleet.storage import Storage
-    from lce_rig.fleet.tables import REPORT_COLUMNS, tables_of
+    from lce_rig.fleet.tables import tables_of
     from lce_rig.session.durable import write_atomically
     from lce_rig.words import as_line, sentence
 
     place = Storage.at(registry)
-    table = Registry(place).read_table(REPORT_COLUMNS)
-    made = tables_of(table)
-    write_atomically(output, page(made, table, place.name))
+    read = Registry(place).read_table
+    made = tables_of(read)
+    write_atomically(output, page(made, read, place.name))
     if csv_folder is not None:
         write_csv(made, csv_folder)
     if json_file is not None:

@@ -41,22 +41,27 @@ def lidar_intrinsics(
     opened = [Session.open(path) for path in sessions]
     with show.progress_bar("detecting") as progress:
         errors = measure_lidar(opened, lidar, progress=progress)
-    if as_json:
-        show.print_json(_document(errors))
-    else:
-        known, mm = errors.found, 1e3
-        show.print_lines(
-            [
-                f"{show.counted(sum(errors.n_captures), 'capture')} of "
-                f"{show.counted(len(errors.n_captures), 'session')}",
-                f"  lens  {mm * known.lens[0]:+.1f} +- {mm * known.lens_sigma[0]:.1f} mm beside the axis, "
-                f"{mm * known.lens[1]:+.1f} +- {mm * known.lens_sigma[1]:.1f} mm per rad of elevation",
-            ]
-        )
-        show.print_table(_table(errors))
+    print_errors(errors, as_json=as_json)
     if save_profile is not None:
         save_lidar(opened[0], lidar, errors, save_profile)
         show.note(f"written: {save_profile}")
+
+
+def print_errors(errors: "LidarErrors", *, as_json: bool) -> None:
+    """Print a LiDAR's errors as a table or as JSON."""
+    if as_json:
+        show.print_json(_document(errors))
+        return
+    known, mm = errors.found, 1e3
+    show.print_lines(
+        [
+            f"{show.counted(sum(errors.n_captures), 'capture')} of "
+            f"{show.counted(len(errors.n_captures), 'session')}",
+            f"  lens  {mm * known.lens[0]:+.1f} +- {mm * known.lens_sigma[0]:.1f} mm beside the axis, "
+            f"{mm * known.lens[1]:+.1f} +- {mm * known.lens_sigma[1]:.1f} mm per rad of elevation",
+        ]
+    )
+    show.print_table(_table(errors))
 
 
 def _table(errors: "LidarErrors") -> Any:

@@ -208,10 +208,15 @@ def _print_warnings(rig: "Rig") -> None:
 @click.option(
     "--from",
     "origin",
-    metavar="RIG|BAG",
-    help="Profile to derive from, or a bag of the rig [default: rlfs, unless a sensor is given].",
+    metavar="RIG|RECORDING",
+    help="Profile to derive from, or a bag of the rig, or a folder with point clouds in pcd/ "
+    "[default: rlfs, unless a sensor is given].",
 )
-@click.option("--lidar", metavar="MODEL", help="Model of the LiDAR, such as OS1-64.")
+@click.option(
+    "--lidar",
+    metavar="MODEL",
+    help="Model of the LiDAR, such as OS1-64; other: its rings are read from the recording.",
+)
 @click.option("--camera", "cameras", multiple=True, metavar="NAME", help="Name of a camera; may be repeated.")
 @click.option(
     "--intrinsics",
@@ -304,13 +309,14 @@ def _is_bag(path: Path) -> bool:
         SourceError: it would be a bag, and is not there; or a folder without one.
     """
     from lce_rig.core.errors import SourceError
+    from lce_rig.pipeline.new_profile import clouds_in
     from lce_rig.recordings.ros.bag_file import SUFFIXES, is_bag_file
 
     if path.is_dir():
-        if any(is_bag_file(entry) for entry in path.iterdir()):
+        if any(is_bag_file(entry) for entry in path.iterdir()) or clouds_in(path):
             return True
         raise SourceError(
-            f"{path} holds no bag ({', '.join(SUFFIXES)})",
+            f"{path} holds no bag ({', '.join(SUFFIXES)}) and no point clouds in pcd/",
             "Of a folder of images, give --lidar, --intrinsics and --board.",
         )
     if path.suffix in SUFFIXES and not path.exists():

@@ -471,7 +471,7 @@ class Extrinsics(Protocol):
 class Calibration:
     """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
 
-    result.json keeps all of it but the last four attributes, which are empty if it is read back.
+    result.json keeps all of it but the last six attributes, which are empty if it is read back.
 
     Attributes:
         channels: of the camera, names.
@@ -497,6 +497,9 @@ class Calibration:
         held_out_m: rms residual of captures where they were not fitted; NaN if no method knows it.
         residuals: of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
+        lens_error, lens_error_sigma: errors of the profile's intrinsics as the boards see them, given less
+            seen: focal length (relative), principal point x and y (px), distortion (px in the image's
+            corner); their standard deviations.
     """
 
     camera: str
@@ -528,6 +531,8 @@ class Calibration:
     held_out_m: float = float("nan")
     residuals: tuple[CaptureResidual, ...] = ()
     observations: Mapping[str, Observation] = field(default_factory=dict)
+    lens_error: tuple[float, ...] = ()
+    lens_error_sigma: tuple[float, ...] = ()
 
     @property
     def channel(self) -> str:

@@ -21,13 +21,18 @@ class _TargetsFile(Settings):
     targets: Annotated[dict[RobotName, TargetSettings], Field(min_length=1)]
 
 
-def read_targets(path: Path) -> dict[str, TargetSettings]:
+def read_targets(path: Path, robot: str = "") -> dict[str, TargetSettings]:
     """Read the block `targets` of a file; paths of this computer become absolute.
+
+    Args:
+        path: the file.
+        robot: what `{robot}` stands for in it; "" leaves it as it is.
 
     Raises:
         ProfileError: no such file, or an invalid one; every problem with line and key.
     """
-    document = read_document(read_profile(path), str(path))
+    text = read_profile(path)
+    document = read_document(text.replace("{robot}", robot) if robot else text, str(path))
     try:
         found: Any = _TargetsFile.model_validate(document.data)
     except ValidationError as error:
@@ -35,7 +40,9 @@ def read_targets(path: Path) -> dict[str, TargetSettings]:
     return {name: target.located(path.parent) for name, target in found.targets.items()}
 
 
-def find_target(name: str, file: Path | None, session: Path | None, rig: Rig | None) -> TargetSettings:
+def find_target(
+    name: str, file: Path | None, session: Path | None, rig: Rig | None, *, robot: str = ""
+) -> TargetSettings:
     """Find a target: in the file if one is given, else beside the session, else in its profile.
 
     Args:
@@ -43,6 +50,7 @@ def find_target(name: str, file: Path | None, session: Path | None, rig: Rig | N
         file: that lists targets.
         session: its folder; deploy.yaml is looked for in its parent.
         rig: the session's profile.
+        robot: what `{robot}` stands for in the file.
 
     Raises:
         ProfileError: a file is invalid.
@@ -51,7 +59,7 @@ def find_target(name: str, file: Path | None, session: Path | None, rig: Rig | N
     known: dict[str, TargetSettings] = {}
     beside = None if session is None else session.resolve().parent / TARGETS_FILE
     if file is not None:
-        known = read_targets(file)
+        known = read_targets(file, robot)
     else:
         known |= {} if rig is None else rig.targets
         if beside is not None and beside.is_file():

@@ -255,4 +255,4 @@ def is_export(path: Path) -> bool:
 
 def _begin(path: Path, n_bytes: int) -> bytes:
     with reading(path, SessionError), path.open("rb") as file:
-        return file.read(n_bytes)
+        return b" ".join(file.read(n_bytes).split())  # YAML breaks long lines

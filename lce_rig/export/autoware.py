@@ -176,11 +176,12 @@ def _check_base(path: Path, T_base_kit: Array) -> None:
         raise LceRigError(f"{path}: reads back differently")
 
 
+@reads_back
 def read_block(path: Path, root: str) -> dict[str, Array]:
     """Read the poses (4, 4) of the frames below one from a file of Autoware's.
 
     Raises:
-        KeyError: it has no such frame.
+        LceRigError: it has no such frame, or is damaged.
     """
     import yaml
 

@@ -56,7 +56,8 @@ def bag_writer(folder: Path, what: str, job: ExportJob) -> Iterator[Any]:
     try:
         if folder.is_dir():
             shutil.rmtree(folder)
-        writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+        # Version 8 states QoS in the numbers that Humble reads as well; 9 does in words, since Jazzy.
+        writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         for index, line in enumerate(header(what, job.rig, job.chosen)):
             writer.set_custom_data(f"about_{index}", line)

@@ -58,12 +58,13 @@ def export_mcap(job: ExportJob) -> list[Path]:
     seen: set[str] = set()
     with bag_writer(folder, "session as a ROS 2 bag", job) as writer:
         topics = _Topics(writer)
-        before_ns = 0
+        before_ns, limits_m = 0, None
         for index, capture in enumerate(captures):
             scans = [capture.scan(lidar) for lidar in capture.lidars]
             images = list(_images(capture, job))
             time_ns = _time_ns(scans, images) or before_ns + _STEP_NS
             before_ns = time_ns
+            limits_m = limits_m or range_limits(scans)  # the same colours in all captures
             if not index:
                 write_tf_static(writer, job, time_ns)
             for scan in scans:
@@ -72,7 +73,7 @@ def export_mcap(job: ExportJob) -> list[Path]:
                 seen.add(image.sensor)
                 _write_image(topics, _timed(image, time_ns), time_ns, job)
             for calibration in job.chosen:
-                _write_projected(topics, calibration, scans, images, time_ns, job)
+                _write_projected(topics, calibration, scans, images, time_ns, limits_m, job)
     for name in dict.fromkeys(c.camera for c in job.chosen):
         if name not in seen:
             job.findings.append(Finding("export.no_images", "warning", name, {"format": "mcap"}))
@@ -126,6 +127,7 @@ def _write_projected(
     scans: list[Scan],
     images: list[Image],
     time_ns: int,
+    limits_m: tuple[float, float],
     job: ExportJob,
 ) -> None:
     import cv2
@@ -136,8 +138,7 @@ def _write_projected(
     if scan is None or not own:
         return
     camera = job.rig.cameras[calibration.camera]
-    T_cam_lidar = calibration.T_cam_lidar
-    picture = draw_projection(own[0], scan, camera.to_intrinsics(), T_cam_lidar, range_limits([scan]))
+    picture = draw_projection(own[0], scan, camera.to_intrinsics(), calibration.T_cam_lidar, limits_m)
     is_done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     assert is_done
     message = typestore(False).types[_JPEG_TYPE](

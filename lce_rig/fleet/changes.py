@@ -216,6 +216,20 @@ def _shrunk(factor: Array, n: int) -> Array:
     return np.sqrt((20 + n * np.maximum(factor, 0.05) ** 2) / (20 + n))
 
 
+def pooled(sessions: Sessions) -> Sessions:
+    """Take half of each covariance from the mean of its series.
+
+    A covariance from a few placements of the board is itself uncertain; sessions whose covariance came out
+    too small by chance would rule the weighted means.
+    """
+    starts = sessions.starts
+    if len(starts) < 2:
+        return sessions
+    lengths = np.diff(starts)
+    mean = np.add.reduceat(sessions.cov, starts[:-1]) / lengths[:, None, None]
+    return replace(sessions, cov=(sessions.cov + np.repeat(mean, lengths, axis=0)) / 2)
+
+
 def rescaled(sessions: Sessions, scale: Array) -> Sessions:
     """Multiply the standard deviations of what scatters by factors (6,)."""
     return replace(sessions, cov=sessions.cov * scale[:, None] * scale)

@@ -18,6 +18,7 @@ from lce_rig.fleet.changes import (
     References,
     Sessions,
     find_changes,
+    pooled,
     references,
     rescaled,
     scale_of,
@@ -160,7 +161,8 @@ def history_of(table: Any) -> History:
         table: `pyarrow.Table` with at least `COLUMNS`.
     """
     known, n_failed = _usable(table)
-    order = known[_order(table.select(_KEYS).take(pa.array(known)))]
+    keys = table.select(_KEYS)
+    order = known[_order(keys if len(known) == len(table) else keys.take(pa.array(known)))]
     in_order = table.select(_KEYS).take(pa.array(order))
     starts = _starts(in_order)
     limits = Limits.of(np.diff(starts))
@@ -305,9 +307,10 @@ class _Reader:
         instants = pc.strptime(part["date"], format="%Y-%m-%dT%H:%M:%SZ", unit="s", error_is_null=True)
         seconds = pc.fill_null(pc.cast(instants, pa.int64()), 0).to_numpy()
         days = seconds / 86400.0
-        return Sessions(
+        sessions = Sessions(
             starts, tangents, cov - shared, shared, _codes(part["profile_sha256"]), days - days.min()
-        ), T_first
+        )
+        return pooled(sessions), T_first
 
 
 def _zero_where_null(column: Any) -> Any:

@@ -14,7 +14,10 @@ from lce_rig.report.drawing import BLUE, FAINT, ORANGE, QUIET, RED, WIDTH_IN, dr
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.words.extrinsics import motion_words
 
-_HEIGHT_IN = 2.9
+MATRICES = ("T_cam_lidar", "cov", "cov_shared")
+"""Columns of the table that drawings in time require."""
+
+_HEIGHT_IN = 3.05
 _MOST_SESSIONS = 400
 
 
@@ -31,7 +34,7 @@ def in_time(history: History, table: Any, change: Change) -> Markup:
     # Long series: the sessions about the change.
     at = int(first) + change.found.session
     shown = np.arange(max(int(first), at - _MOST_SESSIONS // 2), min(int(last), at + _MOST_SESSIONS // 2))
-    rows = table.select(["T_cam_lidar", "cov", "cov_shared"]).take(pa.array(history.rows[shown]))
+    rows = table.select(MATRICES).take(pa.array(history.rows[shown]))
     T, cov = poses(rows["T_cam_lidar"]), covariances(rows["cov"])
     if not rows["cov_shared"].null_count:
         cov = cov - covariances(rows["cov_shared"])
@@ -41,9 +44,9 @@ def in_time(history: History, table: Any, change: Change) -> Markup:
     cusum = _cusum(difference(T, np.broadcast_to(T[0], T.shape)), cov, history)[:, axis]
     days = _days([history.dates[int(k)].as_py() for k in shown])
     with style():
-        figure, (upper,) = new_axes(_HEIGHT_IN, left_in=0.62, bottom_in=1.15, top_in=0.08)
+        figure, (upper,) = new_axes(_HEIGHT_IN, left_in=0.62, bottom_in=1.3, top_in=0.08)
         left_in, width_in = 0.62, WIDTH_IN - 0.62 - 0.1
-        place = (left_in / WIDTH_IN, 0.25 / _HEIGHT_IN, width_in / WIDTH_IN, 0.8 / _HEIGHT_IN)
+        place = (left_in / WIDTH_IN, 0.4 / _HEIGHT_IN, width_in / WIDTH_IN, 0.8 / _HEIGHT_IN)
         lower = figure.add_axes(place, sharex=upper)
         upper.tick_params(labelbottom=False)
         upper.errorbar(days, values, 2 * sigma, fmt="o", ms=3, lw=0.8, color=BLUE, ecolor=FAINT)

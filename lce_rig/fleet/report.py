@@ -1,6 +1,7 @@
 """The report of a fleet: a page that a manager reads, and the tables behind it."""
 
 import json
+from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array
 from lce_rig.fleet.changes import FALSE_ALARMS, FALSE_CUSUMS
 from lce_rig.fleet.history import STATES, History, finding_of
-from lce_rig.fleet.plots import beside_siblings, in_time
+from lce_rig.fleet.plots import MATRICES, beside_siblings, in_time
 from lce_rig.fleet.siblings import Mounting
 from lce_rig.fleet.tables import FleetTables
 from lce_rig.report.page import render
@@ -24,7 +25,6 @@ from lce_rig.words.extrinsics import motion_words
 
 FORMAT_VERSION = 1
 _MOST_ROWS, _MOST_DRAWINGS, _MOST_MOUNTINGS = 60, 12, 4
-_ONLY_CSV = ("sessions",)
 _CODE_WORDS = {
     "fleet.moved": "Moved",
     "fleet.moved_last": "Moved before the last session",
@@ -100,7 +100,7 @@ def write_csv(made: FleetTables, folder: Path) -> list[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    for name, table in made.tables.items():
+    for name, table in (*made.tables.items(), ("sessions", made.sessions())):
         path = folder / f"{name}.csv"
         pc_csv.write_csv(table, path)
         paths.append(path)
@@ -123,7 +123,6 @@ def document(made: FleetTables) -> dict[str, Any]:
         "tables": {
             name: [{k: _finite(v) for k, v in row.items()} for row in table.to_pylist()]
             for name, table in made.tables.items()
-            if name not in _ONLY_CSV
         },
     }
 
@@ -137,18 +136,18 @@ def write_json(made: FleetTables, path: Path) -> None:
     write_atomically(path, json.dumps(document(made), allow_nan=False) + "\n")
 
 
-def page(made: FleetTables, table: Any, registry: str) -> str:
+def page(made: FleetTables, read: Callable[[Sequence[str]], Any], registry: str) -> str:
     """Write the page.
 
     Args:
         made: the tables.
-        table: that they were made of.
+        read: reads columns of the table that they were made of.
         registry: its name.
     """
     history, named = made.history, findings(made)
     states = list(history.robots.values())
     dates = pc.min_max(history.dates).as_py() if len(history.dates) else {"min": "", "max": ""}
-    drawings = _drawings(history, table)
+    drawings = _drawings(history, read(MATRICES)) if history.changes else []
     robots = {each.subject for each in named if each.code == "fleet.apart_from_siblings"}
     tables = made.tables
     return render(
@@ -156,7 +155,7 @@ def page(made: FleetTables, table: Any, registry: str) -> str:
         registry=registry,
         first=(dates["min"] or "")[:10],
         last=(dates["max"] or "")[:10],
-        n_robots=len(pc.unique(table["robot"])),
+        n_robots=made.n_robots,
         n_rows=history.n_rows,
         n_sessions=len(history.rows),
         n_unusable=history.n_failed,
@@ -246,7 +245,6 @@ def _change_cells(row: dict[str, Any]) -> tuple[Any, ...]:
     return (
         row["robot"], f"{row['camera']}, {row['lidar']}", kind, sensor,
         ", ".join(map(_short, row["axes"].split())), row["before"][:10], row["after"][:10], told,
-        f"{row['rotation_deg']:.2f}", f"{1e3 * row['translation_m']:.1f}",
         f"{row['sessions_before']}, {row['sessions_after']}", f"{row['chi2']:.0f}",
     )  # fmt: skip
 

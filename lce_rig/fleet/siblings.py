@@ -10,7 +10,7 @@ that any of an ordinary fleet exceeds with a probability of 5 %.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,19 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Figure, Finding, ranked
 from lce_rig.core.geometry import Array, difference
 from lce_rig.fleet.history import COLUMNS, History, finding_of, history_of
-from lce_rig.fleet.table import Row, as_table, covariances, poses
+from lce_rig.fleet.query import query
+from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.table import Row, as_table, covariances, poses, result_columns
+from lce_rig.pipeline.result_files import Result
 from lce_rig.scene.alignment import AXES, IS_ROTATION
+from lce_rig.session.session import PROFILE
 
 FEWEST_SIBLINGS = 5
+# Where more are apart, robots are of several kinds: nobody is odd.
+_MOST_APART = 0.2
 _FALSE_OUTLIERS = 0.05
 _OF_NORMAL = 1.4826
 # Rows whose nominal pose differs by no more than this are of one drawing.
@@ -72,9 +78,14 @@ class Mounting:
         return np.asarray(_OF_NORMAL * np.median(np.abs(self.apart - self.median), axis=0))
 
     @property
+    def is_one_kind(self) -> bool:
+        """Whether few robots are beyond the limit along any axis."""
+        return float(np.mean(np.abs(self.z).max(axis=1) > self.limit)) <= _MOST_APART
+
+    @property
     def outliers(self) -> list[tuple[int, int]]:
-        """(robot, axis) beyond the limit, by their numbers; the farthest first."""
-        found = np.argwhere(np.abs(self.z) > self.limit)
+        """(robot, axis) beyond the limit, by their numbers; the farthest first. None if they are many."""
+        found = np.argwhere(np.abs(self.z) > self.limit) if self.is_one_kind else np.empty((0, 2), int)
         order = np.argsort(-np.abs(self.z[found[:, 0], found[:, 1]]), kind="stable")
         return [(int(r), int(a)) for r, a in found[order]]
 
@@ -146,6 +157,33 @@ def deviations(apart: Array, sigma: Array) -> Array:
     return np.asarray(off / np.sqrt(np.maximum(spread**2 + excess, 1e-18)))
 
 
+def with_registry(result: Result, registry: Registry) -> Result:
+    """Add notes on how a result compares with those of a registry; the verdict does not change.
+
+    Args:
+        result: of one session.
+        registry: with a table.
+
+    Raises:
+        SessionError: there is no table, or it cannot be read.
+    """
+    told, rig = result.provenance, result.session.rig
+    name = rig.name.replace("'", "''")
+    table = query(registry, f"rig = '{name}'", tuple(dict.fromkeys((*COLUMNS, *MOUNTING_COLUMNS))))
+    base = Row(
+        told.robot or rig.name,
+        rig=rig.name,
+        date=told.date or None,
+        session_sha256=told.session_sha256,
+        profile_sha256=result.document()["inputs_sha256"][PROFILE],
+    )
+    pairs = []
+    for pair in result.pairs:
+        notes = compare(replace(base, **result_columns(pair, rig, told.serials)), table)
+        pairs.append(replace(pair, findings=ranked([*pair.findings, *notes])))
+    return replace(result, pairs=tuple(pairs))
+
+
 def compare(row: Row, table: Any) -> list[Finding]:
     """Compare a new result with earlier ones of its robot and with its siblings.
 
@@ -199,9 +237,10 @@ def _beside(row: Row, company: Any) -> list[Finding]:
     own_cov = as_table([row])["cov"]
     cov = np.concatenate([covariances(others["cov"]), covariances(own_cov)])
     nominal = T[0] if row.nominal is None else np.array(row.nominal).reshape(4, 4)
-    z = deviations(difference(T, nominal), np.sqrt(np.einsum("gii->gi", cov)))[-1]
+    *siblings, z = deviations(difference(T, nominal), np.sqrt(np.einsum("gii->gi", cov)))
     axis, limit = int(np.argmax(np.abs(z))), limit_of(len(T), n_asked=1)
-    if abs(z[axis]) <= limit:
+    several_kinds = np.mean(np.abs(siblings).max(axis=1) > limit_of(len(T), len(T))) > _MOST_APART
+    if several_kinds or abs(z[axis]) <= limit:
         return []
     apart = difference(T, nominal)[:, axis]
     unit, scale = ("deg", float(np.degrees(1.0))) if IS_ROTATION[axis] else ("m", 1.0)

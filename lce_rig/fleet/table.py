@@ -182,6 +182,8 @@ def result_columns(calibration: Calibration, rig: Rig, serials: Mapping[str, str
         "mpe_m": _known(c.metrics.mpe_m),
         "mee_m": _known(c.metrics.mee_m),
         "reprojection_px": _known(c.metrics.reprojection_px),
+        "lens_error": c.lens_error or None,
+        "lens_error_sigma": c.lens_error_sigma or None,
         "time_offset_s": float(np.mean(offsets)) if offsets else None,
         "camera_scale": _known(c.diagnostics.camera_scale),
         "scene": None if c.scene is None else c.scene.state,

@@ -1,19 +1,18 @@
 """Tables of a fleet's report, as `pyarrow` tables that a page shows and programs read."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from lce_rig.core.geometry import Array
 from lce_rig.fleet.history import COLUMNS, STATES, Change, History, history_of
 from lce_rig.fleet.overview import OVERVIEW_COLUMNS, cameras, causes, lidars, quality, verdicts
 from lce_rig.fleet.siblings import MOUNTING_COLUMNS, Mounting, mountings
 from lce_rig.scene.alignment import AXES, IS_ROTATION
-
-REPORT_COLUMNS = tuple(dict.fromkeys((*COLUMNS, *MOUNTING_COLUMNS, *OVERVIEW_COLUMNS)))
-"""Columns of a registry's table that a report requires."""
 
 _UNIT = np.where(IS_ROTATION, np.degrees(1.0), 1.0)
 _NAMES = [f"{axis}_{'deg' if turns else 'm'}" for axis, turns in zip(AXES, IS_ROTATION, strict=True)]
@@ -27,21 +26,28 @@ class FleetTables:
         history: each robot in time.
         mountings: robots beside their siblings.
         tables: by name, for export; units in the names of columns.
+        n_robots: in the registry, with a usable result or not.
     """
 
     history: History
     mountings: tuple[Mounting, ...]
     tables: dict[str, Any]
+    n_robots: int
+
+    def sessions(self) -> Any:
+        """Each session against those before it, which is as long as the registry's table."""
+        return _sessions(self.history)
 
 
-def tables_of(table: Any) -> FleetTables:
+def tables_of(read: Callable[[Sequence[str]], Any]) -> FleetTables:
     """Make the tables of a report.
 
     Args:
-        table: of a registry, with `REPORT_COLUMNS`.
+        read: reads columns of a registry's table; of a large one, a part is held at a time.
     """
-    history = history_of(table)
-    siblings = mountings(table, history)
+    history = history_of(read(COLUMNS))
+    siblings = mountings(read(MOUNTING_COLUMNS), history)
+    table = read(OVERVIEW_COLUMNS)
     return FleetTables(
         history,
         siblings,
@@ -55,8 +61,8 @@ def tables_of(table: Any) -> FleetTables:
             "cameras": cameras(table),
             "lidars": lidars(table),
             "quality": quality(table),
-            "sessions": _sessions(history),
         },
+        len(pc.unique(table["robot"])),
     )
 
 
@@ -159,7 +165,7 @@ def _mounting_robots(siblings: tuple[Mounting, ...]) -> Any:
                 "camera": pa.array([each.camera] * len(each.robots), pa.string()),
                 "lidar": pa.array([each.lidar] * len(each.robots), pa.string()),
                 "siblings": pa.array([len(each.robots) - 1] * len(each.robots), pa.int64()),
-                "is_outlier": np.abs(each.z).max(axis=1) > each.limit,
+                "is_outlier": each.is_one_kind & (np.abs(each.z).max(axis=1) > each.limit),
                 **_by_axis("apart", each.apart),
                 **{f"sigmas_{axis}": each.z[:, k] for k, axis in enumerate(AXES)},
             }

@@ -271,6 +271,7 @@ def _calibrate(
 
     def fill(folder: Path) -> None:
         result.write(folder)
+        replace_file(folder / PROFILE, dump_rig(session.rig).encode())
         if settings.pictures != "none":
             checks = verification.write(folder / OVERLAYS)
             for path in (path for check in checks for path in check.pictures):

@@ -430,6 +430,7 @@ def _judged(
     n_captures = len({name for pair in sensors.pairs for name in detections.captures(pair)})
     verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, others)
     lens = rig.cameras[camera].to_intrinsics()
+    lens_error, lens_error_sigma = _lens_error(validation)
     return Calibration(
         camera=camera,
         channels=tuple(channel.channel for channel in estimate.channels),
@@ -457,7 +458,17 @@ def _judged(
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,
+        lens_error=lens_error,
+        lens_error_sigma=lens_error_sigma,
     )
+
+
+def _lens_error(validation: Validation) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Give the errors of the profile's intrinsics as the boards see them, and their standard deviations."""
+    check = validation.intrinsics
+    if check is None or check.errors is None or check.errors_cov is None:
+        return (), ()
+    return check.errors, tuple(np.sqrt(np.diag(np.array(check.errors_cov))).tolist())
 
 
 def _diagnostics(estimate: CalibrationEstimate, validation: Validation) -> Diagnostics:

@@ -2,17 +2,29 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Scan
+from lce_rig.core.data_sheets import find_data_sheet
 from lce_rig.core.errors import UsageError
+from lce_rig.detect.lidar.segments import order_scan
 from lce_rig.export.camera_info import load_camera_info
+from lce_rig.recordings.folder.cloud import to_scan
+from lce_rig.recordings.folder.cloud_file import DECODERS, read_cloud
 from lce_rig.recordings.ros.survey import SensorTopic, survey_bag
+from lce_rig.rig import LidarSettings
 from lce_rig.rig.draft import CameraDraft, ChannelDraft, LidarDraft, draft_profile
 
 _UNKNOWN_MODEL = "other"
+# A ring that sees one distance only has no height: 0.1 mrad against 15 mm.
+_HEIGHT_PRIOR = (1e-4 / 0.015) ** 2
 _BOARD = re.compile(r"(\d+)x(\d+),([^,x]+),([^,x]+)x([^,x]+)(?:,([^,x]+),([^,x]+))?")
 _SIZE = re.compile(r"(\d{1,5})x(\d{1,5})")
 _FAMILIES: dict[str, Literal["radtan", "equidistant"]] = {
@@ -42,7 +54,8 @@ def new_profile(
     Args:
         name: of the rig.
         board: as it was measured.
-        recording: a bag; its topics name the sensors, frames, rates and, by camera_info, the lenses.
+        recording: a bag, whose topics name the sensors, frames, rates and, by camera_info, the lenses; or a
+            folder with point clouds in pcd/. The beams of a LiDAR of no known model are measured in it.
         lidar_model: maker's name of the LiDAR's model; None where it is not known.
         cameras: names of the cameras, in the order of their topics where there is a bag.
         intrinsics: of the cameras, in the same order; those of a bag where it is empty.
@@ -56,10 +69,13 @@ def new_profile(
         SourceError: the bag cannot be read, or holds no camera or no LiDAR.
         ProfileError: the parts do not make a valid profile.
     """
-    topics = [] if recording is None else survey_bag(recording)
+    clouds = None if recording is None else clouds_in(recording)
+    topics = survey_bag(recording) if recording is not None and not clouds else []
     lidars = list(_lidars([t for t in topics if t.kind == "scans"], lidar_model))
+    if clouds:
+        lidars = [_with_beams(lidars[0], read_cloud(clouds[0]), str(clouds[0]))]
     groups = _by_camera([t for t in topics if t.kind != "scans"])
-    if recording is not None:
+    if recording is not None and not clouds:
         _require_both(recording, topics)
         _require_count(len(cameras), len(groups), "names (--camera)", recording)
         _require_count(len(intrinsics), len(groups), "--intrinsics", recording)
@@ -79,7 +95,45 @@ def new_profile(
         used.add(frame)
         channels = tuple(ChannelDraft("events" if t.kind == "events" else "frames", t.topic) for t in group)
         drafts.append(CameraDraft(camera, lens, frame, channels or (ChannelDraft(),)))
-    return draft_profile(name, lidars, drafts, board, source), [_line(topic) for topic in topics]
+    found = [_line(topic) for topic in topics] + [f"{each.name}: {each.sees}" for each in lidars if clouds]
+    return draft_profile(name, lidars, drafts, board, source), found
+
+
+def clouds_in(folder: Path) -> list[Path]:
+    """List the point clouds of a folder that holds images and them, by name; empty for any other."""
+    there = (folder / "pcd").iterdir() if (folder / "pcd").is_dir() else ()
+    return sorted(path for path in there if path.suffix in DECODERS)
+
+
+def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
+    """Measure a LiDAR's beams in one of its scans.
+
+    A laser h above the frame's origin and inclined by alpha draws the line z = rho tan(alpha) + h over the
+    distance rho from the axis: z / rho is fitted against 1 / rho for each ring.
+
+    Args:
+        scan: of at least a few metres around, in the LiDAR's own frame.
+
+    Returns:
+        The elevation of each ring in deg, from the lowest; firings of each ring per revolution, None where
+        too few returns follow each other.
+    """
+    rho = np.hypot(scan.points[:, 0], scan.points[:, 1]).astype(np.float64)
+    x, y = 1 / rho, scan.points[:, 2] / rho
+    elevations = []
+    for ring in np.unique(scan.ring):
+        mine = scan.ring == ring
+        # Fit twice: returns of foreign rings and of edges are few, but far off.
+        for _ in range(2):
+            dx, dy = x[mine] - x[mine].mean(), y[mine] - y[mine].mean()
+            height_m = float(np.clip((dx @ dy) / (dx @ dx + _HEIGHT_PRIOR * mine.sum()), -0.05, 0.05))
+            slope = float(np.median(y[mine] - height_m * x[mine]))
+            mine = mine & (np.abs(y - height_m * x - slope) < 0.01)
+            if not mine.any():
+                break
+        elevations.append(float(np.degrees(np.arctan(slope))))
+    step_rad = order_scan(scan, min_range_m=0.3).step_rad
+    return sorted(elevations), round(2 * np.pi / step_rad) if step_rad > 0 else None
 
 
 def parse_board(text: str) -> Board:
@@ -132,9 +186,20 @@ def _lidars(topics: Sequence[SensorTopic], model: str | None) -> Iterator[LidarD
         name = "lidar" if len(topics) == 1 else f"lidar_{index + 1}"
         sees = "" if topic.n_rings is None else f"{topic.n_rings} rings in the recording"
         rate_hz = None if topic.rate_hz is None else round(topic.rate_hz, 1) or None
-        yield LidarDraft(name, model or _UNKNOWN_MODEL, topic.frame or None, topic.topic, rate_hz, sees)
+        draft = LidarDraft(name, model or _UNKNOWN_MODEL, topic.frame or None, topic.topic, rate_hz, sees)
+        yield draft if topic.cloud is None else _with_beams(draft, topic.cloud, topic.topic)
     if not topics:
         yield LidarDraft(model=model or _UNKNOWN_MODEL)
+
+
+def _with_beams(lidar: LidarDraft, cloud: NDArray[Any], where: str) -> LidarDraft:
+    """Add the beams that a cloud shows, where the model's are not known."""
+    if find_data_sheet(lidar.model) is not None:
+        return lidar
+    scan = to_scan(cloud, lidar.name, LidarSettings.model_validate({"model": lidar.model}), where).scan
+    elevations_deg, columns = measure_beams(scan)
+    sees = f"{len(elevations_deg)} rings, {columns or 'unknown'} columns in the recording"
+    return replace(lidar, elevations_deg=elevations_deg, columns=columns, sees=sees)
 
 
 def _by_camera(topics: Sequence[SensorTopic]) -> list[list[SensorTopic]]:

@@ -9,6 +9,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.recordings.folder.recorded_folder import list_parts
 from lce_rig.recordings.protocol import Recording, SourceOptions
 from lce_rig.recordings.ros.bag_file import kind_of
+from lce_rig.recordings.sensor_choice import choose_lidar
 from lce_rig.rig import Rig
 
 RECORDINGS = {
@@ -27,6 +28,7 @@ RECORDINGS = {
     ".zip": "lce_rig.recordings.events.camera_file:EventCameraFile",
 }
 """Reader by suffix, or "folder"; imported when wanted."""
+_PACKETS, _OUSTER = (".pcap", ".pcapng"), "lce_rig.recordings.ouster.pcap:OusterRecording"
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
@@ -43,8 +45,16 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
         known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
         hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
         raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
-    recording: Recording = resolve_name(RECORDINGS[kind])(path, rig, options or SourceOptions())
+    options = options or SourceOptions()
+    reader = _OUSTER if kind in _PACKETS and _is_of_ouster(rig, options) else RECORDINGS[kind]
+    recording: Recording = resolve_name(reader)(path, rig, options)
     return recording
+
+
+def _is_of_ouster(rig: Rig, options: SourceOptions) -> bool:
+    """Return whether the LiDAR that packets belong to is an Ouster: OS0, OS1, OS2."""
+    lidar = rig.lidars[choose_lidar(rig, options, [])]
+    return lidar.model.upper().removeprefix("OUSTER").lstrip(" -_").startswith("OS")
 
 
 def open_recordings(

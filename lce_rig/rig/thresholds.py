@@ -97,8 +97,8 @@ class VerdictSettings(Settings):
         max_held_out_ratio: largest ratio of the residuals of held-out and used captures.
         max_prior_sigmas: largest range offset of a laser, in units of the profile's `laser_bias_sigma_m`.
         max_change: largest difference of earlier and later captures, in targets; twice it fails.
-        max_contrast: the same between near and far, left and right, upper and lower boards, whose differences
-            nearly cancel in the whole.
+        max_contrast: the same between near and far, left and right, upper and lower boards, and between two
+            groups of captures, whose differences nearly cancel in the whole.
         max_camera_difference: largest difference of two cameras' relative pose between extrinsics and images,
             and its largest change during the session, in targets; `fail_factor` times that, or twice for a
             change, fails.

@@ -22,6 +22,8 @@ _KEYS: dict[str, Key | TakeBack] = {
 }
 _ENDING_S = 10.0
 HELP = "q stop   space capture now   u take back   n another place"
+PAGE_HELP = "   p QR code"
+"""The key that shows the page's QR code, where there is a page."""
 
 
 @dataclass
@@ -31,17 +33,21 @@ class Controls:
     Attributes:
         is_interactive: whether keys can be pressed at all.
         signal: that was received, by its number; None for none.
+        wants_code: whether the page's QR code is wanted on the screen.
     """
 
     is_interactive: bool
     signal: int | None = None
+    wants_code: bool = False
 
     def __call__(self) -> Key | TakeBack | None:
         """Give the next thing that is asked for; None where nothing is."""
         if self.signal is not None:
             return "stop"
         if self.is_interactive and select.select([sys.stdin], [], [], 0)[0]:
-            return _KEYS.get(sys.stdin.read(1).lower())
+            key = sys.stdin.read(1).lower()
+            self.wants_code = key == "p" and not self.wants_code
+            return _KEYS.get(key)
         return None
 
 

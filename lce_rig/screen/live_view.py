@@ -1,17 +1,21 @@
 """A live collection in a terminal: one screen, of 80x24 or larger, or plain lines for scripts and logs."""
 
+import io
+import math
 import sys
 import textwrap
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import pairwise
 from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from lce_rig.collect.live.state import LiveState, Phase, StreamState
 from lce_rig.core.geometry import Array
-from lce_rig.screen.keys import HELP
+from lce_rig.screen.keys import HELP, PAGE_HELP
 
 # Outlines drawn with braille characters: two by four dots each, which every terminal shows.
 
@@ -57,6 +61,7 @@ def _draw(dots: np.ndarray, polygon: Array, stride: int) -> None:
     dots[at[is_inside, 1], at[is_inside, 0]] = True
 
 
+CODE_STYLE = "bright_white on black"
 _STYLES: dict[Phase, str] = {
     "starting": "white on grey30",
     "searching": "white on dark_red",
@@ -68,6 +73,8 @@ _STYLES: dict[Phase, str] = {
     "lost": "white on red",
     "ended": "white on grey30",
 }
+# Told apart by their number; rung too fast, they would be one.
+_BELL_EVERY_S = 0.2
 _BELLS = {"captured": 1, "taken_back": 1, "refused": 2, "enough": 3, "lost": 3, "tick": 0}
 _HEIGHT, _WIDTH = 24, 80
 # Bars and figures; the drawing stands beside them.
@@ -89,37 +96,72 @@ class View(Protocol):
 
 
 @contextmanager
-def open_view(*, is_plain: bool, has_keys: bool, links: tuple[str, ...] = ()) -> Iterator[View]:
+def open_view(
+    *,
+    is_plain: bool,
+    has_keys: bool,
+    links: tuple[str, ...] = (),
+    is_silent: bool = False,
+    wants_code: Callable[[], bool] = lambda: False,
+) -> Iterator[View]:
     """Open a screen where stderr is a terminal that can draw one, else, or where wanted, plain lines.
 
     Args:
         is_plain: lines are wanted.
         has_keys: whether keys can be pressed.
         links: of the page, the likeliest first; a screen covers what was printed before it.
+        is_silent: no bell rings.
+        wants_code: asked whether to show the page's QR code in place of the guidance.
     """
+    bell = Bell(is_silent or not sys.stderr.isatty())
     if is_plain or not sys.stderr.isatty():
-        yield PlainView()
+        yield PlainView(bell)
         return
     from rich.console import Console
     from rich.live import Live
 
     console = Console(stderr=True, highlight=False)
     if console.is_dumb_terminal:
-        yield PlainView()
+        yield PlainView(bell)
         return
     live = Live(console=console, screen=True, auto_refresh=False)
     live.start()
     try:
-        yield ScreenView(live, console, has_keys=has_keys, links=links)
+        yield ScreenView(live, console, bell, has_keys=has_keys, links=links, wants_code=wants_code)
     finally:
         with suppress(OSError):  # The terminal may be gone.
             live.stop()
 
 
+class Bell:
+    """Rings the terminal's bell for what is new in states: once for a capture, twice for a refused one."""
+
+    def __init__(
+        self,
+        is_silent: bool = False,
+        ring: Callable[[], object] = lambda: print("\a", end="", file=sys.stderr, flush=True),  # noqa: T201
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._is_silent, self._ring, self._now_s = is_silent, ring, now_s
+        self._n_cued = self._n_due = 0
+        self._rung_s = -math.inf
+
+    def take(self, state: LiveState) -> None:
+        """Note the cues of a state, and ring once if a ring is due; states come several times a second."""
+        for cue in state.cues:
+            if cue.number > self._n_cued and _BELLS[cue.sound]:
+                self._n_due = _BELLS[cue.sound]
+        self._n_cued = state.cues[-1].number if state.cues else 0
+        if self._n_due and not self._is_silent and self._now_s() - self._rung_s >= _BELL_EVERY_S:
+            self._n_due, self._rung_s = self._n_due - 1, self._now_s()
+            self._ring()
+
+
 class PlainView:
     """A line on stderr whenever something changes; instructions, which change all the time, now and then."""
 
-    def __init__(self) -> None:
+    def __init__(self, bell: Bell) -> None:
+        self._bell = bell
         self._said: tuple[str, str] | None = None
         self._said_s = -_PLAIN_EVERY_S
         self._n_logged = 0
@@ -128,6 +170,7 @@ class PlainView:
 
     def show(self, state: LiveState) -> None:
         """Print what is new."""
+        self._bell.take(state)
         for note in state.notes:
             if note not in self._notes:
                 self._notes.add(note)
@@ -153,23 +196,62 @@ class PlainView:
 class ScreenView:
     """One screen, redrawn with every state."""
 
-    def __init__(self, live: Any, console: Any, *, has_keys: bool, links: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        live: Any,
+        console: Any,
+        bell: Bell,
+        *,
+        has_keys: bool,
+        links: tuple[str, ...] = (),
+        wants_code: Callable[[], bool] = lambda: False,
+    ) -> None:
         self._live = live
         self._console = console
+        self._bell = bell
         self._has_keys = has_keys
         self._links = links
-        self._n_cued = 0
+        self._wants_code = wants_code
 
     def show(self, state: LiveState) -> None:
-        """Draw a state, and ring the bell for what is new in it."""
-        for cue in state.cues:
-            if cue.number > self._n_cued:
-                for _ in range(_BELLS[cue.sound]):
-                    self._console.bell()
-        self._n_cued = state.cues[-1].number if state.cues else 0
+        """Draw a state, or the page's QR code before the sensors send, and ring the bell."""
+        self._bell.take(state)
         height, width = self._console.height, self._console.width
-        screen = render(state, has_keys=self._has_keys, links=self._links, height=height, width=width)
-        self._live.update(screen, refresh=True)
+        code = None
+        if self._links and (state.phase == "starting" or self._wants_code()):
+            code = render_code(self._links[0], state, height=height, width=width)
+        self._live.update(
+            code or render(state, has_keys=self._has_keys, links=self._links, height=height, width=width),
+            refresh=True,
+        )
+
+
+def render_code(link: str, state: LiveState, *, height: int = _HEIGHT, width: int = _WIDTH) -> Any:
+    """Lay out a page's QR code with its link and the headline; None if there is no room, or no use."""
+    from rich.console import Group
+    from rich.text import Text
+
+    code = qr_lines(link)
+    said = [f"page: {link}", state.headline]
+    lines = [line for text in said for line in _folded(text, width)]
+    if not code or len(code) + len(lines) > height or len(code[0]) > width:
+        return None
+    return Group(*(Text(line, style=CODE_STYLE) for line in code), *map(Text, lines))
+
+
+def qr_lines(link: str) -> list[str]:
+    """Draw a QR code of a link with two modules a character; none of a link that no phone can open.
+
+    Light modules are drawn, dark ones are the background: the colours must be set, see `CODE_STYLE`.
+    """
+    host = urlsplit(link).hostname or ""
+    if host in ("localhost", "::1") or host.startswith("127."):
+        return []
+    import segno
+
+    drawn = io.StringIO()
+    segno.make(link, error="l", micro=False).terminal(drawn, border=2, compact=True)
+    return drawn.getvalue().rstrip("\n").split("\n")
 
 
 def render(
@@ -209,7 +291,7 @@ def render(
     streams, n_streams = _stream_table(state.streams, width)
     # A link that is cut is none: it wraps where it is too long.
     page = [line for link in links[:1] for line in _folded(f"page: {link}", width)]
-    keys = [HELP] if has_keys else []
+    keys = [HELP + (PAGE_HELP if links and qr_lines(links[0]) else "")] if has_keys else []
     newest = _wrap(state.log[-1], width) if state.log else []
     notes = [_wrap(f"! {note}", width) for note in state.notes]
 

@@ -23,7 +23,7 @@ from lce_rig.extrinsics.tolerances import Sensitivity, Source
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 from lce_rig.validation.intrinsics_check import IntrinsicsCheck
 from lce_rig.validation.nuisances import Nuisances
-from lce_rig.validation.split_consistency import Contrast
+from lce_rig.validation.split_consistency import Contrast, objections
 from lce_rig.validation.weighing import SURPRISING_CHI2
 
 # A lens differs significantly below this probability, scales beyond this many standard deviations.
@@ -103,11 +103,10 @@ def split_contradictions(
 
     Where the extrinsics change on the way, it lies a whole change from one of the two that may hold now.
     """
-    for contrast in contrasts:
-        if contrast.excess(target, limits) > 1:
-            share = 1.0 if contrast.is_change else _HALF
-            source = f"{contrast.first}_{contrast.second}"
-            yield Contradiction(source, share * np.array([contrast.apart]))
+    for contrast in objections(contrasts, target, limits):
+        share = 1.0 if contrast.is_change else _HALF
+        source = f"{contrast.first}_{contrast.second}"
+        yield Contradiction(source, share * np.array([contrast.apart]))
 
 
 def channels_contradiction(

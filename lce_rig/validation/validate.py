@@ -27,7 +27,7 @@ from lce_rig.validation.contributions import (
 from lce_rig.validation.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.validation.negative_control import NegativeControl, run_control
 from lce_rig.validation.nuisances import Nuisances, estimate_nuisances
-from lce_rig.validation.split_consistency import Contrast, contrast_halves
+from lce_rig.validation.split_consistency import Contrast, contrast_halves, find_groups
 
 # Check the reported uncertainty with bootstrap samples, leave-one-out results and random halves.
 
@@ -213,7 +213,7 @@ def validate(
         rig,
         widened_by,
         remark,
-        contrast_halves(settled, centres),
+        (*contrast_halves(settled, centres), *find_groups(settled)),
         control,
         estimate_nuisances(expansion, rings),
         intrinsics,

@@ -170,6 +170,7 @@ _CONTRADICTIONS = {
     "scale": "the camera's distances and the LiDAR's",
     "channels": "the camera's channels",
     "cameras": "the cameras",
+    "group_rest": "two groups of captures",
 }
 _MEASURE_LENS = (
     "measure the intrinsics (`lce-rig intrinsics --save-profile FILE`), or enter their standard deviations "
@@ -390,6 +391,10 @@ PHRASES: dict[str, Phrase] = {
     "verdict.changed": Phrase(
         "extrinsics change significantly at capture {capture}, by " + _APART,
         "fasten the sensors, one may have moved, and collect again",
+    ),
+    "verdict.two_groups": Phrase(
+        "{n_captures} captures ({captures}) fit other extrinsics than the rest, significantly, by " + _APART,
+        "fasten the sensors, one may have moved to and fro, and collect again",
     ),
     "verdict.shares_differ": Phrase(
         "{first} and {second} boards differ significantly, by " + _APART,

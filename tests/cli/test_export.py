@@ -50,3 +50,43 @@ def test_a_failed_result_does_not_reach_a_robot(lce_rig, calibrated, tmp_path):
     assert robot.read_text() == ROBOT
     assert lce_rig("export", calibrated, "--into", robot, "--force").code == 0
     assert robot.read_text() != ROBOT
+
+
+def test_files_fit_into_the_robots_tree_and_what_is_left_out_is_told(lce_rig, calibrated, tmp_path, mute):
+    robot, out = tmp_path / "robot.urdf", tmp_path / "out"
+    robot.write_text(ROBOT)
+    told = lce_rig("export", calibrated, "-o", out, "--formats", "isaac,autoware")
+    assert told.code == 0 and told.err.count("export.no_frame") == 4  # each with its action
+    outcome = lce_rig("export", calibrated, "-o", out, "--formats", "isaac,ros2_launch,mcap", "--tree", robot)
+    assert outcome.code == 0 and "export." not in outcome.err
+    assert {path.name for path in out.iterdir()} == {
+        *("isaac_calibration.urdf", "rles.launch.py", "rles_session"),
+    }
+    read = URDF.load(str(out / "isaac_calibration.urdf"), load_meshes=False)
+    T = read.get_transform("velodyne", "davis_optical_frame")
+    np.testing.assert_allclose(T, extrinsics(calibrated), atol=1e-9)
+    # The session's own recording of transforms is a tree as well.
+    args = ("--formats", "urdf", "--tree", out / "rles_session")
+    assert lce_rig("export", calibrated, "-o", tmp_path / "again", *args).code == 0
+    assert lce_rig("export", calibrated, "--into", robot, "--tree", robot).code == 2
+
+
+def test_every_format_is_listed_with_its_files(lce_rig):
+    from lce_rig.export import EXPORTS
+
+    lines = lce_rig("export", "--list").out.splitlines()
+    assert [line.split()[0] for line in lines] == list(EXPORTS)
+
+
+def test_calibrate_writes_the_formats_of_the_profile(lce_rig, simulated, tmp_path):
+    import shutil
+
+    session = tmp_path / "session"
+    shutil.copytree(simulated, session)
+    profile = session / "rig.yaml"
+    profile.write_text(profile.read_text().replace("exports: []", "exports: [opencv, tf_static_bag]"))
+    assert lce_rig("calibrate", session).code == 0
+    names = {path.name for path in (session / "calibration").iterdir()} - {"report.html"}
+    assert names == {"result.json", "opencv_davis.yaml", "tf_static"}
+    assert lce_rig("calibrate", session, "--seed", "1").code == 0
+    assert names <= {path.name for path in (session / "calibration/previous").iterdir()}

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from lce_rig.collect.guidance import Coverage
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
-from lce_rig.screen.live_view import PlainView, ScreenView, draw_outlines, render
+from lce_rig.screen.live_view import Bell, PlainView, ScreenView, draw_outlines, qr_lines, render
 
 SQUARE = np.array([[300.0, 200.0], [700, 240], [660, 500], [280, 470], [300, 200]])
 STREAMS = (
@@ -135,31 +135,71 @@ def test_every_phase_has_a_look(phase: str) -> None:
     assert drawn(replace(STATE, phase=phase))  # type: ignore[arg-type]
 
 
-def test_the_bell_rings_once_for_each_cue() -> None:
-    class Bells:
-        height, width = 24, 80
+def test_the_bell_rings_once_for_a_capture_and_twice_for_a_refused_one_apart_in_time() -> None:
+    clock = [0.0]
+    rung: list[float] = []
 
-        n = 0
+    def heard(state: LiveState, n_states: int = 20, is_silent: bool = False) -> list[float]:
+        bell = Bell(is_silent, lambda: rung.append(clock[0]), lambda: clock[0])
+        rung.clear()
+        for _ in range(n_states):
+            clock[0] += 0.05
+            bell.take(state)
+        return rung
 
-        def bell(self) -> None:
-            self.n += 1
+    assert len(heard(replace(STATE, cues=(Cue(1, "captured"),)))) == 1
+    twice = heard(replace(STATE, cues=(Cue(2, "refused"),)))
+    assert len(twice) == 2 and twice[1] - twice[0] >= 0.2 - 1e-9
+    assert heard(replace(STATE, cues=(Cue(3, "tick"),))) == []
+    # What came last counts: a capture right after a refused one must not be heard as refused.
+    assert len(heard(replace(STATE, cues=(Cue(1, "refused"), Cue(2, "captured"))))) == 1
+    assert heard(STATE, is_silent=True) == []
 
-    class Screen:
-        def update(self, _what: object, *, refresh: bool) -> None:
-            assert refresh
 
-    bells = Bells()
-    view = ScreenView(Screen(), bells, has_keys=False)
-    view.show(STATE)
-    assert bells.n == 1 + 2
-    view.show(STATE)
-    assert bells.n == 3
-    view.show(replace(STATE, cues=(*STATE.cues, Cue(3, "tick"), Cue(4, "enough"))))
-    assert bells.n == 6
+def test_the_pages_code_fits_and_holds_its_link() -> None:
+    import cv2
+
+    link = "http://192.168.100.200:8765/?token=q3Zk9Xw0aB4_"
+    lines = qr_lines(link)
+    assert len(lines) + 2 <= 24 and max(map(len, lines)) <= 80
+    # Each character shows two modules, light ones drawn.
+    halves = {" ": (0, 0), "▀": (1, 0), "▄": (0, 1), "█": (1, 1)}
+    rows = [[halves[character][k] for character in line] for line in lines for k in (0, 1)]
+    picture = np.kron(255 * np.array(rows[: len(lines[0])], np.uint8), np.ones((8, 8), np.uint8))
+    assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == link
+    assert qr_lines("http://127.0.0.1:8765/") == [] == qr_lines("http://localhost:8765/")
+
+
+def test_the_code_stands_in_place_of_the_guidance_before_it_begins_and_when_asked_for() -> None:
+    link = "http://192.168.100.200:8765/?token=q3Zk9Xw0aB4_"
+    wanted = [False]
+
+    def shown(state: LiveState, size: tuple[int, int] = (24, 80)) -> str:
+        console = Console(height=size[0], width=size[1], file=io.StringIO(), force_terminal=False)
+
+        class Screen:
+            def update(self, what: object, *, refresh: bool) -> None:
+                assert refresh
+                console.print(what)
+
+        bell = Bell(is_silent=True)
+        view = ScreenView(Screen(), console, bell, has_keys=True, links=(link,), wants_code=lambda: wanted[0])
+        view.show(state)
+        assert isinstance(console.file, io.StringIO)
+        text = console.file.getvalue().rstrip("\n")
+        assert len(text.split("\n")) <= size[0]
+        return text
+
+    starting = replace(STATE, phase="starting", headline="waiting for the sensors")
+    assert qr_lines(link)[5] in shown(starting) and link in shown(starting)
+    assert qr_lines(link)[5] not in shown(STATE) and "p QR code" in shown(STATE)
+    wanted[0] = True
+    assert qr_lines(link)[5] in shown(STATE)
+    assert qr_lines(link)[5] not in shown(STATE, (16, 80)), "no room for it"
 
 
 def test_plain_lines_say_what_changes_once(capsys: pytest.CaptureFixture[str]) -> None:
-    view = PlainView()
+    view = PlainView(Bell(is_silent=True))
     moving = replace(
         STATE, phase="moving", headline="one step left", hold_s=None, cues=(), log=(), notes=("a note",)
     )

@@ -1,6 +1,8 @@
 """Deployments: a whole set or the earlier one, refused where it must be, and back byte for byte."""
 
+import contextlib
 import os
+import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
@@ -292,6 +294,59 @@ def test_where_flock_is_missing_a_folder_is_the_lock_and_a_dead_holders_is_taken
     back = ("", names[1], names[0], "10", "", "{}")
     assert run_without_flock(robot, tools, *back).code == 0
     assert not (robot / ".lock.d").exists()
+
+
+TOOLS = ("cat", "flock", "ln", "ls", "mkdir", "mv", "rm", "sync")
+
+
+class Failing(LocalPlace):
+    """A place where the shell is killed before it starts its n-th program; flushing is left out."""
+
+    def __init__(self, path: str, tools: Path, n: int) -> None:
+        super().__init__(path)
+        self._tools = tools
+        shutil.rmtree(tools, ignore_errors=True)
+        tools.mkdir()
+        for name in TOOLS:
+            wrapper = tools / name
+            wrapper.write_text(
+                f"#!/bin/sh\necho >>{tools}/count\n"
+                f'[ "$(/usr/bin/wc -l <{tools}/count)" -eq {n} ] && kill -9 $PPID && exit 1\n'
+                + ("exit 0\n" if name == "sync" else f'exec {shutil.which(name)} "$@"\n')
+            )
+            wrapper.chmod(0o755)
+
+    def command(self, script: str, *arguments: str) -> list[str]:
+        return ["env", f"PATH={self._tools}:/usr/bin:/bin", *super().command(script, *arguments)]
+
+
+@pytest.mark.long
+def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(
+    result: Result, rig: Rig, local: TargetSettings, robot: Path, tmp_path: Path
+) -> None:
+    settings = with_settings(local, keep=2, formats=["urdf"])
+    folders = [result("a"), result("b", 0.15)]
+    sound = Failing(str(robot), tmp_path / "sound", 0)
+    for folder in (*folders, folders[0]):
+        deploy(folder, rig, settings, place=sound)
+    sets = {set_sha256(standing(settings).state.releases[k].files) for k in (0, 1)}
+    n_new = n_old = 0
+    for n in range(1, 100):
+        before = content_of(robot / "current")
+        place = Failing(str(robot), tmp_path / "tools", n)
+        with contextlib.suppress(TargetError):
+            deploy(folders[1], rig, settings, place=place)
+        found = content_of(robot / "current")
+        assert set_sha256(found) in sets, f"step {n}"
+        n_new, n_old = n_new + (found != before), n_old + (found == before)
+        assert not standing(settings).changed
+        if len((tmp_path / "tools" / "count").read_text()) < n:
+            break
+        deploy(folders[0], rig, settings, place=sound)
+        assert content_of(robot / "current") == before
+        assert {entry.name for entry in robot.glob(".*")} <= {".lock"}, f"step {n}"
+        assert len(list((robot / "releases").iterdir())) <= 3
+    assert n > 15 and n_new > 2 and n_old > 2
 
 
 def test_a_set_is_known_by_what_sha256sum_prints(tmp_path: Path) -> None:

@@ -5,7 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.fleet.changes import Limits, Sessions, find_changes, references, rescaled, scale_of, statistics
+from lce_rig.fleet.changes import (
+    Limits,
+    Sessions,
+    find_changes,
+    pooled,
+    references,
+    rescaled,
+    scale_of,
+    statistics,
+)
 from lce_rig.scene.alignment import AXES
 
 SIGMA = np.array([3e-3, 3e-3, 4e-3, *np.radians([0.08, 0.08, 0.05])])
@@ -187,3 +196,12 @@ def test_the_smallest_change_is_seen_in_95_of_100_trials():
         tangents[8, axis] += smallest[axis]
         seen += statistics(replace(like_last, tangents=tangents)).step[8] > limits.chi2
     assert 0.91 * n <= seen <= 0.985 * n
+
+
+def test_a_covariance_too_small_by_chance_takes_half_of_its_series():
+    sessions = draw(11, 2)
+    small = sessions.cov.copy()
+    small[3] /= 100
+    found = pooled(replace(sessions, cov=small)).cov
+    assert np.allclose(found[3], (small[3] + small[:8].mean(axis=0)) / 2)
+    assert np.allclose(found[8:].mean(axis=0), small[8:].mean(axis=0))

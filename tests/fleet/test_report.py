@@ -38,17 +38,17 @@ def table(row):
 
 
 def test_the_page_names_who_moved_and_escapes_what_it_is_told(table):
-    made = tables_of(table)
-    text = page(made, table, "north")
+    made = tables_of(table.select)
+    text = page(made, table.select, "north")
     assert "<b>&lt;r1&gt;</b>" in text and "<r1>" not in text
     assert "Ann &amp; Bo" in text and "fleet.signal" in text
     assert text.count("<svg") == 2
     assert "http" not in text.replace("http-equiv", "")
-    assert text == page(tables_of(table), table, "north")
+    assert text == page(tables_of(table.select), table.select, "north")
 
 
 def test_findings_and_tables_are_for_programs(table, tmp_path):
-    made = tables_of(table)
+    made = tables_of(table.select)
     moved = findings(made)[0]
     assert (moved.code, moved.subject, moved.figures["axes"]) == ("fleet.moved", "<r1>", ("rotation_y",))
     told = json.loads(json.dumps(document(made), allow_nan=False))
@@ -56,14 +56,14 @@ def test_findings_and_tables_are_for_programs(table, tmp_path):
     assert told["tables"]["changes"][0]["after"] == "2026-01-06T10:00:00Z"
     assert "sessions" not in told["tables"]
     written = {path.stem: path for path in write_csv(made, tmp_path / "csv")}
-    assert set(written) == set(made.tables)
+    assert set(written) == {*made.tables, "sessions"}
     rows = list(csv.DictReader(written["sessions"].read_text().splitlines()))
     assert len(rows) == 80 and rows[0]["chi2"] == "" and float(rows[1]["chi2"]) > 0
 
 
 def test_a_page_of_nothing_says_so(row):
     table = as_table([row("r1", T_cam_lidar=None)])
-    text = page(tables_of(table), table, "empty")
+    text = page(tables_of(table.select), table.select, "empty")
     assert "Nothing." in text and "<svg" not in text
 
 

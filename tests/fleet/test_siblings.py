@@ -1,14 +1,18 @@
 """A robot beside its siblings."""
 
+import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import lce_rig as lce
+from lce_rig.cli.main import run
 from lce_rig.core.geometry import exp_so3, perturb, pose
 from lce_rig.fleet.history import history_of
 from lce_rig.fleet.siblings import compare, deviations, limit_of, mountings
-from lce_rig.fleet.table import as_table
+from lce_rig.fleet.table import Row, as_table, result_columns, write_table
 
 SIGMA = np.array([1e-3, 1e-3, 1e-3, *np.radians([0.03, 0.03, 0.03])])
 SPREAD = np.array([3e-3, 3e-3, 3e-3, *np.radians([0.4, 0.4, 0.4])])
@@ -65,6 +69,18 @@ def test_a_robot_known_less_well_needs_to_be_farther_apart():
     assert near > 4 > 1.2 > deviations(apart, sigma)[8, 0]
 
 
+def test_robots_of_two_kinds_name_nobody(fleet):
+    shifted = 20 * SPREAD * np.eye(6)[3]
+    rng = np.random.default_rng(1)
+    rows = [
+        fleet(f"r{k}", 0.1 * SPREAD * rng.normal(size=6) + (shifted if k % 3 == 0 else 0)) for k in range(30)
+    ]
+    table = as_table(rows)
+    (mounting,) = mountings(table, history_of(table))
+    assert not mounting.is_one_kind and mounting.outliers == []
+    assert compare(fleet("new", shifted), table) == []
+
+
 def test_few_siblings_name_nobody():
     assert limit_of(5, 5) == np.inf
     assert 3.5 < limit_of(60, 60) < 4.5
@@ -88,3 +104,27 @@ def test_a_new_result_is_compared_with_its_siblings_and_with_its_past(fleet):
     assert all(finding.severity == "note" for finding in (since, beside))
     assert compare(replace(bent, session_sha256="r0-5"), as_table(rows[-1:])) == []
     assert compare(bent, as_table(rows[1:4])) == []
+
+
+@pytest.mark.long
+def test_calibrate_notes_what_the_registry_knows(simulated, tmp_path):
+    own = tmp_path / "session"
+    shutil.copytree(simulated, own)
+    result = lce.calibrate(lce.Session.open(own))
+    (pair,) = result.pairs
+    columns = result_columns(pair, result.session.rig, {})
+    rng = np.random.default_rng(0)
+    rows = []
+    for k in range(12):
+        T = perturb(pair.T_cam_lidar, np.radians(5) * np.eye(6)[4] + 1e-3 * rng.normal(size=6))
+        known = {**columns, "T_cam_lidar": tuple(T.ravel().tolist())}
+        rows.append(Row(f"r{k}", rig=result.session.rig.name, date="2026-01-01T00:00:00Z", **known))
+    write_table(tmp_path / "fleet.parquet", as_table(rows))
+    before = (own / "rig.yaml").read_bytes()
+    assert run(["calibrate", str(own), "--registry", str(tmp_path), "--no-report"]) == 0
+    (written,) = json.loads((own / "calibration/result.json").read_text())["pairs"]
+    notes = [each for each in written["findings"] if each["code"] == "fleet.apart_from_siblings"]
+    assert [each["severity"] for each in notes] == ["note"]
+    assert (notes[0]["figures"]["axis"], notes[0]["figures"]["n_siblings"]) == ("rotation_y", 12)
+    assert written["verdict"] == pair.verdict
+    assert (own / "rig.yaml").read_bytes() == before

@@ -1,5 +1,6 @@
 """A profile of one's own rig, from numbers or from a bag, holds what was given and nothing of another rig."""
 
+import numpy as np
 import pytest
 
 from lce_rig.core.camera import Intrinsics
@@ -56,3 +57,39 @@ def test_a_file_that_is_no_camera_info_is_named(tmp_path, content):
     path.write_text(content)
     with pytest.raises(ProfileError, match=r"info\.yaml"):
         parse_intrinsics(str(path))
+
+
+def write_cloud(path, elevations_deg, columns):
+    """A room seen by lasers 10 mm above the origin at most, in firing order."""
+    rng = np.random.default_rng(3)
+    azimuth = -2 * np.pi * np.arange(columns) / columns
+    azimuth, elevation = (
+        each.ravel() for each in np.meshgrid(azimuth, np.radians(elevations_deg), indexing="ij")
+    )
+    height_m = 0.01 * np.sin(5 * elevation)
+    rho = 3.0 + 1.5 * np.sin(3 * azimuth) + 0.01 * rng.standard_normal(len(azimuth))
+    z = rho * np.tan(elevation) + height_m
+    ring = np.tile(np.arange(len(elevations_deg)), columns)
+    rows = np.stack([rho * np.cos(azimuth), rho * np.sin(azimuth), z, ring], axis=1)
+    head = (
+        "VERSION 0.7\nFIELDS x y z ring\nSIZE 4 4 4 2\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+        f"WIDTH {len(rows)}\nHEIGHT 1\nPOINTS {len(rows)}\nDATA ascii\n"
+    )
+    path.parent.mkdir(parents=True)
+    path.write_text(head + "\n".join(f"{x:.5f} {y:.5f} {z:.5f} {int(k)}" for x, y, z, k in rows))
+
+
+def test_the_beams_of_an_unknown_model_are_measured_in_a_recording(tmp_path):
+    elevations_deg = np.sort(np.r_[np.linspace(-20, -6, 8), np.linspace(-5, 5, 16), [8, 14]])
+    write_cloud(tmp_path / "pcd" / "0.pcd", elevations_deg, 900)
+    lens = parse_intrinsics("radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0")
+    text, found = new_profile(
+        "mine", parse_board(BOARD), recording=tmp_path, lidar_model="other", intrinsics=[lens]
+    )
+    settings = parse_rig(text).lidars["lidar"]
+    assert np.array(settings.elevations_deg) == pytest.approx(elevations_deg, abs=0.05)
+    assert settings.columns == 900
+    assert settings.data_sheet() is not None and found == ["lidar: 26 rings, 900 columns in the recording"]
+    # Of a known model, its data sheet counts.
+    text, _ = new_profile("a", parse_board(BOARD), recording=tmp_path, lidar_model="XT32", intrinsics=[lens])
+    assert parse_rig(text).lidars["lidar"].elevations_deg is None

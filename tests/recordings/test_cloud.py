@@ -181,3 +181,11 @@ def test_an_organised_cloud_keeps_its_returns_only(room, nothing):
     assert np.array_equal(sparse.scan.points, whole.scan.points)
     assert np.array_equal(sparse.scan.ring, whole.scan.ring)
     assert sparse.n_not_finite + sparse.n_zero_range - whole.n_zero_range == len(room)
+
+
+def test_more_rings_than_the_model_has_are_reported(room):
+    assert to_scan(room, "lidar", FIRST, "here").notes == ()
+    cloud = np.concatenate([room, room])
+    cloud["ring"][len(room) :] += 16
+    cloud["z"][len(room) :] += 2.0 * np.hypot(room["x"], room["y"])
+    assert has_note(to_scan(cloud, "lidar", FIRST, "here").notes, "32 rings", "VLP-16", "lidars.lidar.model")

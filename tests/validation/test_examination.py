@@ -12,7 +12,7 @@ from lce_rig.extrinsics.local_quadratic import SCALE, SHIFT, expand
 from lce_rig.rig import CalibrationSettings, VerdictSettings, load_rig
 from lce_rig.validation.negative_control import control_findings, run_control
 from lce_rig.validation.nuisances import estimate_nuisances, nuisance_findings
-from lce_rig.validation.split_consistency import contrast_halves, split_findings
+from lce_rig.validation.split_consistency import contrast_halves, find_groups, split_findings
 from lce_rig.validation.validate import resample, validate, widening
 from tests.extrinsics.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
@@ -131,6 +131,39 @@ def test_near_boards_that_say_something_else_than_far_ones_are_found():
     found = contrast_halves(expanded(boards).settled(), middles(boards))
     findings = split_findings(found, [seen.capture for seen in boards], TARGET, LIMITS)
     assert any(finding.figures.get("first") == "near" for finding in findings)
+
+
+def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest():
+    nudge = perturb(np.eye(4), np.array([0, 0, 0, np.radians(1.0), 0, 0]))
+    away = (1, 4, 5, 9, 13)
+    nudged = [
+        moved(seen, nudge @ seen.image.T_cam_board) if k in away else seen
+        for k, seen in enumerate(observed(16, 4))
+    ]
+    found = find_groups(expanded(nudged).settled())
+    (finding,) = split_findings(found, [seen.capture for seen in nudged], TARGET, LIMITS)
+    assert finding.code == "verdict.two_groups"
+    assert finding.figures["captures"] == tuple(f"{k:06d}" for k in away)
+    assert finding.figures["rotation_deg"] == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_change_at_one_capture_is_not_told_as_two_groups_as_well():
+    nudge = perturb(np.eye(4), np.array([0, 0, 0, np.radians(1.0), 0, 0]))
+    nudged = [
+        moved(seen, nudge @ seen.image.T_cam_board) if k >= 8 else seen
+        for k, seen in enumerate(observed(16, 4))
+    ]
+    settled = expanded(nudged).settled()
+    contrasts = (*contrast_halves(settled, middles(nudged)), *find_groups(settled))
+    assert contrasts[-1].excess(TARGET, LIMITS) > 1
+    codes = [each.code for each in split_findings(contrasts, [o.capture for o in nudged], TARGET, LIMITS)]
+    assert codes == ["verdict.changed"]
+
+
+def test_a_sound_session_has_no_groups_more_often_than_by_chance():
+    chances = [find_groups(expanded(observed(15, seed)).settled())[0].chance for seed in range(8)]
+    assert min(chances) > 0.001
+    assert np.median(chances) > 0.05
 
 
 def test_a_sound_session_shows_no_contrast_more_often_than_by_chance():

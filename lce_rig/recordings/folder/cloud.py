@@ -205,6 +205,9 @@ def to_scan(
     if n_kept < len(points):
         points, cloud = points[is_kept], cloud[is_kept]
     ring = _ring(cloud, fields, points, where, notes)
+    sheet, n_rings = settings.data_sheet(), len(np.unique(ring))
+    if sheet is not None and n_rings > sheet.n_rings:
+        notes.append(f"{n_rings} rings, a {sheet.name} has {sheet.n_rings}: check lidars.{lidar}.model")
     offset_ns, stamp_ns = _times(cloud, fields, settings, stamp_ns, notes)
     scan = Scan(lidar, stamp_ns, points, _intensity(cloud, fields, notes), ring, offset_ns, host_ns)
     return CloudReading(scan, len(is_finite) - n_finite, n_finite - n_kept, tuple(notes))

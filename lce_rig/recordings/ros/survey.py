@@ -1,11 +1,12 @@
 """What a bag holds of cameras and LiDARs: what a rig's profile has to say of them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SourceError
@@ -40,6 +41,7 @@ class SensorTopic:
         n_rings: number of rings of a scan; None where points have none.
         intrinsics: by the camera_info topic in the same namespace; None where there is no usable one.
         note: why there is no usable one, "" where there is one or no topic.
+        cloud: the first point cloud of a topic of scans; None where it has packets.
     """
 
     topic: str
@@ -51,6 +53,7 @@ class SensorTopic:
     n_rings: int | None = None
     intrinsics: Intrinsics | None = None
     note: str = ""
+    cloud: NDArray[Any] | None = field(default=None, compare=False, repr=False)
 
     @property
     def namespace(self) -> str:
@@ -133,17 +136,19 @@ def _probe(found: SensorTopic, message: RawMessage) -> SensorTopic | None:
             is_compressed = message.msgtype.endswith("CompressedImage")
             pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
             return replace(found, size_px=(pixels.shape[1], pixels.shape[0]))
-        return found if message.msgtype in PACKET_TYPES else replace(found, n_rings=_count_rings(content))
+        if message.msgtype in PACKET_TYPES:
+            return found
+        cloud = decode_pointcloud2(content)
+        return replace(found, n_rings=_count_rings(cloud, int(content.height)), cloud=cloud)
     except (SourceError, ValueError):
         return None
 
 
-def _count_rings(content: Any) -> int | None:
-    cloud = decode_pointcloud2(content)
+def _count_rings(cloud: NDArray[Any], height: int) -> int | None:
     for name in ("ring", "channel"):
         if name in (cloud.dtype.names or ()) and len(cloud):
             return len(np.unique(cloud[name]))
-    return int(content.height) if content.height > 1 else None
+    return height if height > 1 else None
 
 
 def _with_lens(found: SensorTopic, first: dict[str, RawMessage], infos: set[str]) -> SensorTopic:

@@ -1,0 +1,416 @@
+"""Every output read by a program that is not ours: where it puts the points that the result projects.
+
+A reader takes the folder of an export and returns the pixels (N, 2) of given LiDAR points, by the documented
+conventions of the format, through its own parser and OpenCV's projection. Tests run all of them.
+"""
+
+import json
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from benchmarks.tables import print_head, print_row
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.geometry import Array, exp_so3, pose, transform
+from lce_rig.core.results import Calibration, Certificate, Metrics
+from lce_rig.export import EXPORTS, export_formats
+from lce_rig.export.lens import fit_coefficients
+from lce_rig.export.probes import probe_points
+from lce_rig.rig import Rig, load_rig
+from lce_rig.rig.mount import Mount
+from lce_rig.session import Session
+
+Lens = tuple[str, Array, Array]
+"""Model ("fisheye" or another), camera matrix (3, 3), coefficients."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What was exported, and what readers may know beside the files: names, no figures of the result.
+
+    Attributes:
+        folder: of the export.
+        points_lidar: (N, 3) m to be drawn.
+        lens: of the profile, for files without one.
+    """
+
+    folder: Path
+    rig: Rig
+    calibration: Calibration
+    points_lidar: Array
+    lens: Lens
+
+    @property
+    def camera(self) -> str:
+        """The camera's name."""
+        return self.calibration.camera
+
+    @property
+    def frames(self) -> tuple[str, str]:
+        """The camera's optical frame and the LiDAR's frame."""
+        camera, lidar = self.rig.cameras[self.camera], self.rig.lidars[self.calibration.lidar]
+        return camera.optical_frame, lidar.frame
+
+
+def project(points_lidar: Array, T_cam_lidar: Array, lens: Lens) -> Array:
+    """Draw points by OpenCV."""
+    model, K, distortion = lens
+    function = cv2.fisheye.projectPoints if model == "fisheye" else cv2.projectPoints
+    points = transform(T_cam_lidar, points_lidar)[:, None]
+    return np.asarray(function(points, np.zeros(3), np.zeros(3), K, distortion)[0].reshape(-1, 2))
+
+
+def _matrix(xyz: Any, R: Any) -> Array:
+    return pose(np.asarray(R, dtype=np.float64).reshape(3, 3), np.asarray(xyz, dtype=np.float64))
+
+
+def _chained(joints: dict[str, tuple[str, Array]], optical: str, lidar: str) -> Array:
+    def from_root(frame: str) -> Array:
+        T = np.eye(4)
+        while frame in joints:
+            frame, T_parent_child = joints[frame]
+            T = T_parent_child @ T
+        return T
+
+    return np.asarray(np.linalg.inv(from_root(optical)) @ from_root(lidar))
+
+
+def _yaml(path: Path) -> Any:
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def _extrinsics(case: Case) -> Array:
+    (pair,) = _yaml(case.folder / "extrinsics.yaml")["pairs"]
+    block = pair["T_cam_lidar"]
+    R = Rotation.from_quat(block["quaternion_xyzw"]).as_matrix()
+    return project(case.points_lidar, _matrix(block["translation_m"], R), case.lens)
+
+
+def _urdf(case: Case, name: str | None = None) -> Array:
+    from yourdfpy import URDF
+
+    robot = URDF.load(str(case.folder / (name or f"{case.rig.name}.urdf")), load_meshes=False)
+    optical, lidar = case.frames
+    return project(case.points_lidar, np.asarray(robot.get_transform(lidar, optical)), case.lens)
+
+
+def _isaac(case: Case) -> Array:
+    from yourdfpy import URDF
+
+    path = case.folder / "isaac_calibration.urdf"
+    if URDF.load(str(path), load_meshes=False).base_link != "base_link":
+        raise ValueError("the root is not base_link")
+    return _urdf(case, path.name)
+
+
+def _info_lens(data: Any) -> Lens:
+    model = "fisheye" if data["distortion_model"] == "equidistant" else "radtan"
+    K = np.reshape(data["camera_matrix"]["data"], (3, 3))
+    return model, K, np.array(data["distortion_coefficients"]["data"])
+
+
+def _camera_info(case: Case) -> Array:
+    lens = _info_lens(_yaml(case.folder / f"camera_info_{case.camera}.yaml"))
+    return project(case.points_lidar, case.calibration.T_cam_lidar, lens)
+
+
+def _static_tf(case: Case) -> Array:
+    """Parse the lines of ROS 2 as a shell and the publisher's options do."""
+    lines = (case.folder / "static_transforms.txt").read_text(encoding="utf-8").splitlines()
+    calls = [shlex.split(line)[4:] for line in lines if line.startswith("ros2 run tf2_ros static")]
+    return _published(case, calls)
+
+
+def _published(case: Case, calls: list[list[str]]) -> Array:
+    joints = {}
+    for words in calls:
+        given = dict(zip(words[::2], words[1::2], strict=True))
+        xyz = [float(given[f"--{axis}"]) for axis in "xyz"]
+        quaternion = [float(given[f"--q{axis}"]) for axis in "xyzw"]
+        T = _matrix(xyz, Rotation.from_quat(quaternion).as_matrix())
+        joints[given["--child-frame-id"]] = given["--frame-id"], T
+    return project(case.points_lidar, _chained(joints, *case.frames), case.lens)
+
+
+def _ros2_launch(case: Case) -> Array:
+    """Run the launch file as `ros2 launch` does, with classes that keep what they are given."""
+    names = {"launch": "LaunchDescription", "launch_ros": "", "launch_ros.actions": "Node"}
+    modules = {name: ModuleType(name) for name in names}
+    modules["launch"].LaunchDescription = list  # type: ignore[attr-defined]
+    modules["launch_ros.actions"].Node = dict  # type: ignore[attr-defined]
+    before = {name: sys.modules.get(name) for name in names}
+    sys.modules.update(modules)
+    try:
+        space: dict[str, Any] = {}
+        exec((case.folder / f"{case.rig.name}.launch.py").read_text(encoding="utf-8"), space)
+        nodes = space["generate_launch_description"]()
+    finally:
+        for name, module in before.items():
+            sys.modules.pop(name)
+            if module is not None:
+                sys.modules[name] = module
+    if {(node["package"], node["executable"]) for node in nodes} != {
+        ("tf2_ros", "static_transform_publisher")
+    }:
+        raise ValueError("another node is started")
+    return _published(case, [node["arguments"] for node in nodes])
+
+
+def _messages(path: Path) -> dict[str, list[Any]]:
+    """Read all messages of an mcap file by topic."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    found: dict[str, list[Any]] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append(message)
+    return found
+
+
+def _joints(messages: list[Any]) -> dict[str, tuple[str, Array]]:
+    joints = {}
+    for each in messages[0].transforms:
+        t, q = each.transform.translation, each.transform.rotation
+        T = _matrix((t.x, t.y, t.z), Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix())
+        joints[each.child_frame_id] = each.header.frame_id, T
+    return joints
+
+
+def _tf_static_bag(case: Case) -> Array:
+    joints = _joints(_messages(case.folder / "tf_static/tf_static.mcap")["/tf_static"])
+    return project(case.points_lidar, _chained(joints, *case.frames), case.lens)
+
+
+def _tf_static_rosbags(case: Case) -> Array:
+    from rosbags.highlevel import AnyReader
+
+    with AnyReader([case.folder / "tf_static"]) as reader:
+        (connection,) = reader.connections
+        qos = connection.ext.offered_qos_profiles[0]
+        if (qos.durability.name, qos.reliability.name) != ("TRANSIENT_LOCAL", "RELIABLE"):
+            raise ValueError(f"late subscribers miss it: {qos}")
+        messages = [reader.deserialize(raw, connection.msgtype) for _, _, raw in reader.messages()]
+    return project(case.points_lidar, _chained(_joints(messages), *case.frames), case.lens)
+
+
+def _kalibr(case: Case) -> Array:
+    block = _yaml(case.folder / f"camchain_{case.calibration.lidar}.yaml")["cam0"]
+    fx, fy, cx, cy = block["intrinsics"]
+    model = "fisheye" if block["distortion_model"] == "equidistant" else "radtan"
+    lens = model, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(block["distortion_coeffs"])
+    return project(case.points_lidar, np.array(block["T_cam_lidar"]), lens)
+
+
+def _autoware(case: Case) -> Array:
+    """Compose as Autoware's xacro does: kit, housing and its centre; kit, body and its optical frame."""
+
+    def matrix(block: dict[str, float]) -> Array:
+        R = Rotation.from_euler("xyz", [block[angle] for angle in ("roll", "pitch", "yaw")]).as_matrix()
+        return _matrix([block[axis] for axis in "xyz"], R)
+
+    kit = _yaml(case.folder / "sensor_kit_calibration.yaml")["sensor_kit_base_link"]
+    base = _yaml(case.folder / "sensors_calibration.yaml")["base_link"]["sensor_kit_base_link"]
+    joints = {"kit": ("base_link", matrix(base))}
+    joints |= {key: ("kit", matrix(block)) for key, block in kit.items()}
+    optical, lidar = case.frames
+    joints[lidar] = f"{lidar}_base_link", _matrix([0, 0, 0.0377], np.eye(3))  # Velodyne's VLP-16.urdf.xacro
+    turn = Rotation.from_euler("xyz", [-np.pi / 2, 0, -np.pi / 2]).as_matrix()
+    joints[optical] = f"{case.camera}/camera_link", _matrix(np.zeros(3), turn)
+    return project(case.points_lidar, _chained(joints, optical, lidar), case.lens)
+
+
+def _fast_livo2(case: Case) -> Array:
+    given = _yaml(case.folder / f"fast_livo2_{case.camera}.yaml")["extrin_calib"]
+    camera = _yaml(case.folder / f"fast_livo2_camera_{case.camera}.yaml")
+    fx, fy, cx, cy = (camera[f"cam_{key}"] * camera["scale"] for key in ("fx", "fy", "cx", "cy"))
+    is_fisheye = camera["cam_model"] == "EquidistantCamera"
+    keys = [f"k{i}" for i in range(1, 5)] if is_fisheye else [f"cam_d{i}" for i in range(4)]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    lens = "fisheye" if is_fisheye else "radtan", K, np.array([camera[key] for key in keys])
+    return project(case.points_lidar, _matrix(given["Pcl"], given["Rcl"]), lens)
+
+
+def _koide3(case: Case) -> Array:
+    data = json.loads((case.folder / f"calib_{case.camera}.json").read_text(encoding="utf-8"))
+    *xyz, qx, qy, qz, qw = data["results"]["T_lidar_camera"]
+    T_lidar_cam = _matrix(xyz, Rotation.from_quat([qx, qy, qz, qw]).as_matrix())
+    fx, fy, cx, cy = data["camera"]["intrinsics"]
+    model = "fisheye" if data["camera"]["camera_model"] == "fisheye" else "radtan"
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    lens = model, K, np.array(data["camera"]["distortion_coeffs"])
+    return project(case.points_lidar, np.linalg.inv(T_lidar_cam), lens)
+
+
+def _opencv(case: Case) -> Array:
+    file = cv2.FileStorage(str(case.folder / f"opencv_{case.camera}.yaml"), cv2.FILE_STORAGE_READ)
+    names = ("rvec", "tvec", "camera_matrix", "distortion_coefficients")
+    rvec, tvec, K, distortion = (file.getNode(name).mat() for name in names)
+    is_fisheye = file.getNode("distortion_model").string() == "fisheye"
+    function = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
+    return np.asarray(function(case.points_lidar[:, None], rvec, tvec, K, distortion)[0].reshape(-1, 2))
+
+
+def _mcap(case: Case) -> Array:
+    """Read transforms and camera model; images and points must be those of the session."""
+    name = f"{case.rig.name}_session"
+    found = _messages(case.folder / name / f"{name}.mcap")
+    (info,) = found[next(topic for topic in found if topic.endswith("/camera_info"))]
+    (projected,) = found[next(topic for topic in found if topic.endswith("/projected/compressed"))]
+    (cloud,) = (each for topic in found for each in found[topic] if hasattr(each, "point_step"))
+    (image,) = (each for topic in found for each in found[topic] if hasattr(each, "encoding"))
+    optical, lidar = case.frames
+    if (cloud.header.frame_id, image.header.frame_id, info.header.frame_id) != (lidar, optical, optical):
+        raise ValueError("messages in other frames")
+    if (info.header.stamp.sec, info.header.stamp.nanosec) != (
+        image.header.stamp.sec,
+        image.header.stamp.nanosec,
+    ):
+        raise ValueError("an image and its camera model of different times")
+    if not np.array_equal(np.frombuffer(image.data, np.uint8), session_image(case.rig, case.camera).ravel()):
+        raise ValueError("another image")
+    read = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_step)[:, :12].copy().view("<f4")
+    if not np.array_equal(read, case.points_lidar.astype(np.float32)):
+        raise ValueError("other points")
+    drawn = cv2.imdecode(np.frombuffer(projected.data, np.uint8), cv2.IMREAD_COLOR)
+    if drawn.shape[:2] != (info.height, info.width):
+        raise ValueError("a projected cloud of another size")
+    lens = "fisheye" if info.distortion_model == "equidistant" else "radtan", np.reshape(info.k, (3, 3))
+    T_cam_lidar = _chained(_joints(found["/tf_static"]), optical, lidar)
+    return project(case.points_lidar, T_cam_lidar, (*lens, np.array(info.d)))
+
+
+def _ply(case: Case) -> Array:
+    """Read positions and colours; a colour says from which pixel it was taken.
+
+    The image's blue and green are the column's and row's number. Where a colour is as the projection says,
+    the pixel is that of the projection; elsewhere it is the one that the colour names.
+    """
+    import open3d
+
+    cloud = open3d.t.io.read_point_cloud(str(case.folder / f"coloured_{case.camera}.ply"))
+    positions, colours = cloud.point.positions.numpy(), cloud.point.colors.numpy().astype(int)
+    wanted = project(case.points_lidar, case.calibration.T_cam_lidar, case.lens)
+    order = [int(np.abs(positions - p).sum(axis=1).argmin()) for p in case.points_lidar.astype(np.float32)]
+    if not np.array_equal(positions[order], case.points_lidar.astype(np.float32)):
+        raise ValueError("other points")
+    named = colours[order][:, [2, 1]]
+    nearest = np.round(wanted).astype(int)
+    return wanted + (named - nearest % 256)
+
+
+READERS: dict[tuple[str, str], Callable[[Case], Array]] = {
+    ("extrinsics", "PyYAML, scipy"): _extrinsics,
+    ("urdf", "yourdfpy"): _urdf,
+    ("camera_info", "PyYAML, OpenCV"): _camera_info,
+    ("static_tf", "shlex, scipy"): _static_tf,
+    ("ros2_launch", "Python, stand-ins for `launch`"): _ros2_launch,
+    ("tf_static_bag", "mcap, mcap-ros2-support"): _tf_static_bag,
+    ("tf_static_bag", "rosbags"): _tf_static_rosbags,
+    ("kalibr", "PyYAML, OpenCV"): _kalibr,
+    ("autoware", "PyYAML, scipy"): _autoware,
+    ("fast_livo2", "PyYAML, OpenCV"): _fast_livo2,
+    ("koide3", "json, OpenCV"): _koide3,
+    ("opencv", "cv::FileStorage"): _opencv,
+    ("isaac", "yourdfpy"): _isaac,
+    ("mcap", "mcap, mcap-ros2-support"): _mcap,
+    ("ply", "Open3D"): _ply,
+}
+"""By format and what reads it."""
+FITTED = {"kalibr": 4, "fast_livo2": 4, "koide3": 5}
+"""Formats with fewer radtan coefficients than the profile may have."""
+MODELS = {"radtan": "k1 k2 p1 p2 k3", "fisheye": "equidistant", "rational": "k1 to k6"}
+"""Kinds of lens, and their coefficients."""
+
+
+def session_image(rig: Rig, camera: str) -> Array:
+    """Draw an image in which each pixel's blue, green and red are its column, its row (mod 256) and 7."""
+    width, height = rig.cameras[camera].resolution_px
+    image = np.full((height, width, 3), 7, np.uint8)
+    image[..., 0] = np.arange(width)[None, :] % 256
+    image[..., 1] = np.arange(height)[:, None] % 256
+    return image
+
+
+def outputs_case(rig_name: str, folder: Path, *, model: str = "radtan", seed: int = 0) -> Case:
+    """Export all formats of a random result.
+
+    Args:
+        rig_name: a shipped profile, mounted on a base_link.
+        folder: to write into.
+        model: the kind of lens, of `MODELS`.
+        seed: of the pose.
+    """
+    rig = load_rig(rig_name)
+    (camera,), (lidar,) = rig.cameras, rig.lidars
+    mount = Mount(parent="base_link", of=rig.lidars[lidar].frame, xyz_m=(0.2, -0.1, 0.9), rpy_deg=(1, 2, 30))
+    settings = rig.cameras[camera]
+    given = {
+        "radtan": settings.intrinsics,
+        "fisheye": settings.intrinsics.model_copy(
+            update={"model": "equidistant", "distortion": (-0.02, 0.01, -0.005, 0.001)}
+        ),
+        "rational": settings.intrinsics.model_copy(
+            update={"distortion": (-0.3, 0.1, 1e-3, -2e-5, 0.01, 0.02, -0.01, 0.003)}
+        ),
+    }[model]
+    cameras = {camera: settings.model_copy(update={"intrinsics": given})}
+    rig = rig.model_copy(update={"mount": mount, "cameras": cameras})
+    rng = np.random.default_rng(seed)
+    T_cam_lidar = pose(
+        exp_so3(np.array([1.2, -1.2, 1.2]) + 0.1 * rng.normal(size=3)), 0.1 * rng.normal(size=3)
+    )
+    certificate, metrics = Certificate(True, 1e-9), Metrics(0.01, 0.01, 0.2)
+    cov = 1e-6 * np.eye(6)
+    calibration = Calibration(
+        *(camera, (next(iter(settings.channels)),), lidar, T_cam_lidar, cov, certificate, metrics, 1, 1),
+        *(("000000",), {}, "pass"),
+    )
+    intrinsics = cameras[camera].to_intrinsics()
+    lens = "fisheye" if model == "fisheye" else model, intrinsics.matrix, np.array(intrinsics.distortion)
+    points = probe_points(calibration, rig)[::3].astype(np.float32)  # 1 m away each: none hides another
+    with Session.create(folder / "session", rig) as session:
+        channel = next(iter(settings.channels))
+        zeros = np.zeros(len(points), np.float32)
+        scan = Scan(lidar, 10**18, points, zeros, (np.arange(len(points)) % 16).astype(np.int16), None)
+        image = Image(camera, channel, 10**18 + 5, session_image(rig, camera))
+        session.add_capture([image], [scan], {})
+        export_formats([calibration], rig, folder / "out", formats=EXPORTS, session=session)
+    return Case(folder / "out", rig, calibration, points.astype(np.float64), lens)
+
+
+def off_px(case: Case, name: str, reader: Callable[[Case], Array]) -> float:
+    """Measure by how much the points that a reader draws miss those of the result, px, at most.
+
+    A format with fewer coefficients holds the model that was fitted, and said to be so.
+    """
+    given = case.rig.cameras[case.camera].to_intrinsics()
+    intrinsics = fit_coefficients(given, FITTED[name]).intrinsics if name in FITTED else given
+    wanted, is_seen = intrinsics.project(transform(case.calibration.T_cam_lidar, case.points_lidar))
+    return float(np.abs(reader(case) - wanted)[is_seen].max())
+
+
+def bench_outputs() -> None:
+    """Tabulate the largest difference of every reader over kinds of lens, and what fitted models miss."""
+    with tempfile.TemporaryDirectory() as folder:
+        cases = [outputs_case("rlfs", Path(folder) / model, model=model) for model in MODELS]
+        print_head("format", "reader", *(f"{model} (px)" for model in MODELS.values()))
+        for (name, program), reader in READERS.items():
+            print_row(f"`{name}`", program, *(f"{off_px(case, name, reader):.1g}" for case in cases))
+    print_head("coefficients", *(f"{model}: rms, most (px)" for model in MODELS.values()))
+    for n_coefficients in sorted(set(FITTED.values())):
+        given = [case.rig.cameras[case.camera].to_intrinsics() for case in cases]
+        fits = [fit_coefficients(each, n_coefficients) for each in given]
+        told = (f"{fit.rms_px:.2g}, {fit.max_px:.2g}" if fit.max_px else "as given" for fit in fits)
+        print_row(n_coefficients, *told)
