@@ -17,7 +17,7 @@ from lce_rig.words.extrinsics import motion_words
 MATRICES = ("T_cam_lidar", "cov", "cov_shared")
 """Columns of the table that drawings in time require."""
 
-_HEIGHT_IN = 2.9
+_HEIGHT_IN = 3.05
 _MOST_SESSIONS = 400
 
 
@@ -44,9 +44,9 @@ def in_time(history: History, table: Any, change: Change) -> Markup:
     cusum = _cusum(difference(T, np.broadcast_to(T[0], T.shape)), cov, history)[:, axis]
     days = _days([history.dates[int(k)].as_py() for k in shown])
     with style():
-        figure, (upper,) = new_axes(_HEIGHT_IN, left_in=0.62, bottom_in=1.15, top_in=0.08)
+        figure, (upper,) = new_axes(_HEIGHT_IN, left_in=0.62, bottom_in=1.3, top_in=0.08)
         left_in, width_in = 0.62, WIDTH_IN - 0.62 - 0.1
-        place = (left_in / WIDTH_IN, 0.25 / _HEIGHT_IN, width_in / WIDTH_IN, 0.8 / _HEIGHT_IN)
+        place = (left_in / WIDTH_IN, 0.4 / _HEIGHT_IN, width_in / WIDTH_IN, 0.8 / _HEIGHT_IN)
         lower = figure.add_axes(place, sharex=upper)
         upper.tick_params(labelbottom=False)
         upper.errorbar(days, values, 2 * sigma, fmt="o", ms=3, lw=0.8, color=BLUE, ecolor=FAINT)

@@ -29,6 +29,8 @@ from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.session.session import PROFILE
 
 FEWEST_SIBLINGS = 5
+# Where more are apart, robots are of several kinds: nobody is odd.
+_MOST_APART = 0.2
 _FALSE_OUTLIERS = 0.05
 _OF_NORMAL = 1.4826
 # Rows whose nominal pose differs by no more than this are of one drawing.
@@ -76,9 +78,14 @@ class Mounting:
         return np.asarray(_OF_NORMAL * np.median(np.abs(self.apart - self.median), axis=0))
 
     @property
+    def is_one_kind(self) -> bool:
+        """Whether few robots are beyond the limit along any axis."""
+        return float(np.mean(np.abs(self.z).max(axis=1) > self.limit)) <= _MOST_APART
+
+    @property
     def outliers(self) -> list[tuple[int, int]]:
-        """(robot, axis) beyond the limit, by their numbers; the farthest first."""
-        found = np.argwhere(np.abs(self.z) > self.limit)
+        """(robot, axis) beyond the limit, by their numbers; the farthest first. None if they are many."""
+        found = np.argwhere(np.abs(self.z) > self.limit) if self.is_one_kind else np.empty((0, 2), int)
         order = np.argsort(-np.abs(self.z[found[:, 0], found[:, 1]]), kind="stable")
         return [(int(r), int(a)) for r, a in found[order]]
 
@@ -230,9 +237,10 @@ def _beside(row: Row, company: Any) -> list[Finding]:
     own_cov = as_table([row])["cov"]
     cov = np.concatenate([covariances(others["cov"]), covariances(own_cov)])
     nominal = T[0] if row.nominal is None else np.array(row.nominal).reshape(4, 4)
-    z = deviations(difference(T, nominal), np.sqrt(np.einsum("gii->gi", cov)))[-1]
+    *siblings, z = deviations(difference(T, nominal), np.sqrt(np.einsum("gii->gi", cov)))
     axis, limit = int(np.argmax(np.abs(z))), limit_of(len(T), n_asked=1)
-    if abs(z[axis]) <= limit:
+    several_kinds = np.mean(np.abs(siblings).max(axis=1) > limit_of(len(T), len(T))) > _MOST_APART
+    if several_kinds or abs(z[axis]) <= limit:
         return []
     apart = difference(T, nominal)[:, axis]
     unit, scale = ("deg", float(np.degrees(1.0))) if IS_ROTATION[axis] else ("m", 1.0)

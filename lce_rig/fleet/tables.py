@@ -165,7 +165,7 @@ def _mounting_robots(siblings: tuple[Mounting, ...]) -> Any:
                 "camera": pa.array([each.camera] * len(each.robots), pa.string()),
                 "lidar": pa.array([each.lidar] * len(each.robots), pa.string()),
                 "siblings": pa.array([len(each.robots) - 1] * len(each.robots), pa.int64()),
-                "is_outlier": np.abs(each.z).max(axis=1) > each.limit,
+                "is_outlier": each.is_one_kind & (np.abs(each.z).max(axis=1) > each.limit),
                 **_by_axis("apart", each.apart),
                 **{f"sigmas_{axis}": each.z[:, k] for k, axis in enumerate(AXES)},
             }

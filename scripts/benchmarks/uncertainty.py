@@ -2,14 +2,18 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+from benchmarks.profile_errors import with_profile_errors
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
+from lce_rig import pipeline
 from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, difference, invert
 from lce_rig.extrinsics import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
@@ -17,7 +21,7 @@ from lce_rig.extrinsics.likelihood.image_terms import stack_images
 from lce_rig.extrinsics.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.extrinsics.likelihood.refine import to_extrinsic
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA, State, Terms, assemble, density, linearise
-from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
+from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, Method
 from lce_rig.residuals.along_rays import (
     N_FIELDS,
     N_OF_LASER,
@@ -60,6 +64,7 @@ CASES = (
     Case("rles", "rles"),
     Case("rlfs", "rlfs, ranges +2 cm, edges +3 mm", range_offset_m=0.02, edge_growth_m=0.003),
 )
+PROFILES_IN_ERROR = CASES[:2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +73,17 @@ class Run:
 
     error: Array
     cov: Array
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedRun(Run):
+    """With the bound (6, 6) of its captures."""
+
     bound: Array
 
 
 def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: int = 30) -> None:
-    """Tabulate errors, bounds and coverage of the joint estimate.
+    """Tabulate errors, bounds and coverage of the joint estimate, and of every method with profiles in error.
 
     Args:
         n_seeds: sessions of each case.
@@ -90,31 +101,61 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
             runs = list(_runs(case, n_seeds, folder, n_captures))
             print_row(case.label, len(runs), n_captures, *_cells(runs))
 
-
-def _cells(runs: list[Run]) -> Iterator[str]:
-    errors = np.array([run.error for run in runs])
-    bound, claimed = (np.mean([getattr(run, name) for run in runs], axis=0) for name in ("bound", "cov"))
-    deg, mm = (
-        np.degrees(rms(np.linalg.norm(errors[:, 3:], axis=1))),
-        rms(np.linalg.norm(errors[:, :3], axis=1)),
+    print("\nProfiles in error as their standard deviations say\n")
+    print_head(
+        "rig", "method", "sessions", "captures", "rms deg / mm", *head.split(", ")[-2:], "95 % regions hold"
     )
-    bound_deg, bound_mm = _sizes(bound)
-    claimed_deg, claimed_mm = _sizes(claimed)
+    for case, method in product(PROFILES_IN_ERROR, get_args(Method)):
+        if only in case.label:
+            own = list(_runs_in_error(case, method, n_seeds, folder, n_captures))
+            size, *others = _claim_cells(own)
+            print_row(case.label, method, len(own), n_captures, size, *others)
+
+
+def _cells(runs: list[BoundedRun]) -> Iterator[str]:
+    size, *others = _claim_cells(runs)
+    deg, mm = _rms(runs)
+    bound_deg, bound_mm = _sizes(np.mean([run.bound for run in runs], axis=0))
+    yield size
+    yield f"{bound_deg:.4f} / {bound_mm:.2f}"
+    yield f"{deg / bound_deg:.2f} / {mm / bound_mm:.2f}"
+    yield from others
+
+
+def _claim_cells(runs: Sequence[Run]) -> Iterator[str]:
+    """Say how large the errors are, how large the reported ones, NEES with its interval, and coverage."""
+    deg, mm = _rms(runs)
+    claimed_deg, claimed_mm = _sizes(np.mean([run.cov for run in runs], axis=0))
     nees = np.array([run.error @ np.linalg.solve(run.cov, run.error) for run in runs])
     low, high = chi2.ppf([0.025, 0.975], _FREEDOMS * len(runs)) / len(runs)
-    yield f"{deg:.4f} / {1e3 * mm:.2f}"
-    yield f"{bound_deg:.4f} / {bound_mm:.2f}"
-    yield f"{deg / bound_deg:.2f} / {1e3 * mm / bound_mm:.2f}"
+    yield f"{deg:.4f} / {mm:.2f}"
     yield f"{claimed_deg:.4f} / {claimed_mm:.2f}"
     yield f"{nees.mean():.2f} ({low:.2f} to {high:.2f})"
     yield f"{100 * np.mean(nees < chi2.ppf(0.95, _FREEDOMS)):.0f} %"
+
+
+def _rms(runs: Sequence[Run]) -> tuple[float, float]:
+    errors = np.array([run.error for run in runs])
+    rotation, translation = (rms(np.linalg.norm(errors[:, part], axis=1)) for part in (slice(3, 6), slice(3)))
+    return float(np.degrees(rotation)), float(1e3 * translation)
 
 
 def _sizes(cov: Array) -> tuple[float, float]:
     return float(np.degrees(np.sqrt(np.trace(cov[3:, 3:])))), float(1e3 * np.sqrt(np.trace(cov[:3, :3])))
 
 
-def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[Run]:
+def _runs_in_error(case: Case, method: Method, n_seeds: int, folder: Path, n_captures: int) -> Iterator[Run]:
+    """Calibrate sessions as a user would, with profiles whose lens, board and ranges are off."""
+    rig = load_rig(case.rig)
+    for seed in range(n_seeds):
+        session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
+        profile, found = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
+        options = CalibrateOptions(method=method, n_draws=0)
+        (calibration,), _ = pipeline.calibrate_detections(profile, found, options)
+        yield Run(difference(calibration.T_cam_lidar, session.T_cam_lidar), calibration.cov)
+
+
+def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[BoundedRun]:
     rig = load_rig(case.rig)
     board = rig.board.to_board()
     lidar = next(iter(rig.lidars.values()))
@@ -129,7 +170,7 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[R
     for session, terms in zip(sessions, at_truth, strict=True):
         estimate = fit_extrinsic(session.candidates, board, options)
         bound = cramer_rao_bound(terms, levels, priors, session.T_cam_lidar)
-        yield Run(difference(estimate.T_cam_lidar, session.T_cam_lidar), estimate.cov, bound)
+        yield BoundedRun(difference(estimate.T_cam_lidar, session.T_cam_lidar), estimate.cov, bound)
 
 
 def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: Array) -> Array:

@@ -69,6 +69,18 @@ def test_a_robot_known_less_well_needs_to_be_farther_apart():
     assert near > 4 > 1.2 > deviations(apart, sigma)[8, 0]
 
 
+def test_robots_of_two_kinds_name_nobody(fleet):
+    shifted = 20 * SPREAD * np.eye(6)[3]
+    rng = np.random.default_rng(1)
+    rows = [
+        fleet(f"r{k}", 0.1 * SPREAD * rng.normal(size=6) + (shifted if k % 3 == 0 else 0)) for k in range(30)
+    ]
+    table = as_table(rows)
+    (mounting,) = mountings(table, history_of(table))
+    assert not mounting.is_one_kind and mounting.outliers == []
+    assert compare(fleet("new", shifted), table) == []
+
+
 def test_few_siblings_name_nobody():
     assert limit_of(5, 5) == np.inf
     assert 3.5 < limit_of(60, 60) < 4.5
