@@ -23,7 +23,7 @@ from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import SCHEMA, TABLE, as_table, merged, table_bytes
 
 _KILL_EVERY_S, _CLIENT_LIVES_S = 20.0, 45.0
-_FEW_ROBOTS, _FEW_SESSIONS = 10, 40
+_FEW_ROBOTS, _FEW_SESSIONS = 10, 30
 _TABLE_ROWS = 1_000_000
 # Figures of a run, not of a session.
 _OF_A_RUN = ("duration_s", "cpu_s", "peak_memory_mb", "finished", "source")
@@ -52,7 +52,7 @@ def bench_fleet(folder: Path, only: str = "") -> None:
 
 
 def few_sessions(folder: Path) -> Path:
-    """Write forty sessions of ten robots, unless they are there."""
+    """Write thirty sessions of ten robots, unless they are there."""
     root = folder / "few"
     make_fleet(root, folder / "captures", _FEW_ROBOTS, _FEW_SESSIONS, 0)
     return root
