@@ -93,6 +93,9 @@ fleet.add_command(lidar)
     show_default=True,
     help="Keep the overlays of all captures, their contact sheets only, or draw none.",
 )
+@click.option(
+    "--lidar-intrinsics", is_flag=True, help="Estimate the range offset of each laser from each session, too."
+)
 @click.option("--retry", is_flag=True, help="Run sessions without a result again.")
 @json_option
 def run(
@@ -105,6 +108,7 @@ def run(
     memory_limit: float,
     method: Any,
     pictures: Any,
+    lidar_intrinsics: bool,
     retry: bool,
     as_json: bool,
 ) -> None:
@@ -123,7 +127,8 @@ def run(
 
     place = Storage.at(registry)
     jobs = find_jobs(Storage.at(root), None if manifest is None else Storage.at(manifest))
-    settings = Settings(place.url, method, time_limit, memory_limit, retry, pictures)
+    limits = (time_limit, memory_limit)
+    settings = Settings(place.url, method, *limits, retry, pictures, lidar_intrinsics)
     n_workers = workers or len(os.sched_getaffinity(0))
     show.note(f"{show.counted(len(jobs), 'session')} in {root}")
     with patience(_GRACE_S), cluster(n_workers, memory_limit, scheduler) as client:

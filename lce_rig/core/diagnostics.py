@@ -37,9 +37,11 @@ class Diagnostics:
         range_offset_m, laser_spread_m: mean and standard deviation over lasers of their range errors.
         lens_lateral_m, lens_vertical_m_per_rad: displacement of the LiDAR's lens.
         camera_scale: of the camera's distances.
+        bow_width_m, bow_height_m: height of the plate's middle over its ends, along its width and its height.
         noise_range_m: of ranges; noise_ring_m: of a ring in one capture.
         noise_ring_end_mrad: of ring ends, along azimuth.
         ring_ends_lost: share 0..1.
+        noise_edge_shift_m: of the edge shift from one capture to the next.
         noise_tilt_deg, noise_spin_deg, noise_depth_m, noise_across_m: of the board's pose by the camera,
             beyond what its corners' noise explains.
         alone_sigma_rotation_deg, alone_sigma_translation_m: standard deviations without the other cameras.
@@ -79,10 +81,13 @@ class Diagnostics:
     lens_lateral_m: float = _NONE
     lens_vertical_m_per_rad: float = _NONE
     camera_scale: float = _NONE
+    bow_width_m: float = _NONE
+    bow_height_m: float = _NONE
     noise_range_m: float = _NONE
     noise_ring_m: float = _NONE
     noise_ring_end_mrad: float = _NONE
     ring_ends_lost: float = _NONE
+    noise_edge_shift_m: float = _NONE
     noise_tilt_deg: float = _NONE
     noise_spin_deg: float = _NONE
     noise_depth_m: float = _NONE

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, reads_back
 from lce_rig.export.job import ExportJob
+from lce_rig.scene.colouring import colour_points
 from lce_rig.session.capture import Capture
 from lce_rig.session.durable import write_atomically
 
@@ -24,8 +24,6 @@ _FIELDS = [
     *(("intensity", "<f4"), ("capture", "<i4")),
 ]
 _POINT = np.dtype(_FIELDS)
-# Cells in which the camera's view is compared with the LiDAR's are at least this large.
-_SMALLEST_CELL_PX = 4.0
 _PLY_TYPES = {"<f4": "float", "u1": "uchar", "<i4": "int"}
 
 
@@ -77,54 +75,22 @@ def _coloured(capture: Capture, calibration: Calibration, job: ExportJob) -> NDA
     if not channels or calibration.lidar not in capture.lidars:
         return None
     image = capture.image(calibration.camera, channels[0])
-    return colour_points(image, capture.scan(calibration.lidar), calibration, job, int(capture.name))
+    return coloured(image, capture.scan(calibration.lidar), calibration, job, int(capture.name))
 
 
-def colour_points(
+def coloured(
     image: Image, scan: Scan, calibration: Calibration, job: ExportJob, number: int
 ) -> NDArray[np.void]:
-    """Take the colour of the nearest pixel for each point (N,) that the camera sees; others are left out."""
-    intrinsics = job.rig.cameras[calibration.camera].to_intrinsics()
-    points_camera = transform(calibration.T_cam_lidar, np.asarray(scan.points, np.float64))
-    pixels, _ = intrinsics.project(points_camera)
-    is_seen = intrinsics.is_inside(pixels)
-    cell_px = max(_SMALLEST_CELL_PX, _ring_step_rad(scan) * intrinsics.fx_px)
-    baseline_m = float(np.linalg.norm(calibration.T_cam_lidar[:3, 3]))
-    is_seen[is_seen] = ~_is_hidden(
-        pixels[is_seen], points_camera[is_seen, 2], cell_px, baseline_m * intrinsics.fx_px
-    )
-    at = np.round(pixels[is_seen]).astype(int)
-    colours = image.pixels if image.pixels.ndim == 3 else np.repeat(image.pixels[:, :, None], 3, axis=2)
+    """Give the points that the camera sees the colours of their pixels, as records of the file."""
+    lens = job.rig.cameras[calibration.camera].to_intrinsics()
+    colours, is_seen = colour_points(scan, image.pixels, calibration.T_cam_lidar, lens)
     points = np.empty(int(is_seen.sum()), _POINT)
     for axis, name in enumerate("xyz"):
         points[name] = scan.points[is_seen, axis]
-    for place, name in enumerate(("blue", "green", "red")):
-        points[name] = colours[at[:, 1], at[:, 0], place]
+    for place, name in enumerate(("red", "green", "blue")):
+        points[name] = colours[is_seen, place]
     points["intensity"], points["capture"] = scan.intensity[is_seen], number
     return points
-
-
-def _ring_step_rad(scan: Scan) -> float:
-    """Estimate the angle between neighbouring rings, rad: the median step of their elevations."""
-    points = np.asarray(scan.points, np.float64)
-    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
-    rings = [np.median(elevation[scan.ring == ring]) for ring in np.unique(scan.ring)]
-    return float(np.median(np.diff(np.sort(rings)))) if len(rings) > 1 else 0.0
-
-
-def _is_hidden(pixels: Array, depth_m: Array, cell_px: float, baseline_m_px: float) -> NDArray[np.bool_]:
-    """Find the points behind nearer ones that the LiDAR looks past and the camera does not.
-
-    In a cell of the image as large as the gap between rings, the point at depth d shifts against the nearest
-    one, at d0, by baseline * f * (1 / d0 - 1 / d) between the views of camera and LiDAR. Below half a cell
-    both are parts of what both sensors see.
-    """
-    cells = np.floor(pixels / cell_px).astype(int)
-    _, place = np.unique(cells, axis=0, return_inverse=True)
-    inverse = 1 / np.maximum(depth_m, 1e-3)
-    nearest = np.zeros(int(place.max(initial=-1)) + 1)
-    np.maximum.at(nearest, place.ravel(), inverse)
-    return np.asarray(baseline_m_px * (nearest[place.ravel()] - inverse) > cell_px / 2)
 
 
 def _head(points: NDArray[np.void], calibration: Calibration, job: ExportJob) -> bytes:

@@ -16,7 +16,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Observation
 from lce_rig.extrinsics.tolerances import Sensitivity, Tolerances, Variant, sensitivities_of, vary
-from lce_rig.residuals.features import CaptureFeatures, FeatureSettings, extract_features
+from lce_rig.residuals.features import CaptureFeatures, FeatureSettings, extract_features, see_lidar
 from lce_rig.residuals.moments import Problem
 from lce_rig.solvers.covariance import symmetric_inverse
 
@@ -65,7 +65,8 @@ def ring_sensitivities(
 
     def features_of(k: int) -> list[CaptureFeatures]:
         shifted = shift_rings(boards[k], seen[k], STEP_M)
-        return [extract_features(replace(observations[k], lidar=lidar), board, settings) for lidar in shifted]
+        own = extract_features(observations[k], board, settings)
+        return [see_lidar(own, lidar, settings) for lidar in shifted]
 
     change = np.zeros((len(ring), len(information)))
     np.add.at(change, column, _changes(features_of, board, problem, x, edge_ids) / STEP_M)

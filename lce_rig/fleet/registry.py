@@ -4,8 +4,9 @@ import io
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from itertools import chain, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,6 +22,8 @@ from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import replacing
 
 FORMAT_VERSION = 1
+# Earlier results of sources that have a later one; no folder of a robot begins with a dot.
+SUPERSEDED = ".superseded"
 # Small files from an object store take their time, not the processor's.
 _READERS = 16
 
@@ -40,7 +43,8 @@ class Registry:
         """Yield an empty folder on this computer that becomes a session's result when the block ends.
 
         `ROWS` is what makes it a result; `write_rows` writes it. Here the folder appears in one step; in an
-        object store its files are written one by one, and `ROWS` last.
+        object store its files are written one by one, and `ROWS` last. What an earlier result in this folder
+        held, and the new one does not, is kept below `SUPERSEDED`.
 
         Args:
             folder: "robot/date-hash".
@@ -52,13 +56,14 @@ class Registry:
         try:
             if root is not None:
                 root.mkdir(parents=True, exist_ok=True)
-                with replacing(root, root / folder) as draft:
+                with replacing(root, root / folder, lambda _, new: self._keep(folder, new)) as draft:
                     yield draft
                 return
             with TemporaryDirectory(prefix="lce-rig-") as scratch:
                 draft = Path(scratch) / "result"
                 draft.mkdir()
                 yield draft
+                self._keep(folder, draft)
                 self._upload(draft, self.place / folder)
         except OSError as error:
             raise SessionError(
@@ -104,13 +109,53 @@ class Registry:
         names = [name for name in (self.place / robot).names() if name.endswith(f"-{ending}")]
         return f"{robot}/{names[-1]}" if names else None
 
-    def remove(self, folder: str) -> None:
-        """Remove a result, its rows first."""
-        target = self.place / folder
-        if (target / ROWS).exists():
-            target.fs.rm_file((target / ROWS).path)
-        if target.exists():
-            target.fs.rm(target.path, recursive=True)
+    def set_aside(self, folder: str) -> None:
+        """Move a result below `SUPERSEDED`, where the table does not find it.
+
+        Raises:
+            SessionError: it cannot be written; the result stays.
+        """
+        place, target = self.place / folder, self._aside(folder)
+        try:
+            if place.local is not None and target.local is not None:
+                target.local.parent.mkdir(parents=True, exist_ok=True)
+                with suppress(FileNotFoundError):  # another run was faster
+                    place.local.rename(target.local)
+                return
+            self._copy_aside(place, target)
+            if (place / ROWS).exists():
+                place.fs.rm_file((place / ROWS).path)
+            if place.exists():
+                place.fs.rm(place.path, recursive=True)
+        except OSError as error:
+            raise SessionError(
+                f"{place.url} cannot be moved to {target.url}: {error.strerror or error}",
+                "Free space, or see to the registry's permissions, and run again.",
+            ) from error
+
+    def _keep(self, folder: str, draft: Path) -> None:
+        """Copy an earlier result of a folder aside, unless all its files are in the new one."""
+        place = self.place / folder
+        prefix = place.path.rstrip("/") + "/"
+        held = {path: draft / path.removeprefix(prefix) for path in place.fs.find(place.path)}
+        own = [(path, new) for path, new in held.items() if path != prefix + ROWS]
+        if any(not new.is_file() or place.fs.cat_file(path) != new.read_bytes() for path, new in own):
+            self._copy_aside(place, self._aside(folder))
+
+    def _aside(self, folder: str) -> Storage:
+        """Give the place of a result that is set aside: numbered, if there is one already."""
+        endings = chain([""], (f"-{n}" for n in count(2)))
+        places = (self.place / f"{SUPERSEDED}/{folder}{ending}" for ending in endings)
+        return next(place for place in places if not place.names())
+
+    def _copy_aside(self, place: Storage, target: Storage) -> None:
+        """Copy a result's files."""
+        prefix = place.path.rstrip("/") + "/"
+        for name in [path.removeprefix(prefix) for path in place.fs.find(place.path)]:
+            copy = target / name
+            if copy.local is not None:
+                copy.local.parent.mkdir(parents=True, exist_ok=True)
+            place.fs.cp_file((place / name).path, copy.path)
 
     def read_table(self, columns: Iterable[str] | None = None) -> Any:
         """Read the table as a `pyarrow.Table`; raises as `lce_rig.fleet.table.read_table`."""
@@ -135,7 +180,7 @@ class Registry:
         """Bring the table in line with the folders and write it.
 
         Rows of folders that are gone are dropped, those of folders that the table lacks are read. Of two
-        results of one source the later one stays; the other's folder is removed.
+        results of one source the later one stays; the other's folder is moved below `SUPERSEDED`.
 
         Args:
             fresh: rows written since the table was; they replace those of the same folder.
@@ -159,7 +204,7 @@ class Registry:
         table = table.filter(pc.is_in(table["folder"], value_set=pa.array(folders, pa.string())))
         outdated = _superseded(table)
         for folder in outdated:
-            self.remove(folder)
+            self.set_aside(folder)
         table = merged([_without(table, pa.array(outdated, pa.string()))])
         self.write_table(table)
         return table

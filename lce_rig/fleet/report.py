@@ -245,7 +245,7 @@ def _change_cells(row: dict[str, Any]) -> tuple[Any, ...]:
     return (
         row["robot"], f"{row['camera']}, {row['lidar']}", kind, sensor,
         ", ".join(map(_short, row["axes"].split())), row["before"][:10], row["after"][:10], told,
-        f"{row['sessions_before']}, {row['sessions_after']}", f"{row['chi2']:.0f}",
+        f"{row['sessions_before']}, {row['sessions_after']}",
     )  # fmt: skip
 
 

@@ -76,6 +76,11 @@ def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) 
     settings = {
         "distributed.scheduler.allowed-failures": _MOST_LOST_WORKERS,
         "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.scheduler.active-memory-manager.start": False,
+        # Workers wait for processes: what Dask watches in them, up to a hundred times a second, is of no use.
+        "distributed.worker.profile.enabled": False,
+        "distributed.admin.tick.interval": "1s",
+        "distributed.admin.system-monitor.interval": "2s",
         "distributed.admin.large-graph-warning-threshold": "1GB",
     }
     # Workers that end while their scheduler does are no news.

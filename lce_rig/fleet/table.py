@@ -33,6 +33,8 @@ STATUSES: tuple[Status, ...] = ("ok", "failed", "timed_out", "crashed", "out_of_
 _UPPER = np.triu_indices(6)
 # So many rows share minima and maxima, by which a query skips them.
 _ROWS_PER_GROUP = 1 << 16
+# Poses and covariances, most of the bytes, do not shrink: what is read fastest wins.
+_COMPRESSION = "lz4"
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Row:
             estimate, and refused.
         refusals: code of each refused capture.
         mpe_m, mee_m, reprojection_px: residuals, see docs/conventions.md.
-        laser_range_m, laser_range_sigma_m: range offset of each laser and its standard deviation.
+        laser_range_m, laser_range_sigma_m: range offset of each laser, by ring, and its standard deviation.
         lens_error, lens_error_sigma: errors of the profile's intrinsics as the session's boards see them,
             given less seen: focal length (relative), principal point x and y (px), distortion (px in the
             image's corner); standard deviations.
@@ -235,7 +237,14 @@ def merged(tables: Sequence[Any]) -> Any:
 def table_bytes(table: Any) -> bytes:
     """Write a table of `SCHEMA` as Parquet; equal tables give equal bytes."""
     buffer = io.BytesIO()
-    pq.write_table(table.cast(SCHEMA), buffer, compression="zstd", row_group_size=_ROWS_PER_GROUP)
+    repeated = [field.name for field in SCHEMA if pa.types.is_string(field.type)]
+    pq.write_table(
+        table.cast(SCHEMA),
+        buffer,
+        compression=_COMPRESSION,
+        use_dictionary=repeated,
+        row_group_size=_ROWS_PER_GROUP,
+    )
     return buffer.getvalue()
 
 

@@ -3,6 +3,7 @@
 import resource
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -28,6 +29,7 @@ from lce_rig.fleet.process import Ended
 from lce_rig.fleet.registry import Registry, write_rows
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import Row, Status, result_columns
+from lce_rig.pipeline.lidar_intrinsics import measure_lidar
 from lce_rig.pipeline.result_files import OVERLAYS, Result
 from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.rig import Rig, dump_rig, load_rig
@@ -71,6 +73,7 @@ class Settings:
         memory_limit_mb: that its process may hold.
         retry: whether sessions without a result are run again.
         pictures: whether overlays of all captures are kept, contact sheets of them only, or nothing is drawn.
+        lidar_intrinsics: whether the range offsets of each session's lasers are estimated, too.
     """
 
     registry: str
@@ -79,6 +82,7 @@ class Settings:
     memory_limit_mb: float = 4000.0
     retry: bool = False
     pictures: Pictures = "sheets"
+    lidar_intrinsics: bool = False
 
     def opened(self) -> Registry:
         """The registry."""
@@ -114,11 +118,11 @@ def work(job: Job, settings: Settings, tell: Callable[[Mapping[str, Any]], None]
             row = _dated(row, provenance_of([session]), opened.ending)
             tell(asdict(row))
         except (LceRigError, OSError) as error:
-            return publish(registry, [_failed(row, error)], start_s)
+            return publish(registry, [_failed(row, error, Path(scratch))], start_s)
         try:
             return _calibrate(registry, session, row, settings, start_s)
         except LceRigError as error:
-            return publish(registry, [_failed(row, error)], start_s)
+            return publish(registry, [_failed(row, error, Path(scratch))], start_s)
 
 
 def first_row(job: Job, settings: Settings) -> Row:
@@ -230,13 +234,15 @@ def _is_done(rows: list[dict[str, Any]], row: Row, *, retry: bool) -> bool:
     )
 
 
-def _failed(row: Row, error: LceRigError | OSError) -> Row:
+def _failed(row: Row, error: LceRigError | OSError, scratch: Path) -> Row:
+    """Say why there is no result, by the names that files have where the session lies."""
     if isinstance(error, OSError):
         error = SourceError(f"{row.source} cannot be read: {error.strerror or error}")
     own = error.finding if isinstance(error, NotEnoughDataError) else None
     code = next((code for kind, code in _CODES if isinstance(error, kind)), "fleet.other_error")
     cause = own or Finding(code, figures={"what": error.what, "hint": error.hint})
-    return without_result(row, "failed", cause)
+    failed = without_result(row, "failed", cause)
+    return replace(failed, detail=(failed.detail or "").replace(str(scratch / "session"), row.source))
 
 
 def without_result(row: Row, status: Status, cause: Finding) -> Row:
@@ -261,7 +267,8 @@ def _calibrate(
     for c in result.pairs:
         own = doubts.get((c.camera, c.lidar), [])
         known = replace(c, findings=(*c.findings, *own))
-        rows.append(replace(row, **result_columns(known, session.rig, serials)))
+        lasers = _laser_columns(session, c.lidar, detections) if settings.lidar_intrinsics else {}
+        rows.append(replace(row, **result_columns(known, session.rig, serials), **lasers))
     rows += _lacking(result, detections, row)
 
     def fill(folder: Path) -> None:
@@ -274,6 +281,17 @@ def _calibrate(
                     path.unlink()
 
     return publish(registry, rows, start_s, fill)
+
+
+def _laser_columns(session: Session, lidar: str, detections: Detections) -> dict[str, Any]:
+    """Estimate the range offset of each laser; nothing where the captures do not determine them."""
+    with suppress(NotEnoughDataError, ResultRefusedError):
+        errors = measure_lidar([session], lidar, found=[detections]).found
+        return {
+            "laser_range_m": tuple(map(float, errors.lasers[0])),
+            "laser_range_sigma_m": tuple(map(float, errors.lasers_sigma[0])),
+        }
+    return {}
 
 
 def _lacking(result: Result, detections: Detections, row: Row) -> list[Row]:

@@ -124,17 +124,24 @@ def residuals_px(setup: Setup, state: LensState) -> Array:
 
 def _project(setup: Setup, state: LensState) -> tuple[Array, Array, Array, Array]:
     """Compute residuals (K, N, 2), derivatives by point and lens, and the corners rotated into the camera."""
+    turned, points = _in_camera(setup, state)
+    pixels, by_point, by_lens = setup.model.project(state.lens, points)
+    return pixels - setup.corners_px, by_point, by_lens, turned
+
+
+def _in_camera(setup: Setup, state: LensState) -> tuple[Array, Array]:
+    """Rotate the corners (K, N, 3) into the camera, and place them before it."""
     T = state.T_cam_board
     turned = corners_of(setup, state.shape) @ np.swapaxes(T[:, :3, :3], 1, 2)
-    pixels, by_point, by_lens = setup.model.project(state.lens, turned + T[:, None, :3, 3])
-    return pixels - setup.corners_px, by_point, by_lens, turned
+    return turned, turned + T[:, None, :3, 3]
 
 
 def _by_pose(setup: Setup, state: LensState) -> tuple[Array, Array]:
     """Compute residuals (K, 2 N) and their derivative (K, 2 N, 6) by the tangent of each pose."""
-    residuals, by_point, _, turned = _project(setup, state)
+    turned, points = _in_camera(setup, state)
+    pixels, by_point = setup.model.project_points(state.lens, points)
     J = np.concatenate([by_point, -by_point @ skew(turned)], axis=-1)
-    return residuals.reshape(len(J), -1), J.reshape(len(J), -1, 6)
+    return (pixels - setup.corners_px).reshape(len(J), -1), J.reshape(len(J), -1, 6)
 
 
 def linearise(setup: Setup, state: LensState) -> tuple[Array, Array, Array]:

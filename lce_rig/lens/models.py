@@ -1,7 +1,7 @@
 """Lens models as vectors of parameters, with the derivatives for fitting."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -76,6 +76,14 @@ class LensModel:
         by_parameter[..., 4:] = focal[:, None] * by_coefficient
         return xy * focal + vector[2:4], focal[:, None] * by_point, by_parameter
 
+    def project_points(self, vector: Array, points_camera: Array) -> tuple[Array, Array]:
+        """Project points and differentiate the pixels by the points alone, as `project`."""
+        if self.family == "equidistant":
+            pixels, by_point, _ = self.project(vector, points_camera)
+            return pixels, by_point
+        _, xy, by_point = _radtan(vector[4:], points_camera)
+        return xy * vector[:2] + vector[2:4], vector[:2, None] * by_point
+
 
 _NO_PRIOR = float("inf")
 MODELS = {
@@ -132,37 +140,50 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
     return vector
 
 
-def _distort_radtan(coefficients: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Distort x/z, y/z; derivatives by the point (..., 2, 3) and by the coefficients (..., 2, n)."""
+class _Radii(NamedTuple):
+    """x/z, y/z, their squared radius s, the radial scale and its denominator."""
+
+    x: Array
+    y: Array
+    s: Array
+    scale: Array
+    lower: Array
+
+
+def _radtan(coefficients: Array, points: Array) -> tuple[_Radii, Array, Array]:
+    """Distort x/z, y/z: (..., 2), and its derivative by the point (..., 2, 3)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
-    x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
+    z = points[..., 2]
+    x, y = points[..., 0] / z, points[..., 1] / z
     s = x * x + y * y
     upper, lower = 1 + s * (k1 + s * (k2 + s * k3)), 1 + s * (k4 + s * (k5 + s * k6))
     scale = upper / lower
     # Derivative of the radial scale by s = r^2.
     slope = (k1 + s * (2 * k2 + 3 * s * k3) - scale * (k4 + s * (2 * k5 + 3 * s * k6))) / lower
-    xy = np.stack(
-        [
-            x * scale + 2 * p1 * x * y + p2 * (s + 2 * x * x),
-            y * scale + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    xy, by_point = np.empty((*s.shape, 2)), np.empty((*s.shape, 2, 3))
+    xy[..., 0] = x * scale + 2 * p1 * x * y + p2 * (s + 2 * x * x)
+    xy[..., 1] = y * scale + p1 * (s + 2 * y * y) + 2 * p2 * x * y
     across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    xx = scale + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    yy = scale + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    by_xy = np.stack([np.stack([xx, across], axis=-1), np.stack([across, yy], axis=-1)], axis=-2)
-    by_z = -(by_xy @ np.stack([x, y], axis=-1)[..., None])
-    by_point = np.concatenate([by_xy, by_z], axis=-1) / points[..., 2, None, None]
+    by_point[..., 0, 0] = xx = scale + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    by_point[..., 1, 1] = yy = scale + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    by_point[..., 0, 1] = by_point[..., 1, 0] = across
+    by_point[..., 0, 2], by_point[..., 1, 2] = -(xx * x + across * y), -(across * x + yy * y)
+    by_point /= z[..., None, None]
+    return _Radii(x, y, s, scale, lower), xy, by_point
 
-    powers = np.stack([s, s * s, s * s * s], axis=-1) / lower[..., None]
-    radial = np.stack([x, y], axis=-1)[..., None] * powers[..., None, :]
-    tangential = np.stack(
-        [np.stack([2 * x * y, s + 2 * x * x], axis=-1), np.stack([s + 2 * y * y, 2 * x * y], axis=-1)],
-        axis=-2,
-    )
-    all_eight = [radial[..., :2], tangential, radial[..., 2:], -scale[..., None, None] * radial]
-    return xy, by_point, np.concatenate(all_eight, axis=-1)[..., : len(coefficients)]
+
+def _distort_radtan(coefficients: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Distort x/z, y/z; derivatives by the point (..., 2, 3) and by the coefficients (..., 2, n)."""
+    (x, y, s, scale, lower), xy, by_point = _radtan(coefficients, points)
+    by_coefficient = np.empty((*s.shape, 2, 8))
+    power = 1 / lower
+    for column in (0, 1, 4):
+        power = power * s
+        by_coefficient[..., 0, column], by_coefficient[..., 1, column] = x * power, y * power
+    by_coefficient[..., 0, 2] = by_coefficient[..., 1, 3] = 2 * x * y
+    by_coefficient[..., 0, 3], by_coefficient[..., 1, 2] = s + 2 * x * x, s + 2 * y * y
+    by_coefficient[..., 5:] = -scale[..., None, None] * by_coefficient[..., [0, 1, 4]]
+    return xy, by_point, by_coefficient[..., : len(coefficients)]
 
 
 def _distort_equidistant(coefficients: Array, points: Array) -> tuple[Array, Array, Array]:

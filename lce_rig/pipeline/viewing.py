@@ -40,15 +40,17 @@ def capture_in_3d(session: Session, capture: Capture, calibrations: Sequence[Cal
     lidar = calibrations[0].lidar
     if lidar not in capture.lidars:
         raise SessionError(f"capture {capture.name} has no scan of {lidar}", "Choose another capture.")
-    points = capture.scan(lidar).points
-    points = points[np.isfinite(points).all(axis=1)]
+    scan = capture.scan(lidar)
+    points = scan.points
     colours, is_seen = np.zeros((len(points), 3), np.uint8), np.zeros(len(points), bool)
     for c in calibrations:
         for channel in c.channels:
             if capture.has_image(c.camera, channel):
                 pixels = capture.image(c.camera, channel).pixels
                 lens = session.rig.cameras[c.camera].to_intrinsics()
-                own, is_own = colour_points(points, pixels, c.T_cam_lidar, lens)
+                own, is_own = colour_points(scan, pixels, c.T_cam_lidar, lens)
                 colours[is_own & ~is_seen] = own[is_own & ~is_seen]
                 is_seen |= is_own
-    return CaptureIn3D(capture.name, points.astype(np.float32), colours, is_seen)
+    is_finite = np.isfinite(points).all(axis=1)
+    shown = points[is_finite].astype(np.float32)
+    return CaptureIn3D(capture.name, shown, colours[is_finite], is_seen[is_finite])

@@ -11,7 +11,7 @@ of products of
 
     v = [(1, x, y) / (n . u); 1; -r n . u' / (n . u); -n . f / (n . u); residual of (1)]
 
-(9 x 9) with x and y on the board, however many there are.
+(11 x 11) with x and y on the board, however many there are.
 
 Ring ends. A ring's last ray on the board meets its plane s inside an edge, the next ray a step D
 farther out along the edge's normal. The beam has a width, so that the board is lost where the ray passes d
@@ -39,6 +39,11 @@ point lies at
     p + lateral e_a + vertical alpha e_z                                                                 (4)
 
 instead of p.
+
+Plate. No plate is flat. With n the board's normal, and h_w and h_h the height of one that is bent by 1 m
+along its width or its height (`bow_heights`), a point p of the plate stands for the point of the plane at
+
+    p - (bow_w h_w + bow_h h_h) n                                                                        (5)
 """
 
 from collections.abc import Sequence
@@ -54,7 +59,9 @@ from lce_rig.core.results import LidarBoard
 from lce_rig.residuals.plane_and_ends import differentiate, distance_inside, freedoms_of_plane
 
 Indices = NDArray[np.intp]
-N_FIELDS = 2
+FIELDS = ("lens beside the axis", "lens height", "bow along the width", "bow along the height")
+"""Displacements of points that all lasers share, (4) and (5)."""
+N_FIELDS, N_LENS, N_BOW = len(FIELDS), 2, 2
 # Half a beam's width, and what the outline found in the scan may be off by.
 _BORDER_M = 0.02
 ERRORS_OF_LASER = ("range", "azimuth", "elevation")
@@ -62,8 +69,8 @@ ERRORS_OF_LASER = ("range", "azimuth", "elevation")
 N_OF_LASER = len(ERRORS_OF_LASER)
 # Columns of a return: three freedoms of its plane, its laser's errors, the lens, the residual.
 _OWN = 3
-_LENS = _OWN + N_OF_LASER
-_OF_RETURN = _LENS + N_FIELDS + 1
+_OF_FIELDS = _OWN + N_OF_LASER
+_OF_RETURN = _OF_FIELDS + N_FIELDS + 1
 SHIFTS = ("d_0", "c", "d_1", "d_2", "d_3", "p", "along azimuth", "upwards")
 """Unknowns of (3), the plate's shape, and the displacement of ring ends."""
 N_SHIFTS = len(SHIFTS)
@@ -87,11 +94,11 @@ class StackedScans:
         capture, ring: (N,) of each return; `ring` is an index into `rings`.
         rays: (N, 3) unit vectors, frame lidar.
         range_m: (N,).
-        fields: (N, 3, 2) displacement by (4) for a lateral offset of 1 m, a vertical one of 1 m per rad.
+        fields: (N, 3, 4) displacement by (4) and (5), per unit of `FIELDS`.
         end_capture, end_ring: (M,) of each ring end, ordered by capture.
         end_rays: (M, 3) unit vectors towards it.
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
-        end_fields: (M, 3, 2) as `fields`.
+        end_fields: (M, 3, 4) as `fields`.
         end_background: (M, 3) what is behind it, `describe_background`.
     """
 
@@ -126,8 +133,8 @@ def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
     return replace(lidar, points=lidar.points[keep], ring=lidar.ring[keep], offset_ns=offset_ns)
 
 
-def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:
-    """Stack the boards of F captures."""
+def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
+    """Stack the boards of F captures; `board` is their size."""
     rings = np.unique(np.concatenate([numbers for b in boards for numbers in (b.ring, b.edge_ring)]))
     capture = np.repeat(np.arange(len(boards)), [len(board.points) for board in boards])
     ring = np.searchsorted(rings, np.concatenate([board.ring for board in boards]))
@@ -135,6 +142,7 @@ def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:
     order = np.lexsort((ring, capture))
     points, capture, ring = points[order], capture[order], ring[order]
     range_m = np.linalg.norm(points, axis=1)
+    T_lidar_board = np.array([lidar.T_lidar_board for lidar in boards])
     end_capture = np.repeat(np.arange(len(boards)), [len(board.edge_points) for board in boards])
     end_ring = np.searchsorted(rings, np.concatenate([board.edge_ring for board in boards]))
     sorted_ends = np.lexsort((end_ring, end_capture))
@@ -149,12 +157,12 @@ def stack_scans(boards: Sequence[LidarBoard]) -> StackedScans:
         ring=ring,
         rays=points / range_m[:, None],
         range_m=range_m,
-        fields=lens_fields(points),
+        fields=_fields(points, T_lidar_board[capture], board),
         end_capture=end_capture[sorted_ends],
         end_ring=end_ring[sorted_ends],
         end_rays=end_rays,
         next_rays=turn_about_z(end_rays, angle),
-        end_fields=lens_fields(ends),
+        end_fields=_fields(ends, T_lidar_board[end_capture[sorted_ends]], board),
         end_background=np.concatenate([describe_background(board) for board in boards])[sorted_ends],
     )
 
@@ -167,10 +175,31 @@ def turn_about_z(vectors: Array, angle_rad: Array) -> Array:
     return np.stack([x, y, vectors[:, 2]], axis=1)
 
 
+def _fields(points: Array, T_lidar_board: Array, board: Board) -> Array:
+    """Compute the displacements (4) and (5) of points (N, 3) on boards (N, 4, 4), frame lidar: (N, 3, 4)."""
+    R, t = T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 3]
+    height = bow_heights(np.einsum("nji,nj->ni", R, points - t), board)
+    by_bow = -R[:, :, 2, None] * height[:, None]
+    return np.concatenate([lens_fields(points), by_bow], axis=2)
+
+
+def bow_heights(on_board: Array, board: Board) -> Array:
+    """Compute the height (..., 2) of a plate bent by 1 m along its width, or its height.
+
+    It is a parabola whose mean over the plate is zero: the board's frame lies in the middle of its height.
+
+    Args:
+        on_board: (..., 2 or 3) points, frame board, m.
+        board: its size.
+    """
+    half = np.array([board.width_m, board.height_m]) / 2
+    return np.asarray(1 / 3 - (on_board[..., :2] / half) ** 2)
+
+
 def lens_fields(points: Array) -> Array:
     """Compute the displacements (4) of points (N, 3), frame lidar: (N, 3, 2)."""
     across = np.hypot(points[:, 0], points[:, 1])
-    fields = np.zeros((len(points), 3, N_FIELDS))
+    fields = np.zeros((len(points), 3, N_LENS))
     fields[:, 0, 0], fields[:, 1, 0] = -points[:, 1] / across, points[:, 0] / across
     fields[:, 2, 1] = np.arctan2(points[:, 2], across)
     return fields
@@ -207,7 +236,7 @@ class RangeSums:
     """Sums of v v^T by capture and ring, at given board poses.
 
     Attributes:
-        sums: (F, L, 9, 9).
+        sums: (F, L, 11, 11).
         by_pose: (F, 3, 6) derivative of the plane's three freedoms by the tangent of T_lidar_board.
     """
 
@@ -215,14 +244,14 @@ class RangeSums:
     by_pose: Array
 
 
-def sum_ranges(scans: StackedScans, T_lidar_board: Array, lasers: Array, lens: Array) -> RangeSums:
+def sum_ranges(scans: StackedScans, T_lidar_board: Array, lasers: Array, fields: Array) -> RangeSums:
     """Sum the returns' terms.
 
     Args:
         scans: rays.
         T_lidar_board: (F, 4, 4) board poses.
         lasers: (3, L) `ERRORS_OF_LASER` of each ring.
-        lens: (2,) theta.
+        fields: (4,) theta.
     """
     R, n = T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 2]
     k = scans.capture
@@ -235,10 +264,10 @@ def sum_ranges(scans: StackedScans, T_lidar_board: Array, lasers: Array, lens: A
     v[:, 0], v[:, 1], v[:, 2] = 1 / cosine, r * x - middle[k, 0], r * y - middle[k, 1]
     v[:, 1:_OWN] /= cosine[:, None]
     across = -n[k] / cosine[:, None]
-    v[:, _OWN + 1 : _LENS] = r[:, None] * np.einsum("ni,nij->nj", across, turn_rays(scans.rays))
-    v[:, _LENS:-1] = np.einsum("ni,nij->nj", across, scans.fields)
-    own = np.sum(v[:, _OWN:_LENS] * lasers[:, scans.ring].T, axis=1)
-    v[:, -1] = r + own + v[:, _LENS:-1] @ lens - scans.range_m
+    v[:, _OWN + 1 : _OF_FIELDS] = r[:, None] * np.einsum("ni,nij->nj", across, turn_rays(scans.rays))
+    v[:, _OF_FIELDS:-1] = np.einsum("ni,nij->nj", across, scans.fields)
+    own = np.sum(v[:, _OWN:_OF_FIELDS] * lasers[:, scans.ring].T, axis=1)
+    v[:, -1] = r + own + v[:, _OF_FIELDS:-1] @ fields - scans.range_m
     sums = np.zeros((scans.n_captures * len(scans.rings), _OF_RETURN, _OF_RETURN))
     first = np.flatnonzero(np.diff(scans.group, prepend=-1))
     # Products of columns, each one contiguous: several times faster than outer products of rows.
@@ -259,7 +288,7 @@ def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tupl
         (I - k 1 1^T) / sigma^2,    k = sigma_ring^2 / (sigma^2 + n sigma_ring^2)
 
     Returns:
-        The weighted sums (F, L, 9, 9) and the log (F,) of the covariance's determinant.
+        The weighted sums (F, L, 11, 11) and the log (F,) of the covariance's determinant.
     """
     n = ranges.sums[..., _OWN, _OWN]
     total = sigma_m**2 + n * sigma_ring_m**2
@@ -275,10 +304,10 @@ def range_system(ranges: RangeSums, weighted: Array) -> Array:
 
     Args:
         ranges: the sums at the poses where the system is wanted.
-        weighted: (F, L, 9, 9) from `weigh_ranges`.
+        weighted: (F, L, 11, 11) from `weigh_ranges`.
 
     Returns:
-        (F, n, n), n = 6 + 3 L + 3: sums of products of [by board pose, by the lasers' errors, by lens,
+        (F, n, n), n = 6 + 3 L + 5: sums of products of [by board pose, by the lasers' errors, by lens,
         residual], in the order of `spread_rings`.
     """
     F = len(weighted)
@@ -322,7 +351,7 @@ class EdgeRows:
 
     Attributes:
         capture, ring: (M,).
-        rows: (M, 20) by board pose (6), by its laser's errors (3), by lens (2), by `SHIFTS`, e in m.
+        rows: (M, 22) by board pose (6), by its laser's errors (3), by `FIELDS` (4), by `SHIFTS`, e in m.
         step_m: (M,) D.
         range_m: (M,) to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
@@ -339,12 +368,12 @@ class EdgeRows:
 
     @cached_property
     def columns(self) -> Array:
-        """Derivatives (19, M), each column of `rows` contiguous."""
+        """Derivatives (21, M), each column of `rows` contiguous."""
         return np.ascontiguousarray(self.rows[:, :-1].T)
 
     @cached_property
     def products(self) -> Array:
-        """Products of each row's derivatives with each other (190, M), in the order of `np.triu_indices`."""
+        """Products of each row's derivatives with each other (231, M), in the order of `np.triu_indices`."""
         i, j = np.triu_indices(_OF_END - 1)
         return np.asarray(self.columns[i] * self.columns[j])
 
@@ -359,7 +388,13 @@ class EdgeRows:
 
 
 def edge_rows(
-    scans: StackedScans, T_lidar_board: Array, board: Board, lasers: Array, lens: Array, shifts: Array
+    scans: StackedScans,
+    T_lidar_board: Array,
+    board: Board,
+    lasers: Array,
+    fields: Array,
+    shifts: Array,
+    own_shift_m: Array,
 ) -> EdgeRows:
     """Linearise (2).
 
@@ -368,8 +403,9 @@ def edge_rows(
         T_lidar_board: (F, 4, 4) board poses.
         board: its size.
         lasers: (3, L) `ERRORS_OF_LASER` of each ring.
-        lens: (2,) theta.
+        fields: (4,) theta.
         shifts: (8,) `SHIFTS`.
+        own_shift_m: (F,) what each capture adds to d_0.
     """
     T = T_lidar_board[scans.end_capture]
     R, t, n = T[:, :3, :3], T[:, :3, 3], T[:, :3, 2]
@@ -377,7 +413,7 @@ def edge_rows(
     cosine = np.sum(n * scans.end_rays, axis=1)
     range_m = h / cosine
     turned = turn_rays(scans.end_rays)
-    off = scans.end_fields @ lens
+    off = scans.end_fields @ fields
     off += range_m[:, None] * np.einsum("mij,jm->mi", turned, lasers[1:, scans.end_ring])
     # A displaced point is where its displaced ray meets the plane.
     off -= (np.sum(n * off, axis=1) / cosine)[:, None] * scans.end_rays
@@ -396,10 +432,11 @@ def edge_rows(
     rows[:, :6] = -differentiate(sideways, here)
     rows[:, 6] = 0
     rows[:, 7 : 6 + N_OF_LASER] = -range_m[:, None] * np.einsum("mi,mij->mj", sideways, turned)
-    of_lens, of_shifts = np.split(np.arange(6 + N_OF_LASER, _OF_END - 1), [N_FIELDS])
-    rows[:, of_lens] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
+    of_fields, of_shifts = np.split(np.arange(6 + N_OF_LASER, _OF_END - 1), [N_FIELDS])
+    rows[:, of_fields] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
     rows[:, of_shifts] = _by_shifts(scans, sideways, range_m, outwards)
     rows[:, -1] = inside_m + rows[:, of_shifts] @ shifts - step_m / 2
+    rows[:, -1] += rows[:, of_shifts[0]] * own_shift_m[scans.end_capture]
     is_backed = scans.end_background[:, BLENDS] > 0
     return EdgeRows(scans.end_capture, scans.end_ring, rows, step_m, range_m, is_backed, len(scans.rings))
 

@@ -63,14 +63,16 @@ def extract_features(
     observation: Observation, board: Board, settings: FeatureSettings = AS_FITTED
 ) -> CaptureFeatures:
     """Build one capture's contribution to the cost."""
-    lidar = observation.lidar
     return CaptureFeatures(
         capture=observation.capture,
-        plane_points=_onto_plane(lidar.points, lidar.plane, settings),
-        edge_points=_ring_ends(lidar, settings),
-        lidar_normal=lidar.plane[:3],
+        **_scanned(observation.lidar, settings),
         **_seen_at(observation.image.T_cam_board, observation.image.cov, board),
     )
+
+
+def see_lidar(features: CaptureFeatures, lidar: LidarBoard, settings: FeatureSettings) -> CaptureFeatures:
+    """Build the features of another scan of the board that the camera sees."""
+    return replace(features, **_scanned(lidar, settings))
 
 
 def place_features(
@@ -85,6 +87,15 @@ def place_features(
         board: its size.
     """
     return replace(features, **_seen_at(T_cam_board, cov, board))
+
+
+def _scanned(lidar: LidarBoard, settings: FeatureSettings) -> dict[str, Any]:
+    """Compute the features of the LiDAR's side, by the names of `CaptureFeatures`."""
+    return {
+        "plane_points": _onto_plane(lidar.points, lidar.plane, settings),
+        "edge_points": _ring_ends(lidar, settings),
+        "lidar_normal": lidar.plane[:3],
+    }
 
 
 def _seen_at(T_cam_board: Array, cov: Array, board: Board) -> dict[str, Any]:

@@ -1,38 +1,37 @@
-"""Colours of a scan's points from the camera's image, without points that something nearer hides."""
+"""Colours of a scan's points from the image, without points that the camera sees something before."""
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, transform
 
-# A scan is sparse: points within one part in so many of the image's width hide each other.
-_CELLS = 160
-# A surface seen at a grazing angle does not hide itself.
-_DEEPER_M, _DEEPER_SHARE = 0.2, 0.05
+# Cells in which the camera's view is compared with the LiDAR's are at least this large.
+_SMALLEST_CELL_PX = 4.0
 
 
 def colour_points(
-    points_lidar: NDArray[np.floating], pixels: NDArray[np.uint8], T_cam_lidar: Array, lens: Intrinsics
+    scan: Scan, pixels: NDArray[np.uint8], T_cam_lidar: Array, lens: Intrinsics
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Give each point the colour of its nearest pixel.
+    """Give each point of a scan the colour of its nearest pixel.
 
     Args:
-        points_lidar: (N, 3) m, frame lidar.
+        scan: of N points; those that are not finite get no colour.
         pixels: (H, W) grey or (H, W, 3) BGR, of the camera's resolution.
         T_cam_lidar: (4, 4).
         lens: of the camera.
 
     Returns:
         RGB (N, 3), black where the camera does not see the point, and whether it does (N,): in the image,
-        with nothing nearer before it.
+        with nothing before it.
     """
-    points_camera = transform(T_cam_lidar, np.asarray(points_lidar, np.float64))
+    points_camera = transform(T_cam_lidar, np.asarray(scan.points, np.float64))
     at, _ = lens.project(points_camera)
     is_seen = lens.is_inside(at)
-    depth_m = np.linalg.norm(points_camera, axis=1)
-    is_seen[is_seen] = ~_is_hidden(at[is_seen], depth_m[is_seen], lens)
+    cell_px = max(_SMALLEST_CELL_PX, _ring_step_rad(scan) * lens.fx_px)
+    baseline_m = float(np.linalg.norm(T_cam_lidar[:3, 3]))
+    is_seen[is_seen] = ~_is_hidden(at[is_seen], points_camera[is_seen, 2], cell_px, baseline_m * lens.fx_px)
     column, row = np.round(at[is_seen]).astype(int).T
     colours = np.zeros((len(at), 3), np.uint8)
     seen = pixels[row, column]
@@ -40,11 +39,24 @@ def colour_points(
     return colours, is_seen
 
 
-def _is_hidden(at: Array, depth_m: Array, lens: Intrinsics) -> NDArray[np.bool_]:
-    """Compare each point's depth with the nearest one in its cell of the image and the cells around."""
-    cell_px = max(lens.width_px / _CELLS, 1.0)
-    column, row = np.floor((at + 0.5) / cell_px).astype(int).T
-    nearest_m = np.full((row.max(initial=0) + 1, column.max(initial=0) + 1), 1e9, np.float32)
-    np.minimum.at(nearest_m, (row, column), depth_m.astype(np.float32))
-    around_m = cv2.erode(nearest_m, np.ones((3, 3), np.uint8))
-    return np.asarray(depth_m > (1 + _DEEPER_SHARE) * around_m[row, column] + _DEEPER_M)
+def _ring_step_rad(scan: Scan) -> float:
+    """Estimate the angle between neighbouring rings, rad: the median step of their elevations."""
+    points = np.asarray(scan.points, np.float64)
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    rings = [np.nanmedian(elevation[scan.ring == ring]) for ring in np.unique(scan.ring)]
+    return float(np.median(np.diff(np.sort(rings)))) if len(rings) > 1 else 0.0
+
+
+def _is_hidden(at: Array, depth_m: Array, cell_px: float, baseline_m_px: float) -> NDArray[np.bool_]:
+    """Find the points behind nearer ones that the LiDAR looks past and the camera does not.
+
+    In a cell of the image as large as the gap between rings, the point at depth d shifts against the nearest
+    one, at d0, by baseline * f * (1 / d0 - 1 / d) between the views of camera and LiDAR. Below half a cell
+    both are parts of what both sensors see.
+    """
+    cells = np.floor(at / cell_px).astype(int)
+    _, place = np.unique(cells, axis=0, return_inverse=True)
+    inverse = 1 / np.maximum(depth_m, 1e-3)
+    nearest = np.zeros(int(place.max(initial=-1)) + 1)
+    np.maximum.at(nearest, place.ravel(), inverse)
+    return np.asarray(baseline_m_px * (nearest[place.ravel()] - inverse) > cell_px / 2)

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import logging
 import os
 import resource
 import shutil
@@ -18,13 +19,15 @@ import numpy as np
 
 from benchmarks.fleet_sessions import BROKEN, TRUTH, break_sessions, make_fleet
 from benchmarks.tables import print_head, print_row
+from lce_rig.fleet.history import COLUMNS, history_of
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import SCHEMA, TABLE, as_table, merged, table_bytes
 
 _KILL_EVERY_S, _CLIENT_LIVES_S = 20.0, 45.0
-_FEW_ROBOTS, _FEW_SESSIONS = 10, 40
+_FEW_ROBOTS, _FEW_SESSIONS = 10, 30
 _TABLE_ROWS = 1_000_000
+_NAMED = ("moved", "moved_last", "drifts", "creeps")
 # Figures of a run, not of a session.
 _OF_A_RUN = ("duration_s", "cpu_s", "peak_memory_mb", "finished", "source")
 
@@ -52,7 +55,7 @@ def bench_fleet(folder: Path, only: str = "") -> None:
 
 
 def few_sessions(folder: Path) -> Path:
-    """Write forty sessions of ten robots, unless they are there."""
+    """Write thirty sessions of ten robots, unless they are there."""
     root = folder / "few"
     make_fleet(root, folder / "captures", _FEW_ROBOTS, _FEW_SESSIONS, 0)
     return root
@@ -98,6 +101,26 @@ def bench_sessions(folder: Path) -> None:
         f"{in_sessions_s:.0f}", f"{megabytes:.0f}",
     )  # fmt: skip
     print(f"\ntruth: {root / TRUTH}, registry: {registry}", flush=True)
+    compare_with_truth(root, registry)
+
+
+def compare_with_truth(root: Path, registry: Path) -> None:
+    """Which robots the report names, with which date and axis, beside those that were nudged."""
+    truth: dict[str, Any] = json.loads((root / TRUTH).read_text())
+    history = history_of(Registry(Storage.at(registry)).read_table(COLUMNS))
+    named = {robot for robot, state in history.robots.items() if state in _NAMED}
+    right = set()
+    for change in history.changes:
+        nudge = truth[change.robot]
+        if nudge is not None and change.found.kind == "step" and change.after[:10] == nudge["date"]:
+            right |= {change.robot} if change.found.axes[0].axis == nudge["motion"] else set()
+    nudged = {robot for robot, nudge in truth.items() if nudge is not None}
+    print_head("robots", "nudged", "named", "with date and axis", "unchanged", "named", "odd sessions")
+    odd = sum(change.found.kind == "odd" for change in history.changes)
+    unchanged = truth.keys() - nudged
+    print_row(
+        len(truth), len(nudged), len(named & nudged), len(right), len(unchanged), len(named & unchanged), odd
+    )
 
 
 def bench_workers(folder: Path) -> None:
@@ -183,7 +206,7 @@ def bench_broken(folder: Path) -> None:
     shutil.rmtree(registry, ignore_errors=True)
     make_fleet(root, folder / "captures", _FEW_ROBOTS, _FEW_SESSIONS, 0)
     broken = break_sessions(root)
-    run_cli(root, registry, "--workers", "2", "--time-limit", "60", "--memory-limit", "1500")
+    run_cli(root, registry, "--workers", "2", "--time-limit", "60", "--memory-limit", "1000")
     rows = {row["source"]: row for row in rows_of(registry)}
     print_head("kind", "sessions", "status", "cause")
     for kind, (_, wanted) in BROKEN.items():
@@ -280,6 +303,7 @@ def s3_server() -> Iterator[str]:
     from moto.server import ThreadedMotoServer
     from s3fs import S3FileSystem
 
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
     server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()

@@ -193,7 +193,7 @@ def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: 
 def _true_levels(noise: LidarNoise, edges: Sequence[EdgeRows]) -> Levels:
     """Ranges and lasers as the simulator's options say, ring ends as they are, no pose error."""
     none = 1e-6
-    without = Levels(ring_m=none, tilt_rad=none, spin_rad=none, depth_m=none, across_m=none)
+    without = Levels(ring_m=none, own_shift_m=none, tilt_rad=none, spin_rad=none, depth_m=none, across_m=none)
     lidar = replace(without, range_m=noise.range_sigma_m, laser_m=noise.laser_sigma_m)
     return replace(lidar, **_fit_ends(edges))
 
@@ -201,12 +201,14 @@ def _true_levels(noise: LidarNoise, edges: Sequence[EdgeRows]) -> Levels:
 def _at_truth(rig: Rig, session: StillSession) -> Terms:
     found = [item for item in session.candidates if is_board(session, item)]
     board = rig.board.to_board()
-    scans = stack_scans([interior(item.lidar[0], board) for item in found])
-    pictures = stack_images(np.arange(len(found)), [item.image for item in found], np.ones(len(found)))
+    scans = stack_scans([interior(item.lidar[0], board) for item in found], board)
+    pictures = stack_images(np.arange(len(found)), [item.image for item in found], np.ones(len(found)), board)
     T = session.T_cam_lidar
     T_lidar_board = invert(T) @ np.array([session.T_cam_board[item.capture] for item in found])
     constants = np.zeros(PER_CAMERA + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)
-    return linearise(scans, (pictures,), board, State(T[None], T_lidar_board, constants))
+    return linearise(
+        scans, (pictures,), board, State(T[None], T_lidar_board, np.zeros(len(found)), constants)
+    )
 
 
 def is_board(session: StillSession, item: CaptureCandidates) -> bool:

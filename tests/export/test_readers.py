@@ -11,7 +11,7 @@ from benchmarks.outputs import MODELS, READERS, Case, off_px, outputs_case, sess
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.export import EXPORTS, is_export, remove_exports, usual_formats
-from lce_rig.export.coloured_cloud import colour_points
+from lce_rig.export.coloured_cloud import coloured
 from lce_rig.export.job import ExportJob
 from lce_rig.rig import load_rig
 from lce_rig.rig.profile import OutputFormat
@@ -86,7 +86,7 @@ def test_points_that_only_the_lidar_sees_get_no_colour(case: Case) -> None:
     scan = Scan(calibration.lidar, None, points_lidar, np.zeros(len(points), np.float32), rings, None)
     image = Image(case.camera, "frames", None, session_image(case.rig, case.camera))
     job = ExportJob([calibration], case.rig, case.folder)
-    cloud = colour_points(image, scan, calibration, job, 0)
+    cloud = coloured(image, scan, calibration, job, 0)
     kept = {tuple(p) for p in np.stack([cloud[axis] for axis in "xyz"], axis=1)}
     seen = np.array([tuple(p) in kept for p in points_lidar])
     assert not seen[is_behind].any() and seen[is_board].all() and seen[is_free].all()

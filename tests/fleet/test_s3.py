@@ -52,5 +52,10 @@ def test_a_result_in_a_store_counts_when_its_rows_are_there(row, bucket):
     assert registry.consolidate(rebuild=True)["n_used"].to_pylist() == [9]
     registry.place.fs.rm_file((registry.place / "r1/a/fleet.json").path)
     assert registry.rows("r1/a") == [] and len(registry.consolidate(rebuild=True)) == 0
-    registry.remove("r1/a")
+    with registry.result("r1/a") as draft:
+        write_rows(draft, [row(folder="r1/a", source="s")])
+    registry.set_aside("r1/a")
     assert registry.folders() == []
+    aside = registry.place / ".superseded/r1"
+    kept = {name: (aside / name).names() for name in aside.names()}
+    assert kept == {"a": ["fleet.json", "old.txt"], "a-2": ["new.txt"], "a-3": ["fleet.json"]}

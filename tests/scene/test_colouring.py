@@ -3,10 +3,17 @@
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Scan
 from lce_rig.scene.colouring import colour_points
 
 LENS = Intrinsics(300.0, 300.0, 159.5, 119.5, 320, 240)
 LEFT, RIGHT = (10, 20, 200), (200, 30, 0)
+
+
+def _scan(points, rings=None):
+    n = len(points)
+    ring = np.zeros(n, np.int16) if rings is None else np.asarray(rings, np.int16)
+    return Scan("lidar", None, np.asarray(points, np.float32), np.zeros(n, np.float32), ring, None)
 
 
 def _picture():
@@ -17,14 +24,14 @@ def _picture():
 
 def test_colours_come_from_the_pixel_as_rgb():
     points = np.array([[-0.5, 0, 2], [0.5, 0, 2]], np.float32)
-    colours, is_seen = colour_points(points, _picture(), np.eye(4), LENS)
+    colours, is_seen = colour_points(_scan(points), _picture(), np.eye(4), LENS)
     assert is_seen.all()
     assert colours.tolist() == [[*LEFT[::-1]], [*RIGHT[::-1]]]
 
 
 def test_points_behind_the_camera_or_beside_the_image_have_none():
     points = np.array([[0, 0, -2], [5, 0, 2]], np.float32)
-    colours, is_seen = colour_points(points, _picture(), np.eye(4), LENS)
+    colours, is_seen = colour_points(_scan(points), _picture(), np.eye(4), LENS)
     assert not is_seen.any() and not colours.any()
 
 
@@ -32,18 +39,24 @@ def test_a_wall_behind_a_board_has_none_and_the_wall_beside_it_does():
     y, x = np.meshgrid(np.linspace(-0.2, 0.2, 21), np.linspace(-0.3, 0.3, 31))
     board = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], axis=1)
     behind, beside = np.array([[0.1, 0.05, 4.0]]), np.array([[1.5, 0.0, 4.0]])
-    _, is_seen = colour_points(np.concatenate([board, behind, beside]), _picture(), np.eye(4), LENS)
+    # The LiDAR stands half a metre to the left of the camera and looks past the board.
+    T = np.eye(4)
+    T[0, 3] = -0.5
+    points = np.concatenate([board, behind, beside]) - T[:3, 3]
+    _, is_seen = colour_points(_scan(points), _picture(), T, LENS)
     assert is_seen[:-2].all() and not is_seen[-2] and is_seen[-1]
 
 
 def test_a_floor_seen_at_a_grazing_angle_does_not_hide_itself():
     z, x = np.meshgrid(np.linspace(4, 8, 200), np.linspace(-0.5, 0.5, 30))
     floor = np.stack([x.ravel(), np.full(x.size, 1.2), z.ravel()], axis=1)
-    _, is_seen = colour_points(floor, _picture(), np.eye(4), LENS)
+    T = np.eye(4)
+    T[1, 3] = -0.3
+    _, is_seen = colour_points(_scan(floor - T[:3, 3]), _picture(), T, LENS)
     assert is_seen.mean() > 0.95
 
 
 def test_grey_images_and_empty_scans():
-    colours, _ = colour_points(np.array([[0.0, 0, 2]]), np.full((240, 320), 77, np.uint8), np.eye(4), LENS)
+    colours, _ = colour_points(_scan([[0.0, 0, 2]]), np.full((240, 320), 77, np.uint8), np.eye(4), LENS)
     assert colours.tolist() == [[77, 77, 77]]
-    assert colour_points(np.zeros((0, 3)), _picture(), np.eye(4), LENS)[0].shape == (0, 3)
+    assert colour_points(_scan(np.zeros((0, 3))), _picture(), np.eye(4), LENS)[0].shape == (0, 3)

@@ -76,7 +76,8 @@ def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     if options.tolerances is not None:
         # The effects of focal length and squares on the result contain what the scale does not absorb.
         scale = max(options.tolerances.scale, _EXACT)
-        priors = replace(priors, scale=scale, scale_is_claimed=False)
+        bow_m = max(options.tolerances.bow_m, _EXACT)
+        priors = replace(priors, scale=scale, bow_m=bow_m, profile_is_claimed=False)
     return priors, Levels(laser_m=options.laser_bias_sigma_m)
 
 
@@ -148,13 +149,16 @@ def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation
         edge_shift_blended_echo_m=shifts["d_3"],
         range_offset_m=float(np.mean(joint.lasers[0])),
         laser_spread_m=float(np.std(joint.lasers[0])),
-        lens_lateral_m=float(joint.lens_m[0]),
-        lens_vertical_m_per_rad=float(joint.lens_m[1]),
+        lens_lateral_m=float(joint.fields[0]),
+        lens_vertical_m_per_rad=float(joint.fields[1]),
+        bow_width_m=float(joint.fields[-2]),
+        bow_height_m=float(joint.fields[-1]),
         camera_scale=1.0 - float(joint.scale[camera]),
         noise_range_m=levels.range_m,
         noise_ring_m=levels.ring_m,
         noise_ring_end_mrad=1e3 * levels.edge_rad,
         ring_ends_lost=levels.lost_share,
+        noise_edge_shift_m=levels.own_shift_m,
         noise_tilt_deg=float(np.degrees(levels.tilt_rad)),
         noise_spin_deg=float(np.degrees(levels.spin_rad)),
         noise_depth_m=levels.depth_m,

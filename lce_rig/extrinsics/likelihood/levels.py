@@ -32,6 +32,7 @@ class Levels:
         edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`along_rays`).
         backed_rad: the same with an object close behind.
         lost_share: fraction of ring ends whose last returns are missing.
+        own_shift_m: what each capture adds to the edge shift of all.
         tilt_rad, spin_rad: errors of a board's turn in an image beyond corner noise.
         depth_m, across_m: errors of its place, along and across the line of sight.
         laser_m: of the lasers' range offsets about their mean.
@@ -42,6 +43,7 @@ class Levels:
     edge_rad: float = 0.0005
     backed_rad: float = 0.001
     lost_share: float = 0.08
+    own_shift_m: float = 0.0005
     tilt_rad: float = 3.5e-3
     spin_rad: float = 5e-4
     depth_m: float = 0.004
@@ -65,6 +67,7 @@ LOG_SIGMA: Mapping[str, float] = {
     "edge_rad": 0.7,
     "backed_rad": 1.0,
     "lost_share": 1.0,
+    "own_shift_m": 1.0,
     "tilt_rad": 0.7,
     "spin_rad": 0.7,
     "depth_m": 0.7,
@@ -89,11 +92,12 @@ class Priors:
         displacement_m: displacement of all ring ends against the returns between them.
         lateral_m: lens beside the LiDAR's axis, `along_rays`.
         vertical_m: its height, per rad of elevation.
+        bow_m: height of the plate's middle over its ends, along its width and its height.
         azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
         known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
         scale: relative error of each camera's distances, from squares or focal length; one figure for all.
-        scale_is_claimed: whether the covariance contains that error. It must not where the effects of focal
-            length and squares are added to it (`tolerances`).
+        profile_is_claimed: whether the covariance contains the errors of scale and bow. It must not where the
+            effects of lens and board are added to it (`tolerances`).
     """
 
     offset_m: float = 0.005
@@ -104,11 +108,17 @@ class Priors:
     displacement_m: float = 0.00025
     lateral_m: float = 0.02
     vertical_m: float = 0.04
+    bow_m: float = 0.001
     azimuth_rad: float = 4e-4
     elevation_rad: float = 2e-4
     known: KnownLidar | None = None
     scale: float | tuple[float, ...] = 0.001
-    scale_is_claimed: bool = True
+    profile_is_claimed: bool = True
+
+    @property
+    def fields(self) -> Array:
+        """Deviations (4,) in the order of `along_rays.FIELDS`."""
+        return np.array([self.lateral_m, self.vertical_m, self.bow_m, self.bow_m])
 
     @property
     def shifts(self) -> Array:

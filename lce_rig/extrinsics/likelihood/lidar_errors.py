@@ -11,7 +11,7 @@ from lce_rig.core.results import Observation
 from lce_rig.extrinsics.likelihood.calibrate_jointly import what_is_known
 from lce_rig.extrinsics.likelihood.refine import refine
 from lce_rig.extrinsics.options import EstimateSettings, KnownLidar
-from lce_rig.residuals.along_rays import ERRORS_OF_LASER, N_OF_LASER
+from lce_rig.residuals.along_rays import ERRORS_OF_LASER, N_LENS, N_OF_LASER
 
 WIDENED = np.array([1.26, 1.39, 1.0])
 """By what factor the deviations of ranges, azimuths and elevations exceed those of the joint estimate.
@@ -77,10 +77,10 @@ def estimate_lidar(
     prior = np.array([joint.levels.laser_m, priors.azimuth_rad, priors.elevation_rad])
     # Lasers that met few boards are known as well as without these sessions.
     sigma = np.minimum(sigma * WIDENED[:, None], np.maximum(sigma, prior[:, None]))
-    lens = slice(N_OF_LASER * L, N_OF_LASER * L + len(joint.lens_m))
+    lens = slice(N_OF_LASER * L, N_OF_LASER * L + N_LENS)
     rings = np.concatenate([o.lidar.ring for own in sessions for o in own])
     known = KnownLidar(
-        joint.rings.astype(np.intp), joint.lasers, sigma, joint.lens_m, joint.constants_sigma[lens]
+        joint.rings.astype(np.intp), joint.lasers, sigma, joint.fields[:N_LENS], joint.constants_sigma[lens]
     )
     n_points = np.array([np.count_nonzero(rings == ring) for ring in joint.rings])
     assert len(prior) == len(ERRORS_OF_LASER)

@@ -26,6 +26,7 @@ from lce_rig.extrinsics.likelihood.system import (
     scale_places,
 )
 from lce_rig.residuals.along_rays import (
+    N_BOW,
     N_FIELDS,
     N_OF_LASER,
     N_SHIFTS,
@@ -108,10 +109,10 @@ class JointEstimate:
         to_extrinsics: (C, 6, G) derivative of each result's tangent by the unknowns z of `system`.
         rings: (L,) ring numbers.
         lasers: (3, L) errors of each ring, `along_rays.ERRORS_OF_LASER`; positive for ranges too long.
-        lens_m: (2,) lateral and vertical displacement of the LiDAR's lens, `along_rays`.
+        fields: (4,) `along_rays.FIELDS`, the displacement of the LiDAR's lens first.
         shifts: (8,) of ring ends, `along_rays.SHIFTS`.
         scale: (C,) relative error of each camera's distances, positive for too short.
-        constants_sigma: (3 L + 10,) standard deviations of the lasers' errors, lens and shifts.
+        constants_sigma: (3 L + 12,) standard deviations of the lasers' errors, fields and shifts.
         trust: (F,) weight of each capture, by name.
         levels: of the noise.
         cost: of the F captures at the optimum, in the unknowns z of `system`.
@@ -127,7 +128,7 @@ class JointEstimate:
     to_extrinsics: Array
     rings: NDArray[np.int16]
     lasers: Array
-    lens_m: Array
+    fields: Array
     shifts: Array
     scale: Array
     constants_sigma: Array
@@ -162,13 +163,14 @@ def refine(
     usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
     seen = {o.capture: (o, T) for own, T in zip(cameras, T_cam_lidar, strict=True) for o in own}
     order = {name: k for k, name in enumerate(sorted(seen))}
-    scans = stack_scans([interior(seen[name][0].lidar, board) for name in order])
-    images = tuple(_stack_images(own, order) for own in cameras)
+    scans = stack_scans([interior(seen[name][0].lidar, board) for name in order], board)
+    images = tuple(_stack_images(own, order, board) for own in cameras)
     if pose_ratios is not None:
         images = tuple(p.with_larger_errors(r) for p, r in zip(images, pose_ratios, strict=True))
     state = State(
         np.array(T_cam_lidar),
         np.array([invert(T) @ o.image.T_cam_board for o, T in (seen[name] for name in order)]),
+        np.zeros(len(order)),
         np.zeros(PER_CAMERA * len(cameras) + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS),
     )
     problem = _Problem(scans, images, board, priors, np.ones(len(order)))
@@ -239,11 +241,11 @@ class _Problem:
         return state
 
 
-def _stack_images(observations: Sequence[Observation], order: dict[str, int]) -> StackedImages:
+def _stack_images(observations: Sequence[Observation], order: dict[str, int], board: Board) -> StackedImages:
     placement = group_placements(observations)
     capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
     n_repeats = np.bincount(placement)[placement].astype(np.float64)
-    return stack_images(capture, [o.image for o in observations], n_repeats)
+    return stack_images(capture, [o.image for o in observations], n_repeats, board)
 
 
 def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:
@@ -281,7 +283,7 @@ def _summarise(
     scatter, of_constants = _covariance_parts(cost, priors, C)
     cov = scatter + of_constants
     J = _to_extrinsics(state).reshape(C, 6, -1)
-    lasers, lens, shifts = of_the_lidar(constants[PER_CAMERA * C :])
+    lasers, fields, shifts = of_the_lidar(constants[PER_CAMERA * C :])
     return JointEstimate(
         T_cam_lidar=perturb(state.T_cam_lidar, J @ constants),
         T_lidar_board=state.T_lidar_board,
@@ -291,7 +293,7 @@ def _summarise(
         to_extrinsics=J,
         rings=rings,
         lasers=lasers,
-        lens_m=lens,
+        fields=fields,
         shifts=shifts,
         scale=constants[scale_places(C)],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
@@ -309,9 +311,10 @@ def _covariance_parts(cost: Quadratics, priors: Priors, n_cameras: int) -> tuple
     With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
     """
     inverse, claimed = cost.covariance(), cost.prior
-    if not priors.scale_is_claimed:
-        claimed, scale = claimed.copy(), scale_places(n_cameras)
-        claimed[scale, scale] = 0.0
+    if not priors.profile_is_claimed:
+        bows = len(claimed) - N_SHIFTS - N_BOW + np.arange(N_BOW)
+        claimed, of_profile = claimed.copy(), np.append(scale_places(n_cameras), bows)
+        claimed[of_profile, of_profile] = 0.0
     return inverse @ cost.hessians.sum(axis=0) @ inverse, inverse @ claimed @ inverse
 
 
@@ -327,8 +330,8 @@ def move_under(joint: JointEstimate, observations: Sequence[Observation], board:
         (6,) tangent (translation m, rotation rad).
     """
     seen = sorted(observations, key=lambda o: o.capture)
-    scans = stack_scans([interior(o.lidar, board) for o in seen])
-    images = (_stack_images(seen, {o.capture: k for k, o in enumerate(seen)}),)
+    scans = stack_scans([interior(o.lidar, board) for o in seen], board)
+    images = (_stack_images(seen, {o.capture: k for k, o in enumerate(seen)}, board),)
     terms = linearise(scans, images, board, joint.state, joint.trust)
     moved = assemble(terms, joint.levels, joint.priors).cost
     change = (moved.gradients - joint.cost.gradients).sum(axis=0)

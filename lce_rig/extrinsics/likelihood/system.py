@@ -1,11 +1,12 @@
 """All terms at one state, and their normal equations for any noise levels.
 
-Unknowns are the tangent y_k (6) of each board's T_lidar_board, and z, which all captures share:
+Unknowns are y_k (7) of each capture, the tangent of T_lidar_board and its own shift of ring ends, and z,
+which all captures share:
 
     z = [tangent of T_cam_lidar (6) and scale of each camera, errors of each laser's range (L), azimuth (L)
-         and elevation (L), lens (2), shifts of ring ends (8)]
+         and elevation (L), fields (4), shifts of ring ends (8)]
 
-A board pose enters only the terms of its own capture: the matrix is an arrow head, and y_k is eliminated
+They enter only the terms of their own capture: the matrix is an arrow head, and y_k is eliminated
 capture by capture (Schur complement).
 """
 
@@ -21,7 +22,9 @@ from lce_rig.core.geometry import Array, perturb
 from lce_rig.extrinsics.likelihood.image_terms import StackedImages, image_rows
 from lce_rig.extrinsics.likelihood.levels import Levels, PoseLevels, Priors
 from lce_rig.residuals.along_rays import (
+    N_BOW,
     N_FIELDS,
+    N_LENS,
     N_OF_LASER,
     N_SHIFTS,
     EdgeRows,
@@ -113,7 +116,7 @@ def information(blur: Array, lost_share: float) -> Array:
 def edge_system(
     edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float, n_captures: int
 ) -> Array:
-    """Expand -2 ln p of the ring ends to second order, by capture and ring: (F, L, 20, 20).
+    """Expand -2 ln p of the ring ends to second order, by capture and ring: (F, L, 22, 22).
 
     With J a row without its residual: J J^T times the information, J times the score in the last column, and
     -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur, as that of a
@@ -158,6 +161,9 @@ def _normal(z: Array) -> Array:
 
 
 PER_CAMERA = 7
+PER_CAPTURE = 7
+# Column of a capture's own shift of ring ends among its unknowns.
+_OWN_SHIFT = 6
 # Of the logarithm of a level, for differences.
 _LOG_STEP = 1e-4
 # The lasers' own errors have zero mean: that of ranges is the common offset, those of angles are part of the
@@ -177,11 +183,13 @@ class State:
     Attributes:
         T_cam_lidar: (C, 4, 4).
         T_lidar_board: (F, 4, 4).
-        constants: (7 C + 3 L + 10,) z, zero in the places of the tangents.
+        own_shift_m: (F,) shift of each capture's ring ends beyond that of all, like `SHIFTS`' d_0.
+        constants: (7 C + 3 L + 12,) z, zero in the places of the tangents.
     """
 
     T_cam_lidar: Array
     T_lidar_board: Array
+    own_shift_m: Array
     constants: Array
 
     def moved(self, z: Array, y: Array) -> "State":
@@ -189,13 +197,18 @@ class State:
         tangents = np.arange(PER_CAMERA * len(self.T_cam_lidar)).reshape(-1, PER_CAMERA)[:, :6]
         constants = self.constants + z
         constants[tangents] = 0
-        return State(perturb(self.T_cam_lidar, z[tangents]), perturb(self.T_lidar_board, y), constants)
+        return State(
+            perturb(self.T_cam_lidar, z[tangents]),
+            perturb(self.T_lidar_board, y[:, :_OWN_SHIFT]),
+            self.own_shift_m + y[:, _OWN_SHIFT],
+            constants,
+        )
 
 
 def of_the_lidar(constants: Array) -> tuple[Array, Array, Array]:
-    """Split the constants that follow the cameras': errors of the lasers (3, L), lens (2,), shifts (8,)."""
-    lasers, lens, shifts = np.split(constants, [-N_FIELDS - N_SHIFTS, -N_SHIFTS])
-    return lasers.reshape(N_OF_LASER, -1), lens, shifts
+    """Split the constants that follow the cameras': errors of the lasers (3, L), fields (4,), shifts (8,)."""
+    lasers, fields, shifts = np.split(constants, [-N_FIELDS - N_SHIFTS, -N_SHIFTS])
+    return lasers.reshape(N_OF_LASER, -1), fields, shifts
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +221,7 @@ class Terms:
         images: of each camera.
         image_rows: linearised, of each camera.
         constants: z of the state.
+        own_shift_m: (F,) of the state.
         trust: (F,) weight of each capture.
         rings: (L,) ring numbers.
     """
@@ -217,6 +231,7 @@ class Terms:
     images: tuple[StackedImages, ...]
     image_rows: tuple[Array, ...]
     constants: Array
+    own_shift_m: Array
     trust: Array
     rings: NDArray[np.int16]
 
@@ -236,17 +251,18 @@ def linearise(
     """Linearise all terms; `trust` (F,) is 1 for each capture by default."""
     per_camera = state.constants[: PER_CAMERA * len(images)].reshape(-1, PER_CAMERA)
     of_lidar = state.constants[PER_CAMERA * len(images) :]
-    lasers, lens, shifts = of_the_lidar(of_lidar)
+    lasers, fields, shifts = of_the_lidar(of_lidar)
     T_lidar_board = state.T_lidar_board
     return Terms(
-        sum_ranges(scans, T_lidar_board, lasers, lens),
-        edge_rows(scans, T_lidar_board, board, lasers, lens, shifts),
+        sum_ranges(scans, T_lidar_board, lasers, fields),
+        edge_rows(scans, T_lidar_board, board, lasers, fields, shifts, state.own_shift_m),
         tuple(images),
         tuple(
-            image_rows(own, T, T_lidar_board, float(constants[-1]))
+            image_rows(own, T, T_lidar_board, float(constants[-1]), fields[-N_BOW:])
             for own, T, constants in zip(images, state.T_cam_lidar, per_camera, strict=True)
         ),
         state.constants,
+        state.own_shift_m,
         np.ones(scans.n_captures) if trust is None else trust,
         scans.rings,
     )
@@ -254,41 +270,41 @@ def linearise(
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """Normal equations with the board poses eliminated.
+    """Normal equations with the captures' own unknowns eliminated.
 
     Attributes:
         cost: of F captures in z, at the constants' present values.
-        board_steps: (F, 6, G + 1), y = -board_steps [z; 1].
-        of_boards: (F, 6, 6) information of the board poses alone.
+        own_steps: (F, 7, G + 1), y = -own_steps [z; 1].
+        of_own: (F, 7, 7) information of the captures' own unknowns alone.
         minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
     """
 
     cost: Quadratics
-    board_steps: Array
-    of_boards: Array
+    own_steps: Array
+    of_own: Array
     minus_2_log_evidence: float
 
     def step(self) -> tuple[Array, Array]:
-        """Solve for z (G,) and y (F, 6)."""
+        """Solve for z (G,) and y (F, 7)."""
         # Priors of constants differ by many orders of magnitude, too many for `Quadratics.optimum`.
         gradient = self.cost.gradients.sum(axis=0) + self.cost.prior_gradient
         z = -np.linalg.solve(self.cost.information, gradient)
-        return z, -self.board_steps @ np.append(z, 1.0)
+        return z, -self.own_steps @ np.append(z, 1.0)
 
     def second_moments(self) -> Array:
-        """Compute the mean (F, 6 + G + 1, 6 + G + 1) of v v^T, v = [y, z, 1], given the data."""
+        """Compute the mean (F, 7 + G + 1, 7 + G + 1) of v v^T, v = [y, z, 1], given the data."""
         z, y = self.step()
         F, G = len(y), len(z)
-        by_z = np.concatenate([-self.board_steps[:, :, :G], np.broadcast_to(np.eye(G), (F, G, G))], axis=1)
+        by_z = np.concatenate([-self.own_steps[:, :, :G], np.broadcast_to(np.eye(G), (F, G, G))], axis=1)
         v = np.column_stack([y, np.broadcast_to(np.append(z, 1.0), (F, G + 1))])
         found = v[:, :, None] * v[:, None, :]
         found[:, :-1, :-1] += by_z @ np.linalg.inv(self.cost.information) @ np.swapaxes(by_z, 1, 2)
-        found[:, :6, :6] += np.linalg.inv(self.of_boards)
+        found[:, :PER_CAPTURE, :PER_CAPTURE] += np.linalg.inv(self.of_own)
         return np.asarray(found)
 
 
 def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
-    """Weight all terms and eliminate the board poses.
+    """Weight all terms and eliminate the captures' own unknowns.
 
     Args:
         terms: of F captures.
@@ -315,23 +331,24 @@ class Assembly:
         self._image_block = lru_cache(maxsize=2)(partial(_image_block, terms))
 
     def at(self, levels: Levels) -> Reduced:
-        """Weight all terms and eliminate the board poses."""
+        """Weight all terms and eliminate the captures' own unknowns."""
         of_ranges, range_volume = self._range_block(levels.range_m, levels.ring_m)
         of_edges = self._edge_block(levels.edge_rad, levels.backed_rad, levels.lost_share)
+        of_own, own_volume = _own_block(self._terms, levels.own_shift_m)
         of_pictures, picture_volume = self._image_block(levels.pose)
         return _eliminate(
-            (of_ranges + of_edges + of_pictures) * self._terms.trust[:, None, None],
+            (of_ranges + of_edges + of_pictures + of_own) * self._terms.trust[:, None, None],
             self._terms,
             levels,
             self._priors,
-            range_volume + picture_volume,
+            range_volume + picture_volume + own_volume,
         )
 
     def evidence(self, levels: Levels, names: Sequence[str]) -> tuple[float, Array]:
         """Compute -2 ln p(data | levels) and its derivative by the logarithms of some levels.
 
         By a level, it is the mean of v^T dM v over all unknowns given the data, with M the products of
-        [board pose, z, 1] and their priors, and the change of the covariances' log determinants. Only M is
+        [y, z, 1] and their priors, and the change of the covariances' log determinants. Only M is
         differentiated by differences.
         """
         terms, reduced = self._terms, self.at(levels)
@@ -343,8 +360,13 @@ class Assembly:
         prior, mean, prior_volume = _prior(terms, levels, self._priors)
         # All captures have the same z; the mean of the square of its distance from that of the prior.
         z = terms.constants - mean
-        shift = moments[0, 6:-1, -1]
-        of_constants = moments[0, 6:-1, 6:-1] + np.outer(z, z) + np.outer(z, shift) + np.outer(shift, z)
+        shift = moments[0, PER_CAPTURE:-1, -1]
+        of_constants = (
+            moments[0, PER_CAPTURE:-1, PER_CAPTURE:-1]
+            + np.outer(z, z)
+            + np.outer(z, shift)
+            + np.outer(shift, z)
+        )
 
         def change(name: str) -> float:
             there = replace(levels, **{name: getattr(levels, name) * np.exp(_LOG_STEP)})
@@ -354,6 +376,10 @@ class Assembly:
             if name in PoseLevels._fields:
                 moved, volume = _image_block(terms, there.pose)
                 return float(np.vdot(own, moved - pictures)) + volume - picture_volume
+            if name == "own_shift_m":
+                moved, volume = _own_block(terms, there.own_shift_m)
+                before, own_volume = _own_block(terms, levels.own_shift_m)
+                return float(np.vdot(own, moved - before)) + volume - own_volume
             if name == "laser_m":
                 moved, _, volume = _prior(terms, there, self._priors)
                 return float(np.vdot(of_constants, moved - prior)) + volume - prior_volume
@@ -366,7 +392,7 @@ class Assembly:
 def _end_costs(terms: Terms, moments: Array) -> Callable[[Levels], float]:
     """Return the ring ends' part of -2 ln p for moments (F, n, n) of all unknowns, by level."""
     edges, n_cameras, n_rings = terms.edges, len(terms.images), terms.n_rings
-    lasers = 6 + PER_CAMERA * n_cameras + n_rings * np.arange(N_OF_LASER)
+    lasers = PER_CAPTURE + PER_CAMERA * n_cameras + n_rings * np.arange(N_OF_LASER)
     shared = np.arange(lasers[0] + N_OF_LASER * n_rings, moments.shape[1] - 1)
     M = len(edges.rows)
     place = np.column_stack(
@@ -374,9 +400,10 @@ def _end_costs(terms: Terms, moments: Array) -> Callable[[Levels], float]:
             np.broadcast_to(np.arange(6), (M, 6)),
             edges.ring[:, None] + lasers,
             np.broadcast_to(shared, (M, len(shared))),
+            np.full((M, 1), _OWN_SHIFT),
         ]
     )
-    J, k = edges.rows[:, :-1], edges.capture
+    J, k = np.column_stack([edges.rows[:, :-1], edges.rows[:, -1 - N_SHIFTS]]), edges.capture
     squares = np.einsum("mi,mij,mj->m", J, moments[k[:, None, None], place[:, :, None], place[:, None, :]], J)
     firsts = np.sum(J * moments[k[:, None], place, -1], axis=1)
 
@@ -391,7 +418,9 @@ def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, fl
     """Weight the returns' terms, and sum the log determinants of their covariances."""
     block = _no_block(terms)
     weighted, log_volumes = weigh_ranges(terms.ranges, range_m, ring_m)
-    place = np.r_[0:6, 6 + PER_CAMERA * len(terms.images) : block.shape[1] - 1 - N_SHIFTS, block.shape[1] - 1]
+    place = np.r_[
+        0:6, PER_CAPTURE + PER_CAMERA * len(terms.images) : block.shape[1] - 1 - N_SHIFTS, block.shape[1] - 1
+    ]
     block[:, place[:, None], place] = range_system(terms.ranges, weighted)
     return block, float(log_volumes.sum())
 
@@ -399,10 +428,22 @@ def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, fl
 def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: float) -> Array:
     """Weight the ring ends' terms."""
     block = _no_block(terms)
-    place = np.r_[0:6, 6 + PER_CAMERA * len(terms.images) : block.shape[1]]
+    place = np.r_[0:6, PER_CAPTURE + PER_CAMERA * len(terms.images) : block.shape[1]]
     by_ring = edge_system(terms.edges, edge_rad, backed_rad, lost_share, len(block))
     block[:, place[:, None], place] = spread_rings(by_ring)
+    # A capture's own shift acts as that of all captures does.
+    block[:, _OWN_SHIFT] = block[:, -1 - N_SHIFTS]
+    block[:, :, _OWN_SHIFT] = block[:, :, -1 - N_SHIFTS]
     return block
+
+
+def _own_block(terms: Terms, own_shift_m: float) -> tuple[Array, float]:
+    """Build what is known of the captures' own shifts, and the log of its covariance's determinant."""
+    block, precision = _no_block(terms), own_shift_m**-2
+    block[:, _OWN_SHIFT, _OWN_SHIFT] = precision
+    block[:, _OWN_SHIFT, -1] = block[:, -1, _OWN_SHIFT] = precision * terms.own_shift_m
+    block[:, -1, -1] = precision * terms.own_shift_m**2
+    return block, 2 * len(block) * float(np.log(own_shift_m))
 
 
 def _image_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
@@ -410,8 +451,10 @@ def _image_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
     block, log_volume = _no_block(terms), 0.0
     for c, (images, rows) in enumerate(zip(terms.images, terms.image_rows, strict=True)):
         cov = images.total_cov(pose_levels)
-        own = 6 + PER_CAMERA * c
-        place = np.r_[own : own + 6, 0:6, own + 6, block.shape[1] - 1]
+        own = PER_CAPTURE + PER_CAMERA * c
+        last = block.shape[1] - 1
+        bows = last - N_SHIFTS - N_BOW + np.arange(N_BOW)
+        place = np.r_[own : own + 6, 0:6, own + 6, bows, last]
         products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
         block[images.capture[:, None, None], place[:, None], place] += products
         log_volume += float(np.linalg.slogdet(cov)[1].sum())
@@ -419,16 +462,17 @@ def _image_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
 
 
 def _no_block(terms: Terms) -> Array:
-    """Allocate products of [board pose (6), z (G), residual] by capture."""
-    size = 6 + len(terms.constants) + 1
+    """Allocate products of [y (7), z (G), residual] by capture."""
+    size = PER_CAPTURE + len(terms.constants) + 1
     return np.zeros((len(terms.ranges.sums), size, size))
 
 
 def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volume: float) -> Reduced:
-    """Eliminate the board poses from M (F, 6 + G + 1, 6 + G + 1) and add the priors."""
-    of_boards, rest = M[:, :6, :6], M[:, :6, 6:]
-    steps = np.linalg.solve(of_boards, rest)
-    reduced = M[:, 6:, 6:] - np.swapaxes(rest, 1, 2) @ steps
+    """Eliminate the captures' own unknowns from M (F, 7 + G + 1, 7 + G + 1) and add the priors."""
+    p = PER_CAPTURE
+    of_own, rest = M[:, :p, :p], M[:, :p, p:]
+    steps = np.linalg.solve(of_own, rest)
+    reduced = M[:, p:, p:] - np.swapaxes(rest, 1, 2) @ steps
     hessians, gradients, costs = reduced[:, :-1, :-1], reduced[:, :-1, -1], reduced[:, -1, -1]
     prior, mean, log_prior_volume = _prior(terms, levels, priors)
     off = terms.constants - mean
@@ -436,9 +480,9 @@ def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volum
     information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
     least = costs.sum() + off @ summed.prior_gradient
     least -= gradient @ np.linalg.solve(information, gradient)
-    log_volume += np.linalg.slogdet(of_boards)[1].sum() + np.linalg.slogdet(information)[1]
+    log_volume += np.linalg.slogdet(of_own)[1].sum() + np.linalg.slogdet(information)[1]
     evidence = float(least + log_volume + log_prior_volume)
-    return Reduced(summed, np.asarray(steps), of_boards, evidence)
+    return Reduced(summed, np.asarray(steps), of_own, evidence)
 
 
 def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, float]:
@@ -457,7 +501,7 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, 
         (priors.azimuth_rad, 0.0),
         (priors.elevation_rad, 0.0),
     )
-    lens_sigma = np.array([priors.lateral_m, priors.vertical_m])
+    fields_sigma = priors.fields
     known = priors.known
     for k, (own, common) in enumerate(of_lasers):
         cov = own**2 * (np.eye(L) - 1 / L)
@@ -471,8 +515,8 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, 
         log_volume += float(np.linalg.slogdet(cov)[1])
     last = np.arange(PER_CAMERA * C + N_OF_LASER * L, len(prior))
     if known is not None:
-        mean[last[:N_FIELDS]], lens_sigma = known.lens, known.lens_sigma
-    prior[last, last] = np.concatenate([lens_sigma, priors.shifts]) ** -2.0
+        mean[last[:N_LENS]], fields_sigma[:N_LENS] = known.lens, known.lens_sigma
+    prior[last, last] = np.concatenate([fields_sigma, priors.shifts]) ** -2.0
     return prior, mean, log_volume
 
 

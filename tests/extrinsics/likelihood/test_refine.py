@@ -10,9 +10,10 @@ from lce_rig.extrinsics import EstimateSettings, error_to_reference, fit_extrins
 from lce_rig.extrinsics.consensus import find_consensus
 from lce_rig.extrinsics.likelihood.levels import Levels, Priors
 from lce_rig.extrinsics.likelihood.refine import inflate, refine
+from lce_rig.extrinsics.tolerances import Tolerances, vary
 from lce_rig.residuals.along_rays import SHIFTS, turn_about_z
 from lce_rig.residuals.placements import group_placements
-from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, photograph, simulate
+from tests.extrinsics.boards import BOARD, CAMERA, T_FORWARD, Scenario, photograph, simulate
 
 ML = EstimateSettings(method="ml", n_draws=3, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
 REAL = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.008, end_sigma_m=0.001)
@@ -106,6 +107,31 @@ def test_pictures_that_err_by_more_than_their_corners_are_seen_to_do_so():
     assert error @ np.linalg.solve(joint.cov[0], error) < 25
 
 
+def test_a_bent_plate_is_found_by_its_bow():
+    """Corners, returns and ring ends of a plate whose middle lies 1 mm over its left and right edges."""
+    flat = observations(20, 0, REAL)
+    known = Tolerances(CAMERA, 0.0015, 0.9, 0.45, 0.001, 0.003, 0.002, 0.001)
+    bent = next(each for each in vary(flat, BOARD, known) if each.source == "board_bow")
+    joints = [refine([each], BOARD, [T_FORWARD]) for each in (flat, bent.observations)]
+    found = joints[1].fields - joints[0].fields
+    assert found[-2:] == pytest.approx([bent.step, 0.0], abs=2e-4)
+    moved = difference(joints[1].T_cam_lidar[0], joints[0].T_cam_lidar[0])
+    assert np.linalg.norm(moved[:3]) < 5e-4
+
+
+def test_captures_whose_ring_ends_lie_farther_out_than_the_others_are_seen_to_do_so():
+    """The beam reaches 6 mm over the edges of every second capture, 10 mm over those of the others."""
+    near, far = (observations(20, 0, replace(REAL, footprint_m=reach_m)) for reach_m in (0.006, 0.010))
+    mixed = [*near[::2], *far[1::2]]
+    joint = refine([mixed], BOARD, [T_FORWARD])
+    own_m = dict(zip(sorted(o.capture for o in mixed), joint.state.own_shift_m, strict=True))
+    apart_m = np.mean([own_m[o.capture] for o in far[1::2]]) - np.mean([own_m[o.capture] for o in near[::2]])
+    assert apart_m == pytest.approx(0.004, abs=5e-4)
+    assert 0.001 < joint.levels.own_shift_m < 0.003
+    alike = refine([near], BOARD, [T_FORWARD])
+    assert alike.levels.own_shift_m < 0.0005
+
+
 def test_cameras_that_share_captures_share_what_the_lidar_says():
     """A second camera 30 cm aside, with ten times the first one's corner noise, gains from the first one."""
     T_second = pose(exp_so3(np.array([0, 0.2, 0])), np.array([0.3, 0.0, 0.05])) @ T_FORWARD
@@ -180,8 +206,10 @@ def test_a_bright_background_takes_the_edges_and_is_allowed_for():
     error = difference(joint.T_cam_lidar[0], T_FORWARD)
     assert error @ np.linalg.solve(joint.cov[0], error) < 25
     blind = [replace(o, lidar=replace(o.lidar, edge_echo=np.zeros(len(o.lidar.edge_side)))) for o in lit]
-    wrong = difference(refine([blind], BOARD, [T_FORWARD]).T_cam_lidar[0], T_FORWARD)
-    assert np.linalg.norm(wrong[3:]) > 1.5 * np.linalg.norm(error[3:])
+    unaware = refine([blind], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
+    # Shifts of single captures take its place, which say less.
+    assert unaware.levels.own_shift_m > 2 * joint.levels.own_shift_m
+    assert np.trace(unaware.cov[0]) > 1.1 * np.trace(joint.cov[0])
 
 
 def lighten(observation, share, sooner_m):

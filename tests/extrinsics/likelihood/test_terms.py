@@ -27,17 +27,23 @@ from lce_rig.residuals.along_rays import (
 from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, simulate
 
 STEP = 1e-6
-NO_LENS, NO_SHIFTS = np.zeros(N_FIELDS), np.zeros(N_SHIFTS)
+NO_FIELDS, NO_SHIFTS = np.zeros(N_FIELDS), np.zeros(N_SHIFTS)
 
 
 def no_errors(scans):
     return np.zeros((N_OF_LASER, len(scans.rings)))
 
 
-def ends(scans, T_lidar_board, lasers=None, lens=NO_LENS, shifts=NO_SHIFTS):
+def ends(scans, T_lidar_board, lasers=None, fields=NO_FIELDS, shifts=NO_SHIFTS, own_shift_m=None):
     """Ring ends at boards' poses, with no errors but those given."""
     return edge_rows(
-        scans, T_lidar_board, BOARD, no_errors(scans) if lasers is None else lasers, lens, shifts
+        scans,
+        T_lidar_board,
+        BOARD,
+        no_errors(scans) if lasers is None else lasers,
+        fields,
+        shifts,
+        np.zeros(len(T_lidar_board)) if own_shift_m is None else own_shift_m,
     )
 
 
@@ -50,12 +56,12 @@ def observations():
 
 @pytest.fixture(scope="module")
 def scans(observations):
-    return stack_scans([o.lidar for o in observations])
+    return stack_scans([o.lidar for o in observations], BOARD)
 
 
 @pytest.fixture(scope="module")
 def images(observations):
-    return stack_images(np.arange(4), [o.image for o in observations], np.ones(4))
+    return stack_images(np.arange(4), [o.image for o in observations], np.ones(4), BOARD)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +87,7 @@ def freedoms(scans, T_lidar_board):
 def test_derivatives_by_a_boards_pose_are_those_of_differences(scans, T_lidar_board, axis):
     tangent = STEP * np.eye(6)[axis]
     ahead, behind = perturb(T_lidar_board, tangent), perturb(T_lidar_board, -tangent)
-    by_pose = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_LENS).by_pose[scans.capture]
+    by_pose = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_FIELDS).by_pose[scans.capture]
     expected = (ranges_to(scans, ahead) - ranges_to(scans, behind)) / (2 * STEP)
     slopes = np.sum(freedoms(scans, T_lidar_board) * by_pose[:, :, axis], axis=1)
     assert np.allclose(slopes, expected, atol=1e-6)
@@ -98,17 +104,17 @@ def test_a_displaced_lens_moves_ranges_and_ends_as_its_derivatives_say(
     theta = 1e-3
     moved = []
     for observation in observations:
-        own = stack_scans([observation.lidar])
+        own = stack_scans([observation.lidar], BOARD)
         points = own.rays * own.range_m[:, None] + theta * own.fields[:, :, lens]
         points_of_ends = observation.lidar.edge_points
         points_of_ends = points_of_ends + theta * lens_fields(points_of_ends)[:, :, lens]
         moved.append(
             replace(observation.lidar, points=points, ring=own.rings[own.ring], edge_points=points_of_ends)
         )
-    there = stack_scans(moved)
+    there = stack_scans(moved, BOARD)
     gap = there.range_m - ranges_to(there, T_lidar_board) - (scans.range_m - ranges_to(scans, T_lidar_board))
-    sums = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_LENS).sums
-    assert sums.shape[2] == 9
+    sums = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_FIELDS).sums
+    assert sums.shape[2] == 11
     # Displacement along the normal over the ray's slope: what a range along the old ray would have to read.
     n = T_lidar_board[scans.capture, :3, 2]
     by_lens = -np.einsum("ni,ni->n", n, scans.fields[:, :, lens]) / np.sum(n * scans.rays, axis=1)
@@ -127,7 +133,7 @@ def test_a_lasers_angles_move_its_ranges_and_ends_as_its_derivatives_say(scans, 
     is_mine = scans.ring == ring
     turned = scans.rays + np.where(is_mine, 5e-5, 0.0)[:, None] * turn_rays(scans.rays)[:, :, error - 1]
     expected = ranges_to(replace(scans, rays=turned), T_lidar_board) - ranges_to(scans, T_lidar_board)
-    sums = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_LENS).sums
+    sums = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_FIELDS).sums
     by_error = [np.sum(expected[is_mine & (scans.capture == k)]) / 5e-5 for k in range(scans.n_captures)]
     assert np.allclose(sums[:, ring, 3, 3 + error], by_error, rtol=1e-3, atol=0.02)
     plain, told = (ends(scans, T_lidar_board, each) for each in (None, lasers))
@@ -138,13 +144,13 @@ def test_a_lasers_angles_move_its_ranges_and_ends_as_its_derivatives_say(scans, 
 
 def test_a_displaced_lens_leaves_ring_ends_at_their_edges(scans, T_lidar_board):
     """Points 25 mm beside their rays, and boards as far the other way: each end keeps its edge and step."""
-    lens = np.array([0.025, 0.0])
+    lens = np.array([0.025, 0.0, 0.0, 0.0])
     plain = ends(scans, T_lidar_board)
     moved = T_lidar_board.copy()
     centres = moved[:, :3, 3]
     across = np.stack([-centres[:, 1], centres[:, 0], 0 * centres[:, 0]], axis=1)
     moved[:, :3, 3] += lens[0] * across / np.linalg.norm(across, axis=1, keepdims=True)
-    there = ends(scans, moved, lens=lens)
+    there = ends(scans, moved, fields=lens)
     # The board is small: the displacement turns with azimuth by a few millimetres over its width.
     assert np.abs(there.rows[:, -1] - plain.rows[:, -1]).max() < 0.005
     assert np.allclose(there.step_m, plain.step_m, rtol=0.1)
@@ -166,7 +172,7 @@ def test_ring_ends_displaced_against_all_returns_are_what_the_shifts_say(scans, 
 
 
 def test_derivatives_of_pictures_are_those_of_differences(images, T_lidar_board):
-    rows = image_rows(images, T_FORWARD, T_lidar_board, 0.0)
+    rows = image_rows(images, T_FORWARD, T_lidar_board, 0.0, np.zeros(2))
     for axis in range(6):
         tangent = STEP * np.eye(6)[axis]
         by_camera = [
@@ -180,7 +186,7 @@ def test_derivatives_of_pictures_are_those_of_differences(images, T_lidar_board)
 
 
 def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans, T_lidar_board):
-    ranges = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_LENS)
+    ranges = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_FIELDS)
     weighted, log_volume = weigh_ranges(ranges, 0.01, 0.004)
     ring = scans.ring[np.searchsorted(scans.capture, 1)]
     mine = (scans.capture == 1) & (scans.ring == ring)
@@ -188,7 +194,7 @@ def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans,
     by_plane = freedoms(scans, T_lidar_board)[mine]
     v = np.column_stack([by_plane, np.ones(len(r)), r - scans.range_m[mine]])
     cov = 0.01**2 * np.eye(len(r)) + 0.004**2
-    plain = [0, 1, 2, 3, 8]
+    plain = [0, 1, 2, 3, 10]
     assert np.allclose(weighted[1, ring][np.ix_(plain, plain)], v.T @ np.linalg.solve(cov, v), rtol=1e-8)
     total = 0.0
     for ring in range(len(scans.rings)):
@@ -204,7 +210,8 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
     by_camera = terms.image_rows[0]
     for k in range(F):
         own = np.zeros((6, G + 6 * F + 1))
-        own[:, :6], own[:, 6], own[:, -1] = by_camera[k, :, :6], by_camera[k, :, 12], by_camera[k, :, 13]
+        own[:, :6], own[:, 6], own[:, -1] = by_camera[k, :, :6], by_camera[k, :, 12], by_camera[k, :, 15]
+        own[:, 7 + 3 * terms.n_rings + 2 : 7 + 3 * terms.n_rings + 4] = by_camera[k, :, 13:15]
         own[:, G + 6 * k : G + 6 * k + 6] = by_camera[k, :, 6:12]
         rows.append(own)
         noise.append(terms.images[0].total_cov(levels.pose)[k])
@@ -216,7 +223,7 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
         own[0, 7 + scans.ring[i]] = 1
         turned = r[i] * turn_rays(scans.rays[i : i + 1])[0]
         own[0, [7 + L + scans.ring[i], 7 + 2 * L + scans.ring[i]]] = -n @ turned / (n @ scans.rays[i])
-        own[0, 7 + 3 * L : 7 + 3 * L + 2] = -n @ scans.fields[i] / (n @ scans.rays[i])
+        own[0, 7 + 3 * L : 7 + 3 * L + 4] = -n @ scans.fields[i] / (n @ scans.rays[i])
         own[0, -1] = r[i] - scans.range_m[i]
         rows.append(own)
     same = scans.group[:, None] == scans.group[None]
@@ -235,7 +242,9 @@ def without_ends(edges):
 def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, images, T_lidar_board):
     L = len(scans.rings)
     G = 7 + N_OF_LASER * L + N_FIELDS + N_SHIFTS
-    terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(G)))
+    terms = linearise(
+        scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(4), np.zeros(G))
+    )
     terms = replace(terms, edges=without_ends(terms.edges))
     priors = Priors()
     r = ranges_to(scans, T_lidar_board)
@@ -248,7 +257,7 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, image
         lasers = block_diag(
             *(a**2 * about_mean + b**2 + 1e-12 * np.eye(L) for a, b in zip(own, common, strict=True))
         )
-        constants = np.square([priors.lateral_m, priors.vertical_m, *priors.shifts])
+        constants = np.square([*priors.fields, *priors.shifts])
         known = block_diag(priors.scale**-2, np.linalg.inv(lasers), np.diag(1 / constants))
         A, e = rows[:, :-1], rows[:, -1]
         H, g = A.T @ np.linalg.solve(cov, A), A.T @ np.linalg.solve(cov, e)
@@ -270,7 +279,9 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, image
 def test_the_evidence_changes_with_each_level_as_its_derivative_says(scans, images, T_lidar_board):
     zeros = np.zeros(7 + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)
     trust = np.linspace(0.4, 1.0, scans.n_captures)
-    terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, zeros), trust)
+    terms = linearise(
+        scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(4), zeros), trust
+    )
     assembly, base, step = Assembly(terms, Priors()), Levels(), 1e-3
     value, slopes = assembly.evidence(base, list(LOG_SIGMA))
     assert value == assembly.at(base).minus_2_log_evidence
@@ -284,7 +295,7 @@ def test_the_evidence_changes_with_each_level_as_its_derivative_says(scans, imag
 
 def test_what_a_search_for_levels_keeps_is_right_at_each_step_and_gone_with_it(scans, images, T_lidar_board):
     zeros = np.zeros(7 + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)
-    terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, zeros))
+    terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(4), zeros))
     assembly, base = Assembly(terms, Priors()), Levels()
     for changed in (base, replace(base, range_m=0.02), replace(base, lost_share=0.3), base):
         plainly = assemble(terms, changed, Priors()).minus_2_log_evidence
