@@ -1,7 +1,8 @@
 """What makers publish of their spinning LiDARs: beams, timing, noise. The only place with such figures.
 
 The simulator, the guidance, a profile's defaults and `lce-rig rigs new` read this table. Every entry names
-its source, and what in it is an estimate. Rings of a single unit differ from its model's by hundredths of a
+where its figures are published, and what in it is an estimate; docs/rig-profiles.md says which were compared
+with a document or a unit. Rings of a single unit differ from its model's by hundredths of a
 degree: `elevations_deg` in a profile replaces them.
 """
 

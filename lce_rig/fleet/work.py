@@ -118,11 +118,11 @@ def work(job: Job, settings: Settings, tell: Callable[[Mapping[str, Any]], None]
             row = _dated(row, provenance_of([session]), opened.ending)
             tell(asdict(row))
         except (LceRigError, OSError) as error:
-            return publish(registry, [_failed(row, error)], start_s)
+            return publish(registry, [_failed(row, error, Path(scratch))], start_s)
         try:
             return _calibrate(registry, session, row, settings, start_s)
         except LceRigError as error:
-            return publish(registry, [_failed(row, error)], start_s)
+            return publish(registry, [_failed(row, error, Path(scratch))], start_s)
 
 
 def first_row(job: Job, settings: Settings) -> Row:
@@ -234,13 +234,15 @@ def _is_done(rows: list[dict[str, Any]], row: Row, *, retry: bool) -> bool:
     )
 
 
-def _failed(row: Row, error: LceRigError | OSError) -> Row:
+def _failed(row: Row, error: LceRigError | OSError, scratch: Path) -> Row:
+    """Say why there is no result, by the names that files have where the session lies."""
     if isinstance(error, OSError):
         error = SourceError(f"{row.source} cannot be read: {error.strerror or error}")
     own = error.finding if isinstance(error, NotEnoughDataError) else None
     code = next((code for kind, code in _CODES if isinstance(error, kind)), "fleet.other_error")
     cause = own or Finding(code, figures={"what": error.what, "hint": error.hint})
-    return without_result(row, "failed", cause)
+    failed = without_result(row, "failed", cause)
+    return replace(failed, detail=(failed.detail or "").replace(str(scratch / "session"), row.source))
 
 
 def without_result(row: Row, status: Status, cause: Finding) -> Row:

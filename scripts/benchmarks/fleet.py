@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import logging
 import os
 import resource
 import shutil
@@ -205,7 +206,7 @@ def bench_broken(folder: Path) -> None:
     shutil.rmtree(registry, ignore_errors=True)
     make_fleet(root, folder / "captures", _FEW_ROBOTS, _FEW_SESSIONS, 0)
     broken = break_sessions(root)
-    run_cli(root, registry, "--workers", "2", "--time-limit", "60", "--memory-limit", "1500")
+    run_cli(root, registry, "--workers", "2", "--time-limit", "60", "--memory-limit", "1000")
     rows = {row["source"]: row for row in rows_of(registry)}
     print_head("kind", "sessions", "status", "cause")
     for kind, (_, wanted) in BROKEN.items():
@@ -302,6 +303,7 @@ def s3_server() -> Iterator[str]:
     from moto.server import ThreadedMotoServer
     from s3fs import S3FileSystem
 
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
     server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()

@@ -6,6 +6,7 @@ sessions of one robot share a capture.
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -215,9 +216,9 @@ def _torn_marker(session: Path) -> None:
 
 
 def _other_board(session: Path) -> None:
-    """State a board of other squares than the one in the images."""
+    """State a board of fewer squares than the one in the images."""
     text = (session / "rig.yaml").read_text()
-    (session / "rig.yaml").write_text(text.replace("[8, 6]", "[11, 7]"))
+    (session / "rig.yaml").write_text(text.replace("[8, 6]", "[7, 5]"))
 
 
 def _other_rig(session: Path) -> None:
@@ -238,8 +239,9 @@ def _memory_bomb(session: Path) -> None:
     """Hold images of 67 megapixels."""
     import hashlib
 
-    text = (session / "rig.yaml").read_text()
-    (session / "rig.yaml").write_text(text.replace("[640, 360]", "[8192, 8192]"))
+    text = (session / "rig.yaml").read_text().replace("[640, 360]", "[8192, 8192]")
+    text = re.sub(r"([fc][xy]_px): ([0-9.]+)", lambda found: f"{found[1]}: {16 * float(found[2]):.4f}", text)
+    (session / "rig.yaml").write_text(text)
     noise = np.random.default_rng(0).integers(0, 255, (64, 64), dtype=np.uint8)
     data = cv2.imencode(".png", np.tile(noise, (128, 128)))[1].tobytes()
     for manifest in sorted(session.glob("captures/*/meta.json")):
