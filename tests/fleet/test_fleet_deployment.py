@@ -142,7 +142,7 @@ def test_a_robot_that_refuses_is_passed_over_but_not_as_a_canary(
     # r4's files come from later captures than its newest result in this registry.
     add("r4", "2026-03-01T10:00:00Z")
     deploy(registry, targets)
-    registry.remove("r4/2026-03-01-0f")
+    registry.set_aside("r4/2026-03-01-0f")
     registry.consolidate()
     rollout = deploy(registry, targets)
     assert rollout.robots["r4"].state == "refused" and not rollout.stopped_by
