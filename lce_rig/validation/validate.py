@@ -1,7 +1,7 @@
 """Checks of a result on its own captures, before the verdict."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import Contribution
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.local_quadratic import SCALE, expand
+from lce_rig.extrinsics.tolerances import Sensitivity
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import LidarSettings, Rig, VerdictSettings
@@ -25,7 +26,7 @@ from lce_rig.validation.contributions import (
     split_contradictions,
 )
 from lce_rig.validation.intrinsics_check import IntrinsicsCheck, check_intrinsics
-from lce_rig.validation.negative_control import NegativeControl, run_control
+from lce_rig.validation.negative_control import NegativeControl, run_control, run_control_with_constants
 from lce_rig.validation.nuisances import Nuisances, estimate_nuisances
 from lce_rig.validation.split_consistency import Contrast, contrast_halves, find_groups
 
@@ -197,15 +198,12 @@ def validate(
     settled = expansion.hold(SCALE).settled()
     # Compare a covariance with the scatter of its own method, as another cost scatters differently.
     widened_by, remark = widening(estimate.cov, resample(estimate.expansion or settled), rig.verdict)
-    control = run_control(
-        observations,
-        board,
-        estimate.T_cam_lidar,
-        widened_by**2 * estimate.cov,
-        settled,
-        rig.calibration,
-        rig.verdict.control_sigmas,
-    )
+    cov, moved = widened_by**2 * estimate.cov, (rig.calibration, rig.verdict.control_sigmas)
+    if estimate.method == "ml":
+        with_constants = _with_prior_of_scale(expansion, estimate.sensitivities)
+        control = run_control_with_constants(with_constants, cov, estimate.lever_m, *moved)
+    else:
+        control = run_control(observations, board, estimate.T_cam_lidar, cov, settled, *moved)
     rings = np.unique(np.concatenate([observation.lidar.ring for observation in observations]))
     centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
     return _reported(
@@ -218,6 +216,16 @@ def validate(
         estimate_nuisances(expansion, rings),
         intrinsics,
     )
+
+
+def _with_prior_of_scale(expansion: Quadratics, sensitivities: Sequence[Sensitivity]) -> Quadratics:
+    """Let the camera's scale be wrong as the profile's focal length and squares may be."""
+    sigmas = [each.sigma for each in sensitivities if each.source in ("square_size", "focal_length")]
+    if not sigmas:
+        return expansion.hold(SCALE)
+    prior = expansion.prior.copy()
+    prior[SCALE, SCALE] = 1 / sum(sigma**2 for sigma in sigmas)
+    return replace(expansion, prior=prior)
 
 
 def _reported(
