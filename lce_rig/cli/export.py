@@ -61,7 +61,7 @@ def _list_formats(context: click.Context, _param: click.Parameter, is_asked: boo
     "--output",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Write the files into this folder.",
+    help="Write the files into this folder; those of an earlier export there are removed.",
 )
 @click.option("--force", is_flag=True, help="Export a failed result, too.")
 def export(
@@ -85,11 +85,15 @@ def export(
     from lce_rig.core.errors import UsageError
     from lce_rig.pipeline.result_files import RESULT, result_parts
 
-    if (into is None) == (output is None) or (into is not None and (formats or tree) is not None):
+    if (into is None) == (output is None):
         raise UsageError(
-            "where to is not clear",
-            "Give --output FOLDER (and --formats, --tree) for files, or --into URDF for the robot's own.",
+            "neither --output nor --into is given"
+            if into is None
+            else "--output and --into exclude each other",
+            "Give --output FOLDER for files, or --into URDF for the robot's own.",
         )
+    if into is not None and (formats or tree) is not None:
+        raise UsageError("--formats and --tree apply to --output only", "Omit them, or omit --into.")
     opened = lce.Session.open(session)
     pairs = lce.read_result(opened.path.joinpath(*result_parts(name), RESULT)).pairs
     if output is not None:

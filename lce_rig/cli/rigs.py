@@ -40,7 +40,8 @@ def list_profiles(as_json: bool) -> None:
         table.add_row(rig.name, ", ".join(summary["lidars"]), cameras, _board(rig), rig.description)
     screen.print_table(table)
     screen.note(
-        "for your own rig: lce-rig rigs new NAME --from rlfs, then pass --rig NAME.yaml to every verb"
+        "for your own rig: lce-rig rigs new NAME --from rlfs, "
+        "then pass --rig NAME.yaml to doctor and collect; sessions keep it"
     )
 
 

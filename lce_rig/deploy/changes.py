@@ -45,7 +45,7 @@ def sensor_changes(earlier: Path, new: Path) -> list[SensorChange]:
 
 
 def text_changes(earlier: Path, new: Path, changed: Mapping[str, str]) -> list[str]:
-    """Give the lines in which texts of two sets differ, as `diff -u` does; other files by name.
+    """Give the lines in which texts differ, as `diff -u` does; new, removed and other files by name.
 
     Args:
         earlier, new: folders of the sets.
@@ -53,7 +53,7 @@ def text_changes(earlier: Path, new: Path, changed: Mapping[str, str]) -> list[s
     """
     lines: list[str] = []
     for name, how in changed.items():
-        texts = [_lines(folder / name) for folder in (earlier, new)]
+        texts = [_lines(folder / name) if how == "changed" else None for folder in (earlier, new)]
         if texts[0] is None or texts[1] is None:
             lines.append(f"{name}: {'new' if how == 'added' else 'removed' if how == 'missing' else how}")
         else:
@@ -69,11 +69,9 @@ def _extrinsics(folder: Path) -> dict[tuple[str, str], Array]:
 
 
 def _lines(path: Path) -> Sequence[str] | None:
-    """Read the lines of a text, none of a missing file; None if it is no text that people read."""
+    """Read the lines of a text; None if it is no text that people read."""
     if path.suffix not in _TEXTS:
         return None
-    if not path.exists():
-        return []
     with suppress(OSError, ValueError):
         return read_file(path, MAX_DOCUMENT_BYTES).decode().splitlines()
     return None

@@ -54,7 +54,7 @@ class Plan:
         changed: files that differ from the current release's: "changed", "missing", "added".
         changed_there: current files that are not as they were deployed.
         sensors: how far the extrinsics differ.
-        text: the lines that differ, as `diff -u` gives them.
+        text: the lines that differ, as `diff -u` gives them; new and removed files by name.
         objections: what speaks against it; a deployment is refused unless it is forced.
     """
 
@@ -185,9 +185,10 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
     wanted = state.current.replaces if name is None else name
     release = state.named(wanted)
     if release is None:
-        kept = ", ".join(each.name for each in state.releases)
+        others = ", ".join(each.name for each in state.releases if each.name != state.current.name)
+        hint = f"`--release NAME` restores another one: {others}" if others else "No other one is there."
         what = f"there is no release {wanted}" if wanted else "the current release is the first"
-        raise TargetError(f"{place.label}: {what}", f"Releases there: {kept}")
+        raise TargetError(f"{place.label}: {what}", hint)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
         place.get(f"releases/{release.name}", Path(folder) / "release")
         wrong = differences(content_of(Path(folder) / "release"), release.files)

@@ -1,6 +1,5 @@
 """Write results as files for other programs; each is read back and checked."""
 
-import math
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -190,13 +189,13 @@ def _unused_mount(rig: Rig, robot: RobotTree | None) -> list[Finding]:
     if rig.mount is None or robot is None or rig.mount.of not in robot.above:
         return []
     joint = robot.above[rig.mount.of]
-    angle_rad, distance_m = tangent_sizes(difference(joint.T_parent_child, rig.mount.to_matrix()))
-    if joint.parent != rig.mount.parent or (angle_rad < 1e-6 and distance_m < 1e-6):
+    angle_deg, distance_m = tangent_sizes(difference(joint.T_parent_child, rig.mount.to_matrix()))
+    if joint.parent != rig.mount.parent or (angle_deg < 1e-4 and distance_m < 1e-6):
         return []
     figures: dict[str, Figure] = {
         "source": robot.source,
         "frame": rig.mount.of,
-        "angle_deg": math.degrees(angle_rad),
+        "angle_deg": angle_deg,
         "distance_m": distance_m,
     }
     return [Finding("export.mount_unused", "note", figures=figures)]

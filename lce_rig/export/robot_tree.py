@@ -149,8 +149,7 @@ class JointChange:
         """By how much, (deg, m); None for a new joint."""
         if self.before is None:
             return None
-        angle_rad, distance_m = tangent_sizes(difference(self.joint.T_parent_child, self.before))
-        return float(np.degrees(angle_rad)), distance_m
+        return tangent_sizes(difference(self.joint.T_parent_child, self.before))
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,6 +82,7 @@ def test_a_dry_run_gives_degrees_millimetres_and_lines_and_changes_nothing(
     assert planned.state.current is None and not robot.exists()
     (change,) = planned.sensors
     assert (change.moved, change.is_new) == (None, True)
+    assert planned.text == tuple(f"{name}: new" for name in sorted(planned.record.files))
     deploy(result("b"), rig, target)
     before = {path: path.stat().st_mtime_ns for path in robot.rglob("*")}
     planned = plan(result("c", 0.15), rig, target)

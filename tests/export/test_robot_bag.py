@@ -163,7 +163,11 @@ def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles: Rig, make: Make
     # The robot's own pose counts, and that is told.
     rig = rles.model_copy(update={"mount": mount})
     exported = export_formats([make()], rig, tmp_path / "out", formats=["urdf"], robot=whole)
-    assert [finding.code for finding in exported.findings] == ["export.mount_unused"]
+    (finding,) = exported.findings
+    assert finding.code == "export.mount_unused"
+    assert (finding.figures["angle_deg"], finding.figures["distance_m"]) == pytest.approx(
+        (90, np.hypot(0.1, 0.2))
+    )
 
 
 def test_autowares_kit_and_housing_stay_as_the_robot_has_them(rles: Rig, make: Make, tmp_path: Path) -> None:

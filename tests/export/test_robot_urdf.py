@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
 from lce_rig.core.errors import SessionError
@@ -77,7 +78,11 @@ def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(
     mast = MAST.replace('"base_link"', '"davis_link"')
     path.write_text(HEAD + BASE + CAMERA.format(kind="fixed") + mast + OPTICAL + "</robot>\n")
     update = write_into_urdf(path, [calibration], rles, NOW)
-    assert [change.joint.child for change in update.changes] == ["velodyne"]
+    (change,) = update.changes
+    assert change.joint.child == "velodyne" and change.before is not None and change.moved is not None
+    turn = Rotation.from_matrix(change.joint.T_parent_child[:3, :3] @ change.before[:3, :3].T)
+    shift = change.joint.T_parent_child[:3, 3] - change.before[:3, 3]
+    assert change.moved == pytest.approx((np.degrees(turn.magnitude()), np.linalg.norm(shift)))
     np.testing.assert_allclose(found(path, rles), calibration.T_cam_lidar, atol=1e-9)
     assert "9 9 9" in path.read_text() and 'xyz="0.2 0 0.9"' not in path.read_text()
 
