@@ -181,7 +181,7 @@ def table(
     registry: str, where: str, columns: list[str] | None, as_csv: bool, as_json: bool, rebuild: bool
 ) -> None:
     """Print rows of the registry's table."""
-    from lce_rig.core.errors import UsageError
+    from lce_rig.core.errors import SessionError, UsageError
     from lce_rig.fleet.query import query
     from lce_rig.fleet.registry import Registry
     from lce_rig.fleet.storage import Storage
@@ -190,6 +190,8 @@ def table(
         raise UsageError("--csv and --json exclude each other", "Choose one.")
     opened: Registry = Registry(Storage.at(registry))
     if rebuild:
+        if not opened.place.exists():
+            raise SessionError(f"{opened.place.url} does not exist", "`lce-rig fleet run` writes a registry.")
         opened.consolidate(rebuild=True)
     chosen = query(opened, where, columns or (None if as_csv or as_json else _SHOWN))
     if as_csv:

@@ -30,6 +30,7 @@ from lce_rig.core.errors import (
 from lce_rig.deploy import deployment
 from lce_rig.deploy.place import LostError
 from lce_rig.deploy.targets import find_target
+from lce_rig.fleet.jobs import folder_name
 from lce_rig.fleet.query import query
 from lce_rig.fleet.registry import Registry
 from lce_rig.pipeline.detect_session import Progress, silent
@@ -116,8 +117,13 @@ def read_rollout(registry: Registry, target: str) -> Rollout:
     """Read what was done for a target; empty if nothing was.
 
     Raises:
+        UsageError: no target can have this name.
         SessionError: the file is damaged.
     """
+    if target != folder_name(target):
+        raise UsageError(
+            f"{target!r} cannot name a target", "Use letters, digits, dots, dashes and underscores."
+        )
     place = registry.place / FOLDER / f"{target}.json"
     content = place.read()
     if content is None:
@@ -165,11 +171,22 @@ class FleetDeployment:
         file: that lists targets.
         check: command run on this computer after each deployment; `{robot}`, `{result}` and `{to}` are
             filled in. It contradicts the result with exit code 7, and cannot tell with 6, as `drift` does.
+
+    Raises:
+        UsageError: the target's name, or the check, cannot be used.
+        SessionError: the registry's state of the roll-out is damaged.
     """
 
     def __init__(self, registry: Registry, target: str, file: Path, check: str = "") -> None:
         self._registry, self._target, self._file = registry, target, file
-        self._check = shlex.split(check)
+        try:
+            self._check = shlex.split(check)
+            _filled(self._check, "", "", "")
+        except (ValueError, LookupError, AttributeError) as error:
+            raise UsageError(
+                f"--check {check!r}: {error}",
+                "Close quotes; use {robot}, {result} and {to}; write {{ for a brace.",
+            ) from error
         self._lock = threading.Lock()
         self.rollout = read_rollout(registry, target)
 
@@ -195,11 +212,15 @@ class FleetDeployment:
             progress: called with (done, total) robots.
 
         Raises:
+            UsageError: a canary has no result, or the file no such target.
+            ProfileError: the file with the targets is invalid.
             SessionError: the registry cannot be written.
         """
         unknown = [robot for robot in canaries if robot not in wanted]
         if unknown:
             raise UsageError(f"{unknown[0]} has no result in the registry", f"Robots: {', '.join(wanted)}.")
+        for robot in [robot for robot, state in wanted.items() if state.state != "left_out"][:1]:
+            self._target_of(robot)  # a mistake in the file is not a robot's refusal
         first = [wanted[robot].model_copy(update={"is_canary": True}) for robot in canaries]
         others = [state for robot, state in wanted.items() if robot not in set(canaries)]
         total, done = len(first) + (0 if only_canaries else len(others)), 0
@@ -280,8 +301,7 @@ class FleetDeployment:
         """Run the check, if there is one."""
         if not self._check:
             return _ended(state, "in_place")
-        filled = {"robot": state.robot, "result": str(folder / RESULT), "to": state.to}
-        words = [word.format_map(filled) for word in self._check]
+        words = _filled(self._check, state.robot, str(folder / RESULT), state.to)
         try:
             ran = subprocess.run(
                 words, capture_output=True, text=True, errors="replace", timeout=_CHECK_LIMIT_S, check=False
@@ -333,6 +353,10 @@ class FleetDeployment:
             ordered = dict(sorted(self.rollout.robots.items()))
             self.rollout.robots = ordered
             _write(self._registry, self.rollout)
+
+
+def _filled(words: Iterable[str], robot: str, result: str, to: str) -> list[str]:
+    return [word.format_map({"robot": robot, "result": result, "to": to}) for word in words]
 
 
 def _write(registry: Registry, rollout: Rollout) -> None:

@@ -122,7 +122,9 @@ def _entries(manifest: Storage, content: bytes) -> list[Entry]:
             else (yaml.safe_load(text) or {})
         )
         if isinstance(documents, Mapping):
-            documents = documents["sessions"]
+            documents = documents.get("sessions")
+        if not isinstance(documents, list):
+            raise TypeError("no list `sessions`")
         entries = [Entry.model_validate(document) for document in documents]
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
@@ -133,8 +135,12 @@ def _entries(manifest: Storage, content: bytes) -> list[Entry]:
         ) from None
     except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
         raise UsageError(
-            f"{manifest.url} is not a manifest: {error}", "List entries with `path` below `sessions:`."
+            f"{manifest.url} is not a manifest: {' '.join(str(error).split())}",
+            "List entries with `path` below `sessions:`.",
         ) from error
+    outside = next((e.path for e in entries if e.path.startswith("/") or ".." in e.path.split("/")), None)
+    if outside is not None:
+        raise UsageError(f"{manifest.url}: path: {outside} is not below the root", "Give a path below it.")
     unknown = {name for entry in entries for name in _FIELD.findall(entry.path)} - set(_FIELDS)
     if unknown:
         raise UsageError(

@@ -188,7 +188,12 @@ class Registry:
 
         Returns:
             The table.
+
+        Raises:
+            SessionError: the registry is a file, or cannot be written.
         """
+        if self.place.exists() and not self.place.is_folder():
+            raise SessionError(f"{self.place.url} is a file, not a registry", "Give a folder.")
         new = as_table(fresh)
         try:
             old = as_table([]) if rebuild else self.read_table()

@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow.compute as pc
 import pyarrow.csv as pc_csv
 
+from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array
 from lce_rig.fleet.changes import FALSE_ALARMS, FALSE_CUSUMS
@@ -96,14 +97,19 @@ def write_csv(made: FleetTables, folder: Path) -> list[Path]:
     """Write each table as a file of comma-separated values into a folder.
 
     Raises:
-        OSError: it cannot be written.
+        SessionError: it cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    for name, table in (*made.tables.items(), ("sessions", made.sessions())):
-        path = folder / f"{name}.csv"
-        pc_csv.write_csv(table, path)
-        paths.append(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, table in (*made.tables.items(), ("sessions", made.sessions())):
+            path = folder / f"{name}.csv"
+            pc_csv.write_csv(table, path)
+            paths.append(path)
+    except OSError as error:
+        raise SessionError(
+            f"{folder}: cannot be written: {error.strerror or error}", "Free space or choose another folder."
+        ) from error
     return paths
 
 

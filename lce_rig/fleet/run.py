@@ -81,6 +81,8 @@ def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) 
         "distributed.worker.profile.enabled": False,
         "distributed.admin.tick.interval": "1s",
         "distributed.admin.system-monitor.interval": "2s",
+        # Ctrl-C reaches all processes of a terminal; this one ends the workers.
+        "distributed.worker.preload": ["import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"],
         "distributed.admin.large-graph-warning-threshold": "1GB",
     }
     # Workers that end while their scheduler does are no news.

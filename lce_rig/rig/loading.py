@@ -73,6 +73,8 @@ def _problem(detail: ErrorDetails) -> _InvalidKey:
         what.replace("a valid i", "an i")
         .replace("a valid ", "a ")
         .replace("List should", "must")
+        .replace("a tuple", "a list")
+        .replace("a dictionary", "a block of keys")
         .replace(" after validation", "")
     )
     return _InvalidKey(path, f"{what}; {_shown(given)} given")

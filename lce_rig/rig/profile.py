@@ -20,27 +20,10 @@ from lce_rig.rig.sensors import (
 )
 from lce_rig.rig.settings import FrameName, Name, RigName, RobotName, Settings, Text, problem
 from lce_rig.rig.sync_settings import SyncSettings
-from lce_rig.rig.target_settings import TargetSettings
+from lce_rig.rig.target_settings import OutputFormat, TargetSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 _MOST_SENSORS, _MOST_TARGETS = 64, 256
-OutputFormat = Literal[
-    "extrinsics",
-    "urdf",
-    "camera_info",
-    "static_tf",
-    "ros2_launch",
-    "tf_static_bag",
-    "kalibr",
-    "autoware",
-    "fast_livo2",
-    "koide3",
-    "opencv",
-    "isaac",
-    "mcap",
-    "ply",
-    "ply_captures",
-]
 
 
 class Rig(Settings):

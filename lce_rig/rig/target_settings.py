@@ -6,8 +6,25 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from lce_rig.rig.settings import Name, RobotName, Settings, Text, problem
+from lce_rig.rig.settings import RobotName, Settings, Text, problem
 
+OutputFormat = Literal[
+    "extrinsics",
+    "urdf",
+    "camera_info",
+    "static_tf",
+    "ros2_launch",
+    "tf_static_bag",
+    "kalibr",
+    "autoware",
+    "fast_livo2",
+    "koide3",
+    "opencv",
+    "isaac",
+    "mcap",
+    "ply",
+    "ply_captures",
+]
 # None of these makes ssh run a program on this computer.
 SshOption = Literal[
     "AddressFamily",
@@ -52,7 +69,7 @@ class TargetSettings(Settings):
 
     to: Text
     robot: RobotName | None = None
-    formats: Annotated[tuple[Name, ...], Field(min_length=1, max_length=64)] | None = None
+    formats: Annotated[tuple[OutputFormat, ...], Field(min_length=1, max_length=64)] | None = None
     files: Annotated[tuple[Text, ...], Field(max_length=64)] = ()
     run: Text | None = None
     run_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 60.0
@@ -65,6 +82,13 @@ class TargetSettings(Settings):
         if remote is not None and not _REMOTE_PATH.fullmatch(remote[2]):
             what = f"{remote[2]!r}: a path there has letters, digits and _ . / + @ = - only"
             raise problem(what, "to")
+        if (
+            remote is None
+            and "@" in (named := self.to.partition(":")[0])
+            and ":" in self.to
+            and "/" not in named
+        ):
+            raise problem(f"{self.to!r}: neither a folder nor user@host:path; ./NAME is a folder", "to")
         if not self.to or self.to.startswith("-") or "\0" in self.to:
             raise problem("no folder and no user@host:path", "to")
         if remote is None and self.ssh:

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import Array, invert, pose, transform
+from lce_rig.session.durable import write_atomically
 from lce_rig.validation.reach import outermost_pixels
 
 _WIDTH_PX, _HEIGHT_PX = 1600, 1000
@@ -22,6 +24,7 @@ _NEAREST_M, _FARTHEST_M = 0.05, 300.0
 _UNSEEN, _GROUND, _FRUSTUM = (0.45, 0.47, 0.5), (0.06, 0.07, 0.08), (1.0, 0.7, 0.1)
 _POINT_PX = 4.0
 _HINT = "Install OpenGL and EGL (`apt install libgl1 libegl1`), or run on a computer with a display."
+_PICTURES = (".png", ".jpg", ".jpeg")
 _NEXT, _PREVIOUS = ord("N"), ord("P")
 
 
@@ -88,20 +91,26 @@ def show_window(captures: Sequence[CaptureIn3D], cameras: Sequence[CameraIn3D], 
 
 
 def draw_picture(path: Path, capture: CaptureIn3D, cameras: Sequence[CameraIn3D]) -> None:
-    """Write what the window would show first, as PNG.
+    """Write what the window would show first, as PNG or JPEG by the name of the file.
 
     Raises:
-        SourceError: nothing can be rendered here, or the file cannot be written.
+        SourceError: nothing can be rendered here, or the name is of no such picture.
+        SessionError: the file cannot be written.
     """
+    if path.suffix.lower() not in _PICTURES:
+        raise SourceError(f"{path} is no name of a picture", "Name a PNG or JPEG file.")
     o3d = _open3d()
     window = _opened(o3d.visualization.Visualizer(), is_visible=False)
     _fill(o3d, window, _cloud(o3d, capture), cameras)
     window.poll_events()
     window.update_renderer()
-    window.capture_screen_image(str(path), do_render=True)
-    window.destroy_window()
-    if not path.exists():
-        raise SourceError(f"{path} cannot be written", "Name a PNG file in a folder that exists.")
+    with TemporaryDirectory(prefix="lce-rig-") as folder:
+        drawn = Path(folder) / f"view{path.suffix.lower()}"
+        window.capture_screen_image(str(drawn), do_render=True)
+        window.destroy_window()
+        if not drawn.exists():
+            raise SourceError("Open3D has drawn no picture", _HINT)
+        write_atomically(path, drawn.read_bytes())
 
 
 def _open3d() -> Any:

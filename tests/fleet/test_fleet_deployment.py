@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lce_rig.cli.main import run
-from lce_rig.core.errors import UsageError
+from lce_rig.core.errors import ProfileError, UsageError
 from lce_rig.export.result import layout, to_json_dict
 from lce_rig.fleet.deployment import FleetDeployment, Rollout, newest_results, read_rollout
 from lce_rig.fleet.registry import Registry, write_rows
@@ -182,8 +182,9 @@ def test_what_was_deployed_by_others_since_is_not_rolled_back(
 def test_an_unknown_canary_or_target_is_refused(registry: Registry, targets: Path) -> None:
     with pytest.raises(UsageError, match="r9"):
         deploy(registry, targets, ("r9",))
-    rollout = FleetDeployment(registry, "base", targets).run(newest_results(registry), ("r1",))
-    assert rollout.robots["r1"].state == "refused" and held(targets, "r1") is None
+    with pytest.raises(UsageError, match="base"):
+        FleetDeployment(registry, "base", targets).run(newest_results(registry), ("r1",))
+    assert read_rollout(registry, "base").robots == {} and held(targets, "r1") is None
 
 
 @pytest.mark.usefixtures("whole")
@@ -211,3 +212,24 @@ def test_the_verb_plans_deploys_shows_and_rolls_back(
     assert code == 0 and all(robot in shown for robot in ROBOTS)
     assert call("--rollback", "--reason", "test")[0] == 0
     assert call("--status", "--rollback")[0] == 2
+
+
+@pytest.mark.parametrize(
+    "check", ["see 'this", "see {robots}", "see {robot", "see {0}", "see {robot.wheels}"]
+)
+def test_a_check_that_cannot_be_filled_in_is_refused_before_anything_is_deployed(registry, targets, check):
+    with pytest.raises(UsageError, match="--check"):
+        FleetDeployment(registry, "nav", targets, check)
+
+
+def test_a_name_of_a_target_does_not_lead_out_of_the_registry(registry, targets):
+    with pytest.raises(UsageError):
+        FleetDeployment(registry, "../nav", targets)
+
+
+@pytest.mark.usefixtures("whole")
+def test_a_mistake_in_the_targets_is_an_error_and_not_a_refusal(registry, targets):
+    targets.write_text("targets: {nav: {too: x}}")
+    with pytest.raises(ProfileError):
+        FleetDeployment(registry, "nav", targets).run(newest_results(registry), ["r1"])
+    assert read_rollout(registry, "nav").robots == {}

@@ -51,6 +51,9 @@ def test_a_table_of_comma_separated_values_serves_as_well(tmp_path):
         "sessions: [{robot: a}]",
         "sessions: [{path: '{driver}/*'}]",
         "runs: []",
+        "sessions: 3",
+        "sessions: [{path: '../*'}]",
+        "sessions: [{path: /etc}]",
         "[",
     ],
 )

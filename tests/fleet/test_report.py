@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lce_rig.cli.main import run
+from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import perturb
 from lce_rig.fleet.report import document, findings, page, write_csv
 from lce_rig.fleet.table import Row, as_table, write_table
@@ -56,6 +57,9 @@ def test_findings_and_tables_are_for_programs(table, tmp_path):
     assert told["tables"]["changes"][0]["after"] == "2026-01-06T10:00:00Z"
     assert "sessions" not in told["tables"]
     written = {path.stem: path for path in write_csv(made, tmp_path / "csv")}
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SessionError, match="file"):
+        write_csv(made, tmp_path / "file")
     assert set(written) == {*made.tables, "sessions"}
     rows = list(csv.DictReader(written["sessions"].read_text().splitlines()))
     assert len(rows) == 80 and rows[0]["chi2"] == "" and float(rows[1]["chi2"]) > 0

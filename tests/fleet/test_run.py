@@ -1,7 +1,11 @@
 """Sessions of several robots, from their folders to the table."""
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -101,3 +105,24 @@ def test_range_offsets_of_lasers_are_estimated_where_asked_for(simulated, tmp_pa
     assert offsets_m.shape == sigma_m.shape == (16,) and sigma_m.max() < 0.004
     assert np.corrcoef(offsets_m, truth_m)[0, 1] > 0.98
     assert not (tmp_path / "registry" / row["folder"] / "overlays").exists()
+
+
+def test_ctrl_c_at_a_terminal_ends_all_processes_with_one_line(fleet_root, tmp_path):
+    words = [
+        sys.executable,
+        "-m",
+        "lce_rig",
+        "fleet",
+        "run",
+        str(fleet_root),
+        "--registry",
+        str(tmp_path / "r"),
+    ]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True) as ran:
+        assert ran.stderr is not None
+        while "dashboard" not in ran.stderr.readline():
+            assert ran.poll() is None
+        os.killpg(ran.pid, signal.SIGINT)  # a terminal's Ctrl-C reaches the workers, too
+        told = ran.stderr.read()
+    assert ran.returncode == 130 and "interrupted" in told
+    assert "Traceback" not in told
