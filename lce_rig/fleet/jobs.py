@@ -1,6 +1,7 @@
 """Find sessions and recordings below a root, with what a manifest says of them."""
 
 import csv
+import hashlib
 import io
 import re
 from collections.abc import Iterable, Mapping
@@ -169,5 +170,8 @@ def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list
 
 
 def folder_name(text: str) -> str:
-    """Make a name of a folder from any text."""
-    return _SAFE.sub("_", text).strip(".")[:80] or "unnamed"
+    """Make a name of a folder from any text; different texts give different names."""
+    name = _SAFE.sub("_", text).strip(".")[:80]
+    if name == text:
+        return name
+    return f"{name or 'unnamed'}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"

@@ -50,6 +50,10 @@ def _select(path: Path, where: str, columns: Sequence[str] | None) -> Any:
     held = [name for name in names if name in known]
     settings: dict[str, str | bool | int | float | list[str]] = {"memory_limit": _MEMORY, "threads": 2}
     with duckdb.connect(config=settings) as connection:
+        # A condition reads the table and no other file.
+        allowed = str(path).replace("'", "''")
+        connection.execute(f"SET allowed_paths = ['{allowed}']")
+        connection.execute("SET enable_external_access = false")
         try:
             # `filter` takes one condition and nothing else; rows keep the order of the file.
             chosen = connection.read_parquet(str(path)).filter(where)

@@ -8,10 +8,9 @@ import numpy as np
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Figure, Finding, ranked
 from lce_rig.core.geometry import Array, largest_sizes, rotation_angle, sigma_sizes, tangent_sizes
-from lce_rig.core.results import Calibration, Metrics
+from lce_rig.core.results import MOTIONS, Calibration, Metrics, WeakestMotion
 from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.extrinsics.estimate import CalibrationEstimate
-from lce_rig.extrinsics.observability import find_weakest
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 from lce_rig.validation.contributions import largest, measure_action, uncertainty_notes
 from lce_rig.validation.intrinsics_check import explain
@@ -166,7 +165,7 @@ def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig)
                 f"sigma_{unit}": sigma,
                 f"target_{unit}": goal,
                 f"by_axis_{unit}": tuple(float(axis) for axis in axes),
-                **find_weakest(examination.cov, estimate.lever_m).figures(),
+                **_weakest_of(examination.cov, code == "verdict.rotation_uncertain").figures(),
             }
             # A contradiction is judged by the check that found it; here it says how wrong the result may be.
             is_fail = agreed[unit] > rig.verdict.fail_factor * goal
@@ -176,6 +175,14 @@ def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig)
             action = "measure_ranges" if is_of_lidar else measure_action(main)
             found.append(reason(code, figures, is_fail=is_fail, action=action))
     return found
+
+
+def _weakest_of(cov: Array, is_rotation: bool) -> WeakestMotion:
+    """Name the least determined rotation, or the least determined translation."""
+    sigmas = np.sqrt(np.diag(cov))
+    places = range(3, 6) if is_rotation else range(3)
+    worst = max(places, key=lambda place: sigmas[place])
+    return WeakestMotion(MOTIONS[worst], float(sigmas[worst]))
 
 
 def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[Finding]:
