@@ -124,6 +124,8 @@ def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None) -> "Dri
         return drift_live(rig, saved, open_live(rig), is_over=is_over)
 
 
+# Along such an axis there is no best fit, and so no change that would have been seen.
+_WITHOUT_FIT = ("scene.flat", "scene.no_peak")
 _COLOURS = {"unchanged": "none", "changed": "red", "unknown": "yellow"}
 
 
@@ -157,7 +159,7 @@ def _axis(axis: "AxisDrift") -> str:
 
 def _figures(axis: "AxisDrift") -> tuple[str, str]:
     scale, digits = (1.0, 2) if axis.is_rotation else (1000.0, 0)
-    if not math.isfinite(axis.sigma):
+    if not math.isfinite(axis.sigma) or axis.reason in _WITHOUT_FIT:
         return "-", "-"
     best = f"{scale * axis.change:+.{digits}f} +- {scale * axis.sigma:.{digits}f}"
     return best, f"{scale * axis.smallest:.{digits}f}" if math.isfinite(axis.smallest) else "-"

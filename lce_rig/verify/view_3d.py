@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import numpy as np
@@ -114,6 +114,8 @@ def draw_picture(path: Path, capture: CaptureIn3D, cameras: Sequence[CameraIn3D]
 
 
 def _open3d() -> Any:
+    # Where no desktop runs, a graphics library complains without it.
+    os.environ.setdefault("XDG_RUNTIME_DIR", gettempdir())
     try:
         import open3d
     except (ImportError, OSError) as error:
