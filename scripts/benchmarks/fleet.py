@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.request import Request, urlopen
 
 import numpy as np
 
@@ -317,6 +318,8 @@ def s3_server() -> Iterator[str]:
     os.environ |= settings
     S3FileSystem.clear_instance_cache()  # an instance keeps the address that it was made with
     try:
+        # Servers of one process share what they hold.
+        urlopen(Request(f"http://{host}:{port}/moto-api/reset", method="POST")).close()
         Storage("s3://fleet").fs.mkdir("fleet")
         yield "s3://fleet"
     finally:

@@ -10,6 +10,7 @@ import pytest
 
 from lce_rig.cli.main import run
 from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data_sheets import find_data_sheet
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.recordings import open_recording
 from lce_rig.recordings.events import open_events
@@ -113,7 +114,9 @@ def test_points_brought_to_one_time_by_the_true_trajectory_lie_on_the_true_board
     assert board["t_ns"] == pytest.approx(mean_ns, abs=1e6)
     plane = invert(np.array(board["T_sensor_board"]))
     distance_m = transform(plane, at_one_time)[:, 2]
-    noise = OPTIONS.lidar
+    sheet = find_data_sheet("VLP-16")
+    assert sheet is not None
+    noise = OPTIONS.noise_of(sheet)
     sigma_m = np.hypot(noise.range_sigma_m, noise.laser_sigma_m)
     assert np.sqrt(np.mean(distance_m**2)) < 1.3 * sigma_m
     # A control: the board where it was 0.3 s before does not fit.

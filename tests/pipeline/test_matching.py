@@ -1,6 +1,5 @@
 """Scans are searched again where the other captures say that the board is."""
 
-import os
 from pathlib import Path
 
 import pytest
@@ -12,14 +11,13 @@ from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.matching import expected_poses, refusals_of
 from lce_rig.session import Session
 
-DATA = Path(os.environ.get("LCE_RIG_DATA", "/nonexistent"))
 RIGS = Path(__file__).parents[1] / "rigs"
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
+def session(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
     rig = lce.load_rig(RIGS / "os1_64.yaml")
-    return lce.collect_from(rig, DATA / "os1_64", tmp_path_factory.mktemp("os1") / "session")
+    return lce.collect_from(rig, recordings / "os1_64", tmp_path_factory.mktemp("os1") / "session")
 
 
 @pytest.mark.dataset

@@ -1,6 +1,5 @@
 """Packets of every Velodyne that is read become scans with its own beams and times."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -152,8 +151,8 @@ def test_a_bag_of_another_models_packets_is_refused_with_its_name(tmp_path: Path
 
 
 @pytest.mark.dataset
-def test_a_recorded_hdl32e_is_read() -> None:
-    path = Path(os.environ["LCE_RIG_DATA"]) / "vlp16_packets" / "mrpt" / "sample_velodyne_hdl32.pcap"
+def test_a_recorded_hdl32e_is_read(recordings: Path) -> None:
+    path = recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_hdl32.pcap"
     recording = open_recording(path, load_rig("hdl32e"), SourceOptions(is_part=True))
     assert isinstance(recording, PcapRecording)
     (scan,) = recording.samples()
