@@ -208,6 +208,7 @@ def _tell_done(done: "Deployed", target: "TargetSettings", *, as_json: bool) -> 
                 "replaces": done.replaces,
                 "is_new": done.is_new,
                 "output": done.output,
+                "changed_there": dict(done.changed_there),
             }
         )
         return
@@ -215,5 +216,8 @@ def _tell_done(done: "Deployed", target: "TargetSettings", *, as_json: bool) -> 
     show.say(f"{target.to}: {_told(done.release)} {state}")
     if done.is_new and done.replaces == done.release.replaces != "":
         show.note(f"replaces {done.replaces}; `--rollback` restores it")
+    if done.changed_there:
+        _tell_changed_there(done.changed_there)
+        show.note(f"the changed files stay there in releases/{done.replaces}/")
     if done.output:
         show.say(done.output.rstrip())

@@ -11,7 +11,7 @@ import shutil
 import socket
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -81,12 +81,14 @@ class Deployed:
         replaces: the release that was current before; "" for the first.
         is_new: whether something changed; False if these very files were in place already.
         output: of the command that ran afterwards; None if none ran.
+        changed_there: files of the earlier release that were not as they were deployed.
     """
 
     release: ReleaseRecord
     replaces: str
     is_new: bool
     output: str | None = None
+    changed_there: Mapping[str, str] = field(default_factory=dict)
 
 
 def plan(result: Path, rig: Rig, target: TargetSettings, *, session: Session | None = None) -> Plan:
@@ -151,7 +153,8 @@ def deploy(
             forced = sorted({each.code for each in planned.objections})
             record = record.model_copy(update={"reason": reason, "forced": forced})
         _write(place, target, record, Path(folder))
-    return Deployed(record, record.replaces, True, _run(place, target, record.name))
+    output = _run(place, target, record.name)
+    return Deployed(record, record.replaces, True, output, planned.changed_there)
 
 
 def standing(target: TargetSettings) -> Standing:

@@ -70,7 +70,9 @@ def test_the_same_files_are_deployed_once(
     (robot / "current" / "extrinsics.yaml").write_text("mine")
     assert standing(local).changed == {"extrinsics.yaml": "changed"}
     assert plan(folder, rig, local).changed_there == {"extrinsics.yaml": "changed"}
-    assert deploy(folder, rig, local).is_new and standing(local).changed == {}
+    anew = deploy(folder, rig, local)
+    assert anew.is_new and anew.changed_there == {"extrinsics.yaml": "changed"}
+    assert standing(local).changed == {} and not deploy(folder, rig, local).changed_there
     with pytest.raises(TargetError, match=r"not as it was deployed: extrinsics\.yaml changed"):
         rollback(local)
 
