@@ -11,9 +11,10 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from lce_rig.core.errors import NotEnoughDataError, UsageError
+from lce_rig.core.errors import NotEnoughDataError, ProfileError, UsageError
 from lce_rig.core.limits import describe
 from lce_rig.fleet.storage import Storage
+from lce_rig.rig.loading import find_profile
 from lce_rig.session.identity import MARKER
 
 MANIFESTS = ("fleet.yaml", "fleet.csv")
@@ -82,6 +83,7 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
 
     Raises:
         UsageError: the manifest cannot be used.
+        ProfileError: it names a profile that does not exist.
         NotEnoughDataError: there is nothing to run.
     """
     if not root.exists():
@@ -157,9 +159,7 @@ def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list
     jobs: dict[str, Job] = {}
     for entry in entries:
         given = entry.model_dump(include=set(_FIELDS))
-        rig = entry.rig
-        if rig and "://" not in rig and not rig.startswith("/") and "." in rig:
-            rig = f"{manifest.url.rpartition('/')[0]}/{rig}"
+        rig = _profile_of(entry, manifest)
         for path in sorted(map(str, root.fs.glob(prefix + entry.glob))):
             own = path.rstrip("/").removeprefix(prefix)
             if path not in jobs and own not in MANIFESTS:
@@ -167,6 +167,23 @@ def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list
                 fields = {k: given[k] or told.get(k, "") for k in _FIELDS}
                 jobs[path] = Job(root.url_of(path.rstrip("/")), rig=rig, **fields)
     return list(jobs.values())
+
+
+def _profile_of(entry: Entry, manifest: Storage) -> str:
+    """Name the profile of an entry; paths start at the manifest's folder.
+
+    Raises:
+        ProfileError: there is no such profile.
+    """
+    rig = entry.rig
+    if rig and "://" not in rig and not rig.startswith("/") and "." in rig:
+        rig = f"{manifest.url.rpartition('/')[0]}/{rig}"
+    if "://" in rig:
+        if not Storage(rig).exists():
+            raise ProfileError(f"{manifest.url}: rig: {rig} does not exist", "Name a profile's file.")
+    elif rig:
+        find_profile(rig)
+    return rig
 
 
 def folder_name(text: str) -> str:

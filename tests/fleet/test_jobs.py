@@ -2,7 +2,7 @@
 
 import pytest
 
-from lce_rig.core.errors import NotEnoughDataError, UsageError
+from lce_rig.core.errors import NotEnoughDataError, ProfileError, UsageError
 from lce_rig.fleet.jobs import Entry, find_jobs
 from lce_rig.fleet.storage import Storage
 
@@ -24,6 +24,8 @@ def test_a_manifest_names_robot_profile_and_collector_by_patterns(tmp_path):
     lay_out(tmp_path, "hall/r1/a", "hall/r2/b", "yard/r1/c")
     (tmp_path / "bags").mkdir()
     (tmp_path / "bags/r7.bag").write_bytes(b"")
+    (tmp_path / "profiles").mkdir()
+    (tmp_path / "profiles/r.yaml").write_text("name: r")
     (tmp_path / "fleet.yaml").write_text(
         "sessions:\n"
         "  - {path: 'hall/{robot}/*', collector: Ann, site: hall 3}\n"
@@ -61,6 +63,14 @@ def test_a_manifest_that_cannot_be_used_is_refused(tmp_path, text):
     lay_out(tmp_path, "a")
     (tmp_path / "fleet.yaml").write_text(text)
     with pytest.raises(UsageError):
+        find_jobs(Storage.at(tmp_path))
+
+
+@pytest.mark.parametrize("rig", ["nosuch.yaml", "/nosuch/r.yaml", "rlfz"])
+def test_a_profile_that_does_not_exist_is_refused_before_anything_runs(tmp_path, rig):
+    lay_out(tmp_path, "a")
+    (tmp_path / "fleet.yaml").write_text(f"sessions: [{{path: '*', rig: {rig}}}]")
+    with pytest.raises(ProfileError, match=rig.rpartition("/")[2]):
         find_jobs(Storage.at(tmp_path))
 
 
