@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from lce_rig.core.errors import (
     CommandError,
     LceRigError,
+    NotEnoughDataError,
     ResultRefusedError,
     SessionError,
     TargetError,
@@ -56,9 +57,12 @@ State = Literal[
 ]
 # After these, nothing more is deployed: what is wrong here may be wrong everywhere.
 _STOPS: frozenset[State] = frozenset({"not_written", "command_failed", "contradicted", "check_failed"})
+# Anything else at a canary stops it, too.
+_FINE: frozenset[State] = frozenset({"in_place", "left_out"})
 # The new files are at the robot, whatever happened afterwards.
 _HELD: frozenset[State] = frozenset({"in_place", "command_failed", "contradicted", "check_failed"})
-_CONTRADICTS, _CANNOT_TELL = 7, 6
+# As `drift` ends.
+_CONTRADICTS, _CANNOT_TELL = ResultRefusedError.exit_code, NotEnoughDataError.exit_code
 _CHECK_LIMIT_S = 1800.0
 _COLUMNS = ("robot", "folder", "date", "finished", "status", "verdict", "cause")
 
@@ -226,12 +230,10 @@ class FleetDeployment:
         total, done = len(first) + (0 if only_canaries else len(others)), 0
         self.rollout.stopped_by = ""
         for state in first:
-            ended = self._step(state)
+            self._step(state)
             done += 1
             progress(done, total)
-            if ended.state not in ("in_place", "left_out"):
-                self.rollout.stopped_by = state.robot
-                self._note(ended)
+            if self.rollout.stopped_by:
                 return self.rollout
         if only_canaries:
             return self.rollout
@@ -256,16 +258,16 @@ class FleetDeployment:
     def _unless_stopped(self, state: RobotState) -> bool:
         if self.rollout.stopped_by:
             return False
-        ended = self._step(state)
-        if ended.state in _STOPS:
-            self.rollout.stopped_by = state.robot
-            self._note(ended)
+        self._step(state)
         return True
 
-    def _step(self, state: RobotState) -> RobotState:
+    def _step(self, state: RobotState) -> None:
+        """Deploy to one robot, keep its state, and stop the roll-out if that is a reason to."""
         ended = state if state.state == "left_out" else self._deploy(state)
+        is_stopped = ended.state not in _FINE if ended.is_canary else ended.state in _STOPS
+        if is_stopped:
+            self.rollout.stopped_by = ended.robot
         self._note(ended)
-        return ended
 
     def _deploy(self, state: RobotState) -> RobotState:
         try:
@@ -278,8 +280,6 @@ class FleetDeployment:
                 return self._checked(state, folder)
         except CommandError as error:
             return self._with_current(_ended(state, "command_failed", error))
-        except ResultRefusedError as error:
-            return _ended(state, "refused", error)
         except LostError as error:
             return _ended(state, "unreachable", error)
         except TargetError as error:

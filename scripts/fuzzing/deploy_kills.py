@@ -23,13 +23,11 @@ import yaml
 from wire.sshd import NoServerError, Sshd
 
 from fuzzing.report import Report
+from fuzzing.started import PATIENCE_S, must_end_well, said, start
 from lce_rig.core.errors import TargetError
 from lce_rig.deploy.releases import content_of
 
-_ROOT = Path(__file__).parents[2]
-_MAIN = "from lce_rig.cli.main import main; main()"
 _N_CAPTURES = 8
-_PATIENCE_S = 300.0
 _EVERY = 10
 _VARIANTS = ((), ("--name", "other"))
 _KEEP = 4
@@ -128,11 +126,11 @@ def fuzz_deploy_kills(n: int, seed: int) -> DeployKillReport:
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         session = folder / "session"
-        _must(
-            _start(["simulate", "--rig", "rlfs", str(session), "--captures", str(_N_CAPTURES), "--seed", "1"])
+        must_end_well(
+            start(["simulate", "--rig", "rlfs", str(session), "--captures", str(_N_CAPTURES), "--seed", "1"])
         )
         for variant in ((), ("--method", "ml", "--name", "other")):
-            _must(_start(["calibrate", str(session), "--draws", "5", *variant]))
+            must_end_well(start(["calibrate", str(session), "--draws", "5", *variant]))
         robots, targets = [], {}
         for k in range(_N_LANES):
             robots.append(_Robot(f"folder{k}", folder / f"robot{k}", lambda: None))
@@ -183,7 +181,7 @@ def _learn(session: Path, robot: _Robot) -> None:
         began_s = time.monotonic()
         process = _deploy(session, robot, k)
         drafted_s = _wait_for_draft(robot, process)
-        _must(process)
+        must_end_well(process)
         robot.seconds = time.monotonic() - began_s
         robot.swap_s = 0.0 if drafted_s is None else time.monotonic() - drafted_s
         robot.sets.append(_current(robot.folder))
@@ -206,17 +204,17 @@ def _kill_once(
     report.n_too_late += process.poll() is not None
     if kind == "other end":
         robot.lose()
-        process.wait(_PATIENCE_S)  # It must notice, and end in words.
-        text = _said(process)
+        process.wait(PATIENCE_S)  # It must notice, and end in words.
+        text = said(process)
         if process.returncode not in (0, 8, 9) or "Traceback" in text:
             report.wrong.append(f"{robot.name} {k}: ends with {process.returncode}: {text[-300:]}")
     elif kind == "all":
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        process.wait(_PATIENCE_S)
+        process.wait(PATIENCE_S)
     else:
         process.kill()
-        process.wait(_PATIENCE_S)
+        process.wait(PATIENCE_S)
     found = _current(robot.folder)
     report.n += 1
     report.n_by_kind[f"{'ssh' if robot.is_far else 'folder'}, {kind}"] += 1
@@ -233,15 +231,15 @@ def _undisturbed(session: Path, robot: _Robot, report: DeployKillReport) -> Iter
     """Deploy to the end, which clears what was left; then go back, byte for byte."""
     before = robot.sets.index(_settled(robot))
     process = _deploy(session, robot, 1 - before)
-    if process.wait(_PATIENCE_S) != 0:
-        yield f"deploy ends with {process.returncode} afterwards: {_said(process)[-300:]}"
+    if process.wait(PATIENCE_S) != 0:
+        yield f"deploy ends with {process.returncode} afterwards: {said(process)[-300:]}"
     if _current(robot.folder) != robot.sets[1 - before]:
         yield "the deployment is not in place"
     if left := _left(robot.folder):
         yield f"left behind: {', '.join(left)}"
-    process = _start(["deploy", str(session), "--target", robot.name, "--rollback"])
-    if process.wait(_PATIENCE_S) != 0:
-        yield f"rollback ends with {process.returncode}: {_said(process)[-300:]}"
+    process = start(["deploy", str(session), "--target", robot.name, "--rollback"])
+    if process.wait(PATIENCE_S) != 0:
+        yield f"rollback ends with {process.returncode}: {said(process)[-300:]}"
     report.n_rollbacks += 1
     if _current(robot.folder) != robot.sets[before]:
         yield "rollback did not restore the earlier set"
@@ -276,41 +274,13 @@ def _left(folder: Path) -> list[str]:
 
 
 def _deploy(session: Path, robot: _Robot, variant: int) -> "subprocess.Popen[bytes]":
-    return _start(["deploy", str(session), "--target", robot.name, *_VARIANTS[variant]])
-
-
-def _start(words: list[str]) -> "subprocess.Popen[bytes]":
-    environment = {**os.environ, "PYTHONPATH": str(_ROOT), "OMP_NUM_THREADS": "1"}
-    log = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process's object
-    process = subprocess.Popen(
-        [sys.executable, "-c", _MAIN, *words],
-        stdin=subprocess.DEVNULL,
-        stdout=log,
-        stderr=log,
-        env=environment,
-        start_new_session=True,
-    )
-    process.said = log  # type: ignore[attr-defined]
-    return process
-
-
-def _said(process: "subprocess.Popen[bytes]") -> str:
-    log = process.said  # type: ignore[attr-defined]
-    log.seek(0)
-    text: str = log.read().decode(errors="replace")
-    log.close()
-    return text
-
-
-def _must(process: "subprocess.Popen[bytes]") -> None:
-    code = process.wait(_PATIENCE_S)
-    text = _said(process)
-    assert code == 0, f"{process.args} ended with {code}:\n{text[-2000:]}"
+    words = ["deploy", str(session), "--target", robot.name, *_VARIANTS[variant]]
+    return start(words, in_own_session=True)
 
 
 def _wait_for_draft(robot: _Robot, process: "subprocess.Popen[bytes]") -> float | None:
     """Wait until new files appear at the target; gives when, None where the process ends first."""
-    deadline_s = time.monotonic() + _PATIENCE_S
+    deadline_s = time.monotonic() + PATIENCE_S
     while process.poll() is None and time.monotonic() < deadline_s:
         if any(robot.folder.glob(".new-*")):
             return time.monotonic()

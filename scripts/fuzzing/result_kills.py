@@ -19,16 +19,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fuzzing.report import Report
+from fuzzing.started import PATIENCE_S, must_end_well, said, start
 from lce_rig.core.errors import LceRigError
 from lce_rig.export import export
 from lce_rig.export.result import read_result
 from lce_rig.rig import load_rig
 
-_ROOT = Path(__file__).parents[2]
-_MAIN = "from lce_rig.cli.main import main; main()"
 _N_CAPTURES = 8
 _SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-_PATIENCE_S = 300.0
 _EVERY = 6
 # Ctrl-C ends a verb in words; whatever came too late finds it done.
 _MAX_STOP_S = 2.0
@@ -105,8 +103,8 @@ def fuzz_result_kills(n: int, seed: int) -> ResultKillReport:
     report, chance, began_s = ResultKillReport(), random.Random(seed), time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"
-        _must(
-            _start(["simulate", "--rig", "rlfs", str(session), "--captures", str(_N_CAPTURES), "--seed", "1"])
+        must_end_well(
+            start(["simulate", "--rig", "rlfs", str(session), "--captures", str(_N_CAPTURES), "--seed", "1"])
         )
         known = _learn(session)
         for k in range(n):
@@ -171,7 +169,8 @@ def _misread(session: Path, folder: Path) -> list[str]:
     except LceRigError as error:
         return [str(error)]
     on_disk = dict(_own_content(folder))
-    on_disk.pop("result.json")
+    # No exports; that they belong to the run, `check` has found by their content.
+    del on_disk["result.json"], on_disk["report.html"]
     return (
         []
         if on_disk == exports
@@ -193,12 +192,10 @@ def _learn(session: Path) -> _Known:
     known = _Known()
     for variant in (0, 1):
         for name in VERBS:
-            _must(_start(_words(session, name, variant)))
+            must_end_well(start(_words(session, name, variant)))
             began_s = time.monotonic()
-            drafted_s = _wait_for_sign(
-                session, process := _start(_words(session, name, variant)), _PATIENCE_S
-            )
-            _must(process)
+            drafted_s = _wait_for_sign(session, process := start(_words(session, name, variant)), PATIENCE_S)
+            must_end_well(process)
             known.seconds[name] = time.monotonic() - began_s
             if drafted_s is not None:
                 known.swap_s[name] = time.monotonic() - drafted_s
@@ -217,34 +214,6 @@ def _words(session: Path, name: str, variant: int) -> list[str]:
     return [name, str(session), *VERBS[name].variants[variant]]
 
 
-def _start(words: list[str]) -> "subprocess.Popen[bytes]":
-    environment = {**os.environ, "PYTHONPATH": str(_ROOT), "OMP_NUM_THREADS": "1"}
-    log = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process's object
-    process = subprocess.Popen(
-        [sys.executable, "-c", _MAIN, *words],
-        stdin=subprocess.DEVNULL,
-        stdout=log,
-        stderr=log,
-        env=environment,
-    )
-    process.said = log  # type: ignore[attr-defined]
-    return process
-
-
-def _said(process: "subprocess.Popen[bytes]") -> str:
-    log = process.said  # type: ignore[attr-defined]
-    log.seek(0)
-    text: str = log.read().decode(errors="replace")
-    log.close()
-    return text
-
-
-def _must(process: "subprocess.Popen[bytes]") -> None:
-    code = process.wait(_PATIENCE_S)
-    text = _said(process)
-    assert code == 0, f"{process.args} ended with {code}:\n{text[-2000:]}"
-
-
 def _kill_once(
     session: Path,
     name: str,
@@ -255,8 +224,8 @@ def _kill_once(
     report: ResultKillReport,
 ) -> None:
     is_about_swap = chance.random() < 0.5
-    process = _start(_words(session, name, variant))
-    if is_about_swap and _wait_for_sign(session, process, _PATIENCE_S) is not None:
+    process = start(_words(session, name, variant))
+    if is_about_swap and _wait_for_sign(session, process, PATIENCE_S) is not None:
         time.sleep(chance.uniform(0, 1.2 * known.swap_s.get(name, 0.1)))
         report.n_about_swap += 1
     elif not is_about_swap:
@@ -266,12 +235,12 @@ def _kill_once(
     began_s = time.monotonic()
     process.send_signal(number)
     try:
-        process.wait(_PATIENCE_S)
+        process.wait(PATIENCE_S)
     except subprocess.TimeoutExpired:
-        report.wrong.append(f"{name} goes on for {_PATIENCE_S:g} s after {number.name}")
+        report.wrong.append(f"{name} goes on for {PATIENCE_S:g} s after {number.name}")
         process.kill()
         process.wait()
-    seconds, text = time.monotonic() - began_s, _said(process)
+    seconds, text = time.monotonic() - began_s, said(process)
     if number == signal.SIGINT:
         # Python itself ends with 1 where it is stopped before anything of this program has run.
         is_ours = process.returncode != 1 or "lce_rig" in text
@@ -288,9 +257,9 @@ def _run_undisturbed(session: Path, chance: random.Random, known: _Known) -> Ite
     """Run all three verbs to their end: they must work, and clear what was left behind."""
     variant = chance.randrange(2)
     for name in VERBS:
-        process = _start(_words(session, name, variant))
-        if process.wait(_PATIENCE_S) != 0:
-            yield f"{name} ends with {process.returncode} afterwards: {_said(process)[-300:]}"
+        process = start(_words(session, name, variant))
+        if process.wait(PATIENCE_S) != 0:
+            yield f"{name} ends with {process.returncode} afterwards: {said(process)[-300:]}"
     if drafts := _drafts(session):
         yield f"drafts are left: {', '.join(drafts)}"
     if _own_content(session / "calibration") != known.results[variant]:
