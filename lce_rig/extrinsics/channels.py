@@ -72,7 +72,8 @@ def calibrate_channels(
         n_captures = len(consensus.observations)
         result = _channel_result(name, n_captures, noise_px[name], estimate, estimate, None)
         return replace(estimate, channels=(result,))
-    still = {name: _alone(consensus, board, options) for name, consensus in agreed.items()}
+    plain = _for_comparison(options)
+    still = {name: calibrate_observations(own.observations, board, plain) for name, own in agreed.items()}
     start = next(iter(still.values()))
     offsets = _offsets(samples, scans, board, options, clocks, start) if is_moving else None
     mover = _Mover(samples, scans, offsets, start.T_cam_lidar, clocks.sweep_s)
@@ -88,7 +89,7 @@ def calibrate_channels(
         )
         for name in sorted(agreed)
     )
-    apart, cov = _difference(mover, results, board, options)
+    apart, cov = _difference(mover, results, board, plain)
     return replace(estimate, channels=results, channel_difference=apart, channel_difference_cov=cov)
 
 
@@ -132,13 +133,10 @@ def _agree(candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board) 
     return {name: agreed[name] for name in sorted(agreed, key=lambda name: noise[name])}
 
 
-def _alone(consensus: Consensus, board: Board, options: EstimateSettings) -> CalibrationEstimate:
-    """Calibrate one channel by Algorithm 1 as if boards stood still, without draws."""
-    return calibrate_observations(
-        consensus.observations,
-        board,
-        replace(options, method="paper", estimator=None, n_draws=0, tolerances=None),
-    )
+def _for_comparison(options: EstimateSettings) -> EstimateSettings:
+    """Choose Algorithm 1, without draws and without what all channels of a camera have in common."""
+    plain = replace(options, method="paper", estimator=None, n_draws=0, tolerances=None)
+    return replace(plain, laser_bias_sigma_m=0.0, range_offset_sigma_m=0.0)
 
 
 def _alone_moved(
@@ -233,13 +231,18 @@ def _difference(
     If only the two channels together show how boards moved, each pose depends on both; then one channel's
     extrinsic from half of the scans is compared with the other's from the other half, and of several ways to
     share them out the median counts.
+
+    Args:
+        mover: of the boards.
+        results: of the channels, each alone.
+        board: its specification.
+        options: for halves.
     """
     if len(results) != 2:
         return None, None
     first, second = results
     if mover.offsets is None or mover.is_motion_own:
         return difference(first.T_cam_lidar, second.T_cam_lidar), first.cov + second.cov
-    fast = replace(options, n_draws=0, tolerances=None)
     seen = [mover.observations(result.channel) for result in results]
     rng = np.random.default_rng(options.seed)
     ways: list[tuple[float, Array, Array]] = []
@@ -248,7 +251,7 @@ def _difference(
         names = {mover.scans[k].capture for k in mine}
         try:
             halves = [
-                calibrate_observations([o for o in own if (o.capture in names) == is_first], board, fast)
+                calibrate_observations([o for o in own if (o.capture in names) == is_first], board, options)
                 for own, is_first in zip(seen, (True, False), strict=True)
             ]
         except NotEnoughDataError:

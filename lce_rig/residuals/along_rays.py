@@ -49,6 +49,7 @@ along its width or its height (`bow_heights`), a point p of the plate stands for
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,10 +117,15 @@ class StackedScans:
     end_fields: Array
     end_background: Array
 
-    @property
+    @cached_property
     def group(self) -> Indices:
         """Index (N,) of each return's pair of capture and ring, of F L in all; ascending."""
-        return self.capture * len(self.rings) + self.ring
+        return np.asarray(self.capture * len(self.rings) + self.ring)
+
+    @cached_property
+    def turned(self) -> Array:
+        """Derivative (N, 3, 2) of each return's ray by azimuth and elevation."""
+        return turn_rays(self.rays)
 
 
 def interior(lidar: LidarBoard, board: Board) -> LidarBoard:
@@ -243,6 +249,11 @@ class RangeSums:
     sums: Array
     by_pose: Array
 
+    @property
+    def n_returns(self) -> Array:
+        """Number (F, L) of returns."""
+        return np.asarray(self.sums[..., _OWN, _OWN])
+
 
 def sum_ranges(scans: StackedScans, T_lidar_board: Array, lasers: Array, fields: Array) -> RangeSums:
     """Sum the returns' terms.
@@ -264,17 +275,14 @@ def sum_ranges(scans: StackedScans, T_lidar_board: Array, lasers: Array, fields:
     v[:, 0], v[:, 1], v[:, 2] = 1 / cosine, r * x - middle[k, 0], r * y - middle[k, 1]
     v[:, 1:_OWN] /= cosine[:, None]
     across = -n[k] / cosine[:, None]
-    v[:, _OWN + 1 : _OF_FIELDS] = r[:, None] * np.einsum("ni,nij->nj", across, turn_rays(scans.rays))
+    v[:, _OWN + 1 : _OF_FIELDS] = r[:, None] * np.einsum("ni,nij->nj", across, scans.turned)
     v[:, _OF_FIELDS:-1] = np.einsum("ni,nij->nj", across, scans.fields)
-    own = np.sum(v[:, _OWN:_OF_FIELDS] * lasers[:, scans.ring].T, axis=1)
+    own = np.einsum("ni,ni->n", v[:, _OWN:_OF_FIELDS], lasers.T[scans.ring])
     v[:, -1] = r + own + v[:, _OF_FIELDS:-1] @ fields - scans.range_m
     sums = np.zeros((scans.n_captures * len(scans.rings), _OF_RETURN, _OF_RETURN))
-    first = np.flatnonzero(np.diff(scans.group, prepend=-1))
-    # Products of columns, each one contiguous: several times faster than outer products of rows.
-    i, j = np.triu_indices(_OF_RETURN)
-    columns = np.ascontiguousarray(v.T)
-    products = np.add.reduceat(columns[i] * columns[j], first, axis=1).T
-    sums[scans.group[first, None], i, j] = sums[scans.group[first, None], j, i] = products
+    bounds = np.flatnonzero(np.diff(scans.group, prepend=-1, append=-1))
+    # A product of matrices for each ring: several times faster than sums of products of columns.
+    sums[scans.group[bounds[:-1]]] = [v[a:b].T @ v[a:b] for a, b in pairwise(bounds.tolist())]
     K = freedoms_of_plane()
     by_pose = np.concatenate([K[:, :3] @ np.swapaxes(R, 1, 2), K[:, 3:] @ np.swapaxes(R, 1, 2)], axis=2)
     return RangeSums(sums.reshape(scans.n_captures, len(scans.rings), _OF_RETURN, _OF_RETURN), by_pose)
@@ -290,7 +298,7 @@ def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tupl
     Returns:
         The weighted sums (F, L, 11, 11) and the log (F,) of the covariance's determinant.
     """
-    n = ranges.sums[..., _OWN, _OWN]
+    n = ranges.n_returns
     total = sigma_m**2 + n * sigma_ring_m**2
     shared = ranges.sums[..., _OWN, :]
     k = (sigma_ring_m**2 / total)[..., None, None]
@@ -365,17 +373,6 @@ class EdgeRows:
     range_m: Array
     is_backed: NDArray[np.bool_]
     n_rings: int
-
-    @cached_property
-    def columns(self) -> Array:
-        """Derivatives (21, M), each column of `rows` contiguous."""
-        return np.ascontiguousarray(self.rows[:, :-1].T)
-
-    @cached_property
-    def products(self) -> Array:
-        """Products of each row's derivatives with each other (231, M), in the order of `np.triu_indices`."""
-        i, j = np.triu_indices(_OF_END - 1)
-        return np.asarray(self.columns[i] * self.columns[j])
 
     @property
     def group(self) -> Indices:

@@ -13,7 +13,7 @@ from lce_rig.core.results import Observation
 from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.likelihood.levels import Levels, Priors
-from lce_rig.extrinsics.likelihood.refine import JointEstimate, inflate, move_under, refine
+from lce_rig.extrinsics.likelihood.refine import JointEstimate, inflate, moves_under, refine
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA
 from lce_rig.extrinsics.metrics import error_to_reference
 from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
@@ -48,7 +48,9 @@ def calibrate_by_likelihood(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
-    start = calibrate_by_algorithm_1(observations, board, replace(options, tolerances=None), progress)
+    # Of the start, the covariance is not used: constant errors of the sensors need not enter it.
+    plain = replace(options, tolerances=None, laser_bias_sigma_m=0.0, range_offset_sigma_m=0.0)
+    start = calibrate_by_algorithm_1(observations, board, plain, progress)
     used = [observation for observation in observations if observation.capture in start.used]
     priors, usual = what_is_known(options)
     joint = refine([used], board, [start.T_cam_lidar], priors, usual)
@@ -64,7 +66,7 @@ def calibrate_by_likelihood(
     found: tuple[Sensitivity, ...] = ()
     if options.tolerances is not None:
         variants = vary(used, board, options.tolerances)
-        moves = np.array([move_under(joint, each.observations, each.board) for each in variants])
+        moves = moves_under(joint, used, variants, board)
         found = sensitivities_of(variants, moves, options.tolerances)
     return replace(estimate, expansion=expand_joint(joint, 0, placement), sensitivities=found)
 

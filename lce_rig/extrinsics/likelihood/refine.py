@@ -18,6 +18,7 @@ from lce_rig.extrinsics.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_
 from lce_rig.extrinsics.likelihood.system import (
     PER_CAMERA,
     Assembly,
+    Reduced,
     State,
     Terms,
     assemble,
@@ -25,6 +26,7 @@ from lce_rig.extrinsics.likelihood.system import (
     of_the_lidar,
     scale_places,
 )
+from lce_rig.extrinsics.tolerances import Variant
 from lce_rig.residuals.along_rays import (
     N_BOW,
     N_FIELDS,
@@ -65,21 +67,45 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rou
     sigma = np.array([LOG_SIGMA[name] for name in names])
     middle = _logs(usual, names)
     assembly = Assembly(terms, priors)
+    # Thousands of ranges and a few captures determine one level each: without a scale, the search zigzags.
+    n_told = _count_measurements(terms, start)
+    scale = np.sqrt(4 * np.array([n_told[name] for name in names]) + 2 / sigma**2)
 
-    def levels_at(logs: Array) -> Levels:
-        return replace(usual, **dict(zip(names, np.exp(logs).tolist(), strict=True)))
+    def levels_at(x: Array) -> Levels:
+        return replace(usual, **dict(zip(names, np.exp(x / scale).tolist(), strict=True)))
 
-    def cost(logs: Array) -> tuple[float, Array]:
-        evidence, slopes = assembly.evidence(levels_at(logs), names)
-        off = (logs - middle) / sigma
-        return evidence + float(off @ off), slopes + 2 * off / sigma
+    def cost(x: Array) -> tuple[float, Array]:
+        evidence, slopes = assembly.evidence(levels_at(x), names)
+        off = (x / scale - middle) / sigma
+        return evidence + float(off @ off), (slopes + 2 * off / sigma) / scale
 
     highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _ABOVE)
-    bounds = list(zip(middle + _BELOW, highest, strict=True))
+    bounds = list(zip((middle + _BELOW) * scale, highest * scale, strict=True))
     options = {"maxiter": n_rounds, "ftol": 1e-6}
-    first = _logs(start, names)
+    first = _logs(start, names) * scale
     found = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     return levels_at(found.x)
+
+
+def _count_measurements(terms: Terms, levels: Levels) -> dict[str, float]:
+    """Count, roughly, the measurements that tell of each level: n tell its logarithm to 1 / (2 n)^1/2."""
+    n_returns = terms.ranges.n_returns
+    n_ends, n_backed = len(terms.edges.rows), np.count_nonzero(terms.edges.is_backed)
+    n_images = sum(len(images.capture) for images in terms.images)
+    return {
+        "range_m": float(n_returns.sum()),
+        "ring_m": float(np.count_nonzero(n_returns)),
+        # Only ring ends near the ends of their intervals show how blurred these are.
+        "edge_rad": 0.3 * (n_ends - n_backed),
+        "backed_rad": 0.3 * n_backed,
+        "lost_share": 0.5 * levels.lost_share * n_ends,
+        "own_shift_m": 0.3 * len(terms.own_shift_m),
+        "tilt_rad": 2.0 * n_images,
+        "spin_rad": 0.5 * n_images,
+        "depth_m": float(n_images),
+        "across_m": 2.0 * n_images,
+        "laser_m": float(terms.n_rings),
+    }
 
 
 def _logs(levels: Levels, names: list[str]) -> Array:
@@ -88,9 +114,10 @@ def _logs(levels: Levels, names: list[str]) -> Array:
 
 # Steps between changes of the levels, and their maximum at the end.
 _STEPS, _LAST_STEPS = 3, 20
+# Steps end where the next one is shorter than this, in standard deviations of all unknowns together.
+_NEAR, _SETTLED = 0.1, 5e-3
 # Rounds of the search for noise levels, each followed by a new linearisation.
-_LEVEL_ROUNDS = (12, 4, 4)
-_SETTLED = 1e-7
+_LEVEL_ROUNDS = (8, 4, 8)
 # First blurs of ring ends: as long as the edge shift is unknown, all of them may lie outside
 # their intervals, where a sharp density is flat.
 _BLURS_RAD = (4e-3, 1.5e-3)
@@ -117,6 +144,7 @@ class JointEstimate:
         levels: of the noise.
         cost: of the F captures at the optimum, in the unknowns z of `system`.
         state: all unknowns at the optimum.
+        terms: linearised there.
         priors: of the constants.
     """
 
@@ -136,6 +164,7 @@ class JointEstimate:
     levels: Levels
     cost: Quadratics
     state: State
+    terms: Terms
     priors: Priors
 
 
@@ -173,24 +202,24 @@ def refine(
         np.zeros(len(order)),
         np.zeros(PER_CAMERA * len(cameras) + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS),
     )
-    problem = _Problem(scans, images, board, priors, np.ones(len(order)))
+    problem = _Problem(scans, images, board, priors)
     placement = group_shared_placements(cameras, order)
-    now = levels or usual
+    now, here = levels or usual, problem.at(state, np.ones(len(order)))
     for blur_rad in _BLURS_RAD:
-        state = problem.settle(state, now.blurred(blur_rad))
+        here = problem.settle(here, now.blurred(blur_rad))
     for n_rounds in _LEVEL_ROUNDS if levels is None else ():
-        state = problem.settle(state, now)
-        now = fit_levels(problem.linearise(state), now, usual, priors, n_rounds)
-        problem = replace(problem, trust=trust_captures(problem, state, now, placement))
-    state = problem.settle(state, now, _LAST_STEPS)
-    return _summarise(state, problem.linearise(state), now, priors, scans.rings)
+        here = problem.settle(here, now)
+        now = fit_levels(here.terms, now, usual, priors, n_rounds)
+        here = here.trusting(trust_captures(here, now, priors, placement))
+    here = problem.settle(here, now, _LAST_STEPS, _SETTLED)
+    return _summarise(here, now, priors, scans.rings)
 
 
 # Moves beyond so many of their standard deviations count less than in full (Huber; 95 % efficient).
 _HUBER = 1.5
 
 
-def trust_captures(problem: "_Problem", state: State, levels: Levels, placement: NDArray[np.intp]) -> Array:
+def trust_captures(here: "_Point", levels: Levels, priors: Priors, placement: NDArray[np.intp]) -> Array:
     """Weigh captures (F,) by how far the extrinsics move without them, compared with what noise explains.
 
     Without placement k the unknowns move by m_k = (H - H_k)^-1 g_k, with the covariance (H - H_k)^-1 - H^-1.
@@ -204,9 +233,9 @@ def trust_captures(problem: "_Problem", state: State, levels: Levels, placement:
     References:
         Huber, "Robust Statistics", 1981.
     """
-    terms = replace(problem.linearise(state), trust=np.ones(len(placement)))
-    cost = replace(assemble(terms, levels, problem.priors).cost, placement=placement)
-    J = _to_extrinsics(state)
+    terms = here.trusting(np.ones(len(placement))).terms
+    cost = replace(assemble(terms, levels, priors).cost, placement=placement)
+    J = _to_extrinsics(here.state)
     H, own = cost.information, np.tensordot(cost.groups, cost.hessians, axes=1)
     without = symmetric_inverse(H - own)
     moves = (without @ (cost.groups @ cost.gradients)[..., None])[..., 0] @ J.T
@@ -219,6 +248,18 @@ def trust_captures(problem: "_Problem", state: State, levels: Levels, placement:
 
 
 @dataclass(frozen=True, eq=False)
+class _Point:
+    """A state, and all terms there."""
+
+    state: State
+    terms: Terms
+
+    def trusting(self, trust: Array) -> "_Point":
+        """Weigh captures by (F,)."""
+        return replace(self, terms=replace(self.terms, trust=trust))
+
+
+@dataclass(frozen=True, eq=False)
 class _Problem:
     """Constants of the optimisation."""
 
@@ -226,19 +267,61 @@ class _Problem:
     images: tuple[StackedImages, ...]
     board: Board
     priors: Priors
-    trust: Array
 
-    def linearise(self, state: State) -> Terms:
-        return linearise(self.scans, self.images, self.board, state, self.trust)
+    def at(self, state: State, trust: Array) -> _Point:
+        return _Point(state, linearise(self.scans, self.images, self.board, state, trust))
 
-    def settle(self, state: State, levels: Levels, n_steps: int = _STEPS) -> State:
-        """Find the optimum at given levels."""
+    def settle(self, here: _Point, levels: Levels, n_steps: int = _STEPS, short: float = _NEAR) -> _Point:
+        """Find the optimum at given levels, in at most so many steps, until the next one is short."""
+        mixing = _Mixing()
         for _ in range(n_steps):
-            z, y = assemble(self.linearise(state), levels, self.priors).step()
-            state = state.moved(z, y)
-            if max(np.abs(z).max(), np.abs(y).max()) < _SETTLED:
+            reduced = assemble(here.terms, levels, self.priors)
+            z, y = reduced.step()
+            if -reduced.gradient @ z < short**2:
                 break
-        return state
+            z, y = mixing.mix(z, y, reduced)
+            here = self.at(here.state.moved(z, y), here.terms.trust)
+        return here
+
+
+# Plain steps before any are mixed, and how many are.
+_PLAIN, _MIXED = 3, 5
+# A mixed step is at most so many times as long as the plain one.
+_LONGEST = 5.0
+
+
+class _Mixing:
+    """Corrects steps by how earlier ones turned out (Anderson mixing).
+
+    The mean information of ring ends is not the curvature of their cost: plain steps are a fifth of what
+    they should be in some directions, and leap back and forth in others. From steps s_k and moves m_k,
+
+        m = s - (dM + dS) gamma,    gamma = argmin |s - dS gamma|, in standard deviations of the unknowns
+
+    References:
+        Walker, Ni, "Anderson acceleration for fixed-point iterations", SIAM J. Numerical Analysis, 2011.
+    """
+
+    def __init__(self) -> None:
+        self._steps: list[Array] = []
+        self._moves: list[Array] = []
+
+    def mix(self, z: Array, y: Array, reduced: Reduced) -> tuple[Array, Array]:
+        """Return the move for a step z (G,), y (F, 7)."""
+        step = np.append(z, y)
+        move = step
+        self._steps.append(step)
+        if len(self._steps) > _PLAIN:
+            of_own = np.diagonal(reduced.of_own, axis1=1, axis2=2)
+            weight = np.sqrt(np.append(np.diag(reduced.cost.information), of_own))
+            dS = np.diff(self._steps[-_MIXED - 1 :], axis=0).T
+            dM = np.transpose(self._moves[-dS.shape[1] :])
+            gamma = np.linalg.lstsq(weight[:, None] * dS, weight * step, rcond=1e-6)[0]
+            move = step - (dM + dS) @ gamma
+            length, plain = (float(np.linalg.norm(weight * each)) for each in (move, step))
+            move = move * min(1.0, _LONGEST * plain / max(length, np.finfo(float).tiny))
+        self._moves.append(move)
+        return move[: len(z)], move[len(z) :].reshape(y.shape)
 
 
 def _stack_images(observations: Sequence[Observation], order: dict[str, int], board: Board) -> StackedImages:
@@ -275,10 +358,8 @@ def _to_extrinsics(state: State) -> Array:
     return np.concatenate([to_extrinsic(T[c], c, len(state.constants)) for c in range(len(T))])
 
 
-def _summarise(
-    state: State, terms: Terms, levels: Levels, priors: Priors, rings: NDArray[np.int16]
-) -> JointEstimate:
-    cost = assemble(terms, levels, priors).cost
+def _summarise(here: _Point, levels: Levels, priors: Priors, rings: NDArray[np.int16]) -> JointEstimate:
+    state, cost = here.state, assemble(here.terms, levels, priors).cost
     C, constants = len(state.T_cam_lidar), state.constants
     scatter, of_constants = _covariance_parts(cost, priors, C)
     cov = scatter + of_constants
@@ -297,10 +378,11 @@ def _summarise(
         shifts=shifts,
         scale=constants[scale_places(C)],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
-        trust=terms.trust,
+        trust=here.terms.trust,
         levels=levels,
         cost=cost,
         state=state,
+        terms=here.terms,
         priors=priors,
     )
 
@@ -318,24 +400,36 @@ def _covariance_parts(cost: Quadratics, priors: Priors, n_cameras: int) -> tuple
     return inverse @ cost.hessians.sum(axis=0) @ inverse, inverse @ claimed @ inverse
 
 
-def move_under(joint: JointEstimate, observations: Sequence[Observation], board: Board) -> Array:
-    """Compute how far other observations of the same captures move one camera's extrinsics, to first order.
+def moves_under(
+    joint: JointEstimate, used: Sequence[Observation], variants: Sequence[Variant], board: Board
+) -> Array:
+    """Compute how far errors of the profile move one camera's extrinsics, to first order.
 
     Args:
         joint: of one camera.
-        observations: of the F captures, as they would be with some error.
-        board: that is assumed.
+        used: the F observations, in the order of `variants`.
+        variants: V of what would have been observed.
+        board: as the profile says.
 
     Returns:
-        (6,) tangent (translation m, rotation rad).
+        (V, 6) tangents (translation m, rotation rad).
     """
-    seen = sorted(observations, key=lambda o: o.capture)
-    scans = stack_scans([interior(o.lidar, board) for o in seen], board)
-    images = (_stack_images(seen, {o.capture: k for k, o in enumerate(seen)}, board),)
-    terms = linearise(scans, images, board, joint.state, joint.trust)
-    moved = assemble(terms, joint.levels, joint.priors).cost
-    change = (moved.gradients - joint.cost.gradients).sum(axis=0)
-    return np.asarray(-joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, change))
+    order = {name: k for k, name in enumerate(sorted(o.capture for o in used))}
+    here, changes = Assembly(joint.terms, joint.priors), []
+    for variant in variants:
+        images = (_stack_images(variant.observations, order, variant.board),)
+        lidars = {o.capture: o.lidar for o in variant.observations}
+        is_of_image = variant.board == board and all(o.lidar is lidars[o.capture] for o in used)
+        if is_of_image:
+            moved = here.with_images(images, joint.state)
+        else:
+            scans = stack_scans([interior(lidars[name], variant.board) for name in order], variant.board)
+            terms = linearise(scans, images, variant.board, joint.state, joint.trust)
+            moved = Assembly(terms, joint.priors)
+        gradients = moved.at(joint.levels).cost.gradients
+        changes.append((gradients - joint.cost.gradients).sum(axis=0))
+    moves = np.linalg.solve(joint.cost.information, np.transpose(changes))
+    return np.asarray(-(joint.to_extrinsics[0] @ moves).T)
 
 
 # Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.

@@ -11,8 +11,10 @@ capture by capture (Schur complement).
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,13 +128,13 @@ def edge_system(
     system = np.zeros((n_captures * edges.n_rings, size, size))
     if len(edges.rows):
         weight, score, value = _expand_ends(edges, edge_rad, backed_rad, lost_share)
-        weighted = [edges.products * weight, edges.columns * score, value[None]]
-        first = np.flatnonzero(np.diff(edges.group, prepend=-1))
-        sums = np.add.reduceat(np.concatenate(weighted), first, axis=1).T
-        seen, (i, j) = edges.group[first], np.triu_indices(size - 1)
-        system[seen[:, None], i, j] = system[seen[:, None], j, i] = sums[:, : len(i)]
-        system[seen, :-1, -1] = system[seen, -1, :-1] = sums[:, len(i) : -1]
-        system[seen, -1, -1] = sums[:, -1]
+        J = edges.rows[:, :-1]
+        weighted = np.concatenate([J * weight[:, None], score[:, None]], axis=1)
+        bounds = np.flatnonzero(np.diff(edges.group, prepend=-1, append=-1))
+        seen = edges.group[bounds[:-1]]
+        system[seen, :-1] = [J[a:b].T @ weighted[a:b] for a, b in pairwise(bounds.tolist())]
+        system[seen, -1, :-1] = system[seen, :-1, -1]
+        system[seen, -1, -1] = np.add.reduceat(value, bounds[:-1])
     return system.reshape(n_captures, edges.n_rings, size, size)
 
 
@@ -249,22 +251,27 @@ def linearise(
     trust: Array | None = None,
 ) -> Terms:
     """Linearise all terms; `trust` (F,) is 1 for each capture by default."""
-    per_camera = state.constants[: PER_CAMERA * len(images)].reshape(-1, PER_CAMERA)
-    of_lidar = state.constants[PER_CAMERA * len(images) :]
-    lasers, fields, shifts = of_the_lidar(of_lidar)
+    lasers, fields, shifts = of_the_lidar(state.constants[PER_CAMERA * len(images) :])
     T_lidar_board = state.T_lidar_board
     return Terms(
         sum_ranges(scans, T_lidar_board, lasers, fields),
         edge_rows(scans, T_lidar_board, board, lasers, fields, shifts, state.own_shift_m),
         tuple(images),
-        tuple(
-            image_rows(own, T, T_lidar_board, float(constants[-1]), fields[-N_BOW:])
-            for own, T, constants in zip(images, state.T_cam_lidar, per_camera, strict=True)
-        ),
+        _rows_of_images(images, state),
         state.constants,
         state.own_shift_m,
         np.ones(scans.n_captures) if trust is None else trust,
         scans.rings,
+    )
+
+
+def _rows_of_images(images: Sequence[StackedImages], state: State) -> tuple[Array, ...]:
+    n = PER_CAMERA * len(images)
+    per_camera = state.constants[:n].reshape(-1, PER_CAMERA)
+    bow_m = of_the_lidar(state.constants[n:])[1][-N_BOW:]
+    return tuple(
+        image_rows(own, T, state.T_lidar_board, float(constants[-1]), bow_m)
+        for own, T, constants in zip(images, state.T_cam_lidar, per_camera, strict=True)
     )
 
 
@@ -284,11 +291,15 @@ class Reduced:
     of_own: Array
     minus_2_log_evidence: float
 
+    @cached_property
+    def gradient(self) -> Array:
+        """(G,) by z, of all captures and priors."""
+        return np.asarray(self.cost.gradients.sum(axis=0) + self.cost.prior_gradient)
+
     def step(self) -> tuple[Array, Array]:
         """Solve for z (G,) and y (F, 7)."""
         # Priors of constants differ by many orders of magnitude, too many for `Quadratics.optimum`.
-        gradient = self.cost.gradients.sum(axis=0) + self.cost.prior_gradient
-        z = -np.linalg.solve(self.cost.information, gradient)
+        z = np.asarray(-np.linalg.solve(self.cost.information, self.gradient))
         return z, -self.own_steps @ np.append(z, 1.0)
 
     def second_moments(self) -> Array:
@@ -330,6 +341,13 @@ class Assembly:
         self._edge_block = lru_cache(maxsize=2)(partial(_edge_block, terms))
         self._image_block = lru_cache(maxsize=2)(partial(_image_block, terms))
 
+    def with_images(self, images: Sequence[StackedImages], state: State) -> "Assembly":
+        """Replace the images of terms that were linearised at a state; the other terms stay cached."""
+        other = copy(self)
+        other._terms = replace(self._terms, images=tuple(images), image_rows=_rows_of_images(images, state))
+        other._image_block = lru_cache(maxsize=2)(partial(_image_block, other._terms))
+        return other
+
     def at(self, levels: Levels) -> Reduced:
         """Weight all terms and eliminate the captures' own unknowns."""
         of_ranges, range_volume = self._range_block(levels.range_m, levels.ring_m)
@@ -356,7 +374,7 @@ class Assembly:
         own = moments * terms.trust[:, None, None]
         block, range_volume = self._range_block(levels.range_m, levels.ring_m)
         pictures, picture_volume = self._image_block(levels.pose)
-        of_ends = _end_costs(terms, own)
+        of_ends = lru_cache(_end_costs(terms, own))
         prior, mean, prior_volume = _prior(terms, levels, self._priors)
         # All captures have the same z; the mean of the square of its distance from that of the prior.
         z = terms.constants - mean
