@@ -86,7 +86,9 @@ def main() -> None:
     )
     parser.add_argument("--first-seed", type=int, default=0, help="of `goes_on` and `usable` (default 0)")
     parser.add_argument(
-        "--methods", default="", help="those `paper` runs anew (default: what is not kept); that of `real`"
+        "--methods",
+        default="",
+        help="those `paper` runs anew (default: what is not kept); that of `real` (ml)",
     )
     parser.add_argument(
         "--scans", type=int, default=100, help="simulated sessions that `faults` draws from (100)"
@@ -95,7 +97,7 @@ def main() -> None:
     arguments = parser.parse_args()
     bench = getattr(import_module(f"benchmarks.{arguments.part}"), f"bench_{arguments.part}")
     if arguments.part == "real":
-        bench(arguments.splits, arguments.only, arguments.methods or "paper")
+        bench(arguments.splits, arguments.only, arguments.methods or "ml")
     elif arguments.part == "paper":
         methods = arguments.methods.split(",") if arguments.methods else ()
         bench(arguments.seeds or PARTS["paper"], arguments.output, methods, arguments.only)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 import numpy as np
@@ -19,7 +19,7 @@ from lce_rig.cli.options import (
 )
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, sigma_sizes
-from lce_rig.core.results import Calibration, OtherCamera
+from lce_rig.core.results import DEFAULT_METHOD, Calibration, Method, OtherCamera
 from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
 from lce_rig.detect.detection import Pair
 from lce_rig.words import not_enough, sentence
@@ -205,10 +205,11 @@ if TYPE_CHECKING:
 @event_image_option
 @click.option(
     "--method",
-    type=click.Choice(["ml", "paper"]),
-    default="paper",
+    type=click.Choice(get_args(Method)),
+    default=DEFAULT_METHOD,
     show_default=True,
-    help="Estimate with Algorithm 1 of LCE-Calib (paper), or refine its result by maximum likelihood (ml).",
+    help="Estimate by maximum likelihood, from the result of Algorithm 1 of LCE-Calib (ml), or by that alone "
+    "(paper).",
 )
 @click.option(
     "--use-scene", is_flag=True, help="Estimate from the edges of the scene too, not from the board alone."
@@ -443,7 +444,8 @@ def _certificate(calibration: Calibration) -> str:
     is_optimal, gap = calibration.certificate.is_optimal, calibration.certificate.gap
     if not math.isfinite(gap):
         return f"none (method {calibration.method} has no certificate)"
-    return f"{'global minimum' if is_optimal else '[red]not proven[/]'}, gap {gap:.0e}"
+    of_start = "" if calibration.method == "paper" else " of Algorithm 1, where the estimate starts"
+    return f"{'global minimum' if is_optimal else '[red]not proven[/]'}{of_start}, gap {gap:.0e}"
 
 
 def _channel_lines(calibration: Calibration) -> list[str]:

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -13,6 +13,7 @@ from lce_rig.cli.fleet_deploy import deploy
 from lce_rig.cli.fleet_lidar import lidar
 from lce_rig.cli.fleet_report import report
 from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
+from lce_rig.core.results import DEFAULT_METHOD, Method
 
 if TYPE_CHECKING:
     from lce_rig.fleet.run import FleetRun
@@ -81,8 +82,8 @@ fleet.add_command(lidar)
 )
 @click.option(
     "--method",
-    type=click.Choice(["ml", "paper"]),
-    default="paper",
+    type=click.Choice(get_args(Method)),
+    default=DEFAULT_METHOD,
     show_default=True,
     help="Estimate as `lce-rig calibrate` does with this method.",
 )
@@ -92,9 +93,6 @@ fleet.add_command(lidar)
     default="sheets",
     show_default=True,
     help="Keep the overlays of all captures, their contact sheets only, or draw none.",
-)
-@click.option(
-    "--lidar-intrinsics", is_flag=True, help="Estimate the range offset of each laser from each session, too."
 )
 @click.option("--retry", is_flag=True, help="Run sessions without a result again.")
 @json_option
@@ -108,7 +106,6 @@ def run(
     memory_limit: float,
     method: Any,
     pictures: Any,
-    lidar_intrinsics: bool,
     retry: bool,
     as_json: bool,
 ) -> None:
@@ -128,7 +125,7 @@ def run(
     place = Storage.at(registry)
     jobs = find_jobs(Storage.at(root), None if manifest is None else Storage.at(manifest))
     limits = (time_limit, memory_limit)
-    settings = Settings(place.url, method, *limits, retry, pictures, lidar_intrinsics)
+    settings = Settings(place.url, method, *limits, retry, pictures)
     n_workers = workers or len(os.sched_getaffinity(0))
     show.note(f"{show.counted(len(jobs), 'session')} in {root}")
     with patience(_GRACE_S), cluster(n_workers, memory_limit, scheduler) as client:

@@ -29,7 +29,7 @@ def lidar_intrinsics(
 
     Prints the errors of range, azimuth and elevation of each laser and the displacement of the beams' origin,
     with standard deviations. The sessions' extrinsics may differ; boards must have stood still. With the
-    profile written by --save-profile, `calibrate --method ml` of later sessions starts from these errors.
+    profile written by --save-profile, `calibrate` of later sessions starts from these errors.
     Exits with 6 for too few captures, with 7 if boards moved or captures do not determine the lasers' ranges.
     """
     from lce_rig.core.errors import UsageError

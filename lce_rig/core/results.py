@@ -16,6 +16,9 @@ from lce_rig.core.scene_opinion import SceneOpinion
 
 Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
 STAGES: tuple[Stage, ...] = ("read", "image", "lidar", "pair", "calibrate")
+Method = Literal["ml", "paper"]
+DEFAULT_METHOD: Method = "ml"
+"""How extrinsics are estimated: the joint maximum likelihood, or Algorithm 1 of LCE-Calib."""
 
 
 @dataclass(frozen=True)
@@ -471,7 +474,7 @@ class Extrinsics(Protocol):
 class Calibration:
     """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
 
-    result.json keeps all of it but the last six attributes, which are empty if it is read back.
+    result.json keeps all of it but the last eight attributes, which are empty if it is read back.
 
     Attributes:
         channels: of the camera, names.
@@ -500,6 +503,8 @@ class Calibration:
         lens_error, lens_error_sigma: errors of the profile's intrinsics as the boards see them, given less
             seen: focal length (relative), principal point x and y (px), distortion (px in the image's
             corner); their standard deviations.
+        laser_range_m, laser_range_sigma_m: range offset of each of the LiDAR's lasers, by ring; its standard
+            deviation about their mean. Empty where the method knows none, or the boards moved.
     """
 
     camera: str
@@ -533,6 +538,8 @@ class Calibration:
     observations: Mapping[str, Observation] = field(default_factory=dict)
     lens_error: tuple[float, ...] = ()
     lens_error_sigma: tuple[float, ...] = ()
+    laser_range_m: tuple[float, ...] = ()
+    laser_range_sigma_m: tuple[float, ...] = ()
 
     @property
     def channel(self) -> str:

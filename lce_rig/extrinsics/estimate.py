@@ -13,6 +13,7 @@ from lce_rig.core.results import (
     Observation,
     Refusal,
 )
+from lce_rig.extrinsics.known_lidar import KnownLidar
 from lce_rig.extrinsics.tolerances import Sensitivity
 from lce_rig.residuals.quadratics import Quadratics
 
@@ -41,6 +42,7 @@ class CalibrationEstimate:
             `EstimateSettings.tolerances`.
         expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
             cameras estimated with it) alone; None if the method has none.
+        lidar: constant errors of the LiDAR that were estimated with it; None if the method knows none.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
         channels: the result of each channel of the camera alone; empty if they were not separated.
@@ -63,6 +65,7 @@ class CalibrationEstimate:
     method: str = "paper"
     sensitivities: tuple[Sensitivity, ...] = ()
     expansion: Quadratics | None = None
+    lidar: KnownLidar | None = None
     estimated_with: tuple[str, ...] = ()
     same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     channels: tuple[ChannelResult, ...] = ()

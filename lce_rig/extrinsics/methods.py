@@ -5,12 +5,12 @@ from dataclasses import replace
 
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
-from lce_rig.core.results import Observation
+from lce_rig.core.results import Method, Observation
 from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.extrinsics.consensus import Consensus, find_consensus
 from lce_rig.extrinsics.estimate import CalibrationEstimate
 from lce_rig.extrinsics.likelihood import calibrate_by_likelihood
-from lce_rig.extrinsics.options import CaptureCandidates, EstimateSettings, Estimator, Method
+from lce_rig.extrinsics.options import CaptureCandidates, EstimateSettings, Estimator
 from lce_rig.words import not_enough
 
 Progress = Callable[[int, int], None]

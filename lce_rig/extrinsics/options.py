@@ -2,21 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+from lce_rig.core.results import DEFAULT_METHOD, ImageBoard, LidarBoard, Method, Observation
 from lce_rig.extrinsics.estimate import CalibrationEstimate
+from lce_rig.extrinsics.known_lidar import KnownLidar
 from lce_rig.extrinsics.tolerances import Tolerances
 from lce_rig.residuals.features import AS_FITTED, FeatureSettings
-from lce_rig.rig import LidarIntrinsicsSettings, LidarSettings
-
-Method = Literal["ml", "paper"]
-
+from lce_rig.rig import LidarSettings
 
 EDGE_SHIFT_SIGMA_M = 0.015
 """Prior standard deviation of the distance of ring ends beyond an edge: about a beam's width."""
@@ -44,13 +37,13 @@ class CalibrateOptions:
     """A user's choices for a calibration.
 
     Attributes:
-        method: "paper" (Algorithm 1 of LCE-Calib) or "ml" (Algorithm 1, then maximum likelihood of
-            extrinsics, all board poses and the sensors' constant errors).
+        method: "ml" (Algorithm 1, then maximum likelihood of extrinsics, all board poses and the sensors'
+            constant errors) or "paper" (Algorithm 1 of LCE-Calib alone).
         n_draws: I, subsets drawn for each subset size; they judge the result and do not change it.
         seed: of the draws.
     """
 
-    method: Method = "paper"
+    method: Method = DEFAULT_METHOD
     n_draws: int = 100
     seed: int = 0
 
@@ -80,44 +73,6 @@ class Algorithm1Parts:
     def edge_shift_precision(self) -> float | None:
         """Inverse variance of the edge shift a priori, 1/m^2; None if it is held at zero."""
         return 1 / EDGE_SHIFT_SIGMA_M**2 if self.is_shift_free and self.use_ends else None
-
-
-@dataclass(frozen=True, eq=False)
-class KnownLidar:
-    """Constant errors of a LiDAR, measured before.
-
-    Attributes:
-        rings: (K,) ring numbers.
-        lasers: (3, K) errors of range m, azimuth rad and elevation rad, as `along_rays.ERRORS_OF_LASER`.
-        lasers_sigma: (3, K) their standard deviations about what is common to all lasers.
-        lens: (2,) lateral m and vertical m per rad displacement of the lens.
-        lens_sigma: (2,) of it.
-    """
-
-    rings: NDArray[np.intp]
-    lasers: Array
-    lasers_sigma: Array
-    lens: Array
-    lens_sigma: Array
-
-    @classmethod
-    def of(cls, settings: LidarIntrinsicsSettings | None) -> "KnownLidar | None":
-        """Read a profile's block; None if there is none."""
-        if settings is None:
-            return None
-        lasers = settings.lasers
-        values = [[e.range_m, np.radians(e.azimuth_deg), np.radians(e.elevation_deg)] for e in lasers]
-        sigmas = [
-            [e.range_sigma_m, np.radians(e.azimuth_sigma_deg), np.radians(e.elevation_sigma_deg)]
-            for e in lasers
-        ]
-        return cls(
-            np.array([e.ring for e in lasers], dtype=np.intp),
-            np.array(values).T,
-            np.array(sigmas).T,
-            np.array([settings.lens_lateral_m, settings.lens_vertical_m_per_rad]),
-            np.array([settings.lens_lateral_sigma_m, settings.lens_vertical_sigma_m_per_rad]),
-        )
 
 
 @dataclass(frozen=True)

@@ -184,6 +184,8 @@ def result_columns(calibration: Calibration, rig: Rig, serials: Mapping[str, str
         "reprojection_px": _known(c.metrics.reprojection_px),
         "lens_error": c.lens_error or None,
         "lens_error_sigma": c.lens_error_sigma or None,
+        "laser_range_m": c.laser_range_m or None,
+        "laser_range_sigma_m": c.laser_range_sigma_m or None,
         "time_offset_s": float(np.mean(offsets)) if offsets else None,
         "camera_scale": _known(c.diagnostics.camera_scale),
         "scene": None if c.scene is None else c.scene.state,

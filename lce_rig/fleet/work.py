@@ -3,7 +3,6 @@
 import resource
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -21,15 +20,14 @@ from lce_rig.core.errors import (
     UsageError,
 )
 from lce_rig.core.findings import Finding
+from lce_rig.core.results import DEFAULT_METHOD, Method
 from lce_rig.detect.detection import Detections
 from lce_rig.export.files import MADE_BY
-from lce_rig.extrinsics.options import Method
 from lce_rig.fleet.jobs import Job, folder_name
 from lce_rig.fleet.process import Ended
 from lce_rig.fleet.registry import Registry, write_rows
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import Row, Status, result_columns
-from lce_rig.pipeline.lidar_intrinsics import measure_lidar
 from lce_rig.pipeline.result_files import OVERLAYS, Result
 from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.rig import Rig, dump_rig, load_rig
@@ -73,16 +71,14 @@ class Settings:
         memory_limit_mb: that its process may hold.
         retry: whether sessions without a result are run again.
         pictures: whether overlays of all captures are kept, contact sheets of them only, or nothing is drawn.
-        lidar_intrinsics: whether the range offsets of each session's lasers are estimated, too.
     """
 
     registry: str
-    method: Method = "paper"
+    method: Method = DEFAULT_METHOD
     time_limit_s: float = 600.0
     memory_limit_mb: float = 4000.0
     retry: bool = False
     pictures: Pictures = "sheets"
-    lidar_intrinsics: bool = False
 
     def opened(self) -> Registry:
         """The registry."""
@@ -267,8 +263,7 @@ def _calibrate(
     for c in result.pairs:
         own = doubts.get((c.camera, c.lidar), [])
         known = replace(c, findings=(*c.findings, *own))
-        lasers = _laser_columns(session, c.lidar, detections) if settings.lidar_intrinsics else {}
-        rows.append(replace(row, **result_columns(known, session.rig, serials), **lasers))
+        rows.append(replace(row, **result_columns(known, session.rig, serials)))
     rows += _lacking(result, detections, row)
 
     def fill(folder: Path) -> None:
@@ -281,17 +276,6 @@ def _calibrate(
                     path.unlink()
 
     return publish(registry, rows, start_s, fill)
-
-
-def _laser_columns(session: Session, lidar: str, detections: Detections) -> dict[str, Any]:
-    """Estimate the range offset of each laser; nothing where the captures do not determine them."""
-    with suppress(NotEnoughDataError, ResultRefusedError):
-        errors = measure_lidar([session], lidar, found=[detections]).found
-        return {
-            "laser_range_m": tuple(map(float, errors.lasers[0])),
-            "laser_range_sigma_m": tuple(map(float, errors.lasers_sigma[0])),
-        }
-    return {}
 
 
 def _lacking(result: Result, detections: Detections, row: Row) -> list[Row]:

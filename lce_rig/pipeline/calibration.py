@@ -431,6 +431,7 @@ def _judged(
     verdict, findings = judge(estimate, validation, rig, camera, lidar, n_captures, others)
     lens = rig.cameras[camera].to_intrinsics()
     lens_error, lens_error_sigma = _lens_error(validation)
+    laser_range_m, laser_range_sigma_m = _laser_ranges(rig, solved[k])
     return Calibration(
         camera=camera,
         channels=tuple(channel.channel for channel in estimate.channels),
@@ -460,6 +461,8 @@ def _judged(
         observations=estimate.observations,
         lens_error=lens_error,
         lens_error_sigma=lens_error_sigma,
+        laser_range_m=laser_range_m,
+        laser_range_sigma_m=laser_range_sigma_m,
     )
 
 
@@ -469,6 +472,21 @@ def _lens_error(validation: Validation) -> tuple[tuple[float, ...], tuple[float,
     if check is None or check.errors is None or check.errors_cov is None:
         return (), ()
     return check.errors, tuple(np.sqrt(np.diag(np.array(check.errors_cov))).tolist())
+
+
+def _laser_ranges(rig: Rig, solved: _Solved) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Give the range offset of each laser, by ring, and its standard deviation.
+
+    Boards that moved between image and scan would make them up.
+    """
+    found, sheet = solved.estimate.lidar, rig.lidars[solved.lidar].data_sheet()
+    if found is None or sheet is None or not solved.is_still:
+        return (), ()
+    range_m = np.zeros(sheet.n_rings)
+    # A laser that met no board is known as well as before.
+    sigma_m = np.full(sheet.n_rings, rig.lidars[solved.lidar].laser_bias_sigma_m)
+    range_m[found.rings], sigma_m[found.rings] = found.lasers[0], found.lasers_sigma[0]
+    return tuple(range_m.tolist()), tuple(sigma_m.tolist())
 
 
 def _diagnostics(estimate: CalibrationEstimate, validation: Validation) -> Diagnostics:

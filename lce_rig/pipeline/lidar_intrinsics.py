@@ -55,7 +55,7 @@ def measure_lidar(
                 f"{session.path} has another board than {sessions[0].path}", "Give sessions of one board."
             )
     board, settings = rig.board.to_board(), rig.lidars[name]
-    options = EstimateSettings.of(CalibrateOptions(n_draws=0), settings)
+    options = EstimateSettings.of(CalibrateOptions("paper", n_draws=0), settings)
     used, starts = [], []
     for k, session in enumerate(sessions):
         detections = detect(session, progress=progress) if found is None else found[k]

@@ -113,7 +113,7 @@ class LaserSettings(Settings):
 
 
 class LidarIntrinsicsSettings(Settings):
-    """Constant errors of a LiDAR, as `lce-rig lidar-intrinsics` measures them, for `--method ml`.
+    """Constant errors of a LiDAR, as `lce-rig lidar-intrinsics` measures them, for the joint estimate.
 
     Attributes:
         lens_lateral_m: displacement of the beams' origin from the axis, towards growing azimuth.

@@ -12,10 +12,9 @@ from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration
+from lce_rig.core.results import Calibration, Method
 from lce_rig.detect.detection import Detections
 from lce_rig.extrinsics import CalibrateOptions
-from lce_rig.extrinsics.options import Method
 from lce_rig.rig import Rig
 from lce_rig.validation.weighing import Verdict
 from lce_rig.words import sentence

@@ -38,18 +38,18 @@ from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
 
 def _changed(**parts: Any) -> EstimateSettings:
     """Change parts of Algorithm 1; draws cost time and judge the solution, but do not change it."""
-    return EstimateSettings(n_draws=0, parts=Algorithm1Parts(**parts))
+    return EstimateSettings("paper", n_draws=0, parts=Algorithm1Parts(**parts))
 
 
 # The paper's switches by the names of its table III, then ours.
 _VARIANTS: dict[str, EstimateSettings] = {
-    "full (I = 100)": EstimateSettings(n_draws=100),
+    "full (I = 100)": EstimateSettings("paper", n_draws=100),
     "without point projection": _changed(features=FeatureSettings(point_projection="none")),
     "without uncertainty model": _changed(use_uncertainty=False),
     "without point-to-plane": _changed(use_planes=False),
     "without point-to-line": _changed(use_ends=False),
-    "I = 1": EstimateSettings(n_draws=1),
-    "I = 5": EstimateSettings(n_draws=5),
+    "I = 1": EstimateSettings("paper", n_draws=1),
+    "I = 5": EstimateSettings("paper", n_draws=5),
     "projection along the normal": _changed(features=FeatureSettings(point_projection="normal")),
     "without half step": _changed(features=FeatureSettings(half_step=False)),
     "without edge shift": _changed(is_shift_free=False),

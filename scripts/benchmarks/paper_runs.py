@@ -10,13 +10,19 @@ import numpy as np
 
 from benchmarks.baselines import settings_of
 from benchmarks.kept import kept_folder
-from benchmarks.paper_sets import LEVELS, N_CAPTURES, PaperSet, paper_rig, paper_set
+from benchmarks.paper_sets import LEVELS, LIDAR, N_CAPTURES, PaperSet, paper_rig, paper_set
 from benchmarks.tables import compare
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, Observation
-from lce_rig.extrinsics import CaptureCandidates, EstimateSettings, capture_residual, fit_extrinsic
+from lce_rig.extrinsics import (
+    CalibrateOptions,
+    CaptureCandidates,
+    EstimateSettings,
+    capture_residual,
+    fit_extrinsic,
+)
 
 # The middle of the ten levels stands for all where something else is varied.
 MIDDLE_LEVEL = 5
@@ -60,6 +66,7 @@ def simulated_runs(folder: Path, n_seeds: int, methods: Sequence[str], anew: Seq
     sets = folder / "sets"
     path = kept_folder(sets, paper_rig()) / "simulated.csv"
     runs = [run for run in read_runs(path) if run.method not in anew]
+    known = EstimateSettings.of(CalibrateOptions(n_draws=0), paper_rig().lidars[LIDAR])
     for seed in range(n_seeds):
         missing = [name for name in methods if (name, seed) not in {(run.method, run.seed) for run in runs}]
         if not missing:
@@ -68,7 +75,7 @@ def simulated_runs(folder: Path, n_seeds: int, methods: Sequence[str], anew: Seq
         for level in LEVELS:
             counts = FRAME_COUNTS if level == MIDDLE_LEVEL else (N_CAPTURES,)
             for method in missing:
-                options = settings_of(method, EstimateSettings(n_draws=0))
+                options = settings_of(method, known)
                 runs += [measure(seen, method, level, seed, n, options) for n in counts]
         print(f"set {seed + 1} of {n_seeds} done", file=sys.stderr, flush=True)
         write_runs(path, runs)

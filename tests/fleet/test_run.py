@@ -95,8 +95,8 @@ def test_limits_end_a_session_and_no_other(fleet_root, tmp_path):
     assert row["status"] == "ok"
 
 
-def test_range_offsets_of_lasers_are_estimated_where_asked_for(simulated, tmp_path):
-    settings = Settings(str(tmp_path / "registry"), pictures="none", lidar_intrinsics=True)
+def test_range_offsets_of_lasers_are_those_of_the_estimate(simulated, tmp_path):
+    settings = Settings(str(tmp_path / "registry"), pictures="none")
     (row,) = work(Job(str(simulated), "r1"), settings, lambda _: None)
     offsets_m, sigma_m = np.array(row["laser_range_m"]), np.array(row["laser_range_sigma_m"])
     stage = set_stage(load_rig("rlfs"), 3)

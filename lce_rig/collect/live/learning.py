@@ -119,7 +119,7 @@ class _Teacher:
     def learn(self, k: int, candidates: Sequence[CaptureCandidates]) -> Planner | None:
         """Calibrate what one guide's sensors have shown; None where more captures are needed."""
         try:
-            estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings(n_draws=0))
+            estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings("paper", n_draws=0))
         except (NotEnoughDataError, np.linalg.LinAlgError):
             return None
         figures = estimate.diagnostics

@@ -12,20 +12,18 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 from lce_rig.extrinsics.algorithm_1 import calibrate_by_algorithm_1
 from lce_rig.extrinsics.estimate import CalibrationEstimate
-from lce_rig.extrinsics.likelihood.levels import Levels, Priors
+from lce_rig.extrinsics.likelihood.levels import what_is_known
+from lce_rig.extrinsics.likelihood.lidar_errors import lidar_of
 from lce_rig.extrinsics.likelihood.refine import JointEstimate, inflate, moves_under, refine
 from lce_rig.extrinsics.likelihood.system import PER_CAMERA
 from lce_rig.extrinsics.metrics import error_to_reference
-from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
+from lce_rig.extrinsics.options import EstimateSettings
 from lce_rig.extrinsics.report import report_estimate, with_parts
 from lce_rig.extrinsics.tolerances import Sensitivity, sensitivities_of, vary
 from lce_rig.residuals.along_rays import N_SHIFTS, SHIFTS
 from lce_rig.residuals.features import extract_features
 from lce_rig.residuals.placements import group_placements
 from lce_rig.residuals.quadratics import Quadratics
-
-# A profile that states no range errors, or none of its scale, is used as it says.
-_EXACT_M, _EXACT = 1e-6, 1e-6
 
 
 def calibrate_by_likelihood(
@@ -71,18 +69,6 @@ def calibrate_by_likelihood(
     return replace(estimate, expansion=expand_joint(joint, 0, placement), sensitivities=found)
 
 
-def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
-    """Read the priors of constant errors and noise from the options."""
-    offset_m = max(options.range_offset_sigma_m, _EXACT_M)
-    priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
-    if options.tolerances is not None:
-        # The effects of focal length and squares on the result contain what the scale does not absorb.
-        scale = max(options.tolerances.scale, _EXACT)
-        bow_m = max(options.tolerances.bow_m, _EXACT)
-        priors = replace(priors, scale=scale, bow_m=bow_m, profile_is_claimed=False)
-    return priors, Levels(laser_m=options.laser_bias_sigma_m)
-
-
 def describe(
     joint: JointEstimate,
     camera: int,
@@ -106,7 +92,7 @@ def describe(
         figures: diagnostics.
     """
     features = [extract_features(observation, board, options.parts.features) for observation in used]
-    return report_estimate(
+    estimate = report_estimate(
         joint.T_cam_lidar[camera],
         cov,
         used,
@@ -117,6 +103,7 @@ def describe(
         refused=start.refused,
         diagnostics=figures,
     )
+    return replace(estimate, lidar=lidar_of(joint))
 
 
 def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Quadratics:

@@ -9,8 +9,8 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation, Refusal
 from lce_rig.extrinsics.estimate import CalibrationEstimate
-from lce_rig.extrinsics.likelihood.calibrate_jointly import add_figures, describe, expand_joint, what_is_known
-from lce_rig.extrinsics.likelihood.levels import PoseLevels
+from lce_rig.extrinsics.likelihood.calibrate_jointly import add_figures, describe, expand_joint
+from lce_rig.extrinsics.likelihood.levels import PoseLevels, what_is_known
 from lce_rig.extrinsics.likelihood.refine import inflate, refine
 from lce_rig.extrinsics.options import EstimateSettings
 from lce_rig.extrinsics.shared_scans import scan_key

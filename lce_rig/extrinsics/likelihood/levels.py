@@ -8,7 +8,8 @@ import numpy as np
 
 from lce_rig.core.geometry import Array
 from lce_rig.extrinsics.background import BACKGROUND_SIGMAS_M
-from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, KnownLidar
+from lce_rig.extrinsics.known_lidar import KnownLidar
+from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
 
 
 class PoseLevels(NamedTuple):
@@ -129,3 +130,17 @@ class Priors:
 
 # Offsets of lasers without any in the profile.
 NO_LASER_M = 1e-6
+# A profile that states no range errors, or none of its scale, is used as it says.
+_EXACT_M, _EXACT = 1e-6, 1e-6
+
+
+def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
+    """Read the priors of constant errors and noise from the options."""
+    offset_m = max(options.range_offset_sigma_m, _EXACT_M)
+    priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
+    if options.tolerances is not None:
+        # The effects of focal length and squares on the result contain what the scale does not absorb.
+        scale = max(options.tolerances.scale, _EXACT)
+        bow_m = max(options.tolerances.bow_m, _EXACT)
+        priors = replace(priors, scale=scale, bow_m=bow_m, profile_is_claimed=False)
+    return priors, Levels(laser_m=options.laser_bias_sigma_m)

@@ -8,9 +8,10 @@ import numpy as np
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
-from lce_rig.extrinsics.likelihood.calibrate_jointly import what_is_known
-from lce_rig.extrinsics.likelihood.refine import refine
-from lce_rig.extrinsics.options import EstimateSettings, KnownLidar
+from lce_rig.extrinsics.known_lidar import KnownLidar
+from lce_rig.extrinsics.likelihood.levels import what_is_known
+from lce_rig.extrinsics.likelihood.refine import JointEstimate, refine
+from lce_rig.extrinsics.options import EstimateSettings
 from lce_rig.residuals.along_rays import ERRORS_OF_LASER, N_LENS, N_OF_LASER
 
 WIDENED = np.array([1.26, 1.39, 1.0])
@@ -65,23 +66,27 @@ def estimate_lidar(
     ]
     priors, usual = what_is_known(replace(options, known=None))
     joint = refine(apart, board, T_cam_lidar, priors, usual)
-    L = len(joint.rings)
-    cov = joint.cost.covariance()[-len(joint.constants_sigma) :, -len(joint.constants_sigma) :]
-    about_mean = np.eye(L) - 1 / L
-    sigma = np.array(
-        [
-            np.sqrt(np.diag(about_mean @ cov[k * L : (k + 1) * L, k * L : (k + 1) * L] @ about_mean))
-            for k in range(N_OF_LASER)
-        ]
-    )
-    prior = np.array([joint.levels.laser_m, priors.azimuth_rad, priors.elevation_rad])
-    # Lasers that met few boards are known as well as without these sessions.
-    sigma = np.minimum(sigma * WIDENED[:, None], np.maximum(sigma, prior[:, None]))
-    lens = slice(N_OF_LASER * L, N_OF_LASER * L + N_LENS)
+    known, prior = lidar_of(joint), _prior_sigma(joint)
     rings = np.concatenate([o.lidar.ring for own in sessions for o in own])
-    known = KnownLidar(
-        joint.rings.astype(np.intp), joint.lasers, sigma, joint.fields[:N_LENS], joint.constants_sigma[lens]
-    )
     n_points = np.array([np.count_nonzero(rings == ring) for ring in joint.rings])
     assert len(prior) == len(ERRORS_OF_LASER)
     return LidarErrors(known, prior, tuple(len(own) for own in sessions), n_points)
+
+
+def lidar_of(joint: JointEstimate) -> KnownLidar:
+    """Read the LiDAR's constant errors from a joint estimate; a laser's deviations are about the mean."""
+    L = len(joint.rings)
+    cov = joint.cost.covariance()[-len(joint.constants_sigma) :, -len(joint.constants_sigma) :]
+    about_mean = np.eye(L) - 1 / L
+    parts = [cov[k * L : (k + 1) * L, k * L : (k + 1) * L] for k in range(N_OF_LASER)]
+    sigma = np.sqrt([np.diag(about_mean @ part @ about_mean) for part in parts])
+    # Lasers that met few boards are known as well as without them.
+    sigma = np.minimum(sigma * WIDENED[:, None], np.maximum(sigma, _prior_sigma(joint)[:, None]))
+    lens = slice(N_OF_LASER * L, N_OF_LASER * L + N_LENS)
+    rings = joint.rings.astype(np.intp)
+    return KnownLidar(rings, joint.lasers, sigma, joint.fields[:N_LENS], joint.constants_sigma[lens])
+
+
+def _prior_sigma(joint: JointEstimate) -> Array:
+    """Deviations (3,) of a laser's errors about their mean without any boards."""
+    return np.array([joint.levels.laser_m, joint.priors.azimuth_rad, joint.priors.elevation_rad])
