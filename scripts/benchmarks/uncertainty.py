@@ -1,5 +1,6 @@
 """Is the claimed covariance true, and how near is the error to the Cramer-Rao bound of the same captures?"""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -39,6 +40,8 @@ CORNER_SIGMA_PX = 0.1
 # Something found in the scan that lies farther than this from the board is not it.
 _FOUND_M = 0.05
 _FREEDOMS = 6
+# Of a normal distribution.
+_THREE_SIGMAS = 0.9973
 _DISPLACEMENT = SHIFTS[-2:]
 
 
@@ -83,6 +86,13 @@ class BoundedRun(Run):
     bound: Array
 
 
+@dataclass(frozen=True, eq=False)
+class JudgedRun(Run):
+    """With the verdict."""
+
+    verdict: str
+
+
 def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: int = 30) -> None:
     """Tabulate errors, bounds and coverage of the joint estimate, and of every method with profiles in error.
 
@@ -104,13 +114,17 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
 
     print("\nProfiles in error as their standard deviations say\n")
     print_head(
-        "rig", "method", "sessions", "captures", "rms deg / mm", *head.split(", ")[-2:], "95 % regions hold"
-    )
+        "rig", "method", "sessions", "captures", "rms deg / mm", *head.split(", ")[-2:],
+        "95 % regions hold", "beyond 3 sigma", "pass, marginal, fail",
+    )  # fmt: skip
     for case, method in product(PROFILES_IN_ERROR, get_args(Method)):
         if only in case.label:
             own = list(_runs_in_error(case, method, n_seeds, folder, n_captures))
-            size, *others = _claim_cells(own)
-            print_row(case.label, method, len(own), n_captures, size, *others)
+            verdicts = Counter(run.verdict for run in own)
+            counts = ", ".join(str(verdicts[verdict]) for verdict in ("pass", "marginal", "fail"))
+            beyond = sum(nees_of(run) > chi2.ppf(_THREE_SIGMAS, _FREEDOMS) for run in own)
+            cells = (*_claim_cells(own), beyond, counts)
+            print_row(case.label, method, len(own), n_captures, *cells)
 
 
 def _cells(runs: list[BoundedRun]) -> Iterator[str]:
@@ -127,12 +141,17 @@ def _claim_cells(runs: Sequence[Run]) -> Iterator[str]:
     """Say how large the errors are, how large the reported ones, NEES with its interval, and coverage."""
     deg, mm = _rms(runs)
     claimed_deg, claimed_mm = _sizes(np.mean([run.cov for run in runs], axis=0))
-    nees = np.array([run.error @ np.linalg.solve(run.cov, run.error) for run in runs])
+    nees = np.array([nees_of(run) for run in runs])
     low, high = chi2.ppf([0.025, 0.975], _FREEDOMS * len(runs)) / len(runs)
     yield f"{deg:.4f} / {mm:.2f}"
     yield f"{claimed_deg:.4f} / {claimed_mm:.2f}"
     yield f"{nees.mean():.2f} ({low:.2f} to {high:.2f})"
     yield f"{100 * np.mean(nees < chi2.ppf(0.95, _FREEDOMS)):.0f} %"
+
+
+def nees_of(run: Run) -> float:
+    """Compute e^T cov^-1 e, chi square of six freedoms where the claim is true."""
+    return float(run.error @ np.linalg.solve(run.cov, run.error))
 
 
 def _rms(runs: Sequence[Run]) -> tuple[float, float]:
@@ -145,7 +164,9 @@ def _sizes(cov: Array) -> tuple[float, float]:
     return float(np.degrees(np.sqrt(np.trace(cov[3:, 3:])))), float(1e3 * np.sqrt(np.trace(cov[:3, :3])))
 
 
-def _runs_in_error(case: Case, method: Method, n_seeds: int, folder: Path, n_captures: int) -> Iterator[Run]:
+def _runs_in_error(
+    case: Case, method: Method, n_seeds: int, folder: Path, n_captures: int
+) -> Iterator[JudgedRun]:
     """Calibrate sessions as a user would, with profiles whose lens, board and ranges are off."""
     rig = load_rig(case.rig)
     for seed in range(n_seeds):
@@ -153,7 +174,8 @@ def _runs_in_error(case: Case, method: Method, n_seeds: int, folder: Path, n_cap
         profile, found = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
         options = CalibrateOptions(method=method, n_draws=0)
         (calibration,), _ = pipeline.calibrate_detections(profile, found, options)
-        yield Run(difference(calibration.T_cam_lidar, session.T_cam_lidar), calibration.cov)
+        error = difference(calibration.T_cam_lidar, session.T_cam_lidar)
+        yield JudgedRun(error, calibration.cov, calibration.verdict)
 
 
 def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[BoundedRun]:
