@@ -236,10 +236,8 @@ if TYPE_CHECKING:
 @click.option(
     "--draws",
     "n_draws",
-    default=100,
-    show_default=True,
     type=click.IntRange(0, 10_000),
-    help="Set the number of random subsets per size (I in the paper).",
+    help="Set the number of random subsets per size, I in the paper [default: 30; with --method paper 100].",
 )
 def calibrate(
     sessions: tuple[Path, ...],
@@ -256,7 +254,7 @@ def calibrate(
     no_report: bool,
     method: Any,
     seed: int,
-    n_draws: int,
+    n_draws: int | None,
 ) -> None:
     """Estimate the extrinsics between the LiDAR and each camera of SESSION (default: session/).
 

@@ -311,7 +311,7 @@ def calibrate_by_algorithm_1(
     keep = drop_uncertain(features, T_planes) if parts.use_uncertainty else None
     problem, T_planes = _start(features, board, _weights(parts, features, *sigmas), keep)
 
-    draws = draw_subsets(problem, T_planes, options.n_draws, parts.n_rounds, options.seed, progress)
+    draws = draw_subsets(problem, T_planes, options.n_drawn, parts.n_rounds, options.seed, progress)
     # Draws judge the solution and do not choose it, so all begin at the same place.
     solution = problem.solve(np.ones((1, problem.n_captures)), T_planes, parts.n_rounds)
     cost = problem.quadratics(solution.x[0], solution.edge_ids[0], group_placements(fitted))

@@ -39,13 +39,20 @@ class CalibrateOptions:
     Attributes:
         method: "ml" (Algorithm 1, then maximum likelihood of extrinsics, all board poses and the sensors'
             constant errors) or "paper" (Algorithm 1 of LCE-Calib alone).
-        n_draws: I, subsets drawn for each subset size; they judge the result and do not change it.
+        n_draws: I, subsets drawn for each subset size; they judge the result and do not change it. None for
+            what the method usually draws.
         seed: of the draws.
     """
 
     method: Method = DEFAULT_METHOD
-    n_draws: int = 100
+    n_draws: int | None = None
     seed: int = 0
+
+    @property
+    def n_drawn(self) -> int:
+        """I; the paper's 100 for its own method, fewer where Algorithm 1 only gives the start."""
+        usual = 100 if self.method == "paper" else 30
+        return usual if self.n_draws is None else self.n_draws
 
 
 @dataclass(frozen=True)
