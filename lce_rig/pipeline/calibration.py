@@ -480,7 +480,7 @@ def _laser_ranges(rig: Rig, solved: _Solved) -> tuple[tuple[float, ...], tuple[f
     Boards that moved between image and scan would make them up.
     """
     found, sheet = solved.estimate.lidar, rig.lidars[solved.lidar].data_sheet()
-    if found is None or sheet is None or not solved.is_still:
+    if found is None or sheet is None or found.rings.max() >= sheet.n_rings or not solved.is_still:
         return (), ()
     range_m = np.zeros(sheet.n_rings)
     # A laser that met no board is known as well as before.

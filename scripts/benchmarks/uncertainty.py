@@ -19,10 +19,11 @@ from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, difference, invert
 from lce_rig.core.results import Method
 from lce_rig.extrinsics import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.extrinsics.likelihood.end_density import density
 from lce_rig.extrinsics.likelihood.image_terms import stack_images
 from lce_rig.extrinsics.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.extrinsics.likelihood.refine import to_extrinsic
-from lce_rig.extrinsics.likelihood.system import PER_CAMERA, State, Terms, assemble, density, linearise
+from lce_rig.extrinsics.likelihood.system import PER_CAMERA, State, Terms, assemble, linearise
 from lce_rig.extrinsics.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.residuals.along_rays import (
     N_FIELDS,

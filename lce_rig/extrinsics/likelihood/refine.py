@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation
+from lce_rig.extrinsics.likelihood.fit_levels import fit_levels
 from lce_rig.extrinsics.likelihood.image_terms import StackedImages, stack_images
-from lce_rig.extrinsics.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, PoseLevels, Priors
+from lce_rig.extrinsics.likelihood.levels import NO_LASER_M, Levels, PoseLevels, Priors
+from lce_rig.extrinsics.likelihood.settle import Point, Problem
 from lce_rig.extrinsics.likelihood.system import (
     PER_CAMERA,
     Assembly,
-    Reduced,
     State,
     Terms,
     assemble,
@@ -32,7 +33,6 @@ from lce_rig.residuals.along_rays import (
     N_FIELDS,
     N_OF_LASER,
     N_SHIFTS,
-    StackedScans,
     interior,
     lens_fields,
     stack_scans,
@@ -40,77 +40,6 @@ from lce_rig.residuals.along_rays import (
 from lce_rig.residuals.placements import group_placements, group_shared_placements
 from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.solvers.covariance import symmetric_inverse
-
-# Noise levels from the data: those of maximum likelihood.
-#
-# All unknowns are integrated out (restricted maximum likelihood), so that residuals reduced by the fit are
-# not mistaken for small noise. The terms stay linearised: an evaluation involves small matrices only, no
-# points.
-
-# Levels lie within these factors of the typical value, e^-4.6 and e^3.
-_BELOW, _ABOVE = -4.6, 3.0
-
-
-def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rounds: int) -> Levels:
-    """Find the levels that minimise -2 ln p(data | levels) - 2 ln p(levels).
-
-    Args:
-        terms: linearised near the optimum.
-        start: levels to start from.
-        usual: centre of their prior; lasers without offsets there have none.
-        priors: of the constants.
-        n_rounds: of the search, at most.
-    """
-    from scipy.optimize import minimize
-
-    names = [name for name in LOG_SIGMA if name != "laser_m" or usual.laser_m > NO_LASER_M]
-    sigma = np.array([LOG_SIGMA[name] for name in names])
-    middle = _logs(usual, names)
-    assembly = Assembly(terms, priors)
-    # Thousands of ranges and a few captures determine one level each: without a scale, the search zigzags.
-    n_told = _count_measurements(terms, start)
-    scale = np.sqrt(4 * np.array([n_told[name] for name in names]) + 2 / sigma**2)
-
-    def levels_at(x: Array) -> Levels:
-        return replace(usual, **dict(zip(names, np.exp(x / scale).tolist(), strict=True)))
-
-    def cost(x: Array) -> tuple[float, Array]:
-        evidence, slopes = assembly.evidence(levels_at(x), names)
-        off = (x / scale - middle) / sigma
-        return evidence + float(off @ off), (slopes + 2 * off / sigma) / scale
-
-    highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _ABOVE)
-    bounds = list(zip((middle + _BELOW) * scale, highest * scale, strict=True))
-    options = {"maxiter": n_rounds, "ftol": 1e-6}
-    first = _logs(start, names) * scale
-    found = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return levels_at(found.x)
-
-
-def _count_measurements(terms: Terms, levels: Levels) -> dict[str, float]:
-    """Count, roughly, the measurements that tell of each level: n tell its logarithm to 1 / (2 n)^1/2."""
-    n_returns = terms.ranges.n_returns
-    n_ends, n_backed = len(terms.edges.rows), np.count_nonzero(terms.edges.is_backed)
-    n_images = sum(len(images.capture) for images in terms.images)
-    return {
-        "range_m": float(n_returns.sum()),
-        "ring_m": float(np.count_nonzero(n_returns)),
-        # Only ring ends near the ends of their intervals show how blurred these are.
-        "edge_rad": 0.3 * (n_ends - n_backed),
-        "backed_rad": 0.3 * n_backed,
-        "lost_share": 0.5 * levels.lost_share * n_ends,
-        "own_shift_m": 0.3 * len(terms.own_shift_m),
-        "tilt_rad": 2.0 * n_images,
-        "spin_rad": 0.5 * n_images,
-        "depth_m": float(n_images),
-        "across_m": 2.0 * n_images,
-        "laser_m": float(terms.n_rings),
-    }
-
-
-def _logs(levels: Levels, names: list[str]) -> Array:
-    return np.log([getattr(levels, name) for name in names])
-
 
 # Steps between changes of the levels, and their maximum at the end.
 _STEPS, _LAST_STEPS = 3, 20
@@ -202,13 +131,13 @@ def refine(
         np.zeros(len(order)),
         np.zeros(PER_CAMERA * len(cameras) + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS),
     )
-    problem = _Problem(scans, images, board, priors)
+    problem = Problem(scans, images, board, priors)
     placement = group_shared_placements(cameras, order)
     now, here = levels or usual, problem.at(state, np.ones(len(order)))
     for blur_rad in _BLURS_RAD:
-        here = problem.settle(here, now.blurred(blur_rad))
+        here = problem.settle(here, now.blurred(blur_rad), _STEPS, _NEAR)
     for n_rounds in _LEVEL_ROUNDS if levels is None else ():
-        here = problem.settle(here, now)
+        here = problem.settle(here, now, _STEPS, _NEAR)
         now = fit_levels(here.terms, now, usual, priors, n_rounds)
         here = here.trusting(trust_captures(here, now, priors, placement))
     here = problem.settle(here, now, _LAST_STEPS, _SETTLED)
@@ -219,7 +148,7 @@ def refine(
 _HUBER = 1.5
 
 
-def trust_captures(here: "_Point", levels: Levels, priors: Priors, placement: NDArray[np.intp]) -> Array:
+def trust_captures(here: "Point", levels: Levels, priors: Priors, placement: NDArray[np.intp]) -> Array:
     """Weigh captures (F,) by how far the extrinsics move without them, compared with what noise explains.
 
     Without placement k the unknowns move by m_k = (H - H_k)^-1 g_k, with the covariance (H - H_k)^-1 - H^-1.
@@ -245,83 +174,6 @@ def trust_captures(here: "_Point", levels: Levels, priors: Priors, placement: ND
     expected = np.einsum("ij,gji->g", precision, spread)
     z = np.sqrt(squares / np.maximum(expected, np.finfo(float).tiny))
     return np.asarray(np.minimum(1.0, _HUBER / np.maximum(z, _HUBER))[placement])
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """A state, and all terms there."""
-
-    state: State
-    terms: Terms
-
-    def trusting(self, trust: Array) -> "_Point":
-        """Weigh captures by (F,)."""
-        return replace(self, terms=replace(self.terms, trust=trust))
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Constants of the optimisation."""
-
-    scans: StackedScans
-    images: tuple[StackedImages, ...]
-    board: Board
-    priors: Priors
-
-    def at(self, state: State, trust: Array) -> _Point:
-        return _Point(state, linearise(self.scans, self.images, self.board, state, trust))
-
-    def settle(self, here: _Point, levels: Levels, n_steps: int = _STEPS, short: float = _NEAR) -> _Point:
-        """Find the optimum at given levels, in at most so many steps, until the next one is short."""
-        mixing = _Mixing()
-        for _ in range(n_steps):
-            reduced = assemble(here.terms, levels, self.priors)
-            z, y = reduced.step()
-            if -reduced.gradient @ z < short**2:
-                break
-            z, y = mixing.mix(z, y, reduced)
-            here = self.at(here.state.moved(z, y), here.terms.trust)
-        return here
-
-
-# Plain steps before any are mixed, and how many are.
-_PLAIN, _MIXED = 3, 5
-# A mixed step is at most so many times as long as the plain one.
-_LONGEST = 5.0
-
-
-class _Mixing:
-    """Corrects steps by how earlier ones turned out (Anderson mixing).
-
-    The mean information of ring ends is not the curvature of their cost: plain steps are a fifth of what
-    they should be in some directions, and leap back and forth in others. From steps s_k and moves m_k,
-
-        m = s - (dM + dS) gamma,    gamma = argmin |s - dS gamma|, in standard deviations of the unknowns
-
-    References:
-        Walker, Ni, "Anderson acceleration for fixed-point iterations", SIAM J. Numerical Analysis, 2011.
-    """
-
-    def __init__(self) -> None:
-        self._steps: list[Array] = []
-        self._moves: list[Array] = []
-
-    def mix(self, z: Array, y: Array, reduced: Reduced) -> tuple[Array, Array]:
-        """Return the move for a step z (G,), y (F, 7)."""
-        step = np.append(z, y)
-        move = step
-        self._steps.append(step)
-        if len(self._steps) > _PLAIN:
-            of_own = np.diagonal(reduced.of_own, axis1=1, axis2=2)
-            weight = np.sqrt(np.append(np.diag(reduced.cost.information), of_own))
-            dS = np.diff(self._steps[-_MIXED - 1 :], axis=0).T
-            dM = np.transpose(self._moves[-dS.shape[1] :])
-            gamma = np.linalg.lstsq(weight[:, None] * dS, weight * step, rcond=1e-6)[0]
-            move = step - (dM + dS) @ gamma
-            length, plain = (float(np.linalg.norm(weight * each)) for each in (move, step))
-            move = move * min(1.0, _LONGEST * plain / max(length, np.finfo(float).tiny))
-        self._moves.append(move)
-        return move[: len(z)], move[len(z) :].reshape(y.shape)
 
 
 def _stack_images(observations: Sequence[Observation], order: dict[str, int], board: Board) -> StackedImages:
@@ -358,7 +210,7 @@ def _to_extrinsics(state: State) -> Array:
     return np.concatenate([to_extrinsic(T[c], c, len(state.constants)) for c in range(len(T))])
 
 
-def _summarise(here: _Point, levels: Levels, priors: Priors, rings: NDArray[np.int16]) -> JointEstimate:
+def _summarise(here: Point, levels: Levels, priors: Priors, rings: NDArray[np.int16]) -> JointEstimate:
     state, cost = here.state, assemble(here.terms, levels, priors).cost
     C, constants = len(state.T_cam_lidar), state.constants
     scatter, of_constants = _covariance_parts(cost, priors, C)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lce_rig.extrinsics.likelihood.system import density, information
+from lce_rig.extrinsics.likelihood.end_density import density, information
 
 LOST = 0.07
 CASES = [(0.03, LOST), (0.2, LOST), (0.6, 0.3), (2.0, LOST), (10.0, 0.3), (100.0, LOST)]
