@@ -157,7 +157,7 @@ def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
     """List T_cam_board (F, 4, 4) and their covariances (F, 6, 6)."""
     images = [observation.image for observation in observations]
     every = np.arange(len(images), dtype=np.intp)
-    stacked = stack_images(every, images, np.ones(len(images)))
+    stacked = stack_images(every, images)
     return stacked.T_cam_board, stacked.total_cov(Levels().pose)
 
 

@@ -226,7 +226,7 @@ def _at_truth(rig: Rig, session: StillSession) -> Terms:
     found = [item for item in session.candidates if is_board(session, item)]
     board = rig.board.to_board()
     scans = stack_scans([interior(item.lidar[0], board) for item in found], board)
-    pictures = stack_images(np.arange(len(found)), [item.image for item in found], np.ones(len(found)), board)
+    pictures = stack_images(np.arange(len(found)), [item.image for item in found], board)
     T = session.T_cam_lidar
     T_lidar_board = invert(T) @ np.array([session.T_cam_board[item.capture] for item in found])
     constants = np.zeros(PER_CAMERA + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)

@@ -13,21 +13,21 @@ def listed(lce_rig, session):
 
 @pytest.fixture
 def two_results(lce_rig, calibrated):
-    """The current result by Algorithm 1, and one by maximum likelihood, named ml."""
-    assert lce_rig("calibrate", calibrated, "--method", "ml", "--name", "ml").code == 0
+    """The current result by maximum likelihood, and one by Algorithm 1, named paper."""
+    assert lce_rig("calibrate", calibrated, "--method", "paper", "--name", "paper").code == 0
     return calibrated
 
 
 def test_a_named_result_leaves_the_current_one_alone(lce_rig, calibrated):
     before = {file.name: file.read_bytes() for file in (calibrated / "calibration").iterdir()}
-    assert lce_rig("calibrate", calibrated, "--method", "ml", "--name", "ml").code == 0
+    assert lce_rig("calibrate", calibrated, "--method", "paper", "--name", "paper").code == 0
     assert {file.name: file.read_bytes() for file in (calibrated / "calibration").iterdir()} == before
-    assert (calibrated / "results" / "ml" / "extrinsics.yaml").exists()
+    assert (calibrated / "results" / "paper" / "extrinsics.yaml").exists()
     found = listed(lce_rig, calibrated)
-    assert list(found) == ["current", "ml"]
-    assert (found["current"]["pairs"][0]["method"], found["ml"]["pairs"][0]["method"]) == ("paper", "ml")
-    saved = json.loads((calibrated / "results" / "ml" / "result.json").read_text())["pairs"][0]
-    assert found["ml"]["pairs"][0]["sigma_rotation_deg"] == saved["sigma_rotation_deg"]
+    assert list(found) == ["current", "paper"]
+    assert (found["current"]["pairs"][0]["method"], found["paper"]["pairs"][0]["method"]) == ("ml", "paper")
+    saved = json.loads((calibrated / "results" / "paper" / "result.json").read_text())["pairs"][0]
+    assert found["paper"]["pairs"][0]["sigma_rotation_deg"] == saved["sigma_rotation_deg"]
 
 
 def test_results_of_one_session_are_compared_with_a_bound_that_holds_for_any_correlation(
@@ -36,11 +36,11 @@ def test_results_of_one_session_are_compared_with_a_bound_that_holds_for_any_cor
     outcome = lce_rig("repeat", two_results, "--json")
     assert outcome.code == 0, outcome.err
     (pair,) = json.loads(outcome.out)["pairs"]
-    assert pair["sessions"] == ["current", "ml"] and not pair["are_independent"] and pair["agrees"]
+    assert pair["sessions"] == ["current", "paper"] and not pair["are_independent"] and pair["agrees"]
     assert pair["finding"]["code"] == "results.agree"
     T = [
         np.array(json.loads((two_results / folder / "result.json").read_text())["pairs"][0]["T_cam_lidar"])
-        for folder in ("calibration", "results/ml")
+        for folder in ("calibration", "results/paper")
     ]
     turn = T[0][:3, :3] @ T[1][:3, :3].T
     angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
@@ -48,7 +48,7 @@ def test_results_of_one_session_are_compared_with_a_bound_that_holds_for_any_cor
 
 
 def test_results_that_contradict_each_other_exit_with_7(lce_rig, two_results):
-    path = two_results / "results" / "ml" / "result.json"
+    path = two_results / "results" / "paper" / "result.json"
     document = json.loads(path.read_text())
     document["pairs"][0]["T_cam_lidar"][0][3] += 0.3
     path.write_text(json.dumps(document))
@@ -58,10 +58,10 @@ def test_results_that_contradict_each_other_exit_with_7(lce_rig, two_results):
 
 
 def test_a_result_whose_captures_are_gone_is_called_outdated(lce_rig, two_results):
-    used = json.loads((two_results / "results/ml/result.json").read_text())["pairs"][0]["captures_used"]
-    assert not listed(lce_rig, two_results)["ml"]["is_outdated"]
+    used = json.loads((two_results / "results/paper/result.json").read_text())["pairs"][0]["captures_used"]
+    assert not listed(lce_rig, two_results)["paper"]["is_outdated"]
     assert lce_rig("captures", two_results, "--reject", used[0]).code == 0
-    assert listed(lce_rig, two_results)["ml"]["is_outdated"]
+    assert listed(lce_rig, two_results)["paper"]["is_outdated"]
     codes = [each["code"] for each in json.loads(lce_rig("repeat", two_results, "--json").out)["findings"]]
     assert "results.outdated" in codes
 
@@ -75,16 +75,16 @@ def test_a_name_that_cannot_be_one_is_refused_before_anything_is_written(lce_rig
 
 def test_one_result_has_nothing_to_be_compared_with(lce_rig, calibrated):
     assert lce_rig("repeat", calibrated).code == 2
-    assert lce_rig("repeat", calibrated, "--name", "ml", "--name", "current").code == 4
+    assert lce_rig("repeat", calibrated, "--name", "paper", "--name", "current").code == 4
 
 
 def test_overlays_are_drawn_beside_a_named_result_and_again_when_it_changes(lce_rig, two_results):
-    folder = two_results / "results" / "ml" / "overlays"
-    assert lce_rig("verify", two_results, "--name", "ml").code == 0
+    folder = two_results / "results" / "paper" / "overlays"
+    assert lce_rig("verify", two_results, "--name", "paper").code == 0
     drawn = {path.name: path.read_bytes() for path in folder.iterdir()}
     used = json.loads((folder.parent / "result.json").read_text())["pairs"][0]["captures_used"]
     assert lce_rig("captures", two_results, "--reject", used[0]).code == 0
-    assert lce_rig("calibrate", two_results, "--method", "ml", "--name", "ml").code == 0
+    assert lce_rig("calibrate", two_results, "--method", "paper", "--name", "paper").code == 0
     again = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert f"{used[0]}.png" in drawn and f"{used[0]}.png" not in again
     assert len(again) == len(drawn) - 1
@@ -93,21 +93,25 @@ def test_overlays_are_drawn_beside_a_named_result_and_again_when_it_changes(lce_
 
 
 def test_an_unreadable_result_is_listed_as_such(lce_rig, two_results):
-    (two_results / "results" / "ml" / "result.json").write_text("{")
+    (two_results / "results" / "paper" / "result.json").write_text("{")
     outcome = lce_rig("results", two_results)
-    assert outcome.code == 0 and "ml" in outcome.out
-    assert listed(lce_rig, two_results)["ml"]["problem"]
+    assert outcome.code == 0 and "paper" in outcome.out
+    assert listed(lce_rig, two_results)["paper"]["problem"]
 
 
 def test_the_result_before_a_named_one_is_listed_and_drawn(lce_rig, two_results):
-    assert lce_rig("calibrate", two_results, "--method", "ml", "--seed", "9", "--name", "ml").code == 0
-    used = json.loads((two_results / "results/ml/result.json").read_text())["pairs"][0]["captures_used"]
+    assert lce_rig("calibrate", two_results, "--method", "paper", "--seed", "9", "--name", "paper").code == 0
+    used = json.loads((two_results / "results/paper/result.json").read_text())["pairs"][0]["captures_used"]
     assert lce_rig("captures", two_results, "--reject", used[0]).code == 0
-    assert lce_rig("calibrate", two_results, "--method", "ml", "--name", "ml").code == 0
+    assert lce_rig("calibrate", two_results, "--method", "paper", "--name", "paper").code == 0
     found = listed(lce_rig, two_results)
-    assert "ml/previous" in found and found["ml/previous"]["is_outdated"] and not found["ml"]["is_outdated"]
+    assert (
+        "paper/previous" in found
+        and found["paper/previous"]["is_outdated"]
+        and not found["paper"]["is_outdated"]
+    )
     assert lce_rig("verify", two_results, "--name", "nope").code == 4
-    assert lce_rig("calibrate", two_results, "--name", "ml/previous").code == 2
+    assert lce_rig("calibrate", two_results, "--name", "paper/previous").code == 2
 
 
 def test_overlays_are_drawn_again_after_a_run_that_was_killed_before_it_could(lce_rig, calibrated):

@@ -10,7 +10,7 @@ from lce_rig.core.results import Observation
 from lce_rig.extrinsics import EstimateSettings, capture_residual, fit_extrinsic
 from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, simulate
 
-OPTIONS = EstimateSettings(n_draws=0)
+OPTIONS = EstimateSettings("paper", n_draws=0)
 NAMES = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
 
 

@@ -17,7 +17,7 @@ from lce_rig.extrinsics import (
 from lce_rig.residuals.features import FeatureSettings
 from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, simulate
 
-FAST = EstimateSettings(n_draws=3)
+FAST = EstimateSettings("paper", n_draws=3)
 
 
 def errors_over_seeds(scenario, n_captures, n_seeds, options=FAST):

@@ -11,7 +11,7 @@ from lce_rig.extrinsics.board_motion import deskew, fit_motions, sample_poses
 from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board
 from tests.extrinsics.moving_boards import Moving, simulate_moving, skew
 
-OPTIONS = EstimateSettings(n_draws=0)
+OPTIONS = EstimateSettings("paper", n_draws=0)
 TRACKED = Moving(tracked=("events",))
 
 

@@ -3,15 +3,18 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from lce_rig.extrinsics import EstimateSettings, fit_extrinsic
+from lce_rig.extrinsics.methods import METHODS
 from tests.extrinsics.boards import BOARD, simulate
 
 
-def test_the_same_placements_captured_again_claim_no_smaller_sigma():
+@pytest.mark.parametrize("method", METHODS)
+def test_the_same_placements_captured_again_claim_no_smaller_sigma(method):
     once = simulate(14, seed=4)
     again = [replace(item, capture=f"1{item.capture[1:]}") for item in once]
-    options = EstimateSettings(n_draws=1)
+    options = EstimateSettings(method, n_draws=1)
     single, double = (
         fit_extrinsic(once, BOARD, options),
         fit_extrinsic([*once, *again], BOARD, options),

@@ -13,7 +13,7 @@ from lce_rig.residuals.features import FeatureSettings, extract_features
 from lce_rig.residuals.moments import Problem, Weights
 from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, simulate
 
-NO_DRAWS = EstimateSettings(n_draws=0)
+NO_DRAWS = EstimateSettings("paper", n_draws=0)
 LASER_SIGMA_M, OFFSET_SIGMA_M = 0.008, 0.005
 RINGS = np.arange(16, dtype=np.int16)
 

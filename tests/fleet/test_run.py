@@ -79,8 +79,8 @@ def test_what_is_done_is_not_done_again(fleet_root, tmp_path, client):
     changed, _ = run(fleet_root, place, client)
     assert (changed.n_new, changed.n_held) == (1, 1)
     assert len(changed.table) == len(registry.folders()) == 2
-    other, _ = run(fleet_root, place, client, method="ml")
-    assert (other.n_new, set(other.table["method"].to_pylist())) == (2, {"ml"})
+    other, _ = run(fleet_root, place, client, method="paper")
+    assert (other.n_new, set(other.table["method"].to_pylist())) == (2, {"paper"})
 
 
 def test_limits_end_a_session_and_no_other(fleet_root, tmp_path):

@@ -16,7 +16,7 @@ def systematic_sigma_m(*lines: str) -> float:
     images = {item.capture: item.image for item in captures}
     scans = {item.capture: list(item.lidar) for item in captures}
     detections = Detections({("cam", "frames"): images}, {"lidar": scans})
-    (calibration,), _ = pipeline.calibrate_detections(rig, detections, CalibrateOptions(n_draws=0))
+    (calibration,), _ = pipeline.calibrate_detections(rig, detections, CalibrateOptions("paper", n_draws=0))
     return calibration.diagnostics.sigma_systematic_translation_m
 
 

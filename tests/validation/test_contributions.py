@@ -20,7 +20,7 @@ RIG = load_rig("rlfs")
 def validated(lens=CAMERA, board=BOARD, seed=1):
     """Calibrate 20 captures with a profile's lens and board, and check the result."""
     captures = as_profiled(simulate(20, seed, REAL), lens, board)
-    settings = replace(SETTINGS, tolerances=replace(KNOWN, lens=lens))
+    settings = replace(SETTINGS, method="paper", tolerances=replace(KNOWN, lens=lens))
     estimate = fit_extrinsic(captures, board, settings)
     views = [BoardView(item.capture, "frames", item.image) for item in captures]
     of_board = RIG.board.model_copy(update={"square_m": board.square_m})

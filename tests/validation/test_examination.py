@@ -18,7 +18,7 @@ from tests.extrinsics.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
 RIG = load_rig("rlfs")
 LIMITS, TARGET = VerdictSettings(), CalibrationSettings()
-FAST = EstimateSettings(n_draws=0)
+FAST = EstimateSettings("paper", n_draws=0)
 # Any method's result lies about as far from the truth.
 T_NEAR = perturb(T_FORWARD, np.array([0.003, -0.002, 0.004, 0.001, -0.001, 0.001]))
 

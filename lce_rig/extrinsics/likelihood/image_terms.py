@@ -51,16 +51,12 @@ class StackedImages:
         return replace(self, shapes=shapes)
 
 
-def stack_images(
-    capture: Indices, images: Sequence[ImageBoard], n_repeats: Array, board: Board | None = None
-) -> StackedImages:
+def stack_images(capture: Indices, images: Sequence[ImageBoard], board: Board | None = None) -> StackedImages:
     """Stack the images of one camera.
 
     Args:
         capture: (P,) which of the stacked captures they belong to.
         images: P of them.
-        n_repeats: (P,) images that show the board in the same place: they share the error Q, and count
-            together as one.
         board: its corners and size; without it, no plate is bent.
     """
     T = np.array([image.T_cam_board for image in images])
@@ -75,7 +71,7 @@ def stack_images(
         T,
         cov,
         np.zeros((len(T), 6, N_BOW)) if board is None else _by_bow(T, board),
-        {name: n_repeats[:, None, None] * shape for name, shape in shapes.items()},
+        shapes,
     )
 
 

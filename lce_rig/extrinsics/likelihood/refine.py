@@ -37,7 +37,7 @@ from lce_rig.residuals.along_rays import (
     lens_fields,
     stack_scans,
 )
-from lce_rig.residuals.placements import group_placements, group_shared_placements
+from lce_rig.residuals.placements import group_shared_placements
 from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.solvers.covariance import symmetric_inverse
 
@@ -133,7 +133,7 @@ def refine(
     )
     problem = Problem(scans, images, board, priors)
     placement = group_shared_placements(cameras, order)
-    now, here = levels or usual, problem.at(state, np.ones(len(order)))
+    now, here = levels or usual, problem.at(state, _once(placement))
     for blur_rad in _BLURS_RAD:
         here = problem.settle(here, now.blurred(blur_rad), _STEPS, _NEAR)
     for n_rounds in _LEVEL_ROUNDS if levels is None else ():
@@ -156,13 +156,16 @@ def trust_captures(here: "Point", levels: Levels, priors: Priors, placement: NDA
 
         z^2 = m_k^T J^T C^-1 J m_k / tr(C^-1 J ((H - H_k)^-1 - H^-1) J^T),    weight min(1, 1.5 / z)
 
+    shared by the captures of the placement.
+
     Pose errors of recorded images have longer tails than normal ones: on two recordings, one capture of 18
     and one of 27 moved the result by three and five times what noise explains, the next one by less than two.
 
     References:
         Huber, "Robust Statistics", 1981.
     """
-    terms = here.trusting(np.ones(len(placement))).terms
+    once = _once(placement)
+    terms = here.trusting(once).terms
     cost = replace(assemble(terms, levels, priors).cost, placement=placement)
     J = _to_extrinsics(here.state)
     H, own = cost.information, np.tensordot(cost.groups, cost.hessians, axes=1)
@@ -173,14 +176,17 @@ def trust_captures(here: "Point", levels: Levels, priors: Priors, placement: NDA
     squares = np.einsum("gi,ij,gj->g", moves, precision, moves)
     expected = np.einsum("ij,gji->g", precision, spread)
     z = np.sqrt(squares / np.maximum(expected, np.finfo(float).tiny))
-    return np.asarray(np.minimum(1.0, _HUBER / np.maximum(z, _HUBER))[placement])
+    return np.asarray(once * (_HUBER / np.maximum(z, _HUBER))[placement])
+
+
+def _once(placement: NDArray[np.intp]) -> Array:
+    """Weigh captures (F,) so that those of one placement, whose errors are the same, count as one."""
+    return np.asarray(1 / np.bincount(placement)[placement])
 
 
 def _stack_images(observations: Sequence[Observation], order: dict[str, int], board: Board) -> StackedImages:
-    placement = group_placements(observations)
     capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
-    n_repeats = np.bincount(placement)[placement].astype(np.float64)
-    return stack_images(capture, [o.image for o in observations], n_repeats, board)
+    return stack_images(capture, [o.image for o in observations], board)
 
 
 def to_extrinsic(T_cam_lidar: Array, camera: int, n_unknowns: int) -> Array:

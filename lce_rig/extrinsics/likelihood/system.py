@@ -161,12 +161,14 @@ class Reduced:
         cost: of F captures in z, at the constants' present values.
         own_steps: (F, 7, G + 1), y = -own_steps [z; 1].
         of_own: (F, 7, 7) information of the captures' own unknowns alone.
+        trust: (F,) weight of each capture.
         minus_2_log_evidence: -2 ln p(data | levels) up to a constant, all unknowns integrated out.
     """
 
     cost: Quadratics
     own_steps: Array
     of_own: Array
+    trust: Array
     minus_2_log_evidence: float
 
     @cached_property
@@ -181,14 +183,17 @@ class Reduced:
         return z, -self.own_steps @ np.append(z, 1.0)
 
     def second_moments(self) -> Array:
-        """Compute the mean (F, 7 + G + 1, 7 + G + 1) of v v^T, v = [y, z, 1], given the data."""
+        """Compute the mean (F, 7 + G + 1, 7 + G + 1) of v v^T, v = [y, z, 1], given the data.
+
+        A capture of weight w counts as w captures, each with the covariance of y that one of full weight has.
+        """
         z, y = self.step()
         F, G = len(y), len(z)
         by_z = np.concatenate([-self.own_steps[:, :, :G], np.broadcast_to(np.eye(G), (F, G, G))], axis=1)
         v = np.column_stack([y, np.broadcast_to(np.append(z, 1.0), (F, G + 1))])
         found = v[:, :, None] * v[:, None, :]
         found[:, :-1, :-1] += by_z @ np.linalg.inv(self.cost.information) @ np.swapaxes(by_z, 1, 2)
-        found[:, :PER_CAPTURE, :PER_CAPTURE] += np.linalg.inv(self.of_own)
+        found[:, :PER_CAPTURE, :PER_CAPTURE] += self.trust[:, None, None] * np.linalg.inv(self.of_own)
         return np.asarray(found)
 
 
@@ -237,7 +242,7 @@ class Assembly:
             self._terms,
             levels,
             self._priors,
-            range_volume + picture_volume + own_volume,
+            float(self._terms.trust @ (range_volume + picture_volume + own_volume)),
         )
 
     def evidence(self, levels: Levels, names: Sequence[str]) -> tuple[float, Array]:
@@ -268,17 +273,17 @@ class Assembly:
             there = replace(levels, **{name: getattr(levels, name) * np.exp(_LOG_STEP)})
             if name in ("range_m", "ring_m"):
                 moved, volume = _range_block(terms, there.range_m, there.ring_m)
-                return float(np.vdot(own, moved - block)) + volume - range_volume
+                return float(np.vdot(own, moved - block) + terms.trust @ (volume - range_volume))
             if name in PoseLevels._fields:
                 moved, volume = _image_block(terms, there.pose)
-                return float(np.vdot(own, moved - pictures)) + volume - picture_volume
+                return float(np.vdot(own, moved - pictures) + terms.trust @ (volume - picture_volume))
             if name == "own_shift_m":
                 moved, volume = _own_block(terms, there.own_shift_m)
                 before, own_volume = _own_block(terms, levels.own_shift_m)
-                return float(np.vdot(own, moved - before)) + volume - own_volume
+                return float(np.vdot(own, moved - before) + terms.trust @ (volume - own_volume))
             if name == "laser_m":
-                moved, _, volume = _prior(terms, there, self._priors)
-                return float(np.vdot(of_constants, moved - prior)) + volume - prior_volume
+                moved, _, log_volume = _prior(terms, there, self._priors)
+                return float(np.vdot(of_constants, moved - prior)) + log_volume - prior_volume
             return of_ends(there) - of_ends(levels)
 
         slopes = np.array([change(name) for name in names]) / _LOG_STEP
@@ -310,15 +315,15 @@ def _end_costs(terms: Terms, moments: Array) -> Callable[[Levels], float]:
     return cost
 
 
-def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, float]:
-    """Weight the returns' terms, and sum the log determinants of their covariances."""
+def _range_block(terms: Terms, range_m: float, ring_m: float) -> tuple[Array, Array]:
+    """Weight the returns' terms; also the log determinants (F,) of their covariances."""
     block = _no_block(terms)
     weighted, log_volumes = weigh_ranges(terms.ranges, range_m, ring_m)
     place = np.r_[
         0:6, PER_CAPTURE + PER_CAMERA * len(terms.images) : block.shape[1] - 1 - N_SHIFTS, block.shape[1] - 1
     ]
     block[:, place[:, None], place] = range_system(terms.ranges, weighted)
-    return block, float(log_volumes.sum())
+    return block, log_volumes
 
 
 def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: float) -> Array:
@@ -333,18 +338,18 @@ def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: fl
     return block
 
 
-def _own_block(terms: Terms, own_shift_m: float) -> tuple[Array, float]:
-    """Build what is known of the captures' own shifts, and the log of its covariance's determinant."""
+def _own_block(terms: Terms, own_shift_m: float) -> tuple[Array, Array]:
+    """Build what is known of the captures' own shifts; also the logs (F,) of its covariances."""
     block, precision = _no_block(terms), own_shift_m**-2
     block[:, _OWN_SHIFT, _OWN_SHIFT] = precision
     block[:, _OWN_SHIFT, -1] = block[:, -1, _OWN_SHIFT] = precision * terms.own_shift_m
     block[:, -1, -1] = precision * terms.own_shift_m**2
-    return block, 2 * len(block) * float(np.log(own_shift_m))
+    return block, np.full(len(block), 2 * np.log(own_shift_m))
 
 
-def _image_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
-    """Weight the images' terms, and sum the log determinants of their covariances."""
-    block, log_volume = _no_block(terms), 0.0
+def _image_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, Array]:
+    """Weight the images' terms; also the log determinants (F,) of their covariances."""
+    block, log_volumes = _no_block(terms), np.zeros_like(terms.trust)
     for c, (images, rows) in enumerate(zip(terms.images, terms.image_rows, strict=True)):
         cov = images.total_cov(pose_levels)
         own = PER_CAPTURE + PER_CAMERA * c
@@ -353,8 +358,8 @@ def _image_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, float]:
         place = np.r_[own : own + 6, 0:6, own + 6, bows, last]
         products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
         block[images.capture[:, None, None], place[:, None], place] += products
-        log_volume += float(np.linalg.slogdet(cov)[1].sum())
-    return block, log_volume
+        log_volumes[images.capture] += np.linalg.slogdet(cov)[1]
+    return block, log_volumes
 
 
 def _no_block(terms: Terms) -> Array:
@@ -376,9 +381,9 @@ def _eliminate(M: Array, terms: Terms, levels: Levels, priors: Priors, log_volum
     information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
     least = costs.sum() + off @ summed.prior_gradient
     least -= gradient @ np.linalg.solve(information, gradient)
-    log_volume += np.linalg.slogdet(of_own)[1].sum() + np.linalg.slogdet(information)[1]
+    log_volume += float(terms.trust @ np.linalg.slogdet(of_own)[1] + np.linalg.slogdet(information)[1])
     evidence = float(least + log_volume + log_prior_volume)
-    return Reduced(summed, np.asarray(steps), of_own, evidence)
+    return Reduced(summed, np.asarray(steps), of_own, terms.trust, evidence)
 
 
 def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, float]:

@@ -61,7 +61,7 @@ def scans(observations):
 
 @pytest.fixture(scope="module")
 def images(observations):
-    return stack_images(np.arange(4), [o.image for o in observations], np.ones(4), BOARD)
+    return stack_images(np.arange(4), [o.image for o in observations], BOARD)
 
 
 @pytest.fixture(scope="module")
