@@ -44,6 +44,8 @@ _FREEDOMS = 6
 # Of a normal distribution.
 _THREE_SIGMAS = 0.9973
 _DISPLACEMENT = SHIFTS[-2:]
+# Logarithms of simulated levels lie so near to those of recordings.
+_WITHIN = 1.5
 
 
 @dataclass(frozen=True)
@@ -267,5 +269,8 @@ def _fit_ends(edges: Sequence[EdgeRows]) -> dict[str, float]:
     names = ("edge_rad", "lost_share", "backed_rad")
     width_mm = -1e3 * float(np.median(rows[:, -1]))
     start = [width_mm, *np.zeros(n - 1), *(np.log(getattr(usual, name)) for name in names)]
-    found = minimize(cost, start, method="L-BFGS-B").x[n:]
+    # A sharper density is flat where it is not zero: the search must not end there.
+    levels = start[n:]
+    bounds = [(None, None)] * n + [(level - _WITHIN, level + _WITHIN) for level in levels]
+    found = minimize(cost, start, method="L-BFGS-B", bounds=bounds).x[n:]
     return dict(zip(names, np.exp(np.minimum(found, [np.inf, np.log(MOST_LOST), np.inf])), strict=True))
