@@ -38,3 +38,10 @@ def test_every_image_is_shown_somewhere_and_all_are_small():
     images = {path.resolve() for path in (DOCS / "images").iterdir()}
     assert images <= {target for page in pages() for target in links(page)}
     assert sum(path.stat().st_size for path in images) < _IMAGES_BYTES
+
+
+def test_no_page_holds_the_marks_of_a_merge():
+    torn = [
+        page.name for page in pages() if re.search(r"^(<<<<<<<|=======$|>>>>>>>)", page.read_text(), re.M)
+    ]
+    assert not torn
