@@ -57,12 +57,14 @@ def _format(value: Any, spec: str, more: int = 0) -> str:
     """Format a figure; {rms_m:mm}, {tilt_deg:1deg}, {share:percent} scale and add the unit.
 
     Args:
-        value: the figure.
+        value: the figure; those of a tuple are listed.
         spec: as in a template.
         more: digits beyond those of the spec.
     """
     if value is None:
         return "unknown"
+    if isinstance(value, tuple):
+        return ", ".join(_format(each, spec, more) for each in value)
     unit = next((unit for unit in _UNITS if spec.endswith(unit)), None)
     if unit is None:
         fixed = re.fullmatch(r"\.(\d)f", spec)
