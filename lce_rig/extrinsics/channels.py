@@ -1,9 +1,9 @@
 """Joint extrinsics from all channels of a camera: frames and events share pixels and lens, not their times.
 
-    consensus by channel -> shared scans -> motion and time offsets -> one board pose per scan -> Algorithm 1
+    consensus by channel -> shared scans -> motion and time offsets -> one board pose per scan -> the method
 
 If images show how the board moved, its pose at the LiDAR's time replaces its pose in each image. Every
-channel is also calibrated alone for comparison, as a camera has one pose.
+channel is also calibrated alone, and two are compared by Algorithm 1, as a camera has one pose.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -89,7 +89,7 @@ def calibrate_channels(
         )
         for name in sorted(agreed)
     )
-    apart, cov = _difference(mover, results, board, plain)
+    apart, cov = _difference(mover, sorted(agreed), board, plain)
     return replace(estimate, channels=results, channel_difference=apart, channel_difference_cov=cov)
 
 
@@ -224,7 +224,7 @@ def depth_scatter_m(estimate: CalibrationEstimate) -> float:
 
 
 def _difference(
-    mover: _Mover, results: Sequence[ChannelResult], board: Board, options: EstimateSettings
+    mover: _Mover, channels: Sequence[str], board: Board, options: EstimateSettings
 ) -> tuple[Array | None, Array | None]:
     """Compare two channels' extrinsics: the tangent (6,) between them and its covariance.
 
@@ -234,16 +234,16 @@ def _difference(
 
     Args:
         mover: of the boards.
-        results: of the channels, each alone.
+        channels: names.
         board: its specification.
-        options: for halves.
+        options: of Algorithm 1, without what the channels have in common.
     """
-    if len(results) != 2:
+    if len(channels) != 2:
         return None, None
-    first, second = results
+    seen = [mover.observations(channel) for channel in channels]
     if mover.offsets is None or mover.is_motion_own:
+        first, second = (_widened(calibrate_observations(own, board, options), mover.offsets) for own in seen)
         return difference(first.T_cam_lidar, second.T_cam_lidar), first.cov + second.cov
-    seen = [mover.observations(result.channel) for result in results]
     rng = np.random.default_rng(options.seed)
     ways: list[tuple[float, Array, Array]] = []
     for _ in range(_N_SHARES):

@@ -24,10 +24,11 @@ class CalibrationEstimate:
 
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
-        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: from the scatter between
-            captures, and from range errors of the LiDAR that are common to all captures. Errors of the
-            profile's lens and board are not in it, but in `sensitivities`.
-        certificate: of the final cost over all captures used; its gap is infinite if there is none.
+        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: from the noise of the captures
+            and from the sensors' errors that are common to all of them. Errors of the profile's lens
+            and board are not in it, but in `sensitivities`.
+        certificate: of Algorithm 1's final cost over all captures used, from whose solution other methods
+            start; its gap is infinite if there is none.
         metrics: errors over all captures used, of the boards as measured.
         used: names of the captures used, sorted; one stands for all that hold the same scan.
         refused: why each other capture is not used.

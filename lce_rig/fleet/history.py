@@ -33,7 +33,7 @@ STATES: tuple[State, ...] = ("moved", "moved_last", "drifts", "creeps", "odd_ses
 
 _SERIES = ("robot", "camera", "lidar", "camera_serial", "lidar_serial")
 _KEYS = (*_SERIES, "date", "folder", "session_sha256")
-_MATRICES = ("date", "profile_sha256", "T_cam_lidar", "cov", "cov_shared")
+_MATRICES = ("date", "profile_sha256", "method", "T_cam_lidar", "cov", "cov_shared")
 COLUMNS = (*_KEYS, "status", "verdict", "findings", "severities", *_MATRICES[1:])
 """Columns of the table that this requires."""
 # A robot that is far from its drawing has moved, perhaps; other failures say that the result is wrong.
@@ -307,9 +307,9 @@ class _Reader:
         instants = pc.strptime(part["date"], format="%Y-%m-%dT%H:%M:%SZ", unit="s", error_is_null=True)
         seconds = pc.fill_null(pc.cast(instants, pa.int64()), 0).to_numpy()
         days = seconds / 86400.0
-        sessions = Sessions(
-            starts, tangents, cov - shared, shared, _codes(part["profile_sha256"]), days - days.min()
-        )
+        # Another method has other errors in common, as another profile has.
+        made_with = pc.binary_join_element_wise(part["profile_sha256"], part["method"], " ")
+        sessions = Sessions(starts, tangents, cov - shared, shared, _codes(made_with), days - days.min())
         return pooled(sessions), T_first
 
 

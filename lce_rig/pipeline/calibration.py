@@ -475,16 +475,19 @@ def _lens_error(validation: Validation) -> tuple[tuple[float, ...], tuple[float,
 
 
 def _laser_ranges(rig: Rig, solved: _Solved) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Give the range offset of each laser, by ring, and its standard deviation.
+    """Give the range offset of each laser, by ring, and its standard deviation about their mean.
 
-    Boards that moved between image and scan would make them up.
+    Nothing where boards moved, which would make them up, or where the profile states them already.
     """
-    found, sheet = solved.estimate.lidar, rig.lidars[solved.lidar].data_sheet()
-    if found is None or sheet is None or found.rings.max() >= sheet.n_rings or not solved.is_still:
+    estimate, settings = solved.estimate, rig.lidars[solved.lidar]
+    found, sheet = estimate.lidar, settings.data_sheet()
+    is_known = settings.intrinsics is not None or settings.laser_bias_sigma_m == 0
+    has_moved = not solved.is_still or estimate.diagnostics.fit_plane_rms_m > rig.verdict.max_plane_misfit_m
+    if found is None or sheet is None or found.rings.max() >= sheet.n_rings or is_known or has_moved:
         return (), ()
-    range_m = np.zeros(sheet.n_rings)
-    # A laser that met no board is known as well as before.
-    sigma_m = np.full(sheet.n_rings, rig.lidars[solved.lidar].laser_bias_sigma_m)
+    # Lasers that met no board are known as well as before.
+    range_m = np.full(sheet.n_rings, found.lasers[0].mean())
+    sigma_m = np.full(sheet.n_rings, settings.laser_bias_sigma_m)
     range_m[found.rings], sigma_m[found.rings] = found.lasers[0], found.lasers_sigma[0]
     return tuple(range_m.tolist()), tuple(sigma_m.tolist())
 

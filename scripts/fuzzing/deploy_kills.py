@@ -129,7 +129,7 @@ def fuzz_deploy_kills(n: int, seed: int) -> DeployKillReport:
         must_end_well(
             start(["simulate", "--rig", "rlfs", str(session), "--captures", str(_N_CAPTURES), "--seed", "1"])
         )
-        for variant in ((), ("--method", "ml", "--name", "other")):
+        for variant in ((), ("--method", "paper", "--name", "other")):
             must_end_well(start(["calibrate", str(session), "--draws", "5", *variant]))
         robots, targets = [], {}
         for k in range(_N_LANES):

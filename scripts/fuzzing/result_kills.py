@@ -49,7 +49,7 @@ class Verb:
 
 
 VERBS = {
-    "calibrate": Verb("calibration", (("--draws", "5"), ("--draws", "5", "--method", "ml"))),
+    "calibrate": Verb("calibration", (("--draws", "5"), ("--draws", "5", "--method", "paper"))),
     "verify": Verb("calibration/overlays", ((), ())),
     "intrinsics": Verb("intrinsics", (("--model", "radtan5"), ("--model", "rational"))),
 }

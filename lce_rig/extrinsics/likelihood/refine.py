@@ -133,7 +133,7 @@ def refine(
     )
     problem = Problem(scans, images, board, priors)
     placement = group_shared_placements(cameras, order)
-    now, here = levels or usual, problem.at(state, _once(placement))
+    now, here = levels or usual, problem.at(state, _once(placement, images))
     for blur_rad in _BLURS_RAD:
         here = problem.settle(here, now.blurred(blur_rad), _STEPS, _NEAR)
     for n_rounds in _LEVEL_ROUNDS if levels is None else ():
@@ -145,10 +145,10 @@ def refine(
 
 
 # Moves beyond so many of their standard deviations count less than in full (Huber; 95 % efficient).
-_HUBER = 1.5
+_HUBER, _FARTHEST = 1.5, 1e6
 
 
-def trust_captures(here: "Point", levels: Levels, priors: Priors, placement: NDArray[np.intp]) -> Array:
+def trust_captures(here: Point, levels: Levels, priors: Priors, placement: NDArray[np.intp]) -> Array:
     """Weigh captures (F,) by how far the extrinsics move without them, compared with what noise explains.
 
     Without placement k the unknowns move by m_k = (H - H_k)^-1 g_k, with the covariance (H - H_k)^-1 - H^-1.
@@ -164,7 +164,7 @@ def trust_captures(here: "Point", levels: Levels, priors: Priors, placement: NDA
     References:
         Huber, "Robust Statistics", 1981.
     """
-    once = _once(placement)
+    once = _once(placement, here.terms.images)
     terms = here.trusting(once).terms
     cost = replace(assemble(terms, levels, priors).cost, placement=placement)
     J = _to_extrinsics(here.state)
@@ -176,12 +176,19 @@ def trust_captures(here: "Point", levels: Levels, priors: Priors, placement: NDA
     squares = np.einsum("gi,ij,gj->g", moves, precision, moves)
     expected = np.einsum("ij,gji->g", precision, spread)
     z = np.sqrt(squares / np.maximum(expected, np.finfo(float).tiny))
-    return np.asarray(once * (_HUBER / np.maximum(z, _HUBER))[placement])
+    return np.asarray(once * (_HUBER / np.clip(z, _HUBER, _FARTHEST))[placement])
 
 
-def _once(placement: NDArray[np.intp]) -> Array:
-    """Weigh captures (F,) so that those of one placement, whose errors are the same, count as one."""
-    return np.asarray(1 / np.bincount(placement)[placement])
+def _once(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array:
+    """Weigh captures (F,) so that those of one placement, whose errors are the same, count as one.
+
+    Where cameras saw a placement in different numbers of captures, those that few of them saw count more.
+    """
+    fewest = np.full(len(placement), np.inf)
+    for own in images:
+        seen = placement[own.capture]
+        fewest[own.capture] = np.minimum(fewest[own.capture], np.bincount(seen)[seen])
+    return 1 / fewest
 
 
 def _stack_images(observations: Sequence[Observation], order: dict[str, int], board: Board) -> StackedImages:

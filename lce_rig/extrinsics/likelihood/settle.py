@@ -43,7 +43,7 @@ class Problem:
         for _ in range(n_steps):
             reduced = assemble(here.terms, levels, self.priors)
             z, y = reduced.step()
-            if -reduced.gradient @ z < short**2:
+            if reduced.decrement < short**2:
                 break
             z, y = mixing.mix(z, y, reduced)
             here = self.at(here.state.moved(z, y), here.terms.trust)

@@ -176,6 +176,13 @@ class Reduced:
         """(G,) by z, of all captures and priors."""
         return np.asarray(self.cost.gradients.sum(axis=0) + self.cost.prior_gradient)
 
+    @cached_property
+    def decrement(self) -> float:
+        """Squared length of the step, in standard deviations of all unknowns."""
+        z, _ = self.step()
+        y = self.own_steps[:, :, -1]
+        return float(np.einsum("fi,fij,fj", y, self.of_own, y) - self.gradient @ z)
+
     def step(self) -> tuple[Array, Array]:
         """Solve for z (G,) and y (F, 7)."""
         # Priors of constants differ by many orders of magnitude, too many for `Quadratics.optimum`.
@@ -220,15 +227,15 @@ class Assembly:
 
     def __init__(self, terms: Terms, priors: Priors) -> None:
         self._terms, self._priors = terms, priors
-        self._range_block = lru_cache(maxsize=2)(partial(_range_block, terms))
-        self._edge_block = lru_cache(maxsize=2)(partial(_edge_block, terms))
-        self._image_block = lru_cache(maxsize=2)(partial(_image_block, terms))
+        self._range_block = lru_cache(maxsize=1)(partial(_range_block, terms))
+        self._edge_block = lru_cache(maxsize=1)(partial(_edge_block, terms))
+        self._image_block = lru_cache(maxsize=1)(partial(_image_block, terms))
 
     def with_images(self, images: Sequence[StackedImages], state: State) -> "Assembly":
         """Replace the images of terms that were linearised at a state; the other terms stay cached."""
         other = copy(self)
         other._terms = replace(self._terms, images=tuple(images), image_rows=_rows_of_images(images, state))
-        other._image_block = lru_cache(maxsize=2)(partial(_image_block, other._terms))
+        other._image_block = lru_cache(maxsize=1)(partial(_image_block, other._terms))
         return other
 
     def at(self, levels: Levels) -> Reduced:

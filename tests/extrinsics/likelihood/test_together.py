@@ -172,3 +172,14 @@ def test_errors_and_claims_of_dozens_of_sessions_are_true():
             # 6 expected; 20 samples average within 3 standard errors of 0.77. Noise levels of few captures
             # are rather believed to be the usual ones, which are larger than the simulator's.
             assert 1.5 < rows[1][-1] < 8.3
+
+
+def test_a_camera_that_saw_a_placement_once_loses_nothing_where_another_saw_it_often():
+    session = simulate_two(8, 0)
+    again = [replace(item, capture=f"{k}{item.capture[1:]}") for k in range(1, 5) for item in session[LEFT]]
+    once, often = (
+        calibrate_together(alone({LEFT: left, RIGHT: session[RIGHT]}), BOARD, every(session)).estimates[RIGHT]
+        for left in (session[LEFT], [*session[LEFT], *again])
+    )
+    ratio = np.sqrt(np.diag(often.cov) / np.diag(once.cov))
+    assert np.all((ratio > 0.7) & (ratio < 1.2))
