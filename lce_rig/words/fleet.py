@@ -19,7 +19,8 @@ def _motions(finding: Finding) -> str:
     parts = []
     for axis, change, sigma in zip(axes, changes, sigmas, strict=True):
         if axis.startswith("rotation"):
-            size = f"{float(change):+.2f} +- {float(sigma):.2f} deg"
+            places = 2 if float(sigma) >= 0.005 else 3
+            size = f"{float(change):+.{places}f} +- {float(sigma):.{places}f} deg"
         else:
             size = f"{1e3 * float(change):+.1f} +- {1e3 * float(sigma):.1f} mm"
         parts.append(f"{size}, {motion_words(axis)}")

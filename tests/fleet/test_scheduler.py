@@ -1,0 +1,40 @@
+"""A cluster that somebody else runs, and recordings that a manifest names."""
+
+import shutil
+
+import pytest
+from distributed import LocalCluster
+
+from lce_rig.cli.main import run
+from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.storage import Storage
+from lce_rig.rig import dump_rig
+from lce_rig.session import Session
+
+
+@pytest.fixture
+def recorded(simulated, small_rig, tmp_path):
+    """Lay out a folder of images and clouds as somebody recorded it, with a manifest beside it."""
+    root = tmp_path / "root"
+    for name in ("img", "pcd"):
+        (root / "hall3" / "r9" / name).mkdir(parents=True)
+    with Session.open(simulated) as session:
+        for capture in session.captures:
+            shutil.copy(capture.path / "cam.frames.png", root / "hall3/r9/img" / f"{capture.name}.png")
+            shutil.copy(capture.path / "lidar.pcd", root / "hall3/r9/pcd" / f"{capture.name}.pcd")
+    (root / "profile.yaml").write_text(dump_rig(small_rig))
+    (root / "fleet.yaml").write_text(
+        'sessions:\n  - path: "hall3/{robot}"\n    rig: profile.yaml\n    site: hall 3\n'
+    )
+    return root
+
+
+def test_a_recording_is_calibrated_by_a_cluster_that_runs_already(recorded, capsys, tmp_path):
+    words = ["fleet", "run", str(recorded), "--registry", str(tmp_path / "registry"), "--pictures", "none"]
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster:
+        address = cluster.scheduler_address
+        assert run([*words, "--scheduler", address]) == 0
+    (row,) = Registry(Storage.at(tmp_path / "registry")).read_table().to_pylist()
+    assert (row["status"], row["robot"], row["site"], row["n_used"]) == ("ok", "r9", "hall 3", 8)
+    assert run([*words, "--scheduler", address]) == 5
+    assert "no scheduler answers" in capsys.readouterr().err
