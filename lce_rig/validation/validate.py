@@ -221,7 +221,7 @@ def validate(
 def _with_prior_of_scale(expansion: Quadratics, sensitivities: Sequence[Sensitivity]) -> Quadratics:
     """Let the camera's scale be wrong as the profile's focal length and squares may be."""
     sigmas = [each.sigma for each in sensitivities if each.source in ("square_size", "focal_length")]
-    if not sigmas:
+    if not any(sigmas):
         return expansion.hold(SCALE)
     prior = expansion.prior.copy()
     prior[SCALE, SCALE] = 1 / sum(sigma**2 for sigma in sigmas)

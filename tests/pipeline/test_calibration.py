@@ -1,9 +1,14 @@
 """The calibration of a session takes from the rig what the algorithm cannot know."""
 
+from typing import get_args
+
+import pytest
+
 from lce_rig import pipeline
+from lce_rig.core.results import Method
 from lce_rig.detect.detection import Detections
 from lce_rig.extrinsics import CalibrateOptions
-from lce_rig.rig import find_profile, parse_rig
+from lce_rig.rig import find_profile, parse_rig, set_value
 from tests.extrinsics.boards import simulate
 
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
@@ -12,12 +17,14 @@ RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 def systematic_sigma_m(*lines: str) -> float:
     """Calibrate simulated boards for an RLFS whose LiDAR has these lines in its profile."""
     rig = parse_rig(RLFS.replace("    rate_hz: 10\n", "".join(f"    {line}\n" for line in lines), 1))
+    (calibration,), _ = pipeline.calibrate_detections(rig, found(), CalibrateOptions("paper", n_draws=0))
+    return calibration.diagnostics.sigma_systematic_translation_m
+
+
+def found() -> Detections:
     captures = simulate(10, 3)
     images = {item.capture: item.image for item in captures}
-    scans = {item.capture: list(item.lidar) for item in captures}
-    detections = Detections({("cam", "frames"): images}, {"lidar": scans})
-    (calibration,), _ = pipeline.calibrate_detections(rig, detections, CalibrateOptions("paper", n_draws=0))
-    return calibration.diagnostics.sigma_systematic_translation_m
+    return Detections({("cam", "frames"): images}, {"lidar": {c.capture: list(c.lidar) for c in captures}})
 
 
 def test_the_lidars_range_errors_come_from_the_profile() -> None:
@@ -27,3 +34,17 @@ def test_the_lidars_range_errors_come_from_the_profile() -> None:
     assert 0.003 < usual < 0.015
     coarse = systematic_sigma_m("laser_bias_sigma_m: 0.016", "range_offset_sigma_m: 0.01")
     assert coarse > 1.9 * usual
+
+
+@pytest.mark.parametrize("method", get_args(Method))
+def test_a_profile_that_says_that_all_is_exact_is_believed(method: Method) -> None:
+    text = RLFS
+    for key in ("square_sigma_m", "pattern_offset_sigma_m", "plate_sigma_m", "bow_sigma_m"):
+        text = set_value(text, f"board.{key}", "0.0")
+    for key in ("focal_sigma_px", "principal_point_sigma_px", "distortion_sigma_px"):
+        text = set_value(text, f"cameras.cam.intrinsics.{key}", "0.0")
+    options = CalibrateOptions(method, n_draws=0)
+    (calibration,), _ = pipeline.calibrate_detections(parse_rig(text), found(), options)
+    # What checks contradict may widen the claim; lens and board add nothing to it.
+    assert not calibration.cov_shared.any()
+    assert 0 < calibration.sigma_translation_m < 0.02
