@@ -308,8 +308,9 @@ class _Reader:
         seconds = pc.fill_null(pc.cast(instants, pa.int64()), 0).to_numpy()
         days = seconds / 86400.0
         # Another method has other errors in common, as another profile has.
-        made_with = pc.binary_join_element_wise(part["profile_sha256"], part["method"], " ")
-        sessions = Sessions(starts, tangents, cov - shared, shared, _codes(made_with), days - days.min())
+        method = _codes(part["method"])
+        made_with = _codes(part["profile_sha256"]) * (method.max(initial=0) + 2) + method
+        sessions = Sessions(starts, tangents, cov - shared, shared, made_with, days - days.min())
         return pooled(sessions), T_first
 
 
