@@ -9,6 +9,7 @@ def listed(lce_rig, session):
     return {each["name"]: each for each in json.loads(lce_rig("captures", session, "--json").out)["captures"]}
 
 
+@pytest.mark.long
 def test_a_rejected_capture_is_used_no_more_until_it_is_restored(lce_rig, calibrated):
     before = json.loads((calibrated / "calibration" / "result.json").read_text())["pairs"][0]
     name = before["captures_used"][0]

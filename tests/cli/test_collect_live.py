@@ -89,6 +89,7 @@ def start(path: Path, *arguments: str, **options: object) -> "subprocess.Popen[s
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload, no-any-return]
 
 
+@pytest.mark.long
 def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path: Path) -> None:
     path = tmp_path / "session"
     process = start(path, "--plain", "--frames", "2", "--timeout", "240", "--hold", "0.3")
@@ -106,6 +107,7 @@ def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path
     assert "2 captures (minimum 6)" in said and "next:" not in said
 
 
+@pytest.mark.long
 def test_a_signal_ends_the_screen_and_leaves_the_terminal_as_it_was(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     process = start(tmp_path / "session", stdin=theirs)

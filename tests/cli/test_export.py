@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 from yourdfpy import URDF
 
 ROBOT = """<robot name="cart">
@@ -80,6 +81,7 @@ def test_every_format_is_listed_with_its_files(lce_rig):
     assert [line.split()[0] for line in lines] == list(EXPORTS)
 
 
+@pytest.mark.long
 def test_calibrate_writes_the_formats_of_the_profile(lce_rig, simulated, tmp_path):
     import shutil
 

@@ -78,6 +78,7 @@ def test_one_result_has_nothing_to_be_compared_with(lce_rig, calibrated):
     assert lce_rig("repeat", calibrated, "--name", "paper", "--name", "current").code == 4
 
 
+@pytest.mark.long
 def test_overlays_are_drawn_beside_a_named_result_and_again_when_it_changes(lce_rig, two_results):
     folder = two_results / "results" / "paper" / "overlays"
     assert lce_rig("verify", two_results, "--name", "paper").code == 0
@@ -114,6 +115,7 @@ def test_the_result_before_a_named_one_is_listed_and_drawn(lce_rig, two_results)
     assert lce_rig("calibrate", two_results, "--name", "paper/previous").code == 2
 
 
+@pytest.mark.long
 def test_overlays_are_drawn_again_after_a_run_that_was_killed_before_it_could(lce_rig, calibrated):
     folder = calibrated / "calibration"
     assert lce_rig("verify", calibrated).code == 0

@@ -40,6 +40,7 @@ def test_a_camera_without_result_exits_with_6_and_the_others_results_stand(lce_r
     assert "right" in comment and "davis" not in comment
 
 
+@pytest.mark.long
 def test_the_camera_that_was_asked_for_is_calibrated_alone(lce_rig, with_second, calibrated_once):
     assert lce_rig("calibrate", with_second, "--camera", "davis").code == 0
     own, alone = (

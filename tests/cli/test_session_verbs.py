@@ -4,6 +4,7 @@ import json
 import subprocess
 
 import numpy as np
+import pytest
 import yaml
 
 
@@ -58,6 +59,7 @@ def test_the_same_session_gives_the_same_bytes(lce_rig, calibrated):
     assert (calibrated / "calibration" / "result.json").read_bytes() == first
 
 
+@pytest.mark.long
 def test_the_result_names_its_robot_sensors_and_date(lce_rig, session):
     words = ("calibrate", session, "--robot", "kestrel", "--name", "named")
     assert lce_rig(*words).code == 0
@@ -170,6 +172,7 @@ def test_a_run_without_result_leaves_the_earlier_one_untouched_and_says_so(lce_r
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.long
 def test_another_result_moves_the_earlier_one_and_its_overlays_to_previous(lce_rig, calibrated):
     lce_rig("verify", calibrated)
     folder = calibrated / "calibration"
@@ -216,6 +219,7 @@ def test_verify_of_a_result_from_elsewhere_leaves_the_sessions_own_overlays(
     assert (calibrated_few / "overlays" / "000000.png").read_bytes() != before
 
 
+@pytest.mark.long
 def test_a_capture_without_manifest_does_not_hinder_the_others(lce_rig, session):
     (session / "captures" / "000003" / "meta.json").write_bytes(b"")
     outcome = lce_rig("calibrate", session)
@@ -229,6 +233,7 @@ def test_a_session_whose_profile_was_exchanged_is_refused(lce_rig, session):
     assert lce_rig("check", session).code == 4
 
 
+@pytest.mark.long
 def test_a_nominal_extrinsic_far_off_fails_with_7_and_nothing_is_exported(lce_rig, session):
     profile = session / "rig.yaml"
     document = yaml.safe_load(profile.read_text())

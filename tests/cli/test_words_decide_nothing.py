@@ -98,6 +98,7 @@ def test_check_refuses_the_same_captures_for_the_same_codes(run_twice, spoilt):
     assert len(codes(document)) >= 4
 
 
+@pytest.mark.long
 def test_calibrate_gives_the_same_extrinsics_verdict_and_reasons(run_twice, spoilt):
     code, document = run_twice("calibrate", spoilt, options=("--draws", "10"))
     assert code == 0
@@ -105,6 +106,7 @@ def test_calibrate_gives_the_same_extrinsics_verdict_and_reasons(run_twice, spoi
     assert document["pairs"][0]["findings"]
 
 
+@pytest.mark.long
 def test_calibrate_fails_for_the_same_reasons(run_twice, session):
     profile = session / "rig.yaml"
     wrong = profile.read_text().replace("square_m: 0.068", "square_m: 0.075")

@@ -193,6 +193,7 @@ def test_captures_whose_events_begin_late_are_kept_and_counted(tmp_path) -> None
     assert any(note.startswith("davis: 1 captures") and "1.2 s" in note for note in report.notes)
 
 
+@pytest.mark.long
 def test_lamps_that_flicker_are_named_where_frames_make_a_capture_all_the_same(tmp_path) -> None:
     lit = [
         replace(s, polarity=(s.t_ns // 5_000_000) % 2 == 0) if isinstance(s, Events) else s

@@ -72,6 +72,7 @@ def test_two_sessions_are_compared_by_their_figures(workplace, capsys):
     assert sum(" mm, edges " in line for line in lines) == 7
 
 
+@pytest.mark.long
 def test_scans_of_a_reader_of_ones_own_give_the_same_extrinsic(workplace, capsys):
     session = lce.Session.open("monday")
     (workplace / "folder").mkdir()

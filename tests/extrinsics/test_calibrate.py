@@ -36,6 +36,7 @@ def rms_deg_mm(errors):
     return np.degrees(np.sqrt(squares[3:].sum())), 1e3 * np.sqrt(squares[:3].sum())
 
 
+@pytest.mark.long
 def test_thirty_captures_reach_a_few_hundredths_of_a_degree_and_say_so():
     errors, nees = errors_over_seeds(Scenario(range_sigma_m=0.02, corner_sigma_px=0.3), 30, 8)
     rotation_deg, translation_mm = rms_deg_mm(errors)

@@ -84,6 +84,7 @@ def normalised_errors(options, n_seeds):
     return np.array(nees)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n_seeds", [12, pytest.param(40, marks=pytest.mark.slow)])
 def test_range_errors_of_known_size_are_in_the_covariance(n_seeds):
     nees = normalised_errors(

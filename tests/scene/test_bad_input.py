@@ -9,6 +9,7 @@ from lce_rig.simulate import truth_extrinsics
 from tests.scene.conftest import SEED
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CORRUPTIONS)
 def test_a_corruption_is_never_an_all_clear(seen, name) -> None:
     pair = judge_corrupted(seen.rig, seen.captures, seen.truth, CORRUPTIONS[name])

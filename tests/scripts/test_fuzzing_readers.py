@@ -176,6 +176,7 @@ _QUICK = (
 )
 
 
+@pytest.mark.long
 def test_damaged_files_are_refused_or_read_right() -> None:
     report = fuzz_readers(8, 0, names=_QUICK)
     assert report.n_wrong == 0, said(report)

@@ -179,6 +179,7 @@ def test_stamps_mark_the_middle_of_the_exposure(rig: Rig) -> None:
         )
 
 
+@pytest.mark.long
 def test_blur_grows_with_speed(rig: Rig) -> None:
     sharpness = []
     for speed_mps in (0.0, 0.3, 0.6):

@@ -221,6 +221,7 @@ def tile(index: int, warning: str = "") -> Overlay:
     return Overlay(f"{index:06d}", drawn := np.full((270, 480, 3), colour, np.uint8), drawn, "", warning)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n", [1, 2, 7, 18, 40])
 def test_contact_sheets_hold_every_picture_once_and_are_at_most_2000_px_wide(n: int) -> None:
     tiles = [tile(index) for index in range(n)]

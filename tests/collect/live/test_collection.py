@@ -21,6 +21,7 @@ from tests.collect.live.replay import Show, placements, rig
 QUICK = LiveOptions(n_wanted=3, timeout_s=120.0, hold_s=0.3)
 
 
+@pytest.mark.long
 def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Path) -> None:
     show, states = Show(placements(), each_s=2.0), list[LiveState]()
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
@@ -95,6 +96,7 @@ def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path: Path) -> 
     assert len({each.tobytes() for each in wanted}) >= 2
 
 
+@pytest.mark.long
 def test_captures_are_taken_back_one_by_one_and_nothing_is_lost_or_counted_twice(tmp_path: Path) -> None:
     path, states = tmp_path / "session", list[LiveState]()
     show = Show(placements(), each_s=2.0)
@@ -153,6 +155,7 @@ def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(
     assert max(state.n_captures for state in states) == 0
 
 
+@pytest.mark.long
 def test_a_key_press_makes_no_second_capture_of_a_board_that_was_captured_as_it_stands(
     tmp_path: Path,
 ) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from wire.collecting import Collecting
 from wire.reel import Reel
 from wire.rig import WireRig
@@ -20,6 +21,7 @@ from tests.collect.live.sent import (
 Start = Callable[..., WireRig]
 
 
+@pytest.mark.long
 def test_captures_appear_by_themselves_and_hold_what_was_sent(
     wire: Start, reel: Reel, tmp_path: Path
 ) -> None:
