@@ -42,6 +42,7 @@ def test_inner_corners_counted_wrongly_are_named_with_what_is_seen(lce_rig, sess
     assert "8x5" in outcome.err and "9x6" in outcome.err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("square_m", "measured_m"), [(0.064, 0.068), (0.072, 0.068)])
 def test_squares_of_the_wrong_size_fail_and_the_right_size_is_told(lce_rig, session, square_m, measured_m):
     edit_profile(session, board__square_m=square_m)

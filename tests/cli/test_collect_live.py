@@ -128,6 +128,7 @@ def test_a_signal_ends_the_screen_and_leaves_the_terminal_as_it_was(tmp_path: Pa
     assert "captures (" in said and "Traceback" not in said
 
 
+@pytest.mark.long
 def test_ctrl_c_and_a_kill_while_the_simulated_rig_starts_end_it_without_a_trace(tmp_path: Path) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         process = start(tmp_path / number.name, "--plain", start_new_session=True)
@@ -139,6 +140,7 @@ def test_ctrl_c_and_a_kill_while_the_simulated_rig_starts_end_it_without_a_trace
         assert process.returncode in (130, -number) and "Traceback" not in said
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])
 def test_a_terminal_that_is_closed_ends_the_collection_in_good_order(tmp_path: Path, term: str) -> None:
     ours, theirs = pty.openpty()

@@ -45,6 +45,7 @@ def test_absent_devices_are_red_with_what_to_check_and_exit_with_5(lce_rig, abse
     assert all(group in done.err for group in ("lidar", "cam", "sync"))
 
 
+@pytest.mark.long
 def test_on_a_small_terminal_lines_that_are_ok_share_one(absent):
     words = [sys.executable, "-m", "lce_rig", "doctor", "--rig", str(absent), "--duration", "1"]
     host, terminal = pty.openpty()
@@ -115,6 +116,7 @@ def judged(lce_rig, path: Path, n_lines: int) -> tuple[int, dict[tuple[str, str]
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_attached", [False, True])
 def test_words_decide_nothing(lce_rig, tmp_path, is_attached, request):
     rig = make_rig()

@@ -19,6 +19,7 @@ def few(simulated, tmp_path_factory):
     return copy
 
 
+@pytest.mark.long
 def test_the_lens_is_printed_beside_the_profiles_and_written(lce_rig, few, tmp_path):
     refused = lce_rig("intrinsics", few, "--save-profile", tmp_path / "new.yaml")
     assert refused.code == 7

@@ -189,6 +189,7 @@ def test_a_damaged_result_names_its_file(lce_rig, made):
     assert lce_rig("repeat", a, b).code == 4
 
 
+@pytest.mark.long
 def test_sessions_without_a_result_are_calibrated_and_left_as_they_are(lce_rig, simulated, tmp_path):
     halves = []
     for half in range(2):

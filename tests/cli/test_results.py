@@ -100,6 +100,7 @@ def test_an_unreadable_result_is_listed_as_such(lce_rig, two_results):
     assert listed(lce_rig, two_results)["paper"]["problem"]
 
 
+@pytest.mark.long
 def test_the_result_before_a_named_one_is_listed_and_drawn(lce_rig, two_results):
     assert lce_rig("calibrate", two_results, "--method", "paper", "--seed", "9", "--name", "paper").code == 0
     used = json.loads((two_results / "results/paper/result.json").read_text())["pairs"][0]["captures_used"]

@@ -30,6 +30,7 @@ def cameras(session):
     return [pair["camera"] for pair in document["pairs"]]
 
 
+@pytest.mark.long
 def test_a_camera_without_result_exits_with_6_and_the_others_results_stand(lce_rig, with_second):
     outcome = lce_rig("calibrate", with_second)
     assert outcome.code == 6
@@ -54,6 +55,7 @@ def test_the_camera_that_was_asked_for_is_calibrated_alone(lce_rig, with_second,
     assert "'thermal'" in outcome.err and "davis, right" in outcome.err
 
 
+@pytest.mark.long
 def test_a_reference_that_names_no_sensors_is_that_of_one_camera_only(lce_rig, with_second):
     truth = json.loads((with_second / "truth.json").read_text())
     (with_second / "bare.json").write_text(json.dumps({"T_cam_lidar": truth["T_cam_lidar"]}))

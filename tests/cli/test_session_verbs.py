@@ -39,6 +39,7 @@ def test_calibrate_finds_the_simulated_truth_within_four_sigma(lce_rig, session)
     assert np.abs(T - truth).max() < 0.02
 
 
+@pytest.mark.long
 def test_calibrate_uses_the_scene_if_asked_and_keeps_the_result_of_the_boards_beside_it(lce_rig, calibrated):
     alone = read(calibrated / "calibration" / "result.json")["pairs"][0]
     assert alone["scene_share"] is None
@@ -72,6 +73,7 @@ def test_the_result_names_its_robot_sensors_and_date(lce_rig, session):
     assert lce_rig("calibrate", session, "--robot", "../kestrel").code == 2
 
 
+@pytest.mark.long
 def test_the_result_names_its_inputs_by_hashes_that_other_tools_check(lce_rig, session):
     printed = json.loads(lce_rig("calibrate", session, "--json").out)
     document = read(session / "calibration" / "result.json")
@@ -86,6 +88,7 @@ def test_the_result_names_its_inputs_by_hashes_that_other_tools_check(lce_rig, s
     assert done.returncode == 1
 
 
+@pytest.mark.long
 def test_the_reference_never_enters_the_estimate(lce_rig, session):
     plain = json.loads(lce_rig("calibrate", session, "--json").out)["pairs"][0]
     wrong = np.array(read(session / "truth.json")["T_cam_lidar"])
@@ -117,6 +120,7 @@ def test_verify_before_anything_was_calibrated_exits_with_4(lce_rig, session):
     assert lce_rig("verify", session).code == 4
 
 
+@pytest.mark.long
 def test_verify_draws_every_capture_and_one_sheet(lce_rig, calibrated):
     outcome = lce_rig("verify", calibrated)
     assert outcome.code == 0
@@ -204,6 +208,7 @@ def test_verify_again_leaves_what_the_user_put_beside_the_overlays(lce_rig, cali
     assert (folder / "000000.png").exists() and not (folder / "999999.png").exists()
 
 
+@pytest.mark.long
 def test_verify_of_a_result_from_elsewhere_leaves_the_sessions_own_overlays(
     lce_rig, calibrated_few, tmp_path
 ):

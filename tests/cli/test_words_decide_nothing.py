@@ -135,11 +135,13 @@ def halves(simulated, tmp_path) -> list[Path]:
     return halves
 
 
+@pytest.mark.long
 def test_repeat_finds_the_same_agreement(run_twice, halves):
     code, document = run_twice("repeat", *halves)
     assert (code, codes(document)) == (0, {"repeat.agree"})
 
 
+@pytest.mark.long
 def test_repeat_finds_the_same_disagreement(run_twice, halves, lce_rig):
     assert lce_rig("calibrate", halves[1], "--draws", "0").code == 0
     path = moved(halves[1]) / "calibration" / "result.json"

@@ -276,6 +276,7 @@ def test_a_board_cut_off_by_the_border_is_said_to_be() -> None:
     assert (refusal.code, refusal.figures["side"]) == ("image.cut_off", "right")
 
 
+@pytest.mark.long
 def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures() -> None:
     T = looking(20, 30, 40, (0, 0, 1.8))
     noise = np.random.default_rng(0).normal(0, 2, (260, 346))

@@ -53,6 +53,7 @@ def test_every_example_is_run_here():
     }
 
 
+@pytest.mark.long
 def test_a_folder_of_images_and_clouds_becomes_a_result_and_overlays(workplace):
     for capture in lce.Session.open("monday").captures:
         for kind, name in (("img", "davis.frames.png"), ("pcd", "lidar.pcd")):
@@ -65,6 +66,7 @@ def test_a_folder_of_images_and_clouds_becomes_a_result_and_overlays(workplace):
     assert (workplace / "session" / "calibration" / "overlays" / "contact_sheet.png").exists()
 
 
+@pytest.mark.long
 def test_two_sessions_are_compared_by_their_figures(workplace, capsys):
     main_of("compare_sessions.py")("monday", "friday")
     lines = capsys.readouterr().out.splitlines()
@@ -90,6 +92,7 @@ def test_scans_of_a_reader_of_ones_own_give_the_same_extrinsic(workplace, capsys
     assert error_to_truth(lce.calibrate(own).pairs[0], workplace / "monday") < 0.05
 
 
+@pytest.mark.long
 def test_the_notebook_runs_from_top_to_bottom(workplace):
     notebook = json.loads((EXAMPLES / "session.ipynb").read_text())
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]

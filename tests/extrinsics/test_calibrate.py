@@ -46,6 +46,7 @@ def test_thirty_captures_reach_a_few_hundredths_of_a_degree_and_say_so():
     assert 2.4 < nees.mean() < 9.7
 
 
+@pytest.mark.long
 def test_ten_captures_are_not_trusted_too_far():
     _, nees = errors_over_seeds(Scenario(), 10, 20)
     assert np.median(nees) < 5.35  # the median of chi square with 6 degrees

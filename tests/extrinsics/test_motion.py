@@ -86,6 +86,7 @@ def test_time_offsets_of_boards_that_were_followed_are_found_to_milliseconds(fol
     assert max(channel.time_offset_sigma_s for result in results for channel in result.channels) < 0.004
 
 
+@pytest.mark.long
 def test_time_offsets_are_found_from_two_pictures_a_capture():
     moving = Moving()
     results = [calibrate_channels(simulate_moving(20, s, moving), BOARD, OPTIONS, Clocks()) for s in range(2)]
@@ -134,6 +135,7 @@ def test_the_expected_offset_of_the_profile_is_taken_off_first():
         assert abs(channel.time_offset_s) < 4 * channel.time_offset_sigma_s + 1e-3
 
 
+@pytest.mark.long
 def test_pictures_without_stamps_are_timed_by_the_motion_between_channels():
     moving = Moving(has_stamps=False)
     captures = simulate_moving(25, 0, moving)

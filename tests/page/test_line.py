@@ -1,5 +1,7 @@
 """The page's line to the rig, in a real browser."""
 
+import pytest
+
 from lce_rig.page import Preview
 
 from .browser import Browser
@@ -28,6 +30,7 @@ def test_it_says_that_the_line_is_lost_and_finds_back(browser: Browser) -> None:
     assert all(each.startswith("network: WebSocket") for each in page.complaints)
 
 
+@pytest.mark.long
 def test_a_line_that_falls_silent_is_opened_anew(preview: Preview, browser: Browser) -> None:
     counting = """
       const Plain = WebSocket;

@@ -2,6 +2,8 @@
 
 import time
 
+import pytest
+
 from lce_rig.collect.live.state import Cue
 from lce_rig.page import Preview
 
@@ -40,6 +42,7 @@ def test_sounds_are_played_once_each_after_a_tap(preview: Preview, browser: Brow
     assert not page.complaints
 
 
+@pytest.mark.long
 def test_the_voice_reads_settled_instructions_once_and_is_quiet_while_the_board_is_held(
     preview: Preview, browser: Browser
 ) -> None:

@@ -132,6 +132,7 @@ def test_targets_and_texts_of_the_profiles_may_differ(make):
         inputs_sha256(result.session, result.pairs, result.sessions)
 
 
+@pytest.mark.long
 def test_sessions_without_a_scene_keep_the_result_of_the_boards(make):
     sessions, found = [make("monday"), make("tuesday")], [seen(12, 0), seen(12, 1)]
     (by_boards,) = lce.calibrate(sessions, found, options=FAST).pairs

@@ -23,6 +23,7 @@ def test_the_same_result_gives_the_same_bytes(one, one_page):
     assert page(RLFS, one) == one_page
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("which", ["one_page", "two_page"])
 def test_it_is_small_and_names_no_address(which, request):
     text = request.getfixturevalue(which)

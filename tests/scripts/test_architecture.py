@@ -1,6 +1,8 @@
+import pytest
 from draw_architecture import PICTURE, draw, imports, layers, reduced
 
 
+@pytest.mark.long
 def test_the_picture_shows_the_imports_as_they_are() -> None:
     """Run scripts/draw_architecture.py after a change of rooms or imports."""
     assert PICTURE.read_text(encoding="utf-8") == draw()

@@ -57,6 +57,7 @@ def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Pat
     assert max(report.latencies_s) < 5.0
 
 
+@pytest.mark.long
 def test_a_placement_that_was_captured_is_not_captured_twice(tmp_path: Path) -> None:
     show, states = Show(placements()[:1], each_s=100.0), list[LiveState]()
     options = replace(QUICK, timeout_s=6.0)
@@ -81,6 +82,7 @@ def test_a_session_is_continued_and_its_captures_count(tmp_path: Path) -> None:
     assert any(np.array_equal(pixels, placements()[k].images[0].pixels) for k in (2, 3))
 
 
+@pytest.mark.long
 def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path: Path) -> None:
     asked: list[Key | None] = [None] * 15 + ["next", "capture"] + [None] * 25 + ["stop"]
     states: list[LiveState] = []
@@ -212,6 +214,7 @@ def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(
     assert entries[-1]["ending"] == "lost" and "no packets" in entries[-1]["error"]
 
 
+@pytest.mark.long
 def test_a_session_that_cannot_be_written_ends_with_its_error_and_keeps_the_rest(tmp_path: Path) -> None:
     show = Show(placements(), each_s=2.0)
     path = tmp_path / "session"
@@ -234,6 +237,7 @@ def test_every_camera_with_every_lidar_gets_a_guide() -> None:
     assert guide.key == ("davis", "frames") and guide.lidar == "lidar"
 
 
+@pytest.mark.long
 def test_a_run_that_nobody_looks_after_ends_when_nothing_new_is_shown(tmp_path: Path) -> None:
     show = Show(placements()[:1], each_s=100.0)
     options = replace(QUICK, n_wanted=5, idle_s=3.0)
@@ -261,6 +265,7 @@ def met(tmp_path: Path) -> Path:
     return tmp_path / "met"
 
 
+@pytest.mark.long
 def test_who_wants_more_than_enough_goes_on_being_guided_and_captured(met: Path) -> None:
     show, states = Show(placements(), each_s=2.0), list[LiveState]()
     with show.running(), Session.open(met, writable=True) as session:
@@ -280,6 +285,7 @@ def test_who_wants_no_more_than_enough_is_done_at_once(met: Path) -> None:
     assert report.ending == "enough" and not report.captured
 
 
+@pytest.mark.long
 def test_a_board_that_one_camera_has_seen_enough_of_is_sent_before_the_other(met: Path) -> None:
     profile = Session.open(met).rig
     right = {"davis": profile.cameras["davis"], "right": profile.cameras["davis"]}

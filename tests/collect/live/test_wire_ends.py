@@ -91,6 +91,7 @@ def test_what_is_recorded_beside_a_collection_can_be_collected_from(
         assert began_ns < stamp_ns < ended_ns
 
 
+@pytest.mark.long
 def test_a_camera_whose_command_writes_no_pictures_is_named_where_nothing_was_captured(
     wire: Start, tmp_path: Path
 ) -> None:

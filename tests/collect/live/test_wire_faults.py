@@ -70,6 +70,7 @@ def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(
         check_stamps(capture, check_sent(capture, sent), reel.n_placements)
 
 
+@pytest.mark.long
 def test_a_lidar_that_is_gone_for_good_ends_the_collection_and_spares_the_captures(
     wire: Start, tmp_path: Path
 ) -> None:

@@ -174,6 +174,7 @@ def test_errors_and_claims_of_dozens_of_sessions_are_true():
             assert 1.5 < rows[1][-1] < 8.3
 
 
+@pytest.mark.long
 def test_a_camera_that_saw_a_placement_once_loses_nothing_where_another_saw_it_often():
     session = simulate_two(8, 0)
     again = [replace(item, capture=f"{k}{item.capture[1:]}") for k in range(1, 5) for item in session[LEFT]]
