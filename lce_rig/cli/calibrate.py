@@ -442,7 +442,7 @@ def _certificate(calibration: Calibration) -> str:
     is_optimal, gap = calibration.certificate.is_optimal, calibration.certificate.gap
     if not math.isfinite(gap):
         return f"none (method {calibration.method} has no certificate)"
-    of_start = "" if calibration.method == "paper" else " of Algorithm 1, where the estimate starts"
+    of_start = " of Algorithm 1, where the estimate starts" if calibration.is_start_certified else ""
     return f"{'global minimum' if is_optimal else '[red]not proven[/]'}{of_start}, gap {gap:.0e}"
 
 

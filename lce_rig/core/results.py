@@ -504,7 +504,8 @@ class Calibration:
             seen: focal length (relative), principal point x and y (px), distortion (px in the image's
             corner); their standard deviations.
         laser_range_m, laser_range_sigma_m: range offset of each of the LiDAR's lasers, by ring; its standard
-            deviation about their mean. Empty where the method knows none, or the boards moved.
+            deviation about their mean. Empty where the method knows none, the boards moved, or the profile
+            states them.
     """
 
     camera: str
@@ -540,6 +541,11 @@ class Calibration:
     lens_error_sigma: tuple[float, ...] = ()
     laser_range_m: tuple[float, ...] = ()
     laser_range_sigma_m: tuple[float, ...] = ()
+
+    @property
+    def is_start_certified(self) -> bool:
+        """Whether the certificate is of Algorithm 1's solution, where the estimate starts, not of its own."""
+        return self.method != "paper"
 
     @property
     def channel(self) -> str:

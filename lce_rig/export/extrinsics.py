@@ -103,8 +103,7 @@ def _judgement(calibration: Calibration) -> list[str]:
         "of T_cam_lidar: translation in m, then rotation vector in rad, both along the optical frame's axes, "
         "with R = exp(phi) R0 and t = t0 + tau, as in ROS PoseWithCovariance"
     )
-    # The joint estimate starts from the solution that has the certificate.
-    what = "is_globally_optimal" if calibration.method == "paper" else "start_is_globally_optimal"
+    what = "start_is_globally_optimal" if calibration.is_start_certified else "is_globally_optimal"
     return [
         "    covariance:",
         f"      meaning: {quoted(meaning)}",

@@ -82,14 +82,16 @@ def calibrate_channels(
         estimate = with_consensus(estimate, consensus)
     same_scan = {scan.capture: scan.captures for scan in scans if len(scan.captures) > 1}
     estimate = replace(estimate, refused={**conflicts, **estimate.refused}, same_scan=same_scan)
-    alone = {name: _alone_moved(mover, name, board, options, offsets) for name in agreed}
+    seen = {name: mover.observations(name if len(agreed) > 1 else None) for name in sorted(agreed)}
+    fast = replace(options, n_draws=0, tolerances=None)
+    alone = {name: _widened(calibrate_observations(own, board, fast), offsets) for name, own in seen.items()}
     results = tuple(
         _channel_result(
             name, len(agreed[name].observations), noise_px[name], alone[name], still[name], offsets
         )
-        for name in sorted(agreed)
+        for name in seen
     )
-    apart, cov = _difference(mover, sorted(agreed), board, plain)
+    apart, cov = _difference(mover, tuple(seen.values()), board, plain)
     return replace(estimate, channels=results, channel_difference=apart, channel_difference_cov=cov)
 
 
@@ -135,18 +137,7 @@ def _agree(candidates: Mapping[str, Sequence[CaptureCandidates]], board: Board) 
 
 def _for_comparison(options: EstimateSettings) -> EstimateSettings:
     """Choose Algorithm 1, without draws and without what all channels of a camera have in common."""
-    plain = replace(options, method="paper", estimator=None, n_draws=0, tolerances=None)
-    return replace(plain, laser_bias_sigma_m=0.0, range_offset_sigma_m=0.0)
-
-
-def _alone_moved(
-    mover: _Mover, channel: str, board: Board, options: EstimateSettings, offsets: TimeOffsets | None
-) -> CalibrationEstimate:
-    only = channel if len(mover.samples.channels) > 1 else None
-    return _widened(
-        calibrate_observations(mover.observations(only), board, replace(options, n_draws=0, tolerances=None)),
-        offsets,
-    )
+    return replace(options.without_constant_errors(), method="paper", estimator=None, n_draws=0)
 
 
 def _offsets(
@@ -224,7 +215,7 @@ def depth_scatter_m(estimate: CalibrationEstimate) -> float:
 
 
 def _difference(
-    mover: _Mover, channels: Sequence[str], board: Board, options: EstimateSettings
+    mover: _Mover, seen: Sequence[Sequence[Observation]], board: Board, options: EstimateSettings
 ) -> tuple[Array | None, Array | None]:
     """Compare two channels' extrinsics: the tangent (6,) between them and its covariance.
 
@@ -234,13 +225,12 @@ def _difference(
 
     Args:
         mover: of the boards.
-        channels: names.
+        seen: observations of each channel, positioned by it alone.
         board: its specification.
         options: of Algorithm 1, without what the channels have in common.
     """
-    if len(channels) != 2:
+    if len(seen) != 2:
         return None, None
-    seen = [mover.observations(channel) for channel in channels]
     if mover.offsets is None or mover.is_motion_own:
         first, second = (_widened(calibrate_observations(own, board, options), mover.offsets) for own in seen)
         return difference(first.T_cam_lidar, second.T_cam_lidar), first.cov + second.cov

@@ -102,6 +102,10 @@ class EstimateSettings(CalibrateOptions):
     parts: Algorithm1Parts = Algorithm1Parts()
     estimator: "Estimator | None" = None
 
+    def without_constant_errors(self) -> "EstimateSettings":
+        """Leave errors of the LiDAR's ranges, of lens and board out of the covariance."""
+        return replace(self, laser_bias_sigma_m=0.0, range_offset_sigma_m=0.0, tolerances=None)
+
     @classmethod
     def of(
         cls, options: CalibrateOptions, lidar: LidarSettings, tolerances: Tolerances | None = None

@@ -46,9 +46,8 @@ def calibrate_by_likelihood(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
-    # Of the start, the covariance is not used: constant errors of the sensors need not enter it.
-    plain = replace(options, tolerances=None, laser_bias_sigma_m=0.0, range_offset_sigma_m=0.0)
-    start = calibrate_by_algorithm_1(observations, board, plain, progress)
+    # Of the start, the covariance is not used.
+    start = calibrate_by_algorithm_1(observations, board, options.without_constant_errors(), progress)
     used = [observation for observation in observations if observation.capture in start.used]
     priors, usual = what_is_known(options)
     joint = refine([used], board, [start.T_cam_lidar], priors, usual)

@@ -16,7 +16,7 @@ from lce_rig.core.results import Observation
 from lce_rig.extrinsics.likelihood.fit_levels import fit_levels
 from lce_rig.extrinsics.likelihood.image_terms import StackedImages, stack_images
 from lce_rig.extrinsics.likelihood.levels import NO_LASER_M, Levels, PoseLevels, Priors
-from lce_rig.extrinsics.likelihood.settle import Point, Problem
+from lce_rig.extrinsics.likelihood.settle import JointProblem, Point
 from lce_rig.extrinsics.likelihood.system import (
     PER_CAMERA,
     Assembly,
@@ -63,13 +63,11 @@ class JointEstimate:
         cov_scatter, cov_constants: (G, G) of the unknowns z of `system`: the part that differs between
             sessions, and that of constant errors.
         to_extrinsics: (C, 6, G) derivative of each result's tangent by the unknowns z of `system`.
-        rings: (L,) ring numbers.
         lasers: (3, L) errors of each ring, `along_rays.ERRORS_OF_LASER`; positive for ranges too long.
         fields: (4,) `along_rays.FIELDS`, the displacement of the LiDAR's lens first.
         shifts: (8,) of ring ends, `along_rays.SHIFTS`.
         scale: (C,) relative error of each camera's distances, positive for too short.
         constants_sigma: (3 L + 12,) standard deviations of the lasers' errors, fields and shifts.
-        trust: (F,) weight of each capture, by name.
         levels: of the noise.
         cost: of the F captures at the optimum, in the unknowns z of `system`.
         state: all unknowns at the optimum.
@@ -83,18 +81,26 @@ class JointEstimate:
     cov_scatter: Array
     cov_constants: Array
     to_extrinsics: Array
-    rings: NDArray[np.int16]
     lasers: Array
     fields: Array
     shifts: Array
     scale: Array
     constants_sigma: Array
-    trust: Array
     levels: Levels
     cost: Quadratics
     state: State
     terms: Terms
     priors: Priors
+
+    @property
+    def rings(self) -> NDArray[np.int16]:
+        """Numbers (L,) of the rings."""
+        return self.terms.rings
+
+    @property
+    def trust(self) -> Array:
+        """Weight (F,) of each capture, by name."""
+        return self.terms.trust
 
 
 def refine(
@@ -131,7 +137,7 @@ def refine(
         np.zeros(len(order)),
         np.zeros(PER_CAMERA * len(cameras) + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS),
     )
-    problem = Problem(scans, images, board, priors)
+    problem = JointProblem(scans, images, board, priors)
     placement = group_shared_placements(cameras, order)
     now, here = levels or usual, problem.at(state, _once(placement, images))
     for blur_rad in _BLURS_RAD:
@@ -141,7 +147,7 @@ def refine(
         now = fit_levels(here.terms, now, usual, priors, n_rounds)
         here = here.trusting(trust_captures(here, now, priors, placement))
     here = problem.settle(here, now, _LAST_STEPS, _SETTLED)
-    return _summarise(here, now, priors, scans.rings)
+    return _summarise(here, now, priors)
 
 
 # Moves beyond so many of their standard deviations count less than in full (Huber; 95 % efficient).
@@ -223,7 +229,7 @@ def _to_extrinsics(state: State) -> Array:
     return np.concatenate([to_extrinsic(T[c], c, len(state.constants)) for c in range(len(T))])
 
 
-def _summarise(here: Point, levels: Levels, priors: Priors, rings: NDArray[np.int16]) -> JointEstimate:
+def _summarise(here: Point, levels: Levels, priors: Priors) -> JointEstimate:
     state, cost = here.state, assemble(here.terms, levels, priors).cost
     C, constants = len(state.T_cam_lidar), state.constants
     scatter, of_constants = _covariance_parts(cost, priors, C)
@@ -237,13 +243,11 @@ def _summarise(here: Point, levels: Levels, priors: Priors, rings: NDArray[np.in
         cov_scatter=scatter,
         cov_constants=of_constants,
         to_extrinsics=J,
-        rings=rings,
         lasers=lasers,
         fields=fields,
         shifts=shifts,
         scale=constants[scale_places(C)],
         constants_sigma=np.sqrt(np.diag(cov))[PER_CAMERA * C :],
-        trust=here.terms.trust,
         levels=levels,
         cost=cost,
         state=state,

@@ -25,7 +25,7 @@ class Point:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class JointProblem:
     """Constants of the optimisation."""
 
     scans: StackedScans
@@ -42,10 +42,9 @@ class Problem:
         mixing = _Mixing()
         for _ in range(n_steps):
             reduced = assemble(here.terms, levels, self.priors)
-            z, y = reduced.step()
             if reduced.decrement < short**2:
                 break
-            z, y = mixing.mix(z, y, reduced)
+            z, y = mixing.mix(reduced)
             here = self.at(here.state.moved(z, y), here.terms.trust)
         return here
 
@@ -72,8 +71,9 @@ class _Mixing:
         self._steps: list[Array] = []
         self._moves: list[Array] = []
 
-    def mix(self, z: Array, y: Array, reduced: Reduced) -> tuple[Array, Array]:
-        """Return the move for a step z (G,), y (F, 7)."""
+    def mix(self, reduced: Reduced) -> tuple[Array, Array]:
+        """Return the move z (G,), y (F, 7) for the step of normal equations."""
+        z, y = reduced.step
         step = np.append(z, y)
         move = step
         self._steps.append(step)

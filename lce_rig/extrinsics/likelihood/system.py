@@ -176,15 +176,16 @@ class Reduced:
         """(G,) by z, of all captures and priors."""
         return np.asarray(self.cost.gradients.sum(axis=0) + self.cost.prior_gradient)
 
-    @cached_property
+    @property
     def decrement(self) -> float:
         """Squared length of the step, in standard deviations of all unknowns."""
-        z, _ = self.step()
+        z, _ = self.step
         y = self.own_steps[:, :, -1]
         return float(np.einsum("fi,fij,fj", y, self.of_own, y) - self.gradient @ z)
 
+    @cached_property
     def step(self) -> tuple[Array, Array]:
-        """Solve for z (G,) and y (F, 7)."""
+        """Towards the optimum: z (G,) and y (F, 7)."""
         # Priors of constants differ by many orders of magnitude, too many for `Quadratics.optimum`.
         z = np.asarray(-np.linalg.solve(self.cost.information, self.gradient))
         return z, -self.own_steps @ np.append(z, 1.0)
@@ -194,7 +195,7 @@ class Reduced:
 
         A capture of weight w counts as w captures, each with the covariance of y that one of full weight has.
         """
-        z, y = self.step()
+        z, y = self.step
         F, G = len(y), len(z)
         by_z = np.concatenate([-self.own_steps[:, :, :G], np.broadcast_to(np.eye(G), (F, G, G))], axis=1)
         v = np.column_stack([y, np.broadcast_to(np.append(z, 1.0), (F, G + 1))])
@@ -218,7 +219,7 @@ def assemble(terms: Terms, levels: Levels, priors: Priors) -> Reduced:
 class Assembly:
     """The normal equations of terms at one level of noise after another.
 
-    A search for levels changes one at a time; the others' terms are cached.
+    The terms of the last levels stay: the derivative of the evidence needs them again.
 
     Args:
         terms: of F captures.
