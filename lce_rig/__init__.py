@@ -18,6 +18,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lce_rig.calibrate import CalibrateOptions
     from lce_rig.collect import CollectOptions
     from lce_rig.core.data import Events, Image, Scan
     from lce_rig.core.errors import (
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from lce_rig.export import export
     from lce_rig.export.reference import Reference, read_reference
     from lce_rig.export.result import SavedResult, read_result
-    from lce_rig.extrinsics import CalibrateOptions
+    from lce_rig.io.protocol import SourceOptions
     from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
     from lce_rig.pipeline.detect_session import detect
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     from lce_rig.pipeline.result_files import Result
     from lce_rig.pipeline.union import calibrate
     from lce_rig.pipeline.verification import Verification, verify
-    from lce_rig.recordings.protocol import SourceOptions
     from lce_rig.rig import Rig, load_rig
     from lce_rig.session import Session
     from lce_rig.words import describe, recommend, sentence
@@ -97,7 +97,7 @@ __version__ = "0.1.0"
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
 
 _HOMES = {
-    "lce_rig.extrinsics": ("CalibrateOptions",),
+    "lce_rig.calibrate": ("CalibrateOptions",),
     "lce_rig.collect": ("CollectOptions",),
     "lce_rig.core.data": ("Events", "Image", "Scan"),
     "lce_rig.core.errors": tuple(name for name in __all__ if name.endswith("Error")),
@@ -116,7 +116,7 @@ _HOMES = {
     "lce_rig.pipeline.verification": ("Verification", "verify"),
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),
-    "lce_rig.recordings.protocol": ("SourceOptions",),
+    "lce_rig.io.protocol": ("SourceOptions",),
     "lce_rig.words": ("describe", "recommend", "sentence"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

@@ -165,9 +165,9 @@ def collect(
     _refuse_options(tuple(live), "applies to live collection only", "Omit --from or this option.")
     from lce_rig.collect import CollectOptions
     from lce_rig.core.errors import NotEnoughDataError
+    from lce_rig.io import open_recordings
+    from lce_rig.io.protocol import PairedRecording, SourceOptions
     from lce_rig.pipeline.collect_recordings import fill_session
-    from lce_rig.recordings import open_recordings
-    from lce_rig.recordings.protocol import PairedRecording, SourceOptions
     from lce_rig.session import Session
 
     rig = load_rig(rig_name).of_robot(robot)

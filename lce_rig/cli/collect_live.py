@@ -14,7 +14,7 @@ import click
 from lce_rig.cli import show
 from lce_rig.cli.simulate import TRUTH, require_kind, write_truth
 from lce_rig.core.errors import LceRigError
-from lce_rig.screen.keys import Controls, controls
+from lce_rig.show.screen.keys import Controls, controls
 from lce_rig.words import sentence
 
 if TYPE_CHECKING:
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from lce_rig.collect.live.state import LiveReport, LiveState, TakeBack
     from lce_rig.core.findings import Finding
     from lce_rig.devices.reading import LiveSource
-    from lce_rig.page import Preview
     from lce_rig.rig import Rig
     from lce_rig.session import Session
+    from lce_rig.show.phone import Preview
 
 #: An unattended run ends after this time without a capture. The simulated person never rests; a person at a
 #: rig without a terminal may be away for a while.
@@ -64,7 +64,7 @@ def run_live(rig: "Rig", path: Path, given: LiveArguments) -> None:
     from lce_rig.collect.live.collection import collect_live
     from lce_rig.collect.live.state import HOLD_S, LiveOptions
     from lce_rig.core.errors import UsageError
-    from lce_rig.screen.live_view import open_view
+    from lce_rig.show.screen.live_view import open_view
 
     if given.seed is not None and not given.simulated:
         raise UsageError("--seed applies to --simulated only", "Add --simulated, or omit --seed.")
@@ -168,8 +168,8 @@ def _open_preview(
     """Serve the preview page if requested; return its listeners, links and what its viewers ask for."""
     if given.preview is None:
         return [], (), lambda: None
-    from lce_rig.page import Preview, parse_address
-    from lce_rig.screen.live_view import qr_lines
+    from lce_rig.show.phone import Preview, parse_address
+    from lce_rig.show.screen.live_view import qr_lines
 
     host, port = parse_address(given.preview)
     preview = Preview(host, port)

@@ -9,9 +9,9 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
 
 if TYPE_CHECKING:
-    from lce_rig.deploy.changes import SensorChange
-    from lce_rig.deploy.deployment import Deployed, Plan
-    from lce_rig.deploy.releases import ReleaseRecord, Standing
+    from lce_rig.fleet.deploy.changes import SensorChange
+    from lce_rig.fleet.deploy.deployment import Deployed, Plan
+    from lce_rig.fleet.deploy.releases import ReleaseRecord, Standing
     from lce_rig.rig import Rig
     from lce_rig.rig.target_settings import TargetSettings
 
@@ -57,7 +57,7 @@ def deploy(
     9 if the command after it failed and the new set is in place.
     """
     from lce_rig.core.errors import UsageError
-    from lce_rig.deploy import deployment
+    from lce_rig.fleet.deploy import deployment
 
     if sum((dry_run, status, rollback)) > 1:
         raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
@@ -92,7 +92,7 @@ def deploy(
 def _target(name: str, file: Path | None, session: Path, rig: "Rig | None") -> "TargetSettings":
     """Find the target; its session is opened for its profile only if there is no file."""
     import lce_rig as lce
-    from lce_rig.deploy.targets import find_target
+    from lce_rig.fleet.deploy.targets import find_target
 
     if rig is None and file is None and (session / "session.json").exists():
         rig = lce.Session.open(session).rig

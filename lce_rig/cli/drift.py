@@ -107,7 +107,7 @@ def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None) -> "Dri
     from lce_rig.core.interrupts import patience
     from lce_rig.devices.opening import open_live
     from lce_rig.pipeline.drift import drift_live
-    from lce_rig.screen.keys import controls
+    from lce_rig.show.screen.keys import controls
 
     with show.progress_bar("watching, seconds") as progress, controls() as asked, patience(_JUDGING_S):
         began_s: list[float] = []

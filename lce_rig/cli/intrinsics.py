@@ -145,7 +145,7 @@ def _table(measured: "MeasuredIntrinsics") -> Any:
 
 
 def _findings(measured: "MeasuredIntrinsics") -> list[str]:
-    from lce_rig.validation.intrinsics_check import describe as figures_of
+    from lce_rig.judge.intrinsics_check import describe as figures_of
 
     lines = []
     if measured.check is None:

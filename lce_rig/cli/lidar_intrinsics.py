@@ -9,7 +9,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option
 
 if TYPE_CHECKING:
-    from lce_rig.extrinsics.likelihood.lidar_errors import LidarErrors
+    from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors
 
 
 @click.command(name="lidar-intrinsics")

@@ -12,7 +12,7 @@ from lce_rig.words import describe
 
 if TYPE_CHECKING:
     from lce_rig.core.data import Events
-    from lce_rig.recordings.events.event_recording import EventRecording
+    from lce_rig.io.events.event_recording import EventRecording
 
 STAMPS = "stamps.csv"
 # 14 hours at the default period; one wrong timestamp makes a recording centuries long.
@@ -91,7 +91,7 @@ def reconstruct(
     """
     from lce_rig.core.errors import SourceError, UsageError
     from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
-    from lce_rig.recordings.events import open_events
+    from lce_rig.io.events import open_events
 
     if window_s is not None and window_events is not None:
         raise UsageError("--window-s and --window-events exclude each other")
@@ -161,7 +161,7 @@ def _write(
 ) -> tuple[list[Path], list[str]]:
     """Write the images and their timestamps; return the files, and the causes of skipped images."""
     from lce_rig.core.results import Refusal
-    from lce_rig.verify.overlay_files import write_picture
+    from lce_rig.show.overlays.overlay_files import write_picture
 
     lines = ["picture,stamp_ns"]
     files: list[Path] = []
@@ -193,7 +193,7 @@ def _animate(files: list[Path], period_s: float, gif: Path | None, video: Path |
     import cv2
     import numpy as np
 
-    from lce_rig.verify.animation import write_gif, write_video
+    from lce_rig.show.overlays.animation import write_gif, write_video
 
     for path, write in ((gif, write_gif), (video, write_video)):
         if path is not None:

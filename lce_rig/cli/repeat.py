@@ -10,8 +10,8 @@ from lce_rig.cli.options import json_option
 from lce_rig.words import as_line, describe, recommend, sentence
 
 if TYPE_CHECKING:
+    from lce_rig.judge.repeatability import Repeatability
     from lce_rig.pipeline.comparison import Repeat
-    from lce_rig.validation.repeatability import Repeatability
 
 
 @click.command()

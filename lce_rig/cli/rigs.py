@@ -310,8 +310,8 @@ def _is_bag(path: Path) -> bool:
         SourceError: it would be a bag, and is not there; or a folder without one.
     """
     from lce_rig.core.errors import SourceError
+    from lce_rig.io.ros.bag_file import SUFFIXES, is_bag_file
     from lce_rig.pipeline.new_profile import clouds_in
-    from lce_rig.recordings.ros.bag_file import SUFFIXES, is_bag_file
 
     if path.is_dir():
         if any(is_bag_file(entry) for entry in path.iterdir()) or clouds_in(path):

@@ -32,7 +32,7 @@ def view(session: Path, name: str | None, capture: str | None, output: Path | No
     """
     import lce_rig as lce
     from lce_rig.pipeline.viewing import capture_in_3d, view_of
-    from lce_rig.verify.view_3d import draw_picture, show_window
+    from lce_rig.show.overlays.view_3d import draw_picture, show_window
 
     opened = lce.Session.open(session)
     cameras, calibrations = view_of(opened, name)

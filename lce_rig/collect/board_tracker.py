@@ -4,13 +4,13 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from lce_rig.calibrate.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
 from lce_rig.detect.finder import BoardFinder, ImageSearch
 from lce_rig.detect.image.search import NOT_SEEN_AT_ONCE
-from lce_rig.extrinsics.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
 from lce_rig.rig import Rig
 from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.timing.scan_pairing import Frame

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.recordings.folder.image_file import decode_image
+from lce_rig.io.folder.image_file import decode_image
 
 Pixels = NDArray[np.uint8]
 

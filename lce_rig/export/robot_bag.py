@@ -9,8 +9,8 @@ from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import Array, pose
 from lce_rig.export.robot_tree import RobotJoint, RobotTree
 from lce_rig.export.rotations import rotation_from_quaternion
-from lce_rig.recordings.ros.bag_file import BagFile, list_topics
-from lce_rig.recordings.ros.rosbag import deserialize
+from lce_rig.io.ros.bag_file import BagFile, list_topics
+from lce_rig.io.ros.rosbag import deserialize
 
 _TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 # Rounding of the float64 that ROS writes is far below; what differs more is no rotation.

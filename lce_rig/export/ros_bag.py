@@ -19,7 +19,7 @@ from lce_rig.export.job import ExportJob
 from lce_rig.export.robot_bag import read_robot_bag
 from lce_rig.export.robot_tree import check_frames
 from lce_rig.export.rotations import quaternion_wxyz
-from lce_rig.recordings.ros.message_fields import typestore
+from lce_rig.io.ros.message_fields import typestore
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 TF_STATIC = "/tf_static"

@@ -15,10 +15,10 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.results import Calibration
 from lce_rig.export.job import ExportJob
 from lce_rig.export.ros_bag import bag_writer, camera_info, check_bag, ros_header, write_tf_static
-from lce_rig.recordings.ros.bag_recorder import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan
-from lce_rig.recordings.ros.message_fields import typestore
+from lce_rig.io.ros.bag_recorder import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan
+from lce_rig.io.ros.message_fields import typestore
 from lce_rig.session.capture import Capture
-from lce_rig.verify.overlay import draw_projection, range_limits
+from lce_rig.show.overlays.overlay import draw_projection, range_limits
 
 _INFO_TYPE, _JPEG_TYPE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"
 _JPEG_QUALITY = 92

@@ -28,9 +28,9 @@ from lce_rig.core.errors import (
     UsageError,
     reading,
 )
-from lce_rig.deploy import deployment
-from lce_rig.deploy.place import LostError
-from lce_rig.deploy.targets import find_target
+from lce_rig.fleet.deploy import deployment
+from lce_rig.fleet.deploy.place import LostError
+from lce_rig.fleet.deploy.targets import find_target
 from lce_rig.fleet.jobs import folder_name
 from lce_rig.fleet.query import query
 from lce_rig.fleet.registry import Registry

@@ -10,8 +10,8 @@ from lce_rig.fleet.changes import Sessions, references, rescaled
 from lce_rig.fleet.history import Change, History
 from lce_rig.fleet.siblings import Mounting
 from lce_rig.fleet.table import covariances, poses
-from lce_rig.report.drawing import BLUE, FAINT, ORANGE, QUIET, RED, WIDTH_IN, drawing, new_axes, style
 from lce_rig.scene.alignment import AXES, IS_ROTATION
+from lce_rig.show.report.drawing import BLUE, FAINT, ORANGE, QUIET, RED, WIDTH_IN, drawing, new_axes, style
 from lce_rig.words.extrinsics import motion_words
 
 MATRICES = ("T_cam_lidar", "cov", "cov_shared")

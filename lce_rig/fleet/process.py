@@ -23,7 +23,7 @@ from typing import IO, Any
 _POLL_S = 0.1
 _DETAIL_BYTES = 2000
 # Libraries that every session uses; without threads until a session runs.
-_PRELOADED = ("cv2", "lce_rig.fleet.work", "lce_rig.validation.validate", "lce_rig.verify.overlay_files")
+_PRELOADED = ("cv2", "lce_rig.fleet.work", "lce_rig.judge.validate", "lce_rig.show.overlays.overlay_files")
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
 )

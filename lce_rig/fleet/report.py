@@ -18,9 +18,9 @@ from lce_rig.fleet.history import STATES, History, finding_of
 from lce_rig.fleet.plots import MATRICES, beside_siblings, in_time
 from lce_rig.fleet.siblings import Mounting
 from lce_rig.fleet.tables import FleetTables
-from lce_rig.report.page import render
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.session.durable import write_atomically
+from lce_rig.show.report.page import render
 from lce_rig.words import as_json, as_line, describe, recommend
 from lce_rig.words.extrinsics import motion_words
 

@@ -1,7 +1,7 @@
 """The state of a roll-out on one page."""
 
 from lce_rig.fleet.deployment import Rollout
-from lce_rig.report.page import render
+from lce_rig.show.report.page import render
 
 
 def page(rollout: Rollout) -> str:

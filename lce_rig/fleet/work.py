@@ -28,8 +28,8 @@ from lce_rig.fleet.process import Ended
 from lce_rig.fleet.registry import Registry, write_rows
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import Row, Status, result_columns
+from lce_rig.io.fingerprint import fingerprint
 from lce_rig.pipeline.result_files import OVERLAYS, Result
-from lce_rig.recordings.fingerprint import fingerprint
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import Session
 from lce_rig.session.durable import replace_file

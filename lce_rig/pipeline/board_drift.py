@@ -5,19 +5,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lce_rig.calibrate.local_quadratic import SCALE, expand
+from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Metrics, Observation
 from lce_rig.detect.detection import Detections
-from lce_rig.extrinsics.local_quadratic import SCALE, expand
-from lce_rig.extrinsics.metrics import capture_residual, summarise
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State
-from lce_rig.verify.session_check import find_meetings
+from lce_rig.show.overlays.session_check import find_meetings
 
 # What results of one rig differ by from session to session, m and rad, order of AXES.
 _BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.12, 0.10, 0.12])])

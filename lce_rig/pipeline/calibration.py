@@ -12,14 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from lce_rig.core.diagnostics import Diagnostics
-from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
-from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal, SceneShare
-from lce_rig.detect.detection import Detections, Pair
-from lce_rig.export.reference import Reference
-from lce_rig.extrinsics import (
+from lce_rig.calibrate import (
     CalibrateOptions,
     CalibrationEstimate,
     CaptureCandidates,
@@ -27,11 +20,22 @@ from lce_rig.extrinsics import (
     EstimateSettings,
     calibrate_channels,
 )
-from lce_rig.extrinsics.likelihood.calibrate_together import TogetherEstimate, calibrate_together
-from lce_rig.extrinsics.metrics import error_to_reference
-from lce_rig.extrinsics.observability import find_weakest
-from lce_rig.extrinsics.relative_pose import relative_pose
-from lce_rig.extrinsics.tolerances import Tolerances
+from lce_rig.calibrate.likelihood.calibrate_together import TogetherEstimate, calibrate_together
+from lce_rig.calibrate.metrics import error_to_reference
+from lce_rig.calibrate.observability import find_weakest
+from lce_rig.calibrate.relative_pose import relative_pose
+from lce_rig.calibrate.tolerances import Tolerances
+from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
+from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, Refusal, SceneShare
+from lce_rig.detect.detection import Detections, Pair
+from lce_rig.export.reference import Reference
+from lce_rig.judge.camera_pairs import CameraPair, camera_findings, relate
+from lce_rig.judge.reach import point_uncertainties
+from lce_rig.judge.validate import Validation, validate
+from lce_rig.judge.verdict import judge, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.matching import candidates_of
@@ -40,10 +44,6 @@ from lce_rig.pipeline.sharpening import Sharpen, by_boards, fuse, share_findings
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.validation.camera_pairs import CameraPair, camera_findings, relate
-from lce_rig.validation.reach import point_uncertainties
-from lce_rig.validation.validate import Validation, validate
-from lce_rig.validation.verdict import judge, with_opinion
 from lce_rig.words import not_enough, sentence
 
 

@@ -12,13 +12,13 @@ from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.core.results import Calibration
 from lce_rig.export.result import SavedResult, read_result
+from lce_rig.judge.repeatability import Repeatability, compare_calibrations
 from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
 from lce_rig.session import Session
 from lce_rig.session.identity import DifferingKey, differing_keys
 from lce_rig.session.session import CAPTURES
-from lce_rig.validation.repeatability import Repeatability, compare_calibrations
 from lce_rig.words import describe, recommend
 
 # Inputs of the extrinsics besides the captures; another lens is another camera.

@@ -27,9 +27,9 @@ from lce_rig.scene.drift import AxisDrift, Drift, State, overall, watch
 from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
 from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Session
+from lce_rig.show.overlays.drift_picture import draw_drift
+from lce_rig.show.overlays.overlay_files import write_picture
 from lce_rig.timing.rig_time import event_channel, rig_time_ns
-from lce_rig.verify.drift_picture import draw_drift
-from lce_rig.verify.overlay_files import write_picture
 from lce_rig.words import as_json
 
 _MIN_MOVING = 3

@@ -14,6 +14,7 @@ from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
 from lce_rig.core.results import Refusal
 from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
 from lce_rig.export.files import MADE_BY, number, numbers
+from lce_rig.judge.weighing import verdict_of
 from lce_rig.lens.difference import lens_errors
 from lce_rig.pipeline.lens import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_earlier
@@ -31,7 +32,6 @@ from lce_rig.session import Session
 from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import copy_over
 from lce_rig.session.session import INTRINSICS
-from lce_rig.validation.weighing import verdict_of
 from lce_rig.words import as_json, as_line, describe, recommend, refusal_as_json
 
 DOCUMENT = "intrinsics.json"
@@ -72,8 +72,8 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
 
 def _write_camera(folder: Path, rig: Rig, one: MeasuredIntrinsics) -> tuple[str, ...]:
     """Write the files of one camera and return their names."""
-    from lce_rig.verify.intrinsics_plot import draw_intrinsics
-    from lce_rig.verify.overlay_files import write_picture
+    from lce_rig.show.overlays.intrinsics_plot import draw_intrinsics
+    from lce_rig.show.overlays.overlay_files import write_picture
 
     names = _file_names(one.camera)
     block, info, page = (folder / name for name in names)

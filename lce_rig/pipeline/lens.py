@@ -13,6 +13,7 @@ from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import crop_to_intrinsics
+from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, explain, judge_lens
 from lce_rig.lens.calibrate_lens import MIN_CAPTURES, Choice, choose_model, estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of
 from lce_rig.lens.lens_coverage import find_weaknesses
@@ -21,7 +22,6 @@ from lce_rig.lens.models import MODELS, model_of
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
-from lce_rig.validation.intrinsics_check import IntrinsicsCheck, compare_with_given, explain, judge_lens
 from lce_rig.words import describe
 
 AUTO = "auto"

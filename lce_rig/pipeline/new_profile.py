@@ -16,9 +16,9 @@ from lce_rig.core.data_sheets import find_data_sheet
 from lce_rig.core.errors import UsageError
 from lce_rig.detect.lidar.segments import order_scan
 from lce_rig.export.camera_info import load_camera_info
-from lce_rig.recordings.folder.cloud import to_scan
-from lce_rig.recordings.folder.cloud_file import DECODERS, read_cloud
-from lce_rig.recordings.ros.survey import SensorTopic, survey_bag
+from lce_rig.io.folder.cloud import to_scan
+from lce_rig.io.folder.cloud_file import DECODERS, read_cloud
+from lce_rig.io.ros.survey import SensorTopic, survey_bag
 from lce_rig.rig import LidarSettings
 from lce_rig.rig.draft import CameraDraft, ChannelDraft, LidarDraft, draft_profile
 

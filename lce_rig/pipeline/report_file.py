@@ -28,7 +28,7 @@ def report_text(
         document: content of result.json; text: the same as it is written.
         overlays: the folder of overlays beside the report.
     """
-    from lce_rig.report.calibration_page import calibration_page
+    from lce_rig.show.report.calibration_page import calibration_page
 
     pairs = [(c, channel) for c in calibrations for channel in c.channels]
 

@@ -17,10 +17,10 @@ from lce_rig.core.results import Calibration
 from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.export.result import SavedResult
+from lce_rig.io import open_recordings
+from lce_rig.io.joining import join_recordings, require_sensors
+from lce_rig.io.protocol import ContinuousRecording, PairedRecording
 from lce_rig.pipeline.detect_session import Progress
-from lce_rig.recordings import open_recordings
-from lce_rig.recordings.joining import join_recordings, require_sensors
-from lce_rig.recordings.protocol import ContinuousRecording, PairedRecording
 from lce_rig.rig import Rig
 from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.views import MAX_CAPTURES

@@ -5,20 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from lce_rig.calibrate import CalibrationEstimate
+from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Calibration, Extrinsics, SceneShare
 from lce_rig.detect.detection import Detections
-from lce_rig.extrinsics import CalibrationEstimate
-from lce_rig.extrinsics.metrics import capture_residual, summarise
+from lce_rig.judge.weighing import reason
 from lce_rig.pipeline.witness import scene_views
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.estimate import estimate
 from lce_rig.scene.views import MAX_CAPTURES, without_movers
 from lce_rig.session import Session
-from lce_rig.validation.weighing import reason
 
 _KNOWN_SHARE = 0.02  # of the boards' variance that the scene must remove in a direction to have a say in it
 _CHANCE = 0.01  # of a scene that agrees with the boards to be refused

@@ -11,13 +11,15 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
+from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.results import Calibration
 from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.export.reference import Reference
-from lce_rig.extrinsics import CalibrateOptions
+from lce_rig.judge.repeatability import Repeatability
+from lce_rig.judge.verdict import with_opinion
 from lce_rig.pipeline.calibration import calibrate as calibrate_one
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.pipeline.comparison import compare_sensors, require_independent, require_one_rig, session_names
@@ -27,8 +29,6 @@ from lce_rig.pipeline.sharpening import by_boards, sharpen
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys
-from lce_rig.validation.repeatability import Repeatability
-from lce_rig.validation.verdict import with_opinion
 from lce_rig.words import describe, recommend
 
 # Captures of all sessions are estimated with one of these; targets and limits are those of the first session.

@@ -28,9 +28,9 @@ from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import DEBUG
-from lce_rig.verify.event_picture import ImageWithEvents
-from lce_rig.verify.overlay_files import is_overlay
-from lce_rig.verify.session_check import SessionCheck, check_session, draw_check
+from lce_rig.show.overlays.event_picture import ImageWithEvents
+from lce_rig.show.overlays.overlay_files import is_overlay
+from lce_rig.show.overlays.session_check import SessionCheck, check_session, draw_check
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +220,8 @@ def write_debug_images(
     Returns:
         The folder of the images.
     """
-    from lce_rig.verify.debug_image import draw_debug
-    from lce_rig.verify.overlay_files import write_picture
+    from lce_rig.show.overlays.debug_image import draw_debug
+    from lce_rig.show.overlays.overlay_files import write_picture
 
     base = folder or session.own(DEBUG)
     jobs = [(pair, name) for pair in detections.pairs for name in detections.captures(pair)]

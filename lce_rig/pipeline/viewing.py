@@ -10,7 +10,7 @@ from lce_rig.export.result import read_result
 from lce_rig.pipeline.result_files import RESULT, result_parts
 from lce_rig.scene.colouring import colour_points
 from lce_rig.session import Capture, Session
-from lce_rig.verify.view_3d import CameraIn3D, CaptureIn3D
+from lce_rig.show.overlays.view_3d import CameraIn3D, CaptureIn3D
 
 
 def view_of(

@@ -36,16 +36,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate import CalibrationEstimate, EstimateSettings
+from lce_rig.calibrate.algorithm_1 import solve_planes
+from lce_rig.calibrate.methods import METHODS
+from lce_rig.calibrate.observability import require_observable
+from lce_rig.calibrate.options import Estimator
+from lce_rig.calibrate.report import report_estimate
 from lce_rig.core.board import Board
 from lce_rig.core.diagnostics import NO_DIAGNOSTICS
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.core.results import Observation
-from lce_rig.extrinsics import CalibrationEstimate, EstimateSettings
-from lce_rig.extrinsics.algorithm_1 import solve_planes
-from lce_rig.extrinsics.methods import METHODS
-from lce_rig.extrinsics.observability import require_observable
-from lce_rig.extrinsics.options import Estimator
-from lce_rig.extrinsics.report import report_estimate
 from lce_rig.residuals.features import CaptureFeatures, extract_features
 from lce_rig.residuals.moments import Problem, Weights
 from lce_rig.residuals.placements import group_placements

@@ -17,9 +17,9 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, perturb
 from lce_rig.core.results import Calibration
 from lce_rig.export.result import SavedResult, read_result, write_result
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.pipeline.drift import PairDrift, judge
 from lce_rig.pipeline.scene_captures import SceneCaptures
-from lce_rig.recordings.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import SimulatedCapture, simulate_captures, truth_extrinsics
 from lce_rig.timing.scan_pairing import Frame

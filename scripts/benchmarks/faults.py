@@ -12,8 +12,8 @@ from benchmarks.fault_kinds import KINDS, Case
 from benchmarks.fault_sessions import rig_with_drawing, simulated_scans
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.extrinsics import CalibrateOptions
 from lce_rig.rig import Rig
 from lce_rig.words import sentence
 

@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.kept import kept_folder
 from benchmarks.tables import print_head, print_row, rms
 from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions
 from lce_rig.collect.guidance import (
     HeldPose,
     Person,
@@ -25,7 +26,6 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, fit_plane
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.extrinsics import CalibrateOptions
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
 from lce_rig.simulate.captures import capture_at

@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import pose
-from lce_rig.recordings.ros.bag_recorder import BagRecorder
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import SimulationOptions

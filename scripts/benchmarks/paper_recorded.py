@@ -12,10 +12,10 @@ from benchmarks.paper_runs import paper_mge_m
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare
 from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Calibration, ImageBoard
-from lce_rig.extrinsics import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.pipeline import Detections
 from lce_rig.rig import Rig
 

@@ -12,17 +12,17 @@ from benchmarks.baselines import settings_of
 from benchmarks.kept import kept_folder
 from benchmarks.paper_sets import LEVELS, LIDAR, N_CAPTURES, PaperSet, paper_rig, paper_set
 from benchmarks.tables import compare
-from lce_rig.core.board import Board
-from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, Observation
-from lce_rig.extrinsics import (
+from lce_rig.calibrate import (
     CalibrateOptions,
     CaptureCandidates,
     EstimateSettings,
     capture_residual,
     fit_extrinsic,
 )
+from lce_rig.core.board import Board
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import ImageBoard, Observation
 
 # The middle of the ten levels stands for all where something else is varied.
 MIDDLE_LEVEL = 5

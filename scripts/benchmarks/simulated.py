@@ -6,9 +6,9 @@ import numpy as np
 
 from benchmarks.tables import print_head, print_row, rms
 from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.geometry import difference
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.extrinsics import CalibrateOptions
 from lce_rig.rig import load_rig
 
 

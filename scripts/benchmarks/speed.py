@@ -14,9 +14,9 @@ import numpy as np
 from benchmarks.recordings import SETS
 from benchmarks.tables import print_head, print_row
 from lce_rig import pipeline
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.extrinsics import CaptureCandidates, EstimateSettings, fit_extrinsic
 
 
 def bench_speed() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.kept import kept_folder
+from lce_rig.calibrate import CaptureCandidates
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, invert, transform
@@ -18,7 +19,6 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import from_arrays, to_arrays
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import board_from_pose
-from lce_rig.extrinsics import CaptureCandidates
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.carriers import build_carrier

@@ -100,7 +100,7 @@ def _simulate_moving(seed: int) -> Path:
 def _as_recording(each: RecordedSet) -> list[str]:
     """Write a set's pairs as a bag in which each board stands still for a second, for the same rig."""
     from lce_rig.core.data import Image, Scan
-    from lce_rig.recordings.ros.bag_recorder import BagRecorder
+    from lce_rig.io.ros.bag_recorder import BagRecorder
     from lce_rig.session import Session
 
     pairs, bag = FOLDER / f"pairs {each.name}", FOLDER / f"{each.name}.bag"

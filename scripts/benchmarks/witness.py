@@ -17,6 +17,7 @@ from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import worst
@@ -25,15 +26,14 @@ from lce_rig.core.results import MOTIONS, Calibration, ImageBoard
 from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.detect.detection import ImageDetection, LidarDetection
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.extrinsics import CalibrateOptions
+from lce_rig.judge.verdict import scene_findings, with_opinion
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.witness import MAX_CAPTURES, opinion_of
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import build_view, without_board
 from lce_rig.session import Session
-from lce_rig.validation.verdict import scene_findings, with_opinion
-from lce_rig.verify.session_check import check_session
+from lce_rig.show.overlays.session_check import check_session
 
 _SETS = (*SETS, RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)))
 # A fault of boards that stand still; those of hand-held boards would need their times.

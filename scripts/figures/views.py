@@ -14,10 +14,10 @@ from lce_rig.core.geometry import Array, exp_so3, invert, pose
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
+from lce_rig.show.overlays.overlay import camera_part, draw_overlay
 from lce_rig.simulate.captures import capture_at
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.stage import Stage, set_stage
-from lce_rig.verify.overlay import camera_part, draw_overlay
 
 _SAME_M = 0.3
 _GOOD, _BAD = "#15803d", "#b91c1c"

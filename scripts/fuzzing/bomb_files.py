@@ -166,8 +166,8 @@ def aedat4_packet(kind: str, n_bytes: int) -> Callable[[Samples], bytes]:
 
 def aedat4_entities(samples: Samples) -> bytes:
     """Let the text in the head of a file grow by nested entities."""
-    from lce_rig.recordings.events.aedat4_file import MAGIC
-    from lce_rig.recordings.events.aedat4_writer import _header
+    from lce_rig.io.events.aedat4_file import MAGIC
+    from lce_rig.io.events.aedat4_writer import _header
 
     entities = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
     text = f'<?xml version="1.0"?><!DOCTYPE dv [<!ENTITY a0 "lol">{entities}]>'

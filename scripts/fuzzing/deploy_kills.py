@@ -25,7 +25,7 @@ from wire.sshd import NoServerError, Sshd
 from fuzzing.report import Report
 from fuzzing.started import PATIENCE_S, must_end_well, said, start
 from lce_rig.core.errors import TargetError
-from lce_rig.deploy.releases import content_of
+from lce_rig.fleet.deploy.releases import content_of
 
 _N_CAPTURES = 8
 _EVERY = 10

@@ -165,7 +165,7 @@ PCD_COLUMNS = Layer("bytes", _lzf_raw, _pcd_of_raw)
 
 def aedat4_packets(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield place and content of the packets of a file that was never closed: no table follows them."""
-    from lce_rig.recordings.events.aedat4_file import MAGIC
+    from lce_rig.io.events.aedat4_file import MAGIC
 
     at = len(MAGIC) + 4 + int(struct.unpack_from("<I", data, len(MAGIC))[0])
     while at + 8 <= len(data):
@@ -497,7 +497,7 @@ def _pcap_frames(data: bytes) -> Iterator[tuple[int, int]]:
 
 def _pcap_of(data: bytes, parts: list[bytes]) -> bytes:
     """Put UDP payloads back; IP's and UDP's lengths follow."""
-    from lce_rig.recordings.velodyne.datagrams import ETHERNET, build_frame, read_datagram
+    from lce_rig.io.velodyne.datagrams import ETHERNET, build_frame, read_datagram
 
     out = data[:24]
     for (begin, n), part in zip(_pcap_frames(data), parts, strict=True):

@@ -48,8 +48,8 @@ class Reader:
 
 
 def _cloud(folder: Path) -> None:
-    from lce_rig.recordings.folder.cloud import to_scan
-    from lce_rig.recordings.folder.cloud_file import read_cloud
+    from lce_rig.io.folder.cloud import to_scan
+    from lce_rig.io.folder.cloud_file import read_cloud
 
     path = next(folder.iterdir())
     reading = to_scan(read_cloud(path), "lidar", small_rig().lidars["lidar"], str(path))
@@ -57,7 +57,7 @@ def _cloud(folder: Path) -> None:
 
 
 def _image(folder: Path) -> None:
-    from lce_rig.recordings.folder.image_file import read_image
+    from lce_rig.io.folder.image_file import read_image
 
     sanity.check_pixels(read_image(next(folder.iterdir())))
 
@@ -78,8 +78,8 @@ def _drain(samples: Iterator[Any]) -> None:
 
 
 def _recording(folder: Path) -> None:
-    from lce_rig.recordings import open_recordings
-    from lce_rig.recordings.protocol import PairedRecording, SourceOptions
+    from lce_rig.io import open_recordings
+    from lce_rig.io.protocol import PairedRecording, SourceOptions
 
     for recording in open_recordings([next(folder.iterdir())], small_rig(), SourceOptions(is_part=True)):
         if isinstance(recording, PairedRecording):
@@ -98,9 +98,9 @@ def _read_pairs(recording: Any) -> None:
 
 def _joined(folder: Path) -> None:
     """Read a folder of several recorders as `collect` does: all of its parts as one."""
-    from lce_rig.recordings import open_recordings
-    from lce_rig.recordings.joining import join_recordings
-    from lce_rig.recordings.protocol import SourceOptions
+    from lce_rig.io import open_recordings
+    from lce_rig.io.joining import join_recordings
+    from lce_rig.io.protocol import SourceOptions
 
     parts = open_recordings([folder / "folder"], small_rig(), SourceOptions())
     for recording in join_recordings(parts, small_rig()):
@@ -108,7 +108,7 @@ def _joined(folder: Path) -> None:
 
 
 def _events(folder: Path) -> None:
-    from lce_rig.recordings.events import open_events
+    from lce_rig.io.events import open_events
 
     path = next(folder.iterdir())
     events = open_events(path, sensor=CAMERA)
@@ -116,7 +116,7 @@ def _events(folder: Path) -> None:
 
 
 def _own_events(folder: Path) -> None:
-    from lce_rig.recordings.events import open_events
+    from lce_rig.io.events import open_events
 
     _read_events(open_events(next(folder.iterdir()), sensor=CAMERA, resolution=SIZE))
 
@@ -131,8 +131,8 @@ def _read_events(events: Any) -> None:
 
 
 def _event_camera_file(folder: Path) -> None:
-    from lce_rig.recordings.events.camera_file import EventCameraFile
-    from lce_rig.recordings.protocol import SourceOptions
+    from lce_rig.io.events.camera_file import EventCameraFile
+    from lce_rig.io.protocol import SourceOptions
 
     recording = EventCameraFile(next(folder.iterdir()), small_rig(), SourceOptions())
     _drain(recording.samples())
@@ -140,8 +140,8 @@ def _event_camera_file(folder: Path) -> None:
 
 def _named_folder(folder: Path) -> None:
     """Read a folder of images and clouds under names that were damaged."""
-    from lce_rig.recordings.folder.folder import FolderRecording
-    from lce_rig.recordings.protocol import SourceOptions
+    from lce_rig.io.folder.folder import FolderRecording
+    from lce_rig.io.protocol import SourceOptions
 
     base = folder / "recording"
     base.mkdir()

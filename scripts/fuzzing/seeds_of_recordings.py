@@ -233,7 +233,7 @@ def ros2_folder(samples: Samples) -> list[Files]:
 
 
 def _recorded(samples: Samples, name: str) -> bytes:
-    from lce_rig.recordings.ros.bag_recorder import BagRecorder
+    from lce_rig.io.ros.bag_recorder import BagRecorder
 
     def write(path: Path) -> None:
         with BagRecorder(path, samples.rig) as recorder:
@@ -245,7 +245,7 @@ def _recorded(samples: Samples, name: str) -> bytes:
 
 def mcap_file(samples: Samples) -> bytes:
     """Record images, scans and events as mcap, without the folder's metadata."""
-    from lce_rig.recordings.ros.bag_recorder import BagRecorder
+    from lce_rig.io.ros.bag_recorder import BagRecorder
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bag"
@@ -368,7 +368,7 @@ def _payloads(events: Events) -> dict[str, bytes]:
 
 def pcap(samples: Samples) -> list[Files]:
     """A pcap file of two revolutions of a VLP-16, position packets between them."""
-    from lce_rig.recordings.velodyne.datagrams import PcapWriter
+    from lce_rig.io.velodyne.datagrams import PcapWriter
 
     def write(path: Path) -> None:
         with PcapWriter(path) as writer:
@@ -380,7 +380,7 @@ def pcap(samples: Samples) -> list[Files]:
 
 def pcapng(samples: Samples) -> list[Files]:
     """The same as a pcapng file, with options, a packet of each kind."""
-    from lce_rig.recordings.velodyne.datagrams import build_frame
+    from lce_rig.io.velodyne.datagrams import build_frame
 
     def block(kind: int, body: bytes) -> bytes:
         body += bytes(-len(body) % 4)
@@ -401,7 +401,7 @@ def pcapng(samples: Samples) -> list[Files]:
 def _datagrams(samples: Samples) -> list[Any]:
     from wire.vlp16_packets import Vlp16Packets
 
-    from lce_rig.recordings.velodyne.datagrams import Datagram
+    from lce_rig.io.velodyne.datagrams import Datagram
 
     packets = Vlp16Packets()
     sent = [packet for scan in samples.whole_scans for packet in packets.feed(scan)] + packets.finish()
@@ -430,7 +430,7 @@ def aedat4(compression: str) -> Callable[[Samples], list[Files]]:
 
 def closed_aedat4(samples: Samples) -> list[Files]:
     """An AEDAT4 file with its table of packets."""
-    from lce_rig.recordings.events.aedat4_writer import write_aedat4
+    from lce_rig.io.events.aedat4_writer import write_aedat4
 
     return [{"a.aedat4": _written(lambda path: write_aedat4(path, _halves(samples.events)), "a.aedat4")}]
 
@@ -449,8 +449,8 @@ def aedat4_frames(samples: Samples) -> list[Files]:
         .replace(b"EVTS", b"FRME")
     )
     text = xml.replace(b" </node>\n</dv>", frames + b" </node>\n</dv>")
-    from lce_rig.recordings.events.aedat4_file import MAGIC
-    from lce_rig.recordings.events.aedat4_writer import _header
+    from lce_rig.io.events.aedat4_file import MAGIC
+    from lce_rig.io.events.aedat4_writer import _header
 
     body = MAGIC + _header(text)
     for at, packet in packets:
@@ -489,8 +489,8 @@ def frame_table(start_us: int, exposure_us: int, pixels: np.ndarray) -> bytes:
 
 def _open_aedat4(samples: Samples) -> bytes:
     """Write the file and cut its table off, as a recorder that was killed leaves it."""
-    from lce_rig.recordings.events.aedat4_file import read_header
-    from lce_rig.recordings.events.aedat4_writer import _END_AT
+    from lce_rig.io.events.aedat4_file import read_header
+    from lce_rig.io.events.aedat4_writer import _END_AT
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.aedat4"

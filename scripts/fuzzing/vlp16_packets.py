@@ -15,7 +15,7 @@ import numpy as np
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
-from lce_rig.recordings.velodyne.stream import Vlp16Stream
+from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings
 
 Mutation = Callable[[bytearray, np.random.Generator], bytes]

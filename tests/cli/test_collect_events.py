@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.data import Events, Image, Sample
-from lce_rig.recordings.events.aedat4_writer import Aedat4Writer, write_aedat4
-from lce_rig.recordings.ros.bag_recorder import BagRecorder
+from lce_rig.io.events.aedat4_writer import Aedat4Writer, write_aedat4
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.session import Session
 from tests.collect import simulated_moves as moves
-from tests.recordings.events.aedat4_files import RawFrame, write_davis
+from tests.io.events.aedat4_files import RawFrame, write_davis
 
 
 def bag(path: Path, samples: list[Sample]) -> Path:

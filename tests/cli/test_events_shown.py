@@ -14,8 +14,8 @@ from lce_rig.core.results import Calibration, Certificate, Metrics
 from lce_rig.export.result import write_result
 from lce_rig.rig import find_profile, load_rig
 from lce_rig.session import Session
+from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER
 from lce_rig.simulate import SimulationOptions, simulate_captures
-from lce_rig.verify.event_picture import BRIGHTER, DARKER
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from lce_rig.collect.guidance import Coverage
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
-from lce_rig.screen.live_view import Bell, PlainView, ScreenView, draw_outlines, qr_lines, render
+from lce_rig.show.screen.live_view import Bell, PlainView, ScreenView, draw_outlines, qr_lines, render
 
 SQUARE = np.array([[300.0, 200.0], [700, 240], [660, 500], [280, 470], [300, 200]])
 STREAMS = (

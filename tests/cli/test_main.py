@@ -104,8 +104,8 @@ def test_ctrl_c_while_onnxruntime_is_imported_is_not_taken_for_a_missing_package
 
 
 def test_every_method_of_calibration_can_be_chosen():
+    from lce_rig.calibrate.methods import METHODS
     from lce_rig.cli.calibrate import calibrate
-    from lce_rig.extrinsics.methods import METHODS
 
     (option,) = [parameter for parameter in calibrate.params if parameter.name == "method"]
     assert list(option.type.choices) == list(METHODS)

@@ -12,9 +12,9 @@ from lce_rig.cli.main import run
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.data_sheets import find_data_sheet
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.recordings import open_recording
-from lce_rig.recordings.events import open_events
-from lce_rig.recordings.protocol import ContinuousRecording
+from lce_rig.io import open_recording
+from lce_rig.io.events import open_events
+from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import HandMotion, SimulatedCapture, SimulationOptions, simulate_captures

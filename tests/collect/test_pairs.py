@@ -13,7 +13,7 @@ import pytest
 from lce_rig.collect import CollectOptions, collect
 from lce_rig.core.errors import SourceError
 from lce_rig.core.pcd import encode_pcd
-from lce_rig.recordings import open_recording
+from lce_rig.io import open_recording
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 
@@ -131,7 +131,7 @@ import sys
 from lce_rig.collect import collect
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
-from lce_rig.recordings import open_recording
+from lce_rig.io import open_recording
 rig = load_rig("rlfs")
 with Session.resume(sys.argv[1], rig) as session:
     recording = open_recording(sys.argv[2], rig)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.recordings.folder.cloud import rings_from_elevation
+from lce_rig.io.folder.cloud import rings_from_elevation
 
 VLP16_DEG = np.arange(-15.0, 16.0, 2.0)
 VLP16_OFFSET_M = np.linspace(0.0112, -0.0112, 16)

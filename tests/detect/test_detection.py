@@ -5,7 +5,7 @@ import pytest
 
 from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, Pair, from_arrays, to_arrays
-from tests.extrinsics.boards import simulate
+from tests.calibrate.boards import simulate
 
 
 def assert_same(a, b):

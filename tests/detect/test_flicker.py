@@ -8,7 +8,7 @@ import pytest
 
 from lce_rig.core.data import Events
 from lce_rig.detect.events.flicker import measure_flicker
-from lce_rig.recordings.events import open_events
+from lce_rig.io.events import open_events
 
 WIDTH, HEIGHT = 160, 120
 

@@ -12,7 +12,7 @@ import pytest
 
 from lce_rig.core.data import Image
 from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
-from lce_rig.recordings.events import open_events
+from lce_rig.io.events import open_events
 
 pytestmark = pytest.mark.dataset
 N_COLS, N_TAGS = 4, 12

@@ -25,7 +25,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.devices.opening import open_live
 from lce_rig.devices.reading import AttachedSensors
 from lce_rig.devices.ros2.driver import Ros2Source
-from lce_rig.recordings.ros.bag_recorder import encode_image, encode_scan
+from lce_rig.io.ros.bag_recorder import encode_image, encode_scan
 from lce_rig.rig import Rig, load_rig
 
 IMAGES, POINTS = "/camera/image_raw", "/points"

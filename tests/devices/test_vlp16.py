@@ -19,13 +19,13 @@ from lce_rig.core.errors import SourceError
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.vlp16.driver import Reception, Vlp16Source, to_status
 from lce_rig.devices.vlp16.socket import N_AT_ONCE, UdpPort
-from lce_rig.recordings.protocol import SourceOptions
-from lce_rig.recordings.velodyne.pcap import PcapRecording
-from lce_rig.recordings.velodyne.stream import Vlp16Stream
+from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.velodyne.pcap import PcapRecording
+from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.rig.sensors import DriverSettings
 from tests.devices.test_vlp16_web import PAGES, serving
-from tests.recordings.vlp16_room import PERIOD_NS, T0_NS, packets_of, push, room_scans, settings
+from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of, push, room_scans, settings
 
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"
 PATIENT_S = 10.0

@@ -13,9 +13,9 @@ import pytest
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.vlp16.driver import Reception, explain_silence
 from lce_rig.devices.vlp16.web import VelodyneWeb, find_problems
-from lce_rig.recordings.velodyne.stream import Vlp16Stream
+from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.rig.sensors import DriverSettings
-from tests.recordings.vlp16_room import settings
+from tests.io.vlp16_room import settings
 
 INFO = {
     "model": "VLP-16",

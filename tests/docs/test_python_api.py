@@ -26,10 +26,10 @@ def test_every_public_name_is_there_and_on_the_page():
 
 
 def test_packages_of_the_same_name_do_not_hide_functions():
+    import lce_rig.calibrate
     import lce_rig.detect.finder
     import lce_rig.export
-    import lce_rig.extrinsics
-    import lce_rig.verify.overlay  # noqa: F401
+    import lce_rig.show.overlays.overlay  # noqa: F401
 
     for name in ("calibrate", "detect", "export", "verify"):
         assert callable(getattr(lce, name))

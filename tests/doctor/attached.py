@@ -23,7 +23,7 @@ from lce_rig.rig import Rig
 from tests.detect.scans import Plate
 from tests.devices.fake_board import FakeBoard
 from tests.devices.test_vlp16_web import PAGES, serving
-from tests.recordings.vlp16_room import T0_NS, room_scan
+from tests.io.vlp16_room import T0_NS, room_scan
 
 HERE = "127.0.0.1"
 PERIOD_S = 0.1

@@ -11,18 +11,18 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.image.search import find_image_board
+from lce_rig.judge.intrinsics_check import (
+    check_intrinsics,
+    compare_with_given,
+    explain,
+    judge_lens,
+)
 from lce_rig.lens.calibrate_lens import choose_model, estimate_intrinsics
 from lce_rig.lens.difference import certainty_of, compare_lenses
 from lce_rig.lens.lens_coverage import find_weaknesses, reach, tilts_deg
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.lens.models import MODELS, convert, model_of
 from lce_rig.rig import load_rig
-from lce_rig.validation.intrinsics_check import (
-    check_intrinsics,
-    compare_with_given,
-    explain,
-    judge_lens,
-)
 from tests.lens.lens_views import BOARD, FISHEYE, WIDE, Scene, photograph, with_corners
 
 RATIONAL = replace(WIDE, distortion=(0.3, -0.05, 0.001, 0.0002, 0.01, 0.6, -0.02, 0.03))

@@ -5,11 +5,11 @@ from typing import get_args
 import pytest
 
 from lce_rig import pipeline
+from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.results import Method
 from lce_rig.detect.detection import Detections
-from lce_rig.extrinsics import CalibrateOptions
 from lce_rig.rig import find_profile, parse_rig, set_value
-from tests.extrinsics.boards import simulate
+from tests.calibrate.boards import simulate
 
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 

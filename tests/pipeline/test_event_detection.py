@@ -14,8 +14,8 @@ from lce_rig.core.results import ImageBoard, Refusal
 from lce_rig.pipeline.detect_session import picture_stamp_ns
 from lce_rig.rig import Rig, load_rig, parse_rig
 from lce_rig.session import Session
+from tests.calibrate.boards import simulate
 from tests.detect.moving_board import CENTRE_PX, HEIGHT_PX, WIDTH_PX, Motion, board_events
-from tests.extrinsics.boards import simulate
 
 MS = 1_000_000
 T0_NS = 1_700_000_000_000_000_000

@@ -10,7 +10,7 @@ from lce_rig.core.errors import ResultRefusedError
 from lce_rig.core.geometry import perturb
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.lidar_intrinsics import measure_lidar
-from tests.extrinsics.boards import Scenario, simulate
+from tests.calibrate.boards import Scenario, simulate
 
 
 def seen(moved_m):

@@ -14,7 +14,7 @@ from lce_rig.pipeline.result_files import as_named_in, inputs_sha256
 from lce_rig.pipeline.union import join_detections
 from lce_rig.residuals.placements import group_placements
 from lce_rig.rig import find_profile, parse_rig, set_value
-from tests.extrinsics.boards import T_FORWARD, simulate
+from tests.calibrate.boards import T_FORWARD, simulate
 
 TEXT = find_profile("rlfs").read_text(encoding="utf-8")
 FAST = lce.CalibrateOptions(n_draws=0)

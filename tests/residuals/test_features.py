@@ -8,7 +8,7 @@ import pytest
 from lce_rig.core.geometry import exp_so3, transform
 from lce_rig.core.results import Observation
 from lce_rig.residuals.features import FeatureSettings, extract_features, normal_covariance
-from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, simulate
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 
 def observe(seed=0, **scenario):

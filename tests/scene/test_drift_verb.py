@@ -17,19 +17,19 @@ from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
 from lce_rig.export.result import SavedResult, read_result, write_result
+from lce_rig.io.ros.bag_recorder import BagRecorder
+from lce_rig.io.velodyne.datagrams import build_frame
 from lce_rig.pipeline.drift import drift, judge
 from lce_rig.pipeline.scene_captures import SceneCaptures, Thinned
-from lce_rig.recordings.ros.bag_recorder import BagRecorder
-from lce_rig.recordings.velodyne.datagrams import build_frame
 from lce_rig.rig import Rig, dump_rig
 from lce_rig.scene.alignment import AXES
 from lce_rig.session import Session
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.scan_pairing import Frame
 from tests.doctor.attached import Attached, attach
-from tests.recordings.events.aedat4_files import RawFrame, write_davis
-from tests.recordings.test_pcap import to_datagram, write_pcap
-from tests.recordings.vlp16_room import PERIOD_NS, T0_NS, packets_of
+from tests.io.events.aedat4_files import RawFrame, write_davis
+from tests.io.test_pcap import to_datagram, write_pcap
+from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of
 
 
 @pytest.fixture

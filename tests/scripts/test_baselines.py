@@ -13,11 +13,11 @@ from benchmarks.baselines import (
     solve_closed_form,
 )
 
+from lce_rig.calibrate import error_to_reference, fit_extrinsic
+from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, exp_so3, pose, transform
-from lce_rig.extrinsics import error_to_reference, fit_extrinsic
-from lce_rig.extrinsics.consensus import find_consensus
-from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, simulate
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 METHODS = ("zhou", "corners")
 EXACT = Scenario(

@@ -7,8 +7,8 @@ from benchmarks.paper_plots import level_rms
 from benchmarks.paper_published import RECORDED
 from benchmarks.paper_runs import Run, paper_mge_m, read_runs, write_runs
 
-from lce_rig.extrinsics.consensus import find_consensus
-from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, simulate
+from lce_rig.calibrate.consensus import find_consensus
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 
 def test_kept_runs_are_read_back_with_refusals(tmp_path):

@@ -7,7 +7,7 @@ from benchmarks.fault_sessions import WRONG_PLATES_M, SimulatedScans
 
 from lce_rig.core.geometry import exp_so3, fit_plane, invert, pose, transform
 from lce_rig.rig import load_rig
-from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board
 
 RIG = load_rig("rlfs")
 

@@ -8,12 +8,12 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import invert, transform
-from lce_rig.recordings.events import open_events
-from lce_rig.recordings.events.aedat4_writer import write_aedat4
+from lce_rig.io.events import open_events
+from lce_rig.io.events.aedat4_writer import write_aedat4
 from lce_rig.rig import Rig
 from lce_rig.simulate import HandMotion, SimulatedRecording, SimulationOptions, simulate_recording
 from lce_rig.simulate.simulated_recording import stamp_of
-from tests.recordings.events.bags import write_event_bag
+from tests.io.events.bags import write_event_bag
 
 from .test_moving_captures import found_corners, moving_rig
 

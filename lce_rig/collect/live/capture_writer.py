@@ -16,7 +16,7 @@ from lce_rig.core.data import Image, Sample
 from lce_rig.core.results import ImageBoard
 from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.reading import LiveSource
-from lce_rig.recordings.folder.folder_recorder import FolderRecorder
+from lce_rig.io.folder.folder_recorder import FolderRecorder
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.timing.event_buffer import EventCut

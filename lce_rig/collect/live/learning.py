@@ -7,12 +7,12 @@ from types import TracebackType
 
 import numpy as np
 
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.guidance import Planner
 from lce_rig.collect.live.guide import Guide, Learned, make_guides
 from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.extrinsics import CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.rig import Rig
 
 _NICE = 10

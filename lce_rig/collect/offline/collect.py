@@ -17,8 +17,8 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import Refusal
 from lce_rig.detect.image.search import compare_size
-from lce_rig.recordings.joining import join_recordings, require_sensors
-from lce_rig.recordings.protocol import (
+from lce_rig.io.joining import join_recordings, require_sensors
+from lce_rig.io.protocol import (
     ContinuousRecording,
     PairedRecording,
     PairFiles,

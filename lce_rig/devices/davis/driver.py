@@ -17,7 +17,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.devices.davis.opened import OpenedCamera, open_davis
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource, RateMeter
-from lce_rig.recordings.events.stream import NS_PER_US
+from lce_rig.io.events.stream import NS_PER_US
 from lce_rig.rig import CameraSettings
 
 # What dv-processing delivers, live or from a file, as samples: events, frames and trigger edges.

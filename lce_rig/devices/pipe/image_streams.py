@@ -14,7 +14,7 @@ import numpy as np
 
 from lce_rig.core.limits import MAX_PIXELS
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, Pixels
-from lce_rig.recordings.folder.image_file import decode_image
+from lce_rig.io.folder.image_file import decode_image
 
 _MAX_HEADER = 4096
 _MAX_JPEG = 1 << 26

@@ -11,9 +11,9 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.recordings.ros.rosbag import TopicDecoder
-from lce_rig.recordings.ros.storage import RawMessage
-from lce_rig.recordings.ros.topics import Target
+from lce_rig.io.ros.rosbag import TopicDecoder
+from lce_rig.io.ros.storage import RawMessage
+from lce_rig.io.ros.topics import Target
 from lce_rig.rig import CameraSettings, LidarSettings
 
 _N_SLOTS = 16

@@ -6,7 +6,7 @@ from lce_rig.collect.guidance import SensorModel, SensorPlace, combine, weigh_pl
 from lce_rig.collect.guidance.sensor_noise import ErrorModel
 from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import QualitySettings
-from tests.extrinsics.boards import BOARD, CAMERA, T_FORWARD, Scenario, random_pose, scan_board
+from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, random_pose, scan_board
 
 # What the simulator of boards has: white noise, no side of a board that is drawn by what stands behind it.
 SURROGATE = ErrorModel(

@@ -22,8 +22,8 @@ from lce_rig.collect.guidance.planner import SPACINGS
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import perturb
 from lce_rig.rig import load_rig
+from tests.calibrate.boards import T_FORWARD
 from tests.collect.guidance.boards import model, placements, predict_covariance, view
-from tests.extrinsics.boards import T_FORWARD
 
 NONE = np.zeros((0, 4, 4))
 

@@ -5,20 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.calibrate import EstimateSettings
+from lce_rig.calibrate.methods import calibrate_observations
+from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.collect.guidance import combine, sigmas, weigh_placements
 from lce_rig.collect.guidance.evidence import combine_with_each
 from lce_rig.collect.guidance.sensor_noise import ErrorModel
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Observation
-from lce_rig.extrinsics import EstimateSettings
-from lce_rig.extrinsics.methods import calibrate_observations
-from lce_rig.extrinsics.systematic import ring_sensitivities
 from lce_rig.residuals.features import FeatureSettings, extract_features
 from lce_rig.residuals.moments import Problem, Weights
 from lce_rig.solvers.covariance import symmetric_inverse
 from lce_rig.solvers.registration import vec_rotation
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, scan_board
 from tests.collect.guidance.boards import SURROGATE, model, placements, predict_covariance
-from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, photograph, scan_board
 
 
 def observe(poses, seed, scenario):

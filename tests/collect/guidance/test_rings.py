@@ -4,8 +4,8 @@ import numpy as np
 
 from lce_rig.collect.guidance.evidence import cross_board
 from lce_rig.core.geometry import invert, transform
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, scan_board
 from tests.collect.guidance.boards import model, placements
-from tests.extrinsics.boards import BOARD, T_FORWARD, Scenario, scan_board
 
 
 def test_rings_and_their_points_are_those_of_a_scan():

@@ -1,0 +1,124 @@
+"""Shift of ring ends by the background: the board seems to end earlier there.
+
+A beam that hits both board and background reports the stronger echo. The brighter and nearer the background,
+the earlier the board is lost. If the background is so near that both echoes merge, the range is off the
+board's plane. Recordings show 17 mm times the background's share of the power (docs/method.md).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.local_quadratic import SHIFT
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Observation
+from lce_rig.residuals.along_rays import describe_background
+from lce_rig.residuals.features import CaptureFeatures
+from lce_rig.residuals.plane_and_ends import end_residuals, end_rows
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
+from lce_rig.solvers.covariance import symmetric_inverse
+
+BACKGROUND_SIGMAS_M = (0.015, 0.01, 0.015)
+"""Prior standard deviations of the shifts, in the order of `describe_background`."""
+# Prior standard deviations of the extrinsics around which the shifts are estimated.
+_SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD = 0.02, 0.01
+_N_SHIFTS = len(BACKGROUND_SIGMAS_M)
+# Noise of a ring end, and the number of sigmas beyond which its weight decreases.
+_END_SIGMA_M, _HUBER = 0.003, 1.5
+_ROUNDS = 5
+# Groups of columns tested for significance: all, far background, near background.
+_TOGETHER = ((0, 1, 2), (0,), (1, 2))
+# Each column must differ from 0 in this number of captures.
+_MIN_CAPTURES = 5
+# They count if chance produces them in at most one session of this number.
+_ONE_IN = 1000
+
+
+def estimate_shifts(
+    observations: Sequence[Observation], features: Sequence[CaptureFeatures], T_cam_lidar: Array, board: Board
+) -> Array:
+    """Estimate how far each column of `describe_background` shifts ring ends, outwards: (3,) m.
+
+    Zero if not significant. Robust least squares over all ring ends, with the extrinsics, the beam's
+    width and the shifts unknown.
+
+    Args:
+        observations: F captures.
+        features: of each.
+        T_cam_lidar: (4, 4) near the truth.
+        board: the board.
+    """
+    parts = [end_rows(f, T_cam_lidar, board) for f in features]
+    first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _ in parts]))
+    inside = np.concatenate([r for r, _ in parts])
+    background = np.concatenate([describe_background(observation.lidar) for observation in observations])
+    # Inside distance = - (change of the extrinsics) - beam's width - shifts.
+    A = -np.column_stack([np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), background])
+    # Columns of few captures have no reliable scatter and stay zero, like insignificant ones.
+    n_having = np.count_nonzero(np.add.reduceat(background, first, axis=0) > 0, axis=0)
+    free = n_having >= _MIN_CAPTURES
+    while free.any():
+        shifts, scatter = _fit_shifts(A, inside, first, free)
+        is_sure = np.zeros(_N_SHIFTS, dtype=bool)
+        for group in _TOGETHER:
+            seen = np.array([column for column in group if free[column]], dtype=int)
+            if len(seen):
+                is_sure[seen] |= _is_sure(shifts[seen], scatter[np.ix_(seen, seen)], n_having[seen].max())
+        if is_sure[free].all():
+            return shifts
+        free = is_sure
+    return np.zeros(_N_SHIFTS)
+
+
+def _fit_shifts(
+    A: Array, inside_m: Array, first: NDArray[np.intp], free: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Solve A x = inside distances (M,) robustly: the shifts (3,), and their scatter (3, 3) over captures.
+
+    Captures begin at the rows `first`; shifts that are not free (3,) are zero.
+    """
+    extrinsic = np.repeat([_SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD], 3)
+    sigmas = np.concatenate([extrinsic, [EDGE_SHIFT_SIGMA_M], BACKGROUND_SIGMAS_M])
+    A = A * np.concatenate([np.ones(SHIFT + 1), free])
+    prior, x = np.diag(np.square(_END_SIGMA_M / sigmas)), np.zeros(len(sigmas))
+    for _ in range(_ROUNDS):
+        weights = 1 / np.maximum(np.abs(inside_m - A @ x) / (_HUBER * _END_SIGMA_M), 1.0)
+        information = A.T @ (weights[:, None] * A) + prior
+        x = np.linalg.solve(information, A.T @ (weights * inside_m))
+    gradients = np.add.reduceat(A * (weights * (A @ x - inside_m))[:, None], first, axis=0)
+    hessians = np.add.reduceat(A[:, :, None] * (weights[:, None] * A)[:, None, :], first, axis=0)
+    cost = Quadratics(gradients, hessians, prior, prior @ x, np.arange(len(first)))
+    scatter = jackknife_scatter(cost.moves())
+    return x[-_N_SHIFTS:], scatter[-_N_SHIFTS:, -_N_SHIFTS:]
+
+
+def _is_sure(shifts: Array, scatter: Array, n_captures: int) -> bool:
+    """Return whether shifts (K,) are significant, by Hotelling's test with their scatter (K, K)."""
+    from scipy.special import fdtri
+
+    freedoms, n_left = len(shifts), n_captures - len(shifts)
+    T2 = shifts @ symmetric_inverse(scatter) @ shifts
+    limit = fdtri(freedoms, n_left, 1 - 1 / _ONE_IN) * freedoms * (n_captures - 1) / n_left
+    return bool(limit < T2)
+
+
+def move_ends(
+    observations: Sequence[Observation],
+    features: Sequence[CaptureFeatures],
+    T_cam_lidar: Array,
+    board: Board,
+    shifts_m: Array,
+) -> list[Observation]:
+    """Subtract the shifts (3,) of `estimate_shifts` from ring ends."""
+    moved = []
+    for observation, f in zip(observations, features, strict=True):
+        _, edge = end_residuals(f, T_cam_lidar, board)
+        outwards = f.edge_normals[edge] @ T_cam_lidar[:3, :3]
+        shift = (describe_background(observation.lidar) @ shifts_m)[:, None] * outwards
+        lidar = replace(observation.lidar, edge_points=observation.lidar.edge_points - shift)
+        moved.append(replace(observation, lidar=lidar))
+    return moved

@@ -1,0 +1,235 @@
+"""Matching of LiDAR candidates and camera poses of each capture.
+
+A scan may contain decoys of the board's size, and an image of a plane two poses. Wrong pairs agree with no
+rigid extrinsic, right ones all with the same. Distances and angles between two boards are the same in both
+sensors (1), for any extrinsics, which already excludes most wrong pairs. The pairs that agree with each other
+form a graph. The edges in the most triangles each propose extrinsics (Wahba on both normals and the line
+between the centres), the proposals are scored by all captures, and the best is refined on what agrees with
+it.
+
+No assumption on how the sensors are mounted is made, only that both see the same side of the board.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.options import CaptureCandidates
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, pose
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation, Refusal
+from lce_rig.solvers.registration import rotation_from_directions
+
+NORMAL_TOLERANCE_RAD = np.radians(12.0)
+CENTRE_TOLERANCE_M = 0.15
+_N_PROPOSALS = 400
+_N_REFINEMENTS = 10
+_MOVED_M = 0.1
+# Beyond this the image alone excludes the second pose, for any error of the camera model.
+_MAX_CHI2_GAP = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """The pairs that agree with one rigid transform.
+
+    Attributes:
+        T_cam_lidar: (4, 4) rough extrinsics from normals and centres.
+        observations: one per agreeing capture, sorted by name.
+        refused: why each other capture is rejected.
+        n_alternative_poses: captures that use the second of the camera's poses.
+    """
+
+    T_cam_lidar: Array
+    observations: tuple[Observation, ...]
+    refused: dict[str, Refusal]
+    n_alternative_poses: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Every combination of a camera pose and a LiDAR candidate of the same capture.
+
+    Attributes:
+        capture, pose, candidate: (P,) indices; pose 0 is the image's first choice.
+        normal_cam, normal_lidar: (P, 3).
+        centre_cam, centre_lidar: (P, 3) m.
+    """
+
+    capture: NDArray[np.intp]
+    pose: NDArray[np.intp]
+    candidate: NDArray[np.intp]
+    normal_cam: Array
+    normal_lidar: Array
+    centre_cam: Array
+    centre_lidar: Array
+
+
+def find_consensus(candidates: Sequence[CaptureCandidates], board: Board) -> Consensus | None:
+    """Choose the pairs that agree with one rigid transform.
+
+    Args:
+        candidates: of each capture.
+        board: its size sets the scale at which an angle weighs as much as a distance.
+
+    Returns:
+        The consensus; None if no three captures agree with any extrinsics.
+    """
+    candidates = sorted(candidates, key=lambda item: item.capture)
+    pairs = _list_pairs(candidates)
+    agreement = _agreement(pairs)
+    proposals = _propose(pairs, agreement, scale_m=np.hypot(board.width_m, board.height_m) / 2)
+    if proposals is None:
+        return None
+    R, t = proposals
+    scores = np.concatenate([_score(pairs, R[i : i + 64], t[i : i + 64])[0] for i in range(0, len(R), 64)])
+    best = int(np.argmax(scores))
+    R_best, t_best, chosen = _refine(pairs, R[best], t[best], len(candidates))
+    agreeing = np.flatnonzero(chosen >= 0)
+    if len(agreeing) < 3:
+        return None
+    observations = tuple(_observation(candidates[k], pairs, chosen[k]) for k in agreeing)
+    refused = {
+        candidates[k].capture: _explain(
+            candidates[k], pairs, np.flatnonzero(pairs.capture == k), R_best, t_best
+        )
+        for k in np.flatnonzero(chosen < 0)
+    }
+    n_alternative = int(np.sum(pairs.pose[chosen[agreeing]] == 1))
+    return Consensus(pose(R_best, t_best), observations, refused, n_alternative)
+
+
+def camera_poses(image: ImageBoard) -> list[Array]:
+    """List the poses (4, 4) of the board that an image leaves open."""
+    if image.T_cam_board_alternative is None or image.chi2_gap > _MAX_CHI2_GAP:
+        return [image.T_cam_board]
+    return [image.T_cam_board, image.T_cam_board_alternative]
+
+
+def _list_pairs(candidates: Sequence[CaptureCandidates]) -> _Pairs:
+    index = [
+        (k, p, c)
+        for k, item in enumerate(candidates)
+        for p in range(len(camera_poses(item.image)))
+        for c in range(len(item.lidar))
+    ]
+    T_cam = np.array([camera_poses(candidates[k].image)[p] for k, p, _ in index]).reshape(-1, 4, 4)
+    lidars = [candidates[k].lidar[c] for k, _, c in index]
+    columns = np.array(index, dtype=np.intp).reshape(-1, 3)
+    return _Pairs(
+        capture=columns[:, 0],
+        pose=columns[:, 1],
+        candidate=columns[:, 2],
+        normal_cam=T_cam[:, :3, 2],
+        normal_lidar=np.array([board.plane[:3] for board in lidars]).reshape(-1, 3),
+        centre_cam=T_cam[:, :3, 3],
+        centre_lidar=np.array([_centre(board) for board in lidars]).reshape(-1, 3),
+    )
+
+
+def _centre(board: LidarBoard) -> Array:
+    return board.T_lidar_board[:3, 3]
+
+
+def _agreement(pairs: _Pairs) -> NDArray[np.float32]:
+    """Return which pairs (P, P) preserve angles and distances between their boards, (1)."""
+    angles, along, lengths = [], [], []
+    for normals, centres in ((pairs.normal_cam, pairs.centre_cam), (pairs.normal_lidar, pairs.centre_lidar)):
+        baseline = centres[None] - centres[:, None]
+        angles.append(np.arccos(np.clip(normals @ normals.T, -1, 1)))
+        lengths.append(np.linalg.norm(baseline, axis=-1))
+        along.append(np.einsum("ijk,ik->ij", baseline, normals))
+    agrees = np.abs(angles[0] - angles[1]) < NORMAL_TOLERANCE_RAD
+    agrees &= np.abs(lengths[0] - lengths[1]) < CENTRE_TOLERANCE_M
+    # The height of one board over the other's plane also depends on the error of the angle between both
+    # planes.
+    height_tolerance = CENTRE_TOLERANCE_M + np.maximum(*lengths) * np.sin(NORMAL_TOLERANCE_RAD)
+    is_level = np.abs(along[0] - along[1]) < height_tolerance
+    agrees &= is_level & is_level.T
+    agrees &= pairs.capture[:, None] != pairs.capture[None]
+    return np.asarray(agrees, dtype=np.float32)
+
+
+def _propose(pairs: _Pairs, agreement: NDArray[np.float32], scale_m: float) -> tuple[Array, Array] | None:
+    """Propose extrinsics R (H, 3, 3), t (H, 3) from the two-pair agreements in the most triangles."""
+    triangles = np.triu((agreement @ agreement) * agreement)
+    order = np.argsort(-triangles, axis=None, kind="stable")[:_N_PROPOSALS]
+    i, j = np.unravel_index(order[triangles.ravel()[order] > 0], triangles.shape)
+    if len(i) == 0:
+        return None
+    directions = [
+        np.stack([normals[i], normals[j], (centres[j] - centres[i]) / scale_m], axis=1)
+        for normals, centres in (
+            (pairs.normal_cam, pairs.centre_cam),
+            (pairs.normal_lidar, pairs.centre_lidar),
+        )
+    ]
+    R = rotation_from_directions(directions[0], directions[1])
+    middle_cam = (pairs.centre_cam[i] + pairs.centre_cam[j]) / 2
+    middle_lidar = (pairs.centre_lidar[i] + pairs.centre_lidar[j]) / 2
+    return R, middle_cam - (R @ middle_lidar[..., None])[..., 0]
+
+
+def _misfit(pairs: _Pairs, R: Array, t: Array) -> tuple[Array, Array]:
+    """Compute angles between normals in rad and distances of centres in m, (H, P) each."""
+    normals = pairs.normal_lidar @ np.swapaxes(R, -1, -2)
+    centres = pairs.centre_lidar @ np.swapaxes(R, -1, -2) + t[:, None]
+    angle = np.arccos(np.clip(np.sum(normals * pairs.normal_cam, axis=-1), -1, 1))
+    return angle, np.linalg.norm(centres - pairs.centre_cam, axis=-1)
+
+
+def _score(pairs: _Pairs, R: Array, t: Array) -> tuple[Array, Array]:
+    """Sum over captures 1 - r^2 of their best pair where r < 1: scores (H,), and r^2 (H, P)."""
+    angle, distance = _misfit(pairs, R, t)
+    r2 = (angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2
+    first = np.flatnonzero(np.r_[True, np.diff(pairs.capture) > 0])
+    best = np.minimum.reduceat(r2, first, axis=-1)
+    return np.asarray(np.sum(np.maximum(1 - best, 0), axis=-1)), r2
+
+
+def _refine(pairs: _Pairs, R: Array, t: Array, n_captures: int) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Fit R and t to the agreeing pairs until stable; return also the pair of each capture, or -1."""
+    chosen = np.full(n_captures, -1, dtype=np.intp)
+    for _ in range(_N_REFINEMENTS):
+        _, r2 = _score(pairs, R[None], t[None])
+        order = np.lexsort((r2[0], pairs.capture))
+        captures, first = np.unique(pairs.capture[order], return_index=True)
+        best = order[first]
+        agreeing = r2[0, best] < 1
+        before, chosen = chosen, np.full(n_captures, -1, dtype=np.intp)
+        chosen[captures[agreeing]] = best[agreeing]
+        used = chosen[chosen >= 0]
+        if len(used) < 2 or np.array_equal(before, chosen):
+            break
+        mean_cam, mean_lidar = pairs.centre_cam[used].mean(axis=0), pairs.centre_lidar[used].mean(axis=0)
+        ratio = NORMAL_TOLERANCE_RAD / CENTRE_TOLERANCE_M
+        R = rotation_from_directions(
+            np.concatenate([pairs.normal_cam[used], ratio * (pairs.centre_cam[used] - mean_cam)]),
+            np.concatenate([pairs.normal_lidar[used], ratio * (pairs.centre_lidar[used] - mean_lidar)]),
+        )
+        t = mean_cam - R @ mean_lidar
+    return R, t, chosen
+
+
+def _observation(item: CaptureCandidates, pairs: _Pairs, index: int) -> Observation:
+    T_cam_board = camera_poses(item.image)[pairs.pose[index]]
+    image = item.image if pairs.pose[index] == 0 else replace(item.image, T_cam_board=T_cam_board)
+    return Observation(item.capture, image, item.lidar[pairs.candidate[index]], item.session)
+
+
+def _explain(item: CaptureCandidates, pairs: _Pairs, rows: NDArray[np.intp], R: Array, t: Array) -> Refusal:
+    """State the deviation of a capture's best pair from the consensus."""
+    if len(rows) == 0:
+        return Refusal("pair.no_candidate")
+    angle, distance = (values[0, rows] for values in _misfit(pairs, R[None], t[None]))
+    best = int(np.argmin((angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2))
+    figures = {
+        "n_candidates": len(item.lidar),
+        "candidate": int(pairs.candidate[rows[best]]),
+        "distance_m": float(distance[best]),
+        "rotation_deg": float(np.degrees(angle[best])),
+    }
+    action = "hold_still" if distance[best] > _MOVED_M else ""
+    return Refusal("pair.elsewhere", figures=figures, action=action)

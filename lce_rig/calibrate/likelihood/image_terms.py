@@ -1,0 +1,116 @@
+"""Residuals of board poses in images from T_cam_lidar T_lidar_board.
+
+Corners enter by their fitted pose and its covariance, which hold their information to first order. Besides
+their noise, an image's pose has errors that its corners share: the lens model's misfit in that part of the
+image, the pattern, the board's bend, its motion. The covariance of these errors is
+
+    Q = sigma_tilt^2 about axes in the board's plane, sigma_spin^2 about its normal,
+        sigma_depth^2 along the line of sight, sigma_across^2 across it                                   (1)
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.calibrate.likelihood.levels import PoseLevels
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, difference, skew
+from lce_rig.core.results import ImageBoard
+from lce_rig.residuals.along_rays import N_BOW, Indices, bow_heights
+
+
+@dataclass(frozen=True, eq=False)
+class StackedImages:
+    """One camera's board poses in P captures.
+
+    Attributes:
+        capture: (P,) which of the stacked captures.
+        T_cam_board: (P, 4, 4).
+        cov: (P, 6, 6) of the corners' noise, tangent of T_cam_board.
+        by_bow: (P, 6, 2) how far the measured pose is off for a plate bent by 1 m (`along_rays.bow_heights`).
+        shapes: (P, 6, 6) each, derivative of Q by the square of each of `PoseLevels`, by name.
+    """
+
+    capture: Indices
+    T_cam_board: Array
+    cov: Array
+    by_bow: Array
+    shapes: Mapping[str, Array]
+
+    def total_cov(self, levels: PoseLevels) -> Array:
+        """Add Q to the corners' covariance: (P, 6, 6)."""
+        Q = np.zeros_like(self.cov)
+        for name, shape in self.shapes.items():
+            Q += getattr(levels, name) ** 2 * shape
+        return self.cov + Q
+
+    def with_larger_errors(self, ratios: PoseLevels) -> "StackedImages":
+        """Scale the images' errors beyond corner noise relative to the levels."""
+        shapes = {name: getattr(ratios, name) ** 2 * shape for name, shape in self.shapes.items()}
+        return replace(self, shapes=shapes)
+
+
+def stack_images(capture: Indices, images: Sequence[ImageBoard], board: Board | None = None) -> StackedImages:
+    """Stack the images of one camera.
+
+    Args:
+        capture: (P,) which of the stacked captures they belong to.
+        images: P of them.
+        board: its corners and size; without it, no plate is bent.
+    """
+    T = np.array([image.T_cam_board for image in images])
+    cov = np.array([image.cov for image in images])
+    shapes = {name: np.zeros((len(T), 6, 6)) for name in PoseLevels._fields}
+    normal, sight = T[:, :3, 2], T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
+    about, along = (v[:, :, None] * v[:, None, :] for v in (normal, sight))
+    shapes["tilt_rad"][:, 3:, 3:], shapes["spin_rad"][:, 3:, 3:] = np.eye(3) - about, about
+    shapes["depth_m"][:, :3, :3], shapes["across_m"][:, :3, :3] = along, np.eye(3) - along
+    return StackedImages(
+        capture,
+        T,
+        cov,
+        np.zeros((len(T), 6, N_BOW)) if board is None else _by_bow(T, board),
+        shapes,
+    )
+
+
+def _by_bow(T_cam_board: Array, board: Board) -> Array:
+    """Differentiate poses (P, 4, 4), fitted to a flat board, by the bows of the plate: (P, 6, 2).
+
+    With J the derivative of a corner's direction by the pose and A by its place, corners that rise by h move
+    the pose by (sum J^T J)^-1 sum J^T A h n.
+    """
+    corners = board.corners()
+    levers = corners @ np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
+    x, y, z = np.moveaxis(levers + T_cam_board[:, None, :3, 3], -1, 0)
+    A = np.zeros((*z.shape, 2, 3))
+    A[..., 0, 0] = A[..., 1, 1] = 1 / z
+    A[..., 0, 2], A[..., 1, 2] = -x / z**2, -y / z**2
+    J = np.concatenate([A, -A @ skew(levers)], axis=-1)
+    raised = (A @ T_cam_board[:, None, :3, 2, None]) * bow_heights(corners, board)[:, None]
+    H, g = np.einsum("pmai,pmaj->pij", J, J), np.einsum("pmai,pmab->pib", J, raised)
+    return np.asarray(np.linalg.solve(H, g))
+
+
+def image_rows(
+    images: StackedImages, T_cam_lidar: Array, T_lidar_board: Array, scale: float, bow_m: Array
+) -> Array:
+    """Linearise the tangent from T_cam_board to T_cam_lidar T_lidar_board.
+
+    Returns:
+        (P, 6, 16): by extrinsic (6), by board pose (6), by scale, by bows (2), residual. A scale s
+        stretches what the camera measures to t_cam_board (1 + s): squares or a focal length that the
+        profile has wrong.
+    """
+    Y = T_lidar_board[images.capture]
+    R = T_cam_lidar[:3, :3]
+    rows = np.zeros((len(Y), 6, 16))
+    rows[:, :3, :3] = rows[:, 3:, 3:6] = np.eye(3)
+    rows[:, :3, 3:6] = -skew(Y[:, :3, 3] @ R.T)
+    rows[:, :3, 6:9] = rows[:, 3:, 9:12] = R
+    rows[:, :3, 12] = -images.T_cam_board[:, :3, 3]
+    rows[:, :, 13:15] = images.by_bow
+    rows[:, :, 15] = difference(T_cam_lidar @ Y, images.T_cam_board) + scale * rows[:, :, 12]
+    rows[:, :, 15] += images.by_bow @ bow_m
+    return rows

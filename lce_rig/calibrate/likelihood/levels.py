@@ -1,0 +1,146 @@
+"""Levels of the errors in the likelihood, and their priors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lce_rig.calibrate.background import BACKGROUND_SIGMAS_M
+from lce_rig.calibrate.known_lidar import KnownLidar
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
+from lce_rig.core.geometry import Array
+
+
+class PoseLevels(NamedTuple):
+    """Errors of a board's pose in an image beyond corner noise, as in `Levels`; or ratios of them."""
+
+    tilt_rad: float
+    spin_rad: float
+    depth_m: float
+    across_m: float
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Standard deviations of errors that differ from one measurement to the next; estimated.
+
+    The defaults are from recordings; `LOG_SIGMA` holds their prior standard deviations.
+
+    Attributes:
+        range_m: noise of a single range.
+        ring_m: error that the returns of one ring in one capture share, beyond the laser's offset.
+        edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`along_rays`).
+        backed_rad: the same with an object close behind.
+        lost_share: fraction of ring ends whose last returns are missing.
+        own_shift_m: what each capture adds to the edge shift of all.
+        tilt_rad, spin_rad: errors of a board's turn in an image beyond corner noise.
+        depth_m, across_m: errors of its place, along and across the line of sight.
+        laser_m: of the lasers' range offsets about their mean.
+    """
+
+    range_m: float = 0.008
+    ring_m: float = 0.002
+    edge_rad: float = 0.0005
+    backed_rad: float = 0.001
+    lost_share: float = 0.08
+    own_shift_m: float = 0.0005
+    tilt_rad: float = 3.5e-3
+    spin_rad: float = 5e-4
+    depth_m: float = 0.004
+    across_m: float = 0.0013
+    laser_m: float = 0.008
+
+    @property
+    def pose(self) -> PoseLevels:
+        """The levels of an image's pose."""
+        return PoseLevels(self.tilt_rad, self.spin_rad, self.depth_m, self.across_m)
+
+    def blurred(self, blur_rad: float) -> "Levels":
+        """Set a minimum blur of ring ends."""
+        edge_rad, backed_rad = max(self.edge_rad, blur_rad), max(self.backed_rad, blur_rad)
+        return replace(self, edge_rad=edge_rad, backed_rad=backed_rad)
+
+
+LOG_SIGMA: Mapping[str, float] = {
+    "range_m": 0.7,
+    "ring_m": 0.7,
+    "edge_rad": 0.7,
+    "backed_rad": 1.0,
+    "lost_share": 1.0,
+    "own_shift_m": 1.0,
+    "tilt_rad": 0.7,
+    "spin_rad": 0.7,
+    "depth_m": 0.7,
+    "across_m": 0.7,
+    "laser_m": 0.3,
+}
+"""Prior standard deviation of the logarithm of each level; the profile gives the lasers' spread."""
+# Most ring ends must be at the board's edge, or the board could not be located.
+MOST_LOST = 0.6
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Standard deviations a priori of the constant errors, which are the same in every capture.
+
+    Attributes:
+        offset_m: range offset common to all lasers.
+        shift_m: edge shift d_0, `along_rays`.
+        growth: c, its change with range; recordings show none.
+        background_m: d_1, d_2 and d_3, by the background of the edge.
+        plate_m: p, half the difference of what its width and height are off by.
+        displacement_m: displacement of all ring ends against the returns between them.
+        lateral_m: lens beside the LiDAR's axis, `along_rays`.
+        vertical_m: its height, per rad of elevation.
+        bow_m: height of the plate's middle over its ends, along its width and its height.
+        azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
+        known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
+        scale: relative error of each camera's distances, from squares or focal length; one figure for all.
+        profile_is_claimed: whether the covariance contains the errors of scale and bow. It must not where the
+            effects of lens and board are added to it (`tolerances`).
+    """
+
+    offset_m: float = 0.005
+    shift_m: float = EDGE_SHIFT_SIGMA_M
+    growth: float = 0.0001
+    background_m: tuple[float, float, float] = BACKGROUND_SIGMAS_M
+    plate_m: float = 0.001
+    displacement_m: float = 0.00025
+    lateral_m: float = 0.02
+    vertical_m: float = 0.04
+    bow_m: float = 0.001
+    azimuth_rad: float = 4e-4
+    elevation_rad: float = 2e-4
+    known: KnownLidar | None = None
+    scale: float | tuple[float, ...] = 0.001
+    profile_is_claimed: bool = True
+
+    @property
+    def fields(self) -> Array:
+        """Deviations (4,) in the order of `along_rays.FIELDS`."""
+        return np.array([self.lateral_m, self.vertical_m, self.bow_m, self.bow_m])
+
+    @property
+    def shifts(self) -> Array:
+        """Deviations (8,) in the order of `along_rays.SHIFTS`."""
+        of_width = [self.shift_m, self.growth, *self.background_m, self.plate_m]
+        return np.array([*of_width, self.displacement_m, self.displacement_m])
+
+
+# Offsets of lasers without any in the profile.
+NO_LASER_M = 1e-6
+# A profile that states no range errors, or none of its scale, is used as it says.
+_EXACT_M, _EXACT = 1e-6, 1e-6
+
+
+def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
+    """Read the priors of constant errors and noise from the options."""
+    offset_m = max(options.range_offset_sigma_m, _EXACT_M)
+    priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
+    if options.tolerances is not None:
+        # The effects of focal length and squares on the result contain what the scale does not absorb.
+        scale = max(options.tolerances.scale, _EXACT)
+        bow_m = max(options.tolerances.bow_m, _EXACT)
+        priors = replace(priors, scale=scale, bow_m=bow_m, profile_is_claimed=False)
+    return priors, Levels(laser_m=options.laser_bias_sigma_m)

@@ -1,0 +1,87 @@
+"""The cost of a result with independent weights, for all checks that leave captures out.
+
+It is built from points, planes and ring ends, for any method. The unknowns are the extrinsics, the edge shift
+and the range offset of each laser, with priors; without the latter two, their effects would look like
+disagreement between captures.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.residuals.features import CaptureFeatures, extract_features
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS, end_rows, feature_sigmas, plane_rows
+from lce_rig.residuals.quadratics import Quadratics
+
+SHIFT, FIRST_RING, SCALE = 6, 7, -1
+"""Indices in the x of `expand`, after the tangent (translation m, rotation rad): edge shift m, range offset m
+of each ring, and last the camera's scale."""
+
+# Minimum range error of lasers, if a profile states none.
+_RANGE_FLOOR_M = 0.0005
+
+
+def expand(
+    observations: Sequence[Observation],
+    board: Board,
+    T_cam_lidar: Array,
+    *,
+    laser_bias_sigma_m: float,
+    range_offset_sigma_m: float,
+) -> Quadratics:
+    """Expand the cost of captures about given extrinsics.
+
+    A capture counts 3 / sigma_plane^2 times the mean square over its points, and the square of each ring end
+    over sigma_end^2, with both sigmas estimated from the captures.
+
+    Args:
+        observations: one a capture.
+        board: the board.
+        T_cam_lidar: (4, 4).
+        laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
+        range_offset_sigma_m: of that mean.
+    """
+    features = [extract_features(seen, board) for seen in observations]
+    sigmas = feature_sigmas(features, board, T_cam_lidar)
+    rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
+    p = FIRST_RING + len(rings) + 1
+    gradients, hessians = np.zeros((len(features), p)), np.zeros((len(features), p, p))
+    for k, (f, seen) in enumerate(zip(features, observations, strict=True)):
+        r_plane, J_plane = _plane_rows(f, T_cam_lidar, seen.lidar, rings)
+        r_end, by_end = end_rows(f, T_cam_lidar, board)
+        J_end = np.zeros((len(r_end), p))
+        J_end[:, [*range(FIRST_RING), SCALE]] = by_end
+        by_plane = PLANE_FREEDOMS / (sigmas.plane_m**2 * max(len(r_plane), 1))
+        for r, J, weight in ((r_plane, J_plane, by_plane), (r_end, J_end, 1 / sigmas.end_m**2)):
+            gradients[k] += weight * r @ J
+            hessians[k] += weight * J.T @ J
+    prior = _prior(len(rings), laser_bias_sigma_m, range_offset_sigma_m)
+    return Quadratics(gradients, hessians, prior, np.zeros(p), group_placements(observations))
+
+
+def _plane_rows(
+    f: CaptureFeatures, T: Array, lidar: LidarBoard, rings: NDArray[np.int16]
+) -> tuple[Array, Array]:
+    """Linearise the plane's residual for points as measured, their rays b too long: values, derivatives."""
+    points = np.asarray(lidar.points, dtype=np.float64)
+    values, by_plane = plane_rows(f, T, points)
+    J = np.zeros((len(points), FIRST_RING + len(rings) + 1))
+    J[:, [*range(SHIFT), SCALE]] = by_plane
+    rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+    J[np.arange(len(points)), FIRST_RING + np.searchsorted(rings, lidar.ring)] = rays @ T[:3, :3].T @ f.normal
+    return values, J
+
+
+def _prior(n_rings: int, laser_m: float, offset_m: float) -> Array:
+    """Write priors as information (p, p): of the edge shift, of offsets about their mean, of the mean."""
+    prior = np.zeros((FIRST_RING + n_rings + 1, FIRST_RING + n_rings + 1))
+    prior[SHIFT, SHIFT] = 1 / EDGE_SHIFT_SIGMA_M**2
+    cov = max(laser_m, _RANGE_FLOOR_M) ** 2 * (np.eye(n_rings) - 1 / n_rings)
+    prior[FIRST_RING:SCALE, FIRST_RING:SCALE] = np.linalg.inv(cov + max(offset_m, _RANGE_FLOOR_M) ** 2)
+    return prior

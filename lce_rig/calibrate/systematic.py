@@ -1,0 +1,171 @@
+"""The effect of constant errors on the solution: of the LiDAR's ranges, of the profile's lens and board.
+
+The scatter between captures shows their noise. A laser whose ranges are all 8 mm too long has the same error
+in each capture: it causes no scatter, but moves the extrinsics.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import groupby, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.tolerances import Sensitivity, Tolerances, Variant, sensitivities_of, vary
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.residuals.features import CaptureFeatures, FeatureSettings, extract_features, see_lidar
+from lce_rig.residuals.moments import Problem
+from lce_rig.solvers.covariance import symmetric_inverse
+
+# Of the order of the errors themselves, so that the difference quotient represents their effect.
+STEP_M = 0.005
+# Captures whose rings are shifted at once: few, as each counts as often as it has rings.
+_CHUNK = 16
+
+
+def ring_sensitivities(
+    observations: Sequence[Observation],
+    board: Board,
+    settings: FeatureSettings,
+    problem: Problem,
+    x: Array,
+    edge_ids: NDArray[np.int8],
+    information: Array,
+) -> Array:
+    """Differentiate the solution by the range offset of each ring, by one Newton step.
+
+    With half gradient g and half Hessian H of the cost, both at the solution, a range error b in
+    ring r move the minimum by
+
+        s_r b = -H^-1 sum_k (g_k(ranges of ring r + b) - g_k)                                            (1)
+
+    A ring that a capture does not see does not change its g_k: only (capture, ring) pairs that occur are
+    built, as captures of one large problem. To first order an offset common to all rings moves the minimum
+    by the sum of all s_r.
+
+    Args:
+        observations: the F captures in `problem`.
+        board: the board.
+        settings: of the feature extraction.
+        problem: their moments.
+        x: (m,) solution [vec R; t; d; 1].
+        edge_ids: (n,) its association, which is held.
+        information: (6 + k, 6 + k) H with the prior.
+
+    Returns:
+        (6 + k, L): a column for each of the L rings seen, tangent (translation m, rotation rad, edge shift m)
+        per m of range.
+    """
+    boards = [observation.lidar for observation in observations]
+    seen = [np.union1d(lidar.ring, lidar.edge_ring) for lidar in boards]
+    ring, column = np.unique(np.concatenate(seen), return_inverse=True)
+
+    def features_of(k: int) -> list[CaptureFeatures]:
+        shifted = shift_rings(boards[k], seen[k], STEP_M)
+        own = extract_features(observations[k], board, settings)
+        return [see_lidar(own, lidar, settings) for lidar in shifted]
+
+    change = np.zeros((len(ring), len(information)))
+    np.add.at(change, column, _changes(features_of, board, problem, x, edge_ids) / STEP_M)
+    return np.asarray(-symmetric_inverse(information) @ change.T)
+
+
+def profile_sensitivities(
+    observations: Sequence[Observation],
+    board: Board,
+    settings: FeatureSettings,
+    problem: Problem,
+    x: Array,
+    edge_ids: NDArray[np.int8],
+    information: Array,
+    known: Tolerances,
+) -> tuple[Sensitivity, ...]:
+    """Differentiate the solution by errors of the profile's lens and board, as (1) does by range offsets.
+
+    Args:
+        observations, board, settings, problem, x, edge_ids, information: as of `ring_sensitivities`.
+        known: the profile's lens and its standard deviations.
+    """
+    variants = vary(observations, board, known)
+    n_captures, changes = len(observations), []
+    for assumed, group in groupby(variants, key=lambda variant: variant.board):
+        features_of = partial(_features_under, tuple(group), settings)
+        by_capture = _changes(features_of, assumed, problem, x, edge_ids)
+        changes.append(by_capture.reshape(n_captures, -1, by_capture.shape[1]).sum(axis=0))
+    moves = -np.concatenate(changes) @ symmetric_inverse(information)[:, :6]
+    return sensitivities_of(variants, moves, known)
+
+
+def _features_under(variants: Sequence[Variant], settings: FeatureSettings, k: int) -> list[CaptureFeatures]:
+    """Extract the features of capture k under each error."""
+    return [extract_features(variant.observations[k], variant.board, settings) for variant in variants]
+
+
+def _changes(
+    features_of: Callable[[int], list[CaptureFeatures]],
+    board: Board,
+    problem: Problem,
+    x: Array,
+    edge_ids: NDArray[np.int8],
+) -> Array:
+    """Compute by how much half gradients (n, 6 + k) differ from those of the captures as observed.
+
+    Args:
+        features_of: a capture's features, as they would be with each of some errors.
+        board: that is assumed.
+        problem, x, edge_ids: as of `ring_sensitivities`.
+
+    Returns:
+        Of the n features, capture by capture.
+    """
+    gradients = problem.quadratics(x, edge_ids).gradients
+    starts = np.searchsorted(problem.edge_capture, np.arange(problem.n_captures + 1))
+    own_ids = [edge_ids[first:last] for first, last in pairwise(starts)]
+    found = []
+    for start in range(0, problem.n_captures, _CHUNK):
+        by_capture = {k: features_of(k) for k in range(start, min(start + _CHUNK, problem.n_captures))}
+        features = [each for own in by_capture.values() for each in own]
+        repeated = [k for k, own in by_capture.items() for _ in own]
+        keep = None if problem.keep is None else [problem.keep[k] for k in repeated]
+        ids = np.concatenate([own_ids[k] for k in repeated])
+        moved = Problem(features, board, problem.weights, keep).quadratics(x, ids).gradients
+        found.append(moved - gradients[repeated])
+    return np.concatenate(found)
+
+
+def shift_rings(lidar: LidarBoard, rings: NDArray[np.int16], offset_m: float) -> list[LidarBoard]:
+    """Lengthen the ranges of one ring at a time, and refit the plane.
+
+    The plane m . p = 1, with m = -n / d, predicts ranges r_i = 1 / (m . u_i) along the rays u_i. Fitted to
+    them by least squares, range errors b_i change it to first order by
+
+        dm = (sum J_i^T J_i)^-1 sum J_i^T b_i,    J_i = -r_i^2 u_i^T                                     (2)
+
+    Args:
+        lidar: a board as measured.
+        rings: (L,) ring numbers.
+        offset_m: added to every range of the ring.
+
+    Returns:
+        The board with the points and ring ends of each ring moved along their rays, and the plane refitted.
+    """
+    rays = lidar.points / np.linalg.norm(lidar.points, axis=1, keepdims=True)
+    end_rays = lidar.edge_points / np.linalg.norm(lidar.edge_points, axis=1, keepdims=True)
+    m = -lidar.plane[:3] / lidar.plane[3]
+    jacobian = -rays / (rays @ m)[:, None] ** 2
+    is_ring, is_end = lidar.ring == rings[:, None], lidar.edge_ring == rings[:, None]
+    m_moved = m + offset_m * (is_ring @ jacobian) @ symmetric_inverse(jacobian.T @ jacobian)
+    planes = np.column_stack([-m_moved, np.ones(len(rings))])
+    planes /= np.linalg.norm(m_moved, axis=1, keepdims=True)
+    return [
+        replace(
+            lidar,
+            points=lidar.points + offset_m * moved[:, None] * rays,
+            edge_points=lidar.edge_points + offset_m * moved_ends[:, None] * end_rays,
+            plane=plane,
+        )
+        for plane, moved, moved_ends in zip(planes, is_ring, is_end, strict=True)
+    ]

@@ -1,6 +1,0 @@
-"""Joint maximum-likelihood estimate of extrinsics, board poses and the sensors' constant errors."""
-
-from lce_rig.extrinsics.likelihood.calibrate_jointly import calibrate_by_likelihood
-from lce_rig.extrinsics.likelihood.refine import JointEstimate, refine
-
-__all__ = ["JointEstimate", "calibrate_by_likelihood", "refine"]

@@ -1,0 +1,263 @@
+"""A folder of images and point clouds: per board placement one point cloud, and one image per camera."""
+
+import hashlib
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lce_rig.core.data import Image
+from lce_rig.core.errors import SourceError, reading
+from lce_rig.core.limits import read_file
+from lce_rig.io.folder.cloud import to_scan
+from lce_rig.io.folder.cloud_file import DECODERS, read_cloud
+from lce_rig.io.folder.file_pairs import Pairing, natural_order, pair_names, parse_times
+from lce_rig.io.folder.image_file import SUFFIXES, read_image
+from lce_rig.io.protocol import PairMethod, RecordedPair, SourceOptions
+from lce_rig.io.sensor_choice import choose_camera, choose_lidar
+from lce_rig.rig import LidarSettings, Rig
+
+# The layout of a folder: its images and point clouds, and the camera of each image folder.
+
+IMAGE_FOLDERS = ("img", "imgs", "image", "images", "camera", "cam", "rgb", "color", "frames")
+CLOUD_FOLDERS = (
+    "pcd",
+    "raw_pcd",
+    "pcds",
+    "cloud",
+    "clouds",
+    "lidar",
+    "velodyne",
+    "points",
+    "pointcloud",
+    "ply",
+)
+
+
+def _images_by_camera(folder: Path, cameras: Collection[str]) -> dict[str, list[Path]]:
+    """List the images in folders named after cameras: img/left/ and img/right/, or left/ and right/.
+
+    Returns:
+        Images by camera, in the order of `cameras`; empty where no folder is named after one.
+    """
+    above = [path for name, path in _folders(folder).items() if name in IMAGE_FOLDERS and name not in cameras]
+    for place in (*above, folder):
+        folders = _folders(place)
+        found = {
+            name: files for name in cameras if name in folders and (files := _files(folders[name], SUFFIXES))
+        }
+        if found:
+            return found
+    return {}
+
+
+def _list(
+    folder: Path, names: Sequence[str], suffixes: frozenset[str], what: str, notes: list[str]
+) -> list[Path]:
+    """List the files of one kind in the folder whose name says so, else in the only one that has any.
+
+    Raises:
+        SourceError: there are none, or several folders have some and no name says which is meant.
+    """
+    folders = _folders(folder)
+    holding = {name: files for name, path in folders.items() if (files := _files(path, suffixes))}
+    named = [name for name in names if name in holding]
+    if len(named) > 1:
+        notes.append(f"{folder.name}: {what} taken from {named[0]}/, not from {', '.join(named[1:])}")
+    if named:
+        return holding[named[0]]
+    if here := _files(folder, suffixes):
+        return here
+    if len(holding) == 1:
+        return next(iter(holding.values()))
+    hint = f"Put them into {names[0]}/ below it; {', '.join(sorted(suffixes))} are read."
+    if holding:
+        raise SourceError(f"{folder}: {what} lie in several folders: {', '.join(sorted(holding))}", hint)
+    empty = next((name for name in names if name in folders), None)
+    raise SourceError(f"{folder}{'/' + empty if empty else ''}: no {what} found", hint)
+
+
+def _folders(folder: Path) -> dict[str, Path]:
+    """List the folders in one, by name in lower case."""
+    return {p.name.lower(): p for p in sorted(folder.iterdir()) if p.is_dir() and p.name[0] != "."}
+
+
+def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
+    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and p.name[0] != "."]
+    return sorted(found, key=lambda p: (natural_order(p.stem), p.name))
+
+
+@dataclass(frozen=True)
+class ImageOnDisk:
+    """An image that has not been read yet; the timestamp comes from its name.
+
+    Attributes:
+        label: its name, for messages; with its folder's where several cameras may have the same names.
+    """
+
+    path: Path
+    label: str
+    camera: str
+    channel: str
+    stamp_ns: int | None
+
+    def read(self) -> Image:
+        """Decode it.
+
+        Raises:
+            SourceError: it is missing, empty, truncated or damaged.
+        """
+        return Image(self.camera, self.channel, self.stamp_ns, read_image(self.path))
+
+
+@dataclass(frozen=True)
+class PairOnDisk:
+    """Images and a point cloud that have not been read yet; the timestamp comes from the file name."""
+
+    images: tuple[ImageOnDisk, ...]
+    cloud_path: Path
+    lidar: str
+    settings: LidarSettings
+    cloud_stamp_ns: int | None
+
+    @property
+    def label(self) -> str:
+        """The files' names, for messages."""
+        return " + ".join([*(image.label for image in self.images), self.cloud_path.name])
+
+    def key(self) -> str:
+        """Fingerprint the bytes of all files and the sensors they are read for.
+
+        Raises:
+            SourceError: a file cannot be read.
+        """
+        sensors = [f"{image.camera} {image.channel}" for image in self.images]
+        digest = hashlib.sha256(" ".join([*sensors, self.lidar]).encode())
+        for path in (*(image.path for image in self.images), self.cloud_path):
+            with reading(path, SourceError):
+                digest.update(hashlib.sha256(read_file(path)).digest())
+        return digest.hexdigest()
+
+    def read(self) -> RecordedPair:
+        """Decode all files.
+
+        Raises:
+            SourceError: one is missing, empty, truncated or damaged.
+        """
+        images = tuple(image.read() for image in self.images)
+        cloud = read_cloud(self.cloud_path)
+        reading = to_scan(cloud, self.lidar, self.settings, str(self.cloud_path), self.cloud_stamp_ns)
+        notes = list(reading.notes)
+        if reading.n_not_finite or reading.n_zero_range:
+            n_dropped = reading.n_not_finite + reading.n_zero_range
+            notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return skipped")
+        return RecordedPair(self.label, self.key(), images, (reading.scan,), tuple(notes))
+
+
+class FolderRecording:
+    """Images and point clouds in folders side by side, or in one; images of several cameras in a folder each.
+
+    Attributes:
+        path: the folder.
+        notes: how pairs were found and what was left over.
+        pairs: every point cloud with its images, by name of the point cloud; read them one by one.
+    """
+
+    def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
+        """Find the files and pair them; nothing is decoded yet.
+
+        Raises:
+            SourceError: no images, no point clouds, no way to pair them, or images whose camera is not known.
+        """
+        self.path = path
+        self.notes: list[str] = []
+        self._rig, self._options = rig, options
+        lidar = choose_lidar(rig, options, self.notes)
+        images = self._images()
+        clouds = _list(path, CLOUD_FOLDERS, frozenset(DECODERS), "point clouds", self.notes)
+        cloud_ns = parse_times([cloud.stem for cloud in clouds])
+        # The second image of one camera that goes with a point cloud makes a pair of its own.
+        together: dict[tuple[int, int], list[ImageOnDisk]] = {}
+        lone = []
+        for own, pairing in zip(images, self._pair(images, clouds), strict=True):
+            n_held = Counter[int]()
+            for i, j in pairing.pairs:
+                together.setdefault((j, n_held[j]), []).append(own[i])
+                n_held[j] += 1
+            lone += [own[i].label for i in pairing.lone_images]
+        with_image = {j for j, _ in together}
+        lone += [cloud.name for j, cloud in enumerate(clouds) if j not in with_image]
+        if lone:
+            self.notes.append(f"{path.name}: without a partner: {_shorten(lone)}")
+        self.pairs = [
+            PairOnDisk(
+                tuple(held),
+                clouds[j],
+                lidar,
+                rig.lidars[lidar],
+                None if cloud_ns is None else int(cloud_ns[j]),
+            )
+            for (j, _), held in sorted(together.items(), key=lambda item: item[0])
+        ]
+
+    def _images(self) -> list[list[ImageOnDisk]]:
+        """List the images of each camera.
+
+        Raises:
+            SourceError: there are none, or none of the camera that was asked for.
+        """
+        rig, wanted = self._rig, self._options.camera
+        found = _images_by_camera(self.path, rig.cameras) if len(rig.cameras) > 1 else {}
+        if not found:
+            images = _list(self.path, IMAGE_FOLDERS, SUFFIXES, "images", self.notes)
+            return [self._of_camera(images, None, is_alone=True)]
+        if wanted in rig.cameras:
+            if wanted not in found:
+                raise SourceError(f"{self.path}: images of {', '.join(found)} found, none of {wanted}")
+            found = {wanted: found[wanted]}
+        return [self._of_camera(paths, camera, is_alone=len(found) == 1) for camera, paths in found.items()]
+
+    def _of_camera(self, paths: Sequence[Path], camera: str | None, *, is_alone: bool) -> list[ImageOnDisk]:
+        camera, channel = choose_camera(self._rig, self._options, self.notes, camera)
+        times_ns = parse_times([path.stem for path in paths])
+        return [
+            ImageOnDisk(
+                path,
+                path.name if is_alone else f"{path.parent.name}/{path.name}",
+                camera,
+                channel,
+                None if times_ns is None else int(times_ns[i]),
+            )
+            for i, path in enumerate(paths)
+        ]
+
+    def _pair(self, images: Sequence[Sequence[ImageOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
+        """Match each camera's images with the point clouds, all cameras' in one way."""
+        pairings = [self._pair_camera(own, clouds, self._options.pair) for own in images]
+        methods = {pairing.method for pairing in pairings}
+        if len(methods) > 1:
+            # A camera whose names match less well must not be counted off against the others' names.
+            method: PairMethod = "stem" if "stem" in methods else "time"
+            pairings = [self._pair_camera(own, clouds, method) for own in images]
+        for own, pairing in zip(images, pairings, strict=True):
+            whose = f"{own[0].camera}: " if len(images) > 1 else ""
+            self.notes.append(f"{self.path.name}: {whose}{pairing.explanation}")
+        return pairings
+
+    def _pair_camera(
+        self, images: Sequence[ImageOnDisk], clouds: Sequence[Path], method: PairMethod
+    ) -> Pairing:
+        first, tolerance_s = images[0], self._options.pair_tolerance_s
+        if tolerance_s is None:
+            tolerance_s = self._rig.cameras[first.camera].channels[first.channel].timestamps.tolerance_s
+        stems = [image.path.stem for image in images], [cloud.stem for cloud in clouds]
+        try:
+            return pair_names(*stems, method, tolerance_s)
+        except SourceError as error:
+            whose = f" (camera {first.camera})" if len(self._rig.cameras) > 1 else ""
+            raise SourceError(f"{self.path}{whose}: {error.what}", error.hint) from None
+
+
+def _shorten(names: Sequence[str], n_shown: int = 6) -> str:
+    shown = ", ".join(names[:n_shown])
+    return shown if len(names) <= n_shown else f"{shown} and {len(names) - n_shown} more"

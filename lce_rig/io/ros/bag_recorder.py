@@ -1,0 +1,317 @@
+"""A bag written as samples arrive, on the topics of the rig's profile."""
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.errors import SourceError
+from lce_rig.io.ros.event_array import encode_event_array
+from lce_rig.io.ros.message_fields import typestore
+from lce_rig.rig import LidarSettings, Rig
+from lce_rig.timing.rig_time import event_channel
+
+# Writing events into ROS bags as dvs_msgs/EventArray.
+#
+# References:
+#     https://github.com/uzh-rpg/rpg_dvs_ros/tree/master/dvs_msgs/msg
+
+MESSAGE_TYPE = "dvs_msgs/msg/EventArray"
+# The drivers' own rate.
+_MESSAGE_NS = 33_000_000
+_HEADER = "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"
+_EVENT = {
+    True: "uint16 x\nuint16 y\ntime ts\nbool polarity\n",
+    False: "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity\n",
+}
+
+
+def open_bag_writer(path: Path) -> Any:
+    """Begin a bag: ROS 1 where the path ends in .bag, else ROS 2's mcap; a context manager of rosbags'."""
+    if path.suffix == ".bag":
+        from rosbags.rosbag1 import Writer as Ros1Writer
+
+        return Ros1Writer(path)
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Ros2Writer
+
+    return Ros2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+
+
+def add_event_topic(writer: Any, topic: str, is_ros1: bool) -> Any:
+    """Announce a topic of events in a bag that may hold others as well."""
+    from rosbags.typesys import get_types_from_msg
+
+    store = typestore(is_ros1)
+    store.register(get_types_from_msg(_EVENT[is_ros1], "dvs_msgs/msg/Event"))
+    store.register(get_types_from_msg(_HEADER, MESSAGE_TYPE))
+    return writer.add_connection(topic, MESSAGE_TYPE, typestore=store)
+
+
+def event_messages(
+    events: Events, frame_id: str, is_ros1: bool, first_number: int = 0
+) -> Iterator[tuple[int, bytes]]:
+    """Cut events into messages of 33 ms.
+
+    Yields:
+        Time of receipt in ns, that of the last event where the host's clock is not known, and the message.
+    """
+    if not len(events):
+        return
+    first_ns, last_ns = int(events.t_ns[0]), int(events.t_ns[-1])
+    edges_ns = np.arange(first_ns, last_ns + _MESSAGE_NS + 1, _MESSAGE_NS)
+    encoding = "ros1" if is_ros1 else "cdr"
+    number = first_number
+    for start_ns in edges_ns[:-1]:
+        part = events.between(int(start_ns), int(start_ns) + _MESSAGE_NS)
+        if len(part):
+            received_ns = int(part.t_ns[-1])
+            if events.host_ns is not None:
+                received_ns = events.host_ns + int(part.t_ns[0]) - first_ns
+            yield received_ns, encode_event_array(part, frame_id, encoding, number)
+            number += 1
+
+
+# Images and scans as ROS messages, with the fields and conventions that other programs expect.
+#
+# References:
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/Image.html
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointCloud2.html
+#     https://github.com/ros-drivers/velodyne (the layout of its point clouds)
+
+IMAGE_TYPE = "sensor_msgs/msg/Image"
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
+_NS_PER_S = 10**9
+_UINT16, _FLOAT32 = 4, 7
+# velodyne_pointcloud's: times are seconds after the header's timestamp, which float32 holds to 4 ns.
+_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2")])
+_TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
+
+
+def encode_image(image: Image, frame_id: str, is_ros1: bool, number: int) -> memoryview:
+    """Encode an image as sensor_msgs/Image, mono8 or bgr8.
+
+    Args:
+        image: the image; one without a timestamp gets 0, which readers take for none.
+        frame_id: of the header.
+        is_ros1: whether for ROS 1.
+        number: of the message in its topic; ROS 1 headers carry it.
+    """
+    height_px, width_px = image.pixels.shape[:2]
+    data = np.ascontiguousarray(image.pixels).reshape(-1)
+    message = typestore(is_ros1).types[IMAGE_TYPE](
+        header=_header(image.stamp_ns or 0, frame_id, is_ros1, number),
+        height=height_px,
+        width=width_px,
+        encoding="mono8" if image.pixels.ndim == 2 else "bgr8",
+        is_bigendian=0,
+        step=len(data) // height_px,
+        data=data,
+    )
+    return _serialize(message, IMAGE_TYPE, is_ros1)
+
+
+def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool, number: int) -> memoryview:
+    """Encode a scan as sensor_msgs/PointCloud2 with x, y, z, intensity, ring and, where known, time.
+
+    Args:
+        scan: the scan; one without a timestamp gets 0, which readers take for none.
+        settings: the LiDAR's frame, and which firing its timestamps mark.
+        is_ros1: whether for ROS 1.
+        number: of the message in its topic; ROS 1 headers carry it.
+    """
+    stamp_ns = _cloud_stamp_ns(scan, settings)
+    points = np.empty(len(scan.points), _POINT if scan.offset_ns is None else _TIMED_POINT)
+    for axis, name in enumerate("xyz"):
+        points[name] = scan.points[:, axis]
+    points["intensity"], points["ring"] = scan.intensity, scan.ring
+    if scan.offset_ns is not None:
+        points["time"] = 1e-9 * (scan.offset_ns + ((scan.stamp_ns or 0) - stamp_ns))
+    types = typestore(is_ros1).types
+    field = types["sensor_msgs/msg/PointField"]
+    message = types[CLOUD_TYPE](
+        header=_header(stamp_ns, settings.frame, is_ros1, number),
+        height=1,
+        width=len(points),
+        fields=[
+            field(name=name, offset=place, datatype=_UINT16 if kind == "<u2" else _FLOAT32, count=1)
+            for name, (kind, place, *_) in (points.dtype.fields or {}).items()
+        ],
+        is_bigendian=False,
+        point_step=points.dtype.itemsize,
+        row_step=points.nbytes,
+        data=points.view(np.uint8),
+        is_dense=True,
+    )
+    return _serialize(message, CLOUD_TYPE, is_ros1)
+
+
+def _cloud_stamp_ns(scan: Scan, settings: LidarSettings) -> int:
+    """Say what the LiDAR's driver would have timestamped: the first firing, or the last one."""
+    if scan.stamp_ns is None or settings.timestamps.reference == "first_firing":
+        return scan.stamp_ns or 0
+    if scan.offset_ns is None or not len(scan.offset_ns):
+        return scan.stamp_ns + round(_NS_PER_S / settings.rate_hz)
+    return scan.stamp_ns + int(scan.offset_ns.max())
+
+
+def _header(stamp_ns: int, frame_id: str, is_ros1: bool, number: int) -> Any:
+    types = typestore(is_ros1).types
+    seconds, nanoseconds = divmod(stamp_ns, _NS_PER_S)
+    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+    sequence = {"seq": number} if is_ros1 else {}
+    return types["std_msgs/msg/Header"](**sequence, stamp=stamp, frame_id=frame_id)
+
+
+def _serialize(message: Any, msgtype: str, is_ros1: bool) -> memoryview:
+    store = typestore(is_ros1)
+    data: memoryview = (store.serialize_ros1 if is_ros1 else store.serialize_cdr)(message, msgtype)
+    return data
+
+
+class BagRecorder:
+    """A bag open for writing; a context manager.
+
+    Samples go to the disk a megabyte at a time and are not kept. A bag that was never closed, because the
+    program was killed or the disk is full, lacks its index; readers here find the messages all the same, and
+    `rosbag reindex` or `ros2 bag reindex` puts the index back.
+
+    Attributes:
+        path: a ROS 1 bag where it ends in .bag, else the folder of a ROS 2 bag (mcap).
+    """
+
+    def __init__(self, path: Path, rig: Rig) -> None:
+        """Begin an empty bag.
+
+        Raises:
+            SourceError: something is there already, or nothing can be written there.
+        """
+        self.path = path
+        self._rig = rig
+        self._is_ros1 = path.suffix == ".bag"
+        self._numbers: Counter[str] = Counter()
+        self._connections: dict[str, tuple[str, Any]] = {}
+        self._failure: SourceError | None = None
+        if path.exists() or path.is_symlink():
+            raise SourceError(
+                f"{path} exists already", "Name another file: recordings are never overwritten."
+            )
+        if path.suffix in (".mcap", ".db3"):
+            raise SourceError(
+                f"{path}: a ROS 2 bag is a folder", f"Name it {path.with_suffix('')}, or end it in .bag."
+            )
+        self._writer: Any = open_bag_writer(path)
+        with self._disk():
+            self._writer.open()
+
+    def write(self, sample: Sample) -> None:
+        """Add an image, a scan or a packet of events.
+
+        Raises:
+            SourceError: the disk is full, now or before; the rig lacks the sensor; or two sensors of the
+                profile share a topic and differ in kind.
+            ValueError: it has no timestamp at all.
+        """
+        if isinstance(sample, Events):
+            self._write_events(sample)
+            return
+        received_ns = sample.stamp_ns if sample.host_ns is None else sample.host_ns
+        if received_ns is None:
+            raise ValueError(f"a sample of {sample.sensor} carries no time")
+        if isinstance(sample, Image):
+            topic, frame = self._camera_topic(sample.sensor, sample.channel)
+            data = encode_image(sample, frame, self._is_ros1, self._numbers[topic])
+            self._write(topic, IMAGE_TYPE, received_ns, data)
+        else:
+            topic = self._lidar_topic(sample)
+            settings = self._rig.lidars[sample.sensor]
+            data = encode_scan(sample, settings, self._is_ros1, self._numbers[topic])
+            self._write(topic, CLOUD_TYPE, received_ns, data)
+
+    def close(self) -> None:
+        """Write the index; does nothing the second time, or after a failure.
+
+        Raises:
+            SourceError: the disk is full; what was written before can be read.
+        """
+        if self._writer is not None and self._failure is None:
+            with self._disk():
+                self._writer.close()
+        self._writer = None
+
+    def __enter__(self) -> "BagRecorder":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+        with suppress(SourceError):
+            self.close()
+
+    def _write_events(self, events: Events) -> None:
+        channel = event_channel(self._rig, events.sensor) or "events"
+        topic, frame = self._camera_topic(events.sensor, channel)
+        for received_ns, data in event_messages(events, frame, self._is_ros1, self._numbers[topic]):
+            self._write(topic, MESSAGE_TYPE, received_ns, data)
+
+    def _write(self, topic: str, msgtype: str, received_ns: int, data: bytes | memoryview) -> None:
+        connection = self._connection(topic, msgtype)
+        with self._disk():
+            self._writer.write(connection, received_ns, data)
+        self._numbers[topic] += 1
+
+    def _connection(self, topic: str, msgtype: str) -> Any:
+        if topic not in self._connections:
+            if msgtype == MESSAGE_TYPE:
+                connection = add_event_topic(self._writer, topic, self._is_ros1)
+            else:
+                connection = self._writer.add_connection(topic, msgtype, typestore=typestore(self._is_ros1))
+            self._connections[topic] = msgtype, connection
+        known, connection = self._connections[topic]
+        if known != msgtype:
+            raise SourceError(
+                f"topic {topic} would carry both {known} and {msgtype}", "Give each a topic in the profile."
+            )
+        return connection
+
+    def _camera_topic(self, camera: str, channel: str) -> tuple[str, str]:
+        settings = self._rig.cameras.get(camera)
+        if settings is None or channel not in settings.channels:
+            raise SourceError(f"rig {self._rig.name!r} has no camera channel {camera}.{channel}")
+        return settings.channels[channel].topic or f"/{camera}/{channel}", settings.optical_frame
+
+    def _lidar_topic(self, scan: Scan) -> str:
+        if scan.sensor not in self._rig.lidars:
+            raise SourceError(f"rig {self._rig.name!r} has no lidar {scan.sensor!r}")
+        return self._rig.lidars[scan.sensor].topic or f"/{scan.sensor}/points"
+
+    @contextmanager
+    def _disk(self) -> Iterator[None]:
+        """End the bag where a full disk or an interrupt tears it: nothing is written behind that."""
+        if self._failure is not None:
+            raise self._failure
+        try:
+            yield
+        except BaseException as error:
+            self._failure = not_writable(self.path, error)
+            with suppress(OSError):
+                # Of rosbags before 0.11 nothing closes a file without trying to write the index.
+                getattr(self._writer, "abort", self._writer.close)()
+            if isinstance(error, OSError):
+                raise self._failure from error
+            raise
+
+
+def not_writable(path: Path, error: BaseException) -> SourceError:
+    """Say that a recording cannot be written, and that what was written before is not lost."""
+    return SourceError(
+        f"{path} cannot be written: {getattr(error, 'strerror', '') or str(error) or type(error).__name__}",
+        "Make room or record elsewhere; what was recorded before can be read.",
+    )

@@ -1,0 +1,459 @@
+"""A bag as a stream of images, scans and events, by the timestamps in their headers."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core import limits
+from lce_rig.core.data import Image, Sample, Scan, Stream
+from lce_rig.core.errors import SourceError
+from lce_rig.core.losses import Losses
+from lce_rig.io.events.choice import CameraEvents
+from lce_rig.io.events.event_recording import EventRecording
+from lce_rig.io.events.stream import NoEventsError, damage, worded
+from lce_rig.io.folder.cloud import to_scan
+from lce_rig.io.folder.image_file import decode_image, to_8_bit
+from lce_rig.io.merging import merge_by_time
+from lce_rig.io.overlap import check_overlap
+from lce_rig.io.protocol import SourceOptions, Span
+from lce_rig.io.ros.bag_file import BagFile, list_topics
+from lce_rig.io.ros.event_messages import BagEvents
+from lce_rig.io.ros.message_fields import MessageReader, read_header, typestore
+from lce_rig.io.ros.storage import RawMessage
+from lce_rig.io.ros.topics import CLOUD_TYPES, PACKET_TYPES, Target, choose_topics
+from lce_rig.io.velodyne.points import OFFSETS_NOTE
+from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.rig import CameraSettings, LidarSettings, Rig
+
+# sensor_msgs/Image and CompressedImage as grey or BGR images.
+#
+# References:
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/image__encodings_8h_source.html
+
+# Encoding: bytes of one channel, channels, name of OpenCV's conversion to BGR ("" where none is needed).
+_ENCODINGS = {
+    "mono8": (1, 1, ""),
+    "8uc1": (1, 1, ""),
+    "mono16": (2, 1, ""),
+    "16uc1": (2, 1, ""),
+    "bgr8": (1, 3, ""),
+    "8uc3": (1, 3, ""),
+    "bgr16": (2, 3, ""),
+    "rgb8": (1, 3, "COLOR_RGB2BGR"),
+    "rgb16": (2, 3, "COLOR_RGB2BGR"),
+    "bgra8": (1, 4, "COLOR_BGRA2BGR"),
+    "8uc4": (1, 4, "COLOR_BGRA2BGR"),
+    "rgba8": (1, 4, "COLOR_RGBA2BGR"),
+    "yuv422": (1, 2, "COLOR_YUV2BGR_UYVY"),
+    "uyvy": (1, 2, "COLOR_YUV2BGR_UYVY"),
+    "yuv422_yuy2": (1, 2, "COLOR_YUV2BGR_YUY2"),
+    "yuyv": (1, 2, "COLOR_YUV2BGR_YUY2"),
+    **{f"bayer_{m}8": (1, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
+    **{f"bayer_{m}16": (2, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
+}
+
+
+def decode_ros_image(message: Any) -> NDArray[np.uint8]:
+    """Decode sensor_msgs/Image.
+
+    Returns:
+        (H, W) grey or (H, W, 3) BGR.
+
+    Raises:
+        ValueError: an unknown encoding, or sizes that contradict each other.
+    """
+    encoding = str(message.encoding).lower()
+    if encoding not in _ENCODINGS:
+        raise ValueError(f"its encoding {message.encoding!r} is not known; known are {', '.join(_ENCODINGS)}")
+    n_bytes, n_channels, conversion = _ENCODINGS[encoding]
+    width, height = int(message.width), int(message.height)
+    if width * height > limits.MAX_PIXELS:
+        raise ValueError(f"it declares {width}x{height} pixels (limit {limits.MAX_PIXELS})")
+    n_row = width * n_channels * n_bytes
+    step = int(message.step) or n_row
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    if width * height == 0 or step < n_row or len(data) < (height - 1) * step + n_row:
+        raise ValueError(
+            f"{len(data)} bytes are not a {width}x{height} image in {encoding} with rows of {step} bytes"
+        )
+    kind = np.dtype(f"{'>' if message.is_bigendian else '<'}u{n_bytes}")
+    rows = np.ndarray((height, width, n_channels), kind, data.data, 0, (step, n_channels * n_bytes, n_bytes))
+    pixels = rows[:, :, 0] if n_channels == 1 else rows
+    return _convert(to_8_bit(pixels.astype(kind.newbyteorder("="))), conversion)
+
+
+def decode_ros_compressed_image(message: Any) -> NDArray[np.uint8]:
+    """Decode sensor_msgs/CompressedImage.
+
+    Returns:
+        (H, W) grey or (H, W, 3) BGR.
+
+    Raises:
+        ValueError: it is damaged, or no image.
+    """
+    form = str(message.format).lower()
+    if "compresseddepth" in form:
+        raise ValueError("it is a depth image")
+    pixels = decode_image(bytes(message.data))
+    mosaic = form.split(";")[0].strip()
+    # A camera's raw mosaic may have been compressed as if it were grey.
+    if mosaic.startswith("bayer_") and mosaic in _ENCODINGS and pixels.ndim == 2:
+        return _convert(pixels, _ENCODINGS[mosaic][2])
+    return pixels
+
+
+def _convert(pixels: NDArray[np.uint8], conversion: str) -> NDArray[np.uint8]:
+    if not conversion:
+        return pixels
+    import cv2
+
+    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)), dtype=np.uint8)
+
+
+# sensor_msgs/PointCloud2 of any layout as a structured array.
+#
+# References:
+#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointCloud2.html
+
+_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def check_field_count(data: bytes, encoding: str) -> None:
+    """Make sure that a message does not declare more fields than points have, before it is deserialised.
+
+    Args:
+        data: sensor_msgs/PointCloud2 as it lies in the bag.
+        encoding: "ros1" or "cdr".
+
+    Raises:
+        ValueError: it does, or it is damaged.
+    """
+    reader = MessageReader(data, encoding)
+    read_header(reader)  # Height and width stand behind the header as they do in messages of events.
+    n_fields = reader.number("I")
+    if n_fields > limits.MAX_FIELDS:
+        raise ValueError(f"it declares {n_fields} fields per point (limit {limits.MAX_FIELDS})")
+
+
+def decode_pointcloud2(message: Any) -> NDArray[Any]:
+    """View a message's points by their names, row by row.
+
+    Field offsets, gaps between fields, gaps behind rows and byte order are as the message says.
+
+    Args:
+        message: sensor_msgs/PointCloud2 of ROS 1 or 2.
+
+    Returns:
+        Structured (height * width,); fields with a count of c > 1 have shape (c,).
+
+    Raises:
+        ValueError: what in the message contradicts itself.
+    """
+    order = ">" if message.is_bigendian else "<"
+    names: list[str] = []
+    formats: list[Any] = []
+    offsets: list[int] = []
+    for entry in message.fields:
+        if entry.datatype not in _KINDS:
+            raise ValueError(f"field {entry.name!r} has the unknown datatype {entry.datatype}")
+        kind, count = np.dtype(order + _KINDS[entry.datatype]), max(int(entry.count), 1)
+        if entry.offset + kind.itemsize * count > message.point_step:
+            raise ValueError(f"field {entry.name!r} does not fit into point_step {message.point_step}")
+        if entry.name and entry.name not in names:
+            names.append(entry.name)
+            formats.append(kind if count == 1 else (kind, (count,)))
+            offsets.append(int(entry.offset))
+    width, height, step = int(message.width), int(message.height), int(message.point_step)
+    if width * height > limits.MAX_POINTS:
+        raise ValueError(f"it declares {width * height} points (limit {limits.MAX_POINTS})")
+    # Some drivers leave row_step at zero in point clouds of one row.
+    row_step = int(message.row_step) or width * step
+    if row_step < width * step:
+        raise ValueError(f"row_step {row_step} is less than {width} points of {step} bytes")
+    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    if width * height == 0:
+        return np.empty(0, dtype=dtype)
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    n_needed = (height - 1) * row_step + width * step
+    if len(data) < n_needed:
+        raise ValueError(f"it holds {len(data)} of {n_needed} bytes of points")
+    rows: NDArray[Any] = np.ndarray((height, width), dtype, data.data, 0, (row_step, step))
+    return rows.reshape(-1)
+
+
+# A timestamp this much earlier than the one before is a clock that was set, not a message that came late.
+CLOCK_JUMP_NS = 1_000_000_000
+# Drivers start within this many messages of each other; the span of a later one is not known beforehand.
+_N_PROBED = 500
+
+
+class TopicDecoder:
+    """Makes the images or scans of one topic from its messages, of a bag or live.
+
+    Args:
+        target: the sensor it belongs to.
+        settings: that sensor's block of the profile.
+
+    Attributes:
+        n_yielded: samples so far.
+        losses: what was skipped.
+        notes: what was assumed, in words.
+        hint: what to do about the last message that could not be decoded.
+    """
+
+    def __init__(self, target: Target, settings: CameraSettings | LidarSettings) -> None:
+        self.n_yielded = 0
+        self.losses = Losses()
+        self.notes: set[str] = set()
+        self._target, self._settings = target, settings
+        self._last_ns: int | None = None
+        self._packets: Vlp16Stream | None = None
+        self._waiting: list[Scan] = []
+        self.hint = ""
+
+    def decode(self, message: RawMessage) -> Image | Scan | None:
+        """Decode one message; None, and counted, where it is damaged, sent twice or late."""
+        try:
+            content = deserialize(message)
+            if message.msgtype in PACKET_TYPES:
+                self._take_packets(content)
+                return self._oldest()
+            stamp_ns = _header_stamp_ns(content)
+            if stamp_ns == 0:
+                self.notes.add("headers have no timestamps; the time of receipt is used")
+                stamp_ns = message.log_ns
+            sample = self._to_sample(message, content, stamp_ns)
+        except (SourceError, ValueError) as error:
+            cause = error.what if isinstance(error, SourceError) else str(error)
+            self.hint = (error.hint or "") if isinstance(error, SourceError) else ""
+            self.losses.add(damage("recording.not_decoded", cause))
+            return None
+        if not self._is_in_order(sample.stamp_ns):
+            return None
+        self.n_yielded += 1
+        return sample
+
+    def finish(self) -> Iterator[Scan]:
+        """Yield the scans that wait: a revolution of packets may end with the recording."""
+        last = self._packets.finish() if self._packets else None
+        self._waiting += [] if last is None else [last]
+        while (scan := self._oldest()) is not None:
+            yield scan
+
+    def account(self) -> list[str]:
+        """Say what was assumed and skipped, in words."""
+        lines = sorted(self.notes) + worded(self.losses)
+        return lines if self._packets is None else lines + self._packets.account()
+
+    def _take_packets(self, content: Any) -> None:
+        """Assemble the packets of a message; a scan ends where the rotor passes the cut, not the message."""
+        assert isinstance(self._settings, LidarSettings)  # as packets have no camera
+        if self._packets is None:
+            self._packets = Vlp16Stream(self._target.sensor, self._settings)
+            self.notes |= {OFFSETS_NOTE, "scans are assembled from packets"}
+        for packet in content.packets:
+            host_ns = int(packet.stamp.sec * 10**9 + packet.stamp.nanosec)
+            scan = self._packets.push_data(np.asarray(packet.data).tobytes(), host_ns)
+            self._waiting += [] if scan is None else [scan]
+        others = self._packets.other_models.most_common(1)
+        if others and not self._packets.n_data:
+            what = f"its packets are of a {others[0][0]}, not of a {self._packets.product.name}"
+            raise SourceError(what, f"Set the model of {self._target.sensor!r} in the profile.")
+
+    def _oldest(self) -> Scan | None:
+        while self._waiting:
+            scan = self._waiting.pop(0)
+            if self._is_in_order(scan.stamp_ns):
+                self.n_yielded += 1
+                return scan
+        return None
+
+    def _to_sample(self, message: RawMessage, content: Any, stamp_ns: int) -> Image | Scan:
+        sensor, channel = self._target.sensor, self._target.channel
+        if isinstance(self._settings, CameraSettings):
+            assert channel is not None  # as every topic of a camera has
+            is_compressed = message.msgtype.endswith("CompressedImage")
+            pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
+            if self._settings.channels[channel].timestamps.reference == "start":
+                self.notes.add(
+                    "messages have no exposure time; timestamps of its start are used as its middle"
+                )
+            return Image(sensor, channel, stamp_ns, pixels, message.log_ns)
+        cloud = decode_pointcloud2(content)
+        reading = to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns)
+        self.notes.update(reading.notes)
+        n_without_return = reading.n_not_finite + reading.n_zero_range
+        self.losses.add(damage("recording.points_without_return"), n_without_return)
+        return reading.scan
+
+    def _is_in_order(self, stamp_ns: int | None) -> bool:
+        """Return whether a timestamp is later than its predecessor; count it where it is not."""
+        if stamp_ns is None or self._last_ns is None or stamp_ns > self._last_ns:
+            self._last_ns = stamp_ns
+            return True
+        if stamp_ns == self._last_ns:
+            self.losses.add(damage("recording.sent_twice"))
+            return False
+        if self._last_ns - stamp_ns < CLOCK_JUMP_NS:
+            self.losses.add(damage("recording.out_of_order"))
+            return False
+        self.losses.add(damage("recording.clock_set_back"))
+        self._last_ns = stamp_ns
+        return True
+
+
+class BagRecording:
+    """A ROS 1 or ROS 2 bag; one message of each kind is in memory at a time.
+
+    Attributes:
+        path: the bag's file or folder.
+        notes: topics taken, and after reading what was skipped and why.
+        key: fingerprint of the bag.
+        n_samples: number of messages with images and scans on the topics taken.
+        streams: what is read, with its span where the bag holds events or is a part of a recording.
+    """
+
+    def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
+        """Find the topics.
+
+        Raises:
+            SourceError: the bag cannot be read, or lacks a topic; the message lists those that are there.
+        """
+        self.path = path
+        self.notes: list[str] = []
+        self._rig = rig
+        self._bag = BagFile(path)
+        self._targets = choose_topics(path, self._bag.topics, rig, options, self.notes)
+        self._events = self._open_events()
+        self.n_samples = sum(self._bag.topics[topic][1] for topic in self._targets)
+        self.key = self._bag.fingerprint()
+        self.streams = self._list_streams(is_spanned=bool(self._events) or options.is_part)
+        events, scans = (
+            {s: span for s, span in self.streams.items() if s.kind == kind} for kind in ("events", "scans")
+        )
+        self.notes += check_overlap(scans, events, rig)
+        for journal in self._bag.unmerged_journals():
+            hint = "its last messages are not read; opening the bag once with sqlite3 merges them"
+            self.notes.append(f"{journal.name} lies beside the bag: {hint}")
+        if self._bag.damage:
+            self.notes.append(f"{path.name}: damaged ({self._bag.damage}); read as far as it goes")
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield images and scans in the order the recorder received them, and events by their timestamps.
+
+        Each sensor's timestamps rise. Messages sent twice, late, or damaged are skipped and counted in
+        `notes`. Where the clock of a camera or LiDAR is set back by more than a second its timestamps start
+        again from there.
+
+        Raises:
+            SourceError: no message of a topic could be decoded; or, after all that can be read, the bag is
+                torn.
+        """
+        parts = [self._messages(), *(events.samples() for events in self._events.values())]
+        try:
+            yield from merge_by_time(parts, self._rig)
+        finally:
+            for events in self._events.values():
+                self.notes += [note for note in events.notes if note not in self.notes]
+
+    def _messages(self) -> Iterator[Sample]:
+        decoders = {
+            topic: TopicDecoder(target, self._settings(target)) for topic, target in self._targets.items()
+        }
+        try:
+            for message in self._bag.messages(self._targets.keys()):
+                sample = decoders[message.topic].decode(message)
+                if sample is not None:
+                    yield sample
+            for decoder in decoders.values():
+                yield from decoder.finish()
+        finally:
+            self._summarise(decoders)
+        for topic, decoder in decoders.items():
+            found = {each.code: each for each in decoder.losses.findings()}
+            if decoder.n_yielded == 0 and found:
+                failed = found.get("recording.not_decoded")
+                cause = failed.figures["where"] if failed else "its timestamps do not increase"
+                raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}", decoder.hint)
+
+    def _settings(self, target: Target) -> CameraSettings | LidarSettings:
+        is_lidar = target.channel is None
+        return self._rig.lidars[target.sensor] if is_lidar else self._rig.cameras[target.sensor]
+
+    def _open_events(self) -> dict[Stream, CameraEvents]:
+        """Take the topics of raw events out of the others and open them.
+
+        Raises:
+            SourceError: events of another resolution; or no events, and no images either.
+        """
+        opened: dict[Stream, CameraEvents] = {}
+        for topic, target in list(self._targets.items()):
+            stream = target.stream(self._bag.topics[topic][0])
+            if stream.kind != "events":
+                continue
+            del self._targets[topic]
+            size = self._rig.cameras[target.sensor].resolution_px
+            try:
+                events = BagEvents(self.path, topic, self._bag)
+                opened[stream] = CameraEvents(EventRecording(self.path, events, target.sensor, size))
+            except NoEventsError as error:
+                if all(other.channel is None for other in self._targets.values()):
+                    raise SourceError(f"{topic} of {error.what}", list_topics(self._bag.topics)) from None
+                self.notes.append(f"{topic} of {error.what}; read without")
+        return opened
+
+    def _list_streams(self, is_spanned: bool) -> dict[Stream, Span | None]:
+        streams: dict[Stream, Span | None] = {s: events.span_ns for s, events in self._events.items()}
+        begun = self._first_stamps() if is_spanned else {}
+        for topic, target in self._targets.items():
+            stamp_ns, log_ns = begun.get(topic, (None, None))
+            end_ns = self._bag.end_ns(topic) if topic in begun else None
+            stream = target.stream(self._bag.topics[topic][0])
+            if stamp_ns is None or log_ns is None or end_ns is None:
+                streams[stream] = None
+            else:
+                streams[stream] = stamp_ns, stamp_ns + end_ns - log_ns
+        return streams
+
+    def _first_stamps(self) -> dict[str, tuple[int, int]]:
+        """Find (timestamp, time of receipt) of the first message of each topic, as far as they come early."""
+        found: dict[str, tuple[int, int]] = {}
+        try:
+            for message in islice(self._bag.messages(self._targets.keys()), _N_PROBED):
+                if message.topic not in found:
+                    with suppress(ValueError):
+                        stamp_ns = _header_stamp_ns(deserialize(message)) or message.log_ns
+                        found[message.topic] = stamp_ns, message.log_ns
+                if len(found) == len(self._targets):
+                    break
+        except SourceError:
+            pass  # Reported once everything before the damage has been read.
+        return found
+
+    def _summarise(self, decoders: dict[str, TopicDecoder]) -> None:
+        for topic, decoder in decoders.items():
+            self.notes += [f"{topic}: {line}" for line in decoder.account()]
+
+
+def _header_stamp_ns(content: Any) -> int:
+    return int(content.header.stamp.sec * 10**9 + content.header.stamp.nanosec)
+
+
+def deserialize(message: RawMessage) -> Any:
+    """Deserialise by ROS's own definitions; those in a bag may be missing, or beyond what rosbags parses."""
+    is_ros1 = message.encoding == "ros1"
+    if message.msgtype in CLOUD_TYPES:
+        check_field_count(message.data, message.encoding)
+    store = typestore(is_ros1)
+    msgtype = message.msgtype.replace("/", "/msg/")
+    try:
+        if is_ros1:
+            return store.deserialize_ros1(message.data, msgtype)
+        return store.deserialize_cdr(message.data, msgtype)
+    except Exception as error:  # A damaged message fails in any way: struct, assert, unicode, index.
+        raise ValueError(f"a message is damaged: {str(error) or type(error).__name__}") from None

@@ -1,0 +1,232 @@
+"""Two cameras that saw the same boards: their relative pose from images, and whether their extrinsics agree.
+
+Each still board that both see gives T_second_first = T_second_board T_first_board^-1 without any LiDAR. The
+extrinsics of both cameras with one LiDAR give the same pose independently.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.likelihood.image_terms import stack_images
+from lce_rig.calibrate.likelihood.levels import Levels
+from lce_rig.calibrate.relative_pose import mean_pose, relative_covariance, relative_pose
+from lce_rig.calibrate.shared_scans import scan_key
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array, difference, tangent_sizes
+from lce_rig.core.results import Observation
+from lce_rig.judge.split_consistency import contrast_halves, split_findings
+from lce_rig.judge.weighing import SURPRISING_CHI2, reason
+from lce_rig.residuals.placements import group_placements
+from lce_rig.residuals.quadratics import Quadratics, without_prior
+from lce_rig.rig import CalibrationSettings, VerdictSettings
+from lce_rig.solvers.covariance import symmetric_inverse
+
+# Fewer placements do not determine the scatter.
+_MIN_PLACEMENTS = 4
+# Fewer placements do not determine the shape of the scatter; that of typical errors is used.
+_MIN_JACKKNIFE = 10
+# Degrees of freedom of the Student distribution that weights single boards, as some may be outliers.
+_STUDENT = 5.0
+# Scatter of boards above this multiple of the typical value has a cause.
+_MAX_SCATTER = 2.0
+
+_BY_IMAGES = {
+    "verdict.changed": "verdict.camera_changed",
+    "verdict.shares_differ": "verdict.camera_shares_differ",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """The relative pose of two cameras from their images.
+
+    Attributes:
+        T_second_first: (4, 4), p_second = R p_first + t.
+        cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the second camera: from the scatter
+            between placements.
+        captures: (F,) that both cameras used, as the first names them.
+        board_rms_m: rms distance between both cameras' positions of a board's middle.
+        scatter: of single boards about it, in typical standard deviations of poses in images.
+        expansion: of the cost about T_second_first, per capture.
+        centres: (F, 3) middle of the board in each, frame of the first camera, m.
+    """
+
+    T_second_first: Array
+    cov: Array
+    captures: tuple[str, ...]
+    board_rms_m: float
+    scatter: float
+    expansion: Quadratics
+    centres: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPair:
+    """Two cameras calibrated to one LiDAR.
+
+    Attributes:
+        captures: that both used, as the first names them.
+        T_second_first: (4, 4) to which their extrinsics compose.
+        from_images: the relative pose from their images; None if both saw too few boards.
+        apart: (6,) tangent from the extrinsics' pose to the images'; None likewise.
+        surprise: its squared length in reported standard deviations.
+        board_rms_m: rms distance between positions of a board's middle under the extrinsics' pose.
+    """
+
+    captures: tuple[str, ...]
+    T_second_first: Array
+    from_images: RelativePose | None
+    apart: Array | None
+    surprise: float
+    board_rms_m: float
+
+
+def shared_boards(
+    first: Mapping[str, Observation], second: Mapping[str, Observation]
+) -> list[tuple[Observation, Observation]]:
+    """Pair observations of two cameras of the same board in the same scan, in any captures.
+
+    Args:
+        first: observations by capture, of one camera.
+        second: of the other.
+    """
+    there = {scan_key(observation): observation for observation in second.values()}
+    found = [(observation, there.get(scan_key(observation))) for observation in first.values()]
+    return [(one, other) for one, other in found if other is not None]
+
+
+def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPair | None:
+    """Compare the extrinsics of two cameras with their images of still boards.
+
+    Returns:
+        None if the cameras share no capture.
+    """
+    shared = shared_boards(first.observations, second.observations)
+    if not shared:
+        return None
+    T, J = relative_pose(second.T_cam_lidar, first.T_cam_lidar)
+    from_images = pose_from_images(shared)
+    captures = tuple(one.capture for one, _ in shared)
+    board_rms_m = _board_rms_m(shared, T)
+    if from_images is None:
+        return CameraPair(captures, T, None, None, 0.0, board_rms_m)
+    apart = difference(from_images.T_second_first, T)
+    # Errors of the images enter both poses and are counted twice, so that the surprise is conservative.
+    cov = relative_covariance(J, second.cov, first.cov) + from_images.cov
+    surprise = float(apart @ np.linalg.solve(cov, apart))
+    return CameraPair(captures, T, from_images, apart, surprise, board_rms_m)
+
+
+def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> RelativePose | None:
+    """Estimate T_second_first from both cameras' images of the same boards.
+
+    An image's pose has the errors of its corners' noise and errors that corners share (`image_terms`).
+
+    Returns:
+        None for fewer than four placements.
+    """
+    firsts, seconds = ([pair[k] for pair in shared] for k in (0, 1))
+    placement = group_placements(firsts)
+    if placement.max() + 1 < _MIN_PLACEMENTS:
+        return None
+    T_first, cov_first = _poses(firsts)
+    T_second, cov_second = _poses(seconds)
+    T, J = relative_pose(T_second, T_first)
+    information = symmetric_inverse(relative_covariance(J, cov_second, cov_first))
+    middle = T[int(np.argmin(np.median(_distances(T, information), axis=1)))]
+    mean, weight = mean_pose(T, information, middle, _student_weights)
+    apart = difference(T, mean)
+    chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
+    hessians = weight[:, None, None] * information
+    gradients = -(hessians @ apart[..., None])[..., 0]
+    expansion = without_prior(gradients, hessians, placement)
+    scatter = float(np.sqrt(chi2 / (6 * (len(T) - 1))))
+    if len(expansion.groups) < _MIN_JACKKNIFE:
+        cov = max(scatter, 1.0) ** 2 * expansion.covariance()
+    else:
+        cov = expansion.jackknife_covariance()
+    captures = tuple(one.capture for one in firsts)
+    board_rms_m = _board_rms_m(shared, mean)
+    return RelativePose(mean, cov, captures, board_rms_m, scatter, expansion, T_first[:, :3, 3])
+
+
+def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
+    """List T_cam_board (F, 4, 4) and their covariances (F, 6, 6)."""
+    images = [observation.image for observation in observations]
+    every = np.arange(len(images), dtype=np.intp)
+    stacked = stack_images(every, images)
+    return stacked.T_cam_board, stacked.total_cov(Levels().pose)
+
+
+def _student_weights(chi2: Array) -> Array:
+    """Weight poses by their squared distances (F,) from the mean, in units of the typical value."""
+    return np.asarray((_STUDENT + 6) / (_STUDENT + chi2 / max(float(np.median(chi2)) / 6, 1.0)))
+
+
+def _distances(T: Array, information: Array) -> Array:
+    """Compute squared distances (F, F) of all poses from each."""
+    apart = difference(T[None].repeat(len(T), axis=0), T[:, None].repeat(len(T), axis=1))
+    return np.asarray(np.einsum("mki,kij,mkj->mk", apart, information, apart))
+
+
+def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_first: Array) -> float:
+    middles = [(T_second_first @ one.image.T_cam_board[:, 3])[:3] for one, _ in shared]
+    seen = [other.image.T_cam_board[:3, 3] for _, other in shared]
+    return float(np.sqrt(np.mean(np.sum((np.array(middles) - seen) ** 2, axis=1))))
+
+
+def camera_findings(
+    pair: CameraPair, names: tuple[str, str], target: CalibrationSettings, limits: VerdictSettings
+) -> list[Finding]:
+    """Find contradictions between the extrinsics of two cameras and their images.
+
+    Args:
+        pair: the cameras.
+        names: of the first and the second.
+        target: standard deviations to reach.
+        limits: of the profile.
+    """
+    if pair.from_images is None or pair.apart is None:
+        return []
+    # Images are accurate enough to show any relevant change.
+    strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
+    halves = contrast_halves(pair.from_images.expansion, pair.from_images.centres)
+    changed = split_findings(halves, pair.from_images.captures, target, strict)
+    by_images = [replace(each, code=_BY_IMAGES[each.code], subject=" to ".join(names)) for each in changed]
+    return [
+        *by_images,
+        *_scattered(pair.from_images, names, limits),
+        *_elsewhere(pair, pair.from_images, pair.apart, names, target, limits),
+    ]
+
+
+def _scattered(from_images: RelativePose, names: tuple[str, str], limits: VerdictSettings) -> list[Finding]:
+    if from_images.scatter <= _MAX_SCATTER or from_images.board_rms_m <= limits.max_plane_misfit_m:
+        return []
+    figures = {"rms_m": from_images.board_rms_m, "scatter": from_images.scatter}
+    return [reason("verdict.cameras_scatter", figures, is_fail=False, subject=" to ".join(names))]
+
+
+def _elsewhere(
+    pair: CameraPair,
+    from_images: RelativePose,
+    apart: Array,
+    names: tuple[str, str],
+    target: CalibrationSettings,
+    limits: VerdictSettings,
+) -> list[Finding]:
+    rotation_deg, translation_m = tangent_sizes(apart)
+    excess = target.in_targets(rotation_deg, translation_m) / limits.max_camera_difference
+    if pair.surprise <= SURPRISING_CHI2 or excess <= 1:
+        return []
+    figures = {
+        "rms_m": pair.board_rms_m,
+        "images_rms_m": from_images.board_rms_m,
+        "rotation_deg": rotation_deg,
+        "translation_m": translation_m,
+    }
+    is_fail = excess > limits.fail_factor
+    return [reason("verdict.cameras_differ", figures, is_fail=is_fail, subject=" to ".join(names))]

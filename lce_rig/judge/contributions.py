@@ -1,0 +1,220 @@
+"""The reported covariance: what the captures show, what the profile may have wrong, what checks contradict.
+
+    cov = widened^2 cov_session + sum_i sigma_i^2 S_i S_i^T + sum_c m_c m_c^T
+
+with S_i the sensitivity to error i of the profile's lens or board, and m_c the move of the extrinsics that
+would resolve contradiction c: a check that finds something else than the profile says, beyond both standard
+deviations, widens the claim until it holds both.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import get_args
+
+import numpy as np
+
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.tolerances import Sensitivity, Source
+from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import Array, sigma_sizes, tangent_sizes
+from lce_rig.core.results import Contribution
+from lce_rig.judge.intrinsics_check import IntrinsicsCheck
+from lce_rig.judge.nuisances import Nuisances
+from lce_rig.judge.split_consistency import Contrast, objections
+from lce_rig.judge.weighing import SURPRISING_CHI2
+from lce_rig.rig import CalibrationSettings, VerdictSettings
+
+# A lens differs significantly below this probability, scales beyond this many standard deviations.
+_CHANCE, _SURE = 0.002, 3.0
+# The session knows a quantity better than the profile below this ratio of their standard deviations.
+_CLEARLY = 0.5
+# Two subsets of the captures that contradict each other: the result is the mean of both.
+_HALF = 0.5
+_CONTRADICTION = "contradiction_"
+
+
+@dataclass(frozen=True, eq=False)
+class Contradiction:
+    """A move of the extrinsics that would resolve what a check contradicts.
+
+    Attributes:
+        source: the check.
+        moves: (n, 6) tangents (translation m, rotation rad).
+    """
+
+    source: str
+    moves: Array
+
+    @property
+    def cov(self) -> Array:
+        """(6, 6) that holds both sides."""
+        return np.asarray(self.moves.T @ self.moves)
+
+
+def profile_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
+    """Sum the covariances (6, 6) by errors of the profile's lens and board."""
+    return np.asarray(sum((each.covariance() for each in sensitivities), np.zeros((6, 6))))
+
+
+def lens_contradiction(
+    check: IntrinsicsCheck | None, sensitivities: Sequence[Sensitivity], target_deg: float
+) -> Iterator[Contradiction]:
+    """Compare the profile's lens with the session's boards, within the standard deviations of both.
+
+    A lens that the verdict objects to contradicts as well, whatever the profile's standard deviations.
+    """
+    from scipy.special import fdtrc
+
+    if check is None or check.errors is None or check.errors_cov is None:
+        return
+    of_lens = {each.source: each for each in sensitivities}
+    if not of_lens:
+        return
+    mine = [of_lens[name] for name in ("focal_length", "principal_point", "distortion")]
+    moves = np.concatenate([each.moves for each in mine])
+    sigmas = np.concatenate([np.full(len(each.moves), each.sigma) for each in mine])
+    errors, expected = np.array(check.errors), np.array(check.errors_cov) + np.diag(sigmas**2)
+    mean_square = float(errors @ np.linalg.solve(expected, errors)) / len(errors)
+    # The deviations come from few captures.
+    chance = float(fdtrc(len(errors), max(check.n_captures - 1, 1), mean_square))
+    if chance < _CHANCE or check.verdict(target_deg) != "pass":
+        yield Contradiction("intrinsics", (errors @ moves)[None])
+
+
+def scale_contradiction(
+    found: Nuisances | None, sensitivities: Sequence[Sensitivity]
+) -> Iterator[Contradiction]:
+    """Compare the camera's distances with the LiDAR's, within what focal length and squares allow."""
+    of_source = {each.source: each for each in sensitivities}
+    if found is None or not of_source:
+        return
+    squares, focal = of_source["square_size"], of_source["focal_length"]
+    expected = found.scale_sigma**2 + squares.sigma**2 + focal.sigma**2
+    if found.scale**2 > _SURE**2 * expected:
+        yield Contradiction("scale", found.scale * squares.moves)
+
+
+def split_contradictions(
+    contrasts: Sequence[Contrast], target: CalibrationSettings, limits: VerdictSettings
+) -> Iterator[Contradiction]:
+    """Compare subsets that should agree: the result lies between both.
+
+    Where the extrinsics change on the way, it lies a whole change from one of the two that may hold now.
+    """
+    for contrast in objections(contrasts, target, limits):
+        share = 1.0 if contrast.is_change else _HALF
+        source = f"{contrast.first}_{contrast.second}"
+        yield Contradiction(source, share * np.array([contrast.apart]))
+
+
+def channels_contradiction(
+    estimate: CalibrationEstimate, target: CalibrationSettings
+) -> Iterator[Contradiction]:
+    """Compare the channels of one camera, which has one pose: the result lies between both."""
+    apart, cov = estimate.channel_difference, estimate.channel_difference_cov
+    if apart is None or cov is None or apart @ np.linalg.solve(cov, apart) <= SURPRISING_CHI2:
+        return
+    if target.in_targets(*tangent_sizes(apart)) > 1:
+        yield Contradiction("channels", _HALF * apart[None])
+
+
+def list_contributions(
+    figures: Diagnostics,
+    widened_by: float,
+    sensitivities: Sequence[Sensitivity],
+    contradictions: Sequence[Contradiction],
+) -> tuple[Contribution, ...]:
+    """List the causes of the reported standard deviations, the largest translation first."""
+    parts = [
+        Contribution(
+            "captures",
+            widened_by * figures.sigma_scatter_rotation_deg,
+            widened_by * figures.sigma_scatter_translation_m,
+        ),
+        Contribution(
+            "lidar_ranges",
+            widened_by * figures.sigma_systematic_rotation_deg,
+            widened_by * figures.sigma_systematic_translation_m,
+        ),
+        *(Contribution(each.source, *sigma_sizes(each.covariance())) for each in sensitivities),
+        *(Contribution(_CONTRADICTION + each.source, *sigma_sizes(each.cov)) for each in contradictions),
+    ]
+    return tuple(sorted(parts, key=lambda part: -part.sigma_translation_m))
+
+
+def largest(causes: Sequence[Contribution], size: str) -> str:
+    """Name the cause with the largest `sigma_rotation_deg` or `sigma_translation_m`; "" if none is known."""
+    known = [each for each in causes if math.isfinite(getattr(each, size))]
+    return max(known, key=lambda each: float(getattr(each, size))).source if known else ""
+
+
+def measure_action(source: str) -> str:
+    """Return the action of a finding against a cause; "" if more captures reduce it."""
+    if source.startswith(_CONTRADICTION):
+        return "resolve"
+    return f"measure_{source}" if source in get_args(Source) else ""
+
+
+@dataclass(frozen=True)
+class KnownBetter:
+    """A quantity of the profile that the session's boards determine better.
+
+    Attributes:
+        source: which, as `Contribution.source`.
+        error, error_sigma: session less profile, with its standard deviation, in the unit of `Sensitivity`.
+        profile_sigma: standard deviation by the profile.
+    """
+
+    source: str
+    error: float
+    error_sigma: float
+    profile_sigma: float
+
+
+def known_better(
+    check: IntrinsicsCheck | None, found: Nuisances | None, sensitivities: Sequence[Sensitivity]
+) -> tuple[KnownBetter, ...]:
+    """Find what the session's boards determine clearly better than the profile: lens, and the squares' size.
+
+    The squares' size follows from the LiDAR's distances, if the focal length is right.
+    """
+    sigma: dict[str, float] = {each.source: each.sigma for each in sensitivities}
+    candidates = []
+    if sigma and check is not None and check.errors is not None and check.errors_cov is not None:
+        deviations = np.sqrt(np.diag(np.array(check.errors_cov)))
+        for source, index in (("focal_length", [0]), ("principal_point", [1, 2])):
+            # Of both coordinates of the principal point, the one that is farther off.
+            worst = max(index, key=lambda k: abs(np.array(check.errors)[k]))
+            error, error_sigma = check.errors[worst], float(deviations[worst])
+            candidates.append(KnownBetter(source, error, error_sigma, sigma[source]))
+    if sigma and found is not None:
+        own = math.hypot(found.scale_sigma, sigma["focal_length"])
+        candidates.append(KnownBetter("square_size", -found.scale, own, sigma["square_size"]))
+    return tuple(each for each in candidates if each.error_sigma < _CLEARLY * each.profile_sigma)
+
+
+def uncertainty_notes(
+    causes: Sequence[Contribution], better: Sequence[KnownBetter], target: CalibrationSettings
+) -> Iterator[Finding]:
+    """Name the largest cause of the standard deviations, and what the session knows better than the profile.
+
+    The larger of rotation and translation counts, in units of the target.
+    """
+    if any(each.source in get_args(Source) for each in causes):
+        sizes = [(each.sigma_rotation_deg, each.sigma_translation_m) for each in causes]
+        total_deg, total_m = np.sqrt(np.nansum(np.square(sizes), axis=0)).tolist()
+        is_rotation = total_deg / target.target_sigma_deg > total_m / target.target_sigma_m
+        size, unit = ("sigma_rotation_deg", "deg") if is_rotation else ("sigma_translation_m", "m")
+        source, total = largest(causes, size), total_deg if is_rotation else total_m
+        part = next(float(getattr(each, size)) for each in causes if each.source == source)
+        figures: dict[str, Figure] = {
+            "source": source,
+            f"sigma_{unit}": part,
+            f"total_{unit}": total,
+            "share": (part / total) ** 2,
+        }
+        yield Finding("verdict.largest_cause", "note", figures=figures, action=measure_action(source))
+    for each in better:
+        yield Finding("verdict.known_better", "note", figures=asdict(each))

@@ -1,0 +1,255 @@
+"""Check whether the profile's intrinsics still fit the camera, with the boards of a calibration.
+
+Residuals alone are insufficient: a focal length error of 2 % moves the boards 2 % away and increases corner
+residuals by a tenth of their noise. The check therefore fits intrinsics to the boards and compares them with
+the profile's in units of their uncertainty.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.judge.weighing import Verdict, reason
+from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
+from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses, lens_errors
+from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
+from lce_rig.lens.models import model_of
+
+# A difference is significant below this probability.
+_CHANCE = 0.002
+# In units of the target rotation. An image bent by as much as that cannot reach it; a camera rotated by its
+# principal point rotates the extrinsics by the same angle, and three times the target counts as wrong.
+_BENT_MARGINAL, _BENT_FAIL = 0.5, 1.0
+_TURN_MARGINAL, _TURN_FAIL = 1.5, 2.5
+_N_FOLDS = 2
+# Residuals that exceed the possible ones by this much are visible.
+_VISIBLE = 1.2
+# Intrinsics for a profile determine pixels to the image's border. The standard deviation there may be as
+# large as the profile's error where boards were seen, within these limits.
+_KNOWN_PX = (1.0, 5.0)
+
+
+@dataclass(frozen=True)
+class IntrinsicsCheck:
+    """Given intrinsics compared with those fitted to the boards.
+
+    Attributes:
+        n_captures: number of captures used.
+        rms_px: rms distance of a corner from its prediction by the given intrinsics.
+        possible_px: the same for fitted intrinsics on held-out captures.
+        displacement_px: rms displacement of pixels between both where boards were seen, after the rotation of
+            the camera that minimises it.
+        displacement_sigma_px: standard deviation of that.
+        displacement_deg: the same as an angle.
+        turn_deg: that rotation, which is an error of extrinsics under the given intrinsics.
+        turn_sigma_deg: standard deviation of that.
+        focal_ratio: fitted over given focal length.
+        focal_sigma: standard deviation of that.
+        chance: probability of a difference this large if the given intrinsics are right; None if the models
+            are of different families.
+        covered: share of the image in which boards were seen.
+        image_sigma_px: standard deviation of the fitted intrinsics, as `LensCertainty.image_sigma_px`.
+        errors: (4,) of the given intrinsics, as `Intrinsics.differentiate_by_errors`; None if they project
+            too little.
+        errors_cov: (4, 4) of these.
+    """
+
+    n_captures: int
+    rms_px: float
+    possible_px: float
+    displacement_px: float
+    displacement_sigma_px: float
+    displacement_deg: float
+    turn_deg: float
+    turn_sigma_deg: float
+    focal_ratio: float
+    focal_sigma: float
+    chance: float | None
+    covered: float
+    image_sigma_px: float
+    errors: tuple[float, ...] | None = None
+    errors_cov: tuple[tuple[float, ...], ...] | None = None
+
+    def verdict(self, target_deg: float = 0.2) -> Verdict:
+        """Judge the given intrinsics; they pass unless significantly different from the fitted ones.
+
+        Args:
+            target_deg: target standard deviation of the extrinsics' rotation.
+        """
+        # Noise alone displaces pixels; only the excess counts.
+        noise = min(self.displacement_sigma_px / max(self.displacement_px, 1e-12), 1.0)
+        bent = self.displacement_deg * float(np.sqrt(1 - noise**2)) if self.is_bent else 0.0
+        turned = self.turn_deg if self.is_turned else 0.0
+        if bent > _BENT_FAIL * target_deg or turned > _TURN_FAIL * target_deg:
+            return "fail"
+        is_marginal = bent > _BENT_MARGINAL * target_deg or turned > _TURN_MARGINAL * target_deg
+        return "marginal" if is_marginal else "pass"
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether pixels are significantly displaced, by their displacement or by all parameters together."""
+        is_other = self.chance is not None and self.chance < _CHANCE
+        return is_other or self.displacement_px > self._sure * self.displacement_sigma_px
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the camera is significantly rotated."""
+        return self.turn_deg > self._sure * self.turn_sigma_deg
+
+    @property
+    def is_focal_off(self) -> bool:
+        """Whether the focal length differs significantly."""
+        return abs(self.focal_ratio - 1) > self._sure * self.focal_sigma
+
+    @property
+    def _sure(self) -> float:
+        """Number of standard deviations that is significant, with few captures more than for a normal one."""
+        from scipy.special import stdtrit  # scipy.stats takes a second to import
+
+        return float(stdtrit(self.n_captures - 1, 1 - _CHANCE / 2))
+
+
+def check_intrinsics(
+    image_boards: Sequence[BoardView], intrinsics: Intrinsics, board: Board
+) -> IntrinsicsCheck | None:
+    """Compare intrinsics with the corners of detected boards.
+
+    Args:
+        image_boards: of one camera, by capture and channel.
+        intrinsics: the intrinsics to check.
+        board: the board.
+
+    Returns:
+        None if there are too few boards, or too little tilt, to fit intrinsics.
+    """
+    # If grossly wrong intrinsics do not converge, they may do so without their distortion.
+    plain = replace(intrinsics, distortion=(0.0,) * 4)
+    for start in (intrinsics, plain):
+        with suppress(NotEnoughDataError):
+            fitted = estimate_intrinsics(image_boards, board, start, model_of(intrinsics), n_folds=_N_FOLDS)
+            return compare_with_given(fitted, intrinsics, board)[0]
+    return None
+
+
+def compare_with_given(
+    fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board: Board
+) -> tuple[IntrinsicsCheck, LensDifference]:
+    """Compare intrinsics with fitted ones.
+
+    Args:
+        fitted: of any model.
+        intrinsics: the intrinsics to check, at the same resolution.
+        board: the board.
+    """
+    given_px = distances_under(intrinsics, fitted.views, board)
+    corners_px = fitted.corners_px.reshape(-1, 2)
+    difference = compare_lenses(intrinsics, fitted.intrinsics, corners_px, fitted.cov, fitted.model)
+    turn = difference.turn_rad
+    angle = float(np.linalg.norm(turn))
+    along = turn / max(angle, 1e-12)
+    given_focal = np.sqrt(intrinsics.fx_px * intrinsics.fy_px)
+    by_focal = np.zeros(fitted.model.size)
+    by_focal[:2] = 0.5 / given_focal
+    certainty = certainty_of(fitted.intrinsics, corners_px, fitted.cov, fitted.model)
+    errors, errors_cov = None, None
+    with suppress(ValueError):
+        found, cov = lens_errors(intrinsics, fitted.intrinsics, corners_px, fitted.cov, fitted.model)
+        errors, errors_cov = tuple(found.tolist()), tuple(map(tuple, cov.tolist()))
+    check = IntrinsicsCheck(
+        n_captures=len({view.capture for view in fitted.views}),
+        rms_px=float(np.sqrt(np.mean(given_px**2))),
+        possible_px=fitted.held_out_rms_px,
+        displacement_px=difference.rms_px,
+        displacement_sigma_px=difference.sigma_px,
+        displacement_deg=float(np.degrees(difference.rms_px / given_focal)),
+        turn_deg=float(np.degrees(angle)),
+        turn_sigma_deg=float(np.degrees(np.sqrt(along @ difference.cov_turn @ along))),
+        focal_ratio=float(np.sqrt(fitted.intrinsics.fx_px * fitted.intrinsics.fy_px) / given_focal),
+        focal_sigma=float(np.sqrt(by_focal @ fitted.cov @ by_focal)),
+        chance=_chance(fitted, intrinsics),
+        covered=certainty.covered,
+        image_sigma_px=certainty.image_sigma_px,
+        errors=errors,
+        errors_cov=errors_cov,
+    )
+    return check, difference
+
+
+def _chance(fitted: IntrinsicsEstimate, intrinsics: Intrinsics) -> float | None:
+    """Compare all parameters at once by the F distribution, as the deviations come from few captures."""
+    from scipy.special import fdtrc
+
+    try:
+        change = fitted.model.vector(intrinsics) - fitted.model.vector(fitted.intrinsics)
+    except ValueError:
+        return None
+    n_captures = len({view.capture for view in fitted.views})
+    scale = 1.0 / fitted.sigma
+    correlation = fitted.cov * np.outer(scale, scale)
+    chi2 = float(change * scale @ np.linalg.solve(correlation, change * scale))
+    return float(fdtrc(len(change), n_captures - 1, chi2 / len(change)))
+
+
+def describe(check: IntrinsicsCheck) -> str:
+    """State the figures of a check, for any verdict."""
+    return (
+        f"profile   reprojection error {check.rms_px:.3f} px (possible {check.possible_px:.3f} px); pixels "
+        f"displaced by {check.displacement_px:.2f} +- {check.displacement_sigma_px:.2f} px, camera "
+        f"rotated by {check.turn_deg:.2f} +- {check.turn_sigma_deg:.2f} deg; focal length "
+        f"{100 * (check.focal_ratio - 1):+.2f} +- {100 * check.focal_sigma:.2f} %"
+    )
+
+
+def judge_lens(
+    covered: float, image_sigma_px: float, check: IntrinsicsCheck | None, target_deg: float = 0.2
+) -> Finding:
+    """Judge whether the boards of a session determine the intrinsics better than the profile.
+
+    They do where the profile's do not fit and a pixel's standard deviation near the image's border is smaller
+    than the profile's error where boards were seen. All verbs judge by this.
+
+    Args:
+        covered: share of the image in which boards were seen.
+        image_sigma_px: of the intrinsics from the boards, as `LensCertainty.image_sigma_px`.
+        check: the profile's intrinsics compared with them; None if they are for another resolution.
+        target_deg: target standard deviation of the extrinsics' rotation.
+
+    Returns:
+        "intrinsics.fit" if the profile's fit, else "intrinsics.undetermined" or "intrinsics.better".
+    """
+    error_px = np.inf if check is None else check.displacement_px
+    limit_px = float(np.clip(error_px, *_KNOWN_PX))
+    figures: dict[str, Figure] = {"covered": covered, "image_sigma_px": image_sigma_px, "limit_px": limit_px}
+    if check is not None and check.verdict(target_deg) == "pass":
+        return Finding("intrinsics.fit", "note", figures=figures)
+    if image_sigma_px > limit_px:
+        return Finding("intrinsics.undetermined", "warning", figures=figures)
+    return Finding("intrinsics.better", "note", figures=figures)
+
+
+def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
+    """Return the finding that the given intrinsics do not fit, and how they differ.
+
+    Args:
+        check: with a verdict other than "pass".
+        target_deg: target standard deviation of the extrinsics' rotation.
+    """
+    judgement = judge_lens(check.covered, check.image_sigma_px, check, target_deg)
+    figures: dict[str, Figure] = {
+        **{name: value for name, value in asdict(check).items() if not name.startswith("errors")},
+        **judgement.figures,
+        "is_visible": check.rms_px >= _VISIBLE * check.possible_px,
+        "is_bent": check.is_bent,
+        "is_turned": check.is_turned,
+        "is_focal_off": check.is_focal_off,
+    }
+    action = "refocused" if check.is_focal_off else ""
+    if judgement.code == "intrinsics.undetermined":
+        action = "collect"
+    return reason("verdict.intrinsics", figures, is_fail=check.verdict(target_deg) == "fail", action=action)

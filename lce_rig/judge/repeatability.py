@@ -1,0 +1,222 @@
+"""Compare calibrations of one rig with their reported uncertainties."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from lce_rig.calibrate.relative_pose import mean_pose
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import Array, difference, log_so3
+from lce_rig.core.results import Calibration
+
+# Calibrations disagree if correct ones spread this far with less than this probability.
+_CHANCE = 0.01
+# If correct ones spread farther with more than this probability, reported uncertainties are conservative.
+_GENEROUS = 0.95
+
+
+@dataclass(frozen=True)
+class PairDifference:
+    """The difference of two calibrations.
+
+    Attributes:
+        first, second: names of their sessions or results.
+        rotation_deg, translation_m: angle and distance between the extrinsics.
+        distance: Mahalanobis distance d, d^2 = x^T (cov_1 + cov_2)^-1 x with x the tangent between them;
+            for results of the same captures with 2 (cov_1 + cov_2).
+        p: probability that correct calibrations differ this much or more.
+    """
+
+    first: str
+    second: str
+    rotation_deg: float
+    translation_m: float
+    distance: float
+    p: float
+
+
+@dataclass(frozen=True, eq=False)
+class Repeatability:
+    """Several calibrations of the same sensors, compared.
+
+    Attributes:
+        names: of the sessions, or of the results of one session.
+        camera, lidar: the calibrated sensors.
+        T_cam_lidar: (4, 4) mean with equal weights.
+        deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
+        spread_rotation_deg, spread_translation_m: standard deviation of one calibration, from these.
+        reported_rotation_deg, reported_translation_m: the same as reported by the calibrations, rms.
+        scatter_rotation_deg, scatter_translation_m: the part of it that is independent between sessions; None
+            if a calibration does not report it. All share the rest, constant errors of the LiDAR.
+        chi2: least sum of squared distances from one common extrinsic, in units of the reported covariances.
+        dof: its mean if these are right.
+        p: probability that correct calibrations spread this far or farther.
+        differences: of each pair.
+        odd_one: the session without which the others agree; None if all agree or none can be identified.
+        are_independent: whether each has its own captures. If not, common errors stay hidden, and chi2, dof
+            and p are those of the pair that differs most, with p times the number of pairs.
+    """
+
+    names: tuple[str, ...]
+    camera: str
+    lidar: str
+    T_cam_lidar: Array
+    deviations: Array
+    spread_rotation_deg: float
+    spread_translation_m: float
+    reported_rotation_deg: float
+    reported_translation_m: float
+    scatter_rotation_deg: float | None
+    scatter_translation_m: float | None
+    chi2: float
+    dof: int
+    p: float
+    differences: tuple[PairDifference, ...]
+    odd_one: str | None
+    are_independent: bool = True
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the reported uncertainties explain the spread."""
+        return self.p >= _CHANCE
+
+    @property
+    def ratio(self) -> float:
+        """Ratio of the spread to the prediction of the reported uncertainties."""
+        return float(np.sqrt(self.chi2 / self.dof))
+
+    @property
+    def max_rotation_deg(self) -> float:
+        """Largest angle between two of them."""
+        return max(pair.rotation_deg for pair in self.differences)
+
+    @property
+    def max_translation_m(self) -> float:
+        """Largest distance between two of them."""
+        return max(pair.translation_m for pair in self.differences)
+
+    @property
+    def finding(self) -> Finding:
+        """Whether they agree, "repeat.agree" or "repeat.disagree", with its figures."""
+        figures: dict[str, Figure] = {
+            "camera": self.camera,
+            "lidar": self.lidar,
+            "n_sessions": len(self.names),
+            "are_independent": self.are_independent,
+            "rotation_deg": self.max_rotation_deg,
+            "translation_m": self.max_translation_m,
+            "p": self.p,
+        }
+        if not self.are_independent:
+            worst = min(self.differences, key=lambda pair: pair.p)
+            figures |= {"first": worst.first, "second": worst.second}
+            if self.agrees:
+                return Finding("results.agree", "note", figures=figures)
+            return Finding("results.disagree", "error", figures=figures)
+        if self.agrees:
+            figures["is_generous"] = self.p > _GENEROUS
+            return Finding("repeat.agree", "note", figures=figures)
+        figures |= {"ratio": self.ratio, "odd_one": self.odd_one}
+        action = "" if self.odd_one is None else "odd_one"
+        return Finding("repeat.disagree", "error", figures=figures, action=action)
+
+
+def compare_calibrations(
+    calibrations: Mapping[str, Calibration], *, are_independent: bool = True
+) -> Repeatability:
+    """Compare calibrations of the same camera and LiDAR.
+
+    Results of the same captures share errors to an unknown extent. For any correlation, the covariance of
+    a - b is at most 2 (cov_a + cov_b), because that of a + b is not negative: this bound is used for them.
+
+    Args:
+        calibrations: by the name of their session or result, at least two.
+        are_independent: whether each was made from captures of its own.
+
+    Raises:
+        ValueError: there are fewer than two.
+    """
+    if len(calibrations) < 2:
+        raise ValueError("a comparison requires two calibrations, 1 given")
+    names = tuple(calibrations)
+    T = np.array([calibrations[name].T_cam_lidar for name in names])
+    cov = np.array([calibrations[name].cov for name in names])
+    if are_independent:
+        # Errors of a lens and board that all sessions share do not make their results differ.
+        cov = cov - np.array([calibrations[name].cov_shared for name in names])
+    # A mean weighted by full covariances may lie outside all values, which is right for chi2 but confusing in
+    # a table.
+    mean, _ = mean_pose(T, np.broadcast_to(np.eye(6), cov.shape))
+    deviations = difference(T, mean)
+    pairs = list(combinations(range(len(names)), 2))
+    factor = 1.0 if are_independent else 2.0
+    differences = tuple(_difference(names, T, factor * cov, i, j) for i, j in pairs)
+    if are_independent:
+        chi2, dof = _spread(T, cov), 6 * (len(names) - 1)
+        p = _tail(chi2, dof)
+    else:
+        chi2, dof = max(pair.distance for pair in differences) ** 2, 6
+        p = min(1.0, len(pairs) * _tail(chi2, dof))
+    first = calibrations[names[0]]
+    scatter_deg = _rms([c.diagnostics.sigma_scatter_rotation_deg for c in calibrations.values()])
+    scatter_m = _rms([c.diagnostics.sigma_scatter_translation_m for c in calibrations.values()])
+    spread = np.sum(deviations**2, axis=0) / (len(names) - 1)
+    return Repeatability(
+        names=names,
+        camera=first.camera,
+        lidar=first.lidar,
+        T_cam_lidar=mean,
+        deviations=deviations,
+        spread_rotation_deg=float(np.degrees(np.sqrt(spread[3:].sum()))),
+        spread_translation_m=float(np.sqrt(spread[:3].sum())),
+        reported_rotation_deg=float(np.degrees(np.sqrt(np.mean(np.trace(cov[:, 3:, 3:], axis1=1, axis2=2))))),
+        reported_translation_m=float(np.sqrt(np.mean(np.trace(cov[:, :3, :3], axis1=1, axis2=2)))),
+        scatter_rotation_deg=scatter_deg,
+        scatter_translation_m=scatter_m,
+        chi2=chi2,
+        dof=dof,
+        p=p,
+        differences=differences,
+        odd_one=_odd_one(names, T, cov) if are_independent and p < _CHANCE else None,
+        are_independent=are_independent,
+    )
+
+
+def _spread(T: Array, cov: Array) -> float:
+    """Compute chi2: the least sum of squared Mahalanobis distances from one pose."""
+    weights = np.asarray(np.linalg.inv(cov))
+    deviations = difference(T, mean_pose(T, weights)[0])
+    return float(np.einsum("ki,kij,kj->", deviations, weights, deviations))
+
+
+def _difference(names: Sequence[str], T: Array, cov: Array, i: int, j: int) -> PairDifference:
+    tangent = difference(T[i], T[j])
+    chi2 = float(tangent @ np.linalg.solve(cov[i] + cov[j], tangent))
+    angle_deg = float(np.degrees(np.linalg.norm(log_so3(T[i, :3, :3] @ T[j, :3, :3].T))))
+    distance_m = float(np.linalg.norm(tangent[:3]))
+    return PairDifference(names[i], names[j], angle_deg, distance_m, float(np.sqrt(chi2)), _tail(chi2, 6))
+
+
+def _odd_one(names: Sequence[str], T: Array, cov: Array) -> str | None:
+    """Name the calibration without which the others agree, if there is exactly one."""
+    if len(names) < 3:
+        return None
+    blamed = []
+    for index, name in enumerate(names):
+        rest = np.arange(len(names)) != index
+        if _tail(_spread(T[rest], cov[rest]), 6 * (len(names) - 2)) >= _CHANCE:
+            blamed.append(name)
+    return blamed[0] if len(blamed) == 1 else None
+
+
+def _rms(values: Sequence[float]) -> float | None:
+    """Give None where one of them is unknown."""
+    return float(np.sqrt(np.mean(np.square(values)))) if np.isfinite(values).all() else None
+
+
+def _tail(chi2: float, dof: int) -> float:
+    from scipy.special import chdtrc
+
+    return float(chdtrc(dof, chi2))

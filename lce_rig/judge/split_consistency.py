@@ -1,0 +1,265 @@
+"""Compare extrinsics from two subsets of the captures: early and late, near and far, left and right.
+
+Random subsets differ by noise. These subsets differ by more if a sensor moved during the session, or if the
+intrinsics are wrong. The difference of random subsets is the reference. Two subsets that no order tells are
+looked for: those of a sensor that moved to and fro.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.geometry import Array, tangent_sizes
+from lce_rig.judge.weighing import reason
+from lce_rig.residuals.quadratics import Quadratics
+from lce_rig.rig import CalibrationSettings, VerdictSettings
+
+# Fewer placements are not split.
+_MIN_PLACEMENTS = 6
+_MIN_SHARE = 3
+_N_LOTS = 400
+# Median of the chi-squared distribution with six degrees of freedom.
+_MEDIAN_CHI2 = 5.348
+# Differences beyond this many limits fail.
+_FAIL = 2.0
+# Groups of captures: of fewer placements none are looked for, and a group has this share of them at least.
+_MIN_GROUPED, _MIN_GROUP = 8, 0.2
+_N_NULL, _N_STARTS, _N_ROUNDS = 100, 10, 8
+_EULER = 0.5772
+# Errors that placements have in common, such as those of a laser, gain a tenth more than random ones.
+_COMMON = 1.1
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Two subsets of the captures, calibrated separately.
+
+    Attributes:
+        first, second: their names, such as "near" and "far".
+        rotation_deg, translation_m: angle and distance between their extrinsics.
+        chance: probability that random subsets differ as much, in units of their noise.
+        n_first: number of captures in the first subset.
+        apart: (6,) tangent (translation m, rotation rad) from the second's extrinsics to the first's.
+        group: indices of the first subset's captures, where no order tells them.
+    """
+
+    first: str
+    second: str
+    rotation_deg: float
+    translation_m: float
+    chance: float
+    n_first: int
+    apart: tuple[float, ...] = ()
+    group: tuple[int, ...] = ()
+
+    @property
+    def is_change(self) -> bool:
+        """Whether the subsets are the captures before and after one of them."""
+        return self.first == "before"
+
+    def excess(self, target: CalibrationSettings, limits: VerdictSettings) -> float:
+        """Measure the difference in units of its limit; 0 if random subsets may differ as much."""
+        if self.chance > limits.least_chance:
+            return 0.0
+        limit = limits.max_change if self.is_change else limits.max_contrast
+        return target.in_targets(self.rotation_deg, self.translation_m) / limit
+
+
+def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tuple[Contrast, ...]:
+    """Compare subsets that should agree.
+
+    Args:
+        expansion: of F captures in the order in which they were taken, settled.
+        centres: (F, 3) middle of the board in each, frame camera, m.
+        seed: of the random subsets.
+
+    Returns:
+        Subsets before and after the capture of the largest change, near and far, left and right, upper and
+        lower; none for fewer than 6 placements.
+    """
+    n_placements = len(expansion.groups)
+    if n_placements < _MIN_PLACEMENTS:
+        return ()
+    order = np.argsort(np.random.default_rng(seed).random((_N_LOTS, n_placements)), axis=1)
+    by_lot, _ = _chi2(expansion, (order < n_placements // 2) @ expansion.groups)
+    unit = max(float(np.median(by_lot)) / _MEDIAN_CHI2, 1e-12)
+    x, y, z = centres.T
+    found = [_changed_on_the_way(expansion, unit)]
+    for first, second, key in (
+        ("near", "far", np.linalg.norm(centres, axis=1)),
+        ("left", "right", x / z),
+        ("upper", "lower", y / z),
+    ):
+        is_first = (np.argsort(np.argsort(key)) < len(key) // 2)[None].astype(np.float64)
+        chi2, apart = _chi2(expansion, is_first)
+        found.append(_contrast(first, second, apart[0], _tail(chi2[0] / unit), int(is_first.sum())))
+    return tuple(found)
+
+
+def find_groups(expansion: Quadratics, seed: int = 0) -> tuple[Contrast, ...]:
+    """Look for two groups of captures with extrinsics of their own, whatever their order.
+
+    Placements are shared out so that two extrinsics x_1 and x_2 explain them best (k-means with the captures'
+    costs), which gains
+
+        s^2 = min_x C(x) - min_{x_1, x_2} sum_k min(C_k(x_1), C_k(x_2))
+
+    over one. Noise gains as well: the same search is run on the errors that two extrinsics leave, exchanged
+    between placements, axis by axis, with random signs.
+
+    Args:
+        expansion: of F captures, settled.
+        seed: of starts and rotations.
+
+    Returns:
+        The smaller group compared with the rest; none for fewer than 8 placements.
+    """
+    n = len(expansion.groups)
+    if n < _MIN_GROUPED:
+        return ()
+    rng = np.random.default_rng(seed)
+    H = np.tensordot(expansion.groups, expansion.hessians, axes=1)
+    g = expansion.groups @ expansion.gradients
+    starts = rng.random((_N_NULL + 1, _N_STARTS, n)) < 0.5
+    starts[:, 0] = np.arange(n) % 2 == 0
+    gain, is_first, left = _share_out(g[None], H, starts[:1])
+    values, axes = np.linalg.eigh(H)
+    roots = np.sqrt(np.maximum(values, 1e-9 * values[:, -1:]))
+    white = np.einsum("kji,kj->ki", axes, left[0]) / roots
+    order = np.argsort(rng.random((_N_NULL, n, 6)), axis=1)
+    signs = rng.choice([-1.0, 1.0], size=order.shape)
+    drawn = signs * np.take_along_axis(white[None], order, axis=1)
+    gains, _, left = _share_out(np.einsum("kij,bkj->bki", axes, roots * drawn), H, starts[1:])
+    # The search makes errors smaller, the captures' own as much as those drawn.
+    made_smaller = np.linalg.norm(np.einsum("kji,bkj->bki", axes, left) / roots) / np.linalg.norm(drawn)
+    gains = gains * _COMMON / made_smaller
+    # The largest of many gains follows a Gumbel distribution.
+    width = float(gains.std(ddof=1)) * np.sqrt(6) / np.pi
+    excess = (float(gain[0]) - gains.mean()) / max(width, 1e-12) + _EULER
+    chance = float(-np.expm1(-np.exp(-excess)))
+    smaller = is_first[0] if 2 * is_first[0].sum() <= n else ~is_first[0]
+    shares = smaller @ expansion.groups
+    _, apart = _chi2(expansion, shares[None])
+    members = np.flatnonzero(shares)
+    found = _contrast("group", "rest", apart[0], chance, len(members))
+    return (replace(found, group=tuple(members.tolist())),)
+
+
+def _share_out(g: Array, H: Array, starts: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_], Array]:
+    """Share n placements out over two extrinsics.
+
+    Args:
+        g: (B, n, 6) half gradients of B sessions.
+        H: (n, 6, 6) half Hessians.
+        starts: (B, R, n) which placements belong to the first, to begin with.
+
+    Returns:
+        The root of the best gain (B,), which placements belong to the first (B, n), and the half gradients
+        (B, n, 6) at the extrinsics of each one's group.
+    """
+    (n_sessions, _, n), is_first, flat = starts.shape, starts, H.reshape(len(H), 36)
+    least = max(_MIN_SHARE, int(np.ceil(_MIN_GROUP * n)))
+    total_H, total_g, floor = H.sum(axis=0), g.sum(axis=1), np.eye(6)
+
+    def costs(H_own: Array, g_own: Array) -> tuple[Array, Array]:
+        x = -np.linalg.solve(H_own + floor, g_own[..., None])[..., 0]
+        squares = (x[..., :, None] * x[..., None, :]).reshape(*x.shape[:-1], 36)
+        return np.asarray(2 * x @ np.swapaxes(g, 1, 2) + squares @ flat.T), np.asarray(x)
+
+    for is_last in (*[False] * _N_ROUNDS, True):
+        H_first = (is_first @ flat).reshape(*is_first.shape[:2], 6, 6)
+        g_first = is_first.astype(np.float64) @ g
+        first, x_first = costs(H_first, g_first)
+        second, x_second = costs(total_H - H_first, total_g[:, None] - g_first)
+        if not is_last:
+            rank = np.argsort(np.argsort(first - second, axis=-1), axis=-1)
+            n_first = np.clip(np.sum(first < second, axis=-1), least, n - least)
+            is_first = rank < n_first[..., None]
+    one, _ = costs(np.broadcast_to(total_H, (n_sessions, 1, 6, 6)), total_g[:, None])
+    gains = one.sum(axis=(1, 2))[:, None] - np.where(is_first, first, second).sum(axis=-1)
+    best, each = np.argmax(gains, axis=1), np.arange(n_sessions)
+    found = is_first[each, best]
+    x = np.where(found[..., None], x_first[each, best][:, None], x_second[each, best][:, None])
+    left = g + np.einsum("kij,bkj->bki", H, x)
+    return np.sqrt(np.maximum(gains[each, best], 0.0)), found, left
+
+
+def _changed_on_the_way(expansion: Quadratics, unit: float) -> Contrast:
+    """Find the capture from which on the results differ most, corrected for the number of captures tried."""
+    n = len(expansion.gradients)
+    cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
+    chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
+    best = int(np.argmax(chi2))
+    chance = min(len(cuts) * _tail(chi2[best] / unit), 1.0)
+    return _contrast("before", "after", apart[best], chance, int(cuts[best]))
+
+
+def _tail(chi2: float) -> float:
+    from scipy.special import chdtrc
+
+    return float(chdtrc(6, chi2))
+
+
+def _chi2(expansion: Quadratics, shares: Array) -> tuple[Array, Array]:
+    """Compare subsets (B, F) with the rest: squared distance (B,) in units of noise, tangents (B, 6)."""
+    H_first = np.tensordot(shares, expansion.hessians, axes=1)
+    g_first = shares @ expansion.gradients
+    H_rest = expansion.hessians.sum(axis=0) - H_first
+    g_rest = expansion.gradients.sum(axis=0) - g_first
+    # A subset of few captures may leave a direction undetermined; a floor of 1 m and 1 rad keeps it finite.
+    floor = np.eye(6)
+    C_first, C_rest = np.linalg.inv(H_first + floor), np.linalg.inv(H_rest + floor)
+    apart = -(C_first @ g_first[..., None] - C_rest @ g_rest[..., None])[..., 0]
+    scaled = np.linalg.solve(C_first + C_rest, apart[..., None])[..., 0]
+    return np.asarray(np.sum(apart * scaled, axis=1)), np.asarray(apart)
+
+
+def _contrast(first: str, second: str, apart: Array, chance: float, n_first: int) -> Contrast:
+    rotation_deg, translation_m = tangent_sizes(apart)
+    return Contrast(first, second, rotation_deg, translation_m, chance, n_first, tuple(apart.tolist()))
+
+
+def objections(
+    contrasts: Sequence[Contrast], target: CalibrationSettings, limits: VerdictSettings
+) -> list[Contrast]:
+    """List the subsets that differ significantly and by more than their limit.
+
+    A change at one capture makes two groups, too: it is told as the former.
+    """
+    found = [contrast for contrast in contrasts if contrast.excess(target, limits) > 1]
+    has_changed = any(contrast.is_change for contrast in found)
+    return [contrast for contrast in found if not (has_changed and contrast.group)]
+
+
+def split_findings(
+    contrasts: Sequence[Contrast],
+    captures: Sequence[str],
+    target: CalibrationSettings,
+    limits: VerdictSettings,
+) -> list[Finding]:
+    """Find subsets that differ by more than the target and significantly more than random ones.
+
+    Args:
+        contrasts: see `contrast_halves`.
+        captures: names, in the order in which they were taken.
+        target: standard deviations to reach.
+        limits: of the profile.
+    """
+    findings = []
+    for c in objections(contrasts, target, limits):
+        excess = c.excess(target, limits)
+        apart = {"rotation_deg": c.rotation_deg, "translation_m": c.translation_m, "chance": c.chance}
+        if c.is_change:
+            figures: dict[str, Figure] = {"capture": captures[c.n_first], **apart}
+            findings.append(reason("verdict.changed", figures, is_fail=excess > _FAIL))
+        elif c.group:
+            figures = {"captures": tuple(captures[k] for k in c.group), "n_captures": c.n_first, **apart}
+            findings.append(reason("verdict.two_groups", figures, is_fail=False))
+        else:
+            figures = {"first": c.first, "second": c.second, **apart}
+            action = "near" if c.first == "near" else ""
+            findings.append(reason("verdict.shares_differ", figures, is_fail=excess > _FAIL, action=action))
+    return findings

@@ -1,0 +1,271 @@
+"""Checks of a result on its own captures, before the verdict."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.local_quadratic import SCALE, expand
+from lce_rig.calibrate.tolerances import Sensitivity
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Contribution
+from lce_rig.judge.contributions import (
+    KnownBetter,
+    channels_contradiction,
+    known_better,
+    lens_contradiction,
+    list_contributions,
+    profile_covariance,
+    scale_contradiction,
+    split_contradictions,
+)
+from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
+from lce_rig.judge.negative_control import NegativeControl, run_control, run_control_with_constants
+from lce_rig.judge.nuisances import Nuisances, estimate_nuisances
+from lce_rig.judge.split_consistency import Contrast, contrast_halves, find_groups
+from lce_rig.lens.lens_estimate import BoardView
+from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
+from lce_rig.rig import LidarSettings, Rig, VerdictSettings
+
+# Check the reported uncertainty with bootstrap samples, leave-one-out results and random halves.
+
+_N_DRAWS = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Spread of the extrinsics under resampling: covariances (6, 6) of the result from each method.
+
+    Attributes:
+        bootstrap: placements drawn with replacement.
+        left_out: each placement left out in turn (jackknife).
+        halves: random halves, their difference halved.
+    """
+
+    bootstrap: Array
+    left_out: Array
+    halves: Array
+
+    def ratio_to(self, cov: Array) -> tuple[float, str]:
+        """Compare with a reported covariance (6, 6).
+
+        Returns:
+            Largest ratio of the three to the reported standard deviation, in rotation or translation, and the
+            name of its method.
+        """
+        ways = {
+            "bootstrap": self.bootstrap,
+            "left_out": self.left_out,
+            "halves": self.halves,
+        }
+        ratios = {
+            words: float(
+                np.sqrt(
+                    max(
+                        np.trace(spread[part, part]) / np.trace(cov[part, part])
+                        for part in (slice(0, 3), slice(3, 6))
+                    )
+                )
+            )
+            for words, spread in ways.items()
+        }
+        words = max(ratios, key=lambda name: ratios[name])
+        return ratios[words], words
+
+
+def resample(expansion: Quadratics, seed: int = 0) -> Spread:
+    """Estimate the spread of the extrinsics by resampling placements.
+
+    Args:
+        expansion: of the captures, settled.
+        seed: of the draws.
+    """
+    rng = np.random.default_rng(seed)
+    groups = expansion.groups
+    n = len(groups)
+    drawn = rng.multinomial(n, np.full(n, 1 / n), size=_N_DRAWS).astype(np.float64)
+    # Samples of few different placements may leave a direction undetermined.
+    drawn = drawn[np.count_nonzero(drawn, axis=1) >= min(n, 4)]
+    halves = (np.argsort(rng.random((_N_DRAWS, n)), axis=1) < n // 2).astype(np.float64)
+    without = expansion.without_each()[:, :6]
+    apart = (expansion.solve(halves @ groups) - expansion.solve((1 - halves) @ groups))[:, :6] / 2
+    return Spread(
+        bootstrap=_robust_cov(expansion.solve(drawn @ groups)[:, :6]),
+        left_out=jackknife_scatter(without - without.mean(axis=0)),
+        halves=_robust_cov(np.concatenate([apart, -apart])),
+    )
+
+
+def _robust_cov(tangents: Array) -> Array:
+    """Estimate a covariance (6, 6) by the nine tenths of the samples (B, 6) nearest to the middle.
+
+    Samples that nearly leave a direction undetermined are outliers and do not represent all captures.
+    """
+    about = tangents - np.median(tangents, axis=0)
+    scale = np.median(np.abs(about), axis=0) + 1e-12
+    far = np.linalg.norm(about / scale, axis=1)
+    kept = about[far <= np.quantile(far, 0.9)]
+    return np.asarray(kept.T @ kept / len(kept))
+
+
+def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float, Finding | None]:
+    """Compare a reported covariance with the spread of resampled captures.
+
+    Args:
+        cov: (6, 6) of the method.
+        spread: of the same extrinsics.
+        limits: of the verdict.
+
+    Returns:
+        The factor by which to widen standard deviations, 1 if they are large enough, and a note with the
+        reason, else None.
+    """
+    ratio, way = spread.ratio_to(cov)
+    if ratio <= limits.max_spread_ratio:
+        return 1.0, None
+    return ratio, Finding("verdict.widened", "note", figures={"ratio": ratio, "spread": way})
+
+
+# Fewer placements do not allow leave-one-out.
+_MIN_PLACEMENTS = 4
+# More images do not improve the check of the intrinsics, and take time.
+_MAX_VIEWS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Results of checks of an estimate on its own captures.
+
+    Attributes:
+        cov: (6, 6) to report: the estimate's, widened if resampling spreads it farther, with errors of the
+            profile and what checks contradict.
+        cov_agreed: (6, 6) the same without what checks contradict.
+        cov_shared: (6, 6) the part of it from errors of the profile's lens and board.
+        contributions: its causes, the largest first.
+        known_better: what the session's boards determine better than the profile.
+        widened_by: factor by which the standard deviations were widened; 1 if they were not.
+        remark: why; None if they were not.
+        contrasts: subsets of the captures that should agree.
+        control: residuals of held-out captures when the result is moved.
+        nuisances: the nuisance parameters.
+        intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
+    """
+
+    cov: Array
+    cov_agreed: Array
+    cov_shared: Array
+    contributions: tuple[Contribution, ...]
+    known_better: tuple[KnownBetter, ...]
+    widened_by: float
+    remark: Finding | None
+    contrasts: tuple[Contrast, ...]
+    control: NegativeControl | None
+    nuisances: Nuisances | None
+    intrinsics: IntrinsicsCheck | None
+
+
+def validate(
+    estimate: CalibrationEstimate,
+    rig: Rig,
+    lidar: LidarSettings,
+    lens: Intrinsics,
+    views: Sequence[BoardView],
+) -> Validation:
+    """Check a result on its own captures.
+
+    Args:
+        estimate: the result of any method.
+        rig: board, targets and limits.
+        lidar: its range error settings.
+        lens: of the camera.
+        views: its boards in the captures used.
+    """
+    board = rig.board.to_board()
+    intrinsics = check_intrinsics(_thinned(views), lens, board) if views else None
+    observations = [estimate.fitted[name] for name in estimate.used]
+    expansion = expand(
+        observations,
+        board,
+        estimate.T_cam_lidar,
+        laser_bias_sigma_m=lidar.laser_bias_sigma_m,
+        range_offset_sigma_m=lidar.range_offset_sigma_m,
+    )
+    if len(expansion.groups) < _MIN_PLACEMENTS:
+        return _reported(estimate, rig, intrinsics=intrinsics)
+    settled = expansion.hold(SCALE).settled()
+    # Compare a covariance with the scatter of its own method, as another cost scatters differently.
+    widened_by, remark = widening(estimate.cov, resample(estimate.expansion or settled), rig.verdict)
+    cov, moved = widened_by**2 * estimate.cov, (rig.calibration, rig.verdict.control_sigmas)
+    if estimate.method == "ml":
+        with_constants = _with_prior_of_scale(expansion, estimate.sensitivities)
+        control = run_control_with_constants(with_constants, cov, estimate.lever_m, *moved)
+    else:
+        control = run_control(observations, board, estimate.T_cam_lidar, cov, settled, *moved)
+    rings = np.unique(np.concatenate([observation.lidar.ring for observation in observations]))
+    centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
+    return _reported(
+        estimate,
+        rig,
+        widened_by,
+        remark,
+        (*contrast_halves(settled, centres), *find_groups(settled)),
+        control,
+        estimate_nuisances(expansion, rings),
+        intrinsics,
+    )
+
+
+def _with_prior_of_scale(expansion: Quadratics, sensitivities: Sequence[Sensitivity]) -> Quadratics:
+    """Let the camera's scale be wrong as the profile's focal length and squares may be."""
+    sigmas = [each.sigma for each in sensitivities if each.source in ("square_size", "focal_length")]
+    if not any(sigmas):
+        return expansion.hold(SCALE)
+    prior = expansion.prior.copy()
+    prior[SCALE, SCALE] = 1 / sum(sigma**2 for sigma in sigmas)
+    return replace(expansion, prior=prior)
+
+
+def _reported(
+    estimate: CalibrationEstimate,
+    rig: Rig,
+    widened_by: float = 1.0,
+    remark: Finding | None = None,
+    contrasts: tuple[Contrast, ...] = (),
+    control: NegativeControl | None = None,
+    nuisances: Nuisances | None = None,
+    intrinsics: IntrinsicsCheck | None = None,
+) -> Validation:
+    """Sum up the covariance to report."""
+    known = estimate.sensitivities
+    contradictions = [
+        *lens_contradiction(intrinsics, known, rig.calibration.target_sigma_deg),
+        *scale_contradiction(nuisances, known),
+        *split_contradictions(contrasts, rig.calibration, rig.verdict),
+        *channels_contradiction(estimate, rig.calibration),
+    ]
+    cov_shared = profile_covariance(known)
+    cov_agreed = widened_by**2 * estimate.cov + cov_shared
+    cov = cov_agreed + sum(each.cov for each in contradictions)
+    causes = list_contributions(estimate.diagnostics, widened_by, known, contradictions)
+    better = known_better(intrinsics, nuisances, known)
+    return Validation(
+        cov,
+        cov_agreed,
+        cov_shared,
+        causes,
+        better,
+        widened_by,
+        remark,
+        contrasts,
+        control,
+        nuisances,
+        intrinsics,
+    )
+
+
+def _thinned(views: Sequence[BoardView]) -> list[BoardView]:
+    every = -(-len(views) // _MAX_VIEWS)
+    return list(views[::every])

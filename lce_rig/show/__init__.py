@@ -1,0 +1,1 @@
+"""What people see: overlays, reports, the live screen, the phone page."""

@@ -1,0 +1,189 @@
+"""Write images into a folder, with contact sheets of them."""
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lce_rig.core.errors import SessionError
+from lce_rig.session.durable import write_atomically
+from lce_rig.show.overlays import canvas
+from lce_rig.show.overlays.canvas import FAINT, GREEN, INK, ORANGE, RED, Picture
+from lce_rig.show.overlays.overlay import MARKS, draw_mark
+
+CONTACT_SHEET = "contact_sheet.png"
+# Overlays have large even areas and thin marks: run lengths compress them as well as a search, in half the
+# time.
+_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+
+# A sheet has at most four columns, 1970 px, and is about as high as wide.
+_TILE_PX, _GAP_PX, _MOST_COLUMNS, _MOST_ROWS_PX = 480, 10, 4, 1660
+_TEXT_PX, _LINE_PX = 11, 22
+_COLOURS = {"pass": GREEN, "marginal": ORANGE, "fail": RED}
+
+
+@dataclass(frozen=True, eq=False)
+class Overlay:
+    """One capture's image.
+
+    Attributes:
+        name: of the capture.
+        picture: (H, W, 3) BGR with title and legend.
+        part: what of it goes onto the contact sheet.
+        figures: its residuals, one line.
+        warning: why the capture was not used; empty if it was.
+    """
+
+    name: str
+    picture: Picture
+    part: Picture
+    figures: str = ""
+    warning: str = ""
+
+
+@dataclass(frozen=True)
+class SheetHead:
+    """What stands above the images of a contact sheet.
+
+    Attributes:
+        title: rig and sensors.
+        verdict: of the calibration.
+        lines: its figures, then findings, which only the first sheet shows.
+        limits_m: ends of the range scale of all images.
+    """
+
+    title: str
+    verdict: str
+    lines: Sequence[str]
+    limits_m: tuple[float, float]
+
+
+def contact_sheets(tiles: Sequence[Overlay], head: SheetHead) -> list[Picture]:
+    """Arrange images in rows on sheets at most 2000 px wide, each with name, residuals and state below.
+
+    Raises:
+        ValueError: there are no tiles.
+    """
+    if not tiles:
+        raise ValueError("a contact sheet needs at least one image")
+    n_columns = min(_MOST_COLUMNS, max(2, math.ceil(math.sqrt(len(tiles)))))
+    rows = [_row(tiles[k : k + n_columns], n_columns) for k in range(0, len(tiles), n_columns)]
+    n_per_sheet = max(1, _MOST_ROWS_PX // max(row.shape[0] for row in rows))
+    # Rows are spread evenly, so that the last sheet does not hold a single one.
+    n_sheets = math.ceil(len(rows) / n_per_sheet)
+    n_per_sheet = math.ceil(len(rows) / n_sheets)
+    parts = [rows[k : k + n_per_sheet] for k in range(0, len(rows), n_per_sheet)]
+    return [
+        np.vstack([_head(head, rows[0].shape[1], (number, len(parts))), *part])
+        for number, part in enumerate(parts, 1)
+    ]
+
+
+def _row(tiles: Sequence[Overlay], n_columns: int) -> Picture:
+    """Draw a row of images with their captions; orange frames mark captures that were not used."""
+    height_px = max(round(_TILE_PX * tile.part.shape[0] / tile.part.shape[1]) for tile in tiles)
+    warnings = [canvas.wrapped(tile.warning, _TILE_PX - 8, _TEXT_PX) for tile in tiles]
+    n_lines = 1 + max(map(len, warnings))
+    cell_px = _TILE_PX + _GAP_PX
+    row = canvas.panel(n_columns * cell_px + _GAP_PX, height_px + n_lines * _LINE_PX + 2 * _GAP_PX)
+    for k, (tile, warning) in enumerate(zip(tiles, warnings, strict=True)):
+        u, bottom = _GAP_PX + k * cell_px, _GAP_PX + height_px
+        row[_GAP_PX:bottom, u : u + _TILE_PX] = canvas.fitted(tile.part, _TILE_PX, height_px)
+        if tile.warning:
+            cv2.rectangle(row, (u, _GAP_PX), (u + _TILE_PX - 1, bottom - 1), ORANGE, 6)
+        canvas.draw_text(row, tile.name, u + 4, bottom + 17, _TEXT_PX, INK)
+        canvas.draw_text(row, tile.figures, u + _TILE_PX - 4, bottom + 17, _TEXT_PX, INK, align=1)
+        for index, line in enumerate(warning, 1):
+            canvas.draw_text(row, line, u + 4, bottom + 17 + index * _LINE_PX, _TEXT_PX, ORANGE)
+    return row
+
+
+def _head(head: SheetHead, width_px: int, page: tuple[int, int]) -> Picture:
+    """Draw title, verdict, figures, and what marks and colours mean."""
+    left, right = 1.5 * _GAP_PX, width_px - 1.5 * _GAP_PX
+    number, n_pages = page
+    stated = head.lines if number == 1 else head.lines[:1]
+    lines = [part for line in stated for part in canvas.wrapped(line, right - left, _TEXT_PX)]
+    strip = canvas.panel(width_px, 44 + (len(lines) + 3) * _LINE_PX + 2 * _GAP_PX)
+    canvas.draw_text(strip, head.title, left, 32, 16, INK)
+    pages = f"sheet {number} of {n_pages}" if n_pages > 1 else ""
+    canvas.draw_text(strip, pages, right, 32, _TEXT_PX, FAINT, align=1)
+    verdict_left = left + canvas.text_width_px(head.title, 16) + 24
+    canvas.draw_text(strip, head.verdict.upper(), verdict_left, 32, 16, _COLOURS.get(head.verdict, INK))
+    baseline = 44 + 0.7 * _LINE_PX
+    for line in lines:
+        canvas.draw_text(strip, line, left, baseline, _TEXT_PX, INK)
+        baseline += _LINE_PX
+    baseline += 0.5 * _GAP_PX
+    for k, (name, kind) in enumerate(MARKS):
+        u = left + 12 + 230 * k
+        draw_mark(strip, kind, u, baseline - 0.45 * _TEXT_PX, 1.0)
+        canvas.draw_text(strip, name, u + 22, baseline, _TEXT_PX, INK)
+    baseline += 1.3 * _LINE_PX
+    canvas.draw_text(strip, "range from the LiDAR", left, baseline, _TEXT_PX, INK)
+    u = round(left + canvas.text_width_px("range from the LiDAR", _TEXT_PX)) + 20
+    canvas.draw_scale(strip, (u, round(baseline) - 13, 360, 14), *head.limits_m, "m", _TEXT_PX)
+    cv2.rectangle(strip, (u + 420, round(baseline) - 12), (u + 440, round(baseline) + 1), ORANGE, 3)
+    canvas.draw_text(strip, "capture refused or not used", u + 452, baseline, _TEXT_PX, INK)
+    return strip
+
+
+def write_overlays(
+    folder: Path, overlays: Iterable[Overlay], head: SheetHead
+) -> tuple[list[Path], list[Path]]:
+    """Write one PNG per named image and contact sheets of them all.
+
+    Images are taken one at a time and only small copies are kept, so that a long session needs little memory.
+
+    Args:
+        folder: created if it does not exist.
+        overlays: in the order of the sheets.
+        head: above each sheet's images.
+
+    Returns:
+        The images; and the sheets, contact_sheet.png or contact_sheet_1.png and so on; none without images.
+
+    Raises:
+        SessionError: a file cannot be written.
+    """
+    files: list[Path] = []
+    tiles: list[Overlay] = []
+    for overlay in overlays:
+        files.append(write_picture(folder / f"{_file_name(overlay.name)}.png", overlay.picture))
+        part = overlay.part
+        small = canvas.fitted(part, _TILE_PX, round(part.shape[0] * _TILE_PX / part.shape[1]))
+        tiles.append(replace(overlay, picture=small, part=small))
+    sheets = contact_sheets(tiles, head) if tiles else []
+    stem, suffix = CONTACT_SHEET.split(".")
+    names = (
+        [f"{stem}_{k}.{suffix}" for k in range(1, len(sheets) + 1)] if len(sheets) > 1 else [CONTACT_SHEET]
+    )
+    written = [write_picture(folder / name, sheet) for name, sheet in zip(names, sheets, strict=False)]
+    return files, written
+
+
+def is_overlay(path: Path) -> bool:
+    """Return whether a file has a name that `write_overlays` gives to a session's captures."""
+    return re.fullmatch(r"([0-9]{6,}|contact_sheet(_[0-9]+)?)\.png", path.name) is not None
+
+
+def write_picture(path: Path, picture: Picture) -> Path:
+    """Write one PNG in one step.
+
+    Raises:
+        SessionError: the file cannot be written.
+    """
+    is_encoded, data = cv2.imencode(".png", picture, _PNG)
+    if not is_encoded:
+        raise SessionError(f"{path}: an image of shape {picture.shape} cannot be written as PNG")
+    write_atomically(path, np.asarray(data).tobytes())
+    return path
+
+
+def _file_name(name: str) -> str:
+    """Keep letters, digits, dot, dash and underscore of a name, so that it stays in its folder."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).lstrip(".") or "picture"

@@ -1,0 +1,42 @@
+"""Render a page from its template: one file that loads nothing, with everything escaped that is put into it.
+
+`templates/frame.html` is the frame of every page, with its style and its content security policy, which
+forbids requests; `templates/parts.html` holds tables, drawings and badges.
+"""
+
+import re
+from functools import cache
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+
+@cache
+def environment() -> Environment:
+    """Give the templates: everything that is put into them is escaped, and nothing may be missing."""
+    made = Environment(
+        loader=PackageLoader("lce_rig.show.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters["words"] = as_markup
+    return made
+
+
+def as_markup(text: str) -> Markup:
+    """Set words of findings for a page: commands between backquotes as code, +- as one sign."""
+    escaped = str(escape(text)).replace("+-", "±")
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped).replace("\n", "<br>"))
+
+
+def render(template: str, **values: object) -> str:
+    """Write a page: the same values give the same bytes.
+
+    Args:
+        template: file of `templates/`; it extends frame.html.
+        values: what the template names. Text is escaped; `drawing` returns markup, which is not;
+            the filter `words` sets what `words/` writes.
+    """
+    return environment().get_template(template).render(**values) + "\n"

@@ -1,0 +1,186 @@
+"""Several cameras in one likelihood, against truth: errors, claims, few captures, order, conflicts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.likelihood.calibrate_together import calibrate_together
+from lce_rig.calibrate.relative_pose import relative_pose
+from lce_rig.core.geometry import difference
+from lce_rig.core.results import Observation
+from lce_rig.residuals.placements import group_placements, group_shared_placements
+from tests.calibrate.boards import BOARD, simulate
+from tests.calibrate.test_tolerances import KNOWN
+from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, only, simulate_two
+
+ML = EstimateSettings(method="ml", n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+FEW = 6
+
+
+def alone(session):
+    return {name: fit_extrinsic(captures, BOARD, ML) for name, captures in session.items()}
+
+
+def every(cameras):
+    """The same settings for each camera."""
+    return dict.fromkeys(cameras, ML)
+
+
+def few_on_the_right(n, seed):
+    """Simulate captures of which the right camera saw but some; its corners are worse."""
+    session = simulate_two(n, seed, right_corner_sigma_px=0.3)
+    return {LEFT: session[LEFT], RIGHT: only(session[RIGHT], range(FEW))}
+
+
+def run(sessions):
+    """Estimate each session by camera and together."""
+    each = [alone(session) for session in sessions]
+    return [(own, calibrate_together(own, BOARD, every(own))) for own in each]
+
+
+def sizes(errors):
+    """Rms rotation in deg and translation in mm of tangents (N, 6)."""
+    squares = np.mean(np.square(errors), axis=0)
+    return np.degrees(np.sqrt(squares[3:].sum())), 1e3 * np.sqrt(squares[:3].sum())
+
+
+def nees(errors, covs):
+    return np.mean([e @ np.linalg.solve(cov, e) for e, cov in zip(errors, covs, strict=True)])
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Three sessions of 16 captures, the right camera in 6 of them."""
+    return run([few_on_the_right(16, seed) for seed in range(3)])
+
+
+def test_a_camera_with_few_captures_gains_from_one_with_many(runs):
+    for own, together in runs:
+        before, after = own[RIGHT], together.estimates[RIGHT]
+        for part in (slice(0, 3), slice(3, 6)):
+            # Half to a third of the standard deviation is left: 0.07 deg, 3 mm come to 0.03 deg, 1.4 mm.
+            assert np.trace(after.cov[part, part]) < 0.7**2 * np.trace(before.cov[part, part])
+        error = difference(after.T_cam_lidar, TRUTH[RIGHT])
+        assert error @ np.linalg.solve(after.cov, error) < 25  # 0.9997 of chi square with 6 degrees
+        assert after.estimated_with == (LEFT,)
+        assert after.used == tuple(f"{k:06d}" for k in range(FEW))
+        assert len(together.estimates[LEFT].used) == 16
+
+
+def test_the_cameras_place_to_each_other_is_known_better_than_each_to_the_lidar(runs):
+    for _, together in runs:
+        left, right = (together.estimates[name] for name in (LEFT, RIGHT))
+        T, J = relative_pose(right.T_cam_lidar, left.T_cam_lidar)
+        cov = J @ together.covariance_of(RIGHT, LEFT) @ J.T
+        error = difference(T, T_RIGHT_LEFT)
+        assert error @ np.linalg.solve(cov, error) < 25
+        assert np.degrees(np.linalg.norm(error[3:])) < 0.06
+        # Extrinsics with independent errors would compose to more than either.
+        assert np.trace(cov[3:, 3:]) < np.trace(right.cov[3:, 3:])
+
+
+def test_blocks_of_the_joint_covariance_are_those_of_the_estimates(runs):
+    for _, together in runs:
+        for name in (LEFT, RIGHT):
+            other = RIGHT if name == LEFT else LEFT
+            mine = together.covariance_of(name, other)[:6, :6]
+            assert np.allclose(mine, together.estimates[name].cov, rtol=1e-6)
+        assert np.linalg.eigvalsh(together.cov)[0] > 0
+
+
+def test_the_order_of_cameras_does_not_matter(runs):
+    own, together = runs[0]
+    turned = calibrate_together(dict(reversed(own.items())), BOARD, every(own))
+    assert turned.cameras == together.cameras
+    assert np.array_equal(turned.cov, together.cov)
+    for name in together.cameras:
+        first, second = (each.estimates[name] for each in (together, turned))
+        assert np.array_equal(first.T_cam_lidar, second.T_cam_lidar)
+        assert first.diagnostics.figures() == second.diagnostics.figures()
+
+
+def test_the_same_cameras_under_other_names_give_the_same(runs):
+    """Names decide the order inside: that it does not matter there either holds to the search's tolerance."""
+    own, together = runs[0]
+    names = {LEFT: "z", RIGHT: "a"}
+    other = {names[name]: estimate for name, estimate in own.items()}
+    renamed = calibrate_together(other, BOARD, every(other))
+    for name in (LEFT, RIGHT):
+        first, second = together.estimates[name], renamed.estimates[names[name]]
+        apart = difference(first.T_cam_lidar, second.T_cam_lidar)
+        assert np.sqrt(apart @ np.linalg.solve(first.cov, apart)) < 0.05
+        assert np.allclose(np.diag(first.cov), np.diag(second.cov), rtol=0.05)
+
+
+def test_each_cameras_scale_has_the_prior_of_its_own_lens(runs):
+    own, _ = runs[0]
+    exact = replace(ML, tolerances=replace(KNOWN, focal_length=0.0, square_size=0.0))
+    loose = replace(ML, tolerances=KNOWN)
+    for name, other in ((LEFT, RIGHT), (RIGHT, LEFT)):
+        together = calibrate_together(own, BOARD, {name: exact, other: loose})
+        off = {each: abs(1 - together.estimates[each].diagnostics.camera_scale) for each in own}
+        assert off[name] < 1e-6 < 0.1 * off[other]
+
+
+def test_captures_whose_scan_the_cameras_use_differently_are_left_out(runs):
+    own, _ = runs[0]
+    seen = dict(own[RIGHT].observations)
+    lidar = seen["000002"].lidar
+    seen["000002"] = replace(seen["000002"], lidar=replace(lidar, points=lidar.points + 0.001))
+    together = calibrate_together({**own, RIGHT: replace(own[RIGHT], observations=seen)}, BOARD, every(own))
+    for estimate in together.estimates.values():
+        assert "000002" not in estimate.used
+        assert len(estimate.residuals) == len(estimate.used)
+        refusal = estimate.refused["000002"]
+        assert (refusal.code, refusal.figures) == ("pair.two_places", {"first": "left", "second": "right"})
+
+
+def test_placements_are_those_of_any_camera():
+    """The second camera sees captures 1 and 2 in one place, the first does not see 2 at all."""
+    captures = simulate(4, 0)
+    observations = [Observation(c.capture, c.image, c.lidar[0]) for c in captures]
+    order = {o.capture: k for k, o in enumerate(observations)}
+    first = [observations[k] for k in (0, 1, 3)]
+    second = [replace(observations[1], capture=observations[k].capture) for k in (1, 2)]
+    assert group_shared_placements([first, second], order).tolist() == [0, 1, 1, 2]
+    assert np.array_equal(group_shared_placements([observations], order), group_placements(observations))
+
+
+@pytest.mark.slow
+def test_errors_and_claims_of_dozens_of_sessions_are_true():
+    """40 sessions of 20 captures: the right camera in all of them, or in 6."""
+    for few, sessions in (
+        (20, [simulate_two(20, seed) for seed in range(20)]),
+        (FEW, [few_on_the_right(20, seed) for seed in range(100, 120)]),
+    ):
+        found = run(sessions)
+        for name in (LEFT, RIGHT):
+            before = [own[name] for own, _ in found]
+            after = [joint.estimates[name] for _, joint in found]
+            rows = []
+            for estimates in (before, after):
+                errors = np.array([difference(e.T_cam_lidar, TRUTH[name]) for e in estimates])
+                covs = np.array([e.cov for e in estimates])
+                claimed = np.degrees(np.sqrt(np.mean(np.trace(covs[:, 3:, 3:], axis1=1, axis2=2))))
+                rows.append((*sizes(errors), claimed, nees(errors, covs)))
+                figures = "rms {:.4f} deg, {:.2f} mm; claimed {:.4f} deg; NEES {:.2f}".format(*rows[-1])
+                print(f"{name} of 20 and {few} captures: {figures}")
+            # No worse than alone, but for chance; for the camera in few captures much better.
+            assert all(joint < 1.1 * own for own, joint in zip(rows[0][:2], rows[1][:2], strict=True))
+            # 6 expected; 20 samples average within 3 standard errors of 0.77. Noise levels of few captures
+            # are rather believed to be the usual ones, which are larger than the simulator's.
+            assert 1.5 < rows[1][-1] < 8.3
+
+
+@pytest.mark.long
+def test_a_camera_that_saw_a_placement_once_loses_nothing_where_another_saw_it_often():
+    session = simulate_two(8, 0)
+    again = [replace(item, capture=f"{k}{item.capture[1:]}") for k in range(1, 5) for item in session[LEFT]]
+    once, often = (
+        calibrate_together(alone({LEFT: left, RIGHT: session[RIGHT]}), BOARD, every(session)).estimates[RIGHT]
+        for left in (session[LEFT], [*session[LEFT], *again])
+    )
+    ratio = np.sqrt(np.diag(often.cov) / np.diag(once.cov))
+    assert np.all((ratio > 0.7) & (ratio < 1.2))

@@ -1,0 +1,205 @@
+"""Algorithm 1 on simulated boards: accuracy, honesty of the covariance, switches, refusals, repeatability."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import (
+    Algorithm1Parts,
+    EstimateSettings,
+    capture_residual,
+    error_to_reference,
+    fit_extrinsic,
+)
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import difference, exp_so3, pose
+from lce_rig.residuals.features import FeatureSettings
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
+
+FAST = EstimateSettings("paper", n_draws=3)
+
+
+def errors_over_seeds(scenario, n_captures, n_seeds, options=FAST):
+    """Errors (n, 6) and normalised squared errors (n,)."""
+    errors, nees = [], []
+    for seed in range(n_seeds):
+        estimate = fit_extrinsic(simulate(n_captures, seed, scenario), BOARD, options)
+        error = difference(estimate.T_cam_lidar, T_FORWARD)
+        errors.append(error)
+        nees.append(error @ np.linalg.solve(estimate.cov, error))
+    return np.array(errors), np.array(nees)
+
+
+def rms_deg_mm(errors):
+    squares = np.mean(errors**2, axis=0)
+    return np.degrees(np.sqrt(squares[3:].sum())), 1e3 * np.sqrt(squares[:3].sum())
+
+
+@pytest.mark.long
+def test_thirty_captures_reach_a_few_hundredths_of_a_degree_and_say_so():
+    errors, nees = errors_over_seeds(Scenario(range_sigma_m=0.02, corner_sigma_px=0.3), 30, 8)
+    rotation_deg, translation_mm = rms_deg_mm(errors)
+    assert rotation_deg < 0.06
+    assert translation_mm < 3.0
+    # 6 expected; 8 samples of chi square with 6 degrees average within 3 standard errors of 1.2.
+    assert 2.4 < nees.mean() < 9.7
+
+
+@pytest.mark.long
+def test_ten_captures_are_not_trusted_too_far():
+    _, nees = errors_over_seeds(Scenario(), 10, 20)
+    assert np.median(nees) < 5.35  # the median of chi square with 6 degrees
+
+
+def test_exact_data_give_the_exact_extrinsic():
+    scenario = Scenario(range_sigma_m=0.0, corner_sigma_px=0.0, step_deg=0.01)
+    estimate = fit_extrinsic(simulate(8, 0, scenario), BOARD, FAST)
+    angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, T_FORWARD)
+    assert angle_deg < 0.005
+    assert distance_m < 2e-4
+    assert estimate.certificate.is_optimal
+
+
+def test_ring_ends_beyond_the_printed_edge_are_explained_by_the_shift():
+    captures = simulate(20, 0, Scenario(footprint_m=0.008))
+    free = fit_extrinsic(captures, BOARD, FAST)
+    off = fit_extrinsic(captures, BOARD, replace(FAST, parts=Algorithm1Parts(is_shift_free=False)))
+    shift, sigma = free.diagnostics.edge_shift_m, free.diagnostics.edge_shift_sigma_m
+    assert abs(shift - 0.008) < 4 * sigma + 3e-4
+    assert np.isnan(off.diagnostics.edge_shift_m)
+    assert free.held_out_m < off.held_out_m
+
+
+def test_the_same_captures_in_any_order_give_the_same_bytes():
+    captures = simulate(9, 5)
+    first, second = fit_extrinsic(captures, BOARD, FAST), fit_extrinsic(captures[::-1], BOARD, FAST)
+    assert first.T_cam_lidar.tobytes() == second.T_cam_lidar.tobytes()
+    assert first.cov.tobytes() == second.cov.tobytes()
+    assert first.diagnostics == second.diagnostics
+    assert first.residuals == second.residuals
+
+
+@pytest.mark.parametrize("turn_deg", [(0, 0, 180), (180, 0, 0), (0, 15, 95)])
+def test_the_result_is_as_good_with_the_lidar_turned(turn_deg):
+    R_turn = exp_so3(np.radians(np.array(turn_deg, dtype=float)))
+    T = pose(T_FORWARD[:3, :3] @ R_turn.T, np.array([0.3, -0.2, 0.15]))
+    estimate = fit_extrinsic(simulate(12, 3, T_cam_lidar=T), BOARD, FAST)
+    angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, T)
+    assert angle_deg < 0.15
+    assert distance_m < 0.006
+    assert estimate.certificate.is_optimal
+
+
+@pytest.mark.parametrize(
+    "switch",
+    [
+        {"features": FeatureSettings(point_projection="normal")},
+        {"features": FeatureSettings(point_projection="none")},
+        {"features": FeatureSettings(half_step=False)},
+        {"use_uncertainty": False},
+        {"use_planes": False},
+        {"use_ends": False},
+        {"is_shift_free": False},
+        {"reject_outliers": False},
+        {"n_rounds": 1},
+    ],
+)
+def test_without_any_part_of_algorithm_1_the_result_changes_or_not_but_never_breaks(switch):
+    captures = simulate(12, 8)
+    estimate = fit_extrinsic(captures, BOARD, replace(FAST, parts=Algorithm1Parts(**switch)))
+    angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, T_FORWARD)
+    assert angle_deg < 0.6
+    assert distance_m < 0.02
+    unchanged = {"reject_outliers", "n_rounds"}
+    is_same = np.array_equal(estimate.T_cam_lidar, fit_extrinsic(captures, BOARD, FAST).T_cam_lidar)
+    assert is_same <= (set(switch) <= unchanged)
+
+
+@pytest.mark.parametrize("draws", [{"n_draws": 1}, {"n_draws": 1, "seed": 5}, {"n_draws": 10}])
+def test_draws_judge_the_result_and_do_not_change_it(draws):
+    # Lost returns and wide steps near the corners: ring ends may be taken for either edge's.
+    captures = simulate(8, 21, Scenario(step_deg=0.4, footprint_m=0.01, lost_share=0.3))
+    T, T_drawn = (
+        fit_extrinsic(captures, BOARD, replace(FAST, **own)).T_cam_lidar for own in ({"n_draws": 0}, draws)
+    )
+    assert np.array_equal(T, T_drawn)
+
+
+def spoil(captures, numbers):
+    """Move the board by 6 cm between the sensors in the captures of these numbers."""
+    spoilt = list(captures)
+    for k in numbers:
+        seen = captures[k].lidar[0]
+        shift = np.array([0.06, 0.0, 0.0])
+        plane = seen.plane - np.append(np.zeros(3), seen.plane[:3] @ shift)
+        lidar = replace(seen, points=seen.points + shift, edge_points=seen.edge_points + shift, plane=plane)
+        spoilt[k] = replace(captures[k], lidar=[lidar])
+    return spoilt
+
+
+def test_of_many_captures_those_whose_board_moved_are_refused_too():
+    numbers = (2, 3, 50, 62, 90)
+    estimate = fit_extrinsic(spoil(simulate(100, 9), numbers), BOARD, replace(FAST, n_draws=2))
+    assert set(estimate.refused) == {f"{k:06d}" for k in numbers}
+    assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 0.1
+    # Sizes of random subsets are limited to 40, twice three rounds each.
+    assert estimate.diagnostics.n_solved == 40 * 2 * 3
+
+
+def test_a_board_that_moved_between_the_sensors_is_refused_with_its_figures():
+    spoilt = spoil(simulate(15, 9), [4])
+    estimate = fit_extrinsic(spoilt, BOARD, FAST)
+    assert set(estimate.refused) == {"000004"}
+    refusal = estimate.refused["000004"]
+    assert refusal.code == "calibrate.outlier"
+    assert refusal.figure("edges_m") > 0.02 > refusal.figure("edges_median_m")
+    assert "000004" not in estimate.used
+    assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 0.15
+
+
+def test_too_few_captures_are_refused_with_their_number():
+    with pytest.raises(NotEnoughDataError, match="2 captures"):
+        fit_extrinsic(simulate(2, 0), BOARD, FAST)
+
+
+def test_nearly_parallel_boards_are_refused_with_the_weak_direction_named():
+    captures = simulate(10, 1, Scenario(facing_deg=1.0, distance_m=(2.0, 2.2)))
+    facing = [item for item in captures if abs(item.image.T_cam_board[2, 2]) > 0.9]
+    with pytest.raises(NotEnoughDataError) as caught:
+        fit_extrinsic(facing, BOARD, FAST)
+    found = caught.value.finding
+    assert found.code == "shortage.undetermined"
+    assert "rotation_z" in found.figures["motions"]
+    assert found.figure("spread_deg") < 5
+
+
+def test_three_well_tilted_boards_are_enough_but_judged_on_nothing():
+    captures = simulate(3, 12, Scenario(tilt_deg=(30.0, 45.0)))
+    estimate = fit_extrinsic(captures, BOARD, FAST)
+    assert len(estimate.used) == 3
+    assert np.isnan(estimate.held_out_m)
+    assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 1.0
+
+
+def test_residuals_are_those_of_the_extrinsic_and_grow_away_from_it():
+    estimate = fit_extrinsic(simulate(8, 2, Scenario(range_sigma_m=0.01)), BOARD, FAST)
+    assert 0.004 < estimate.metrics.mpe_m < 0.012
+    assert estimate.metrics.mge_m == estimate.metrics.mpe_m + estimate.metrics.mee_m
+    off = estimate.T_cam_lidar.copy()
+    off[2, 3] += 0.05
+    for residual in estimate.residuals:
+        worse = capture_residual(off, estimate.observations[residual.capture], BOARD)
+        assert worse.plane_mean_m > 2 * residual.plane_mean_m
+        assert residual.plane_mean_m <= residual.plane_rms_m
+
+
+def test_progress_reaches_the_end():
+    seen = []
+    fit_extrinsic(simulate(6, 0), BOARD, FAST, lambda done, total: seen.append((done, total)))
+    assert seen[-1] == (9, 9)
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_the_estimate_names_its_method():
+    assert fit_extrinsic(simulate(6, 0), BOARD, replace(FAST, method="paper")).method == "paper"

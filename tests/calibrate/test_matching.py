@@ -1,0 +1,25 @@
+"""A known extrinsic pairs the right candidate with the right pose."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lce_rig.core.geometry import perturb
+from lce_rig.show.overlays.session_check import match_candidates
+from tests.calibrate.boards import BOARD, T_FORWARD, simulate
+
+
+def test_the_candidate_where_the_picture_puts_the_board_is_taken_wherever_it_is_listed():
+    first, second = simulate(2, seed=0)
+    for order in ([first.lidar[0], second.lidar[0]], [second.lidar[0], first.lidar[0]]):
+        found = match_candidates(replace(first, lidar=order), BOARD, T_FORWARD)
+        assert found.lidar is first.lidar[0]
+
+
+def test_the_pose_that_the_scan_confirms_is_taken():
+    item = simulate(1, seed=3)[0]
+    right = item.image.T_cam_board
+    wrong = perturb(right, np.array([0, 0, 0, 0.5, 0.3, 0]))
+    swapped = replace(item.image, T_cam_board=wrong, T_cam_board_alternative=right)
+    found = match_candidates(replace(item, image=swapped), BOARD, T_FORWARD)
+    np.testing.assert_array_equal(found.image.T_cam_board, right)

@@ -1,0 +1,78 @@
+"""Recordings by others: the extrinsic against their reference, which the algorithm never sees."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, error_to_reference, fit_extrinsic
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.pcd import decode_pcd
+from lce_rig.core.results import Refusal
+from lce_rig.detect.image.search import find_image_board
+from lce_rig.detect.lidar.search import find_lidar_boards
+from lce_rig.io.folder.cloud import rings_from_elevation
+from lce_rig.rig import Rig, load_rig
+
+pytestmark = pytest.mark.dataset
+
+
+def read_scan(path: Path) -> Scan:
+    cloud = decode_pcd(path.read_bytes())
+    points = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=1).astype(np.float32)
+    kept = np.isfinite(points).all(axis=1) & (np.linalg.norm(points, axis=1) > 0.1)
+    ring = rings_from_elevation(points[kept])
+    return Scan("lidar", None, points[kept], np.zeros(kept.sum(), dtype=np.float32), ring)
+
+
+def detect(folder: Path, rig: Rig) -> list[CaptureCandidates]:
+    (camera,) = rig.cameras.values()
+    board, intrinsics = rig.board.to_board(), camera.to_intrinsics()
+    pictures, clouds = ({f.stem: f for f in (folder / name).iterdir()} for name in ("img", "pcd"))
+    shared = sorted(pictures.keys() & clouds.keys())
+    names = [(k, k) for k in shared] or list(zip(sorted(pictures), sorted(clouds), strict=True))
+    found = []
+    for picture, cloud in names:
+        image = Image("cam", "frames", None, cv2.imread(str(pictures[picture])))
+        seen = find_image_board(image, board, intrinsics)
+        places = find_lidar_boards(read_scan(clouds[cloud]), board)
+        if not isinstance(seen, Refusal) and not isinstance(places, Refusal):
+            found.append(CaptureCandidates(picture, seen, places))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("recording", "profile", "n_captures", "max_deg", "max_m"),
+    [
+        ("rlfs01", "rlfs", 18, 0.25, 0.012),
+        ("sss_noise15mm", "sss", 20, 0.10, 0.003),
+        ("rles01_lf", "rles", 19, 0.9, 0.035),
+        ("rles01_le", "rles", 33, 1.0, 0.040),
+    ],
+)
+def test_the_extrinsic_is_near_the_reference(recordings, recording, profile, n_captures, max_deg, max_m):
+    rig = load_rig(profile)
+    estimate = fit_extrinsic(detect(recordings / recording, rig), rig.board.to_board())
+    reference = np.array(json.loads((recordings / recording / "reference.json").read_text())["T_cam_lidar"])
+    angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, reference)
+    assert angle_deg <= max_deg
+    assert distance_m <= max_m
+    assert len(estimate.used) >= n_captures
+    assert estimate.certificate.is_optimal
+
+
+def test_random_halves_of_a_recording_agree(recordings):
+    rig = load_rig("rlfs")
+    captures, board = detect(recordings / "rlfs01", rig), rig.board.to_board()
+    rng = np.random.default_rng(0)
+    differences = []
+    for _ in range(20):
+        order = rng.permutation(len(captures))
+        halves = [[captures[k] for k in half] for half in np.array_split(order, 2)]
+        T = [fit_extrinsic(half, board, EstimateSettings(n_draws=5)).T_cam_lidar for half in halves]
+        differences.append(error_to_reference(*T))
+    angle_deg, distance_m = np.sqrt(np.mean(np.square(differences), axis=0))
+    assert angle_deg <= 0.25
+    assert distance_m <= 0.008

@@ -1,0 +1,137 @@
+"""Range errors that all captures share: what they do to the solution, and whether the covariance says so."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings
+from lce_rig.core.geometry import difference, fit_plane, perturb
+from lce_rig.core.results import Observation
+from lce_rig.residuals.features import FeatureSettings, extract_features
+from lce_rig.residuals.moments import Problem, Weights
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
+
+NO_DRAWS = EstimateSettings("paper", n_draws=0)
+LASER_SIGMA_M, OFFSET_SIGMA_M = 0.008, 0.005
+RINGS = np.arange(16, dtype=np.int16)
+
+
+def longer(item, rings, offset_m):
+    """Measure a capture's board again with the ranges of some rings lengthened, the plane fitted anew."""
+    (lidar,) = item.lidar
+
+    def moved(points, ring):
+        reach = np.linalg.norm(points, axis=1)
+        return points * (1 + offset_m * np.isin(ring, rings) / reach)[:, None]
+
+    points = moved(lidar.points, lidar.ring)
+    ends = moved(lidar.edge_points, lidar.edge_ring)
+    plane, _ = fit_plane(points)
+    return CaptureCandidates(
+        item.capture, item.image, [replace(lidar, points=points, edge_points=ends, plane=plane)]
+    )
+
+
+def linearised(captures, settings):
+    """Solve captures for good, and differentiate the solution by each ring's offset."""
+    observations = [Observation(item.capture, item.image, item.lidar[0]) for item in captures]
+    features = [extract_features(seen, BOARD, settings) for seen in observations]
+    problem = Problem(features, BOARD, Weights(3e4, 2e5, 1 / 0.015**2))
+    solution = problem.solve(np.ones((1, len(features))), T_FORWARD, 5)
+    x, edge_ids = solution.x[0], solution.edge_ids[0]
+    information = problem.quadratics(x, edge_ids).information
+    columns = ring_sensitivities(observations, BOARD, settings, problem, x, edge_ids, information)
+    return solution.T[0], solution.linear[0, 3], columns
+
+
+@pytest.mark.parametrize("rings", [[5], [11], list(range(16))])
+@pytest.mark.parametrize("projection", ["ray", "normal", "none"])
+def test_longer_ranges_move_the_solution_as_its_sensitivities_say(rings, projection):
+    settings = FeatureSettings(point_projection=projection)
+    captures = simulate(15, 4)
+    T, shift_m, columns = linearised(captures, settings)
+    seen = np.unique(np.concatenate([item.lidar[0].ring for item in captures]))
+    T_moved, shift_moved_m, _ = linearised([longer(item, rings, 0.005) for item in captures], settings)
+    motion = np.append(difference(T_moved, T), shift_moved_m - shift_m)
+    expected = 0.005 * columns[:, np.isin(seen, rings)].sum(axis=1)
+    # Board at 2 m: metres and radians are comparable. fit_plane weighs points otherwise than ranges do.
+    np.testing.assert_allclose(motion, expected, atol=0.1 * np.linalg.norm(expected))
+
+
+def test_the_plane_follows_a_ring_as_if_it_were_fitted_anew():
+    for item in simulate(6, 2, Scenario(range_sigma_m=0.0)):
+        (lidar,) = item.lidar
+        for ring, moved in zip(RINGS, shift_rings(lidar, RINGS, 0.005), strict=True):
+            (expected,) = longer(item, [ring], 0.005).lidar
+            np.testing.assert_allclose(moved.points, expected.points, atol=1e-12)
+            np.testing.assert_allclose(moved.edge_points, expected.edge_points, atol=1e-12)
+            np.testing.assert_allclose(moved.plane, expected.plane, atol=2e-3)
+            if ring not in lidar.ring:
+                np.testing.assert_allclose(moved.plane, lidar.plane, atol=1e-12)
+
+
+def normalised_errors(options, n_seeds):
+    """e^T cov^-1 e (n,) of LiDARs whose lasers err by 8 mm about a mean that is off by 5 mm."""
+    nees = []
+    for seed in range(n_seeds):
+        offset_m = OFFSET_SIGMA_M * np.random.default_rng([seed, 2]).standard_normal()
+        scenario = Scenario(laser_bias_sigma_m=LASER_SIGMA_M, range_offset_m=offset_m)
+        estimate = fit_extrinsic(simulate(20, seed, scenario), BOARD, options)
+        error = difference(estimate.T_cam_lidar, T_FORWARD)
+        nees.append(error @ np.linalg.solve(estimate.cov, error))
+    return np.array(nees)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("n_seeds", [12, pytest.param(40, marks=pytest.mark.slow)])
+def test_range_errors_of_known_size_are_in_the_covariance(n_seeds):
+    nees = normalised_errors(
+        replace(NO_DRAWS, laser_bias_sigma_m=LASER_SIGMA_M, range_offset_sigma_m=OFFSET_SIGMA_M), n_seeds
+    )
+    # 6 expected, less because biases also scatter; the mean of 40 samples is good to 0.55, of 12 to 1.0.
+    assert 3.0 < nees.mean() < 7.5
+
+
+def test_range_errors_of_which_nothing_is_known_are_not_in_the_covariance():
+    assert normalised_errors(NO_DRAWS, 12).mean() > 12.0
+
+
+def test_a_common_offset_moves_the_lidar_by_about_its_size_and_is_claimed_so():
+    options = replace(NO_DRAWS, range_offset_sigma_m=0.02)
+    estimate = fit_extrinsic(simulate(20, 3, Scenario(range_offset_m=0.02)), BOARD, options)
+    error = difference(estimate.T_cam_lidar, T_FORWARD)
+    assert 0.01 < np.linalg.norm(error[:3]) < 0.03
+    assert 0.01 < estimate.diagnostics.sigma_systematic_translation_m < 0.03
+    assert error @ np.linalg.solve(estimate.cov, error) < 16.8  # 99 % of chi square with 6 degrees
+
+
+def test_systematic_errors_add_to_the_scatter_and_change_nothing_else():
+    captures = simulate(12, 6)
+    pure = fit_extrinsic(captures, BOARD, NO_DRAWS)
+    wider = fit_extrinsic(
+        captures, BOARD, replace(NO_DRAWS, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+    )
+    assert pure.T_cam_lidar.tobytes() == wider.T_cam_lidar.tobytes()
+    assert np.linalg.eigvalsh(wider.cov - pure.cov).min() > 0
+    for kind, trace in (
+        ("rotation_deg", lambda cov: np.degrees(np.sqrt(np.trace(cov[3:, 3:])))),
+        ("translation_m", lambda cov: np.sqrt(np.trace(cov[:3, :3]))),
+    ):
+        scatter, added = (
+            getattr(wider.diagnostics, f"sigma_{part}_{kind}") for part in ("scatter", "systematic")
+        )
+        assert getattr(pure.diagnostics, f"sigma_systematic_{kind}") == 0
+        assert getattr(pure.diagnostics, f"sigma_scatter_{kind}") == scatter == pytest.approx(trace(pure.cov))
+        assert np.hypot(scatter, added) == pytest.approx(trace(wider.cov))
+
+
+def test_rays_start_from_the_lidar_wherever_it_sits():
+    options = replace(NO_DRAWS, laser_bias_sigma_m=0.008)
+    T = perturb(T_FORWARD, np.array([0.3, -0.1, 0.1, 0.0, 0.2, 0.0]))
+    estimate = fit_extrinsic(
+        simulate(20, 3, Scenario(laser_bias_sigma_m=0.008), T_cam_lidar=T), BOARD, options
+    )
+    error = difference(estimate.T_cam_lidar, T)
+    assert error @ np.linalg.solve(estimate.cov, error) < 16.8

@@ -1,0 +1,72 @@
+"""Two cameras side by side before the same boards and one LiDAR: sessions for tests/rigs/two_cameras.yaml."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from lce_rig.calibrate import CaptureCandidates
+from lce_rig.core.geometry import Array, exp_so3, invert, perturb, pose
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, random_pose, scan_board
+
+LEFT, RIGHT = "left", "right"
+T_RIGHT_LEFT = pose(exp_so3(np.array([0.02, -0.03, 0.01])), np.array([-0.3, 0.005, 0.01]))
+TRUTH = {LEFT: T_FORWARD, RIGHT: T_RIGHT_LEFT @ T_FORWARD}
+"""T_cam_lidar (4, 4) by camera."""
+
+REAL = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.008, end_sigma_m=0.001)
+Session = dict[str, list[CaptureCandidates]]
+
+
+def simulate_two(
+    n: int,
+    seed: int,
+    scenario: Scenario = REAL,
+    *,
+    right_corner_sigma_px: float | None = None,
+    nudge: Array | None = None,
+    nudged_from: int = 0,
+) -> Session:
+    """Simulate n captures in which both cameras and the LiDAR see the board.
+
+    Args:
+        n: captures.
+        seed: of everything random.
+        scenario: noise, beam, and how the board is held.
+        right_corner_sigma_px: noise of the right camera's corners, where it differs.
+        nudge: (6,) tangent by which the right camera is moved.
+        nudged_from: capture from which on it is.
+    """
+    captures = _captures(seed, scenario, right_corner_sigma_px, nudge, nudged_from)
+    pairs = [next(captures) for _ in range(n)]
+    return {LEFT: [left for left, _ in pairs], RIGHT: [right for _, right in pairs]}
+
+
+def _captures(
+    seed: int,
+    scenario: Scenario,
+    right_corner_sigma_px: float | None,
+    nudge: Array | None,
+    nudged_from: int,
+) -> Iterator[tuple[CaptureCandidates, CaptureCandidates]]:
+    rng = np.random.default_rng([seed, 2])
+    bias_m = scenario.laser_bias_sigma_m * np.random.default_rng([seed, 1]).standard_normal(16)
+    bias_m += scenario.range_offset_m - bias_m.mean()
+    of_right = replace(scenario, corner_sigma_px=right_corner_sigma_px or scenario.corner_sigma_px)
+    n_seen = 0
+    while True:
+        is_nudged = nudge is not None and n_seen >= nudged_from
+        T_right_left = perturb(T_RIGHT_LEFT, nudge) if is_nudged and nudge is not None else T_RIGHT_LEFT
+        T_left_board = random_pose(rng, scenario, BOARD)
+        lidar = scan_board(invert(T_FORWARD) @ T_left_board, rng, scenario, BOARD, bias_m)
+        left = photograph(T_left_board, rng, scenario, BOARD)
+        right = photograph(T_right_left @ T_left_board, rng, of_right, BOARD)
+        if lidar is not None and left is not None and right is not None:
+            name = f"{n_seen:06d}"
+            yield CaptureCandidates(name, left, [lidar]), CaptureCandidates(name, right, [lidar])
+            n_seen += 1
+
+
+def only(captures: list[CaptureCandidates], kept: range) -> list[CaptureCandidates]:
+    """Keep captures by their place."""
+    return [captures[k] for k in kept]

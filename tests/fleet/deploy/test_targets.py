@@ -1,0 +1,83 @@
+"""Targets: found by name, and refused where a path or an option could be taken for something else."""
+
+from pathlib import Path
+
+import pytest
+
+from lce_rig.core.errors import ProfileError, TargetError, UsageError
+from lce_rig.fleet.deploy.deployment import standing
+from lce_rig.fleet.deploy.place import SshPlace
+from lce_rig.fleet.deploy.targets import find_target, read_targets
+from lce_rig.rig import load_rig
+from lce_rig.rig.target_settings import TargetSettings
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_a_target_is_found_in_the_file_beside_the_session_or_in_the_profile(tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    session.mkdir()
+    rig = load_rig("rles").model_copy(update={"targets": {"heron": TargetSettings(to="/profile")}})
+    assert find_target("heron", None, session, rig).to == "/profile"
+    write(tmp_path / "deploy.yaml", "targets: {heron: {to: calib}, kestrel: {to: 'robot@kestrel:calib'}}")
+    # A relative folder is one beside the file that names it.
+    assert find_target("heron", None, session, rig).to == str(tmp_path / "calib")
+    assert find_target("kestrel", None, session, None).host == "robot@kestrel"
+    other = write(tmp_path / "other.yaml", "targets: {kestrel: {to: /other}}")
+    assert find_target("kestrel", other, session, rig).to == "/other"
+    with pytest.raises(UsageError) as caught:
+        find_target("heron", other, session, rig)
+    assert caught.value.hint == "Known targets: kestrel."
+
+
+@pytest.mark.parametrize(
+    ("to", "host", "path"),
+    [
+        ("/opt/calibration", None, "/opt/calibration"),
+        ("robot@kestrel.local:calibration", "robot@kestrel.local", "calibration"),
+        ("kestrel:~/calibration", "kestrel", "calibration"),
+        ("robot@[fe80::1%eth0]:/opt/c", "robot@[fe80::1%eth0]", "/opt/c"),
+        ("./a:b", None, "./a:b"),
+    ],
+)
+def test_places_are_read_as_scp_reads_them(to: str, host: str | None, path: str) -> None:
+    target = TargetSettings(to=to)
+    assert (target.host, target.path) == (host, path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "to: ''",
+        "to: -oProxyCommand=touch",
+        "to: 'kestrel:-rf'",
+        "to: 'robot@:c'",
+        "to: '@kestrel:c'",
+        "to: /opt\n    formats: [nonsense]",
+        "to: 'kestrel:a b'",
+        "to: 'kestrel:$(reboot)'",
+        "to: /opt\n    ssh: {Port: 22}",
+        "to: 'kestrel:c'\n    ssh: {ProxyCommand: touch}",
+        "to: /opt\n    keep: 1",
+    ],
+)
+def test_what_a_shell_or_ssh_could_take_for_something_else_is_refused(tmp_path: Path, text: str) -> None:
+    path = write(tmp_path / "deploy.yaml", f"targets:\n  kestrel:\n    {text}\n")
+    with pytest.raises(ProfileError, match=r"deploy\.yaml:[34]: targets\.kestrel"):
+        read_targets(path)
+
+
+def test_arguments_reach_the_script_as_they_are(tmp_path: Path) -> None:
+    words = SshPlace(TargetSettings(to="kestrel:c", ssh={"Port": 2222})).command("echo $2", "it's; $(reboot)")
+    assert words[0] == "ssh" and "Port=2222" in words and "BatchMode=yes" in words
+    assert words[-2] == "kestrel" and words[-1] == """sh -c 'echo $2' sh c 'it'"'"'s; $(reboot)'"""
+
+
+@pytest.mark.long
+def test_a_computer_that_is_not_there_is_an_error_in_words() -> None:
+    with pytest.raises(TargetError) as caught:
+        standing(TargetSettings(to="robot@127.0.0.1:c", ssh={"Port": 1}))
+    assert "no connection" in caught.value.what and caught.value.exit_code == 8

@@ -1,0 +1,121 @@
+"""Frames of AEDAT4 files: every pixel, and the middle of the exposure whichever program wrote them."""
+
+import re
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.core.losses import Losses
+from lce_rig.io.events.aedat4 import Aedat4Image, decode_frame
+from lce_rig.io.events.aedat4_file import Aedat4File
+from tests.io.events.aedat4_files import RawFrame, flatbuffer, write_davis
+from tests.io.events.encoders import random_events
+
+START_US = 1_700_000_000_000_000
+RNG = np.random.default_rng(0)
+GREY = RNG.integers(0, 256, (260, 346), dtype=np.uint8)
+COLOUR = RNG.integers(0, 256, (260, 346, 3), dtype=np.uint8)
+
+
+def read(path: Path, losses: Losses | None = None) -> list[Aedat4Image]:
+    file = Aedat4File(path)
+    number = file.first_stream("FRME")
+    assert number is not None
+    return list(file.packets(number, losses or Losses(), decode_frame))
+
+
+@pytest.mark.parametrize("style", ["dv", "dv-processing", "exposure only"])
+def test_frames_are_stamped_at_mid_exposure_whatever_their_own_stamp_marks(
+    tmp_path: Path, style: str
+) -> None:
+    frames = [RawFrame(START_US + 40_000 * k, 8001, GREY, style) for k in range(3)]
+    found = read(write_davis(tmp_path / "a.aedat4", [random_events(500, 1, start_us=START_US)], frames))
+    assert [f.mid_exposure_ns for f in found] == [
+        (START_US + 40_000 * k) * 1000 + 4_000_500 for k in range(3)
+    ]
+    assert all(f.exposure_ns == 8_001_000 and np.array_equal(f.pixels, GREY) for f in found)
+
+
+def test_an_exposure_that_is_not_known_leaves_the_stamp_as_it_is(tmp_path: Path) -> None:
+    (frame,) = read(write_davis(tmp_path / "a.aedat4", [], [RawFrame(START_US, 8000, GREY, "stamp only")]))
+    assert (frame.mid_exposure_ns, frame.exposure_ns) == (START_US * 1000, 0)
+
+
+def test_colour_frames_are_blue_green_red(tmp_path: Path) -> None:
+    with_alpha = np.dstack([COLOUR, np.full((260, 346), 9, np.uint8)])
+    frames = [RawFrame(START_US, 0, COLOUR), RawFrame(START_US + 1, 0, with_alpha)]
+    for frame in read(write_davis(tmp_path / "a.aedat4", [], frames)):
+        assert np.array_equal(frame.pixels, COLOUR)
+
+
+def test_dv_processings_own_frames_are_read(tmp_path: Path) -> None:
+    dv = pytest.importorskip("dv_processing")
+    for compression in (dv.CompressionType.NONE, dv.CompressionType.LZ4, dv.CompressionType.ZSTD):
+        path = tmp_path / f"{compression.name}.aedat4"
+        config = dv.io.MonoCameraWriter.Config("DAVIS346_0", compression)
+        config.addEventStream((346, 260))
+        config.addFrameStream((346, 260))
+        writer = dv.io.MonoCameraWriter(str(path), config)
+        for k, pixels in enumerate((GREY, COLOUR)):
+            frame = dv.Frame(START_US + 40_000 * k, pixels)
+            frame.exposure = timedelta(microseconds=8000)
+            writer.writeFrame(frame)
+        del writer
+        grey, colour = read(path)
+        assert (grey.mid_exposure_ns, grey.exposure_ns) == ((START_US + 4000) * 1000, 8_000_000)
+        assert colour.mid_exposure_ns == (START_US + 44_000) * 1000
+        assert np.array_equal(grey.pixels, GREY) and np.array_equal(colour.pixels, COLOUR)
+
+
+def test_dv_processing_reads_what_the_tests_write(tmp_path: Path) -> None:
+    dv = pytest.importorskip("dv_processing")
+    events = random_events(2000, 1, start_us=START_US)
+    path = write_davis(tmp_path / "a.aedat4", [events], [RawFrame(START_US + 5, 8000, GREY)])
+    recording = dv.io.MonoCameraRecording(str(path))
+    frame = recording.getNextFrame()
+    assert (frame.timestamp, frame.exposure) == (START_US + 5, timedelta(microseconds=8000))
+    assert np.array_equal(frame.image, GREY)
+    assert np.array_equal(recording.getNextEventBatch().numpy()["x"], events.x)
+
+
+def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path: Path) -> None:
+    frames = [RawFrame(START_US + 40_000 * k, 8000, GREY) for k in range(3)]
+    path = write_davis(tmp_path / "a.aedat4", [], frames)
+    data = bytearray(path.read_bytes())
+    second = [found.start() for found in re.finditer(b"FRME", data)][-2]
+    data[second : second + 4] = b"????"
+    path.write_bytes(data[:-100])
+    losses = Losses()
+    assert [f.mid_exposure_ns for f in read(path, losses)] == [(START_US + 4000) * 1000]
+    assert losses.by_code() == {"recording.broken_packets": 1, "recording.torn_end": 1}
+
+
+def test_pictures_that_contradict_themselves_are_refused_by_what_is_wrong() -> None:
+    sound = {0: ("q", START_US), 6: ("h", 346), 7: ("h", 260), 10: GREY.tobytes()}
+    assert np.array_equal(decode_frame(flatbuffer(b"FRME", sound)[4:]).pixels, GREY)
+    for wrong, cause in [
+        ({5: ("b", 17)}, "OpenCV's type 17"),
+        ({6: ("h", 347)}, "89960 bytes .*347x260"),
+        ({7: ("h", 0)}, "346x0"),
+    ]:
+        with pytest.raises(ValueError, match=cause):
+            decode_frame(flatbuffer(b"FRME", sound | wrong)[4:])
+    with pytest.raises(ValueError, match="not a frame"):
+        decode_frame(flatbuffer(b"IMUS", sound)[4:])
+
+
+@pytest.mark.dataset
+def test_a_real_davis_file_is_read_as_its_makers_read_it(recordings: Path) -> None:
+    dv = pytest.importorskip("dv_processing")
+    path = recordings / "events" / "davis346_short.aedat4"
+    truth = dv.io.MonoCameraRecording(str(path))
+    found = read(path)
+    assert len(found) == 4
+    for frame in found:
+        other = truth.getNextFrame()
+        # Their library moves the stamps of old files to the start of the exposure.
+        exposure_us = other.exposure // timedelta(microseconds=1)
+        assert frame.mid_exposure_ns == other.timestamp * 1000 + exposure_us * 500
+        assert np.array_equal(frame.pixels, other.image)

@@ -1,0 +1,135 @@
+"""Events in bags: topics, packets lost or broken, torn bags."""
+
+from pathlib import Path
+
+import pytest
+
+from lce_rig.core.errors import SourceError
+from lce_rig.io.events import EventRecording, open_events
+from lce_rig.io.ros.bag_recorder import add_event_topic, event_messages
+from tests.io.events import encoders
+from tests.io.events.bags import write_event_bag, write_packet_bag
+from tests.io.events.encoders import Event, listed, random_events
+from tests.notes import has_note
+
+TOPIC = "/event_camera/events"
+TRUTH = listed(random_events(2000, 11))
+PIECES = [TRUTH[i : i + 100] for i in range(0, 2000, 100)]
+
+
+def messages(is_ros1: bool, encoding: str = "mono") -> list[tuple[str, int, bytes]]:
+    encode = {"mono": lambda piece: encoders.mono(piece, 0), "evt3": encoders.evt3}[encoding]
+    return [
+        (TOPIC, 10**9 + 10**7 * i, encoders.packet(encode(piece), encoding, is_ros1=is_ros1, number=i))
+        for i, piece in enumerate(PIECES)
+    ]
+
+
+def everything(recording: EventRecording) -> list[Event]:
+    return [event for stretch in recording for event in listed(stretch)]
+
+
+@pytest.mark.parametrize("name", ["a.bag", "ros2"])
+@pytest.mark.parametrize("encoding", ["mono", "evt3"])
+def test_packets_of_a_topic_are_one_recording(tmp_path: Path, name: str, encoding: str) -> None:
+    path = write_packet_bag(tmp_path / name, messages(name == "a.bag", encoding))
+    recording = open_events(path)
+    assert everything(recording) == TRUTH
+    assert recording.notes == [f"{name}: events from {TOPIC} (20 messages)"]
+
+
+def test_sqlite_bags_are_read_as_a_folder_and_as_a_file(tmp_path: Path) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    events = random_events(2000, 11, start_us=1_700_000_000_000_000)
+    with Writer(tmp_path / "ros2", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = add_event_topic(writer, "/dvs/events", is_ros1=False)
+        for received_ns, message in event_messages(events, "cam", is_ros1=False):
+            writer.write(connection, received_ns, message)
+    (file,) = (tmp_path / "ros2").glob("*.db3")
+    for path in (tmp_path / "ros2", file):
+        assert everything(open_events(path)) == listed(events)
+
+
+@pytest.mark.parametrize("name", ["a.bag", "ros2"])
+def test_broken_packets_are_counted_and_the_first_is_named(tmp_path: Path, name: str) -> None:
+    sent = messages(name == "a.bag")
+    for i in (5, 9, 17):
+        topic, received_ns, data = sent[i]
+        sent[i] = topic, received_ns, data[:-3]
+    recording = open_events(write_packet_bag(tmp_path / name, sent))
+    kept = [event for i, piece in enumerate(PIECES) if i not in (5, 9, 17) for event in piece]
+    assert everything(recording) == kept
+    assert has_note(recording.notes, "3 broken packets", "message 5", "0.050 s")
+
+
+def test_a_packet_whose_time_base_is_beyond_any_clock_is_skipped_and_named(tmp_path: Path) -> None:
+    sent = messages(is_ros1=True)
+    data = encoders.packet(encoders.mono(PIECES[3], 0), "mono", is_ros1=True, number=3, base_ns=2**63 + 5)
+    sent[3] = TOPIC, sent[3][1], data
+    recording = open_events(write_packet_bag(tmp_path / "a.bag", sent))
+    assert everything(recording) == [event for i, piece in enumerate(PIECES) if i != 3 for event in piece]
+    assert has_note(recording.notes, "1 broken packets", "any clock")
+
+
+def test_a_sensor_of_more_pixels_than_any_event_camera_has_is_damage(tmp_path: Path) -> None:
+    data = encoders.packet(encoders.mono(TRUTH, 0), "mono", is_ros1=True, size=(2**32 - 688, 60))
+    path = write_packet_bag(tmp_path / "a.bag", [(TOPIC, 10**9, data)])
+    with pytest.raises(SourceError, match="declares a sensor of 4294966608x60 pixels"):
+        open_events(path)
+
+
+def test_packets_that_never_arrived_are_counted(tmp_path: Path) -> None:
+    sent = messages(is_ros1=True)
+    recording = open_events(write_packet_bag(tmp_path / "a.bag", sent[:4] + sent[7:]))
+    assert len(everything(recording)) == 1700
+    assert has_note(recording.notes, "3 packets lost")
+
+
+def test_packets_of_another_size_or_encoding_are_broken_ones(tmp_path: Path) -> None:
+    sent = messages(is_ros1=True)
+    odd = encoders.packet(b"", "mono", is_ros1=True, number=20, size=(640, 480))
+    strange = encoders.packet(b"12345678", "evt9", is_ros1=True, number=21)
+    sent += [(TOPIC, 2 * 10**9, odd), (TOPIC, 2 * 10**9, strange)]
+    recording = open_events(write_packet_bag(tmp_path / "a.bag", sent))
+    assert everything(recording) == TRUTH
+    assert has_note(recording.notes, "2 broken packets", "640x480")
+
+
+def test_a_bag_torn_in_the_middle_is_read_up_to_there_and_the_loss_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    events = random_events(100_000, 3, start_us=1_700_000_000_000_000, step_us=100)
+    write_event_bag(path, [events])
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    # Bags are written chunk by chunk; the first, of about a megabyte, is torn here.
+    with pytest.raises(SourceError, match=r"a\.bag"):
+        open_events(path)
+    path.write_bytes(whole[:-2000])
+    recording = open_events(path)
+    found = everything(recording)
+    assert 50_000 < len(found) < len(events)
+    assert found == listed(events)[: len(found)]
+    assert any("torn" in note for note in recording.notes)
+
+
+def test_the_topic_is_found_among_triggers_and_others(tmp_path: Path) -> None:
+    edges = [(10, 0, 1, True), (400, 0, 1, False)]
+    trigger = encoders.packet(encoders.mono(edges, 0), "trigger", is_ros1=True)
+    sent = [("/event_camera/triggers", 10**9, trigger), *messages(is_ros1=True)]
+    path = write_packet_bag(tmp_path / "a.bag", sent)
+    assert everything(open_events(path)) == TRUTH
+    with pytest.raises(SourceError, match=r"no events.*1 packets of triggers"):
+        open_events(path, topic="/event_camera/triggers")
+
+
+def test_two_cameras_need_a_topic_and_the_topics_are_listed(tmp_path: Path) -> None:
+    sent = messages(is_ros1=True)
+    path = write_packet_bag(tmp_path / "a.bag", sent + [("/other", t, data) for _, t, data in sent[:3]])
+    with pytest.raises(SourceError, match="2 topics") as caught:
+        open_events(path)
+    assert has_note([caught.value.hint], "/other", "EventPacket, 3")
+    assert everything(open_events(path, topic="/other")) == TRUTH[:300]
+    with pytest.raises(SourceError, match="no topic /none") as caught:
+        open_events(path, topic="/none")
+    assert TOPIC in caught.value.hint

@@ -1,0 +1,184 @@
+"""What is encoded as cameras and drivers do comes back event for event, however the stream is cut."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.core.data import EventColumns, Events, join_events
+from lce_rig.io.events.prophesee_raw import Evt2Decoder
+from lce_rig.io.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
+from lce_rig.io.ros.event_array import decode_event_array, encode_event_array
+from lce_rig.io.ros.event_messages import PacketDecoder, parse_packet
+from tests.io.events import encoders
+from tests.io.events.encoders import Event, listed, random_events
+
+WORDS = {"evt2": (encoders.evt2, "<u4"), "evt21": (encoders.evt21, "<u8"), "evt3": (encoders.evt3, "<u2")}
+
+
+def columns_listed(columns: EventColumns) -> list[Event]:
+    return listed(Events("", columns.t_ns, columns.x, columns.y, columns.polarity, 1, 1))
+
+
+def decoder_of(name: str) -> WordDecoder | Evt2Decoder:
+    return WordDecoder(EVT3) if name == "evt3" else Evt2Decoder(has_vectors=name == "evt21")
+
+
+@pytest.mark.parametrize("name", sorted(WORDS))
+@given(
+    n=st.integers(1, 120),
+    seed=st.integers(0, 10**6),
+    cuts=st.lists(st.integers(0, 300), max_size=6),
+    start_us=st.integers(0, 1 << 23),
+)
+def test_streams_come_back_however_they_are_cut_into_blocks(
+    name: str, n: int, seed: int, cuts: list[int], start_us: int
+) -> None:
+    encode, dtype = WORDS[name]
+    truth = listed(random_events(n, seed, (1280, 720), start_us))
+    words = np.frombuffer(encode(truth), dtype)
+    decoder = decoder_of(name)
+    parts = [decoder.decode(block) for block in np.split(words, sorted(min(c, len(words)) for c in cuts))]
+    assert columns_listed(join_events(parts)) == truth
+    assert (decoder.n_unknown, decoder.n_untimed) == (0, 0)
+
+
+def test_a_vector_of_evt3_goes_on_where_the_last_one_ended() -> None:
+    # Base 100, then 12 + 12 + 8 places, of which the first of each is set.
+    words = [8 << 12, 6 << 12 | 5, 7, 3 << 12 | 1 << 11 | 100, 4 << 12 | 1, 4 << 12 | 1, 5 << 12 | 1]
+    events = WordDecoder(EVT3).decode(np.array(words, "<u2"))
+    assert columns_listed(events) == [(5, 100, 7, True), (5, 112, 7, True), (5, 124, 7, True)]
+
+
+@pytest.mark.parametrize(("name", "bits"), [("evt3", 24), ("evt2", 34)])
+def test_clocks_of_the_sensor_wrap_without_a_trace(name: str, bits: int) -> None:
+    encode, dtype = WORDS[name]
+    truth = listed(random_events(400, 1, (640, 480), (1 << bits) - 400))
+    assert truth[0][0] < 1 << bits < truth[-1][0]
+    assert columns_listed(decoder_of(name).decode(np.frombuffer(encode(truth), dtype))) == truth
+
+
+def test_a_time_word_that_steps_back_a_little_is_no_wrap() -> None:
+    words = [8 << 12 | 50, 6 << 12, 9, 2 << 12 | 1, 8 << 12 | 49, 2 << 12 | 2, 8 << 12 | 51, 2 << 12 | 3]
+    events = WordDecoder(EVT3).decode(np.array(words, "<u2"))
+    assert (events.t_ns // 4_096_000).tolist() == [50, 49, 51]
+
+
+@pytest.mark.parametrize("name", sorted(WORDS))
+def test_a_damaged_time_word_is_repaired_and_counted(name: str) -> None:
+    encode, dtype = WORDS[name]
+    truth = [(5000 * i, i, i, True) for i in range(100)]
+    words = np.frombuffer(encode(truth), dtype).copy()
+    code_at = words.dtype.itemsize * 8 - 4
+    high = np.flatnonzero(words >> words.dtype.type(code_at) == 8)
+    words[high[50]] ^= words.dtype.type(1 << {"evt2": 20, "evt21": 52, "evt3": 10}[name])
+    decoder = decoder_of(name)
+    found = columns_listed(decoder.decode(words))
+    assert decoder.n_repaired == 1
+    assert found[:50] + found[51:] == truth[:50] + truth[51:]
+    assert abs(found[50][0] - truth[50][0]) < 10_000
+
+
+def test_events_before_the_first_stamp_are_left_out_and_counted() -> None:
+    truth = listed(random_events(50, 2))
+    for name, (encode, dtype) in WORDS.items():
+        words = np.frombuffer(encode(truth), dtype)
+        event = {"evt2": 1 << 28, "evt21": 1 << 60 | 1, "evt3": 2 << 12 | 1}[name]
+        decoder = decoder_of(name)
+        events = decoder.decode(np.concatenate((np.array([event, event], words.dtype), words)))
+        assert columns_listed(events) == truth
+        assert decoder.n_untimed == 2
+
+
+def test_words_of_no_known_code_are_counted_and_passed_over() -> None:
+    truth = listed(random_events(50, 3))
+    words = np.frombuffer(encoders.evt3(truth), "<u2")
+    decoder = WordDecoder(EVT3)
+    events = decoder.decode(np.concatenate((np.array([1 << 12, 11 << 12, 14 << 12], "<u2"), words)))
+    assert columns_listed(events) == truth
+    assert decoder.n_unknown == 2
+
+
+@given(n=st.integers(1, 120), seed=st.integers(0, 10**6), start_us=st.integers(0, 1 << 50))
+def test_events_in_a_column_come_back_from_the_drivers_compression(n: int, seed: int, start_us: int) -> None:
+    events = random_events(n, seed, start_us=start_us)
+    truth = listed(events)
+    decoder = WordDecoder(LIBCAER_CMP)
+    decoder.start_packet()
+    columns = decoder.decode(np.frombuffer(encoders.libcaer_cmp(truth, start_us), "<u2"))
+    assert columns_listed(columns) == [(t - start_us, x, y, p) for t, x, y, p in truth]
+
+
+@pytest.mark.parametrize("is_ros1", [True, False])
+@pytest.mark.parametrize("encoding", ["evt3", "libcaer", "libcaer_cmp", "mono"])
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 60))
+def test_packets_of_every_encoding_come_back(encoding: str, is_ros1: bool, seed: int, n: int) -> None:
+    start_us = 0 if encoding == "evt3" else 1_700_000_000_000_000
+    truth = listed(random_events(n, seed, start_us=start_us))
+    payloads = {
+        "evt3": lambda part: encoders.evt3(part),
+        "libcaer": lambda part: encoders.libcaer(part, start_us),
+        "libcaer_cmp": lambda part: encoders.libcaer_cmp(part, start_us),
+        "mono": lambda part: encoders.mono(part, start_us * 1000),
+    }
+    decoder = PacketDecoder()
+    parts = []
+    for half in (truth[: n // 2], truth[n // 2 :]):
+        payload = payloads[encoding](half)
+        data = encoders.packet(payload, encoding, is_ros1=is_ros1, base_ns=start_us * 1000, stamp_ns=77)
+        parts += list(decoder.decode(parse_packet(data, "ros1" if is_ros1 else "cdr")))
+    parts += list(decoder.finish())
+    assert columns_listed(join_events(parts)) == truth
+    assert parts[0].host_ns == 77
+
+
+def test_stamps_that_wrap_inside_a_libcaer_packet_go_on() -> None:
+    start_us = (1 << 31) - 30
+    truth = [(start_us + 20 * i, i, i, True) for i in range(5)]
+    data = encoders.packet(encoders.libcaer(truth, 0), "libcaer", is_ros1=False)
+    (columns,) = PacketDecoder().decode(parse_packet(data, "cdr"))
+    assert columns_listed(columns) == truth
+
+
+def test_packets_of_triggers_hold_no_events() -> None:
+    edges = [(10, 0, 3, True), (20, 0, 3, False)]
+    data = encoders.packet(encoders.mono(edges, 0), "trigger", is_ros1=True, base_ns=0)
+    assert list(PacketDecoder().decode(parse_packet(data, "ros1"))) == []
+
+
+@pytest.mark.parametrize("encoding", ["ros1", "cdr"])
+@given(n=st.integers(1, 40), seed=st.integers(0, 10**6), frame_id=st.text("abc_/", max_size=9))
+def test_event_arrays_come_back(encoding: str, n: int, seed: int, frame_id: str) -> None:
+    events = random_events(n, seed, start_us=1_700_000_000_000_000)
+    header, columns = decode_event_array(encode_event_array(events, frame_id, encoding), encoding)
+    assert columns_listed(columns) == listed(events)
+    assert (header.width_px, header.height_px, header.frame_id) == (346, 260, frame_id)
+    assert header.stamp_ns == events.t_ns[0]
+
+
+@pytest.mark.parametrize("is_ros1", [True, False])
+def test_event_arrays_are_what_ros_itself_reads(is_ros1: bool) -> None:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    from lce_rig.io.ros import bag_recorder as bag_writer
+
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(bag_writer._EVENT[is_ros1], "dvs_msgs/msg/Event"))
+    store.register(get_types_from_msg(bag_writer._HEADER, bag_writer.MESSAGE_TYPE))
+    events = random_events(20, 4, start_us=1_700_000_000_000_000)
+    data = encode_event_array(events, "cam", "ros1" if is_ros1 else "cdr", number=5)
+    read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+    message = read(data, bag_writer.MESSAGE_TYPE)
+    found = [(e.ts.sec * 10**6 + e.ts.nanosec // 1000, e.x, e.y, e.polarity) for e in message.events]
+    assert found == listed(events)
+    write = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+    assert bytes(write(message, bag_writer.MESSAGE_TYPE)) == data
+
+
+@given(data=st.binary(max_size=200), is_ros1=st.booleans())
+def test_rubbish_is_refused_in_words_and_nothing_else(data: bytes, is_ros1: bool) -> None:
+    for decode in (parse_packet, decode_event_array):
+        try:
+            decode(data, "ros1" if is_ros1 else "cdr")
+        except ValueError as error:
+            assert str(error)

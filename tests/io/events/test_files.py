@@ -1,0 +1,325 @@
+"""Files of events: read back exactly, and where they are damaged as far as they go."""
+
+import struct
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Events
+from lce_rig.core.errors import SourceError
+from lce_rig.core.event_file import encode_events
+from lce_rig.io.events import EventRecording, open_events
+from lce_rig.io.events.aedat4_writer import Aedat4Writer, write_aedat4
+from tests.io.events import encoders
+from tests.io.events.bags import write_event_bag
+from tests.io.events.encoders import listed, random_events
+from tests.notes import has_note
+
+START_US = 1_700_000_000_000_000
+EVENTS = random_events(30_000, 7, start_us=START_US)
+
+
+def everything(recording: EventRecording) -> list[encoders.Event]:
+    return [event for stretch in recording for event in listed(stretch)]
+
+
+def write_text(path: Path, events: Events, with_size: bool = True) -> None:
+    lines = [f"{t // 10**6}.{t % 10**6:06d} {x} {y} {p:d}" for t, x, y, p in listed(events)]
+    head = [f"{events.width_px} {events.height_px}"] if with_size else []
+    path.write_text("\n".join(head + lines) + "\n")
+
+
+def write_zip(path: Path, events: Events) -> None:
+    write_text(path.with_suffix(".txt"), events)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.write(path.with_suffix(".txt"), "events.txt")
+
+
+def write_dsec(path: Path, events: Events) -> None:
+    import h5py
+
+    t_us = events.t_ns // 1000
+    with h5py.File(path, "w") as file:
+        file["events/t"] = (t_us - START_US).astype(np.uint32)
+        file["events/x"], file["events/y"] = events.x, events.y
+        file["events/p"] = events.polarity.astype(np.uint8)
+        file["t_offset"] = START_US
+        file["ms_to_idx"] = np.zeros(1, np.uint64)
+
+
+def write_raw(path: Path, events: Events) -> None:
+    head = "% evt 3.0\n% geometry 346x260\n% end\n"
+    # The raw formats count from the sensor's start, and so do their stamps here.
+    local = [(t - START_US, x, y, p) for t, x, y, p in listed(events)]
+    path.write_bytes(head.encode() + encoders.evt3(local))
+
+
+WRITERS: dict[str, Callable[[Path, Events], object]] = {
+    "a.aedat4": lambda path, events: write_aedat4(path, [events]),
+    "a.npz": lambda path, events: path.write_bytes(encode_events(events)),
+    "a.bag": lambda path, events: write_event_bag(path, [events]),
+    "ros2": lambda path, events: write_event_bag(path, [events]),
+    "a.h5": write_dsec,
+    "a.txt": write_text,
+    "a.zip": write_zip,
+    "a.raw": write_raw,
+}
+
+
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_every_format_gives_every_event_back_to_the_microsecond(tmp_path: Path, name: str) -> None:
+    WRITERS[name](tmp_path / name, EVENTS)
+    recording = open_events(tmp_path / name, sensor="davis")
+    shift_us = START_US if name == "a.raw" else 0
+    assert [(t + shift_us, x, y, p) for t, x, y, p in everything(recording)] == listed(EVENTS)
+    assert recording.resolution_px == (EVENTS.x.max() + 1, EVENTS.y.max() + 1) == (346, 260)
+    assert recording.duration_s == pytest.approx((EVENTS.t_ns[-1] - EVENTS.t_ns[0]) * 1e-9)
+    first = next(iter(recording))
+    assert first.sensor == "davis"
+    assert (first.t_ns.dtype, first.x.dtype, first.polarity.dtype) == (np.int64, np.uint16, np.bool_)
+
+
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_no_events_is_an_error_that_names_the_file(tmp_path: Path, name: str) -> None:
+    if name == "a.aedat4":
+        Aedat4Writer(tmp_path / name, (346, 260)).close()
+    else:
+        WRITERS[name](tmp_path / name, EVENTS.select(slice(0, 0)))
+    with pytest.raises(SourceError, match=name):
+        open_events(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", sorted(set(WRITERS) - {"a.h5"}))
+def test_events_of_another_camera_are_refused_by_both_resolutions(tmp_path: Path, name: str) -> None:
+    WRITERS[name](tmp_path / name, EVENTS)
+    with pytest.raises(SourceError, match=r"346x260.*'davis'.*640x480"):
+        open_events(tmp_path / name, sensor="davis", resolution=(640, 480))
+
+
+def test_events_beyond_the_profiles_resolution_are_refused_by_both(tmp_path: Path) -> None:
+    write_dsec(tmp_path / "a.h5", EVENTS)
+    with pytest.raises(SourceError, match=r"column 345, row 259.*'davis'.*240x180"):
+        list(open_events(tmp_path / "a.h5", sensor="davis", resolution=(240, 180)))
+
+
+def test_a_file_of_no_declared_resolution_takes_its_extent_and_says_so(tmp_path: Path) -> None:
+    write_dsec(tmp_path / "a.h5", EVENTS)
+    recording = open_events(tmp_path / "a.h5")
+    assert recording.resolution_px == (346, 260)
+    assert any("346x260, the extent" in note for note in recording.notes)
+    assert not open_events(tmp_path / "a.h5", resolution=(346, 260)).notes
+
+
+def test_dv_processing_reads_what_is_written(tmp_path: Path) -> None:
+    dv = pytest.importorskip("dv_processing")
+    write_aedat4(
+        tmp_path / "a.aedat4", [EVENTS.select(slice(0, 9)), EVENTS.select(slice(9, None))], "cam & co"
+    )
+    recording = dv.io.MonoCameraRecording(str(tmp_path / "a.aedat4"))
+    assert tuple(recording.getEventResolution()) == (346, 260)
+    assert recording.getCameraName() == "cam & co"
+    assert recording.getTimeRange() == (EVENTS.t_ns[0] // 1000, EVENTS.t_ns[-1] // 1000)
+    batches = []
+    while (batch := recording.getNextEventBatch()) is not None:
+        batches.append(batch.numpy().copy())
+    found = np.concatenate(batches)
+    assert np.array_equal(found["timestamp"] * 1000, EVENTS.t_ns)
+    assert np.array_equal(found["x"], EVENTS.x)
+    assert np.array_equal(found["y"], EVENTS.y)
+    assert np.array_equal(found["polarity"].astype(bool), EVENTS.polarity)
+
+
+def test_what_dv_processing_writes_is_read(tmp_path: Path) -> None:
+    dv = pytest.importorskip("dv_processing")
+    few = EVENTS.select(slice(0, 3000))
+    store = dv.EventStore()
+    for t, x, y, p in listed(few):
+        store.push_back(t, x, y, p)
+    for compression in (dv.CompressionType.NONE, dv.CompressionType.LZ4, dv.CompressionType.ZSTD):
+        path = tmp_path / f"{compression.name}.aedat4"
+        config = dv.io.MonoCameraWriter.EventOnlyConfig("cam", (346, 260), compression)
+        writer = dv.io.MonoCameraWriter(str(path), config)
+        writer.writeEvents(store)
+        del writer
+        assert everything(open_events(path)) == listed(few)
+
+
+def test_a_writer_that_was_killed_leaves_a_readable_file(tmp_path: Path) -> None:
+    writer = Aedat4Writer(tmp_path / "a.aedat4", (346, 260))
+    writer.write(EVENTS)
+    writer._file.flush()
+    recording = open_events(tmp_path / "a.aedat4")
+    assert everything(recording) == listed(EVENTS)
+    assert any("never closed" in note for note in recording.notes)
+    writer.close()
+    assert not open_events(tmp_path / "a.aedat4").notes
+
+
+def test_a_packet_cut_off_costs_only_itself_and_is_said(tmp_path: Path) -> None:
+    write_aedat4(tmp_path / "whole.aedat4", [EVENTS])
+    whole = (tmp_path / "whole.aedat4").read_bytes()
+    (tmp_path / "torn.aedat4").write_bytes(whole[: len(whole) * 3 // 4])
+    recording = open_events(tmp_path / "torn.aedat4")
+    found = everything(recording)
+    assert 8192 <= len(found) < len(EVENTS)
+    assert found == listed(EVENTS)[: len(found)]
+    assert has_note(recording.notes, "1 torn ends")
+
+
+@pytest.mark.parametrize(("from_byte", "to_byte"), [(8, 60), (0, 8), (4, 8)])
+def test_a_damaged_packet_is_left_out_and_its_place_is_said(
+    tmp_path: Path, from_byte: int, to_byte: int
+) -> None:
+    write_aedat4(tmp_path / "a.aedat4", [EVENTS])
+    data = bytearray((tmp_path / "a.aedat4").read_bytes())
+    begin = 14 + 4 + struct.unpack_from("<I", data, 14)[0]
+    second = begin + 8 + struct.unpack_from("<i", data, begin + 4)[0]
+    data[second + from_byte : second + to_byte] = b"\xff" * (to_byte - from_byte)
+    (tmp_path / "a.aedat4").write_bytes(data)
+    recording = open_events(tmp_path / "a.aedat4")
+    assert everything(recording) == listed(EVENTS)[:8192] + listed(EVENTS)[16384:]
+    assert has_note(recording.notes, "1 broken packets", "packet 1")
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.raw", "a.zip", "a.npz", "a.h5", "a.aedat4", "a.txt"])
+@pytest.mark.parametrize("share", [0.1, 0.6, 0.97])
+def test_a_torn_file_gives_its_beginning_or_one_clear_error(tmp_path: Path, name: str, share: float) -> None:
+    WRITERS[name](tmp_path / name, EVENTS)
+    whole = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(whole[: int(len(whole) * share)])
+    shift_us = START_US if name == "a.raw" else 0
+    try:
+        found = [(t + shift_us, x, y, p) for t, x, y, p in everything(open_events(tmp_path / name))]
+    except SourceError as error:
+        assert name in error.what
+        assert "\n" not in error.what
+        return
+    assert found[:-1] == listed(EVENTS)[: len(found) - 1]
+
+
+def test_a_torn_word_of_a_raw_file_is_said(tmp_path: Path) -> None:
+    write_raw(tmp_path / "a.raw", EVENTS)
+    with (tmp_path / "a.raw").open("ab") as file:
+        file.write(b"\x01")
+    recording = open_events(tmp_path / "a.raw")
+    assert len(everything(recording)) == len(EVENTS)
+    assert has_note(recording.notes, "torn", "last word")
+
+
+@pytest.mark.parametrize(
+    ("head", "encode"),
+    [
+        ("% evt 2.0\n% plugin_name hal_plugin_gen31_fx3\n", encoders.evt2),
+        ("% format EVT2;height=480;width=640\n% end\n", encoders.evt2),
+        ("% evt 2.1\n% sensor_generation 3.1\n% end\n", encoders.evt21),
+        ("% format EVT21;endianness=little;height=480;width=640\n% end\n", encoders.evt21),
+        ("% format EVT3;height=480;width=640\n% end\n", encoders.evt3),
+    ],
+)
+def test_raw_files_of_every_version_and_header_are_read(
+    tmp_path: Path, head: str, encode: Callable[[list[encoders.Event]], bytes]
+) -> None:
+    truth = listed(random_events(500, 8, (640, 480)))
+    (tmp_path / "a.raw").write_bytes(head.encode() + encode(truth))
+    recording = open_events(tmp_path / "a.raw")
+    assert recording.resolution_px == (640, 480)
+    assert everything(recording) == truth
+
+
+@pytest.mark.parametrize("head", ["% format EVT21;endianness=legacy\n", "% evt 2.1\n"])
+def test_the_legacy_word_order_of_evt21_is_undone(tmp_path: Path, head: str) -> None:
+    truth = listed(random_events(500, 8, (640, 480)))
+    words = np.frombuffer(encoders.evt21(truth), "<u4").reshape(-1, 2)[:, ::-1].tobytes()
+    (tmp_path / "a.raw").write_bytes(head.encode() + words)
+    assert everything(open_events(tmp_path / "a.raw")) == truth
+
+
+@pytest.mark.parametrize("head", [b"", b"% evt 4.0\n", b"\x00\x01\x02"])
+def test_a_raw_file_of_no_known_encoding_is_refused(tmp_path: Path, head: bytes) -> None:
+    (tmp_path / "a.raw").write_bytes(head)
+    with pytest.raises(SourceError, match=r"not EVT2, EVT2\.1 or EVT3"):
+        open_events(tmp_path / "a.raw")
+
+
+def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path: Path) -> None:
+    few = EVENTS.select(slice(0, 100))
+    write_text(tmp_path / "a.txt", few, with_size=False)
+    lines = (tmp_path / "a.txt").read_text().splitlines()
+    lines[40:40] = ["1 2 3", "# a comment", "nan 1 1 1", "what is this?"]
+    (tmp_path / "a.txt").write_text("\n".join(lines))
+    recording = open_events(tmp_path / "a.txt", resolution=(346, 260))
+    assert everything(recording) == listed(few)
+    assert has_note(recording.notes, "3 broken lines", "line 41", "'1 2 3'")
+
+
+def test_archives_of_other_programs_are_read(tmp_path: Path) -> None:
+    columns = {"x": EVENTS.x, "y": EVENTS.y, "p": np.where(EVENTS.polarity, 1, -1)}
+    np.savez(tmp_path / "s.npz", t=EVENTS.t_ns * 1e-9, **columns)
+    np.savez(tmp_path / "us.npz", ts=EVENTS.t_ns // 1000, **columns)
+    for name in ("s.npz", "us.npz"):
+        assert everything(open_events(tmp_path / name)) == listed(EVENTS)
+
+
+def test_a_missing_filter_of_hdf5_is_named_with_its_remedy(tmp_path: Path) -> None:
+    import h5py
+
+    try:
+        import hdf5plugin  # noqa: F401
+
+        pytest.skip("hdf5plugin is installed")
+    except ImportError:
+        pass
+    write_dsec(tmp_path / "a.h5", EVENTS)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["events/x"]
+        blosc = 32001
+        created = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        created.set_chunk((1000,))
+        created.set_filter(blosc, h5py.h5z.FLAG_OPTIONAL, (2, 2, 2, 2000, 5, 1, 1))
+        space = h5py.h5s.create_simple((len(EVENTS),))
+        data = h5py.h5d.create(file["events"].id, b"x", h5py.h5t.STD_U16LE, space, created)
+        for begin in range(0, len(EVENTS), 1000):
+            data.write_direct_chunk((begin,), bytes(900))
+    with pytest.raises(SourceError, match=r"events/x is compressed by .*, which is not installed") as caught:
+        open_events(tmp_path / "a.h5")
+    assert caught.value.hint.startswith("pip install") and "hdf5plugin" in caught.value.hint
+
+
+def test_hdf5_of_another_layout_is_refused_with_what_it_holds(tmp_path: Path) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["davis/left/events"] = np.zeros((3, 4))
+    with pytest.raises(SourceError, match=r"no events/t; it has davis"):
+        open_events(tmp_path / "a.h5")
+
+
+def test_missing_h5py_is_said_with_its_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_dsec(tmp_path / "a.h5", EVENTS)
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(SourceError) as caught:
+        open_events(tmp_path / "a.h5")
+    assert "lce-rig[events]" in caught.value.hint
+
+
+@pytest.mark.parametrize("name", ["a.aedat4", "a.npz", "a.h5", "a.txt", "a.zip", "a.bag", "a.raw"])
+def test_rubbish_by_any_name_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    for rubbish in (b"", b"rubbish\n" * 100, bytes(1000)):
+        (tmp_path / name).write_bytes(rubbish)
+        with pytest.raises(SourceError, match=name) as caught:
+            open_events(tmp_path / name)
+        assert "\n" not in caught.value.what
+
+
+def test_paths_that_are_no_recording_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="does not exist"):
+        open_events(tmp_path / "a.aedat4")
+    (tmp_path / "a.mp4").touch()
+    (tmp_path / "img").mkdir()
+    for name in ("a.mp4", "img"):
+        with pytest.raises(SourceError, match="not an event recording"):
+            open_events(tmp_path / name)

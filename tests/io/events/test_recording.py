@@ -1,0 +1,178 @@
+"""Order, clocks and windows of recordings, told apart by small streams of known content."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.core.data import EventColumns
+from lce_rig.core.errors import SourceError
+from lce_rig.core.losses import Losses
+from lce_rig.io.events.event_recording import REORDER_NS, EventRecording
+from tests.io.events.encoders import random_events
+from tests.notes import has_note
+
+PATH = Path("recording.test")
+
+
+class ListedStream:
+    """A stream of stretches given in advance."""
+
+    def __init__(
+        self, stretches: Sequence[EventColumns], resolution_px: tuple[int, int] | None = (346, 260)
+    ) -> None:
+        self.resolution_px = resolution_px
+        self.notes: list[str] = []
+        self._stretches = stretches
+
+    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
+        yield from self._stretches
+
+
+def columns(t_us: Sequence[int] | np.ndarray) -> EventColumns:
+    """Events at given times; the column says how many came before."""
+    n = len(t_us)
+    x = (np.arange(n) % 346).astype(np.uint16)
+    return EventColumns(np.asarray(t_us, np.int64) * 1000, x, np.zeros(n, np.uint16), np.ones(n, bool))
+
+
+def record(*stretches: EventColumns, resolution: tuple[int, int] | None = (346, 260)) -> EventRecording:
+    return EventRecording(PATH, ListedStream(stretches, resolution), "events", None)
+
+
+def stamps_us(recording: EventRecording) -> list[int]:
+    return [t // 1000 for stretch in recording for t in stretch.t_ns.tolist()]
+
+
+@given(
+    jitter_us=st.integers(0, REORDER_NS // 1000 // 2),
+    seed=st.integers(0, 10**6),
+    cuts=st.lists(st.integers(1, 999), max_size=8),
+)
+def test_stamps_mixed_a_little_are_sorted_and_none_is_lost(
+    jitter_us: int, seed: int, cuts: list[int]
+) -> None:
+    rng = np.random.default_rng(seed)
+    t_us = np.arange(1000) * 997 + rng.integers(0, jitter_us + 1, 1000)
+    # Stretches are longer than the mixing, as packets are.
+    parts = np.split(t_us, sorted({c // 100 * 100 for c in cuts} - {0}))
+    recording = record(*(columns(part) for part in parts))
+    assert stamps_us(recording) == sorted(t_us.tolist())
+    assert any("decrease" in note for note in recording.notes) == bool((np.diff(t_us) < 0).any())
+
+
+def test_equal_stamps_keep_their_order() -> None:
+    stretch = columns([50, 50, 40, 50, 50])
+    (events,) = record(stretch)
+    assert events.x.tolist() == [2, 0, 1, 3, 4]
+
+
+@pytest.mark.parametrize("bits", [31, 32])
+@pytest.mark.parametrize("cut", [1, 400, 500, 999])
+def test_a_clock_that_wraps_goes_on_and_is_said(bits: int, cut: int) -> None:
+    truth = (1 << bits) - 500 * 20 + np.arange(1000) * 20
+    wrapped = truth % (1 << bits)
+    recording = record(columns(wrapped[:cut]), columns(wrapped[cut:]))
+    assert stamps_us(recording) == truth.tolist()
+    assert any("1 wraps of a" in note for note in recording.notes)
+
+
+def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound() -> None:
+    first, second = np.arange(1000) * 1000, np.arange(1000) * 1000 - 5_000_000
+    delivered = []
+    with pytest.raises(SourceError, match=r"5\.999 s") as caught:
+        for stretch in record(columns(first[:500]), columns(first[500:]), columns(second)):
+            delivered += stretch.t_ns.tolist()
+    assert "split" in caught.value.hint
+    assert delivered == (first * 1000).tolist()
+
+
+def test_events_before_the_clock_is_set_at_the_start_are_left_out_and_counted() -> None:
+    before, after = 10**12 + np.arange(200) * 1000, np.arange(1000) * 1000
+    recording = record(columns(before), columns(after[:400]), columns(after[400:]))
+    assert stamps_us(recording) == after.tolist()
+    assert has_note(recording.notes, "200 events", "before")
+    assert recording.duration_s == pytest.approx(0.999)
+    assert recording.start_ns == 0
+
+
+@pytest.mark.parametrize("stray_us", [10**9, -(10**9)])
+@pytest.mark.parametrize("at", [3, 499, 500, 700])
+def test_a_single_stray_stamp_is_left_out_and_counted(stray_us: int, at: int) -> None:
+    truth = np.arange(1000) * 1000
+    t_us = truth.copy()
+    t_us[at] += stray_us
+    recording = record(columns(t_us[:500]), columns(t_us[500:]))
+    assert stamps_us(recording) == np.delete(truth, at).tolist()
+    assert has_note(recording.notes, "1 events", "stray")
+
+
+def test_a_damaged_stretch_between_sound_ones_is_left_out_and_counted() -> None:
+    truth = np.arange(1000) * 1000
+    t_us = truth.copy()
+    t_us[600:700] += 10**9
+    recording = record(columns(t_us[:500]), columns(t_us[500:]))
+    assert stamps_us(recording) == np.delete(truth, np.arange(600, 700)).tolist()
+    assert has_note(recording.notes, "100 events", "stray")
+
+
+def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many() -> None:
+    stretch = columns(np.arange(1000))
+    few, many = stretch.x.copy(), stretch.x.copy()
+    few[7], many[::2] = 2000, 400
+    recording = record(replace(stretch, x=few))
+    assert sum(map(len, recording)) == 999
+    assert has_note(recording.notes, "1 events", "off", "column 2000")
+    with pytest.raises(SourceError, match=r"500 of 1000 events lie off.*346x260"):
+        list(record(replace(stretch, x=many)))
+
+
+def test_no_events_at_all_is_an_error() -> None:
+    with pytest.raises(SourceError, match="holds no events"):
+        record()
+    with pytest.raises(SourceError, match="holds no events"):
+        record(columns([]), columns([]))
+
+
+@given(
+    windows=st.lists(st.tuples(st.integers(-100, 6000), st.integers(0, 3000)), min_size=1, max_size=8),
+    n_parts=st.integers(1, 40),
+)
+def test_windows_hold_what_lies_between_their_ends_in_any_order(
+    windows: list[tuple[int, int]], n_parts: int
+) -> None:
+    events = random_events(2000, 5)
+    whole = EventColumns(events.t_ns, events.x, events.y, events.polarity)
+    cuts = np.array_split(np.arange(2000), n_parts)
+    recording = record(*(whole.select(slice(int(c[0]), int(c[-1]) + 1)) for c in cuts))
+    for start_us, length_us in windows:
+        start_ns, end_ns = start_us * 1000, (start_us + length_us) * 1000
+        window = recording.read(start_ns, end_ns)
+        inside = (events.t_ns >= start_ns) & (events.t_ns < end_ns)
+        assert window.t_ns.tolist() == events.t_ns[inside].tolist()
+        assert window.x.tolist() == events.x[inside].tolist()
+        assert (window.width_px, window.height_px, window.sensor) == (346, 260, "events")
+
+
+def test_the_host_clock_is_taken_from_the_packet_that_waited_least() -> None:
+    delays_ms = [7, 3, 5]
+    stretches = [
+        replace(columns([1000 * i]), host_ns=1_000_000 * (i + delay) + 10**18)
+        for i, delay in enumerate(delays_ms)
+    ]
+    assert record(*stretches).host_offset_ns() == 10**18 + 3_000_000
+    assert record(columns([1])).host_offset_ns() is None
+
+
+def test_findings_of_many_passes_are_said_once() -> None:
+    truth = np.arange(1000) * 1000
+    truth[300] += 10**9
+    recording = record(columns(truth))
+    for _ in range(3):
+        stamps_us(recording)
+    recording.read(0, 10**9)
+    assert len([note for note in recording.notes if "stray" in note]) == 1

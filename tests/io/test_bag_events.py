@@ -1,0 +1,277 @@
+"""Raw events in bags beside pictures and scans: topics, order, clocks, and what may be wrong with them."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Events, Image, Sample, Scan, Stream
+from lce_rig.core.errors import SourceError
+from lce_rig.io import SourceOptions, open_recording
+from lce_rig.io.protocol import ContinuousRecording
+from lce_rig.io.ros.bag_recorder import open_bag_writer
+from lce_rig.rig import Rig, load_rig
+from lce_rig.timing.rig_time import rig_time_ns
+from tests.io.events import encoders
+from tests.io.events.bags import write_packet_bag
+from tests.io.events.encoders import listed
+from tests.notes import has_note
+
+from .rig_samples import KINDS, T0_NS, one_second, packet, picture, record, sweep
+
+SIZE = (346, 260)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("rles")
+
+
+def opened(path: Path, rig: Rig, **options: object) -> ContinuousRecording:
+    recording = open_recording(path, rig, SourceOptions(**options))
+    assert isinstance(recording, ContinuousRecording)
+    return recording
+
+
+def events_of(samples: list[Sample]) -> list[encoders.Event]:
+    return [event for sample in samples if isinstance(sample, Events) for event in listed(sample)]
+
+
+def with_camera(rig: Rig, **changes: object) -> Rig:
+    """The rig with other settings for the channel of events."""
+    camera = rig.cameras["davis"]
+    channels = {**camera.channels, "events": camera.channels["events"].model_copy(update=changes)}
+    return rig.model_copy(update={"cameras": {"davis": camera.model_copy(update={"channels": channels})}})
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(
+    tmp_path: Path, rig: Rig, name: str
+) -> None:
+    given = one_second()
+    recording = opened(record(tmp_path / name, rig, given), rig)
+    samples = list(recording.samples())
+    assert events_of(samples) == events_of(given)
+    assert {e.sensor for e in samples if isinstance(e, Events)} == {"davis"}
+    assert (
+        sum(isinstance(s, Image) for s in samples) == 20 and sum(isinstance(s, Scan) for s in samples) == 10
+    )
+    assert recording.n_samples == 30
+    # Scans are received 0.1 s after their first firing; nothing is handed out later than that.
+    times_ns = np.array([rig_time_ns(sample, rig) for sample in samples])
+    assert (np.maximum.accumulate(times_ns) - times_ns).max() <= 110_000_000
+
+
+def test_the_streams_are_told_with_their_spans_before_anything_is_read(tmp_path: Path, rig: Rig) -> None:
+    recording = opened(record(tmp_path / "r.bag", rig, one_second()), rig)
+    spans = {str(stream): (stream.kind, span) for stream, span in recording.streams.items()}
+    assert {name: kind for name, (kind, _) in spans.items()} == {
+        "davis.events": "events", "davis.frames": "images", "lidar": "scans"
+    }  # fmt: skip
+    for _, span in spans.values():
+        assert span[0] == pytest.approx(T0_NS, abs=1_000_000)
+        assert span[1] == pytest.approx(T0_NS + 10**9, abs=120_000_000)
+
+
+def test_a_topic_of_pictures_that_others_reconstructed_is_read_as_such(tmp_path: Path, rig: Rig) -> None:
+    images = [replace(picture(k), channel="events") for k in range(3)]
+    recording = opened(record(tmp_path / "r.bag", rig, [*images, sweep(0), sweep(1)]), rig)
+    assert [s.channel for s in recording.samples() if isinstance(s, Image)] == ["events"] * 3
+    assert recording.streams.keys() == {Stream("davis", "events", "images"), Stream("lidar", "", "scans")}
+
+
+def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path: Path, rig: Rig) -> None:
+    path = record(tmp_path / "r.bag", rig, one_second(50))
+    open_rig = with_camera(rig, topic=None)
+    recording = opened(path, open_rig)
+    assert has_note(recording.notes, "r.bag", "davis.events", "/davis/events", "only topic")
+    assert len(events_of(list(recording.samples()))) == 2500
+    asked = opened(path, with_camera(rig, topic="/elsewhere"), topics={"davis.events": "/davis/events"})
+    assert Stream("davis", "events", "events") in asked.streams
+    for wrong, cause in [
+        ("/nowhere", "no topic /nowhere"),
+        ("/velodyne_points", "is sensor_msgs/PointCloud2, not"),
+    ]:
+        with pytest.raises(SourceError, match=cause):
+            opened(path, rig, topics={"davis.events": wrong})
+
+
+def test_a_bag_with_a_lidar_and_events_alone_is_enough(tmp_path: Path, rig: Rig) -> None:
+    given = [s for s in one_second(50) if not isinstance(s, Image)]
+    recording = opened(record(tmp_path / "r.bag", rig, given), rig)
+    assert {stream.kind for stream in recording.streams} == {"events", "scans"}
+
+
+def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_path: Path, rig: Rig) -> None:
+    samples = one_second(50)
+    for name, kind in (("events", Events), ("scans", Scan), ("images", Image)):
+        path = record(tmp_path / f"{name}.bag", rig, [s for s in samples if isinstance(s, kind)])
+        with pytest.raises(SourceError, match="no topic"):
+            opened(path, rig)
+        part = opened(path, rig, is_part=True)
+        assert [stream.kind for stream in part.streams] == [name]
+        assert all(isinstance(sample, kind) for sample in part.samples())
+    nothing = record(tmp_path / "other.bag", rig, [sweep(0)])
+    elsewhere = rig.lidars["lidar"].model_copy(update={"topic": "/other"})
+    with pytest.raises(SourceError, match="no topic") as caught:
+        opened(nothing, rig.model_copy(update={"lidars": {"lidar": elsewhere}}), is_part=True)
+    assert has_note([caught.value.hint], "/velodyne_points", "PointCloud2, 1")
+
+
+def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path: Path, rig: Rig) -> None:
+    from lce_rig.io.ros.bag_recorder import add_event_topic, encode_image, encode_scan
+    from lce_rig.io.ros.message_fields import typestore
+
+    def write(path: Path, has_pictures: bool) -> Path:
+        with open_bag_writer(path) as writer:
+            add_event_topic(writer, "/davis/events", is_ros1=True)
+            store = typestore(True)
+            cloud = writer.add_connection("/velodyne_points", "sensor_msgs/msg/PointCloud2", typestore=store)
+            writer.write(cloud, T0_NS, encode_scan(sweep(0), rig.lidars["lidar"], True, 0))
+            if has_pictures:
+                image = writer.add_connection("/davis/image_raw", "sensor_msgs/msg/Image", typestore=store)
+                writer.write(image, T0_NS, encode_image(picture(0), "davis", True, 0))
+        return path
+
+    recording = opened(write(tmp_path / "a.bag", True), rig)
+    assert has_note(recording.notes, "/davis/events", "a.bag", "no events")
+    assert [type(sample) for sample in recording.samples()] == [Scan, Image]
+    with pytest.raises(SourceError, match=r"/davis/events of .*b\.bag holds no events") as caught:
+        opened(write(tmp_path / "b.bag", False), rig)
+    assert has_note([caught.value.hint], "/davis/events", "EventArray, 0")
+
+
+def test_events_of_another_resolution_are_refused_by_both(tmp_path: Path, rig: Rig) -> None:
+    path = record(tmp_path / "r.bag", rig, one_second(50))
+    camera = rig.cameras["davis"].model_copy(update={"resolution_px": (640, 480)})
+    with pytest.raises(SourceError, match=r"346x260 pixels.*'davis' has 640x480"):
+        opened(path, rig.model_copy(update={"cameras": {"davis": camera}}))
+
+
+def test_stamps_mixed_between_messages_are_sorted_and_said(tmp_path: Path, rig: Rig) -> None:
+    given = one_second(200)
+    packets = [s for s in given if isinstance(s, Events)]
+    late = {id(packets[k]): replace(packets[k], t_ns=packets[k].t_ns - 15_000_000) for k in (10, 30)}
+    recording = opened(record(tmp_path / "r.bag", rig, [late.get(id(s), s) for s in given]), rig)
+    stamps_ns = np.concatenate([s.t_ns for s in recording.samples() if isinstance(s, Events)])
+    assert len(stamps_ns) == 10_000 and (np.diff(stamps_ns) >= 0).all()
+    assert has_note(recording.notes, "20 ms", "sorted")
+
+
+def test_a_clock_of_31_bits_that_wraps_goes_on(tmp_path: Path, rig: Rig) -> None:
+    """A driver that counts from the camera's start, 0.5 s before its counter wraps."""
+    wrap_us = 1 << 31
+    begin_us = wrap_us - 500_000
+    messages = []
+    for k in range(50):
+        truth = [(begin_us + 20_000 * k + 100 * j, j, k, True) for j in range(20)]
+        payload = encoders.libcaer(truth, 0)
+        stamp_ns = T0_NS + 20_000_000 * k
+        data = encoders.packet(payload, "libcaer", is_ros1=True, number=k, stamp_ns=stamp_ns)
+        messages.append(("/davis/events", stamp_ns + 1_000_000, data))
+    recording = opened(write_packet_bag(tmp_path / "r.bag", messages), rig, is_part=True)
+    stamps_ns = np.concatenate([s.t_ns for s in recording.samples() if isinstance(s, Events)])
+    assert len(stamps_ns) == 1000
+    assert stamps_ns[-1] - stamps_ns[0] == (49 * 20_000 + 1900) * 1000 and (np.diff(stamps_ns) > 0).all()
+
+
+def test_events_that_count_from_the_sensors_start_are_tied_to_the_host_by_their_arrivals(
+    tmp_path: Path, rig: Rig
+) -> None:
+    """EVT3 stamps begin at zero; packets arrive 2 ms late or more, and the least delay counts."""
+    rng = np.random.default_rng(0)
+    messages = []
+    for k in range(60):
+        first_us = 5_000_000 + 20_000 * k
+        truth = [(first_us + 100 * j, j, k, True) for j in range(20)]
+        host_ns = T0_NS + 20_000_000 * k + 2_000_000 + int(rng.integers(0, 3_000_000)) * (k != 30)
+        data = encoders.packet(encoders.evt3(truth), "evt3", is_ros1=True, number=k, stamp_ns=host_ns)
+        messages.append(("/davis/events", host_ns, data))
+    # Packets are decoded many at a time; each of these is large enough to be one.
+    recording = opened(write_packet_bag(tmp_path / "r.bag", messages), rig, is_part=True)
+    ((_, span),) = recording.streams.items()
+    stamps_ns = np.concatenate([s.t_ns for s in recording.samples() if isinstance(s, Events)])
+    assert 0 <= stamps_ns[0] - T0_NS <= 5_000_000 and span is not None and span[0] == stamps_ns[0]
+    assert np.array_equal(np.diff(stamps_ns) % 1000, np.zeros(len(stamps_ns) - 1))
+    assert has_note(recording.notes, "sensor's start", "added")
+
+
+def test_clocks_that_do_not_overlap_are_refused_with_how_far_they_lie_apart(tmp_path: Path, rig: Rig) -> None:
+    given = one_second(50)
+    late_ns = 1_235_500_000_000
+    moved = [replace(s, t_ns=s.t_ns + late_ns) if isinstance(s, Events) else s for s in given]
+    path = record(tmp_path / "r.bag", rig, moved)
+    with pytest.raises(
+        SourceError, match=r"events run from \d+\.\d+ to .* scans from .*: 1234\.[4-7] s apart"
+    ) as caught:
+        opened(path, rig)
+    assert "cameras.davis.channels.events.timestamps.expected_offset_s" in caught.value.hint
+    assert "-1235.5 s" in caught.value.hint
+    timestamps = rig.cameras["davis"].channels["events"].timestamps
+    bridged = with_camera(rig, timestamps=timestamps.model_copy(update={"expected_offset_s": -1235.5}))
+    assert len(events_of(list(opened(path, bridged).samples()))) == 2500
+
+
+def test_events_that_cover_a_part_of_the_scans_only_are_used_and_it_is_noted(
+    tmp_path: Path, rig: Rig
+) -> None:
+    scans = [sweep(k) for k in range(60)]
+    given = sorted([*scans, *(packet(k, 50) for k in range(100))], key=lambda s: s.host_ns or 0)
+    recording = opened(record(tmp_path / "r.bag", rig, given), rig)
+    assert has_note(recording.notes, "davis.events", "2.0 of", "5.9 s", "lidar's")
+    assert len(events_of(list(recording.samples()))) == 5000
+
+
+@pytest.mark.parametrize("kept", [0.4, 0.8])
+def test_a_bag_torn_in_a_packet_gives_everything_before_and_then_says_so(
+    tmp_path: Path, rig: Rig, kept: float
+) -> None:
+    given = one_second(400)
+    path = record(tmp_path / "r.bag", rig, given)
+    os.truncate(path, int(kept * path.stat().st_size))
+    recording = opened(path, rig)
+    samples = []
+    with pytest.raises(SourceError, match=r"r\.bag is damaged"):
+        for sample in recording.samples():
+            samples.append(sample)
+    found = events_of(samples)
+    assert len(found) > (kept - 0.3) * 20_000 and found == events_of(given)[: len(found)]
+    assert any(isinstance(sample, Scan) for sample in samples)
+    assert has_note(recording.notes, "places", "torn")
+
+
+def test_pictures_stamped_at_the_start_of_an_exposure_that_is_not_told_are_said(
+    tmp_path: Path, rig: Rig
+) -> None:
+    path = record(tmp_path / "r.bag", rig, [picture(0), sweep(0)])
+    davis = rig.cameras["davis"]
+    frames = davis.channels["frames"]
+    timestamps = frames.timestamps.model_copy(update={"reference": "start"})
+    channels = {**davis.channels, "frames": frames.model_copy(update={"timestamps": timestamps})}
+    start = rig.model_copy(update={"cameras": {"davis": davis.model_copy(update={"channels": channels})}})
+    for profile, is_said in ((rig, False), (start, True)):
+        recording = opened(path, profile)
+        assert [s.stamp_ns for s in recording.samples() if isinstance(s, Image)] == [picture(0).stamp_ns]
+        assert has_note(recording.notes, "its start", "used") == is_said
+
+
+@pytest.mark.dataset
+@pytest.mark.parametrize(
+    ("name", "size", "n"),
+    [("davis346_apriltag_libcaer_cmp.mcap", SIZE, 571_266), ("event_packet_ros1.bag", None, 343_474)],
+)
+def test_real_drivers_bags_open_with_a_profile_that_fits(
+    recordings: Path, rig: Rig, name: str, size: tuple[int, int] | None, n: int
+) -> None:
+    from lce_rig.io.events import open_events
+
+    path = recordings / "events" / name
+    resolution = size or open_events(path).resolution_px
+    camera = rig.cameras["davis"].model_copy(update={"resolution_px": resolution})
+    fitting = with_camera(rig.model_copy(update={"cameras": {"davis": camera}}), topic="/event_camera/events")
+    recording = opened(path, fitting, is_part=True)
+    samples = list(recording.samples())
+    assert sum(len(s) for s in samples if isinstance(s, Events)) == n
+    assert recording.streams[Stream("davis", "events", "events")] is not None

@@ -1,0 +1,221 @@
+"""What a rig delivers is recorded as bags that our readers, and others', give back as it was."""
+
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.errors import SourceError
+from lce_rig.io.folder.folder_recorder import FolderRecorder
+from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.ros.bag_recorder import BagRecorder
+from lce_rig.rig import Rig, load_rig
+
+from .rig_samples import KINDS, T0_NS, one_second, packet, picture, read, read_events, record, sweep
+
+
+@pytest.fixture(scope="module")
+def rles() -> Rig:
+    return load_rig("rles")
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_samples_come_back_as_they_were(tmp_path: Path, rles: Rig, name: str) -> None:
+    samples = one_second()
+    path = record(tmp_path / name, rles, samples)
+    images, scans = read(path, rles)
+    for found, given in zip(images, [s for s in samples if isinstance(s, Image)], strict=True):
+        assert np.array_equal(found.pixels, given.pixels)
+        assert (found.sensor, found.channel) == ("davis", "frames")
+        assert (found.stamp_ns, found.host_ns) == (given.stamp_ns, given.host_ns)
+    for found, given in zip(scans, [s for s in samples if isinstance(s, Scan)], strict=True):
+        assert (found.stamp_ns, found.host_ns) == (given.stamp_ns, given.host_ns)
+        for column in ("points", "intensity", "ring"):
+            assert np.array_equal(getattr(found, column), getattr(given, column)), column
+        assert found.offset_ns is not None and given.offset_ns is not None
+        assert np.abs(found.offset_ns - given.offset_ns).max() <= 4, (
+            "float32 seconds, as Velodyne's driver has"
+        )
+    events = [s for s in samples if isinstance(s, Events)]
+    for column, found_column in read_events(path).items():
+        assert np.array_equal(found_column, np.concatenate([getattr(p, column) for p in events])), column
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_rosbags_itself_reads_the_topics_types_and_stamps(tmp_path: Path, rles: Rig, name: str) -> None:
+    from rosbags.highlevel import AnyReader
+
+    path = record(tmp_path / name, rles, one_second(300))
+    with AnyReader([path]) as reader:
+        topics = {
+            connection.topic: (connection.msgtype, connection.msgcount) for connection in reader.connections
+        }
+        assert topics == {
+            "/davis/image_raw": ("sensor_msgs/msg/Image", 20),
+            "/velodyne_points": ("sensor_msgs/msg/PointCloud2", 10),
+            "/davis/events": ("dvs_msgs/msg/EventArray", 50),
+        }
+        frames = set()
+        counts = dict.fromkeys(topics, 0)
+        for connection, received_ns, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            assert 0 <= received_ns - stamp_ns <= 100_000_000
+            frames.add(message.header.frame_id)
+            if connection.topic == "/davis/events":
+                first = message.events[0]
+                assert first.ts.sec * 10**9 + first.ts.nanosec == stamp_ns
+            if connection.topic == "/velodyne_points":
+                assert [field.name for field in message.fields] == [
+                    "x",
+                    "y",
+                    "z",
+                    "intensity",
+                    "ring",
+                    "time",
+                ]
+            counts[connection.topic] += 1
+    assert counts == {topic: n for topic, (_, n) in topics.items()}
+    assert frames == {"davis_optical_frame", "velodyne"}
+
+
+def test_colour_pictures_and_scans_without_times_come_back_too(tmp_path: Path, rles: Rig) -> None:
+    colour = picture(0, (20, 30, 3))
+    given = replace(sweep(0), offset_ns=None, host_ns=None)
+    images, scans = read(record(tmp_path / "r.bag", rles, [colour, given]), rles)
+    assert np.array_equal(images[0].pixels, colour.pixels)
+    assert scans[0].offset_ns is None
+    assert (scans[0].stamp_ns, scans[0].host_ns) == (given.stamp_ns, given.stamp_ns), "arrival unknown"
+
+
+@pytest.mark.parametrize("has_times", [True, False])
+def test_stamps_mark_the_firing_that_the_profile_says(tmp_path: Path, has_times: bool) -> None:
+    rig = load_rig("rles")
+    timestamps = rig.lidars["lidar"].timestamps.model_copy(update={"reference": "last_firing"})
+    lidar = rig.lidars["lidar"].model_copy(update={"timestamps": timestamps})
+    rig = rig.model_copy(update={"lidars": {"lidar": lidar}})
+    given = sweep(3) if has_times else replace(sweep(3), offset_ns=None)
+    _, (found,) = read(record(tmp_path / "r.bag", rig, [picture(0), given]), rig)
+    assert found.stamp_ns == pytest.approx(given.stamp_ns, abs=4 if has_times else 0)
+
+
+def test_a_profile_without_topics_gets_some_of_its_sensors_names(tmp_path: Path) -> None:
+    from rosbags.rosbag1 import Reader
+
+    rig = load_rig("rles")
+    lidar = rig.lidars["lidar"].model_copy(update={"topic": None})
+    channels = {k: c.model_copy(update={"topic": None}) for k, c in rig.cameras["davis"].channels.items()}
+    camera = rig.cameras["davis"].model_copy(update={"channels": channels})
+    rig = rig.model_copy(update={"lidars": {"lidar": lidar}, "cameras": {"davis": camera}})
+    path = record(tmp_path / "r.bag", rig, [sweep(0), picture(0), packet(0), sweep(1)])
+    with Reader(path) as reader:
+        assert sorted(reader.topics) == ["/davis/events", "/davis/frames", "/lidar/points"]
+    options = SourceOptions(topics={"davis.frames": "/davis/frames", "lidar": "/lidar/points"})
+    images, scans = read(path, rig, options)
+    assert (len(images), len(scans)) == (1, 2)
+
+
+def test_long_stretches_of_events_become_messages_of_33_ms_that_arrive_one_after_the_other(
+    tmp_path: Path, rles: Rig
+) -> None:
+    from rosbags.rosbag1 import Reader
+
+    t_ns = T0_NS // 1000 * 1000 + np.arange(0, 200_000_000, 10_000)
+    zeros = np.zeros(len(t_ns), np.uint16)
+    stretch = Events("davis", t_ns, zeros, zeros, zeros > 0, 346, 260, T0_NS + 10**9)
+    path = record(tmp_path / "r.bag", rles, [stretch])
+    with Reader(path) as reader:
+        received_ns = np.array([t for _, t, _ in reader.messages()])
+    assert received_ns[0] == T0_NS + 10**9
+    assert set(np.diff(received_ns)) == {33_000_000}
+    assert np.array_equal(read_events(path)["t_ns"], t_ns)
+
+
+def test_the_same_samples_give_the_same_bytes(tmp_path: Path, rles: Rig) -> None:
+    samples = one_second()[:30]
+    one, other = (record(tmp_path / f"{name}.bag", rles, samples).read_bytes() for name in ("one", "other"))
+    assert one == other
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_nothing_is_ever_overwritten(tmp_path: Path, rles: Rig, name: str) -> None:
+    path = record(tmp_path / name, rles, [picture(0)])
+    with pytest.raises(SourceError, match="exists already"):
+        BagRecorder(path, rles)
+    assert len(read(record(tmp_path / "other.bag", rles, [picture(0), sweep(0)]), rles)[0]) == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "cause"),
+    [
+        ("r.mcap", "is a folder"),
+        ("no/folder/r.bag", "cannot be written: No such file"),
+        ("file/r", "cannot be"),
+    ],
+)
+def test_places_where_no_bag_can_be_are_refused(tmp_path: Path, rles: Rig, path: str, cause: str) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(SourceError, match=cause):
+        BagRecorder(tmp_path / path, rles)
+
+
+def test_samples_that_the_profile_does_not_know_are_refused_and_the_others_kept(
+    tmp_path: Path, rles: Rig
+) -> None:
+    with BagRecorder(tmp_path / "r.bag", rles) as recorder:
+        recorder.write(picture(0))
+        for stranger, cause in (
+            (replace(picture(1), channel="depth"), r"davis\.depth"),
+            (replace(sweep(0), sensor="top"), "no lidar 'top'"),
+            (replace(packet(0), sensor="front"), r"front\.events"),
+        ):
+            with pytest.raises(SourceError, match=cause):
+                recorder.write(stranger)
+        with pytest.raises(ValueError, match="carries no time"):
+            recorder.write(replace(picture(1), stamp_ns=None, host_ns=None))
+        recorder.write(packet(0))
+        with pytest.raises(SourceError, match="/davis/events would carry both"):
+            recorder.write(replace(picture(1), channel="events"))
+        recorder.write(sweep(0))
+        recorder.write(sweep(1))
+    images, scans = read(tmp_path / "r.bag", rles)
+    assert (len(images), len(scans)) == (1, 2)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_memory_stays_flat_however_long_it_records(tmp_path: Path, rles: Rig, name: str) -> None:
+    image, scan, events = picture(0), sweep(0), packet(0)
+    with BagRecorder(tmp_path / name, rles) as recorder:
+        recorder.write(image)
+        recorder.write(scan)
+        recorder.write(events)
+        tracemalloc.start()
+        for k in range(150):
+            later_ns = k * 50_000_000
+            recorder.write(replace(image, stamp_ns=T0_NS + later_ns))
+            recorder.write(replace(scan, stamp_ns=T0_NS + later_ns))
+            recorder.write(replace(events, t_ns=events.t_ns + later_ns))
+        held, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    written = sum(file.stat().st_size for file in tmp_path.rglob("*.*") if file.is_file())
+    assert written > 40_000_000
+    assert held < 3_000_000 and peak < 8_000_000
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_a_folder_holds_a_bag_and_the_events_as_aedat4(tmp_path: Path, rles: Rig, ros: int) -> None:
+    folder = tmp_path / "deep" / "folder"
+    with FolderRecorder(folder, rles, ros) as recorder:
+        for sample in one_second():
+            recorder.write(sample)
+    assert sorted(path.name for path in folder.iterdir()) == sorted(["events.aedat4", recorder.bag.name])
+    for path in (recorder.bag, folder / "events.aedat4"):
+        for column, found in read_events(path).items():
+            given = np.concatenate([getattr(packet(k), column) for k in range(50)])
+            assert np.array_equal(found, given), (path.name, column)
+    assert [len(samples) for samples in read(recorder.bag, rles)] == [20, 10]
+    with pytest.raises(SourceError, match="exists already"):
+        FolderRecorder(folder, rles)

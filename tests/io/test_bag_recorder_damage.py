@@ -1,0 +1,129 @@
+"""A kill, an interrupt or a full disk costs a recording its end, and nothing before it."""
+
+import resource
+import shutil
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lce_rig.core.data import Image
+from lce_rig.core.errors import SourceError
+from lce_rig.io import open_recording
+from lce_rig.io.folder.folder_recorder import FolderRecorder
+from lce_rig.io.protocol import ContinuousRecording
+from lce_rig.io.ros.bag_recorder import BagRecorder
+from lce_rig.rig import Rig, load_rig
+
+from .rig_samples import KINDS, T0_NS, packet, picture, record, sweep
+
+
+@pytest.fixture(scope="module")
+def rles() -> Rig:
+    return load_rig("rles")
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_recorder_that_was_killed_leaves_what_it_had_written(tmp_path: Path, rles: Rig, name: str) -> None:
+    with BagRecorder(tmp_path / name, rles) as recorder:
+        samples = [*map(picture, range(40)), *map(sweep, range(20))]
+        for sample in samples:
+            recorder.write(sample)
+        on_disk = tmp_path / name
+        left = tmp_path / f"left{on_disk.suffix}"
+        # The files as they are at this moment are what a SIGKILL leaves.
+        (shutil.copytree if on_disk.is_dir() else shutil.copy)(on_disk, left)
+    recording = open_recording(left, rles)
+    assert isinstance(recording, ContinuousRecording)
+    found = []
+    with pytest.raises(SourceError, match="damaged"):
+        found.extend(recording.samples())
+    assert 35 <= sum(isinstance(sample, Image) for sample in found) <= 40
+
+
+@contextmanager
+def files_up_to(n_bytes: int) -> Iterator[None]:
+    """Let no file grow beyond a size, as on a disk that is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_full_disk_stops_the_recording_and_what_was_written_is_read(
+    tmp_path: Path, rles: Rig, name: str
+) -> None:
+    samples = [*map(sweep, range(5)), *map(picture, range(50))]
+    n_taken = 0
+    with files_up_to(3_000_000), BagRecorder(tmp_path / name, rles) as recorder:
+        with pytest.raises(SourceError, match=f"{name} cannot be written: File too large") as caught:
+            for sample in samples:
+                recorder.write(sample)
+                n_taken += 1
+        with pytest.raises(SourceError, match="cannot be written"):
+            recorder.write(samples[0])
+    assert "recorded before" in caught.value.hint
+    assert 10 < n_taken < 50
+    recording = open_recording(tmp_path / name, rles)
+    assert isinstance(recording, ContinuousRecording)
+    found = []
+    with pytest.raises(SourceError, match="damaged"):
+        found.extend(recording.samples())
+    assert len(found) >= n_taken - 15
+
+
+def test_a_disk_that_is_full_at_the_end_is_named_too(tmp_path: Path, rles: Rig) -> None:
+    with files_up_to(100_000), pytest.raises(SourceError, match="cannot be written"):
+        record(tmp_path / "r.bag", rles, [picture(0), picture(1)])
+
+
+def test_an_error_of_the_user_of_a_recorder_is_not_hidden_by_a_full_disk(tmp_path: Path, rles: Rig) -> None:
+    with files_up_to(100_000), pytest.raises(KeyError), BagRecorder(tmp_path / "r.bag", rles) as recorder:
+        recorder.write(picture(0))
+        recorder.write(picture(1))
+        raise KeyError
+
+
+# An interrupt may land while a generator is set up, which Python then reports and drops.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("name", KINDS)
+def test_an_interrupt_at_any_moment_leaves_a_bag_that_is_read_up_to_there(
+    tmp_path: Path, rles: Rig, name: str
+) -> None:
+    given = [picture(k) for k in range(10)]
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    try:
+        for attempt in range(8):
+            folder = tmp_path / str(attempt)
+            folder.mkdir()
+            with pytest.raises(KeyboardInterrupt), BagRecorder(folder / name, rles) as recorder:
+                recorder.write(sweep(0))
+                signal.setitimer(signal.ITIMER_REAL, 0.002 + 0.0031 * attempt)
+                for k in range(10_000):
+                    recorder.write(replace(given[k % 10], stamp_ns=T0_NS + k, host_ns=None))
+            found = []
+            with suppress(SourceError):
+                recording = open_recording(folder / name, rles)
+                assert isinstance(recording, ContinuousRecording)
+                found.extend(recording.samples())
+            for k, image in enumerate(sample for sample in found if isinstance(sample, Image)):
+                assert (image.stamp_ns, image.pixels.tobytes()) == (T0_NS + k, given[k % 10].pixels.tobytes())
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_a_full_disk_stops_a_folder_with_one_error(tmp_path: Path, rles: Rig) -> None:
+    with (
+        files_up_to(300_000),
+        pytest.raises(SourceError, match=r"events\.aedat4 cannot be written"),
+        FolderRecorder(tmp_path / "r", rles) as recorder,
+    ):
+        for k in range(100):
+            recorder.write(packet(k, 6000))

@@ -1,0 +1,191 @@
+"""Clouds with any fields become scans of one convention."""
+
+import numpy as np
+import pytest
+from numpy.lib.recfunctions import drop_fields, rename_fields
+
+from lce_rig.core.errors import SourceError
+from lce_rig.io.folder.cloud import to_scan
+from lce_rig.rig import LidarSettings, TimestampSettings
+from tests.notes import has_note
+
+FIRST = LidarSettings()
+LAST = LidarSettings(timestamps=TimestampSettings(reference="last_firing"))
+STAMP_NS = 1_700_000_000 * 10**9
+
+
+def with_time(room, values, name="time"):
+    base = drop_fields(room, "time")
+    out = np.zeros(len(base), dtype=[*base.dtype.descr, (name, values.dtype)])
+    for field in base.dtype.names:
+        out[field] = base[field]
+    out[name] = values
+    return out
+
+
+def test_points_without_a_return_are_dropped_and_counted(room):
+    cloud = room.copy()
+    cloud["x"][:5], cloud["y"][5:7], cloud["z"][7] = np.nan, np.inf, -np.inf
+    for axis in "xyz":
+        cloud[axis][10:14] = 0
+    reading = to_scan(cloud, "lidar", FIRST, "here")
+    assert (reading.n_not_finite, reading.n_zero_range) == (8, 4)
+    assert len(reading.scan.points) == len(reading.scan.ring) == len(reading.scan.offset_ns) == len(room) - 12
+    assert np.isfinite(reading.scan.points).all()
+
+
+def test_a_point_on_the_axis_of_rotation_belongs_to_no_laser_and_is_dropped(room):
+    above = drop_fields(room, "ring")
+    above["x"][7], above["y"][7], above["z"][7] = 0.0, 0.0, 2.0
+    reading = to_scan(above, "lidar", FIRST, "a.pcd")
+    assert reading.n_zero_range == 1 and len(reading.scan.points) == len(room) - 1
+    assert reading.scan.ring.min() == 0
+
+
+def test_a_cloud_without_a_valid_point_is_refused(room):
+    cloud = room[:3].copy()
+    cloud["x"] = np.nan
+    with pytest.raises(SourceError, match=r"here: the point cloud has no valid point \(3 in all\)"):
+        to_scan(cloud, "lidar", FIRST, "here")
+    with pytest.raises(SourceError, match="no valid point"):
+        to_scan(room[:0], "lidar", FIRST, "here")
+
+
+def test_a_cloud_without_coordinates_is_refused(room):
+    with pytest.raises(SourceError, match="no field 'z'; its fields are x, y, intensity"):
+        to_scan(drop_fields(room, "z"), "lidar", FIRST, "here")
+
+
+@pytest.mark.parametrize("name", ["ring", "channel", "laser_id", "RING"])
+def test_rings_go_by_several_names(room, name):
+    reading = to_scan(rename_fields(room, {"ring": name}), "lidar", FIRST, "here")
+    np.testing.assert_array_equal(reading.scan.ring, room["ring"])
+    assert reading.scan.ring.dtype == np.int16 and reading.notes == ()
+
+
+def test_rings_are_told_from_elevations_where_there_is_no_field(room):
+    reading = to_scan(drop_fields(room, "ring"), "lidar", FIRST, "here")
+    np.testing.assert_array_equal(reading.scan.ring, room["ring"])
+    assert len(reading.notes) == 1 and has_note(reading.notes, "no ring", "elevation angles")
+
+
+@pytest.mark.parametrize("table", [np.arange(15, -1, -1), np.r_[0:16:2, 1:16:2], np.arange(16) * 8])
+def test_rings_always_count_from_the_lowest(room, table):
+    cloud = room.copy()
+    cloud["ring"] = table[room["ring"]]
+    reading = to_scan(cloud, "lidar", FIRST, "here")
+    is_ascending = bool((np.diff(table) > 0).all())
+    np.testing.assert_array_equal(reading.scan.ring, cloud["ring"] if is_ascending else room["ring"])
+    assert bool(reading.notes) != is_ascending
+
+
+@pytest.mark.parametrize(
+    ("values", "unit_ns"),
+    [
+        (np.arange(5760) * 17e-6, 17_000),
+        ((np.arange(5760) * 17e-6).astype(np.float32), 17_000),
+        (np.arange(5760, dtype=np.uint32) * 17_000, 17_000),
+        (np.arange(5760, dtype=np.uint32) * 17, 17_000),
+        (1.7e9 + np.arange(5760) * 17e-6, 17_000),
+        (STAMP_NS + np.arange(5760, dtype=np.int64) * 17_000, 17_000),
+    ],
+    ids=["s", "s float32", "ns", "us", "unix s", "unix ns"],
+)
+@pytest.mark.parametrize("name", ["time", "t", "timestamp", "offset"])
+def test_times_in_any_unit_become_ns_after_the_first_firing(room, values, unit_ns, name):
+    scan = to_scan(with_time(room, values, name), "lidar", FIRST, "here", STAMP_NS).scan
+    assert scan.offset_ns is not None and scan.offset_ns.dtype == np.int64
+    np.testing.assert_allclose(scan.offset_ns, np.arange(5760) * unit_ns, atol=300)
+    assert scan.stamp_ns == STAMP_NS
+
+
+def test_stamps_of_the_last_packet_are_brought_to_the_first_firing(room):
+    span_ns = 5759 * 17_000
+    negative = np.arange(-5759, 1) * 17e-6
+    scan = to_scan(with_time(room, negative), "lidar", LAST, "here", STAMP_NS).scan
+    assert scan.stamp_ns == pytest.approx(STAMP_NS - span_ns, abs=1000)
+    assert scan.offset_ns.min() == 0 and scan.offset_ns.max() == pytest.approx(span_ns, abs=1000)
+    counted_up = np.arange(5760, dtype=np.uint32) * 17_000
+    assert (
+        to_scan(with_time(room, counted_up), "lidar", LAST, "here", STAMP_NS).scan.stamp_ns
+        == STAMP_NS - span_ns
+    )
+    timeless = to_scan(drop_fields(room, "time"), "lidar", LAST, "here", STAMP_NS)
+    assert timeless.scan.stamp_ns == STAMP_NS - 100_000_000
+
+
+@pytest.mark.parametrize(
+    "values", [np.zeros(5760), np.full(5760, np.nan), (1.7e9 + np.arange(5760) * 17e-6).astype("f4")]
+)
+def test_times_that_say_nothing_count_as_absent_and_that_is_said(room, values):
+    reading = to_scan(with_time(room, values), "lidar", FIRST, "here", STAMP_NS)
+    assert reading.scan.offset_ns is None
+    assert len(reading.notes) == 1 and has_note(reading.notes, "field 'time'", "no times")
+    (note,) = to_scan(drop_fields(room, "time"), "lidar", FIRST, "here").notes
+    assert "no time" in note and "field" not in note
+
+
+def test_intensity_may_be_called_reflectivity_or_be_absent(room):
+    named = to_scan(rename_fields(room, {"intensity": "reflectivity"}), "lidar", FIRST, "here")
+    assert set(named.scan.intensity) == {30.0} and named.notes == ()
+    absent = to_scan(drop_fields(room, "intensity"), "lidar", FIRST, "here")
+    assert set(absent.scan.intensity) == {0.0} and absent.notes == ("no intensity",)
+
+
+@pytest.mark.parametrize("factor", [1000.0, 100.0])
+def test_coordinates_that_are_no_metres_are_refused_with_a_question(room, factor):
+    cloud = room.copy()
+    for axis in "xyz":
+        cloud[axis] *= factor
+    with pytest.raises(SourceError, match=r"median range \d+ m"):
+        to_scan(cloud, "lidar", FIRST, "here")
+    far = room.copy()
+    for axis in "xyz":
+        far[axis] *= 20
+    assert len(to_scan(far, "lidar", FIRST, "here").scan.points) == len(room)
+
+
+def rosette(n: int = 20_000) -> np.ndarray:
+    """Points of a scanner whose four lines sweep the room in no rings, as a Livox does."""
+    rng = np.random.default_rng(1)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, n), np.radians(rng.uniform(-7, 52, n))
+    distance = rng.uniform(2.0, 8.0, n)
+    cloud = np.zeros(n, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("line", "u1")])
+    cloud["x"] = distance * np.cos(elevation) * np.cos(azimuth)
+    cloud["y"] = distance * np.cos(elevation) * np.sin(azimuth)
+    cloud["z"] = distance * np.sin(elevation)
+    cloud["line"] = np.arange(n) % 4
+    return cloud
+
+
+def test_lines_that_are_no_rings_are_refused_with_cause_and_advice():
+    with pytest.raises(SourceError, match="field 'line' numbers no rings") as caught:
+        to_scan(rosette(), "lidar", FIRST, "livox")
+    assert "Livox" in caught.value.hint
+
+
+def test_rings_in_a_tilted_frame_stay_rings(room):
+    tilt = np.radians(10.0)
+    x, z = room["x"].copy(), room["z"].copy()
+    room["x"], room["z"] = np.cos(tilt) * x + np.sin(tilt) * z, np.cos(tilt) * z - np.sin(tilt) * x
+    assert len(np.unique(to_scan(room, "lidar", FIRST, "tilted").scan.ring)) == 16
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan])
+def test_an_organised_cloud_keeps_its_returns_only(room, nothing):
+    organised = np.zeros(2 * len(room), room.dtype)
+    organised[::2] = room
+    for axis in "xyz":
+        organised[axis][1::2] = nothing
+    whole, sparse = to_scan(room, "lidar", FIRST, "room"), to_scan(organised, "lidar", FIRST, "organised")
+    assert np.array_equal(sparse.scan.points, whole.scan.points)
+    assert np.array_equal(sparse.scan.ring, whole.scan.ring)
+    assert sparse.n_not_finite + sparse.n_zero_range - whole.n_zero_range == len(room)
+
+
+def test_more_rings_than_the_model_has_are_reported(room):
+    assert to_scan(room, "lidar", FIRST, "here").notes == ()
+    cloud = np.concatenate([room, room])
+    cloud["ring"][len(room) :] += 16
+    cloud["z"][len(room) :] += 2.0 * np.hypot(room["x"], room["y"])
+    assert has_note(to_scan(cloud, "lidar", FIRST, "here").notes, "32 rings", "VLP-16", "lidars.lidar.model")

@@ -1,0 +1,198 @@
+"""Files of an event camera's own recorder as recordings: events, frames, and what may be wrong with them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Events, Image, Stream
+from lce_rig.core.errors import SourceError
+from lce_rig.core.event_file import encode_events
+from lce_rig.io import SourceOptions, open_recording
+from lce_rig.io.events.aedat4_writer import Aedat4Writer, write_aedat4
+from lce_rig.io.protocol import ContinuousRecording, serials_of
+from lce_rig.rig import Rig, load_rig
+from tests.io.events import encoders
+from tests.io.events.aedat4_files import RawFrame, write_davis
+from tests.io.events.encoders import listed, random_events
+from tests.notes import has_note
+
+T0_US = 1_700_000_000_000_000
+EVENTS = replace(random_events(20_000, 3, start_us=T0_US, step_us=250), sensor="davis")
+PIECES = [EVENTS.select(slice(k, k + 500)) for k in range(0, 20_000, 500)]
+GREY = np.random.default_rng(0).integers(0, 256, (260, 346), dtype=np.uint8)
+FRAMES = [RawFrame(T0_US + 40_000 * k, 8000, GREY) for k in range(5)]
+EVENT_STREAM, FRAME_STREAM = Stream("davis", "events", "events"), Stream("davis", "frames", "images")
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("rles")
+
+
+def opened(path: Path, rig: Rig, **options: object) -> ContinuousRecording:
+    recording = open_recording(path, rig, SourceOptions(**options))
+    assert isinstance(recording, ContinuousRecording)
+    return recording
+
+
+def events_of(recording: ContinuousRecording) -> list[encoders.Event]:
+    return [event for s in recording.samples() if isinstance(s, Events) for event in listed(s)]
+
+
+def images_of(recording: ContinuousRecording) -> list[Image]:
+    return [s for s in recording.samples() if isinstance(s, Image)]
+
+
+def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path: Path, rig: Rig) -> None:
+    recording = opened(write_davis(tmp_path / "a.aedat4", PIECES, FRAMES), rig)
+    assert (recording.n_samples, set(recording.streams)) == (5, {EVENT_STREAM, FRAME_STREAM})
+    assert events_of(recording) == listed(EVENTS)
+    images = images_of(recording)
+    assert [(i.sensor, i.channel) for i in images] == [("davis", "frames")] * 5
+    assert [i.stamp_ns for i in images] == [(T0_US + 40_000 * k + 4000) * 1000 for k in range(5)]
+    assert all(np.array_equal(i.pixels, GREY) for i in images)
+    assert has_note(recording.notes, "a.aedat4", "davis.frames", "mid exposure", "8.0 ms")
+    assert recording.streams[EVENT_STREAM] == (int(EVENTS.t_ns[0]), int(EVENTS.t_ns[-1]))
+    assert recording.streams[FRAME_STREAM] == (images[0].stamp_ns, images[-1].stamp_ns)
+
+
+def test_an_exposure_that_the_file_does_not_tell_is_said(tmp_path: Path, rig: Rig) -> None:
+    recording = opened(write_davis(tmp_path / "a.aedat4", PIECES, [RawFrame(T0_US, 0, GREY)]), rig)
+    assert has_note(recording.notes, "no exposure")
+
+
+def test_frames_alone_are_a_recording_too(tmp_path: Path, rig: Rig) -> None:
+    recording = opened(write_davis(tmp_path / "a.aedat4", [], FRAMES), rig)
+    assert set(recording.streams) == {FRAME_STREAM} and len(images_of(recording)) == 5
+    assert has_note(recording.notes, "no stream")
+
+
+def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(
+    tmp_path: Path, rig: Rig
+) -> None:
+    camera = rig.cameras["davis"]
+    only_events = camera.model_copy(update={"channels": {"events": camera.channels["events"]}})
+    recording = opened(
+        write_davis(tmp_path / "a.aedat4", PIECES, FRAMES),
+        rig.model_copy(update={"cameras": {"davis": only_events}}),
+    )
+    assert images_of(recording) == [] and events_of(recording) == listed(EVENTS)
+    assert has_note(recording.notes, "frames skipped", "davis", "no channel")
+
+
+def test_frames_out_of_order_are_left_out_and_counted(tmp_path: Path, rig: Rig) -> None:
+    path = write_davis(
+        tmp_path / "a.aedat4", PIECES, [FRAMES[0], replace(FRAMES[1], exposure_us=-90_000), FRAMES[2]]
+    )
+    recording = opened(path, rig)
+    assert len(images_of(recording)) == 2
+    assert has_note(recording.notes, "a.aedat4", "frames: 1 out")
+
+
+def write_dsec(path: Path) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        file["events/t"], file["t_offset"] = (EVENTS.t_ns // 1000 - T0_US).astype(np.uint32), T0_US
+        file["events/x"], file["events/y"], file["events/p"] = EVENTS.x, EVENTS.y, EVENTS.polarity
+
+
+def write_raw(path: Path) -> None:
+    local = [(t - T0_US, x, y, p) for t, x, y, p in listed(EVENTS)]
+    path.write_bytes(b"% evt 3.0\n% geometry 346x260\n% end\n" + encoders.evt3(local))
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "a.aedat4": lambda path: write_aedat4(path, [EVENTS]),
+    "a.npz": lambda path: path.write_bytes(encode_events(EVENTS)),
+    "a.h5": write_dsec,
+    "a.hdf5": write_dsec,
+    "a.raw": write_raw,
+}
+
+
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path: Path, rig: Rig, name: str) -> None:
+    WRITERS[name](tmp_path / name)
+    recording = opened(tmp_path / name, rig)
+    shift_us = T0_US if name == "a.raw" else 0
+    assert [(t + shift_us, x, y, p) for t, x, y, p in events_of(recording)] == listed(EVENTS)
+    span = recording.streams[EVENT_STREAM]
+    assert span is not None
+    assert [stamp + shift_us * 1000 for stamp in span] == [int(EVENTS.t_ns[0]), int(EVENTS.t_ns[-1])]
+
+
+def test_serial_numbers_in_heads_of_files_are_told(tmp_path: Path, rig: Rig) -> None:
+    with Aedat4Writer(tmp_path / "a.aedat4", (346, 260), "DAVIS346_00000499") as writer:
+        writer.write(EVENTS)
+    local = [(t - T0_US, x, y, p) for t, x, y, p in listed(EVENTS)]
+    head = b"% evt 3.0\n% geometry 346x260\n% serial_number 00050423\n% end\n"
+    (tmp_path / "b.raw").write_bytes(head + encoders.evt3(local))
+    write_aedat4(tmp_path / "c.aedat4", [EVENTS])
+    found = [serials_of(opened(tmp_path / name, rig)) for name in ("a.aedat4", "b.raw", "c.aedat4")]
+    assert found == [{"davis": "00000499"}, {"davis": "00050423"}, {}]
+
+
+def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path: Path, rig: Rig) -> None:
+    Aedat4Writer(tmp_path / "none.aedat4", (346, 260)).close()
+    write_aedat4(tmp_path / "a.aedat4", [EVENTS])
+    with pytest.raises(SourceError, match=r"none\.aedat4 holds no events"):
+        opened(tmp_path / "none.aedat4", rig)
+    camera = rig.cameras["davis"].model_copy(update={"resolution_px": (640, 480)})
+    with pytest.raises(SourceError, match=r"346x260 pixels.*'davis' has 640x480"):
+        opened(tmp_path / "a.aedat4", rig.model_copy(update={"cameras": {"davis": camera}}))
+    with pytest.raises(SourceError, match="rig 'rlfs' has no camera with events") as caught:
+        opened(tmp_path / "a.aedat4", load_rig("rlfs"))
+    assert "kind: events" in caught.value.hint
+    with pytest.raises(SourceError, match="no event camera 'left'; it has davis"):
+        opened(tmp_path / "a.aedat4", rig, camera="left")
+
+
+def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path: Path, rig: Rig) -> None:
+    write_aedat4(tmp_path / "a.aedat4", [EVENTS])
+    davis = rig.cameras["davis"]
+    both = rig.model_copy(update={"cameras": {"davis": davis, "right": davis}})
+    assert has_note(opened(tmp_path / "a.aedat4", both).notes, "events assigned", "camera davis")
+    right = opened(tmp_path / "a.aedat4", both, camera="right")
+    assert {s.sensor for s in right.samples()} == {"right"} and next(iter(right.streams)).sensor == "right"
+
+
+def test_a_file_that_ends_in_a_packet_gives_what_comes_before(tmp_path: Path, rig: Rig) -> None:
+    whole = write_davis(tmp_path / "whole.aedat4", PIECES, FRAMES).read_bytes()
+    (tmp_path / "torn.aedat4").write_bytes(whole[: len(whole) * 3 // 5])
+    recording = opened(tmp_path / "torn.aedat4", rig)
+    found, images = events_of(recording), images_of(recording)
+    assert 0 < len(found) < len(EVENTS) and found == listed(EVENTS)[: len(found)] and 1 <= len(images) < 5
+    assert has_note(recording.notes, "1 torn ends")
+    assert recording.streams[EVENT_STREAM] == (int(EVENTS.t_ns[0]), int(EVENTS.t_ns[len(found) - 1]))
+
+
+def test_the_same_file_has_the_same_key_wherever_it_lies(tmp_path: Path, rig: Rig) -> None:
+    write_aedat4(tmp_path / "a.aedat4", [EVENTS])
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "a.aedat4").write_bytes((tmp_path / "a.aedat4").read_bytes())
+    write_aedat4(tmp_path / "b.aedat4", [EVENTS.select(slice(1, None))])
+    keys = [opened(tmp_path / name, rig).key for name in ("a.aedat4", "elsewhere/a.aedat4", "b.aedat4")]
+    assert keys[0] == keys[1] != keys[2]
+
+
+@pytest.mark.dataset
+@pytest.mark.parametrize(
+    ("name", "size", "n_events", "n_frames"),
+    [
+        ("davis346_short.aedat4", (346, 260), 6676, 4),
+        ("dvs_320x240.aedat4", (320, 240), 111_954, 0),
+        ("evt3_pedestrians.raw", (1280, 720), 5000, 0),
+    ],
+)
+def test_real_files_open_with_a_profile_that_fits(
+    recordings: Path, rig: Rig, name: str, size: tuple[int, int], n_events: int, n_frames: int
+) -> None:
+    camera = rig.cameras["davis"].model_copy(update={"resolution_px": size})
+    recording = opened(recordings / "events" / name, rig.model_copy(update={"cameras": {"davis": camera}}))
+    samples = list(recording.samples())
+    assert sum(len(s) for s in samples if isinstance(s, Events)) == n_events
+    assert sum(isinstance(s, Image) for s in samples) == recording.n_samples == n_frames

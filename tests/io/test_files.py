@@ -1,0 +1,165 @@
+"""Pictures and clouds from files, whole and damaged."""
+
+import os
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.core.errors import SourceError
+from lce_rig.core.pcd import encode_pcd
+from lce_rig.io.folder.cloud_file import decode_ply, read_cloud
+from lce_rig.io.folder.image_file import read_image, to_8_bit
+
+POINTS = np.array(
+    [(1.5, -2, 3, 7), (4, 5, 6, 9)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f8"), ("ring", "u2")]
+)
+HEADER = (
+    "ply\nformat {} 1.0\ncomment made by hand\nelement vertex 2\nproperty float x\nproperty float32 y\n"
+    "property double z\nproperty ushort ring\nelement face 1\nproperty list uchar int corners\nend_header\n"
+)
+
+
+@pytest.fixture
+def smooth():
+    noise = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 3)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".ppm", ".PNG"])
+def test_lossless_pictures_are_read_exactly(tmp_path, smooth, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(cv2.imencode(suffix.lower(), smooth)[1].tobytes())
+    assert np.array_equal(read_image(path), smooth)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".pgm", ".bmp", ".tiff"])
+def test_grey_pictures_stay_grey(tmp_path, smooth, suffix):
+    path = tmp_path / f"a{suffix}"
+    cv2.imwrite(str(path), smooth[..., 0])
+    assert np.array_equal(read_image(path), smooth[..., 0])
+
+
+def test_jpeg_and_transparency_are_read(tmp_path, smooth):
+    cv2.imwrite(str(tmp_path / "a.jpg"), smooth)
+    assert np.abs(read_image(tmp_path / "a.jpg").astype(int) - smooth).mean() < 5
+    cv2.imwrite(str(tmp_path / "a.png"), np.dstack([smooth, np.full((40, 60), 9, np.uint8)]))
+    assert np.array_equal(read_image(tmp_path / "a.png"), smooth)
+
+
+def test_deep_pictures_keep_their_contrast(tmp_path, smooth):
+    twelve_bit = smooth[..., 0].astype(np.uint16) * 16
+    cv2.imwrite(str(tmp_path / "a.png"), twelve_bit)
+    read = read_image(tmp_path / "a.png")
+    assert read.dtype == np.uint8 and np.ptp(read) == 255
+    assert np.corrcoef(read.ravel(), smooth[..., 0].ravel())[0, 1] > 0.99
+    with pytest.raises(ValueError, match="complex128"):
+        to_8_bit(np.zeros((2, 2), complex))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("kept", [0, 10, 0.3, 0.9])
+def test_torn_pictures_are_named(tmp_path, smooth, suffix, kept):
+    whole = cv2.imencode(suffix, smooth)[1].tobytes()
+    path = tmp_path / f"board{suffix}"
+    path.write_bytes(whole[: int(kept if kept >= 1 else kept * len(whole))])
+    with pytest.raises(SourceError, match=rf"board{suffix}: it is (empty|a truncated)"):
+        read_image(path)
+
+
+def test_missing_and_foreign_files_are_named(tmp_path):
+    with pytest.raises(SourceError, match=r"gone\.png: cannot be read: No such file"):
+        read_image(tmp_path / "gone.png")
+    (tmp_path / "text.png").write_text("no picture")
+    with pytest.raises(SourceError, match=r"text\.png: it is damaged, or no image"):
+        read_image(tmp_path / "text.png")
+    with pytest.raises(SourceError, match=r"gone\.pcd: cannot be read: No such file"):
+        read_cloud(tmp_path / "gone.pcd")
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(SourceError, match=r"folder\.ply: cannot be read: it is a folder"):
+        read_cloud(tmp_path / "folder.ply")
+
+
+@pytest.mark.parametrize(("form", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
+def test_binary_ply_is_read(tmp_path, form, order):
+    data = (
+        HEADER.format(form).encode() + POINTS.astype(POINTS.dtype.newbyteorder(order)).tobytes() + bytes(13)
+    )
+    (tmp_path / "a.ply").write_bytes(data)
+    read = read_cloud(tmp_path / "a.ply")
+    assert all(np.array_equal(read[name], POINTS[name]) for name in POINTS.dtype.names)
+
+
+def test_text_ply_is_read_with_what_stands_before_its_vertices():
+    header = HEADER.format("ascii").replace(
+        "element vertex", "element device 1\nproperty int id\nelement vertex"
+    )
+    read = decode_ply((header + "5\n1.5 -2 3 7\n4 5 6 9\n3 0 1 1\n").encode())
+    assert all(np.array_equal(read[name], POINTS[name]) for name in POINTS.dtype.names)
+
+
+def test_open3d_and_this_reader_agree(tmp_path):
+    import open3d
+
+    points = np.random.default_rng(1).normal(size=(50, 3))
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    for is_text in (True, False):
+        open3d.io.write_point_cloud(str(tmp_path / "a.ply"), cloud, write_ascii=is_text)
+        read = read_cloud(tmp_path / "a.ply")
+        np.testing.assert_allclose(np.stack([read[axis] for axis in "xyz"], axis=1), points, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("data", "cause"),
+    [
+        (b"", "empty"),
+        (b"ply\n" * 20, "no PLY header"),
+        (HEADER.format("binary_middle_endian").encode(), "format is 'binary_middle_endian'"),
+        (HEADER.format("ascii").encode() + b"1 2 3 4\n", "1 of 2 points"),
+        (HEADER.format("ascii").encode() + b"1 2 3 4\n1 2 x 4\n", "cannot be read as numbers"),
+        (HEADER.format("binary_little_endian").encode() + bytes(20), "1 of 2 points"),
+        (HEADER.format("ascii").replace("vertex 2", "point 2").encode(), "no vertices"),
+        (HEADER.format("ascii").replace("float x", "half x").encode(), "'property half x'"),
+        (HEADER.format("ascii").replace("property float x", "property list uchar int x").encode(), "list"),
+    ],
+)  # fmt: skip
+def test_damaged_ply_is_named(tmp_path, data, cause):
+    (tmp_path / "a.ply").write_bytes(data)
+    with pytest.raises(SourceError, match=rf"a\.ply: .*{cause}"):
+        read_cloud(tmp_path / "a.ply")
+
+
+def test_damaged_pcd_is_named(tmp_path):
+    (tmp_path / "a.pcd").write_bytes(encode_pcd(POINTS)[:-1])
+    with pytest.raises(SourceError, match=r"a\.pcd: it is truncated: 1 of 2 points are there"):
+        read_cloud(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize(
+    ("changed", "cause"),
+    [
+        (("vertex 2", "vertex 1000000000000"), "declares 1000000000000 points"),
+        (("element vertex", "element nothing 5\nelement vertex"), "'nothing' has 0 properties"),
+        (("element vertex", "element much 1000000000000\nproperty int a\nelement vertex"), "0 of 2 points"),
+        (("property ushort ring", "property ushort x"), "are ambiguous"),
+    ],
+)
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_ply_that_declares_what_cannot_be_is_refused(changed, cause, form):
+    with pytest.raises(ValueError, match=cause):
+        decode_ply(HEADER.format(form).replace(*changed).encode() + b"1 2 3 4\n" * 8)
+
+
+def test_pipes_in_place_of_files_are_refused(tmp_path):
+    for name, read in (("a.png", read_image), ("a.pcd", read_cloud)):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(SourceError, match="a pipe or device"):
+            read(tmp_path / name)
+
+
+def test_deep_pixels_that_are_not_finite_are_no_reason_to_stop():
+    pixels = np.linspace(-3e38, 3e38, 64, dtype=np.float32).reshape(8, 8)
+    pixels[0, 0] = np.nan
+    assert to_8_bit(pixels)[0, 0] == 0 and to_8_bit(pixels).max() == 255
+    with pytest.raises(ValueError, match="none of its pixels"):
+        to_8_bit(np.full((4, 4), np.nan, np.float32))

@@ -1,0 +1,191 @@
+"""Folders of pictures and clouds."""
+
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.core.errors import SourceError
+from lce_rig.core.pcd import encode_pcd
+from lce_rig.io import SourceOptions, open_recording
+from lce_rig.io.protocol import PairedRecording
+from lce_rig.rig import load_rig
+from tests.notes import has_note
+
+
+@pytest.fixture
+def make_folder(tmp_path, room):
+    def make(images=("00000", "00001"), clouds=("00000", "00001"), names=("img", "pcd"), suffix=".png"):
+        path = tmp_path / "recording"
+        for name in names:
+            (path / name).mkdir(parents=True, exist_ok=True)
+        for k, stem in enumerate(images):
+            cv2.imwrite(str(path / names[0] / f"{stem}{suffix}"), np.full((72, 128, 3), 10 + k, np.uint8))
+        for stem in clouds:
+            (path / names[1] / f"{stem}.pcd").write_bytes(encode_pcd(room))
+        return path
+
+    return make
+
+
+@pytest.mark.parametrize(
+    "names", [("img", "pcd"), ("images", "raw_pcd"), ("IMG", "clouds"), (".", "."), ("a", "b")]
+)
+def test_folders_are_found_by_name_or_by_what_they_hold(make_folder, rig, room, names):
+    recording = open_recording(make_folder(names=names), rig)
+    assert isinstance(recording, PairedRecording)
+    (note,) = recording.notes
+    assert has_note([note], "2 pairs", "equal file") and "partner" not in note
+    pair = recording.pairs[1].read()
+    assert pair.label == "00001.png + 00001.pcd"
+    assert pair.images[0].pixels.shape == (72, 128, 3) and pair.images[0].pixels.max() == 11
+    assert (pair.images[0].sensor, pair.images[0].channel, pair.scans[0].sensor) == ("cam", "frames", "lidar")
+    np.testing.assert_array_equal(pair.scans[0].ring, room["ring"])
+
+
+def test_names_that_are_times_become_stamps(make_folder, rig):
+    path = make_folder(["2311.422000", "2376.322000"], ["2311.405000", "2376.205000"])
+    recording = open_recording(path, rig)
+    pair = recording.pairs[0].read()
+    assert pair.images[0].stamp_ns == 2311_422_000_000 and pair.scans[0].stamp_ns == 2311_405_000_000
+    assert has_note(recording.notes[:1], "sorted order", "0.117 s")
+
+
+def test_what_is_left_unpaired_is_listed(make_folder, rig):
+    path = make_folder([f"{k:05d}" for k in range(11)], [f"{k:05d}" for k in range(1, 11)])
+    recording = open_recording(path, rig)
+    assert len(recording.pairs) == 10 and has_note(recording.notes[1:2], "without", "00000.png")
+
+
+def test_the_same_files_have_the_same_key_wherever_they_lie(make_folder, rig, tmp_path):
+    path = make_folder()
+    keys = [files.key() for files in open_recording(path, rig).pairs]
+    path.rename(tmp_path / "moved")
+    assert [files.key() for files in open_recording(tmp_path / "moved", rig).pairs] == keys
+    assert len(set(keys)) == 2
+
+
+def test_channel_and_sensors_can_be_chosen(make_folder):
+    rig = load_rig("rles")
+    camera = next(iter(rig.cameras))
+    recording = open_recording(make_folder(), rig, SourceOptions(channel="events"))
+    assert recording.pairs[0].read().images[0].channel == "events"
+    assert has_note(open_recording(make_folder(), rig).notes, "images assigned", f"camera {camera}")
+    for options, cause in [
+        (SourceOptions(camera="side"), f"no camera 'side'; it has {camera}"),
+        (SourceOptions(channel="depth"), "no channel 'depth'; it has frames, events"),
+        (SourceOptions(lidar="top"), "no lidar 'top'"),
+    ]:
+        with pytest.raises(SourceError, match=cause):
+            open_recording(make_folder(), rig, options)
+
+
+def test_missing_folders_and_kinds_are_named(make_folder, rig, tmp_path):
+    with pytest.raises(SourceError, match="nowhere does not exist"):
+        open_recording(tmp_path / "nowhere", rig)
+    with pytest.raises(SourceError, match=r"recording/pcd: no point clouds found"):
+        open_recording(make_folder(clouds=[]), rig)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SourceError, match="empty: no images found"):
+        open_recording(tmp_path / "empty", rig)
+    (tmp_path / "a.avi").touch()
+    with pytest.raises(SourceError, match=r"a\.avi is not a recording"):
+        open_recording(tmp_path / "a.avi", rig)
+
+
+def test_two_folders_of_clouds_without_telling_names_are_not_guessed(make_folder, rig):
+    path = make_folder(names=("img", "one"))
+    make_folder(names=("img", "two"))
+    with pytest.raises(SourceError, match="point clouds lie in several folders: one, two"):
+        open_recording(path, rig)
+
+
+def test_raw_clouds_beside_cut_ones_are_mentioned(make_folder, rig):
+    path = make_folder()
+    make_folder(names=("img", "raw_pcd"))
+    assert has_note(open_recording(path, rig).notes, "from pcd/", "not from", "raw_pcd")
+
+
+TWO = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
+
+
+@pytest.mark.parametrize(
+    "names", [("img/left", "img/right"), ("left", "right"), ("images/Left", "images/Right")]
+)
+def test_pictures_in_folders_named_after_cameras_go_with_the_same_cloud(make_folder, names):
+    make_folder(images=("00000", "00001"), clouds=("00000", "00001", "00002"), names=(names[0], "pcd"))
+    recording = open_recording(make_folder(("00001", "00002", "00003"), (), (names[1], "pcd")), TWO)
+    seen = [[(i.sensor, i.channel, int(i.pixels.max())) for i in p.read().images] for p in recording.pairs]
+    left, right = ("left", "frames"), ("right", "frames")
+    assert seen == [[(*left, 10)], [(*left, 11), (*right, 10)], [(*right, 11)]]
+    folder = Path(names[1]).name
+    assert recording.pairs[1].label == f"{Path(names[0]).name}/00001.png + {folder}/00001.png + 00001.pcd"
+    of_left, of_right, lone = recording.notes
+    assert has_note([of_left], "left: 2 pairs", "0 images", "1 point clouds")
+    assert has_note([of_right], "right: 2 pairs", "1 images", "1 point clouds")
+    assert "without" in lone and lone.endswith(f" {folder}/00003.png")
+
+
+def test_one_of_several_cameras_can_be_read_by_itself(make_folder):
+    make_folder(names=("img/left", "pcd"))
+    path = make_folder(names=("img/right", "pcd"))
+    (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs
+    assert [image.sensor for image in pair.read().images] == ["right"]
+    shutil.rmtree(path / "img" / "right")
+    with pytest.raises(SourceError, match="images of left found, none of right"):
+        open_recording(path, TWO, SourceOptions(camera="right"))
+
+
+def test_pictures_are_not_taken_for_those_of_a_camera_that_nobody_named(make_folder):
+    path = make_folder()
+    with pytest.raises(SourceError, match="has cameras left, right: the images") as caught:
+        open_recording(path, TWO)
+    assert "--camera left" in caught.value.hint and "img/right/" in caught.value.hint
+    (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs
+    assert pair.read().images[0].sensor == "right"
+
+
+def test_two_pictures_of_one_name_are_two_pairs(make_folder, rig):
+    path = make_folder()
+    shutil.copy(path / "img" / "00000.png", path / "img" / "00000.bmp")
+    assert [len(pair.read().images) for pair in open_recording(path, rig).pairs] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("name", ["img/00001.png", "pcd/00001.pcd"])
+def test_a_damaged_file_spoils_its_own_pair_only(make_folder, rig, name):
+    path = make_folder()
+    os.truncate(path / name, 400 if name.endswith("pcd") else 60)
+    recording = open_recording(path, rig)
+    recording.pairs[0].read()
+    with pytest.raises(SourceError, match=name.replace("/", ".*")):
+        recording.pairs[1].read()
+
+
+def test_no_time_and_no_returns_are_said(make_folder, rig, room):
+    path = make_folder()
+    cloud = room[["x", "y", "z", "intensity", "ring"]].copy()
+    cloud["x"][:7] = np.nan
+    (path / "pcd" / "00000.pcd").write_bytes(encode_pcd(cloud))
+    notes = open_recording(path, rig).pairs[0].read().notes
+    assert len(notes) == 2 and "no time" in notes[0] and has_note(notes[1:], "00000.pcd", "7 points")
+
+
+@pytest.mark.dataset
+@pytest.mark.parametrize(
+    ("name", "n_pairs", "method"),
+    [
+        ("rlfs01", 18, "equal file names"),
+        ("sss_noise15mm", 20, "sorted order"),
+        ("rles01_lf", 19, "equal file names"),
+        ("rles02_le", 56, "equal file names"),
+        ("acfr_vlp16", 10, "equal file names"),
+    ],
+)
+def test_recordings_by_others_are_paired_as_their_makers_meant(recordings, rig, name, n_pairs, method):
+    recording = open_recording(recordings / name, rig)
+    assert len(recording.pairs) == n_pairs and method in recording.notes[0]
+    pair = recording.pairs[-1].read()
+    assert len(pair.scans[0].points) > 10_000 and pair.scans[0].ring.max() <= 15

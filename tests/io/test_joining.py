@@ -1,0 +1,184 @@
+"""Recordings of one moment by several recorders: which belong together, and in what order they are read."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Events, Image, Sample, Scan, Stream
+from lce_rig.core.errors import SourceError
+from lce_rig.io.joining import JoinedRecording, join_recordings, require_sensors
+from lce_rig.io.merging import merge_by_time
+from lce_rig.io.protocol import ContinuousRecording, Span
+from lce_rig.rig import Rig, load_rig
+from tests.notes import has_note
+
+S = 10**9
+T0_NS = 1_700_000_000 * S
+LIDAR = Stream("lidar", "", "scans")
+FRAMES, EVENTS = Stream("davis", "frames", "images"), Stream("davis", "events", "events")
+
+
+def sample(stream: Stream, time_s: float) -> Sample:
+    stamp_ns = T0_NS + round(time_s * S)
+    if stream.kind == "images":
+        return Image(stream.sensor, stream.channel, stamp_ns, np.zeros((2, 2), np.uint8))
+    if stream.kind == "scans":
+        column = np.zeros(1, np.float32)
+        return Scan(stream.sensor, stamp_ns, np.ones((1, 3), np.float32), column, np.zeros(1, np.int16))
+    t_ns = stamp_ns + np.arange(3) * 1000
+    place = np.zeros(3, np.uint16)
+    return Events(stream.sensor, t_ns, place, place, np.ones(3, bool), 346, 260)
+
+
+@dataclass
+class Listed:
+    """A recording of samples given in advance, and torn behind them where `torn` says so."""
+
+    name: str
+    contents: list[tuple[Stream, float]]
+    span_s: tuple[float, float] | None = (0.0, 10.0)
+    torn: str = ""
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.path, self.key = Path(self.name), self.name
+        self.n_samples = sum(stream.kind != "events" for stream, _ in self.contents)
+        span: Span | None = None
+        if self.span_s is not None:
+            span = T0_NS + round(self.span_s[0] * S), T0_NS + round(self.span_s[1] * S)
+        self.streams = dict.fromkeys((stream for stream, _ in self.contents), span)
+
+    def samples(self) -> Iterator[Sample]:
+        yield from (sample(stream, time_s) for stream, time_s in self.contents)
+        self.notes.append(f"{self.name} was read")
+        if self.torn:
+            raise SourceError(self.torn)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("rles")
+
+
+def lidar(name: str = "lidar.bag", **kwargs: object) -> Listed:
+    return Listed(name, [(LIDAR, 0.0), (LIDAR, 0.1), (LIDAR, 0.2)], **kwargs)
+
+
+def camera(name: str = "events.aedat4", **kwargs: object) -> Listed:
+    contents = [(EVENTS, 0.01), (FRAMES, 0.05), (EVENTS, 0.12), (FRAMES, 0.15)]
+    return Listed(name, contents, **kwargs)
+
+
+def whole(name: str, *more: Stream) -> Listed:
+    return Listed(name, [(stream, 0.1 * k) for k, stream in enumerate((LIDAR, FRAMES, *more))])
+
+
+def names(recordings: list[object]) -> list[list[str]]:
+    return [
+        [part.name for part in r._parts] if isinstance(r, JoinedRecording) else [r.name] for r in recordings
+    ]
+
+
+def test_each_recording_joins_those_before_it_that_lack_its_sensors(rig: Rig) -> None:
+    events_only = Listed("e", [(EVENTS, 0.0)])
+    for given, wanted in [
+        ([lidar(), camera()], [["lidar.bag", "events.aedat4"]]),
+        ([camera(), lidar()], [["events.aedat4", "lidar.bag"]]),
+        ([whole("a"), whole("b")], [["a"], ["b"]]),
+        ([whole("a"), whole("b", EVENTS)], [["a"], ["b"]]),
+        ([whole("a"), events_only], [["a", "e"]]),
+        ([whole("a"), camera("c")], [["a", "c"]]),
+        (
+            [lidar("1"), camera("2", span_s=None), lidar("3"), camera("4", span_s=None)],
+            [["1", "2"], ["3", "4"]],
+        ),
+        (
+            [camera("1", span_s=None), lidar("2"), camera("3", span_s=None), lidar("4")],
+            [["1", "2"], ["3", "4"]],
+        ),
+    ]:
+        assert names(join_recordings(given, rig)) == wanted
+
+
+def test_a_copy_of_what_is_there_already_is_left_out_and_it_is_said(rig: Rig) -> None:
+    (joined,) = join_recordings([whole("a.bag", EVENTS), camera("c.aedat4")], rig)
+    assert isinstance(joined, JoinedRecording)
+    assert has_note(joined.notes, "davis.events", "a.bag, not", "c.aedat4")
+    assert len(list(joined.samples())) == 3
+    later = camera("c.aedat4", span_s=(20.0, 30.0))
+    assert names(join_recordings([whole("a.bag", EVENTS), later], rig)) == [["a.bag"], ["c.aedat4"]]
+
+
+def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rig: Rig) -> None:
+    (joined,) = join_recordings([lidar(), camera()], rig)
+    assert isinstance(joined, ContinuousRecording)
+    kinds = [type(s).__name__ for s in joined.samples()]
+    assert kinds == ["Scan", "Events", "Image", "Scan", "Events", "Image", "Scan"]
+    assert joined.n_samples == 5 and set(joined.streams) == {LIDAR, FRAMES, EVENTS}
+    assert [note.split()[0] for note in joined.notes[-2:]] == ["lidar.bag", "events.aedat4"]
+    davis = rig.cameras["davis"]
+    frames = davis.channels["frames"]
+    timestamps = frames.timestamps.model_copy(update={"expected_offset_s": -0.06})
+    channels = {**davis.channels, "frames": frames.model_copy(update={"timestamps": timestamps})}
+    shifted = rig.model_copy(update={"cameras": {"davis": davis.model_copy(update={"channels": channels})}})
+    frames_only = Listed("frames.bag", [(FRAMES, 0.05), (FRAMES, 0.15)])
+    kinds = [type(s).__name__ for s in JoinedRecording([lidar(), frames_only], shifted).samples()]
+    assert kinds == ["Image", "Scan", "Image", "Scan", "Scan"]
+
+
+def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rig: Rig) -> None:
+    one, other = JoinedRecording([lidar(), camera()], rig), JoinedRecording([camera(), lidar()], rig)
+    assert one.key == other.key != JoinedRecording([lidar(), camera("x")], rig).key
+
+
+def test_clocks_that_do_not_overlap_are_said_by_how_much_before_anything_is_read(rig: Rig) -> None:
+    parts = [lidar(span_s=(0.0, 30.0)), camera(span_s=(1264.5, 1300.0))]
+    with pytest.raises(
+        SourceError,
+        match=r"events run from 1700001264\.500 to .*00\.000 s, scans from .* s: 1234\.5 s apart",
+    ) as caught:
+        next(iter(JoinedRecording(parts, rig).samples()))
+    assert "channels.events.timestamps.expected_offset_s" in caught.value.hint
+    assert "-1264.5 s" in caught.value.hint
+    since_start = camera(span_s=(-1_699_999_999.0, -1_699_999_990.0))
+    with pytest.raises(SourceError, match=r"1699999990\.0 s apart") as caught:
+        next(iter(JoinedRecording([lidar(), since_start], rig).samples()))
+    assert "one computer's" in caught.value.hint
+
+
+def test_a_partial_overlap_is_noted(rig: Rig) -> None:
+    joined = JoinedRecording([lidar(span_s=(0.0, 30.0)), camera(span_s=(20.0, 60.0))], rig)
+    assert len(list(joined.samples())) == 7
+    assert has_note(joined.notes, "davis.events", "10.0 of", "30.0 s", "lidar's")
+
+
+def test_a_part_that_is_torn_does_not_end_the_others(rig: Rig) -> None:
+    torn = lidar(torn="lidar.bag is damaged")
+    found = []
+    with pytest.raises(SourceError, match=r"lidar\.bag is damaged"):
+        for one in JoinedRecording([torn, camera()], rig).samples():
+            found.append(one)
+    assert len(found) == 7
+
+
+def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rig: Rig) -> None:
+    require_sensors(JoinedRecording([lidar(), camera()], rig))
+    with pytest.raises(
+        SourceError, match=r"events\.aedat4: no scans.* holds events of davis\.events, images of"
+    ):
+        require_sensors(camera())
+    with pytest.raises(SourceError, match=r"lidar\.bag: no images and no events") as caught:
+        require_sensors(lidar())
+    assert re.findall(r"--from (\S+\w)", caught.value.hint) == ["lidar.bag", "events.aedat4"]
+
+
+def test_samples_without_stamps_stay_where_they_are_in_their_own_stream(rig: Rig) -> None:
+    image = sample(FRAMES, 0.05)
+    assert isinstance(image, Image)
+    timeless = replace(image, stamp_ns=None)
+    parts = [[image, timeless], [sample(LIDAR, 0.0), sample(LIDAR, 0.1)]]
+    assert [type(s).__name__ for s in merge_by_time(parts, rig)] == ["Scan", "Image", "Image", "Scan"]

@@ -1,0 +1,332 @@
+"""Recordings of the network of many kinds give the same scans, or an error that says why not."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from wire.vlp16_packets import SensorPacket
+
+from lce_rig.core import velodyne
+from lce_rig.core.data import Scan, Stream
+from lce_rig.core.errors import SourceError
+from lce_rig.io import open_recording
+from lce_rig.io.protocol import ContinuousRecording, SourceOptions
+from lce_rig.io.velodyne.datagrams import Datagram, PcapWriter, build_frame
+from lce_rig.io.velodyne.pcap import PcapFile, PcapRecording
+from lce_rig.rig import Rig
+from tests.notes import has_note
+
+from .vlp16_room import NETWORK_NS, T0_NS, packets_of, room_scans
+
+SENSOR = "192.168.1.201"
+IP_AT = 14
+
+
+def to_datagram(packet: SensorPacket, source: str = SENSOR) -> Datagram:
+    return Datagram(packet.sent_ns + NETWORK_NS, source, packet.port, packet.port, packet.payload)
+
+
+@pytest.fixture(scope="module")
+def datagrams() -> list[Datagram]:
+    return [to_datagram(packet) for packet in packets_of(room_scans(3))]
+
+
+@pytest.fixture(scope="module")
+def frames(datagrams: list[Datagram]) -> list[tuple[int, bytes]]:
+    """Arrival and Ethernet frame of each packet."""
+    return [(datagram.host_ns, build_frame(datagram)) for datagram in datagrams]
+
+
+def read(path: Path, rig: Rig) -> tuple[list[Scan], list[str]]:
+    recording = PcapRecording(path, rig, SourceOptions())
+    return list(recording.samples()), recording.notes
+
+
+def check_scans(scans: list[Scan]) -> None:
+    truth = room_scans(3)
+    assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in truth]
+    for scan, true in zip(scans, truth, strict=True):
+        assert abs(int(scan.stamp_ns or 0) - int(true.stamp_ns or 0)) <= 1000
+        assert np.linalg.norm(scan.points - true.points, axis=1).max() < 2e-3
+
+
+def write_pcap(
+    path: Path,
+    frames: list[tuple[int, bytes]],
+    *,
+    link: int = 1,
+    order: str = "<",
+    is_ns: bool = False,
+    snaplen: int = 65535,
+) -> Path:
+    magic, per_tick = (0xA1B23C4D, 1) if is_ns else (0xA1B2C3D4, 1000)
+    parts = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, snaplen, link)]
+    for host_ns, frame in frames:
+        seconds, ns = divmod(host_ns, 10**9)
+        kept = frame[:snaplen]
+        parts += [struct.pack(f"{order}IIII", seconds, ns // per_tick, len(kept), len(frame)), kept]
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+def block(order: str, kind: int, body: bytes) -> bytes:
+    body += bytes(-len(body) % 4)
+    length = 12 + len(body)
+    return struct.pack(f"{order}II", kind, length) + body + struct.pack(f"{order}I", length)
+
+
+def write_pcapng(path: Path, frames: list[tuple[int, bytes]], order: str = "<") -> Path:
+    """Two cards: one without frames whose stamps are in us, then one in units of 2**-20 s."""
+    resolution = struct.pack(f"{order}HHB3x", 9, 1, 0x80 | 20) + struct.pack(f"{order}HH", 0, 0)
+    parts = [
+        block(order, 0x0A0D0D0A, struct.pack(f"{order}IHHq", 0x1A2B3C4D, 1, 0, -1)),
+        block(order, 1, struct.pack(f"{order}HHI", 1, 0, 0)),
+        block(order, 1, struct.pack(f"{order}HHI", 1, 0, 0) + resolution),
+        block(order, 0x0BAD, b"custom"),
+    ]
+    for host_ns, frame in frames:
+        ticks = (host_ns << 20) // 10**9
+        head = struct.pack(f"{order}IIIII", 1, ticks >> 32, ticks & 0xFFFFFFFF, len(frame), len(frame))
+        parts.append(block(order, 6, head + frame))
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+ETHERNET_TYPE = b"\x08\x00"
+LINKS: dict[str, tuple[int, Callable[[bytes], bytes]]] = {
+    "ethernet": (1, lambda f: f),
+    "ethernet with a trailer": (1, lambda f: f + b"\0\0\0\0"),
+    "VLAN": (1, lambda f: f[:12] + b"\x81\x00\x00\x07" + f[12:]),
+    "two VLANs": (1, lambda f: f[:12] + b"\x88\xa8\x00\x02\x81\x00\x00\x07" + f[12:]),
+    "SLL": (113, lambda f: bytes(14) + ETHERNET_TYPE + f[IP_AT:]),
+    "SLL2": (276, lambda f: ETHERNET_TYPE + bytes(18) + f[IP_AT:]),
+    "raw": (101, lambda f: f[IP_AT:]),
+    "raw IPv4": (228, lambda f: f[IP_AT:]),
+    "BSD loopback": (0, lambda f: struct.pack("<I", 2) + f[IP_AT:]),
+    "OpenBSD loopback": (108, lambda f: struct.pack(">I", 2) + f[IP_AT:]),
+}
+
+
+@pytest.mark.parametrize("name", sorted(LINKS))
+def test_every_link_type_gives_the_same_scans(
+    name: str, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    link, wrap = LINKS[name]
+    path = write_pcap(tmp_path / "a.pcap", [(ns, wrap(frame)) for ns, frame in frames], link=link)
+    check_scans(read(path, rig)[0])
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("is_ns", [False, True])
+def test_byte_orders_and_units_of_time_do_not_matter(
+    order: str, is_ns: bool, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    check_scans(read(write_pcap(tmp_path / "a.pcap", frames, order=order, is_ns=is_ns), rig)[0])
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_wiresharks_own_format_is_read(
+    order: str, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    scans, notes = read(write_pcapng(tmp_path / "a.pcapng", frames, order), rig)
+    check_scans(scans)
+    assert not any("cut off" in note for note in notes)
+
+
+def test_simple_packets_of_pcapng_have_no_arrival(
+    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    head = [
+        block("<", 0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)),
+        block("<", 1, struct.pack("<HHI", 1, 0, 0)),
+    ]
+    body = [block("<", 3, struct.pack("<I", len(frame)) + frame) for _, frame in frames]
+    path = tmp_path / "a.pcapng"
+    path.write_bytes(b"".join(head + body))
+    scans, _ = read(path, rig)
+    assert [scan.stamp_ns for scan in scans] == [None] * 3
+
+
+def test_what_the_writer_wrote_comes_back_byte_for_byte(
+    datagrams: list[Datagram], rig: Rig, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.pcap"
+    with PcapWriter(path) as writer:
+        for datagram in datagrams:
+            writer.write(datagram)
+    back = list(PcapFile(path).datagrams())
+    assert [vars(datagram) for datagram in back] == [vars(datagram) for datagram in datagrams]
+    check_scans(read(path, rig)[0])
+    with pytest.raises(FileExistsError):
+        PcapWriter(path)
+
+
+def test_another_program_reads_what_the_writer_wrote(datagrams: list[Datagram], tmp_path: Path) -> None:
+    dpkt = pytest.importorskip("dpkt")
+    path = tmp_path / "a.pcap"
+    with PcapWriter(path) as writer:
+        for datagram in datagrams:
+            writer.write(datagram)
+    with path.open("rb") as file:
+        for (stamp_s, raw), datagram in zip(dpkt.pcap.Reader(file), datagrams, strict=True):
+            ip = dpkt.ethernet.Ethernet(raw).data
+            assert float(stamp_s) == pytest.approx(datagram.host_ns * 1e-9, abs=1e-6)
+            # With a sum of 0 dpkt fills in the right one.
+            was, ip.sum = ip.sum, 0
+            assert dpkt.ip.IP(bytes(ip)).sum == was != 0
+            assert ip.data.data == datagram.payload and ip.data.dport == datagram.port
+
+
+def test_a_recording_is_found_by_its_suffix(
+    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    recording = open_recording(write_pcap(tmp_path / "a.PCAP", frames), rig)
+    assert isinstance(recording, ContinuousRecording)
+    assert recording.n_samples == 3
+    assert recording.streams == {Stream("lidar", "", "scans"): None}
+    part = open_recording(tmp_path / "a.PCAP", rig, SourceOptions(is_part=True))
+    assert isinstance(part, ContinuousRecording) and part.key == recording.key
+    (span_ns,) = part.streams.values()
+    assert span_ns is not None and T0_NS < span_ns[0] < T0_NS + 2_000_000
+    assert span_ns[1] - span_ns[0] == pytest.approx(0.3e9, rel=0.01)
+
+
+def test_notes_say_what_was_taken_and_what_the_stamps_are(
+    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    lossy = frames[:100] + frames[110:]
+    n_lost = sum(len(frame) > 1206 for _, frame in frames[100:110])  # the others are of the LiDAR's state
+    _, notes = read(write_pcap(tmp_path / "a.pcap", lossy), rig)
+    assert has_note(notes, "vertical offsets") and has_note(notes, "UTC", "PPS")
+    assert 0 < n_lost <= 10 and has_note(notes, f"{n_lost} data packets", "lost")
+
+
+def test_a_torn_file_is_read_up_to_where_it_is_torn(
+    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    whole = write_pcap(tmp_path / "a.pcap", frames).read_bytes()
+    torn = tmp_path / "torn.pcap"
+    for end in (len(whole) - 1, len(whole) - 1260, len(whole) - 1270):
+        torn.write_bytes(whole[:end])
+        scans, notes = read(torn, rig)
+        assert len(scans) >= 2
+        assert has_note(notes, "killed")
+
+
+@pytest.mark.parametrize("suffix", ["pcap", "pcapng"])
+def test_a_file_torn_anywhere_never_crashes(
+    suffix: str, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    writer = write_pcap if suffix == "pcap" else write_pcapng
+    whole = writer(tmp_path / f"a.{suffix}", frames[:4]).read_bytes()
+    torn = tmp_path / f"torn.{suffix}"
+    for end in range(0, len(whole), 29):
+        torn.write_bytes(whole[:end])
+        with pytest.raises(SourceError):
+            read(torn, rig)
+
+
+@pytest.mark.parametrize("suffix", ["pcap", "pcapng"])
+def test_a_file_damaged_anywhere_gives_scans_or_an_error(
+    suffix: str, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    writer = write_pcap if suffix == "pcap" else write_pcapng
+    whole = writer(tmp_path / f"a.{suffix}", frames[:90]).read_bytes()
+    damaged = tmp_path / f"damaged.{suffix}"
+    n_read = 0
+    for _ in range(30):
+        body = bytearray(whole)
+        for at in rng.integers(0, len(body), 20):
+            body[at] = rng.integers(256)
+        body[rng.integers(200)] = rng.integers(256)
+        damaged.write_bytes(body)
+        try:
+            n_read += len(read(damaged, rig)[0])
+        except SourceError:
+            continue
+    assert n_read > 0
+
+
+REFUSED: dict[str, tuple[bytes, str]] = {
+    "empty": (b"", "is empty"),
+    "a text": (b"some text, longer than a header of pcap\n", "not a pcap or pcapng file"),
+    "a torn header": (struct.pack("<IHH", 0xA1B2C3D4, 2, 4), "nothing was recorded"),
+    "without frames": (struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1), "no UDP packets at all"),
+    "of a wireless card": (struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 127), "802.11 radiotap"),
+    "of an unknown card": (struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 999), "type 999"),
+    "pcapng of a wireless card": (
+        block("<", 0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+        + block("<", 1, struct.pack("<HHI", 105, 0, 0)),
+        "802.11 wireless",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", sorted(REFUSED))
+def test_what_cannot_be_read_is_refused_with_its_cause(name: str, rig: Rig, tmp_path: Path) -> None:
+    content, cause = REFUSED[name]
+    path = tmp_path / "a.pcap"
+    path.write_bytes(content)
+    with pytest.raises(SourceError, match=cause):
+        read(path, rig)
+
+
+def test_a_packed_file_is_to_be_unpacked(rig: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "a.pcap"
+    path.write_bytes(b"\x1f\x8b" + bytes(40))
+    with pytest.raises(SourceError) as caught:
+        read(path, rig)
+    assert "gunzip" in caught.value.hint
+
+
+def test_frames_cut_short_by_the_recorder_are_named(
+    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    path = write_pcap(tmp_path / "a.pcap", frames, snaplen=96)
+    with pytest.raises(SourceError, match="243 datagrams"):
+        read(path, rig)
+
+
+def test_packets_of_something_else_are_named_by_port(rig: Rig, tmp_path: Path) -> None:
+    other = Datagram(T0_NS, "10.0.0.1", 5353, 5353, b"mdns")
+    path = write_pcap(tmp_path / "a.pcap", [(T0_NS, build_frame(other))] * 3)
+    with pytest.raises(SourceError, match="by port: 3 to 5353"):
+        read(path, rig)
+
+
+def test_another_velodyne_is_refused_by_name(datagrams: list[Datagram], rig: Rig, tmp_path: Path) -> None:
+    others = [
+        Datagram(d.host_ns, d.source, d.port, d.port, d.payload[:-1] + b"\x21")
+        for d in datagrams
+        if d.port == velodyne.DATA_PORT
+    ]
+    path = write_pcap(tmp_path / "a.pcap", [(d.host_ns, build_frame(d)) for d in others])
+    with pytest.raises(SourceError, match="HDL-32E"):
+        read(path, rig)
+
+
+def test_less_than_a_revolution_is_an_error(
+    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    with pytest.raises(SourceError, match="no whole revolution"):
+        read(write_pcap(tmp_path / "a.pcap", frames[:40]), rig)
+
+
+def test_of_several_sensors_the_profiles_is_taken(
+    datagrams: list[Datagram], rig: Rig, tmp_path: Path
+) -> None:
+    both = [
+        (d.host_ns, build_frame(Datagram(d.host_ns, source, d.port, d.port, d.payload)))
+        for d in datagrams
+        for source in (SENSOR, "192.168.1.77")
+    ]
+    path = write_pcap(tmp_path / "a.pcap", both)
+    check_scans(read(path, rig)[0])
+    lidar = rig.lidars["lidar"]
+    driver = lidar.driver.model_copy(update={"address": "192.168.1.9"})
+    other = rig.model_copy(update={"lidars": {"lidar": lidar.model_copy(update={"driver": driver})}})
+    with pytest.raises(SourceError, match=r"192\.168\.1\.201, 192\.168\.1\.77"):
+        read(path, other)

@@ -1,0 +1,100 @@
+"""PointCloud2 of any layout, without a bag around it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.io.ros.rosbag import decode_pointcloud2
+
+CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def message(dtype, rows, row_step, is_bigendian):
+    fields = [
+        SimpleNamespace(
+            name=name,
+            offset=dtype.fields[name][1],
+            datatype=CODES[dtype[name].base.str[1:]],
+            count=dtype[name].shape[0] if dtype[name].shape else 1,
+        )
+        for name in dtype.names
+    ]
+    data = b"".join(row.tobytes() + bytes(row_step - row.nbytes) for row in rows)
+    return SimpleNamespace(
+        fields=fields, is_bigendian=is_bigendian, width=rows.shape[1], height=rows.shape[0],
+        point_step=dtype.itemsize, row_step=row_step, data=np.frombuffer(data, np.uint8),
+    )  # fmt: skip
+
+
+@st.composite
+def layouts(draw):
+    """Fields in any order with gaps between them, and rows with gaps behind them."""
+    is_bigendian = draw(st.booleans())
+    names, formats, offsets, place = [], [], [], 0
+    for k, kind in enumerate(draw(st.lists(st.sampled_from(list(CODES)), min_size=1, max_size=6))):
+        place += draw(st.integers(0, 5))
+        count = draw(st.integers(1, 3))
+        base = np.dtype((">" if is_bigendian else "<") + kind)
+        names.append(f"f{k}")
+        formats.append(base if count == 1 else (base, (count,)))
+        offsets.append(place)
+        place += base.itemsize * count
+    order = draw(st.permutations(range(len(names))))
+    itemsize = place + draw(st.integers(0, 7))
+    dtype = np.dtype({
+        "names": [names[k] for k in order], "formats": [formats[k] for k in order],
+        "offsets": [offsets[k] for k in order], "itemsize": itemsize,
+    })  # fmt: skip
+    height, width = draw(st.integers(1, 4)), draw(st.integers(1, 9))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    rows = np.zeros((height, width), dtype)
+    for name in names:
+        rows[name] = rng.integers(0, 100, rows[name].shape)
+    return dtype, rows, width * itemsize + draw(st.integers(0, 9)), is_bigendian
+
+
+@given(layouts())
+def test_every_layout_gives_back_its_points_in_order(layout):
+    dtype, rows, row_step, is_bigendian = layout
+    cloud = decode_pointcloud2(message(dtype, rows, row_step, is_bigendian))
+    for name in dtype.names:
+        np.testing.assert_array_equal(cloud[name], rows[name].reshape(cloud[name].shape))
+
+
+@given(layouts(), st.integers(1, 40))
+def test_missing_bytes_are_noticed(layout, n_missing):
+    given_message = message(*layout)
+    given_message.data = given_message.data[: max(len(given_message.data) - n_missing, 0)]
+    _, rows, row_step, _ = layout
+    n_spare = row_step - rows.shape[1] * rows.dtype.itemsize
+    if n_missing <= n_spare:
+        assert len(decode_pointcloud2(given_message)) == rows.size
+    else:
+        with pytest.raises(ValueError, match="bytes of points"):
+            decode_pointcloud2(given_message)
+
+
+def test_contradictions_are_named():
+    dtype = np.dtype([("x", "<f4"), ("y", "<f4")])
+    good = message(dtype, np.zeros((2, 3), dtype), 24, False)
+    assert len(decode_pointcloud2(good)) == 6
+    for change, cause in [
+        ({"row_step": 23}, "row_step 23 is less than 3 points of 8 bytes"),
+        ({"point_step": 7}, "field 'y' does not fit into point_step 7"),
+        ({"fields": [SimpleNamespace(name="x", offset=0, datatype=9, count=1)]}, "unknown datatype 9"),
+    ]:
+        with pytest.raises(ValueError, match=cause):
+            decode_pointcloud2(SimpleNamespace(**{**vars(good), **change}))
+
+
+def test_rows_without_a_step_and_empty_clouds_are_read():
+    dtype = np.dtype([("x", "<f4")])
+    rows = np.arange(3, dtype="<f4").view(dtype).reshape(1, 3)
+    no_step = message(dtype, rows, 12, False)
+    no_step.row_step = 0
+    assert decode_pointcloud2(no_step)["x"].tolist() == [0, 1, 2]
+    no_step.width = 0
+    assert len(decode_pointcloud2(no_step)) == 0

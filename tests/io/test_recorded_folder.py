@@ -1,0 +1,113 @@
+"""A folder that several recorders filled is read as one recording; other folders stay what they were."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.errors import SourceError
+from lce_rig.io import open_recordings
+from lce_rig.io.folder.folder_recorder import FolderRecorder
+from lce_rig.io.folder.recorded_folder import list_parts
+from lce_rig.io.joining import JoinedRecording, join_recordings
+from lce_rig.io.protocol import ContinuousRecording, SourceOptions
+from lce_rig.io.velodyne.datagrams import Datagram, PcapWriter
+from lce_rig.rig import Rig, load_rig
+
+from .rig_samples import KINDS, T0_NS, one_second
+from .vlp16_room import NETWORK_NS, packets_of, room_scans
+
+
+@pytest.fixture(scope="module")
+def rles() -> Rig:
+    return load_rig("rles")
+
+
+def fill(folder: Path, rig: Rig, ros: int = 1) -> int:
+    """Record a second as `collect --record` does: packets apart, all else in a bag, events also in a file."""
+    n_pictures = 0
+    with FolderRecorder(folder, rig, ros) as recorder:
+        for sample in one_second():
+            if not isinstance(sample, Scan):
+                recorder.write(sample)
+                n_pictures += isinstance(sample, Image)
+    with PcapWriter(folder / "lidar.pcap") as packets:
+        for sent in packets_of(room_scans(10, T0_NS)):
+            arrival_ns = sent.sent_ns + NETWORK_NS
+            packets.write(Datagram(arrival_ns, "127.0.0.1", sent.port, sent.port, sent.payload))
+    return n_pictures
+
+
+def read(folder: Path, rig: Rig) -> ContinuousRecording:
+    (joined,) = join_recordings(open_recordings([folder], rig), rig)
+    assert isinstance(joined, ContinuousRecording)
+    return joined
+
+
+@pytest.mark.parametrize(("ros", "bag"), list(enumerate(KINDS, start=1)))
+def test_packets_pictures_and_events_of_a_folder_come_back_as_one_recording(
+    tmp_path: Path, rles: Rig, ros: int, bag: str
+) -> None:
+    folder = tmp_path / "kept"
+    n_pictures = fill(folder, rles, ros)
+    assert {each.name for each in folder.iterdir()} == {bag, "events.aedat4", "lidar.pcap"}
+    joined = read(folder, rles)
+    samples = list(joined.samples())
+    assert sum(isinstance(sample, Image) for sample in samples) == n_pictures
+    scans = [sample for sample in samples if isinstance(sample, Scan)]
+    # A revolution is whole once the next has begun; the sensor counts whole microseconds.
+    assert 8 <= len(scans) <= 10
+    assert all(abs((scan.stamp_ns or 0) - T0_NS) < 1.1e9 for scan in scans)
+    events = np.concatenate([sample.t_ns for sample in samples if isinstance(sample, Events)])
+    assert len(events) == 50 * 4000, "events lie in two files, and are read once"
+    assert joined.key == read(folder, rles).key, "so that a second run knows what was captured"
+
+
+def test_a_file_that_a_killed_recorder_left_empty_is_passed_over_and_named(tmp_path: Path, rles: Rig) -> None:
+    folder = tmp_path / "kept"
+    fill(folder, rles)
+    (folder / "events.aedat4").write_bytes(b"")
+    joined = read(folder, rles)
+    assert any("skipped" in note and "events.aedat4" in note for note in joined.notes)
+    assert isinstance(joined, JoinedRecording)
+    assert sum(isinstance(sample, Events) for sample in joined.samples()) > 0, "those of the bag"
+    for file in folder.iterdir():
+        file.write_bytes(b"")
+    with pytest.raises(SourceError, match=r"recording\.bag|kept"):
+        open_recordings([folder], rles)
+
+
+def test_files_named_after_a_sensor_belong_to_it(tmp_path: Path, rles: Rig) -> None:
+    two = rles.model_copy(update={"lidars": {"left": rles.lidars["lidar"], "right": rles.lidars["lidar"]}})
+    for name in ("recording.bag", "left.pcap", "right.pcap", "davis.aedat4", "notes.txt"):
+        (tmp_path / name).touch()
+    parts = list_parts(tmp_path, two, SourceOptions())
+    read_as = [(path.name, given.lidar, given.camera, given.is_part) for path, given in parts]
+    assert read_as == [
+        (tmp_path.name, None, None, True),
+        ("left.pcap", "left", None, True),
+        ("right.pcap", "right", None, True),
+        ("davis.aedat4", None, "davis", True),
+    ]
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        ("img/0.png", "pcd/0.pcd", "raw.h5"),
+        ("a_0.mcap", "a_1.mcap"),
+        ("a.mcap", "metadata.yaml"),
+        ("0.png", "0.pcd"),
+        (),
+    ],
+    ids=["pictures and clouds", "a bag in pieces", "a bag of ROS 2", "all in one", "empty"],
+)
+def test_other_folders_are_read_as_a_whole(tmp_path: Path, rles: Rig, files: tuple[str, ...]) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    options = SourceOptions()
+    assert list_parts(tmp_path, rles, options) == [(tmp_path, options)]
+    lone = tmp_path / "lone.pcap"
+    assert list_parts(lone, rles, options) == [(lone, options)]

@@ -1,0 +1,369 @@
+"""Bags of all three kinds, with whatever layouts, topics, stamps and damage they come."""
+
+import os
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import SourceError
+from lce_rig.io import SourceOptions, open_recording
+from lce_rig.io.protocol import ContinuousRecording
+from lce_rig.rig import load_rig
+from tests.notes import has_note
+
+KINDS = ["ros1", "sqlite3", "mcap"]
+CAM, LIDAR = "/camera/image_raw", "/velodyne_points"
+T0_NS = 1_700_000_000 * 10**9
+STEP_NS = 100_000_000
+
+
+@pytest.fixture
+def picture():
+    noise = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 2)
+
+
+@pytest.fixture
+def stream(room, picture, cloud_message, image_message):
+    """Messages of a camera and a LiDAR at 10 Hz."""
+
+    def build(n, cam=CAM, lidar=LIDAR, t0_ns=T0_NS):
+        for k in range(n):
+            stamp_ns = t0_ns + k * STEP_NS
+            yield lidar, "PointCloud2", stamp_ns + 2_000_000, cloud_message(room, stamp_ns)
+            pixels = picture.copy()
+            pixels[0, 0] = k % 256
+            yield cam, "Image", stamp_ns + 60_000_000, image_message(pixels, stamp_ns + 50_000_000)
+
+    return build
+
+
+def read(recording):
+    samples = list(recording.samples())
+    return [s for s in samples if isinstance(s, Image)], [s for s in samples if isinstance(s, Scan)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_message_is_read_with_its_header_stamp(tmp_path, rig, room, picture, write_bag, stream, kind):
+    recording = open_recording(write_bag(tmp_path / "bag", kind, stream(5)), rig)
+    assert isinstance(recording, ContinuousRecording) and recording.n_samples == 10
+    images, scans = read(recording)
+    assert [i.stamp_ns for i in images] == [T0_NS + 50_000_000 + k * STEP_NS for k in range(5)]
+    assert [s.stamp_ns for s in scans] == [T0_NS + k * STEP_NS for k in range(5)]
+    assert scans[0].host_ns == T0_NS + 2_000_000
+    assert np.array_equal(images[2].pixels[1:], picture[1:])
+    np.testing.assert_array_equal(scans[0].ring, room["ring"])
+    np.testing.assert_array_equal(scans[0].points[:, 0], room["x"])
+    assert scans[0].offset_ns.max() == pytest.approx(1e8, abs=100)
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_the_storage_file_alone_and_a_folder_without_metadata_are_read(
+    tmp_path, rig, write_bag, stream, kind
+):
+    folder = write_bag(tmp_path / "bag", kind, stream(3))
+    (file,) = (p for p in folder.iterdir() if p.suffix in (".db3", ".mcap"))
+    assert len(read(open_recording(file, rig))[0]) == 3
+    (folder / "metadata.yaml").unlink()
+    assert len(read(open_recording(folder, rig))[0]) == 3
+
+
+def test_a_folder_of_split_bags_is_read_in_order(tmp_path, rig, write_bag, stream):
+    folder = tmp_path / "split"
+    folder.mkdir()
+    for k in range(2):
+        write_bag(folder / f"part_{k}", "ros1", stream(3, t0_ns=T0_NS + 3 * k * STEP_NS))
+    images, _ = read(open_recording(folder, rig))
+    assert np.diff([i.stamp_ns for i in images]).tolist() == [STEP_NS] * 5
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        {},
+        {"offsets": {"x": 0, "y": 4, "z": 8, "intensity": 16, "ring": 20, "time": 24}, "point_step": 32},
+        {"offsets": {"x": 10, "y": 3, "z": 30, "intensity": 20, "ring": 1, "time": 40}, "point_step": 51},
+        {"height": 16, "row_padding": 7},
+        {"is_bigendian": True, "height": 4},
+    ],
+    ids=["22 bytes", "32 bytes", "unaligned", "padded rows", "big endian"],
+)
+def test_clouds_of_any_layout_are_read_alike(
+    tmp_path, rig, room, picture, write_bag, cloud_message, image_message, layout
+):
+    messages = [
+        (LIDAR, "PointCloud2", T0_NS, cloud_message(room, T0_NS, **layout)),
+        (CAM, "Image", T0_NS + 1, image_message(picture, T0_NS)),
+    ]
+    _, (scan,) = read(open_recording(write_bag(tmp_path / "bag", "ros1", messages), rig))
+    points = np.stack([room["x"], room["y"], room["z"]], axis=1)
+    np.testing.assert_array_equal(scan.points, points)
+    np.testing.assert_array_equal(scan.ring, room["ring"])
+    np.testing.assert_allclose(scan.offset_ns, room["time"] * 1e9, atol=100)
+
+
+def test_organised_clouds_with_gaps_lose_the_gaps_only(
+    tmp_path, rig, room, picture, write_bag, cloud_message, image_message
+):
+    gappy = room.copy()
+    gappy["x"][::7] = np.nan
+    messages = [
+        (LIDAR, "PointCloud2", T0_NS, cloud_message(gappy, T0_NS, height=360)),
+        (CAM, "Image", T0_NS, image_message(picture, T0_NS)),
+    ]
+    recording = open_recording(write_bag(tmp_path / "bag", "mcap", messages), rig)
+    _, (scan,) = read(recording)
+    n_gaps = len(room[::7])
+    assert len(scan.points) == len(room) - n_gaps
+    assert has_note(recording.notes, LIDAR, f"{n_gaps} points")
+
+
+def _as_yuv(bgr, order):
+    # ITU-R BT.601, studio range, as cameras deliver it.
+    b, g, r = np.moveaxis(bgr.astype(float), -1, 0)
+    y = 16 + (65.738 * r + 129.057 * g + 25.064 * b) / 256
+    u = 128 + (-37.945 * r - 74.494 * g + 112.439 * b) / 256
+    v = 128 + (112.439 * r - 94.154 * g - 18.285 * b) / 256
+    chroma = np.stack([u, v], axis=-1)
+    chroma[:, 1::2] = chroma[:, ::2]
+    pairs = np.where(np.arange(bgr.shape[1]) % 2 == 0, chroma[..., 0], chroma[..., 1])
+    return np.stack([pairs, y] if order == "uyvy" else [y, pairs], axis=-1).astype(np.uint8)
+
+
+def _as_mosaic(bgr, pattern):
+    letters = {"b": 0, "g": 1, "r": 2}
+    mosaic = np.empty(bgr.shape[:2], np.uint8)
+    for k, letter in enumerate(pattern):
+        mosaic[k // 2 :: 2, k % 2 :: 2] = bgr[k // 2 :: 2, k % 2 :: 2, letters[letter]]
+    return mosaic
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    ["mono8", "8UC1", "bgr8", "8UC3", "rgb8", "bgra8", "rgba8", "yuv422", "uyvy", "yuv422_yuy2", "mono16"]
+    + [f"bayer_{pattern}8" for pattern in ("rggb", "bggr", "gbrg", "grbg")],
+)
+def test_pictures_of_any_encoding_look_the_same(
+    tmp_path, rig, room, write_bag, cloud_message, image_message, encoding
+):
+    # Colours that change slowly, so that mosaics and half the chroma lose next to nothing.
+    ramp = np.linspace(60, 200, 64)
+    bgr = np.dstack([np.tile(ramp, (48, 1)), np.full((48, 64), 90), np.tile(ramp[::-1], (48, 1))]).astype(
+        np.uint8
+    )
+    grey = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)
+    alpha = np.full((48, 64, 1), 7, np.uint8)
+    pixels, wanted = {
+        "mono8": (grey, grey), "8UC1": (grey, grey), "bgr8": (bgr, bgr), "8UC3": (bgr, bgr),
+        "rgb8": (bgr[..., ::-1], bgr), "bgra8": (np.dstack([bgr, alpha]), bgr),
+        "rgba8": (np.dstack([bgr[..., ::-1], alpha]), bgr), "yuv422": (_as_yuv(bgr, "uyvy"), bgr),
+        "uyvy": (_as_yuv(bgr, "uyvy"), bgr), "yuv422_yuy2": (_as_yuv(bgr, "yuyv"), bgr),
+        "mono16": (grey.astype(np.uint16) * 256, None),
+    }.get(encoding) or (_as_mosaic(bgr, encoding[6:10]), bgr)  # fmt: skip
+    messages = [
+        (LIDAR, "PointCloud2", T0_NS, cloud_message(room, T0_NS)),
+        (CAM, "Image", T0_NS, image_message(np.ascontiguousarray(pixels), T0_NS, encoding)),
+    ]
+    (image,), _ = read(open_recording(write_bag(tmp_path / "bag", "sqlite3", messages), rig))
+    if wanted is None:
+        assert (
+            image.pixels.dtype == np.uint8 and np.corrcoef(image.pixels.ravel(), grey.ravel())[0, 1] > 0.999
+        )
+    else:
+        assert image.pixels.shape == wanted.shape
+        inner = (slice(2, -2), slice(2, -2))
+        assert np.abs(image.pixels[inner].astype(int) - wanted[inner]).max() <= 12
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_compressed_pictures_are_found_beside_the_profiles_topic(
+    tmp_path, rig, room, picture, write_bag, cloud_message, suffix
+):
+    data = cv2.imencode(suffix, picture)[1].ravel()
+    fields = {"stamp_ns": T0_NS, "format": f"bgr8; {suffix[1:]} compressed bgr8", "data": data}
+    messages = [
+        (LIDAR, "PointCloud2", T0_NS, cloud_message(room, T0_NS)),
+        (f"{CAM}/compressed", "CompressedImage", T0_NS, fields),
+    ]
+    (image,), _ = read(open_recording(write_bag(tmp_path / "bag", "ros1", messages), rig))
+    assert np.abs(image.pixels.astype(int) - picture).mean() < (8 if suffix == ".jpg" else 1e-9)
+
+
+def test_topics_can_be_given_and_those_that_are_not_there_are_listed(tmp_path, rig, write_bag, stream):
+    bag = write_bag(tmp_path / "bag", "ros1", stream(2, cam="/front/image", lidar="/points"))
+    with pytest.raises(SourceError, match=rf"no topic {CAM} for cam\.frames") as caught:
+        open_recording(bag, rig)
+    assert has_note([caught.value.hint], "/front/image", "Image, 2", "/points", "PointCloud2, 2")
+    topics = {"cam": "/front/image", "lidar": "/points"}
+    images, scans = read(open_recording(bag, rig, SourceOptions(topics=topics)))
+    assert (len(images), len(scans)) == (2, 2)
+    for wrong, cause in [
+        ({**topics, "cam": "/x"}, r"no topic /x for cam\.frames"),
+        (
+            {**topics, "cam": "/points"},
+            "/points for cam.frames is sensor_msgs/PointCloud2, not sensor_msgs/Comp",
+        ),
+        ({**topics, "side": "/x"}, "no sensor 'side'; it has cam, cam.frames, lidar"),
+    ]:
+        with pytest.raises(SourceError, match=cause):
+            open_recording(bag, rig, SourceOptions(topics=wrong))
+
+
+def test_the_only_topic_of_its_kind_is_taken_where_the_profile_names_none(tmp_path, rig, write_bag, stream):
+    bag = write_bag(tmp_path / "bag", "mcap", stream(2, cam="/a", lidar="/b"))
+    lidars = {"lidar": rig.lidars["lidar"].model_copy(update={"topic": None})}
+    channels = {"frames": rig.cameras["cam"].channels["frames"].model_copy(update={"topic": None})}
+    cameras = {"cam": rig.cameras["cam"].model_copy(update={"channels": channels})}
+    recording = open_recording(bag, rig.model_copy(update={"lidars": lidars, "cameras": cameras}))
+    assert has_note(recording.notes, "cam.frames", "from /a", "only topic")
+
+
+def test_a_channel_whose_topic_is_not_in_the_bag_is_done_without(tmp_path, write_bag, stream):
+    rig = load_rig("rles")
+    bag = write_bag(tmp_path / "bag", "ros1", stream(2, cam="/davis/image_raw"))
+    images, scans = read(open_recording(bag, rig))
+    assert {i.channel for i in images} == {"frames"} and len(scans) == 2
+
+
+def test_stamps_that_run_backwards_or_twice_are_left_out_and_counted(
+    tmp_path, rig, room, picture, write_bag, cloud_message, image_message
+):
+    order = [0, 1, 3, 2, 3, 4]
+    messages = [
+        message
+        for k, place in enumerate(order)
+        for message in (
+            (LIDAR, "PointCloud2", T0_NS + k * STEP_NS, cloud_message(room, T0_NS + place * STEP_NS)),
+            (CAM, "Image", T0_NS + k * STEP_NS + 1, image_message(picture, T0_NS + k * STEP_NS)),
+        )
+    ]
+    recording = open_recording(write_bag(tmp_path / "bag", "sqlite3", messages), rig)
+    images, scans = read(recording)
+    assert len(images) == 6 and [(s.stamp_ns - T0_NS) // STEP_NS for s in scans] == [0, 1, 3, 4]
+    assert has_note(recording.notes, LIDAR, "1 out", "decrease")
+    assert has_note(recording.notes, LIDAR, "1 sent twice")
+
+
+def test_a_clock_that_is_set_back_starts_again(tmp_path, rig, write_bag, stream):
+    messages = [*stream(3)]
+    hour_ns = 3600 * 10**9
+    earlier = stream(3, t0_ns=T0_NS - hour_ns)
+    messages += [(topic, msgtype, log_ns + 2 * hour_ns, f) for topic, msgtype, log_ns, f in earlier]
+    recording = open_recording(write_bag(tmp_path / "bag", "ros1", messages), rig)
+    images, scans = read(recording)
+    assert (len(images), len(scans)) == (6, 6)
+    assert has_note(recording.notes, CAM, "1 jumps", "clock back")
+
+
+def test_messages_without_stamps_take_the_time_of_receipt(
+    tmp_path, rig, room, picture, write_bag, cloud_message, image_message
+):
+    messages = [
+        (LIDAR, "PointCloud2", T0_NS + 5, cloud_message(room, 0)),
+        (CAM, "Image", T0_NS + 7, image_message(picture, 0)),
+    ]
+    recording = open_recording(write_bag(tmp_path / "bag", "ros1", messages), rig)
+    (image,), (scan,) = read(recording)
+    assert (image.stamp_ns, scan.stamp_ns) == (T0_NS + 7, T0_NS + 5)
+    assert has_note(recording.notes, CAM, "no timestamps", "of receipt")
+
+
+def test_messages_that_contradict_themselves_are_left_out_and_counted(
+    tmp_path, rig, room, picture, write_bag, cloud_message, image_message
+):
+    def messages(n_bad):
+        for k in range(3):
+            stamp_ns = T0_NS + k * STEP_NS
+            cloud, image = cloud_message(room, stamp_ns), image_message(picture, stamp_ns)
+            if k < n_bad:
+                cloud["data"], image["encoding"] = cloud["data"][:-1], "bgr9"
+            yield LIDAR, "PointCloud2", stamp_ns, cloud
+            yield CAM, "Image", stamp_ns, image
+
+    recording = open_recording(write_bag(tmp_path / "some", "mcap", messages(1)), rig)
+    images, scans = read(recording)
+    assert (len(images), len(scans)) == (2, 2)
+    n_bytes = len(room) * 22
+    cause = f"{n_bytes - 1} of {n_bytes} bytes"
+    assert has_note(recording.notes, LIDAR, "1 could not", cause)
+    with pytest.raises(SourceError, match=r"no message of /.* could be used: "):
+        read(open_recording(write_bag(tmp_path / "all", "mcap", messages(3)), rig))
+
+
+def _only_file(bag):
+    return bag if bag.is_file() else next(p for p in bag.iterdir() if p.suffix in (".db3", ".mcap"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kept", [0.3, 0.6, 0.95])
+def test_a_torn_bag_gives_what_it_has_and_then_says_how_much(tmp_path, rig, write_bag, stream, kind, kept):
+    file = _only_file(write_bag(tmp_path / "bag", kind, stream(60)))
+    os.truncate(file, int(kept * file.stat().st_size))
+    samples = []
+    with pytest.raises(SourceError, match=rf"{file.name} (is damaged|cannot be read)") as caught:
+        for sample in open_recording(file, rig).samples():
+            samples.append(sample)
+    if kind != "sqlite3":
+        assert len(samples) > (kept - 0.25) * 120
+        assert f"{len(samples)} messages over" in caught.value.what
+        assert all(s.stamp_ns <= T0_NS + 60 * STEP_NS for s in samples)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "content", [b"", b"\x00" * 5000, b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\x00"]
+)
+def test_files_that_are_no_bags_are_named(tmp_path, rig, kind, content):
+    file = tmp_path / {"ros1": "a.bag", "sqlite3": "a.db3", "mcap": "a.mcap"}[kind]
+    file.write_bytes(content)
+    with pytest.raises(SourceError, match=rf"{file.name} cannot be read|{file.name}: no"):
+        open_recording(file, rig)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_flipped_bytes_raise_nothing_but_source_errors(tmp_path, rig, write_bag, stream, kind):
+    file = _only_file(write_bag(tmp_path / "bag", kind, stream(4)))
+    whole = file.read_bytes()
+    rng = np.random.default_rng(0)
+    n_read = 0
+    for _ in range(25):
+        damaged = bytearray(whole)
+        for position in rng.integers(0, len(whole), 8):
+            damaged[position] ^= 1 << int(rng.integers(8))
+        file.write_bytes(bytes(damaged))
+        try:
+            for sample in open_recording(file, rig).samples():
+                n_read += 1
+                assert len(sample.points if isinstance(sample, Scan) else sample.pixels) > 0
+        except SourceError as error:
+            assert file.name in error.what
+    assert n_read > 25
+
+
+def test_the_same_bag_has_the_same_key_wherever_it_lies(tmp_path, rig, write_bag, stream):
+    bag = write_bag(tmp_path / "bag", "mcap", stream(3))
+    key = open_recording(bag, rig).key
+    shutil.copytree(bag, tmp_path / "elsewhere" / "bag")
+    other = write_bag(tmp_path / "other" / "bag", "mcap", stream(4))
+    assert open_recording(tmp_path / "elsewhere" / "bag", rig).key == key != open_recording(other, rig).key
+
+
+def test_long_bags_are_streamed(tmp_path, rig, write_bag, room, cloud_message, image_message):
+    import tracemalloc
+
+    pixels = np.zeros((400, 600, 3), np.uint8)
+
+    def messages(n):
+        for k in range(n):
+            yield CAM, "Image", T0_NS + k, image_message(pixels, T0_NS + k)
+        yield LIDAR, "PointCloud2", T0_NS + n, cloud_message(room, T0_NS)
+
+    recording = open_recording(write_bag(tmp_path / "bag", "ros1", messages(60)), rig)
+    tracemalloc.start()
+    n = sum(1 for _ in recording.samples())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert n == 61 and peak < 12 * pixels.nbytes

@@ -1,0 +1,161 @@
+"""Packets of every Velodyne that is read become scans with its own beams and times."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lce_rig.core import velodyne
+from lce_rig.core.data import Scan
+from lce_rig.core.data_sheets import find_data_sheet
+from lce_rig.core.errors import SourceError
+from lce_rig.io import open_recording
+from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.ros.rosbag import BagRecording
+from lce_rig.io.velodyne.pcap import PcapRecording
+from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.rig import LidarSettings, Rig, load_rig
+
+RANGE_M, RATE_HZ, T0_US = 4.0, 10.0, 5_000_000
+
+
+def packets_of(product: velodyne.Product, n_revolutions: float, step_m: float) -> list[bytes]:
+    """Packets of a sensor in the middle of a sphere."""
+    n = int(n_revolutions / RATE_HZ * 1e9 / product.packet_ns(is_dual=False))
+    fields = np.zeros(n, velodyne.DATA_PACKET)
+    block = np.arange(n * velodyne.N_BLOCKS).reshape(n, -1)
+    fields["blocks"]["flag"] = velodyne.BLOCK_FLAG
+    turned = RATE_HZ * velodyne.AZIMUTH_STEPS * product.block_ns * 1e-9 * block
+    fields["blocks"]["azimuth"] = (17_990 + np.rint(turned).astype(int)) % velodyne.AZIMUTH_STEPS
+    fields["blocks"]["returns"]["range"] = round(RANGE_M / step_m)
+    fields["blocks"]["returns"]["reflectivity"] = 50
+    fields["us"] = T0_US + product.packet_ns(is_dual=False) * np.arange(n) // 1000
+    fields["mode"], fields["product"] = velodyne.STRONGEST, product.code
+    return [packet.tobytes() for packet in fields]
+
+
+@pytest.mark.parametrize("product", velodyne.READ, ids=lambda product: product.name)
+def test_scans_have_the_models_rings_and_times(product: velodyne.Product) -> None:
+    sheet = find_data_sheet(product.name)
+    assert sheet is not None
+    stream = Vlp16Stream("lidar", LidarSettings(model=product.name))
+    payloads = packets_of(product, 2.3, sheet.range_step_m)
+    arrivals_ns = 10**18 + product.packet_ns(is_dual=False) * np.arange(1, len(payloads) + 1)
+    pushed = [stream.push_data(payload, int(t)) for payload, t in zip(payloads, arrivals_ns, strict=True)]
+    scans = [scan for scan in pushed if scan is not None]
+    # The stream begins within a revolution.
+    assert len(scans) == 2 and {each.code for each in stream.losses.findings()} <= {"scan.partial"}
+    scan = scans[0]
+    assert np.linalg.norm(scan.points, axis=1) == pytest.approx(RANGE_M, abs=0.03)
+    flat_m = np.hypot(scan.points[:, 0], scan.points[:, 1])
+    elevation = np.arctan2(scan.points[:, 2], flat_m)
+    seen = np.array([np.median(elevation[scan.ring == ring]) for ring in range(sheet.n_rings)])
+    # At 4 m, the laser's own height bends it by up to 0.3 deg.
+    assert seen == pytest.approx(sheet.rings_rad, abs=0.006)
+    n_per_ring = np.bincount(scan.ring)
+    assert n_per_ring == pytest.approx(2 * np.pi / sheet.step_rad(RATE_HZ), abs=2)
+    assert scan.offset_ns is not None
+    assert 0 <= scan.offset_ns.min() < 60_000 and scan.offset_ns.max() == pytest.approx(0.1e9, abs=200_000)
+
+
+def test_packets_of_another_model_than_the_profiles_are_counted_not_read() -> None:
+    stream = Vlp16Stream("lidar", LidarSettings(model="VLP-32C"))
+    for payload in packets_of(velodyne.READ[0], 0.1, 0.002):
+        assert stream.push_data(payload, 0) is None
+    assert set(stream.other_models) == {"VLP-16"} and stream.n_data == 0
+
+
+def test_a_model_without_packets_is_named() -> None:
+    with pytest.raises(SourceError, match="packets of OS1-64 are not read") as caught:
+        Vlp16Stream("lidar", LidarSettings(model="OS1-64"))
+    assert "HDL-32E" in caught.value.hint
+
+
+def write_packets(path: Path, kind: str, payloads: list[bytes], arrivals_ns: list[int]) -> Path:
+    """Write a bag of VelodyneScan messages of 40 packets each, as the ROS drivers record them."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    is_ros1 = kind == "ros1"
+    store: Any = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    packet_text, scan_text = (
+        "time stamp\nuint8[1206] data",
+        "std_msgs/Header header\nVelodynePacket[] packets",
+    )
+    if not is_ros1:
+        packet_text = packet_text.replace("time stamp", "builtin_interfaces/Time stamp")
+    store.register(get_types_from_msg(packet_text, "velodyne_msgs/msg/VelodynePacket"))
+    store.register(get_types_from_msg(scan_text, "velodyne_msgs/msg/VelodyneScan"))
+    packet_type, scan_type, header_type, time_type = (
+        store.types[name]
+        for name in (
+            "velodyne_msgs/msg/VelodynePacket",
+            "velodyne_msgs/msg/VelodyneScan",
+            "std_msgs/msg/Header",
+            "builtin_interfaces/msg/Time",
+        )
+    )
+    writer: Any
+    if is_ros1:
+        writer = Writer1(path.with_suffix(".bag"))
+    else:
+        writer = Writer2(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
+    with writer:
+        name = "velodyne_msgs/msg/VelodyneScan"
+        topic = writer.add_connection("/velodyne_packets", name, typestore=store)
+        for first in range(0, len(payloads), 40):
+            stamps = [time_type(t // 10**9, t % 10**9) for t in arrivals_ns[first : first + 40]]
+            packets = [
+                packet_type(stamp, np.frombuffer(payload, np.uint8))
+                for stamp, payload in zip(stamps, payloads[first : first + 40], strict=True)
+            ]
+            header = header_type(**({"seq": 0} if is_ros1 else {}), stamp=stamps[-1], frame_id="velodyne")
+            serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+            data = serialize(scan_type(header, packets), name)
+            writer.write(topic, arrivals_ns[first : first + 40][-1], data)
+    return path.with_suffix(".bag") if is_ros1 else path
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_packets_in_bags_become_the_scans_that_they_are_in_a_pcap(
+    tmp_path: Path, rig: Rig, kind: str
+) -> None:
+    product = velodyne.READ[0]
+    payloads = packets_of(product, 2.3, 0.002)
+    arrivals_ns = [10**18 + product.packet_ns(is_dual=False) * (k + 1) for k in range(len(payloads))]
+    stream = Vlp16Stream("lidar", rig.lidars["lidar"])
+    pushed = [stream.push_data(payload, t) for payload, t in zip(payloads, arrivals_ns, strict=True)]
+    bag = write_packets(tmp_path / "packets", kind, payloads, arrivals_ns)
+    recording = open_recording(bag, rig, SourceOptions(topics={"lidar": "/velodyne_packets"}, is_part=True))
+    assert isinstance(recording, BagRecording)
+    scans = list(recording.samples())
+    wanted = [scan for scan in pushed if scan is not None]
+    assert len(scans) == len(wanted) == 2
+    for scan, other in zip(scans, wanted, strict=True):
+        assert isinstance(scan, Scan) and scan.stamp_ns == other.stamp_ns
+        np.testing.assert_array_equal(scan.points, other.points)
+    assert any("vertical offsets" in note for note in recording.notes)
+
+
+def test_a_bag_of_another_models_packets_is_refused_with_its_name(tmp_path: Path, rig: Rig) -> None:
+    payloads = packets_of(velodyne.product_of("HDL-32E") or velodyne.READ[0], 0.2, 0.002)
+    bag = write_packets(tmp_path / "packets", "mcap", payloads, [10**18 + k for k in range(len(payloads))])
+    recording = open_recording(bag, rig, SourceOptions(topics={"lidar": "/velodyne_packets"}, is_part=True))
+    assert isinstance(recording, BagRecording)
+    with pytest.raises(SourceError, match="HDL-32E, not of a VLP-16") as caught:
+        list(recording.samples())
+    assert "Set the model" in (caught.value.hint or "")
+
+
+@pytest.mark.dataset
+def test_a_recorded_hdl32e_is_read(recordings: Path) -> None:
+    path = recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_hdl32.pcap"
+    recording = open_recording(path, load_rig("hdl32e"), SourceOptions(is_part=True))
+    assert isinstance(recording, PcapRecording)
+    (scan,) = recording.samples()
+    elevation = np.degrees(np.arctan2(scan.points[:, 2], np.hypot(scan.points[:, 0], scan.points[:, 1])))
+    top = np.median(elevation[scan.ring == 31])
+    assert len(scan.points) > 50_000 and top == pytest.approx(10.67, abs=0.3)

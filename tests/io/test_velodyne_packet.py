@@ -1,0 +1,104 @@
+"""Only whole packets of a VLP-16 are believed."""
+
+import struct
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lce_rig.core import velodyne
+from lce_rig.io.velodyne.packet import (
+    BadPacketError,
+    OtherModelError,
+    read_data_packet,
+    read_position_packet,
+)
+
+from .vlp16_room import (
+    packets_of,
+    room_scans,
+)
+
+US_AT, MODE_AT, PRODUCT_AT = 1200, 1204, 1205
+
+
+@pytest.fixture(scope="module")
+def payload() -> bytes:
+    return packets_of(room_scans(1))[20].payload
+
+
+def damage(payload: bytes, at: int, value: bytes) -> bytes:
+    return payload[:at] + value + payload[at + len(value) :]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "cause"),
+    [
+        (lambda p: p[:-1], "packet.wrong_length"),
+        (lambda p: p + b"\0", "packet.wrong_length"),
+        (lambda p: b"", "packet.wrong_length"),
+        (lambda p: damage(p, 500, b"\xff\xdd"), "packet.wrong_flag"),
+        (lambda p: damage(p, 1102, struct.pack("<H", 36000)), "packet.azimuth_beyond_360"),
+        (lambda p: damage(p, 502, struct.pack("<H", 20000)), "packet.uneven_azimuths"),
+        (lambda p: damage(p, MODE_AT, b"\x39"), "packet.uneven_azimuths"),
+        (lambda p: damage(p, US_AT, struct.pack("<I", velodyne.HOUR_US)), "packet.time_beyond_hour"),
+        (lambda p: damage(p, MODE_AT, b"\0\0"), "packet.unknown_factory_bytes"),
+        (lambda p: damage(p, PRODUCT_AT, b"\x23"), "packet.unknown_factory_bytes"),
+    ],
+)
+def test_a_damaged_data_packet_is_refused_with_its_cause(
+    spoil: Callable[[bytes], bytes], cause: str, payload: bytes
+) -> None:
+    read_data_packet(payload, 0)
+    with pytest.raises(BadPacketError, match=cause):
+        read_data_packet(spoil(payload), 0)
+
+
+def test_blocks_of_a_rotor_that_stands_still_are_refused(payload: bytes) -> None:
+    fields = np.frombuffer(payload, velodyne.DATA_PACKET).copy()
+    fields["blocks"]["azimuth"] = 12345
+    for mode in (velodyne.STRONGEST, velodyne.DUAL):
+        fields["mode"] = mode
+        with pytest.raises(BadPacketError, match="uneven_azimuths"):
+            read_data_packet(fields.tobytes(), 0)
+
+
+@pytest.mark.parametrize(("product", "name"), sorted(velodyne.PRODUCTS.items()))
+def test_other_velodynes_are_refused_by_name(product: int, name: str, payload: bytes) -> None:
+    other = damage(payload, PRODUCT_AT, bytes([product]))
+    if name == "VLP-16":
+        assert read_data_packet(other, 0).mode == velodyne.STRONGEST
+        return
+    with pytest.raises(OtherModelError) as caught:
+        read_data_packet(other, 0)
+    assert caught.value.model == name
+
+
+@given(st.binary(max_size=600))
+def test_whatever_comes_as_a_position_packet_is_read_or_refused(payload: bytes) -> None:
+    for body in (payload, payload.ljust(velodyne.POSITION_BYTES, b"\0")[: velodyne.POSITION_BYTES]):
+        try:
+            read = read_position_packet(body, 1)
+        except BadPacketError:
+            continue
+        assert 0 <= read.us < velodyne.HOUR_US and read.pps in range(4)
+
+
+@pytest.mark.parametrize(
+    ("sentence", "second"),
+    [
+        (b"$GPRMC,081802.00,A,3649.7478558,N,00224.4542928,W,0.034,212.5,210116,0.0,E,A*2E\r\n", 1082),
+        (b"$GPRMC,220516,A,5133.82,N,00042.24,W,173.8,231.8,130694,004.2,W*70\n", 316),
+        (b"$GPRMC,220516,A,5133.82,N,00042.24,W,173.8,231.8,130694,004.2,W*71\n", None),
+        (b"$GNRMC,220516,V,,,,,,,130694,,,N*7A", None),
+        (b"$GPGGA,220516,1,1*6C", None),
+        (b"$GPRMC,226516,A,5133.82,N,00042.24,W,173.8,231.8,130694,004.2,W*76\n", None),
+        (b"\xff" * 306, None),
+    ],
+)
+def test_only_sound_sentences_tell_the_time(sentence: bytes, second: int | None) -> None:
+    body = bytearray(velodyne.POSITION_BYTES)
+    body[0xCE : 0xCE + len(sentence)] = sentence
+    assert read_position_packet(bytes(body), 0).nmea_s == second

@@ -1,0 +1,145 @@
+"""Two cameras before the same boards: silent where both are sound, outspoken where one was moved."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.core.geometry import difference, invert, perturb
+from lce_rig.core.results import Observation
+from lce_rig.judge.camera_pairs import camera_findings, pose_from_images, relate, shared_boards
+from lce_rig.rig.thresholds import CalibrationSettings, VerdictSettings
+from tests.calibrate.boards import BOARD
+from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
+
+OPTIONS = EstimateSettings(n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+TARGET, LIMITS = CalibrationSettings(), VerdictSettings()
+N_SOUND = 21
+TURNED = np.array([0, 0, 0, 0, np.radians(0.5), 0])
+
+
+def observed(session):
+    """Pair both cameras' boards as a calibration would, whose consensus is not what is tested."""
+    return list(
+        zip(
+            *([Observation(c.capture, c.image, c.lidar[0]) for c in session[name]] for name in (LEFT, RIGHT)),
+            strict=True,
+        )
+    )
+
+
+def related(session):
+    left, right = (fit_extrinsic(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
+    return relate(left, right)
+
+
+def findings(pair):
+    return camera_findings(pair, (LEFT, RIGHT), TARGET, LIMITS)
+
+
+@pytest.fixture(scope="module")
+def sound():
+    """Sessions of 12 captures, with lasers off by 8 mm and a beam that reaches 8 mm over edges."""
+    return [simulate_two(12, seed) for seed in range(N_SOUND)]
+
+
+def test_pictures_alone_find_where_cameras_sit_as_well_as_they_claim(sound):
+    found = [pose_from_images(observed(session)) for session in sound]
+    errors = np.array([difference(each.T_second_first, T_RIGHT_LEFT) for each in found])
+    assert np.degrees(np.sqrt(np.mean(np.sum(errors[:, 3:] ** 2, axis=1)))) < 0.03
+    assert np.sqrt(np.mean(np.sum(errors[:, :3] ** 2, axis=1))) < 0.001
+    nees = [e @ np.linalg.solve(f.cov, e) for e, f in zip(errors, found, strict=True)]
+    # 6 expected; the mean of 21 samples of chi square with 6 degrees has a standard error of 0.76, and
+    # covariances from 12 captures have heavier tails than that.
+    assert 3.5 < np.mean(nees) < 10
+
+
+def test_of_few_boards_the_claim_is_that_of_usual_errors(sound):
+    found = [pose_from_images(observed(session)[:5]) for session in sound]
+    errors = [difference(each.T_second_first, T_RIGHT_LEFT) for each in found]
+    nees = [e @ np.linalg.solve(f.cov, e) for e, f in zip(errors, found, strict=True)]
+    # Corners of a simulated lens have no errors in common: the claim is rather too large.
+    assert 0.5 < np.mean(nees) < 8
+
+
+@pytest.mark.long
+def test_sound_sessions_are_not_questioned(sound):
+    for session in sound:
+        pair = related(session)
+        assert len(pair.captures) == 12
+        assert pair.surprise < 16.81
+        assert findings(pair) == []
+
+
+@pytest.mark.parametrize(
+    ("nudge", "figure", "size"),
+    [(TURNED, "rotation_deg", 0.5), (np.array([0.02, 0, 0, 0, 0, 0]), "translation_m", 0.024)],
+    ids=["turned", "shifted"],
+)
+@pytest.mark.parametrize("seed", range(2))
+def test_a_camera_that_is_nudged_on_the_way_is_found_by_the_pictures(seed, nudge, figure, size):
+    found = findings(related(simulate_two(12, seed, nudge=nudge, nudged_from=6)))
+    (change,) = (finding for finding in found if finding.code == "verdict.camera_changed")
+    assert change.subject.split(" to ") == [LEFT, RIGHT]
+    assert change.figures["capture"] == "000006"
+    assert change.figure(figure) == pytest.approx(size, rel=0.25)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_extrinsics_that_contradict_the_pictures_are_told_with_how_far_apart_they_put_boards(seed):
+    """An extrinsic made before the camera was turned, captures of both from after it."""
+    session = simulate_two(12, seed)
+    left, right = (fit_extrinsic(session[name], BOARD, OPTIONS) for name in (LEFT, RIGHT))
+    stale = replace(right, T_cam_lidar=perturb(right.T_cam_lidar, 2 * TURNED))
+    (apart,) = findings(relate(left, stale))
+    assert apart.code == "verdict.cameras_differ"
+    assert apart.subject.split(" to ") == [LEFT, RIGHT]
+    # Boards lie 1.2 to 3.5 m away: 1 deg is 21 to 61 mm.
+    assert 0.025 < apart.figure("rms_m") < 0.055
+
+
+def test_cameras_that_wrongly_scaled_lenses_see_the_boards_in_different_places(sound):
+    session = observed(sound[0])
+    longer = []
+    for left, right in session:
+        T = right.image.T_cam_board.copy()
+        T[:3, 3] *= 1.03
+        longer.append((left, replace(right, image=replace(right.image, T_cam_board=T))))
+    plain, scaled = (pose_from_images(each) for each in (session, longer))
+    assert plain.scatter < 2 < scaled.scatter
+    assert plain.board_rms_m < 0.002 < 0.012 < scaled.board_rms_m
+
+
+def test_a_board_seen_wrongly_hardly_matters(sound):
+    session = observed(sound[1])
+    left, right = session[3]
+    wrong = perturb(right.image.T_cam_board, np.array([0.05, 0, 0.1, 0.2, 0, 0]))
+    session[3] = left, replace(right, image=replace(right.image, T_cam_board=wrong))
+    error = difference(pose_from_images(session).T_second_first, T_RIGHT_LEFT)
+    assert np.degrees(np.linalg.norm(error[3:])) < 0.1
+    assert np.linalg.norm(error[:3]) < 0.003
+
+
+def test_few_boards_tell_nothing_and_none_no_pair(sound):
+    session = sound[2]
+    assert pose_from_images(observed(session)[:3]) is None
+    left = fit_extrinsic(session[LEFT][:6], BOARD, OPTIONS)
+    right = fit_extrinsic(session[RIGHT][6:], BOARD, OPTIONS)
+    assert relate(left, right) is None
+    three = relate(left, fit_extrinsic(session[RIGHT][3:], BOARD, OPTIONS))
+    assert three.from_images is None
+    assert len(three.captures) == 3
+    assert findings(three) == []
+    T = TRUTH[RIGHT] @ invert(TRUTH[LEFT])
+    assert np.linalg.norm(difference(three.T_second_first, T)[:3]) < 0.05
+
+
+def test_boards_are_paired_by_their_scan_whatever_their_captures_are_called(sound):
+    pairs = observed(sound[3])
+    left = {o.capture: o for o, _ in pairs}
+    renamed = {f"{k:06d}": replace(o, capture=f"{k:06d}") for k, (_, o) in enumerate(pairs, 100)}
+    shared = shared_boards(left, renamed)
+    assert [(one.capture, int(other.capture)) for one, other in shared] == [
+        (f"{k:06d}", k + 100) for k in range(12)
+    ]

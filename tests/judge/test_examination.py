@@ -1,0 +1,240 @@
+"""Checks on a result's own captures: true where nothing is wrong, and each sees what it is made for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.local_quadratic import SCALE, SHIFT, expand
+from lce_rig.core.geometry import difference, perturb
+from lce_rig.core.results import Observation
+from lce_rig.judge.negative_control import control_findings, run_control
+from lce_rig.judge.nuisances import estimate_nuisances, nuisance_findings
+from lce_rig.judge.split_consistency import contrast_halves, find_groups, split_findings
+from lce_rig.judge.validate import resample, validate, widening
+from lce_rig.rig import CalibrationSettings, VerdictSettings, load_rig
+from lce_rig.words import describe
+from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
+
+RIG = load_rig("rlfs")
+LIMITS, TARGET = VerdictSettings(), CalibrationSettings()
+FAST = EstimateSettings("paper", n_draws=0)
+# Any method's result lies about as far from the truth.
+T_NEAR = perturb(T_FORWARD, np.array([0.003, -0.002, 0.004, 0.001, -0.001, 0.001]))
+
+
+def calibrated(n=20, seed=1):
+    return fit_extrinsic(simulate(n, seed), BOARD, FAST)
+
+
+def observed(n=15, seed=1, scenario=None):
+    return [Observation(item.capture, item.image, item.lidar[0]) for item in simulate(n, seed, scenario)]
+
+
+def expanded(observations, T=T_NEAR, laser=0.008, offset=0.005, is_scale_free=False):
+    every = expand(observations, BOARD, T, laser_bias_sigma_m=laser, range_offset_sigma_m=offset)
+    return every if is_scale_free else every.hold(SCALE)
+
+
+def nuisances(observations, first_ring=0):
+    rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
+    return estimate_nuisances(expanded(observations, is_scale_free=True), rings + first_ring)
+
+
+def middles(observations):
+    return np.array([seen.image.T_cam_board[:3, 3] for seen in observations])
+
+
+def moved(seen, T_cam_board):
+    return replace(seen, image=replace(seen.image, T_cam_board=T_cam_board))
+
+
+def test_one_step_from_nearby_leads_to_the_same_optimum():
+    observations = observed(20)
+    every = np.ones((1, 20))
+    first, second = (perturb(T, expanded(observations, T).solve(every)[0, :6]) for T in (T_FORWARD, T_NEAR))
+    apart, start = difference(first, second), difference(T_NEAR, T_FORWARD)
+    assert np.linalg.norm(apart[:3]) < 0.35 * np.linalg.norm(start[:3])
+    assert np.linalg.norm(apart[3:]) < 0.35 * np.linalg.norm(start[3:])
+
+
+def test_the_second_opinion_is_as_near_to_the_truth_as_its_covariance_says():
+    nees = []
+    for seed in range(6):
+        expansion = expanded(observed(15, seed, Scenario(laser_bias_sigma_m=0.008)))
+        error = difference(perturb(T_NEAR, expansion.optimum()[:6]), T_FORWARD)
+        nees.append(error @ np.linalg.solve(expansion.covariance()[:6, :6], error))
+    # Weights that come from medians make it careful: six is the mean where it is exact.
+    assert 1.0 < np.mean(nees) < 8.0
+
+
+def test_offsets_of_single_lasers_and_the_edge_shift_are_found():
+    def lengthened(seen, ring, by_m):
+        lidar = seen.lidar
+        rays = lidar.points / np.linalg.norm(lidar.points, axis=1, keepdims=True)
+        points = lidar.points + by_m * (lidar.ring == ring)[:, None] * rays
+        return replace(seen, lidar=replace(lidar, points=points))
+
+    boards = [lengthened(seen, 8, 0.04) for seen in observed(25, 3, Scenario(footprint_m=0.006))]
+    found = nuisances(boards)
+    assert found.laser == 8
+    assert nuisances(boards, first_ring=3).laser == 11
+    assert abs(found.laser_offset_m - 0.04) < 0.012
+    assert abs(found.edge_shift_m - 0.006) < 0.0025
+
+
+def test_scales_agree_within_their_sigma_where_the_board_is_right():
+    errors = []
+    for seed in range(6):
+        found = nuisances(observed(15, seed))
+        errors.append(found.scale / found.scale_sigma)
+    assert np.sqrt(np.mean(np.square(errors))) < 1.6
+
+
+def test_what_cannot_be_gives_findings_and_what_can_is_not():
+    found = nuisances(observed())
+    lidar = RIG.lidars["lidar"]
+    assert nuisance_findings(found, BOARD, lidar, LIMITS) == []
+    for changed, code in (
+        (replace(found, scale=0.03, scale_sigma=0.001), "verdict.scale"),
+        (replace(found, edge_shift_m=0.05), "verdict.edge_shift"),
+        (replace(found, laser_offset_m=-0.06, laser=7), "verdict.laser_offset"),
+    ):
+        (finding,) = nuisance_findings(changed, BOARD, lidar, LIMITS)
+        assert finding.code == code
+
+
+@pytest.mark.parametrize(("angle_deg", "severity"), [(0.0, None), (0.6, "warning"), (2.0, "error")])
+def test_a_sensor_nudged_on_the_way_is_found_with_the_capture(angle_deg, severity):
+    nudge = perturb(np.eye(4), np.array([0, 0, 0, np.radians(angle_deg), 0, 0]))
+    nudged = [
+        moved(seen, nudge @ seen.image.T_cam_board) if k >= 12 else seen
+        for k, seen in enumerate(observed(20, 4))
+    ]
+    contrasts = contrast_halves(expanded(nudged).settled(), middles(nudged))
+    names = [seen.capture for seen in nudged]
+    findings = split_findings(contrasts[:1], names, TARGET, LIMITS)
+    assert [finding.severity for finding in findings] == ([] if severity is None else [severity])
+    if severity is not None:
+        assert abs(contrasts[0].n_first - 12) <= 1
+        assert abs(contrasts[0].rotation_deg - angle_deg) < 0.3 * angle_deg
+
+
+def test_near_boards_that_say_something_else_than_far_ones_are_found():
+    turn = perturb(np.eye(4), np.array([0, 0, 0, 0, np.radians(1.0), 0]))
+    boards = observed(24, 5)
+    distances_m = [np.linalg.norm(seen.image.T_cam_board[:3, 3]) for seen in boards]
+    boards = [
+        moved(seen, turn @ seen.image.T_cam_board) if distance_m < np.median(distances_m) else seen
+        for seen, distance_m in zip(boards, distances_m, strict=True)
+    ]
+    found = contrast_halves(expanded(boards).settled(), middles(boards))
+    findings = split_findings(found, [seen.capture for seen in boards], TARGET, LIMITS)
+    assert any(finding.figures.get("first") == "near" for finding in findings)
+
+
+def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest():
+    nudge = perturb(np.eye(4), np.array([0, 0, 0, np.radians(1.0), 0, 0]))
+    away = (1, 4, 5, 9, 13)
+    nudged = [
+        moved(seen, nudge @ seen.image.T_cam_board) if k in away else seen
+        for k, seen in enumerate(observed(16, 4))
+    ]
+    found = find_groups(expanded(nudged).settled())
+    (finding,) = split_findings(found, [seen.capture for seen in nudged], TARGET, LIMITS)
+    assert finding.code == "verdict.two_groups"
+    assert finding.figures["captures"] == tuple(f"{k:06d}" for k in away)
+    assert "5 captures (000001, 000004, 000005, 000009, 000013) fit" in describe(finding)
+    assert finding.figures["rotation_deg"] == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_change_at_one_capture_is_not_told_as_two_groups_as_well():
+    nudge = perturb(np.eye(4), np.array([0, 0, 0, np.radians(1.0), 0, 0]))
+    nudged = [
+        moved(seen, nudge @ seen.image.T_cam_board) if k >= 8 else seen
+        for k, seen in enumerate(observed(16, 4))
+    ]
+    settled = expanded(nudged).settled()
+    contrasts = (*contrast_halves(settled, middles(nudged)), *find_groups(settled))
+    assert contrasts[-1].excess(TARGET, LIMITS) > 1
+    codes = [each.code for each in split_findings(contrasts, [o.capture for o in nudged], TARGET, LIMITS)]
+    assert codes == ["verdict.changed"]
+
+
+def test_a_sound_session_has_no_groups_more_often_than_by_chance():
+    chances = [find_groups(expanded(observed(15, seed)).settled())[0].chance for seed in range(8)]
+    assert min(chances) > 0.001
+    assert np.median(chances) > 0.05
+
+
+def test_a_sound_session_shows_no_contrast_more_often_than_by_chance():
+    chances = [
+        contrast.chance
+        for seed in range(8)
+        for contrast in contrast_halves(expanded(observed(15, seed)).settled(), middles(observed(15, seed)))
+    ]
+    assert np.mean(np.array(chances) < 0.001) == 0
+    assert np.mean(np.array(chances) < 0.05) < 0.2
+
+
+def test_moving_a_sound_result_makes_left_out_captures_worse_and_moving_a_bad_one_better():
+    estimate = calibrated(20, 6)
+    observations = [estimate.observations[name] for name in estimate.used]
+    settled = expanded(observations, estimate.T_cam_lidar).settled()
+    good = run_control(observations, BOARD, estimate.T_cam_lidar, estimate.cov, settled, TARGET, 3.0)
+    assert control_findings(good) == []
+    bad = perturb(estimate.T_cam_lidar, good.moves[-1])
+    findings = control_findings(run_control(observations, BOARD, bad, estimate.cov, settled, TARGET, 3.0))
+    assert [finding.severity for finding in findings] == ["error"]
+
+
+def test_the_control_moves_a_result_by_no_less_than_the_target():
+    observations = observed(12, 6)
+    settled = expanded(observations).settled()
+    moves = run_control(observations, BOARD, T_NEAR, 1e-10 * np.eye(6), settled, TARGET, 3.0).moves
+    sizes_deg, sizes_m = (
+        np.degrees(np.linalg.norm(moves[:, 3:], axis=1)),
+        np.linalg.norm(moves[:, :3], axis=1),
+    )
+    assert np.maximum(sizes_deg / 0.2, sizes_m / 0.01) == pytest.approx(np.ones(12))
+
+
+def test_a_claim_that_captures_contradict_is_widened_with_the_reason():
+    estimate = calibrated(20, 7)
+    observations = [estimate.observations[name] for name in estimate.used]
+    spread = resample(expanded(observations, estimate.T_cam_lidar).settled())
+    assert widening(estimate.cov, spread, LIMITS) == (1.0, None)
+    bold = estimate.cov / 25
+    factor, remark = widening(bold, spread, LIMITS)
+    assert remark.code == "verdict.widened" and remark.figures["ratio"] == factor
+    assert spread.ratio_to(factor**2 * bold)[0] == pytest.approx(1.0)
+
+
+def test_three_ways_of_resampling_agree_with_the_scatter_over_sessions():
+    errors, claims = [], []
+    for seed in range(6):
+        expansion = expanded(observed(20, seed))
+        settled = expansion.settled()
+        errors.append(difference(perturb(T_NEAR, expansion.optimum()[:6]), T_FORWARD))
+        spread = resample(settled)
+        claims.append([np.trace(cov[3:, 3:]) for cov in (spread.bootstrap, spread.left_out, spread.halves)])
+    actual = np.mean(np.sum(np.array(errors)[:, 3:] ** 2, axis=1))
+    ratios = np.sqrt(np.mean(claims, axis=0) / actual)
+    assert np.all((ratios > 0.4) & (ratios < 2.5))
+
+
+def test_few_placements_leave_nothing_to_be_left_out():
+    estimate = calibrated(20, 1)
+    few = {name: estimate.fitted[estimate.used[k % 3]] for k, name in enumerate(estimate.used)}
+    estimate = replace(estimate, fitted=few)
+    examination = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA, [])
+    assert examination.control is None
+    assert examination.contrasts == ()
+    assert np.array_equal(examination.cov, estimate.cov)
+
+
+def test_settled_expansions_are_at_their_optimum():
+    settled = expanded(observed(20)).settled()
+    assert settled.gradients.shape[1] == SHIFT
+    assert np.abs(settled.solve(np.ones((1, 20)))).max() < 1e-9

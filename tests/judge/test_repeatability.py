@@ -1,0 +1,158 @@
+"""Repeated calibrations: sound ones agree, an odd one is named, and the finding says by how much."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.geometry import exp_so3, perturb, pose
+from lce_rig.core.results import Calibration, Certificate, Metrics
+from lce_rig.judge.repeatability import compare_calibrations
+
+TRUTH = pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.1, -0.06, -0.08]))
+# Translation and rotation are correlated, as they are behind a rotation about far boards.
+ROOT = np.diag([2e-3, 2e-3, 4e-3, 1e-3, 1e-3, 8e-4]) @ (np.eye(6) + 0.5 * np.eye(6, k=4))
+COV = ROOT @ ROOT.T
+
+
+def calibration(T, cov=COV, **diagnostics) -> Calibration:
+    return Calibration(
+        camera="cam",
+        channels=("frames",),
+        lidar="lidar",
+        T_cam_lidar=T,
+        cov=cov,
+        certificate=Certificate(True, 1e-9),
+        metrics=Metrics(0.008, 0.006, 0.1),
+        n_captures=20,
+        n_detected=20,
+        captures_used=("000000",),
+        captures_refused={},
+        verdict="pass",
+        diagnostics=Diagnostics(**diagnostics),
+    )
+
+
+def sessions(n, seed, factor=1.0, cov=COV):
+    """Calibrations scattered by `factor` times what their covariance says."""
+    rng = np.random.default_rng(seed)
+    root = factor * np.linalg.cholesky(cov)
+    return {f"day{k}": calibration(perturb(TRUTH, root @ rng.standard_normal(6)), cov) for k in range(n)}
+
+
+def test_sound_calibrations_spread_as_their_covariance_says():
+    compared = [compare_calibrations(sessions(3, seed)) for seed in range(100)]
+    chi2 = np.array([one.chi2 for one in compared])
+    assert all(one.dof == 12 for one in compared)
+    assert np.mean(chi2) == pytest.approx(12, abs=4 * np.sqrt(2 * 12 / 100))
+    assert np.mean([one.p for one in compared]) == pytest.approx(0.5, abs=0.1)
+    assert np.mean([one.agrees for one in compared]) > 0.96
+    distances = np.array([[pair.distance**2 for pair in one.differences] for one in compared])
+    assert np.mean(distances) == pytest.approx(6, rel=0.12)
+    spread = np.mean([one.spread_translation_m**2 for one in compared])
+    assert spread == pytest.approx(np.mean([one.reported_translation_m**2 for one in compared]), rel=0.15)
+
+
+def test_agreement_is_a_note_with_both_figures():
+    compared = compare_calibrations(sessions(3, 0))
+    found = compared.finding
+    assert (found.code, found.severity) == ("repeat.agree", "note")
+    assert (found.figures["camera"], found.figures["lidar"], found.figures["n_sessions"]) == (
+        "cam",
+        "lidar",
+        3,
+    )
+    assert found.figure("translation_m") == compared.max_translation_m
+    assert not found.figures["is_generous"]
+    assert compared.max_rotation_deg == max(pair.rotation_deg for pair in compared.differences)
+
+
+def test_generous_uncertainties_are_called_so():
+    assert compare_calibrations(sessions(4, 1, 0.2)).finding.figures["is_generous"]
+
+
+def test_uncertainties_that_are_too_small_are_found_out():
+    compared = compare_calibrations(sessions(4, 2, factor=4.0))
+    assert not compared.agrees
+    assert compared.ratio == pytest.approx(4, rel=0.4)
+    assert compared.odd_one is None
+    assert (compared.finding.code, compared.finding.action) == ("repeat.disagree", "")
+    assert compared.finding.figure("ratio") == compared.ratio
+
+
+def test_the_one_that_stands_apart_is_named():
+    three = sessions(4, 3)
+    moved = perturb(three["day2"].T_cam_lidar, np.array([0.03, 0, 0, 0, 0.02, 0]))
+    compared = compare_calibrations(three | {"day2": replace(three["day2"], T_cam_lidar=moved)})
+    assert not compared.agrees
+    assert compared.odd_one == "day2"
+    assert (compared.finding.action, compared.finding.figures["odd_one"]) == ("odd_one", "day2")
+    worst = max(compared.differences, key=lambda pair: pair.distance)
+    assert "day2" in (worst.first, worst.second)
+
+
+def test_of_two_that_disagree_none_is_blamed():
+    two = sessions(2, 4, factor=10.0)
+    assert compare_calibrations(two).odd_one is None
+
+
+def test_the_mean_lies_between_and_the_order_does_not_matter():
+    sure = calibration(perturb(TRUTH, np.full(6, 1e-3)), 1e-4 * COV)
+    rough = calibration(perturb(TRUTH, np.full(6, -1e-3)), COV)
+    compared = compare_calibrations({"sure": sure, "rough": rough})
+    assert np.allclose(compared.T_cam_lidar, TRUTH, atol=1e-5)
+    assert np.allclose(compared.deviations, [np.full(6, 1e-3), np.full(6, -1e-3)], atol=1e-5)
+    swapped = compare_calibrations({"rough": rough, "sure": sure})
+    assert swapped.chi2 == pytest.approx(compared.chi2, rel=1e-6)
+    assert np.allclose(swapped.T_cam_lidar, compared.T_cam_lidar, atol=1e-9)
+
+
+def test_one_that_is_sure_counts_by_its_own_uncertainty():
+    sure = calibration(TRUTH, 1e-4 * COV)
+    near = calibration(perturb(TRUTH, np.linalg.cholesky(COV) @ np.full(6, 0.5)), COV)
+    assert compare_calibrations({"sure": sure, "near": near}).chi2 == pytest.approx(6 * 0.25, rel=0.01)
+
+
+def test_a_half_turn_between_extrinsics_is_no_obstacle():
+    far = {"a": calibration(TRUTH), "b": calibration(perturb(TRUTH, np.array([0, 0, 0, 0, 0, 3.0])))}
+    compared = compare_calibrations(far)
+    assert compared.max_rotation_deg == pytest.approx(np.degrees(3.0), rel=1e-6)
+    assert not compared.agrees
+
+
+def test_the_part_that_can_differ_is_reported_where_all_say_it():
+    figures = {"sigma_scatter_rotation_deg": 0.05, "sigma_scatter_translation_m": 0.002}
+    both = {name: calibration(TRUTH, **figures) for name in ("a", "b")}
+    assert compare_calibrations(both).scatter_rotation_deg == pytest.approx(0.05)
+    assert compare_calibrations(both | {"c": calibration(TRUTH)}).scatter_translation_m is None
+
+
+def test_one_calibration_is_not_compared_with_nothing():
+    with pytest.raises(ValueError, match="requires two calibrations"):
+        compare_calibrations({"a": calibration(TRUTH)})
+
+
+@pytest.mark.parametrize("correlation", [-1.0, 0.0, 0.7])
+def test_results_of_the_same_captures_are_not_accused_whatever_their_correlation(correlation):
+    root = np.linalg.cholesky(COV)
+    rng = np.random.default_rng(5)
+    n_refused = 0
+    for _ in range(300):
+        one, own = rng.standard_normal((2, 6))
+        other = correlation * one + np.sqrt(1 - correlation**2) * own
+        group = {
+            name: calibration(perturb(TRUTH, root @ noise)) for name, noise in (("a", one), ("b", other))
+        }
+        compared = compare_calibrations(group, are_independent=False)
+        n_refused += not compared.agrees
+    # Opposite errors reach the bound: one of a hundred, within 3 sigma of the count.
+    assert n_refused <= 3 + 3 * np.sqrt(3)
+
+
+def test_results_of_the_same_captures_that_differ_beyond_any_correlation_are_named():
+    far = perturb(TRUTH, 12 * ROOT @ np.eye(6)[0])
+    group = {"current": calibration(TRUTH), "ml": calibration(TRUTH), "events": calibration(far)}
+    found = compare_calibrations(group, are_independent=False).finding
+    assert (found.code, found.severity) == ("results.disagree", "error")
+    assert "events" in (found.figures["first"], found.figures["second"])

@@ -1,0 +1,182 @@
+"""The verdict: a sound result passes, and each kind of finding is named with its figure."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.report import NO_CERTIFICATE
+from lce_rig.core.geometry import perturb
+from lce_rig.core.results import Certificate, Refusal
+from lce_rig.judge.validate import validate
+from lce_rig.judge.verdict import judge
+from lce_rig.lens.lens_estimate import BoardView
+from lce_rig.rig import load_rig
+from tests.calibrate.boards import BOARD, CAMERA, simulate
+
+RIG = load_rig("rlfs")
+
+
+@pytest.fixture(scope="module")
+def estimate():
+    return fit_extrinsic(simulate(20, seed=1), BOARD, EstimateSettings(n_draws=3))
+
+
+@functools.cache
+def examined(estimate, lens=CAMERA):
+    views = [BoardView(name, "frames", seen.image) for name, seen in estimate.observations.items()]
+    return validate(estimate, RIG, RIG.lidars["lidar"], lens, views)
+
+
+@pytest.fixture(scope="module")
+def verdict_of(estimate):
+    """Judge a changed estimate by what the checks found on the sound one."""
+
+    def judged(changed, n_captures=20, rig=RIG):
+        examination = replace(examined(estimate), cov=changed.cov, cov_agreed=changed.cov)
+        return judge(changed, examination, rig, "cam", "lidar", n_captures)
+
+    return judged
+
+
+def examined_verdict_of(estimate, lens=CAMERA):
+    return judge(estimate, examined(estimate, lens), RIG, "cam", "lidar", len(estimate.used))
+
+
+def test_a_sound_result_passes_without_reasons(estimate, verdict_of):
+    assert verdict_of(estimate) == ("pass", ())
+
+
+def test_a_result_without_certificate_fails(estimate, verdict_of):
+    verdict, reasons = verdict_of(replace(estimate, certificate=Certificate(False, 0.3)))
+    assert verdict == "fail"
+    assert (reasons[0].code, reasons[0].figures) == ("verdict.not_certified", {"gap": 0.3})
+
+
+def test_a_method_without_certificates_is_marginal_and_named(estimate, verdict_of):
+    verdict, reasons = verdict_of(replace(estimate, certificate=NO_CERTIFICATE, method="other"))
+    assert verdict == "marginal"
+    assert (reasons[0].code, reasons[0].figures) == ("verdict.no_certificate", {"method": "other"})
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(0.5, "pass"), (2.0, "marginal"), (9.0, "fail")])
+def test_a_deviation_above_the_target_is_marginal_and_far_above_fails(estimate, factor, expected, verdict_of):
+    target_deg = RIG.calibration.target_sigma_deg
+    cov = np.diag([1e-8] * 3 + [(np.radians(factor * target_deg)) ** 2 / 3] * 3)
+    verdict, reasons = verdict_of(replace(estimate, cov=cov))
+    assert verdict == expected
+    told = {"pass": set(), "marginal": {"verdict.may_be_off"}, "fail": set()}[expected]
+    assert {reason.code for reason in reasons} - {"verdict.rotation_uncertain"} == told
+
+
+def test_a_contradiction_widens_the_claim_and_fails_nothing_by_its_width(estimate):
+    cov = np.diag([1e-8] * 3 + [np.radians(9.0 * RIG.calibration.target_sigma_deg) ** 2 / 3] * 3)
+    examination = replace(examined(estimate), cov=cov, cov_agreed=estimate.cov)
+    verdict, reasons = judge(estimate, examination, RIG, "cam", "lidar", 20)
+    assert verdict == "marginal"
+    assert [reason.code for reason in reasons] == ["verdict.rotation_uncertain", "verdict.may_be_off"]
+    # Three independent axes of sigma / sqrt(3) each: chi with three degrees of freedom.
+    assert reasons[1].figures["rotation_deg"] == pytest.approx(
+        9.0 * RIG.calibration.target_sigma_deg / np.sqrt(3) * 2.795, rel=1e-3
+    )
+
+
+def test_where_the_lidar_itself_misses_the_target_more_captures_are_not_advised(estimate, verdict_of):
+    cov = np.diag([0.015**2 / 3] * 3 + [1e-8] * 3)
+    by_scatter = replace(estimate, cov=cov)
+    figures = replace(estimate.diagnostics, sigma_systematic_translation_m=0.014)
+    by_lidar = replace(by_scatter, diagnostics=figures)
+    assert verdict_of(by_scatter)[1][0].action == ""
+    assert verdict_of(by_lidar)[1][0].action == "measure_ranges"
+
+
+def test_a_result_far_from_the_nominal_extrinsic_fails_with_both_figures(estimate, verdict_of):
+    moved = perturb(estimate.T_cam_lidar, np.array([0.3, 0, 0, 0, 0, np.radians(20)]))
+    cad = [pose.model_copy(update={"source": "cad"}) for pose in RIG.nominal_extrinsics]
+    drawn = RIG.model_copy(update={"nominal_extrinsics": cad})
+    assert verdict_of(replace(estimate, T_cam_lidar=moved))[0] == "pass"
+    verdict, reasons = verdict_of(replace(estimate, T_cam_lidar=moved), rig=drawn)
+    assert verdict == "fail"
+    assert reasons[0].code == "verdict.far_from_nominal"
+    assert (reasons[0].figures["tolerance_deg"], reasons[0].figures["tolerance_m"]) == (5, 0.05)
+
+
+def test_sensors_that_disagree_in_many_captures_are_a_doubt(estimate, verdict_of):
+    refused = {f"x{k}": Refusal("pair.no_candidate") for k in range(10)}
+    assert verdict_of(replace(estimate, refused=refused))[0] == "marginal"
+    refused |= {f"y{k}": Refusal("calibrate.outlier") for k in range(20)}
+    verdict, reasons = verdict_of(replace(estimate, refused=refused))
+    assert verdict == "fail"
+    assert (reasons[0].figures["n_refused"], reasons[0].figures["n_captures"]) == (30, 50)
+
+
+def test_boards_that_moved_between_picture_and_scan_are_a_doubt(estimate, verdict_of):
+    moving = replace(estimate.diagnostics, fit_plane_rms_m=0.025)
+    verdict, reasons = verdict_of(replace(estimate, diagnostics=moving))
+    assert verdict == "marginal"
+    assert (reasons[0].code, reasons[0].figures) == ("verdict.planes_apart", {"rms_m": 0.025})
+
+
+def test_few_usable_captures_of_many_are_a_doubt(estimate, verdict_of):
+    verdict, reasons = verdict_of(estimate, n_captures=50)
+    assert verdict == "marginal"
+    assert reasons[0].figures == {"n_used": 20, "n_captures": 50}
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.01, "pass"), (1.04, "marginal"), (0.9, "fail")])
+def test_a_plate_of_another_size_than_the_profiles_is_named(estimate, factor, expected, verdict_of):
+    def resized(seen):
+        quality = replace(seen.lidar.quality, width_m=factor * BOARD.width_m, width_sigma_m=0.01)
+        return replace(seen, lidar=replace(seen.lidar, quality=quality))
+
+    other = {name: resized(seen) for name, seen in estimate.observations.items()}
+    verdict, reasons = verdict_of(replace(estimate, observations=other))
+    assert verdict == expected
+    assert expected == "pass" or (reasons[0].code, reasons[0].figures["side"]) == (
+        "verdict.plate_size",
+        "width",
+    )
+
+
+def test_large_residuals_fail_and_name_their_limit(estimate, verdict_of):
+    bad = replace(estimate, metrics=replace(estimate.metrics, mpe_m=0.08))
+    verdict, reasons = verdict_of(bad)
+    assert verdict == "fail"
+    assert reasons[0].figures == {"mean_m": 0.08, "limit_m": 0.03}
+
+
+def test_the_worst_reason_comes_first(estimate, verdict_of):
+    doubtful = replace(estimate, certificate=Certificate(False, 1.0), held_out_m=1.0)
+    verdict, reasons = verdict_of(doubtful)
+    assert verdict == "fail"
+    assert [reason.code for reason in reasons] == ["verdict.not_certified", "verdict.held_out"]
+
+
+def test_squares_of_the_wrong_size_are_told_from_the_distances():
+    """The camera believes in 70 mm squares where they measure 73.5 mm: it sees the boards 5 % too near."""
+    captures = []
+    for item in simulate(20, seed=2):
+        T = item.image.T_cam_board.copy()
+        T[:3, 3] /= 1.05
+        image = replace(item.image, T_cam_board=T, T_cam_board_alternative=None)
+        captures.append(replace(item, image=image))
+    wrong = fit_extrinsic(captures, BOARD, EstimateSettings(n_draws=3))
+    verdict, reasons = examined_verdict_of(wrong)
+    assert verdict == "fail"
+    (scale,) = (reason for reason in reasons if reason.code == "verdict.scale")
+    assert scale.figure("square_m") == pytest.approx(0.0735, abs=5e-4)
+
+
+def test_intrinsics_of_another_lens_are_named(estimate):
+    other = replace(CAMERA, fx_px=1.03 * CAMERA.fx_px, fy_px=1.03 * CAMERA.fy_px)
+    verdict, reasons = examined_verdict_of(estimate, lens=other)
+    assert verdict == "fail"
+    assert (reasons[0].code, reasons[0].severity) == ("verdict.intrinsics", "error")
+
+
+def test_each_axis_is_named_where_the_target_is_missed(estimate, verdict_of):
+    cov = np.diag([1e-8] * 3 + [1e-9, np.radians(0.3) ** 2, 1e-9])
+    _, reasons = verdict_of(replace(estimate, cov=cov))
+    assert reasons[0].figures["by_axis_deg"] == pytest.approx((0.0018, 0.3, 0.0018), abs=5e-5)

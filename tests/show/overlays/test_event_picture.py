@@ -1,0 +1,148 @@
+"""Events over their pictures: where they fell, in the colour of their sign, and in animations."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.verify.test_pictures import (
+    BOARD,
+    FOLDING,
+    count,
+    grey,
+    image_board,
+    lidar_board,
+    overlay,
+    scan_of,
+    wall,
+)
+
+from lce_rig.core.data import Events, Image
+from lce_rig.core.errors import SourceError
+from lce_rig.core.results import Refusal
+from lce_rig.rig import QualitySettings
+from lce_rig.show.overlays.animation import write_gif, write_video
+from lce_rig.show.overlays.debug_image import draw_debug
+from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER, ImageWithEvents, draw_events
+
+MS = 1_000_000
+IMAGE = Image("cam", "events", 500 * MS, grey(FOLDING))
+
+
+def events_at(t_ms: list[float], x: list[int], y: list[int], polarity: list[bool]) -> Events:
+    t_ns = np.rint(np.array(t_ms) * MS).astype(np.int64)
+    columns = np.array(x, np.uint16), np.array(y, np.uint16), np.array(polarity, bool)
+    return Events("cam", t_ns, *columns, FOLDING.width_px, FOLDING.height_px)
+
+
+def coloured(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> set[tuple[int, int]]:
+    """List the pixels (x, y) of the sensor that are drawn in a colour as a whole."""
+    factor = picture.shape[1] // FOLDING.width_px
+    small = picture[factor // 2 :: factor, factor // 2 :: factor]
+    return {(int(x), int(y)) for y, x in np.argwhere(np.all(small == colour, axis=-1))}
+
+
+def test_events_are_drawn_where_they_fell_in_the_colour_of_most_of_them() -> None:
+    events = events_at(
+        [1, 2, 3, 4, 5, 6], [10, 345, 20, 20, 20, 30], [5, 259, 40, 40, 40, 7], [1, 0, 0, 1, 0, 1]
+    )
+    picture, factor = draw_events(IMAGE, events)
+    assert picture.shape == (260 * factor, 346 * factor, 3)
+    assert coloured(picture, BRIGHTER) == {(10, 5), (30, 7)}
+    assert coloured(picture, DARKER) == {(345, 259), (20, 40)}
+
+
+def test_as_many_brighter_as_darker_events_cancel_and_none_at_all_is_fine() -> None:
+    both = events_at([1, 2], [10, 10], [5, 5], [True, False])
+    for events in (both, events_at([], [], [], [])):
+        picture, _ = draw_events(IMAGE, events)
+        assert not coloured(picture, BRIGHTER) and not coloured(picture, DARKER)
+
+
+def test_events_off_a_picture_that_was_cut_are_left_out() -> None:
+    cut = Image("cam", "events", None, grey(FOLDING)[:250])
+    picture, _ = draw_events(cut, events_at([1, 2], [3, 4], [255, 4], [True, True]))
+    assert coloured(picture, BRIGHTER) == {(4, 4)}
+
+
+def test_only_events_shortly_before_the_picture_are_taken_along() -> None:
+    view = ImageWithEvents.of_events(
+        IMAGE, events_at([300, 420, 499, 501], [1, 2, 3, 4], [1] * 4, [True] * 4)
+    )
+    assert view.events is not None and view.events.x.tolist() == [2, 3]
+    n = 20_000
+    storm = events_at(list(np.linspace(410, 499, n)), [7] * n, [7] * n, [True] * n)
+    shown = ImageWithEvents.of_events(IMAGE, storm).events
+    assert shown is not None and len(shown) == round(0.06 * 346 * 260) and shown.t_ns[-1] == storm.t_ns[-1]
+
+
+def test_an_overlay_shows_the_events_and_the_ring_ends_below_the_legend() -> None:
+    points = wall()
+    boards = {"lidar": lidar_board(points), "image": image_board(FOLDING)}
+    events = events_at([450] * 30, list(range(30)), [9] * 30, [True] * 30)
+    plain, drawn = overlay(FOLDING, points, **boards), overlay(FOLDING, points, events=events, **boards)
+    assert np.array_equal(drawn[: len(plain)], plain)
+    below = drawn[len(plain) :]
+    assert below.shape[0] > 260 * 3
+    assert count(below, BRIGHTER) >= 30 * 9
+    assert count(below, (60, 160, 255)) > 50  # orange: the ring ends
+
+
+@pytest.mark.parametrize("is_found", [True, False])
+def test_a_debug_picture_has_the_events_below_the_reconstruction(is_found: bool) -> None:
+    refusal = Refusal("image.no_events")
+    drawn = draw_debug(
+        IMAGE,
+        scan_of(wall()),
+        image_board(FOLDING) if is_found else refusal,
+        [lidar_board(wall())],
+        board=BOARD,
+        intrinsics=FOLDING,
+        limits=QualitySettings(),
+        title="capture 000000",
+        events=events_at([450] * 30, list(range(30)), [9] * 30, [True] * 30),
+    )
+    assert drawn.shape[1] == 1600
+    lower = drawn[drawn.shape[0] // 2 :]
+    assert count(lower[:, :800], BRIGHTER) > 50 > count(lower[:, 800:], BRIGHTER)
+
+
+def frames(n: int = 5) -> list[NDArray[np.uint8]]:
+    return [np.full((26, 34), 40 * index, np.uint8) for index in range(n)]
+
+
+def test_a_gif_holds_every_picture_and_runs_at_the_rate_asked_for(tmp_path: Path) -> None:
+    pillow = pytest.importorskip("PIL.Image")
+    write_gif(tmp_path / "new" / "a.gif", iter(frames()), 0.05)
+    with pillow.open(tmp_path / "new" / "a.gif") as animation:
+        assert (animation.n_frames, animation.size, animation.info["duration"]) == (5, (34, 26), 50)
+        animation.seek(3)
+        assert abs(int(np.asarray(animation.convert("L"))[5, 5]) - 120) < 4
+
+
+@pytest.mark.parametrize("name", ["a.avi", "a.mp4"])
+def test_a_video_holds_every_picture_or_says_that_it_cannot_be_written(tmp_path: Path, name: str) -> None:
+    large = [cv2.resize(frame, (346, 260)) for frame in frames()]
+    try:
+        write_video(tmp_path / name, iter(large), 0.05)
+    except SourceError as error:
+        assert "OpenCV" in error.what and "GIF" in error.hint
+        assert not (tmp_path / name).exists()
+        return
+    video = cv2.VideoCapture(str(tmp_path / name))
+    read = [video.read() for _ in range(6)]
+    assert [is_read for is_read, _ in read] == [True] * 5 + [False]
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(20)
+    assert abs(int(read[3][1][100, 100, 0]) - 120) < 12
+    video.release()
+
+
+def test_files_that_cannot_be_written_are_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    pytest.importorskip("PIL.Image")
+    for write, name in ((write_gif, "a.gif"), (write_video, "a.mp4")):
+        with pytest.raises(SourceError, match=f"file/{name}: cannot be written"):
+            write(tmp_path / "file" / name, iter(frames()), 0.05)
+    with pytest.raises(SourceError, match=r"a\.mov: unknown video format"):
+        write_video(tmp_path / "a.mov", iter(frames()), 0.05)

@@ -1,0 +1,273 @@
+"""Pictures for people: what must be drawn, what must not, and that sizes and files are right."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import SessionError
+from lce_rig.core.geometry import Array, transform
+from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.rig import QualitySettings
+from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, PANEL, Picture, round_ticks, text_width_px, wrapped
+from lce_rig.show.overlays.debug_image import draw_debug
+from lce_rig.show.overlays.overlay import draw_overlay
+from lce_rig.show.overlays.overlay_files import (
+    Overlay,
+    SheetHead,
+    contact_sheets,
+    is_overlay,
+    write_overlays,
+    write_picture,
+)
+from tests.calibrate.boards import measured_plate
+from tests.detect.test_image_board import draw, looking
+
+BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
+FOLDING = Intrinsics(300.0, 300.0, 172.5, 129.5, 346, 260, "radtan", (-0.4, 0.0, 0.0, 0.0, 0.0))
+LARGE = Intrinsics(1177.0, 1177.0, 960.0, 604.0, 1920, 1208, "equidistant", (-0.05, 0.0, 0.0, 0.0))
+# LiDAR x forward, y left, z up; camera x right, y down, z forward; same place.
+T_CAM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
+T_CAM_BOARD = np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.0], [0, 0, 0, 1]], dtype=np.float64)
+
+
+def scan_of(points: Array) -> Scan:
+    n = len(points)
+    return Scan("lidar", None, points.astype(np.float32), np.zeros(n, np.float32), np.zeros(n, np.int16))
+
+
+def wall(x_m: float = 2.0) -> Array:
+    y, z = np.meshgrid(np.linspace(-0.38, 0.38, 39), np.linspace(-0.3, 0.3, 8))
+    return np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], axis=1)
+
+
+def grey(camera: Intrinsics) -> NDArray[np.uint8]:
+    return np.full((camera.height_px, camera.width_px), 128, np.uint8)
+
+
+def image_board(camera: Intrinsics) -> ImageBoard:
+    corners, _ = camera.project(transform(T_CAM_BOARD, BOARD.corners()))
+    return ImageBoard(corners, T_CAM_BOARD, np.eye(6) * 1e-6, None, np.inf, False, 0.1, 0.07)
+
+
+def lidar_board(points: Array) -> LidarBoard:
+    T_lidar_board = np.linalg.inv(T_CAM_LIDAR) @ T_CAM_BOARD
+    ends = points[np.abs(points[:, 1]) > 0.37]
+    return LidarBoard(
+        points=points,
+        ring=np.zeros(len(points), np.int16),
+        edge_points=ends,
+        edge_ring=np.zeros(len(ends), np.int16),
+        edge_side=np.ones(len(ends), np.int8),
+        edge_behind_m=np.full(len(ends), np.inf),
+        edge_echo=np.zeros(len(ends)),
+        azimuth_step_rad=0.0035,
+        plane=np.array([-1.0, 0, 0, 2.0]),
+        sigma_m=0.01,
+        T_lidar_board=T_lidar_board,
+        quality=measured_plate(BOARD.width_m, BOARD.height_m, points),
+    )
+
+
+def overlay(camera: Intrinsics, points: Array, **boards: object) -> Picture:
+    return draw_overlay(
+        Image("cam", "frames", None, grey(camera)),
+        scan_of(points),
+        camera,
+        T_CAM_LIDAR,
+        lidar_board=boards.get("lidar"),  # type: ignore[arg-type]
+        image_board=boards.get("image"),  # type: ignore[arg-type]
+        board=BOARD,
+        residuals={"plane (mm)": 4.25, "verdict": "pass"},
+        title="capture 000000",
+        events=boards.get("events"),  # type: ignore[arg-type]
+        warning=str(boards.get("warning", "")),
+    )
+
+
+def picture_part(drawn: Picture, camera: Intrinsics) -> Picture:
+    """Cut title and legend off."""
+    factor = drawn.shape[1] // camera.width_px
+    top = round(2.6 * 13 * drawn.shape[1] / 1000)
+    return drawn[top : top + factor * camera.height_px]
+
+
+def count(drawn: Picture, colour: tuple[int, int, int]) -> int:
+    return int(np.all(np.abs(drawn.astype(int) - colour) < 20, axis=-1).sum())
+
+
+@pytest.mark.parametrize("camera", [FOLDING, LARGE], ids=["346x260", "1920x1208"])
+def test_points_board_and_ends_are_drawn_at_any_size(camera: Intrinsics) -> None:
+    points = wall()
+    drawn = overlay(camera, points, lidar=lidar_board(points), image=image_board(camera))
+    assert drawn.dtype == np.uint8 and drawn.shape[1] >= 960 and drawn.shape[1] % camera.width_px == 0
+    part = picture_part(drawn, camera)
+    assert count(part, MAGENTA) > 300
+    assert count(part, ORANGE) > 50
+
+
+def test_a_point_appears_where_the_camera_sees_it() -> None:
+    part = picture_part(overlay(FOLDING, np.array([[2.0, 0.4, 0.2]])), FOLDING)
+    v, u = np.argwhere(np.any(part != 128, axis=-1)).mean(axis=0)
+    truth, _ = FOLDING.project(np.array([-0.4, -0.2, 2.0]))
+    assert (u, v) == pytest.approx(tuple((truth + 0.5) * 3 - 0.5), abs=0.8)
+
+
+def test_points_behind_the_camera_or_folded_by_the_distortion_are_not_drawn() -> None:
+    behind = wall(-2.0)
+    # At 60 deg r = 1.73, beyond the fold of 1 - 0.4 r^2 at r = 0.91, where the polynomial draws it at -0.35.
+    folded = np.stack([np.ones(20), np.full(20, np.tan(np.radians(60))), np.linspace(-0.2, 0.2, 20)], axis=1)
+    part = picture_part(overlay(FOLDING, np.concatenate([behind, folded])), FOLDING)
+    assert np.all(part == 128)
+
+
+def test_near_points_cover_far_ones() -> None:
+    far, near = wall(4.0) * [1, 2, 2], wall(2.0)
+    both = picture_part(overlay(FOLDING, np.concatenate([near, far])), FOLDING)
+    swapped = picture_part(overlay(FOLDING, np.concatenate([far, near])), FOLDING)
+    assert np.array_equal(both, swapped)
+
+
+def test_an_empty_scan_and_missing_boards_are_drawn_too() -> None:
+    drawn = overlay(FOLDING, np.zeros((0, 3)))
+    assert np.all(picture_part(drawn, FOLDING) == 128)
+
+
+@pytest.mark.parametrize("has_image", [True, False])
+@pytest.mark.parametrize("has_lidar", [True, False])
+def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar: bool) -> None:
+    points = wall()
+    refusal = Refusal("image.text", figures={"text": "no board", "advice": "show the whole pattern " * 12})
+    drawn = draw_debug(
+        Image("cam", "frames", None, grey(FOLDING)) if has_image else None,
+        scan_of(points) if has_lidar else None,
+        image_board(FOLDING) if has_image else refusal,
+        [lidar_board(points), lidar_board(points - [0, 0.2, 0])] if has_lidar else refusal,
+        board=BOARD,
+        intrinsics=FOLDING,
+        limits=QualitySettings(),
+        title="capture 000000",
+    )
+    assert drawn.shape[1] == 1600
+    assert (count(drawn[:, 800:], MAGENTA) > 100) == has_lidar
+
+
+def test_corners_found_in_a_refused_image_are_drawn() -> None:
+    camera = Intrinsics(349.57, 349.18, 172.49, 126.24, 346, 260)
+    pixels = draw(BOARD, camera, looking(10, 0, 20, (0, 0, 2.0)))
+    refusal = Refusal("image.tilted", figures={"tilt_deg": 71.0, "max_tilt_deg": 70.0, "turn_deg": 6.0})
+    drawn = debug_picture(Image("cam", "frames", None, pixels), refusal, camera)
+    blank = debug_picture(Image("cam", "frames", None, np.full_like(pixels, 110)), refusal, camera)
+    assert count(drawn[34:600, :800], ORANGE) > 100 > count(blank[34:600, :800], ORANGE)
+
+
+def debug_picture(image: Image, refusal: Refusal, camera: Intrinsics) -> NDArray[np.uint8]:
+    return draw_debug(
+        image, None, refusal, refusal, board=BOARD, intrinsics=camera, limits=QualitySettings(), title=""
+    )
+
+
+def test_a_candidate_that_is_elsewhere_is_not_drawn_as_the_board() -> None:
+    points = wall()
+    figures = {"n_candidates": 2, "candidate": 1, "distance_m": 3.0, "rotation_deg": 20.0}
+    arguments = (
+        Image("cam", "frames", None, grey(FOLDING)),
+        scan_of(points),
+        image_board(FOLDING),
+        [lidar_board(points), lidar_board(points - [0, 0.2, 0])],
+    )
+    right, wrong = (
+        draw_debug(
+            *arguments,
+            board=BOARD,
+            intrinsics=FOLDING,
+            limits=QualitySettings(),
+            title="",
+            mismatch=mismatch,
+        )
+        for mismatch in (None, Refusal("pair.elsewhere", figures=figures))
+    )
+    assert count(right[:, 800:], MAGENTA) > 100
+    assert count(wrong[:, 800:], MAGENTA) == 0
+    assert count(wrong[:, 800:], ORANGE) > count(right[:, 800:], ORANGE)
+
+
+def test_text_is_broken_to_fit_and_nothing_is_lost() -> None:
+    text = "board cut off by the right border: 8x6 inner corners wanted, 6x6 seen"
+    lines = wrapped(text, 200, 11)
+    assert " ".join(lines) == text
+    assert len(lines) > 2
+    assert all(text_width_px(line, 11) <= 200 for line in lines)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 10), (1, 20), (0.2, 0.9), (3, 5)])
+def test_ticks_are_round_and_within_the_scale(low: float, high: float) -> None:
+    ticks = round_ticks(low, high, 4)
+    assert 2 <= len(ticks) <= 6
+    assert all(low - 1e-9 <= tick <= high + 1e-9 for tick in ticks)
+    assert len({f"{tick:g}" for tick in ticks}) == len(ticks)
+
+
+HEAD = SheetHead("rig  cam and lidar", "fail", ("7 captures", "the board moved: hold it still"), (1.0, 9.0))
+
+
+def tile(index: int, warning: str = "") -> Overlay:
+    colour = (10 + 3 * index, 200, 30 + 2 * index)
+    return Overlay(f"{index:06d}", drawn := np.full((270, 480, 3), colour, np.uint8), drawn, "", warning)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("n", [1, 2, 7, 18, 40])
+def test_contact_sheets_hold_every_picture_once_and_are_at_most_2000_px_wide(n: int) -> None:
+    tiles = [tile(index) for index in range(n)]
+    sheets = contact_sheets(tiles, HEAD)
+    assert all(sheet.shape[1] <= 2000 and sheet.shape[0] <= 2000 for sheet in sheets)
+    for each in tiles:
+        n_px = [int(np.all(sheet == each.part[0, 0], axis=-1).sum()) for sheet in sheets]
+        assert sorted(n_px)[-1] == sum(n_px) == 270 * 480
+    assert all(np.all(sheet[0, 0] == PANEL) for sheet in sheets)
+
+
+def test_contact_sheets_need_a_picture() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        contact_sheets([], HEAD)
+
+
+def test_a_capture_that_was_not_used_is_framed_on_the_contact_sheet() -> None:
+    used, refused = (contact_sheets([tile(0), tile(1, warning)], HEAD)[0] for warning in ("", "moved " * 30))
+    assert count(refused, ORANGE) > count(used, ORANGE) + 4 * 2 * (270 + 480)
+    # The whole reason is below the image, on as many lines as it takes.
+    assert refused.shape[0] > used.shape[0] + 2 * 22
+
+
+def test_overlays_are_written_with_contact_sheets_and_read_back_unchanged(tmp_path: Path) -> None:
+    drawn = overlay(FOLDING, wall())
+    names = ("000000", "cam/../../000001")
+    files, sheets = write_overlays(tmp_path / "overlays", [Overlay(n, drawn, drawn) for n in names], HEAD)
+    assert [file.parent for file in [*files, *sheets]] == [tmp_path / "overlays"] * 3
+    assert [sheet.name for sheet in sheets] == ["contact_sheet.png"]
+    assert np.array_equal(cv2.imread(str(files[0])), drawn)
+    assert write_overlays(tmp_path / "none", [], HEAD) == ([], [])
+
+
+def test_many_overlays_have_numbered_contact_sheets_which_are_known_as_such(tmp_path: Path) -> None:
+    files, sheets = write_overlays(tmp_path, [tile(index) for index in range(40)], HEAD)
+    assert [sheet.name for sheet in sheets] == ["contact_sheet_1.png", "contact_sheet_2.png"]
+    assert all(map(is_overlay, [*files, *sheets])) and not is_overlay(tmp_path / "contact_sheet_mine.png")
+
+
+def test_the_reason_of_a_refusal_is_below_the_legend() -> None:
+    plain, marked = overlay(FOLDING, wall()), overlay(FOLDING, wall(), warning="refused, pair: moved")
+    assert np.array_equal(marked[: len(plain)], plain)
+    assert count(marked[len(plain) :], ORANGE) > 50
+
+
+def test_a_picture_that_cannot_be_written_names_the_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SessionError, match=r"file.a\.png"):
+        write_picture(tmp_path / "file" / "a.png", np.zeros((4, 4, 3), np.uint8))

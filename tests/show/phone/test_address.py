@@ -1,0 +1,96 @@
+import ipaddress
+import socket
+
+import pytest
+
+from lce_rig.core.errors import UsageError
+from lce_rig.show.phone import Preview, parse_address
+from lce_rig.show.phone.address import is_loopback, links, listen
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"),
+    [
+        ("", "127.0.0.1", 8765),
+        ("9000", "127.0.0.1", 9000),
+        (":9000", "127.0.0.1", 9000),
+        ("0", "127.0.0.1", 0),
+        ("host:", "host", 8765),
+        ("0.0.0.0", "0.0.0.0", 8765),
+        ("0.0.0.0:80", "0.0.0.0", 80),
+        ("rig.local:9000", "rig.local", 9000),
+        (" localhost ", "localhost", 8765),
+        ("::1", "::1", 8765),
+        ("[::1]", "::1", 8765),
+        ("[::]:9000", "::", 9000),
+        ("fe80::1:9000", "fe80::1:9000", 8765),
+    ],
+)
+def test_addresses_are_read_as_people_write_them(text: str, host: str, port: int) -> None:
+    assert parse_address(text) == (host, port)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["host:port", "host:70000", "1:2:3", "[::1", "[::1]9000", "[host]:1", "http://host:1", "a b", "host:-1",
+     "host:8_0", "host:٣"],
+)  # fmt: skip
+def test_what_is_no_address_is_refused_with_examples(text: str) -> None:
+    with pytest.raises(UsageError, match="no address for a page") as caught:
+        parse_address(text)
+    assert "0.0.0.0:8765" in caught.value.hint
+
+
+def test_a_port_in_use_is_said_to_be() -> None:
+    with Preview(port=0) as first:
+        port = int(first.urls[0].rstrip("/").rpartition(":")[2])
+        with pytest.raises(UsageError, match=f"127.0.0.1:{port}: the port is in use") as caught:
+            Preview(port=port).start()
+    assert f"--preview 127.0.0.1:{port + 1}" in caught.value.hint
+    with Preview(port=port):
+        pass  # it is free again at once
+
+
+@pytest.mark.parametrize("host", ["192.0.2.7", "no-such-host.invalid", "a" * 70, "2001:db8::1"])
+def test_an_address_of_another_computer_is_refused(host: str) -> None:
+    with pytest.raises(
+        UsageError, match=r"not an address of this computer|Address family not supported"
+    ) as caught:
+        Preview(host, 0).start()
+    assert caught.value.hint
+
+
+def test_links_lead_to_addresses_of_this_computer_that_others_reach() -> None:
+    with listen("0.0.0.0", 0) as opened:
+        port = opened.getsockname()[1]
+        found = links(opened, "abcdefgh")
+        assert not is_loopback(opened)
+    for link in found:
+        assert link.endswith(f":{port}/?token=abcdefgh")
+        host = link.removeprefix("http://").partition(":")[0]
+        if not host.endswith(".local"):
+            assert not ipaddress.ip_address(host).is_loopback
+            with listen(host, 0):
+                pass  # only own addresses can be bound
+
+
+def test_both_kinds_of_address_are_served_at_once() -> None:
+    try:
+        opened = listen("::", 0)
+    except UsageError:
+        pytest.skip("this computer has no IPv6")
+    with opened:
+        port = opened.getsockname()[1]
+        for family, host in ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1")):
+            with socket.socket(family, socket.SOCK_STREAM) as client:
+                client.connect((host, port))
+
+
+def test_the_link_of_an_ipv6_address_has_brackets() -> None:
+    try:
+        opened = listen("::1", 0)
+    except UsageError:
+        pytest.skip("this computer has no IPv6")
+    with opened:
+        assert is_loopback(opened)
+        assert links(opened, None) == (f"http://[::1]:{opened.getsockname()[1]}/",)

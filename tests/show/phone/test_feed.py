@@ -1,0 +1,288 @@
+import json
+import socket
+import statistics
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.collect.live.state import Drawing
+from lce_rig.show.phone import Preview
+from lce_rig.show.phone import preview as page_module
+from lce_rig.show.phone.preview import MAX_UNDER_WAY
+from lce_rig.show.phone.state_message import MAX_WIDTH_PX, encode_picture
+
+from .conftest import PRESENT_PX, picture, state
+from .watcher import Watcher
+
+LAST = 10_000
+
+
+def test_all_of_a_state_arrives(preview: Preview) -> None:
+    present = PRESENT_PX + 0.04
+    present[1] = np.nan
+    sent = state(sigma_deg=float("nan"), drawing=Drawing("cam", picture(), present, None, True), hold_s=1.5)
+    preview.publish(sent)
+    with Watcher(preview.urls[0]) as watcher:
+        watcher.watch()
+        got, jpeg = watcher.next_state()
+    assert (got["phase"], got["headline"], got["hold_s"]) == ("moving", sent.headline, 1.5)
+    assert (got["n_captures"], got["n_wanted"], got["elapsed_s"]) == (7, 15, 83.4)
+    assert (got["sigma_deg"], got["sigma_mm"], got["target_deg"], got["target_mm"]) == (None, 4.0, 0.1, 5.0)
+    assert got["coverage"] == {"left_right": 0.8, "up_down": 0.4, "near_far": 0.6, "tilt": 0.5, "roll": 1.0}
+    assert got["streams"][1] == {
+        "name": "lidar", "rate_hz": 10.0, "n_lost": 3, "sees_board": False,
+        "reason": sent.streams[1].reason, "figures": "",
+    }  # fmt: skip
+    assert got["cues"] == [{"number": 1, "sound": "tick"}, {"number": 2, "sound": "captured"}]
+    assert (got["log"], got["notes"]) == (["captured 000005", "captured 000006"], list(sent.notes))
+    drawing = got["drawing"]
+    assert (drawing["width_px"], drawing["height_px"], drawing["is_there"]) == (640, 360, True)
+    assert drawing["present_px"] == [[100.0, 80.0], None, [200.0, 180.0], [100.0, 180.0], [100.0, 80.0]]
+    assert drawing["wanted_px"] is None
+    assert jpeg is not None
+    decoded = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    assert np.abs(decoded.astype(int) - picture()).mean() < 1
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        ((720, 1280, 3), (540, 960)),
+        ((720, 1280), (540, 960)),
+        ((260, 346), (260, 346)),
+        ((2048, 2448, 3), (683, 816)),
+        ((2160, 3840, 3), (540, 960)),
+        ((1, 5000), (1, 833)),
+    ],
+)
+def test_pictures_are_made_small_enough_for_a_phone(shape: tuple[int, ...], size: tuple[int, int]) -> None:
+    pixels = np.zeros(shape, np.uint8)
+    pixels[: shape[0] // 2] = 200
+    decoded = cv2.imdecode(np.frombuffer(encode_picture(pixels), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert decoded is not None
+    assert decoded.shape == size
+    assert decoded.shape[1] <= MAX_WIDTH_PX
+    assert abs(decoded.mean() - pixels.mean()) < 2
+
+
+def test_pictures_are_compressed_while_somebody_looks_and_once_for_all(preview: Preview) -> None:
+    for level in range(20):
+        preview.publish(state(drawing=Drawing("cam", picture(level))))
+    assert preview.n_pictures == 0
+    with Watcher(preview.urls[0]) as first, Watcher(preview.urls[0]) as second:
+        for watcher in (first, second):
+            watcher.watch()
+            assert watcher.next_state()[1] is not None
+        assert preview.n_pictures == 1
+        # A page in the background is told everything but the picture, and has it when it comes back.
+        first.answer(1, visible=False)
+        preview.publish(state(drawing=Drawing("cam", picture(99)), headline="next"))
+        got, jpeg = first.next_state(visible=False)
+        assert (got["headline"], jpeg) == ("next", None)
+        first.answer(got["update"], visible=True)
+        assert first.next_state()[1] is not None
+        assert preview.n_pictures == 2
+
+
+def test_the_same_picture_is_not_sent_twice(preview: Preview) -> None:
+    drawing = Drawing("cam", picture(), PRESENT_PX)
+    with Watcher(preview.urls[0]) as watcher:
+        watcher.watch()
+        preview.publish(state(drawing=drawing))
+        assert watcher.next_state()[1] is not None
+        preview.publish(state(drawing=Drawing("cam", drawing.pixels, PRESENT_PX + 5)))
+        got, jpeg = watcher.next_state()
+        assert jpeg is None
+        assert got["drawing"]["present_px"][0] == [105.0, 85.0]
+
+
+def test_states_come_at_most_ten_times_a_second_and_the_newest_wins(preview: Preview) -> None:
+    seen = []
+    with Watcher(preview.urls[0]) as watcher:
+        watcher.watch()
+        publisher = threading.Thread(target=_publish_for, args=(preview, 1.5))
+        publisher.start()
+        began_s = time.monotonic()
+        while not seen or seen[-1] != LAST:
+            seen.append(watcher.next_state()[0]["n_captures"])
+        took_s = time.monotonic() - began_s
+    assert seen == sorted(set(seen))
+    assert 3 <= len(seen) <= 10 * took_s + 2
+
+
+def _publish_for(preview: Preview, duration_s: float) -> None:
+    end_s, k = time.monotonic() + duration_s, 0
+    while time.monotonic() < end_s:
+        preview.publish(state(n_captures=k, drawing=None))
+        k += 1
+        time.sleep(0.005)
+    preview.publish(state(n_captures=LAST, drawing=None))
+
+
+def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pages(preview: Preview) -> None:
+    big = [np.random.default_rng(k).integers(0, 255, (720, 1280, 3), np.uint8) for k in range(5)]
+    with Watcher(preview.urls[0]) as stuck, Watcher(preview.urls[0]) as quick:
+        stuck.watch()
+        quick.watch()
+        took_s, shown = [], 0
+        for k in range(40):
+            moment = state(n_captures=k, drawing=Drawing("cam", big[k % 5]))
+            began_s = time.perf_counter()
+            preview.publish(moment)
+            took_s.append(time.perf_counter() - began_s)
+            if k % 8 == 7:
+                shown = quick.next_state()[0]["n_captures"]
+            time.sleep(0.01)
+        while shown < 39:
+            shown = quick.next_state()[0]["n_captures"]
+        assert statistics.median(took_s) < 1e-3
+        got = stuck.receive_all(quiet_s=0.5)
+        assert sum(isinstance(message, dict) for message in got) <= MAX_UNDER_WAY
+
+
+def test_a_page_that_vanished_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_module, "HEARTBEAT_S", 0.2)
+    monkeypatch.setattr(page_module, "MAX_VIEWERS", 1)
+    with Preview(port=0) as preview, Watcher(preview.urls[0]) as watcher:
+        preview.publish(state())
+        host, port = preview.urls[0].removeprefix("http://").rstrip("/").split(":")
+        with socket.create_connection((host, int(port))) as silent:
+            silent.sendall(
+                f"GET /live HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+            )
+            assert silent.recv(12) == b"HTTP/1.1 101"
+            status, _, _ = watcher.get("live")
+            assert status == 503
+            # It answers no ping, and its place is free again.
+            deadline_s = time.monotonic() + 5
+            while watcher.get("live")[0] == 503:
+                assert time.monotonic() < deadline_s
+                time.sleep(0.1)
+        monkeypatch.undo()
+        watcher.watch()
+        assert watcher.next_state()[0]["n_captures"] == 7
+
+
+def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview: Preview) -> None:
+    with Watcher(preview.urls[0]) as watcher:
+        watcher.watch()
+        preview.publish(state(last_capture="000006"))
+        assert watcher.next_state()[0]["last_capture"] == "000006"
+        assert preview.asked() is None
+        for name in ("000006", "000005"):
+            watcher.send(json.dumps({"take_back": name}))
+        deadline_s, asked = time.monotonic() + 5, list[str]()
+        while len(asked) < 2:
+            assert time.monotonic() < deadline_s
+            if (each := preview.asked()) is not None:
+                asked.append(each.name)
+        assert asked == ["000006", "000005"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "no json", "[]", "{}", '{"shown": 5, "visible": true}', '{"shown": true, "visible": true}',
+     '{"shown": 0, "visible": 1}', '{"shown": -1, "visible": true}', "[" * 200, "x" * 5000,
+     '{"take_back": 6}', '{"take_back": "../../etc"}', '{"take_back": ""}', "7", '"take_back"'],
+)  # fmt: skip
+def test_what_no_page_sends_ends_its_connection_only(preview: Preview, text: str) -> None:
+    with Watcher(preview.urls[0]) as odd, Watcher(preview.urls[0]) as other:
+        odd.watch()
+        odd.send(text)
+        assert odd.receive() in (1008, 1009)
+        preview.publish(state())
+        other.watch()
+        assert other.next_state()[0]["n_captures"] == 7
+
+
+def test_noise_on_the_port_is_survived_in_silence(preview: Preview, caplog: pytest.LogCaptureFixture) -> None:
+    port = int(preview.urls[0].rstrip("/").rpartition(":")[2])
+    random = np.random.default_rng(1)
+    said = [random.bytes(300) for _ in range(20)]
+    said += [
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"GET /" + 100_000 * b"a" + b" HTTP/1.1\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01",
+    ]
+    for each in said:
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            client.sendall(each)
+            client.shutdown(socket.SHUT_WR)
+            assert not client.recv(4096).startswith(b"HTTP/1.1 200")
+    with Watcher(preview.urls[0]) as watcher:
+        assert watcher.get()[0] == 200
+    assert not caplog.records
+
+
+def test_failures_of_the_page_itself_are_logged(preview: Preview, caplog: pytest.LogCaptureFixture) -> None:
+    preview.publish(state(drawing=Drawing("cam", np.zeros((4, 4, 2), np.uint8))))
+    with Watcher(preview.urls[0]) as watcher:
+        watcher.watch()
+        assert isinstance(watcher.receive(), int)
+    assert any(record.levelname == "ERROR" and record.exc_info for record in caplog.records)
+
+
+def test_pages_have_the_last_state_when_the_collection_ends() -> None:
+    preview = Preview(port=0)
+    with Watcher(preview.start()) as watcher:
+        watcher.watch()
+        for k in range(5):
+            preview.publish(state(n_captures=k))
+        preview.publish(state(phase="ended", n_captures=9))
+        closer = threading.Thread(target=preview.close)
+        closer.start()
+        seen = [json.dumps(message) for message in watcher.receive_all(3.0) if isinstance(message, dict)]
+        closer.join(5)
+        assert not closer.is_alive()
+    assert '"phase": "ended"' in seen[-1]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("preview")]
+    preview.publish(state())
+    preview.close()
+
+
+def test_closing_does_not_wait_for_pages_that_are_stuck() -> None:
+    preview = Preview(port=0)
+    with Watcher(preview.start()) as stuck:
+        stuck.watch()
+        for k in range(10):
+            preview.publish(state(n_captures=k))
+            time.sleep(0.02)
+        began_s = time.monotonic()
+        preview.close()
+        assert time.monotonic() - began_s < 5
+
+
+def test_closing_does_not_wait_for_pages_whose_line_is_full() -> None:
+    preview = Preview(port=0)
+    port = int(preview.start().rstrip("/").rpartition(":")[2])
+    noise = np.random.default_rng(1).integers(0, 255, (3000, 960, 3), np.uint8)
+    with socket.socket() as full:
+        full.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        full.connect(("127.0.0.1", port))
+        full.sendall(
+            f"GET /live HTTP/1.1\r\nHost: localhost:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+        for n in (1, 2):
+            preview.publish(state(drawing=Drawing("cam", noise.copy())))
+            while preview.n_pictures < n:
+                time.sleep(0.02)
+        preview.close()
+        # Its thread has ended too, and left no connection behind.
+        assert not [thread for thread in threading.enumerate() if thread.name.startswith("preview")]
+
+
+def test_silence_of_the_collection_is_told(preview: Preview) -> None:
+    with Watcher(preview.urls[0]) as watcher:
+        watcher.watch()
+        assert watcher.receive() == {"beat": True, "age_s": None}
+        preview.publish(state())
+        watcher.next_state()
+        beat = watcher.receive()
+        assert beat["beat"]
+        assert 0.8 < beat["age_s"] < 5

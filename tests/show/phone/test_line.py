@@ -1,0 +1,73 @@
+"""The page's line to the rig, in a real browser."""
+
+import pytest
+
+from lce_rig.show.phone import Preview
+
+from .browser import Browser
+from .screen import OPEN, has_text, shown
+
+
+def test_it_says_that_the_line_is_lost_and_finds_back(browser: Browser) -> None:
+    first = Preview(port=0)
+    page = browser.open(first.start())
+    port = int(first.urls[0].rstrip("/").rpartition(":")[2])
+    shown(first, page, has_text("count", "7"))
+    is_lost = "document.getElementById('banner').textContent.startsWith('Connection to the rig lost')"
+    assert not page.evaluate(is_lost)
+    first.close()
+    page.wait_until(is_lost)
+    assert not page.evaluate("document.getElementById('banner').hidden")
+    assert (
+        page.evaluate("getComputedStyle(document.getElementById('banner')).backgroundColor")
+        == "rgb(211, 18, 31)"
+    )
+    with Preview(port=port) as second:
+        page.wait_until(OPEN)
+        shown(second, page, has_text("count", "8"), n_captures=8)
+        assert not page.evaluate(is_lost)
+    # Nothing but the attempts that found nobody.
+    assert all(each.startswith("network: WebSocket") for each in page.complaints)
+
+
+@pytest.mark.long
+def test_a_line_that_falls_silent_is_opened_anew(preview: Preview, browser: Browser) -> None:
+    counting = """
+      const Plain = WebSocket;
+      window.lines = [];
+      window.WebSocket = class extends Plain { constructor(...a) { super(...a); window.lines.push(this); } };
+      Object.assign(window.WebSocket, { OPEN: Plain.OPEN });
+    """
+    page = browser.open(preview.urls[0], first=counting)
+    shown(preview, page, has_text("count", "7"))
+    # What arrives goes nowhere, as with a phone out of range.
+    page.evaluate("window.lines[0].onmessage = null")
+    page.wait_until("window.lines.length === 2")
+    shown(preview, page, has_text("count", "9"), n_captures=9)
+
+
+def test_it_says_when_the_collection_has_no_news_and_when_it_has_ended(browser: Browser) -> None:
+    preview = Preview(port=0)
+    page = browser.open(preview.start())
+    shown(preview, page, has_text("count", "7"))
+    page.wait_until("document.getElementById('banner').innerText.startsWith('No news from the rig for ')")
+    shown(preview, page, "document.getElementById('banner').hidden", phase="ended")
+    page.wait_until("document.body.dataset.phase === 'ended'")
+    preview.close()
+    # The end is no failure: the last state stays, without outlines that nobody should follow.
+    page.wait_until("document.body.dataset.connection === 'over'")
+    assert page.evaluate("document.getElementById('banner').hidden")
+    assert page.text("count") == "7"
+    assert page.evaluate("getComputedStyle(document.getElementById('outlines')).display") == "none"
+
+
+def test_an_old_link_is_said_to_be_old(browser: Browser) -> None:
+    first = Preview(port=0, token="first-token")
+    page = browser.open(first.start())
+    shown(first, page, has_text("count", "7"))
+    port = int(first.urls[0].partition("/?")[0].rpartition(":")[2])
+    first.close()
+    with Preview(port=port, token="second-token"):
+        page.wait_until(
+            "document.getElementById('banner').innerText.startsWith('This link is no longer valid')"
+        )

@@ -1,0 +1,278 @@
+"""The page in a real browser."""
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.collect.live.state import Drawing, StreamState
+from lce_rig.show.phone import Preview
+
+from .browser import Browser, Page
+from .conftest import HEIGHT_PX, PRESENT_PX, WANTED_PX, WIDTH_PX, picture, state
+from .screen import OPEN, has_text, shown
+
+SIZES = [(360, 640), (640, 360), (1280, 720)]
+# Where the points of an outline lie on the screen.
+_ON_SCREEN = """(() => {
+  const path = document.querySelector('#%s .ink');
+  const matrix = path.getScreenCTM();
+  return [...path.getAttribute('d').matchAll(/[ML]([-\\d.]+) ([-\\d.]+)/g)].map((m) => {
+    const p = new DOMPoint(Number(m[1]), Number(m[2])).matrixTransform(matrix);
+    return [p.x, p.y];
+  });
+})()"""
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_state_is_on_the_screen_whole(preview: Preview, browser: Browser, width: int, height: int) -> None:
+    page = browser.open(preview.urls[0], width, height)
+    shown(preview, page, has_text("headline", "one step left, 0.5 m closer"))
+    assert page.text("phase") == "move"
+    assert page.text("detail") == "Rotation 0.21° -> 0.15°"
+    assert (page.text("count"), page.text("of").strip()) == ("7", "of 15")
+    assert page.text("elapsed") == "01:23"
+    assert page.text("rotation").split() == ["rotation", "0.20°", "/", "0.10"]
+    assert page.text("translation").split() == ["position", "4.0", "mm", "/", "5.0"]
+    assert page.each(".bar.full") == ["translation", "roll"]
+    page.wait_until(
+        "Math.abs(document.querySelector('#left_right em').getBoundingClientRect().width"
+        " / document.querySelector('#left_right i').getBoundingClientRect().width - 0.8) < 0.01"
+    )
+    assert page.text("streams").split("\n")[-1] == state().streams[1].reason
+    assert page.each("#streams li", "className") == ["good", "bad"]
+    assert page.text("log").split("\n") == ["captured 000006", "captured 000005"]
+    assert page.text("notes") == state().notes[0]
+    assert page.evaluate("document.getElementById('countdown').hidden")
+    for element in ("say", "stage", "captures", "streams", "sigmas"):
+        box = page.evaluate(f"document.getElementById('{element}').getBoundingClientRect().toJSON()")
+        assert box["left"] >= 0 and box["top"] >= 0
+        assert box["right"] <= width and box["bottom"] <= height, element
+    is_too_wide = page.evaluate("document.documentElement.scrollWidth > innerWidth")
+    headline = "document.querySelector('#headline span')"
+    headline_px = page.evaluate(f"parseFloat(getComputedStyle({headline}).fontSize)")
+    assert is_too_wide is False and headline_px >= 24
+    assert not page.complaints
+    host = preview.urls[0]
+    assert page.requested and all(
+        each.startswith((host, host.replace("http", "ws"))) for each in page.requested
+    )
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_outlines_lie_where_the_boards_are_in_the_picture(
+    preview: Preview, browser: Browser, width: int, height: int
+) -> None:
+    page = browser.open(preview.urls[0], width, height)
+    shown(preview, page, "document.querySelector('#wanted .ink') !== null")
+    for is_mirrored in (True, False):
+        _compare_with_picture(page, is_mirrored)
+        page.tap("mirror")
+    assert not page.complaints
+
+
+def _compare_with_picture(page: Page, is_mirrored: bool) -> None:
+    found = np.array(page.evaluate(_ON_SCREEN % "present"))
+    wanted = np.array(page.evaluate(_ON_SCREEN % "wanted"))
+    page.evaluate("document.querySelectorAll('#outlines, #legend').forEach((each) => each.style.opacity = 0)")
+    screen = cv2.cvtColor(page.screenshot(), cv2.COLOR_BGR2GRAY)
+    # The bright square of the picture, as the browser painted it.
+    left, top = np.floor(found.min(axis=0)).astype(int) - 15
+    right, bottom = np.ceil(found.max(axis=0)).astype(int) + 15
+    rows, columns = np.nonzero(screen[top:bottom, left:right] > 130)
+    painted = np.array(
+        [columns.min() + left, rows.min() + top, columns.max() + left + 1, rows.max() + top + 1]
+    )
+    assert np.abs(painted - np.concatenate([found.min(axis=0), found.max(axis=0)])).max() <= 1.5
+    # The whole picture fits, and both outlines share its scale.
+    scale = np.ptp(found, axis=0) / np.ptp(PRESENT_PX, axis=0)
+    assert np.allclose(scale, scale[0])
+    assert np.allclose(np.ptp(wanted, axis=0), scale * np.ptp(WANTED_PX, axis=0))
+    stage = page.evaluate("document.getElementById('stage').getBoundingClientRect().toJSON()")
+    assert np.isclose(scale[0], min(stage["width"] / WIDTH_PX, stage["height"] / HEIGHT_PX), rtol=1e-3)
+    assert (wanted[:, 0].mean() < found[:, 0].mean()) == is_mirrored
+
+
+def test_pictures_follow_one_another(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0])
+    page.wait_until(OPEN)
+    # Read from a copy, as reading makes a browser keep a picture elsewhere, and complain.
+    corner = """(() => {
+      const copy = new OffscreenCanvas(1, 1).getContext('2d', { willReadFrequently: true });
+      copy.drawImage(document.getElementById('picture'), -5, -5);
+      return copy.getImageData(0, 0, 1, 1).data[0];
+    })()"""
+    for level in (40, 120, 240):
+        preview.publish(state(drawing=Drawing("cam", picture(level))))
+        page.wait_until(f"Math.abs({corner} - {level}) <= 3")
+    assert page.evaluate("document.getElementById('picture').width") == WIDTH_PX
+    preview.publish(state(drawing=Drawing("cam", np.zeros((260, 346), np.uint8))))
+    page.wait_until("document.getElementById('picture').width === 346")
+    preview.publish(state(drawing=None))
+    page.wait_until("!document.getElementById('nothing').hidden")
+    assert page.each("#outlines path") == []
+    assert not page.complaints
+
+
+def test_outlines_break_off_where_the_lens_sees_no_further(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0])
+    gone = WANTED_PX.copy()
+    gone[2] = np.nan
+    shown(
+        preview,
+        page,
+        "document.querySelector('#wanted .ink') !== null",
+        drawing=Drawing("cam", picture(), None, gone),
+    )
+    drawn = page.evaluate("document.querySelector('#wanted .ink').getAttribute('d')")
+    assert drawn == "M400 100L560 100M400 260L400 100"
+    assert page.each("#arrow path") == []
+    assert not page.complaints
+
+
+def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0])
+    tip = "document.querySelector('#arrow .head')?.getAttribute('d').split('L')[0]"
+    # From (150, 130) towards (480, 180), whose outline begins at x = 400.
+    shown(preview, page, f"{tip}?.startsWith('M400 167.8')")
+    near = Drawing("cam", picture(), PRESENT_PX, PRESENT_PX + [40.0, 0.0])
+    shown(preview, page, f"{tip} === 'M190 130'", drawing=near)
+    there = Drawing("cam", picture(), PRESENT_PX, PRESENT_PX + 2, is_there=True)
+    shown(preview, page, "document.querySelector('#outlines.there') !== null", drawing=there)
+    assert page.each("#arrow path") == []
+
+
+def test_the_last_capture_is_taken_back_by_a_tap(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0], 390, 844)
+    shown(preview, page, has_text("take_back", "take back\n000006"), last_capture="000006")
+    page.tap("take_back")
+    deadline_s = time.monotonic() + 10
+    while (asked := preview.asked()) is None:
+        assert time.monotonic() < deadline_s
+    assert asked.name == "000006"
+    shown(preview, page, "document.getElementById('take_back').hidden", n_captures=1, n_wanted=None)
+    assert page.text("captures").split() == ["1", "capture"]
+    assert not page.complaints
+
+
+def test_the_countdown_runs_while_the_board_is_held(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0])
+    offset = "Number(document.getElementById('ring').style.strokeDashoffset)"
+    shown(preview, page, "!document.getElementById('countdown').hidden", phase="holding", hold_s=2.0)
+    assert page.text("hold") == "2"
+    assert page.evaluate(offset) == pytest.approx(0)
+    shown(preview, page, has_text("hold", "1"), phase="holding", hold_s=0.5)
+    assert page.evaluate(offset) == pytest.approx(0.75)
+    shown(preview, page, "document.getElementById('countdown').hidden", phase="saving")
+    assert page.evaluate("document.body.dataset.phase") == "saving"
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_instructions_are_as_large_as_fits(
+    preview: Preview, browser: Browser, width: int, height: int
+) -> None:
+    page = browser.open(preview.urls[0], width, height)
+    for words in (
+        "hold still",
+        "2 steps right, 1.2 m back, turn the left side a little towards the rig",
+        "the LiDAR sees 2 rings of the board, 4 are needed: lower it by 20 cm, come closer, hold it upright",
+        120 * "x",
+    ):
+        shown(preview, page, has_text("headline", words), headline=words, detail="")
+        box, text = (
+            page.evaluate(f"document.querySelector('{each}').getBoundingClientRect().toJSON()")
+            for each in ("#headline", "#headline span")
+        )
+        assert text["height"] <= box["height"] + 1
+        assert text["width"] <= box["width"] + 1
+        assert text["height"] > 0.4 * box["height"] or text["width"] > 0.7 * box["width"]
+
+
+@pytest.mark.parametrize(("width", "height"), [*SIZES, (390, 844), (320, 900)])
+def test_no_word_of_an_instruction_is_broken(
+    preview: Preview, browser: Browser, width: int, height: int
+) -> None:
+    page = browser.open(preview.urls[0], width, height)
+    for words in ("collection has ended", "cam: synchronisation lost", "wait"):
+        shown(preview, page, has_text("headline", words), headline=words, detail="", phase="ended")
+        # Boxes of a word that is broken lie a line apart; a first letter has a box of its own.
+        apart_px = """(() => {
+          const text = document.querySelector('#headline span').firstChild;
+          return [...text.data.matchAll(/\\S+/g)].map((found) => {
+            const word = document.createRange();
+            word.setStart(text, found.index);
+            word.setEnd(text, found.index + found[0].length);
+            const tops = [...word.getClientRects()].map((box) => box.top);
+            return Math.max(...tops) - Math.min(...tops);
+          });
+        })()"""
+        assert max(page.evaluate(apart_px)) < 5
+    assert page.text("camera") == "cam"
+
+
+def test_what_sensors_say_is_text_and_not_markup(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0])
+    evil = "<img src=x onerror=alert(1)><b>bold</b>"
+    stream = StreamState(evil, reason=evil, figures=evil)
+    said = {"headline": evil, "detail": evil, "log": (evil,), "notes": (evil,), "streams": (stream,)}
+    shown(preview, page, has_text("headline", evil), **said)
+    markup = page.each("img, #say b, #log b, #streams b, #notes b")
+    assert markup == []
+    assert not page.complaints
+
+
+def test_before_the_first_state_it_waits(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0])
+    page.wait_until(has_text("headline", "waiting for the collection"))
+    assert page.text("phase") == "connected"
+
+
+def test_phones_that_may_switch_their_screen_off_are_warned_of(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0], 360, 640)
+    page.wait_until(OPEN)
+    assert page.evaluate("document.getElementById('hint').hidden")
+    # On a plain link to another computer browsers hide the means to keep the screen on.
+    page.call("Page.addScriptToEvaluateOnNewDocument", source="delete Navigator.prototype.wakeLock")
+    page.call("Emulation.setTouchEmulationEnabled", enabled=True)
+    page.evaluate("window.isOld = true")
+    page.call("Page.reload")
+    page.wait_until(f"!window.isOld && {OPEN} && !document.getElementById('hint').hidden")
+    assert not page.complaints
+
+
+def test_what_was_chosen_stays_chosen(preview: Preview, browser: Browser) -> None:
+    page = browser.open(preview.urls[0])
+    page.wait_until(OPEN)
+    assert page.each("#scene.mirrored") == ["scene"]
+    page.tap("mirror")
+    page.evaluate("window.isOld = true")
+    page.call("Page.reload")
+    page.wait_until(f"!window.isOld && {OPEN} && document.querySelector('#scene.mirrored') === null")
+    assert page.evaluate("document.getElementById('mirror').getAttribute('aria-pressed')") == "false"
+
+
+def test_a_page_in_the_background_is_sent_no_pictures(preview: Preview, browser: Browser) -> None:
+    hiding = """
+      window.isHidden = false;
+      Object.defineProperty(Document.prototype, 'hidden', { get: () => window.isHidden });
+    """
+    page = browser.open(preview.urls[0], first=hiding)
+    shown(preview, page, has_text("count", "7"))
+    page.evaluate("window.isHidden = true; document.dispatchEvent(new Event('visibilitychange'))")
+    time.sleep(0.3)
+    before = preview.n_pictures
+    for k in range(3):
+        shown(
+            preview,
+            page,
+            has_text("count", str(20 + k)),
+            n_captures=20 + k,
+            drawing=Drawing("cam", picture(k)),
+        )
+    assert preview.n_pictures == before
+    page.evaluate("window.isHidden = false; document.dispatchEvent(new Event('visibilitychange'))")
+    deadline_s = time.monotonic() + 5
+    while preview.n_pictures == before:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)

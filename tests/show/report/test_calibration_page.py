@@ -1,0 +1,105 @@
+"""The report of a calibration: complete, the same each time, without requests, and its sums add up."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import invert
+from lce_rig.core.results import Refusal
+from lce_rig.rig import load_rig
+from lce_rig.show.report.evidence import gather
+from lce_rig.show.report.worked_point import work_point
+from tests.export.conftest import calibration as without_boards
+
+from .conftest import RLFS, page
+
+_DRAWINGS = 12
+
+
+def test_the_same_result_gives_the_same_bytes(one, one_page):
+    assert page(RLFS, one) == one_page
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("which", ["one_page", "two_page"])
+def test_it_is_small_and_names_no_address(which, request):
+    text = request.getfixturevalue(which)
+    assert len(text) < 3_000_000
+    assert "http:" not in text and "https:" not in text and "<script" not in text
+
+
+def test_it_shows_every_drawing(one_page, two_page):
+    assert one_page.count("<svg ") == _DRAWINGS
+    assert two_page.count("<svg ") == 2 * _DRAWINGS and two_page.count("<article ") == 2
+
+
+@pytest.mark.parametrize("which", ["one_page", "two_page"])
+def test_every_link_leads_to_one_place(which, request):
+    text = request.getfixturevalue(which)
+    ids = re.findall(r' id="([^"]+)"', text)
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r'href="#([^"]+)"', text) + re.findall(r"url\(#([^)]+)\)", text)) <= set(ids)
+
+
+def test_every_capture_s_bars_lead_to_its_overlay(one, one_page):
+    for k, residual in enumerate(one.residuals):
+        # Planes, edges, outline, plate from above, range and angle, residual by range; and the table.
+        assert one_page.count(f'href="#pair-0-capture-{k}"') == 7
+        assert f'src="overlays/cam/{residual.capture}.png"' in one_page
+
+
+def test_the_worked_point_can_be_worked_with_a_calculator(one):
+    board, lens = RLFS.board.to_board(), RLFS.cameras["cam"].to_intrinsics()
+    evidence = gather(one, board, lens)
+    worked = work_point(one, lens, evidence)
+    in_camera = []
+    for line in worked.lines:
+        if found := re.fullmatch(r"[xyz]_cam = (.*) = (\S+) m", line):
+            assert eval(found[1]) == pytest.approx(float(found[2]), abs=1e-4)
+            in_camera.append(float(found[2]))
+        if found := re.fullmatch(r"[uv] = .* = (.*) = (\S+) px", line):
+            assert eval(found[1]) == pytest.approx(float(found[2]), abs=0.06)
+    assert worked.pixel == pytest.approx(lens.project(np.array(in_camera))[0], abs=0.01)
+
+
+def test_points_on_the_board_lie_where_residuals_say(one):
+    board, lens = RLFS.board.to_board(), RLFS.cameras["cam"].to_intrinsics()
+    evidence = gather(one, board, lens)
+    for k, residual in enumerate(one.residuals):
+        own = evidence.plane_m[evidence.capture == k]
+        assert np.abs(own).mean() == pytest.approx(residual.plane_mean_m)
+    # Farther from the camera than its board: behind.
+    far = replace(one, T_cam_lidar=one.T_cam_lidar + np.pad([[0.0, 0, 0, 0.1]], ((2, 1), (0, 0))))
+    assert gather(far, board, lens).plane_m.mean() > 0.05
+
+
+def test_the_pose_is_that_of_the_camera_s_body_in_the_lidar_s_frame(one, one_page):
+    found = re.findall(r"<td>([xyz])</td><td class=\"figure\">(\S+) m</td>", one_page)
+    assert [float(value) for _, value in found] == pytest.approx(invert(one.T_cam_lidar)[:3, 3], abs=1e-4)
+
+
+def test_a_failed_result_is_explained(one):
+    reasons = (
+        Finding("verdict.text", "error", figures={"text": "the <board> moved", "advice": "hold it `still`"}),
+        Finding("verdict.not_certified", "warning", figures={"gap": 0.1}),
+    )
+    text = page(RLFS, replace(one, verdict="fail", findings=reasons))
+    assert 'class="verdict fail"' in text
+    assert "the &lt;board&gt; moved" in text
+    assert "Hold it <code>still</code>." in text
+    assert text.count("<svg ") == _DRAWINGS
+
+
+def test_a_result_that_was_read_from_a_file_lacks_only_its_boards():
+    text = page(load_rig("rles"), without_boards())
+    assert text.count("<svg ") == 3
+    assert "näher – ¼ m" in text
+
+
+def test_causes_of_refusal_are_named(one):
+    refused = {"<000007>": Refusal("image.too_dark", figures={"grey_99": 20.0})}
+    text = page(RLFS, replace(one, captures_refused=refused))
+    assert "&lt;000007&gt;" in text and "<000007>" not in text

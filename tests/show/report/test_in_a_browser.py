@@ -1,0 +1,64 @@
+"""The report in a real browser: no sideways scrolling, no requests, overlays that open."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tests.page.browser import Browser
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    names = ("chromium", "chromium-browser", "google-chrome")
+    executable = next(filter(None, map(shutil.which, names)), None)
+    if executable is None:
+        pytest.skip("no browser is installed")
+    with Browser(executable, tmp_path_factory.mktemp("profile")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def files(one_page, two_page, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("calibration")
+    for name, text in (("one", one_page), ("two", two_page)):
+        (folder / f"{name}.html").write_text(text, encoding="utf-8")
+    (folder / "overlays" / "cam").mkdir(parents=True)
+    cv2.imwrite(str(folder / "overlays" / "cam" / "000001.png"), np.full((1200, 1000, 3), 90, np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize("width_px", [390, 1440])
+@pytest.mark.parametrize("name", ["one", "two"])
+def test_it_fits_the_screen_and_loads_nothing(browser, files, name, width_px):
+    page = browser.open((files / f"{name}.html").as_uri(), width_px, 844)
+    assert page.evaluate("document.documentElement.scrollWidth") == width_px
+    # A colour bar is a picture within the page.
+    requested = [address for address in page.requested if not address.startswith("data:")]
+    assert requested == [(files / f"{name}.html").as_uri()]
+    assert page.complaints == []
+
+
+def test_a_bar_opens_the_capture_s_overlay(browser, files):
+    page = browser.open((files / "one.html").as_uri(), 390, 844)
+    overlays = "[...document.querySelectorAll('.overlay')]"
+    shown = f"{overlays}.filter((each) => each.offsetHeight).map((each) => each.id)"
+    assert page.evaluate(shown) == []
+    page.evaluate(
+        """document.querySelector('svg[aria-label="Residuals by capture"] a[*|href="#pair-0-capture-1"]')
+        .dispatchEvent(new MouseEvent('click', {bubbles: true}))"""
+    )
+    page.wait_until(f"{shown}.length === 1")
+    assert page.evaluate(shown) == ["pair-0-capture-1"]
+    page.wait_until("document.querySelector('#pair-0-capture-1 img').naturalWidth === 1000")
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+
+
+def test_it_prints_on_a4_within_the_paper_s_width(browser, files):
+    page = browser.open((files / "one.html").as_uri(), 690, 1000)
+    page.call("Emulation.setEmulatedMedia", media="print")
+    assert page.evaluate("document.documentElement.scrollWidth") == 690
+    assert page.call("Page.printToPDF", preferCSSPageSize=True)["data"]
