@@ -30,8 +30,8 @@ if TYPE_CHECKING:
         SourceError,
         UsageError,
     )
-    from lce_rig.core.findings import Finding
-    from lce_rig.core.results import Calibration, Refusal
+    from lce_rig.core.findings import Finding, Refusal
+    from lce_rig.core.results import Calibration
     from lce_rig.detect.detection import Detections
     from lce_rig.export import export
     from lce_rig.export.reference import Reference, read_reference
@@ -101,8 +101,8 @@ _HOMES = {
     "lce_rig.collect": ("CollectOptions",),
     "lce_rig.core.data": ("Events", "Image", "Scan"),
     "lce_rig.core.errors": tuple(name for name in __all__ if name.endswith("Error")),
-    "lce_rig.core.findings": ("Finding",),
-    "lce_rig.core.results": ("Calibration", "Refusal"),
+    "lce_rig.core.findings": ("Finding", "Refusal"),
+    "lce_rig.core.results": ("Calibration",),
     "lce_rig.detect.detection": ("Detections",),
     "lce_rig.export": ("export",),
     "lce_rig.export.reference": ("Reference", "read_reference"),

@@ -21,8 +21,9 @@ from lce_rig.calibrate.report import report_estimate, with_parts
 from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities
 from lce_rig.core.board import Board
 from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose, project_to_so3
-from lce_rig.core.results import Certificate, Observation, Refusal
+from lce_rig.core.results import Certificate, Observation
 from lce_rig.residuals.features import CaptureFeatures, extract_features
 from lce_rig.residuals.moments import Problem, Solutions, Weights
 from lce_rig.residuals.placements import group_placements

@@ -10,8 +10,9 @@ from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.observability import lever_arm
 from lce_rig.core.board import Board
 from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, sigma_sizes
-from lce_rig.core.results import Certificate, Observation, Refusal
+from lce_rig.core.results import Certificate, Observation
 from lce_rig.residuals.features import CaptureFeatures
 from lce_rig.residuals.placements import group_placements
 

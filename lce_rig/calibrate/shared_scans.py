@@ -8,7 +8,8 @@ import numpy as np
 from lce_rig.calibrate.board_motion import PoseSamples, sample_poses
 from lce_rig.calibrate.consensus import Consensus
 from lce_rig.calibrate.options import CaptureCandidates
-from lce_rig.core.results import ImageBoard, LidarBoard, Observation, Refusal
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 
 # Images without timestamps may be at any time around the scan they were saved with.
 NO_STAMPS_SIGMA_S = 0.15

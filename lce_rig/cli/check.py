@@ -10,7 +10,8 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, json_option, session_argument
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.lidar.search import plane_limit_m
 from lce_rig.rig import Rig

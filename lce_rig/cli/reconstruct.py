@@ -160,7 +160,7 @@ def _write(
     output: Path, reconstructor: Any, events: "EventRecording", stamps_ns: range
 ) -> tuple[list[Path], list[str]]:
     """Write the images and their timestamps; return the files, and the causes of skipped images."""
-    from lce_rig.core.results import Refusal
+    from lce_rig.core.findings import Refusal
     from lce_rig.show.overlays.overlay_files import write_picture
 
     lines = ["picture,stamp_ns"]

@@ -6,9 +6,10 @@ import numpy as np
 
 from lce_rig.calibrate.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
 from lce_rig.core.data import Image, Scan
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.losses import Losses
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder, ImageSearch
 from lce_rig.detect.image.search import NOT_SEEN_AT_ONCE
 from lce_rig.rig import Rig

@@ -14,8 +14,8 @@ import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey, MovedSlowly
 from lce_rig.core.data import Events
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Refusal
 from lce_rig.detect.events.event_limits import explain_missing_board, look_for_flicker, too_fast
 from lce_rig.detect.events.figures import MEMORY_NS, event_quality, outline_px
 from lce_rig.rig import Rig

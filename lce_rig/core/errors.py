@@ -1,10 +1,11 @@
 """Errors that the user can repair; each states what happened, where, and an action."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Finding, Kind, Refusal, Stage
+from lce_rig.core.phrasing import as_line
 
 
 class LceRigError(Exception):
@@ -65,6 +66,15 @@ class NotEnoughDataError(LceRigError):
         super().__init__(what, hint)
         self.finding = finding
 
+    @staticmethod
+    def of(finding: Finding) -> "NotEnoughDataError":
+        """Make the error that names the missing data and their sensor."""
+        subject, advice = f"{finding.subject}: " if finding.subject else "", finding.advice
+        # Several causes, a line each, are no sentence.
+        return NotEnoughDataError(
+            subject + finding.text, advice if "\n" in advice else as_line(advice), finding
+        )
+
 
 class ResultRefusedError(LceRigError):
     """A computed result that must not be used."""
@@ -106,3 +116,28 @@ def join_shortages(errors: Sequence[NotEnoughDataError]) -> NotEnoughDataError:
     first, *others = errors
     hint = "\n".join([first.hint, *map(str, others)]).strip()
     return NotEnoughDataError(first.what, hint, first.finding)
+
+
+def _hint_or(otherwise: str) -> Callable[[Finding], str]:
+    def hint(finding: Finding) -> str:
+        return str(finding.figures["hint"] or otherwise)
+
+    hint.__doc__ = f"{{hint}}, else: {otherwise}."
+    return hint
+
+
+_ERRORS: dict[Stage, Kind] = {
+    "read": Kind(
+        "read.error",
+        "{what}",
+        _hint_or("collect this placement again"),
+        actions={"record": _hint_or("record it again")},
+    ),
+    "image": Kind("image.error", "{what}", "{hint}"),
+    "lidar": Kind("lidar.error", "{what}", "{hint}"),
+}
+
+
+def refusal_of(stage: Stage, error: LceRigError, action: str = "") -> Refusal:
+    """Refuse a capture for an error that was raised about it."""
+    return _ERRORS[stage].refusal(what=error.what, hint=error.hint, action=action)

@@ -1,12 +1,69 @@
-"""Facts about a sensor, a capture or a result; `words` renders them."""
+"""Facts about a sensor, a capture or a result, and their words.
 
-from collections.abc import Iterable, Mapping
+A kind of finding is declared once, as a `Kind` in `findings.py` of the room that makes it:
+
+    TOO_DARK = Kind("image.too_dark", "too dark: grey {grey_99:.0f}", "expose longer")
+
+and called with its figures: `TOO_DARK("camera", grey_99=12.0)` is a `Finding`,
+`TOO_DARK.refusal(grey_99=12.0)` a `Refusal`.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, cast
+
+from lce_rig.core.phrasing import fill
 
 Severity = Literal["note", "warning", "error"]
 Figure = float | int | bool | str | None | tuple["Figure", ...]
+Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
+STAGES: tuple[Stage, ...] = ("read", "image", "lidar", "pair", "calibrate")
+Template = str | Callable[["Finding"], str]
 _ORDER: tuple[Severity, ...] = ("note", "warning", "error")
+
+KINDS: dict[str, "Kind"] = {}
+"""Every declared kind by its code, as far as its module is imported."""
+
+
+class Kind:
+    """A kind of finding.
+
+    Args:
+        code: "family.name"; stable, listed in docs/findings.md.
+        text: the fact, without an action: a template over subject and figures ({rms_m:mm}, {share:percent}),
+            or a function of the finding, whose docstring is then the template shown in the docs.
+        action: the action, in the imperative; "" for none.
+        severity: the usual one.
+        actions: alternative actions, by the name that `Finding.action` gives.
+    """
+
+    def __init__(
+        self,
+        code: str,
+        text: Template,
+        action: Template = "",
+        *,
+        severity: Severity = "error",
+        actions: Mapping[str, Template] | None = None,
+    ) -> None:
+        if code in KINDS:
+            raise ValueError(f"{code} is declared twice")
+        self.code, self.text, self.action, self.severity = code, text, action, severity
+        self.actions: Mapping[str, Template] = actions or {}
+        KINDS[code] = self
+
+    def __call__(
+        self, subject: str = "", /, *, severity: Severity | None = None, action: str = "", **figures: Figure
+    ) -> "Finding":
+        """Make a finding of this kind."""
+        return Finding(self.code, severity or self.severity, subject, figures, action)
+
+    def refusal(
+        self, subject: str = "", /, *, severity: Severity | None = None, action: str = "", **figures: Figure
+    ) -> "Refusal":
+        """Make a refusal of this kind; the code begins with the stage."""
+        return Refusal(self.code, severity or self.severity, subject, figures, action)
 
 
 @dataclass(frozen=True)
@@ -14,11 +71,12 @@ class Finding:
     """One fact with its figures.
 
     Attributes:
-        code: what was found, "family.name"; stable, listed in docs/findings.md.
+        code: of its kind, "family.name".
         severity: "note" changes nothing; "warning": usable, less well; "error": must not be used.
         subject: a sensor's or capture's name, a profile key or a file; "" if clear.
         figures: by name with units ("rms_m"), for the words and for programs.
-        action: which of several actions applies, by its code in `words`; "" if the code has one only.
+        action: the name of an alternative action of the kind; "" for the usual one.
+        stored: text and action as read from a file; None renders the kind's own.
     """
 
     code: str
@@ -26,10 +84,11 @@ class Finding:
     subject: str = ""
     figures: Mapping[str, Figure] = field(default_factory=dict)
     action: str = ""
+    stored: tuple[str, str] | None = field(default=None, compare=False)
 
     @property
     def family(self) -> str:
-        """The part of the code before the point: what kind of thing was found."""
+        """The part of the code before the point."""
         return self.code.partition(".")[0]
 
     def figure(self, name: str) -> float:
@@ -44,6 +103,64 @@ class Finding:
             raise TypeError(f"{self.code}: {name} is {value!r}")
         return float(value)
 
+    @property
+    def text(self) -> str:
+        """The fact in words, without an action."""
+        return self.stored[0] if self.stored else self._render(KINDS[self.code].text)
+
+    @property
+    def advice(self) -> str:
+        """The action in words; "" for none."""
+        if self.stored:
+            return self.stored[1]
+        kind = KINDS[self.code]
+        return self._render(kind.actions[self.action] if self.action else kind.action)
+
+    @property
+    def sentence(self) -> str:
+        """Fact and action in one line."""
+        return f"{self.text}: {self.advice}" if self.advice else self.text
+
+    def as_json(self) -> dict[str, object]:
+        """Return the finding for programs; all but the texts is stable."""
+        return {
+            "code": self.code,
+            "severity": self.severity,
+            "subject": self.subject,
+            "figures": {name: _finite(figure) for name, figure in self.figures.items()},
+            "action_code": self.action,
+            "text": self.text,
+            "action": self.advice,
+        }
+
+    def _render(self, template: Template) -> str:
+        if callable(template):
+            return template(self)
+        return fill(template, {"subject": self.subject, **self.figures})
+
+
+@dataclass(frozen=True)
+class Refusal(Finding):
+    """The reason for refusing a capture; its code begins with the stage, as "lidar.too_few_rings".
+
+    Stages are "read", "image", "lidar", "pair" (the two sensors disagree) and "calibrate" (an outlier).
+    """
+
+    def __post_init__(self) -> None:
+        if self.family not in STAGES:
+            raise ValueError(f"{self.code} names no stage")
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that refuses the capture."""
+        return cast(Stage, self.family)
+
+    def as_json(self) -> dict[str, object]:
+        """Return the refusal for programs; stage, code, figures and the action's code are stable."""
+        record = super().as_json()
+        kept = {name: record[name] for name in ("code", "figures", "action_code")}
+        return {"stage": self.stage, **kept, "cause": record["text"], "action": record["action"]}
+
 
 def worst(findings: Iterable[Finding]) -> Severity:
     """Return the highest severity; "note" where nothing was found."""
@@ -53,3 +170,10 @@ def worst(findings: Iterable[Finding]) -> Severity:
 def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """List findings, the worst first, otherwise in the order given."""
     return tuple(sorted(findings, key=lambda finding: -_ORDER.index(finding.severity)))
+
+
+def _finite(figure: Figure) -> Figure:
+    """Return None for a number that JSON cannot represent."""
+    if isinstance(figure, tuple):
+        return tuple(_finite(each) for each in figure)
+    return None if isinstance(figure, float) and not math.isfinite(figure) else figure

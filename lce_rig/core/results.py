@@ -3,44 +3,19 @@
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Literal, Protocol, cast
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
-from lce_rig.core.errors import LceRigError
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Figure, Finding, Refusal
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.scene_opinion import SceneOpinion
 
-Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
-STAGES: tuple[Stage, ...] = ("read", "image", "lidar", "pair", "calibrate")
 Method = Literal["ml", "paper"]
 DEFAULT_METHOD: Method = "ml"
 """How extrinsics are estimated: the joint maximum likelihood, or Algorithm 1 of LCE-Calib."""
-
-
-@dataclass(frozen=True)
-class Refusal(Finding):
-    """The reason for refusing a capture; its code begins with the stage, as "lidar.too_few_rings".
-
-    Stages are "read", "image", "lidar", "pair" (the two sensors disagree) and "calibrate" (an outlier).
-    """
-
-    def __post_init__(self) -> None:
-        if self.code.partition(".")[0] not in STAGES:
-            raise ValueError(f"{self.code} names no stage")
-
-    @property
-    def stage(self) -> Stage:
-        """The stage that refuses the capture."""
-        return cast(Stage, self.code.partition(".")[0])
-
-    @staticmethod
-    def of_error(stage: Stage, error: LceRigError, action: str = "") -> "Refusal":
-        """Refuse a capture for an error that was raised about it."""
-        return Refusal(f"{stage}.error", figures={"what": error.what, "hint": error.hint}, action=action)
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,8 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Image
 from lce_rig.core.documents import parse_json
-from lce_rig.core.results import (
-    Calibration,
-    EventQuality,
-    ImageBoard,
-    ImageQuality,
-    LidarBoard,
-    LidarQuality,
-    Refusal,
-)
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import Calibration, EventQuality, ImageBoard, ImageQuality, LidarBoard, LidarQuality
 from lce_rig.words import is_renderable
 
 # Types of the fields of a detection; an entry of a cache may be foreign or outdated.

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image, Scan
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.search import find_in_reconstruction
 from lce_rig.detect.image.search import find_image_board, region_around
 from lce_rig.detect.lidar.measurement import Beam

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import Literal
 
 from lce_rig.core.board import Board
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.rig import QualitySettings
 
 

@@ -7,8 +7,7 @@ import numpy as np
 from lce_rig.core import velodyne
 from lce_rig.core.data import join_events
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Figure, Finding, Severity
-from lce_rig.core.results import Refusal
+from lce_rig.core.findings import Figure, Finding, Refusal, Severity
 from lce_rig.detect.events.event_limits import events_problem
 from lce_rig.detect.image.quality import strongest_edge_px
 from lce_rig.devices.vlp16.web import VelodyneWeb, WebReport, find_problems

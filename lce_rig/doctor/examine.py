@@ -7,9 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from lce_rig.core.data import Image, join_events
-from lce_rig.core.errors import LceRigError, SourceError
-from lce_rig.core.findings import Finding
-from lce_rig.core.results import Refusal
+from lce_rig.core.errors import LceRigError, SourceError, refusal_of
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.detect.events.search import find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.devices.vlp16.web import WebReport
@@ -144,7 +143,7 @@ def _sight_in_image(rig: Rig, image: Image) -> Finding:
     try:
         found = BoardFinder(rig).image(image)
     except LceRigError as error:
-        found = Refusal.of_error("image", error)
+        found = refusal_of("image", error)
     if isinstance(found, Refusal):
         return found
     names, figures = ("distance_m", "n_corners", "corner_rms_px", "sharpness"), found.figures()
@@ -168,7 +167,7 @@ def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
             rig.quality,
         ).board
     except LceRigError as error:
-        found = Refusal.of_error("image", error)
+        found = refusal_of("image", error)
     if isinstance(found, Refusal):
         return found
     return Finding("board.in_events", "note", figures={"distance_m": found.distance_m})

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.documents import read_json
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
-from lce_rig.core.findings import Figure, Finding, Severity
+from lce_rig.core.findings import Figure, Finding, Refusal, Severity
 from lce_rig.core.geometry import FARTHEST_M
 from lce_rig.core.limits import describe
 from lce_rig.core.results import (
@@ -21,7 +21,6 @@ from lce_rig.core.results import (
     Contribution,
     OtherCamera,
     PointUncertainty,
-    Refusal,
     SceneShare,
 )
 from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Refusal
 from lce_rig.lens.fit import N_MODES, LensState, Setup, corners_of, fit, reduced, refine_poses, residuals_px
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import MODELS, LensModel, convert, model_of

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.results import ImageBoard
 from lce_rig.lens.models import LensModel
 
 

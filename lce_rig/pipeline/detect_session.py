@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.data import Image
-from lce_rig.core.errors import ProfileError, SessionError
+from lce_rig.core.errors import ProfileError, SessionError, refusal_of
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.events.search import EventImage, EventSighting, find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
@@ -168,7 +169,7 @@ class _Finder:
             try:
                 return self._boards.image(capture.image(camera, channel))
             except ProfileError as error:
-                return Refusal.of_error("image", error)
+                return refusal_of("image", error)
 
         found: ImageDetection = self._remembered(
             self._digest, capture, f"{camera}.{channel}", ImageBoard, find
@@ -250,7 +251,7 @@ class _Finder:
                     return self._require(from_arrays(cached.arrays), kind)
             detection = find()
         except SessionError as error:
-            return Refusal.of_error("read", error)
+            return refusal_of("read", error)
         self._keep(key, detection)
         return detection
 

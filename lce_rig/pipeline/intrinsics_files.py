@@ -11,7 +11,7 @@ import numpy as np
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.documents import read_json
 from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
-from lce_rig.core.results import Refusal
+from lce_rig.core.findings import Refusal
 from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
 from lce_rig.export.files import MADE_BY, number, numbers
 from lce_rig.judge.weighing import verdict_of

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
-from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, UsageError
-from lce_rig.core.findings import Finding
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, UsageError, refusal_of
+from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import crop_to_intrinsics
@@ -170,9 +170,9 @@ class _Samples:
                 image = capture.image(self._camera, channel)
                 return finder.corners(image, lens, max_reprojection_px=max_reprojection_px)
             except SessionError as error:
-                return Refusal.of_error("read", error)
+                return refusal_of("read", error)
             except ProfileError as error:
-                return Refusal.of_error("image", error)
+                return refusal_of("image", error)
 
         found: dict[Key, ImageDetection] = {}
         with ThreadPoolExecutor(2) as pool:

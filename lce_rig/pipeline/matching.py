@@ -4,8 +4,9 @@ from collections.abc import Mapping
 
 from lce_rig.calibrate import CaptureCandidates
 from lce_rig.calibrate.consensus import camera_poses, find_consensus
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, invert
-from lce_rig.core.results import LidarBoard, Refusal
+from lce_rig.core.results import LidarBoard
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.rig import Rig
 

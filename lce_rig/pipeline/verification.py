@@ -6,7 +6,8 @@ from functools import partial
 from pathlib import Path
 
 from lce_rig.core.errors import SessionError
-from lce_rig.core.results import Calibration, LidarBoard, Refusal
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import Calibration, LidarBoard
 from lce_rig.detect.detection import Detections, LidarDetection, Pair
 from lce_rig.detect.events.search import EventImage
 from lce_rig.export.result import SavedResult, read_result

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
-from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer, EventCut
 from lce_rig.timing.rig_time import rig_time_ns

@@ -76,7 +76,6 @@ _RECOLLECT = _hint_or("collect this placement again")
 
 PHRASES: dict[str, Phrase] = {
     "read.text": Phrase("{text}", "{advice}"),
-    "read.error": Phrase("{what}", _RECOLLECT, {"record": _hint_or("record it again")}),
     "read.network_settling": Phrase(
         "{n_steps} windows of events ({seen_s:.2f} s) precede the image, the network needs {n_warm_up}",
         "keep the board or the camera moving for a second before the first capture",
@@ -105,7 +104,6 @@ PHRASES: dict[str, Phrase] = {
     "lidar.none": Phrase("no board in the scan"),
     "calibrate.same_placement": Phrase("same placement as in an earlier capture"),
     "image.text": Phrase("{text}", "{advice}"),
-    "image.error": Phrase("{what}", "{hint}"),
     "image.not_at_first_sight": Phrase("no board found by the quick search", "search the image thoroughly"),
     "image.too_dark": Phrase(
         "too dark: 99 % of the image below grey {grey_99:.0f}", "expose longer or add light"

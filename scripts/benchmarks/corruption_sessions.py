@@ -13,9 +13,8 @@ import numpy as np
 from benchmarks.fault_sessions import nearly_parallel, rig_with_drawing
 from benchmarks.recordings import RecordedSet
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.errors import ProfileError
+from lce_rig.core.errors import ProfileError, refusal_of
 from lce_rig.core.geometry import Array, perturb
-from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections, ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
@@ -140,7 +139,7 @@ def _see(rig: Rig, image: Image) -> ImageDetection:
     try:
         return BoardFinder(rig).image(image)
     except ProfileError as error:
-        return Refusal.of_error("image", error)
+        return refusal_of("image", error)
 
 
 def _gather(rig: Rig, truth: Array, captures: Iterator[SimulatedCapture]) -> Samples:

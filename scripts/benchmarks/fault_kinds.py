@@ -9,8 +9,9 @@ from benchmarks.fault_sessions import WRONG_PLATES_M, SimulatedScans, with_plate
 from benchmarks.intrinsics import imperfect_corners
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, exp_so3, fit_plane, invert, perturb, pose, transform
-from lce_rig.core.results import LidarBoard, Refusal
+from lce_rig.core.results import LidarBoard
 from lce_rig.detect.detection import ImageDetection, LidarDetection
 from lce_rig.detect.image.search import board_from_pose
 from lce_rig.rig import Rig

@@ -206,7 +206,8 @@ def _journal(folder: Path) -> None:
 
 
 def _cache(folder: Path) -> None:
-    from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+    from lce_rig.core.findings import Refusal
+    from lce_rig.core.results import ImageBoard, LidarBoard
     from lce_rig.detect.detection import from_arrays
     from lce_rig.session import cache
 

@@ -15,7 +15,8 @@ import yaml
 from fuzzing.samples import CAMERA, LIDAR, SIZE, Samples, small_rig
 from fuzzing.seeds_of_recordings import Files
 from lce_rig.core.diagnostics import Diagnostics
-from lce_rig.core.results import Calibration, Certificate, ImageBoard, Metrics, PointUncertainty, Refusal
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import Calibration, Certificate, ImageBoard, Metrics, PointUncertainty
 from lce_rig.rig import find_profile
 from lce_rig.session import Session
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.results import Refusal
+from lce_rig.core.findings import Refusal
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.offline.slow_motion import _Neighbours, find_moving_moments
 from lce_rig.collect.placement_dedupe import Placements
+from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
-from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.scan_pairing import Frame
 

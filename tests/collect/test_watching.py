@@ -7,8 +7,8 @@ import numpy as np
 from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, HeldStill
 from lce_rig.collect.offline.search_ahead import RestingTracker, glance_at, sight_ahead
 from lce_rig.collect.offline.stillness import find_still_moments
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import transform
-from lce_rig.core.results import Refusal
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import Frame

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lce_rig.core.results import Refusal
+from lce_rig.core.findings import Refusal
 from lce_rig.detect.detection import Detections, Pair, from_arrays, to_arrays
 from tests.calibrate.boards import simulate
 

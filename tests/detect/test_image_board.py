@@ -14,8 +14,9 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, difference, exp_so3, pose, rotation_angle, transform
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.image.saddle import fit_crossings
 from lce_rig.detect.image.search import find_image_board, region_around
 

@@ -19,8 +19,8 @@ from scans import (
 )
 
 from lce_rig.core.data import Scan
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import exp_so3, invert, pose, transform
-from lce_rig.core.results import Refusal
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.detect.lidar.search import find_lidar_boards
 

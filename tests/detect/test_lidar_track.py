@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scans import BOARD, board_plate, cast, person, place, room
 
-from lce_rig.core.results import LidarBoard, Refusal
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import LidarBoard
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.detect.lidar.search import find_lidar_boards, look_for_board, track_lidar_board
 

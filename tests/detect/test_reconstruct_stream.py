@@ -9,7 +9,7 @@ from moving_board import COLS, ROWS, Motion, board_events, cut, events_of, inner
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError, UsageError
-from lce_rig.core.results import Refusal
+from lce_rig.core.findings import Refusal
 from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
 
 MS = 1_000_000

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Events, Image
-from lce_rig.core.findings import Finding
-from lce_rig.core.results import Refusal
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.doctor.devices import check_board, check_events, check_image
 from lce_rig.doctor.observing import SensorReport
 

@@ -10,8 +10,8 @@ from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.cli.calibrate import camera_lines, together_lines
 from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, invert
-from lce_rig.core.results import Refusal
 from lce_rig.detect.detection import Detections
 from lce_rig.export import export
 from lce_rig.export.result import read_result, write_result

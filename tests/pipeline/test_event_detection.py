@@ -10,7 +10,8 @@ import pytest
 from lce_rig import pipeline
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import ImageBoard
 from lce_rig.pipeline.detect_session import picture_stamp_ns
 from lce_rig.rig import Rig, load_rig, parse_rig
 from lce_rig.session import Session

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import lce_rig as lce
-from lce_rig.core.results import Refusal
+from lce_rig.core.findings import Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.matching import expected_poses, refusals_of

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import lce_rig
-from lce_rig.core.results import STAGES
+from lce_rig.core.findings import STAGES
 from lce_rig.words.rendering import phrases
 
 MAKERS = ("Finding", "Refusal", "reason", "_warn")
@@ -35,7 +35,7 @@ def test_every_code_has_a_phrase_and_every_phrase_a_code() -> None:
             made |= codes_of(node.args[0])
     assert len(made) > 60
     assert made - phrases().keys() == set()
-    assert phrases().keys() - literal == set()
+    assert {code for code in phrases() if not code.startswith("t.")} - literal == set()
 
 
 def test_codes_are_a_family_and_a_name() -> None:

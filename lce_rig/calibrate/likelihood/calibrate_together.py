@@ -12,8 +12,9 @@ from lce_rig.calibrate.likelihood.refine import inflate, refine
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.shared_scans import scan_key
 from lce_rig.core.board import Board
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Observation, Refusal
+from lce_rig.core.results import Observation
 from lce_rig.residuals.placements import group_shared_placements
 
 

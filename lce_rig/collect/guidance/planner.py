@@ -18,8 +18,8 @@ from lce_rig.collect.guidance.evidence import (
     weigh_placements,
 )
 from lce_rig.collect.guidance.instructions import describe_pose, instruct, is_there, say
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, rotation_angle
-from lce_rig.core.results import Refusal
 
 #: A bar is full where captures span this share of what reachable placements span.
 FULL_SHARE = 0.7

@@ -8,9 +8,9 @@ from lce_rig.collect.live.narration import Narration, narrate_moving, narrate_st
 from lce_rig.collect.offline.slow_motion import MotionGate
 from lce_rig.collect.offline.stillness import StillnessGate
 from lce_rig.collect.placement_dedupe import Placements
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.losses import Losses
-from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import EventCut
 

@@ -30,7 +30,8 @@ from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_u
 from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, LiveState, TakeBack
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.collect.worker import Worker
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import ImageBoard
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource

@@ -22,9 +22,8 @@ from lce_rig.collect.guidance import (
 from lce_rig.collect.guidance.planner import ENOUGH_SHARE
 from lce_rig.collect.placement_dedupe import capture_poses
 from lce_rig.core.errors import LceRigError, ProfileError
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Figure, Finding, Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 

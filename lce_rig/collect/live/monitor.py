@@ -9,8 +9,8 @@ from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
 from lce_rig.collect.live.state import Cue, Drawing, LiveOptions, LiveState, Phase, Sound, StreamState
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Refusal
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import AttachedSensors
 from lce_rig.session import Session

@@ -7,8 +7,9 @@ from lce_rig.collect.event_moment import BEST_SPEED_MPS
 from lce_rig.collect.guidance import say
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.state import Phase
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.words import describe, recommend, sentence
 
 _HOLD = "hold still"

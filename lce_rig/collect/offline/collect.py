@@ -12,10 +12,9 @@ from lce_rig.collect.offline.stillness import find_still_moments
 from lce_rig.collect.offline.stored_events import StoredEvents
 from lce_rig.collect.placement_dedupe import Placements, board_figures, capture_poses, known_placements
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
-from lce_rig.core.errors import LceRigError, SessionError, SourceError
-from lce_rig.core.findings import Finding
+from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.losses import Losses
-from lce_rig.core.results import Refusal
 from lce_rig.detect.image.search import compare_size
 from lce_rig.io.joining import join_recordings, require_sensors
 from lce_rig.io.protocol import (
@@ -234,7 +233,7 @@ class _Collector:
                 message = self._take_pair(files)
             except SourceError as error:
                 failures.append(error)
-                self.report.refused[files.label] = Refusal.of_error("read", error, "record")
+                self.report.refused[files.label] = refusal_of("read", error, "record")
                 message = f"{files.label} refused: {error.what}"
             self._progress(done + 1, len(recording.pairs), message)
         if n_left_out:

@@ -13,8 +13,8 @@ import numpy as np
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, MovedSlowly
 from lce_rig.collect.event_moment import BEST_SPEED_MPS, SPEED_WINDOW_S, judge_detection
 from lce_rig.collect.placement_dedupe import Placements
+from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
-from lce_rig.core.results import Refusal
 from lce_rig.rig import Rig
 
 # A way that strays from a straight one by this counts as much as a speed e times too high or low.

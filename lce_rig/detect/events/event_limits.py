@@ -3,7 +3,8 @@
 import numpy as np
 
 from lce_rig.core.data import Events
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.figures import MEMORY_NS, busiest_events
 from lce_rig.detect.events.flicker import measure_flicker
 from lce_rig.detect.events.reconstruct.filters import hot_pixels

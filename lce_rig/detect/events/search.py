@@ -10,8 +10,9 @@ import numpy as np
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, exp_so3, pose, rotation_angle, skew
-from lce_rig.core.results import ImageBoard, Refusal
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.event_limits import explain_missing_board, gate_event_board
 from lce_rig.detect.events.figures import event_quality, outline_px, with_motion
 from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions

@@ -4,8 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageQuality, Refusal
+from lce_rig.core.results import ImageQuality
 from lce_rig.detect.image.corners import seen_grid, square_size_px, square_values
 from lce_rig.detect.image.saddle import Crossings
 

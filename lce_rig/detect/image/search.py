@@ -10,9 +10,9 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Figure, Finding, Refusal
 from lce_rig.core.geometry import Array, transform
-from lce_rig.core.results import ImageBoard, ImageQuality, Refusal
+from lce_rig.core.results import ImageBoard, ImageQuality
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
 from lce_rig.detect.image.quality import (
     explain_absence,

@@ -6,8 +6,9 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import LidarBoard, Refusal
+from lce_rig.core.results import LidarBoard
 from lce_rig.detect.lidar.measurement import Beam, build_board, refine
 from lce_rig.detect.lidar.plates import propose_plates, screen_plates
 from lce_rig.detect.lidar.segments import Indices, OrderedScan, cut_segments, order_scan

@@ -7,8 +7,9 @@ import numpy as np
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, transform
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.detect.image.corners import find_grid, seen_grid
 from lce_rig.detect.lidar.search import plane_limit_m

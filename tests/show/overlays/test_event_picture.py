@@ -20,7 +20,7 @@ from tests.verify.test_pictures import (
 
 from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SourceError
-from lce_rig.core.results import Refusal
+from lce_rig.core.findings import Refusal
 from lce_rig.rig import QualitySettings
 from lce_rig.show.overlays.animation import write_gif, write_video
 from lce_rig.show.overlays.debug_image import draw_debug

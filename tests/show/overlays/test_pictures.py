@@ -11,8 +11,9 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, transform
-from lce_rig.core.results import ImageBoard, LidarBoard, Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.rig import QualitySettings
 from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, PANEL, Picture, round_ticks, text_width_px, wrapped
 from lce_rig.show.overlays.debug_image import draw_debug

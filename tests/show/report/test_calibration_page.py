@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import invert
-from lce_rig.core.results import Refusal
 from lce_rig.rig import load_rig
 from lce_rig.show.report.evidence import gather
 from lce_rig.show.report.worked_point import work_point

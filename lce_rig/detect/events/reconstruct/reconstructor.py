@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, join_events
 from lce_rig.core.errors import SourceError, UsageError
-from lce_rig.core.results import Refusal
+from lce_rig.core.findings import Refusal
 from lce_rig.detect.events.reconstruct.filters import NoiseFilter
 from lce_rig.detect.events.reconstruct.model import ReconstructionModel, States
 from lce_rig.detect.events.reconstruct.voxels import FloatArray, event_map, normalise_voxels, voxel_grid

@@ -1,0 +1,87 @@
+"""Figures printed with their units, in templates."""
+
+import math
+import re
+import string
+from collections.abc import Mapping
+from typing import Any
+
+# Suffix of a format spec -> (factor, decimals where none are given, unit as printed).
+_UNITS: Mapping[str, tuple[float, int, str]] = {
+    "mm": (1000.0, 0, " mm"),
+    "cm": (100.0, 0, " cm"),
+    "ms": (1000.0, 1, " ms"),
+    "us": (1e6, 0, " us"),
+    "deg": (1.0, 2, " deg"),
+    "percent": (100.0, 0, " %"),
+}
+
+
+_LIMITS = ("limit_", "max_", "min_", "target_", "tolerance_")
+_MOST_DIGITS = 4
+
+
+def _format(value: Any, spec: str, more: int = 0) -> str:
+    """Format a figure; {rms_m:mm}, {tilt_deg:1deg}, {share:percent} scale and add the unit.
+
+    Args:
+        value: the figure; those of a tuple are listed.
+        spec: as in a template.
+        more: digits beyond those of the spec.
+    """
+    if value is None:
+        return "unknown"
+    if isinstance(value, tuple):
+        return ", ".join(_format(each, spec, more) for each in value)
+    unit = next((unit for unit in _UNITS if spec.endswith(unit)), None)
+    if unit is None:
+        fixed = re.fullmatch(r"\.(\d)f", spec)
+        return str(format(value, f".{int(fixed[1]) + more}f" if fixed else spec))
+    factor, decimals, printed = _UNITS[unit]
+    digits = spec.removesuffix(unit)
+    number = factor * float(value)
+    places = (int(digits) if digits else decimals) + more
+    return (f"{number:.{places}f}" if math.isfinite(number) else "unknown") + printed
+
+
+def fill(template: str, figures: Mapping[str, Any]) -> str:
+    """Fill in figures; one that differs from its limit is printed with as many digits as show it."""
+    fields = [(text, name, spec or "") for text, name, spec, _ in string.Formatter().parse(template)]
+    specs = {name: spec for _, name, spec in fields if name is not None}
+    more = dict.fromkeys(specs, 0)
+    for limit in filter(lambda name: name.startswith(_LIMITS), specs):
+        unit = limit.rpartition("_")[2]
+        for name in specs:
+            if name.startswith(_LIMITS) or name.rpartition("_")[2] != unit:
+                continue
+            if isinstance(figures[name], float) and isinstance(figures[limit], float | int):
+                more[name] = more[limit] = _more_digits(
+                    (figures[name], specs[name]), (figures[limit], specs[limit])
+                )
+    return "".join(
+        text + ("" if name is None else _format(figures[name], spec, more[name]))
+        for text, name, spec in fields
+    )
+
+
+def _more_digits(figure: tuple[float, str], limit: tuple[float, str]) -> int:
+    """Count the digits that two figures with their specs lack to print differently; 0 if they are equal."""
+    for more in range(_MOST_DIGITS if figure[0] != limit[0] else 0):
+        first, second = (_format(*each, more).split()[0] for each in (figure, limit))
+        if "unknown" in (first, second) or float(first) != float(second):
+            return more
+    return 0
+
+
+def figures_apart(value: float, limit: float) -> tuple[str, str]:
+    """Print a figure and its limit with two significant digits, or as many as show that they differ."""
+    for digits in range(2, 2 + _MOST_DIGITS):
+        texts = [f"{x:.{digits}g}" if abs(x) < 10**digits else f"{x:.0f}" for x in (value, limit)]
+        if texts[0] != texts[1]:
+            break
+    return texts[0], texts[1]
+
+
+def as_line(text: str) -> str:
+    """Write words as a sentence, with a capital and a full stop."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."

@@ -1,0 +1,62 @@
+import pytest
+
+from lce_rig.core.findings import Finding, Kind, ranked, worst
+from lce_rig.core.phrasing import figures_apart
+
+RINGS = Kind("t.rings", "{n} rings at {distance_m:.1f} m", "come {closer_m:1cm} closer")
+RMS = Kind("t.rms", lambda finding: f"rms of {finding.subject}", actions={"hold": "hold it still"})
+LIMIT = Kind(
+    "t.limit", "error {error_m:mm} (limit {limit_m:mm}), tilt {tilt_deg:.0f} deg ({max_tilt_deg:g} deg)"
+)
+
+
+def test_figures_are_scaled_to_the_unit_that_is_printed() -> None:
+    found = RINGS("velodyne", n=2, distance_m=4.04, closer_m=0.8)
+    assert found.sentence == "2 rings at 4.0 m: come 80.0 cm closer"
+    assert found.as_json()["figures"] == {"n": 2, "distance_m": 4.04, "closer_m": 0.8}
+
+
+def test_a_figure_that_is_not_finite_reads_as_unknown() -> None:
+    assert "unknown cm" in RINGS(n=2, distance_m=1.0, closer_m=float("nan")).advice
+
+
+@pytest.mark.parametrize(
+    ("error_m", "limit_m", "tilt_deg", "words"),
+    [
+        (0.013, 0.012, 61.2, "error 13 mm (limit 12 mm), tilt 61 deg (60 deg)"),
+        (0.0122, 0.012, 60.04, "error 12.2 mm (limit 12.0 mm), tilt 60.04 deg (60 deg)"),
+        (0.012, 0.012, 60.0, "error 12 mm (limit 12 mm), tilt 60 deg (60 deg)"),
+    ],
+)
+def test_a_figure_is_printed_so_that_it_differs_from_its_limit(
+    error_m: float, limit_m: float, tilt_deg: float, words: str
+) -> None:
+    assert LIMIT(error_m=error_m, limit_m=limit_m, tilt_deg=tilt_deg, max_tilt_deg=60.0).text == words
+
+
+def test_two_significant_digits_suffice_unless_figure_and_limit_agree_in_them() -> None:
+    assert figures_apart(0.2034, 0.2) == ("0.203", "0.2")
+    assert figures_apart(112.0, 10.0) == ("112", "10")
+    assert figures_apart(0.2, 0.2) == ("0.2", "0.2")
+
+
+def test_the_action_named_by_the_finding_is_given() -> None:
+    found = RMS("000003", severity="warning", action="hold")
+    assert (found.text, found.advice, found.severity) == ("rms of 000003", "hold it still", "warning")
+    assert RMS("000003").advice == ""
+
+
+def test_a_finding_read_from_a_file_keeps_the_words_of_the_file() -> None:
+    found = Finding("t.of_an_old_version", stored=("the text", "the action"))
+    assert found.sentence == "the text: the action"
+
+
+def test_the_worst_finding_decides_and_order_is_kept_otherwise() -> None:
+    notes = [Finding("a", "note"), Finding("b", "error"), Finding("c", "warning"), Finding("d", "error")]
+    assert worst(notes) == "error" and worst([]) == "note"
+    assert [finding.code for finding in ranked(notes)] == ["b", "d", "c", "a"]
+
+
+def test_a_figure_asked_for_as_a_number_must_be_one() -> None:
+    with pytest.raises(TypeError):
+        Finding("a", figures={"axis": "x"}).figure("axis")
