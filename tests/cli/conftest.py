@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from lce_rig.cli.main import run
+from lce_rig.core.findings import Finding
 
 
 @dataclass(frozen=True)
