@@ -7,6 +7,8 @@ from pathlib import Path
 from lce_rig.core.findings import Finding, Kind, Refusal, Stage
 from lce_rig.core.phrasing import as_line
 
+_MAX_REASON = 200
+
 
 class LceRigError(Exception):
     """Base of every error the user can repair.
@@ -95,20 +97,38 @@ class CommandError(LceRigError):
 
 
 @contextmanager
-def reading(path: Path, kind: type[LceRigError], hint: str = "") -> Iterator[None]:
-    """Turn what prevents a block from reading a file into an error of one kind that names the file.
+def reading(path: Path | str, kind: type[LceRigError] = SourceError, hint: str = "") -> Iterator[None]:
+    """Turn any failure to read a file into one error that names the file.
+
+    Libraries raise whatever their code meets in a damaged file: KeyError, struct.error, RuntimeError and
+    errors of their own. An LceRigError passes: it names its cause already.
 
     Args:
-        path: the file.
-        kind: of the error raised for an OSError, and for a ValueError, whose words follow the file's name.
-        hint: what to do about content that is not what it should be.
+        path: the file, for the message.
+        kind: of the error.
+        hint: an action against content that is damaged or of another kind.
     """
     try:
         yield
+    except LceRigError:
+        raise
+    except MemoryError as error:
+        raise kind(f"{path}: does not fit into the memory that is free", hint) from error
     except OSError as error:
-        raise kind(f"{path}: cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise kind(f"{path}: {error}", hint) from error
+        raise kind(f"{path}: cannot be read: {error.strerror or reason_of(error)}") from error
+    except Exception as error:
+        raise kind(f"{path}: {reason_of(error)}", hint) from error
+
+
+def reason_of(error: Exception) -> str:
+    """Describe an error of a library in one short, printable line."""
+    text = " ".join(str(error).encode(errors="replace").decode().split())
+    text = "".join(character for character in text if character.isprintable())
+    if isinstance(error, KeyError):
+        text = f"it lacks {text}"
+    elif not isinstance(error, ValueError | OSError) or not text:
+        text = f"it is damaged ({type(error).__name__}{': ' if text else ''}{text})"
+    return text if len(text) <= _MAX_REASON else text[: _MAX_REASON - 3] + "..."
 
 
 def join_shortages(errors: Sequence[NotEnoughDataError]) -> NotEnoughDataError:

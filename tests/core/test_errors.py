@@ -1,0 +1,49 @@
+"""One error for whatever a library raises about a file."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from lce_rig.core.errors import ProfileError, SessionError, SourceError, reading
+
+PATH = Path("folder/file.bin")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(5, "Input/output error"),
+        OSError("own words"),
+        ValueError("it is empty"),
+        ValueError("\ud800 half a character"),
+        KeyError("polarity"),
+        EOFError(),
+        IndexError("out of range"),
+        struct.error("unpack requires 4 bytes"),
+        zlib.error("-3"),
+        yaml.YAMLError("line 1\nline 2"),
+        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"),
+        MemoryError(),
+        RecursionError("maximum recursion depth exceeded"),
+        np.exceptions.AxisError(3, 1),
+        RuntimeError("x" * 10_000),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_any_error_of_a_library_becomes_one_line_that_names_the_file(error: Exception) -> None:
+    with pytest.raises(ProfileError) as raised, reading(PATH, ProfileError):
+        raise error
+    assert raised.value.what.startswith(f"{PATH}: ")
+    assert "\n" not in raised.value.what and len(raised.value.what) < 300
+    raised.value.what.encode()
+
+
+def test_an_error_of_lce_rig_passes_unchanged() -> None:
+    error = SessionError("capture 000003 is incomplete", "collect it again")
+    with pytest.raises(SessionError) as raised, reading(PATH, SourceError):
+        raise error
+    assert raised.value is error
