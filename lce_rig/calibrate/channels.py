@@ -11,12 +11,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.algorithm_1 import NOMINAL_SIGMA_M
-from lce_rig.calibrate.board_motion import PoseSamples, fit_motions
+from lce_rig.calibrate.algorithm_1.algorithm import NOMINAL_SIGMA_M
+from lce_rig.calibrate.algorithm_1.moments import Weights
 from lce_rig.calibrate.consensus import Consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.methods import agree, calibrate_observations, with_consensus
+from lce_rig.calibrate.motion.board_motion import PoseSamples, fit_motions
+from lce_rig.calibrate.motion.time_offsets import (
+    TimeOffsets,
+    at_scan_time,
+    deskew_points,
+    estimate_time_offsets,
+)
 from lce_rig.calibrate.options import CaptureCandidates, EstimateSettings
+from lce_rig.calibrate.plane_and_ends import along_normals
 from lce_rig.calibrate.shared_scans import (
     Clocks,
     SharedScan,
@@ -25,13 +33,10 @@ from lce_rig.calibrate.shared_scans import (
     sample_scans,
     time_sigmas_s,
 )
-from lce_rig.calibrate.time_offsets import TimeOffsets, at_scan_time, deskew_points, estimate_time_offsets
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import ChannelResult, Observation
-from lce_rig.residuals.moments import Weights
-from lce_rig.residuals.plane_and_ends import along_normals
 
 # Fewer captures with known motion do not determine time offsets.
 _MIN_MOVING = 6

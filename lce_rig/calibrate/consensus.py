@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.algorithm_1.registration import rotation_from_directions
 from lce_rig.calibrate.options import CaptureCandidates
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
-from lce_rig.solvers.registration import rotation_from_directions
 
 NORMAL_TOLERANCE_RAD = np.radians(12.0)
 CENTRE_TOLERANCE_M = 0.15

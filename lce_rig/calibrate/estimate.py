@@ -4,12 +4,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from lce_rig.calibrate.known_lidar import KnownLidar
+from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.tolerances import Sensitivity
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import CaptureResidual, Certificate, ChannelResult, Metrics, Observation
-from lce_rig.residuals.quadratics import Quadratics
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +35,8 @@ class CalibrationEstimate:
         method: that found it, as `CalibrateOptions.method`.
         sensitivities: how far errors of the profile's lens and board move the result; empty without
             `EstimateSettings.tolerances`.
-        expansion: the method's own cost about its result, capture by capture, in the extrinsic (and those of
-            cameras estimated with it) alone; None if the method has none.
+        cost: the method's own cost about its result, capture by capture, in the extrinsics (and those of
+            cameras estimated with it) alone, boards' poses eliminated; None if the method has none.
         lidar: constant errors of the LiDAR that were estimated with it; None if the method knows none.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
@@ -59,7 +59,7 @@ class CalibrationEstimate:
     diagnostics: Diagnostics
     method: str = "paper"
     sensitivities: tuple[Sensitivity, ...] = ()
-    expansion: Quadratics | None = None
+    cost: Quadratics | None = None
     lidar: KnownLidar | None = None
     estimated_with: tuple[str, ...] = ()
     same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

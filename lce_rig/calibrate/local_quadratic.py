@@ -10,14 +10,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.features import CaptureFeatures, extract_features
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
+from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, end_rows, feature_sigmas, plane_rows
+from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Observation
-from lce_rig.residuals.features import CaptureFeatures, extract_features
-from lce_rig.residuals.placements import group_placements
-from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS, end_rows, feature_sigmas, plane_rows
-from lce_rig.residuals.quadratics import Quadratics
 
 SHIFT, FIRST_RING, SCALE = 6, 7, -1
 """Indices in the x of `expand`, after the tangent (translation m, rotation rad): edge shift m, range offset m

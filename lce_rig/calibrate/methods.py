@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
+from lce_rig.calibrate.algorithm_1.algorithm import calibrate_by_algorithm_1
 from lce_rig.calibrate.consensus import Consensus, find_consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.likelihood import calibrate_by_likelihood

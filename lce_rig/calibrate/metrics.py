@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lce_rig.calibrate.features import AS_MEASURED, extract_features
+from lce_rig.calibrate.plane_and_ends import ends_on_board, plane_residuals
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.core.results import CaptureResidual, Metrics, Observation
-from lce_rig.residuals.features import AS_MEASURED, extract_features
-from lce_rig.residuals.plane_and_ends import ends_on_board, plane_residuals
 
 
 def capture_residual(

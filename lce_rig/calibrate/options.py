@@ -4,11 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.features import AS_FITTED, FeatureSettings
 from lce_rig.calibrate.known_lidar import KnownLidar
 from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.board import Board
 from lce_rig.core.results import DEFAULT_METHOD, ImageBoard, LidarBoard, Method, Observation
-from lce_rig.residuals.features import AS_FITTED, FeatureSettings
 from lce_rig.rig import LidarSettings
 
 EDGE_SHIFT_SIGMA_M = 0.015

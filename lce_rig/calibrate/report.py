@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.observability import lever_arm
+from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.board import Board
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.results import Certificate, Observation
-from lce_rig.residuals.features import CaptureFeatures
-from lce_rig.residuals.placements import group_placements
 
 # For methods without a certificate.
 NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lce_rig.calibrate.board_motion import PoseSamples, sample_poses
 from lce_rig.calibrate.consensus import Consensus
+from lce_rig.calibrate.motion.board_motion import PoseSamples, sample_poses
 from lce_rig.calibrate.options import CaptureCandidates
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation

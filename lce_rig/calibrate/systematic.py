@@ -12,13 +12,13 @@ from itertools import groupby, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.algorithm_1.moments import Problem
+from lce_rig.calibrate.covariance import symmetric_inverse
+from lce_rig.calibrate.features import CaptureFeatures, FeatureSettings, extract_features, see_lidar
 from lce_rig.calibrate.tolerances import Sensitivity, Tolerances, Variant, sensitivities_of, vary
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Observation
-from lce_rig.residuals.features import CaptureFeatures, FeatureSettings, extract_features, see_lidar
-from lce_rig.residuals.moments import Problem
-from lce_rig.solvers.covariance import symmetric_inverse
 
 # Of the order of the errors themselves, so that the difference quotient represents their effect.
 STEP_M = 0.005

@@ -10,12 +10,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, perturb, skew, transform
 from lce_rig.core.results import LidarBoard, Observation
 from lce_rig.rig import BoardSettings, CameraSettings
-from lce_rig.solvers.covariance import symmetric_inverse
 
 Source = Literal[
     "focal_length",

@@ -9,9 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.likelihood.image_terms import stack_images
 from lce_rig.calibrate.likelihood.levels import Levels
+from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.quadratics import Quadratics, without_prior
 from lce_rig.calibrate.relative_pose import mean_pose, relative_covariance, relative_pose
 from lce_rig.calibrate.shared_scans import scan_key
 from lce_rig.core.findings import Finding
@@ -19,10 +22,7 @@ from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.judge.split_consistency import contrast_halves, split_findings
 from lce_rig.judge.weighing import SURPRISING_CHI2, reason
-from lce_rig.residuals.placements import group_placements
-from lce_rig.residuals.quadratics import Quadratics, without_prior
 from lce_rig.rig import CalibrationSettings, VerdictSettings
-from lce_rig.solvers.covariance import symmetric_inverse
 
 # Fewer placements do not determine the scatter.
 _MIN_PLACEMENTS = 4

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.observability import lever_arm, main_motion
+from lce_rig.calibrate.plane_and_ends import capture_costs, feature_sigmas
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Observation
 from lce_rig.judge.weighing import reason
-from lce_rig.residuals.features import extract_features
-from lce_rig.residuals.plane_and_ends import capture_costs, feature_sigmas
-from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import CalibrationSettings
 
 # A gain in the wrong direction of this many standard errors is significant.

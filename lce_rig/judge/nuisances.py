@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.local_quadratic import FIRST_RING, SCALE, SHIFT
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
 from lce_rig.judge.weighing import reason
-from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import LidarSettings, VerdictSettings
 
 # A scale error of this many times the limit fails.

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, tangent_sizes
 from lce_rig.judge.weighing import reason
-from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 
 # Fewer placements are not split.

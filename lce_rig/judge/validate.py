@@ -7,6 +7,7 @@ import numpy as np
 
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.local_quadratic import SCALE, expand
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.tolerances import Sensitivity
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
@@ -27,7 +28,6 @@ from lce_rig.judge.negative_control import NegativeControl, run_control, run_con
 from lce_rig.judge.nuisances import Nuisances, estimate_nuisances
 from lce_rig.judge.split_consistency import Contrast, contrast_halves, find_groups
 from lce_rig.lens.lens_estimate import BoardView
-from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import LidarSettings, Rig, VerdictSettings
 
 # Check the reported uncertainty with bootstrap samples, leave-one-out results and random halves.
@@ -197,7 +197,7 @@ def validate(
         return _reported(estimate, rig, intrinsics=intrinsics)
     settled = expansion.hold(SCALE).settled()
     # Compare a covariance with the scatter of its own method, as another cost scatters differently.
-    widened_by, remark = widening(estimate.cov, resample(estimate.expansion or settled), rig.verdict)
+    widened_by, remark = widening(estimate.cov, resample(estimate.cost or settled), rig.verdict)
     cov, moved = widened_by**2 * estimate.cov, (rig.calibration, rig.verdict.control_sigmas)
     if estimate.method == "ml":
         with_constants = _with_prior_of_scale(expansion, estimate.sensitivities)

@@ -11,10 +11,10 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
+from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.lens.fit import N_MODES, LensState, Setup, corners_of, fit, reduced, refine_poses, residuals_px
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import MODELS, LensModel, convert, model_of
-from lce_rig.solvers.pnp import solve_planar_pose
 
 MIN_CAPTURES = 4
 N_FOLDS = 10

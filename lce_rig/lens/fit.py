@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb, skew
+from lce_rig.core.planar_pose import mirror_tilt
 from lce_rig.lens.models import LensModel
-from lce_rig.solvers.pnp import mirror_tilt
 
 # Prior deviations of boards from the nominal shape: bowed by millimetres, printed longer in one direction by
 # a fraction, single corners displaced by a tenth of a millimetre.
@@ -163,7 +163,7 @@ def linearise(setup: Setup, state: LensState) -> tuple[Array, Array, Array]:
 def refine_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) -> LensState:
     """Fit every board's pose to a given lens and shape.
 
-    This is `solvers.pnp.solve_planar_pose` for all boards at once, with a known start.
+    This is `core.planar_pose.solve_planar_pose` for all boards at once, with a known start.
 
     Args:
         setup: K boards.

@@ -7,13 +7,13 @@ import numpy as np
 
 from lce_rig.calibrate.local_quadratic import SCALE, expand
 from lce_rig.calibrate.metrics import capture_residual, summarise
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Metrics, Observation
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import clocks_of
-from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State

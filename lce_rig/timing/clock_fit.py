@@ -233,7 +233,7 @@ class LineFit:
         covariance is r > 1 times that of independent readings, that one is multiplied by r.
 
         References:
-            `lce_rig.residuals.quadratics.Quadratics.jackknife_covariance`, which has the factor as well.
+            `lce_rig.calibrate.quadratics.Quadratics.jackknife_covariance`, which has the factor as well.
         """
         design, value, information = self._normal()
         inverse = np.linalg.inv(information)

@@ -37,21 +37,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate import CalibrationEstimate, EstimateSettings
-from lce_rig.calibrate.algorithm_1 import solve_planes
-from lce_rig.calibrate.methods import METHODS
-from lce_rig.calibrate.observability import require_observable
-from lce_rig.calibrate.options import Estimator
-from lce_rig.calibrate.report import report_estimate
-from lce_rig.core.board import Board
-from lce_rig.core.diagnostics import NO_DIAGNOSTICS
-from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
-from lce_rig.core.results import Observation
-from lce_rig.residuals.features import CaptureFeatures, extract_features
-from lce_rig.residuals.moments import Problem, Weights
-from lce_rig.residuals.placements import group_placements
-from lce_rig.residuals.plane_and_ends import residual_rows
-from lce_rig.residuals.quadratics import without_prior
-from lce_rig.solvers.registration import (
+from lce_rig.calibrate.algorithm_1.algorithm import solve_planes
+from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
+from lce_rig.calibrate.algorithm_1.registration import (
     N_ROTATION,
     eliminate_linear,
     linear_unknowns,
@@ -61,6 +49,18 @@ from lce_rig.solvers.registration import (
     vec_rotation,
     with_one,
 )
+from lce_rig.calibrate.features import CaptureFeatures, extract_features
+from lce_rig.calibrate.methods import METHODS
+from lce_rig.calibrate.observability import require_observable
+from lce_rig.calibrate.options import Estimator
+from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.plane_and_ends import residual_rows
+from lce_rig.calibrate.quadratics import without_prior
+from lce_rig.calibrate.report import report_estimate
+from lce_rig.core.board import Board
+from lce_rig.core.diagnostics import NO_DIAGNOSTICS
+from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
+from lce_rig.core.results import Observation
 
 INLIER_M = 0.03
 MAX_ROUNDS = 50

@@ -11,11 +11,11 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, exp_so3, fit_plane, invert, perturb, pose, transform
+from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.detection import ImageDetection, LidarDetection
 from lce_rig.detect.image.search import board_from_pose
 from lce_rig.rig import Rig
-from lce_rig.solvers.pnp import solve_planar_pose
 
 # Noise of a corner per coordinate, as recordings of the rigs show it.
 _CORNER_SIGMA_PX = {"rlfs": 0.03, "rles": 0.05}

@@ -9,11 +9,11 @@ from benchmarks.tables import print_head, print_row
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, exp_so3, pose, transform
+from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.core.results import ImageBoard
 from lce_rig.judge.intrinsics_check import check_intrinsics
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import load_rig
-from lce_rig.solvers.pnp import solve_planar_pose
 
 # Noise of a corner per coordinate, as recordings of the rig show it.
 _RIGS = {"rlfs": 0.03, "rles": 0.05}

@@ -31,8 +31,8 @@ from benchmarks.paper_runs import MIDDLE_LEVEL, Run, measure, simulated_runs
 from benchmarks.paper_sets import LEVELS, N_CAPTURES, paper_set
 from benchmarks.tables import print_head, print_row, rms
 from lce_rig.calibrate import Algorithm1Parts, EstimateSettings
+from lce_rig.calibrate.features import FeatureSettings
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.residuals.features import FeatureSettings
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.still_sessions import StillSession, draw_corners
+from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.tolerances import Tolerances, bend, bow
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
@@ -12,7 +13,6 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.rig import Rig
-from lce_rig.solvers.covariance import symmetric_inverse
 
 # A stream of random numbers of its own.
 _STREAM = 3

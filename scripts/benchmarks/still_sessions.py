@@ -15,6 +15,7 @@ from lce_rig.calibrate import CaptureCandidates
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import from_arrays, to_arrays
 from lce_rig.detect.finder import BoardFinder
@@ -25,7 +26,6 @@ from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage, truth_extrinsics
 from lce_rig.simulate.takes import take_scan
-from lce_rig.solvers.pnp import solve_planar_pose
 
 # The camera's backdrop is not needed: the smaller it is, the sooner it is done.
 _SHRINK = 16

@@ -16,6 +16,15 @@ from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.likelihood.along_rays import (
+    N_FIELDS,
+    N_OF_LASER,
+    N_SHIFTS,
+    SHIFTS,
+    EdgeRows,
+    interior,
+    stack_scans,
+)
 from lce_rig.calibrate.likelihood.end_density import density
 from lce_rig.calibrate.likelihood.image_terms import stack_images
 from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
@@ -25,15 +34,6 @@ from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, difference, invert
 from lce_rig.core.results import Method
-from lce_rig.residuals.along_rays import (
-    N_FIELDS,
-    N_OF_LASER,
-    N_SHIFTS,
-    SHIFTS,
-    EdgeRows,
-    interior,
-    stack_scans,
-)
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions
 

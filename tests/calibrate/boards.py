@@ -11,9 +11,9 @@ from lce_rig.calibrate import CaptureCandidates
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, exp_so3, fit_plane, invert, pose, project_to_so3, transform
+from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.core.results import ImageBoard, LidarBoard, LidarQuality
 from lce_rig.detect.image.search import board_from_pose
-from lce_rig.solvers.pnp import solve_planar_pose
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
 CAMERA = Intrinsics(897.0, 897.0, 639.5, 359.5, 1280, 720, "radtan", (-0.44, 0.23, -0.001, 0.0002, -0.07))

@@ -12,9 +12,9 @@ from lce_rig.calibrate import (
     error_to_reference,
     fit_extrinsic,
 )
+from lce_rig.calibrate.features import FeatureSettings
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, exp_so3, pose
-from lce_rig.residuals.features import FeatureSettings
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 FAST = EstimateSettings("paper", n_draws=3)

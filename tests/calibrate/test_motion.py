@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import Clocks, EstimateSettings, calibrate_channels, fit_extrinsic
-from lce_rig.calibrate.board_motion import deskew, fit_motions, sample_poses
+from lce_rig.calibrate.motion.board_motion import deskew, fit_motions, sample_poses
 from lce_rig.core.geometry import Array, difference, invert
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board
 from tests.calibrate.moving_boards import Moving, simulate_moving, skew

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
+from lce_rig.calibrate.features import FeatureSettings, extract_features
 from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings
 from lce_rig.core.geometry import difference, fit_plane, perturb
 from lce_rig.core.results import Observation
-from lce_rig.residuals.features import FeatureSettings, extract_features
-from lce_rig.residuals.moments import Problem, Weights
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 NO_DRAWS = EstimateSettings("paper", n_draws=0)

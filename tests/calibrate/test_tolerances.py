@@ -8,9 +8,9 @@ import pytest
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.geometry import difference
+from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.detect.image.search import board_from_pose
 from lce_rig.judge.contributions import profile_covariance
-from lce_rig.solvers.pnp import solve_planar_pose
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
 KNOWN = Tolerances(

@@ -8,9 +8,9 @@ import pytest
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import difference, perturb, pose, rotation_angle, transform
+from lce_rig.core.planar_pose import mirror_tilt, solve_planar_pose
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.search import align_corner_order, nearest_pose
-from lce_rig.solvers.pnp import mirror_tilt, solve_planar_pose
 
 DAVIS = Intrinsics(349.57, 349.18, 172.49, 126.24, 346, 260, "radtan", (-0.36, 0.18, 0.0, 0.0, 0.0))
 OBLONG = Board(9, 6, 0.068, 0.8, 0.6, pattern_offset_m=(0.03, -0.01))

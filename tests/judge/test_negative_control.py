@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.geometry import Array
 from lce_rig.judge.negative_control import control_findings, run_control_with_constants
-from lce_rig.residuals.quadratics import Quadratics
 from lce_rig.rig import load_rig
 
 N_CAPTURES, N_ROWS, SIGMA_M = 20, 40, 0.005

@@ -6,24 +6,24 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.algorithm_1 import calibrate_by_algorithm_1
+from lce_rig.calibrate.algorithm_1.algorithm import calibrate_by_algorithm_1
 from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.likelihood.along_rays import N_SHIFTS, SHIFTS
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
 from lce_rig.calibrate.likelihood.refine import JointEstimate, inflate, moves_under, refine
 from lce_rig.calibrate.likelihood.system import PER_CAMERA
 from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.report import report_estimate, with_parts
 from lce_rig.calibrate.tolerances import Sensitivity, sensitivities_of, vary
 from lce_rig.core.board import Board
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
-from lce_rig.residuals.along_rays import N_SHIFTS, SHIFTS
-from lce_rig.residuals.features import extract_features
-from lce_rig.residuals.placements import group_placements
-from lce_rig.residuals.quadratics import Quadratics
 
 
 def calibrate_by_likelihood(
@@ -65,7 +65,7 @@ def calibrate_by_likelihood(
         variants = vary(used, board, options.tolerances)
         moves = moves_under(joint, used, variants, board)
         found = sensitivities_of(variants, moves, options.tolerances)
-    return replace(estimate, expansion=expand_joint(joint, 0, placement), sensitivities=found)
+    return replace(estimate, cost=expand_joint(joint, 0, placement), sensitivities=found)
 
 
 def describe(

@@ -10,12 +10,12 @@ from lce_rig.calibrate.likelihood.calibrate_jointly import add_figures, describe
 from lce_rig.calibrate.likelihood.levels import PoseLevels, what_is_known
 from lce_rig.calibrate.likelihood.refine import inflate, refine
 from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.placements import group_shared_placements
 from lce_rig.calibrate.shared_scans import scan_key
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
-from lce_rig.residuals.placements import group_shared_placements
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def calibrate_together(
             estimate,
             method=start.method,
             sensitivities=start.sensitivities,
-            expansion=expand_joint(joint, k, placement),
+            cost=expand_joint(joint, k, placement),
             estimated_with=tuple(other for other in names if other != name),
             same_scan=start.same_scan,
         )

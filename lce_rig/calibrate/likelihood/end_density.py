@@ -18,8 +18,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from lce_rig.calibrate.likelihood.along_rays import EdgeRows
 from lce_rig.core.geometry import Array
-from lce_rig.residuals.along_rays import EdgeRows
 
 STRAY = 0.01
 """Fraction b of (1), from simulated and recorded captures; a is estimated."""

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lce_rig.calibrate.likelihood.along_rays import N_BOW, Indices, bow_heights
 from lce_rig.calibrate.likelihood.levels import PoseLevels
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, difference, skew
 from lce_rig.core.results import ImageBoard
-from lce_rig.residuals.along_rays import N_BOW, Indices, bow_heights
 
 
 @dataclass(frozen=True, eq=False)

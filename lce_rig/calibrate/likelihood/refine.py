@@ -10,6 +10,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.covariance import symmetric_inverse
+from lce_rig.calibrate.likelihood.along_rays import (
+    N_BOW,
+    N_FIELDS,
+    N_OF_LASER,
+    N_SHIFTS,
+    interior,
+    lens_fields,
+    stack_scans,
+)
 from lce_rig.calibrate.likelihood.fit_levels import fit_levels
 from lce_rig.calibrate.likelihood.image_terms import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, PoseLevels, Priors
@@ -24,22 +34,12 @@ from lce_rig.calibrate.likelihood.system import (
     of_the_lidar,
     scale_places,
 )
+from lce_rig.calibrate.placements import group_shared_placements
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.tolerances import Variant
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation
-from lce_rig.residuals.along_rays import (
-    N_BOW,
-    N_FIELDS,
-    N_OF_LASER,
-    N_SHIFTS,
-    interior,
-    lens_fields,
-    stack_scans,
-)
-from lce_rig.residuals.placements import group_shared_placements
-from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
-from lce_rig.solvers.covariance import symmetric_inverse
 
 # Steps between changes of the levels, and their maximum at the end.
 _STEPS, _LAST_STEPS = 3, 20
@@ -310,7 +310,7 @@ def inflate(
 ) -> tuple[Array, float]:
     """Multiply a camera's covariance (6, 6) according to the spread over placements.
 
-    The spread of the optimum without each placement (`lce_rig.residuals.quadratics`) is independent of the
+    The spread of the optimum without each placement (`lce_rig.calibrate.quadratics`) is independent of the
     noise model. If it significantly exceeds the model's covariance, there are errors that the model lacks.
 
     Args:

@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lce_rig.calibrate.likelihood.along_rays import StackedScans
 from lce_rig.calibrate.likelihood.image_terms import StackedImages
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.system import Reduced, State, Terms, assemble, linearise
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
-from lce_rig.residuals.along_rays import StackedScans
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,12 +18,7 @@ from functools import cached_property, lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.likelihood.end_density import edge_system, expand_ends
-from lce_rig.calibrate.likelihood.image_terms import StackedImages, image_rows
-from lce_rig.calibrate.likelihood.levels import Levels, PoseLevels, Priors
-from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, perturb
-from lce_rig.residuals.along_rays import (
+from lce_rig.calibrate.likelihood.along_rays import (
     N_BOW,
     N_FIELDS,
     N_LENS,
@@ -38,7 +33,12 @@ from lce_rig.residuals.along_rays import (
     sum_ranges,
     weigh_ranges,
 )
-from lce_rig.residuals.quadratics import Quadratics
+from lce_rig.calibrate.likelihood.end_density import edge_system, expand_ends
+from lce_rig.calibrate.likelihood.image_terms import StackedImages, image_rows
+from lce_rig.calibrate.likelihood.levels import Levels, PoseLevels, Priors
+from lce_rig.calibrate.quadratics import Quadratics
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, perturb
 
 PER_CAMERA = 7
 PER_CAPTURE = 7

@@ -12,6 +12,7 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Figure, Finding, Refusal
 from lce_rig.core.geometry import Array, transform
+from lce_rig.core.planar_pose import PlanarPose, solve_planar_pose
 from lce_rig.core.results import ImageBoard, ImageQuality
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
 from lce_rig.detect.image.quality import (
@@ -22,7 +23,6 @@ from lce_rig.detect.image.quality import (
     quality_problem,
 )
 from lce_rig.detect.image.saddle import Crossings, fit_crossings
-from lce_rig.solvers.pnp import PlanarPose, solve_planar_pose
 from lce_rig.words import describe, recommend
 
 Region = tuple[int, int, int, int]

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from lce_rig.calibrate import Clocks
-from lce_rig.calibrate.board_motion import fit_motions
 from lce_rig.calibrate.metrics import capture_residual, summarise
+from lce_rig.calibrate.motion.board_motion import fit_motions
+from lce_rig.calibrate.motion.time_offsets import at_scan_time, deskew_points
 from lce_rig.calibrate.options import CaptureCandidates
 from lce_rig.calibrate.shared_scans import SharedScan, sample_scans
-from lce_rig.calibrate.time_offsets import at_scan_time, deskew_points
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SessionError

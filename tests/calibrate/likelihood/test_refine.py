@@ -7,12 +7,12 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.calibrate.consensus import find_consensus
+from lce_rig.calibrate.likelihood.along_rays import SHIFTS, turn_about_z
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import inflate, refine
+from lce_rig.calibrate.placements import group_placements
 from lce_rig.calibrate.tolerances import Tolerances, vary
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
-from lce_rig.residuals.along_rays import SHIFTS, turn_about_z
-from lce_rig.residuals.placements import group_placements
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, photograph, simulate
 
 ML = EstimateSettings(method="ml", n_draws=3, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)

@@ -8,11 +8,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.likelihood.image_terms import image_rows, stack_images
-from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, Levels, Priors
-from lce_rig.calibrate.likelihood.system import Assembly, State, assemble, linearise
-from lce_rig.core.geometry import difference, invert, perturb
-from lce_rig.residuals.along_rays import (
+from lce_rig.calibrate.likelihood.along_rays import (
     N_FIELDS,
     N_OF_LASER,
     N_SHIFTS,
@@ -24,6 +20,10 @@ from lce_rig.residuals.along_rays import (
     turn_rays,
     weigh_ranges,
 )
+from lce_rig.calibrate.likelihood.image_terms import image_rows, stack_images
+from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, Levels, Priors
+from lce_rig.calibrate.likelihood.system import Assembly, State, assemble, linearise
+from lce_rig.core.geometry import difference, invert, perturb
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 STEP = 1e-6

@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings
+from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
+from lce_rig.calibrate.algorithm_1.registration import vec_rotation
+from lce_rig.calibrate.covariance import symmetric_inverse
+from lce_rig.calibrate.features import FeatureSettings, extract_features
 from lce_rig.calibrate.methods import calibrate_observations
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.collect.guidance import combine, sigmas, weigh_placements
@@ -13,10 +17,6 @@ from lce_rig.collect.guidance.evidence import combine_with_each
 from lce_rig.collect.guidance.sensor_noise import ErrorModel
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Observation
-from lce_rig.residuals.features import FeatureSettings, extract_features
-from lce_rig.residuals.moments import Problem, Weights
-from lce_rig.solvers.covariance import symmetric_inverse
-from lce_rig.solvers.registration import vec_rotation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, scan_board
 from tests.collect.guidance.boards import SURROGATE, model, placements, predict_covariance
 

@@ -17,19 +17,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, pose
-from lce_rig.residuals.features import CaptureFeatures
-from lce_rig.residuals.plane_and_ends import residual_rows
-from lce_rig.residuals.quadratics import Quadratics
-from lce_rig.solvers.certificate import Certificates, solve_globally
-from lce_rig.solvers.registration import (
+from lce_rig.calibrate.algorithm_1.certificate import Certificates, solve_globally
+from lce_rig.calibrate.algorithm_1.registration import (
     eliminate_linear,
     linear_unknowns,
     tangent_basis,
     vec_rotation,
     with_one,
 )
+from lce_rig.calibrate.features import CaptureFeatures
+from lce_rig.calibrate.plane_and_ends import residual_rows
+from lce_rig.calibrate.quadratics import Quadratics
+from lce_rig.core.board import Board
+from lce_rig.core.geometry import Array, pose
 
 _EDGE_CHUNK = 4096
 

@@ -54,10 +54,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.plane_and_ends import differentiate, distance_inside, freedoms_of_plane
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
-from lce_rig.residuals.plane_and_ends import differentiate, distance_inside, freedoms_of_plane
 
 Indices = NDArray[np.intp]
 FIELDS = ("lens beside the axis", "lens height", "bow along the width", "bow along the height")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, difference, exp_so3, perturb, pose, rotation_angle, transform
-from lce_rig.solvers.pnp import PlanarPose, mirror_tilt, refine_pose, solve_planar_pose
+from lce_rig.core.planar_pose import PlanarPose, mirror_tilt, refine_pose, solve_planar_pose
 
 BOARD = Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
 RADTAN = Intrinsics(

@@ -4,10 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.core.geometry import exp_so3, project_to_so3, rotation_angle
-from lce_rig.residuals.plane_and_ends import residual_rows
-from lce_rig.solvers.certificate import solve_globally
-from lce_rig.solvers.registration import (
+from lce_rig.calibrate.algorithm_1.certificate import solve_globally
+from lce_rig.calibrate.algorithm_1.registration import (
     cube_rotations,
     eliminate_linear,
     linear_unknowns,
@@ -16,6 +14,8 @@ from lce_rig.solvers.registration import (
     vec_rotation,
     with_one,
 )
+from lce_rig.calibrate.plane_and_ends import residual_rows
+from lce_rig.core.geometry import exp_so3, project_to_so3, rotation_angle
 
 
 def make_planes(seed, sigma_m=0.0, n_boards=8, spread=0.5):

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.calibrate.features import FeatureSettings, extract_features, normal_covariance
 from lce_rig.core.geometry import exp_so3, transform
 from lce_rig.core.results import Observation
-from lce_rig.residuals.features import FeatureSettings, extract_features, normal_covariance
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.core.geometry import Array, difference, fit_plane, perturb, rotation_angle, skew
 from lce_rig.core.results import ImageBoard, LidarBoard
-from lce_rig.solvers.covariance import symmetric_inverse
 
 # Prior of a hand's typical rates: (speed m/s, turn rad/s) per axis, and its weight in captures.
 USUAL_HABITS = np.array([0.15, np.radians(10.0)])

@@ -2,10 +2,15 @@
 
 import numpy as np
 
+from lce_rig.calibrate.algorithm_1.certificate import certify, solve_globally
+from lce_rig.calibrate.algorithm_1.registration import (
+    cube_rotations,
+    eliminate_linear,
+    minimise_on_so3,
+    rotation_cost,
+)
 from lce_rig.core.geometry import exp_so3, rotation_angle
-from lce_rig.solvers.certificate import certify, solve_globally
-from lce_rig.solvers.registration import cube_rotations, eliminate_linear, minimise_on_so3, rotation_cost
-from tests.solvers.test_registration import make_planes, moments_of
+from tests.calibrate.algorithm_1.test_registration import make_planes, moments_of
 
 
 def problems(n, sigma_m, n_boards, spread=0.5):

@@ -16,15 +16,15 @@ from itertools import product
 
 import numpy as np
 
-from lce_rig.calibrate.board_motion import BoardMotions, PoseSamples, board_time_s, deskew, fit_motions
+from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
+from lce_rig.calibrate.covariance import symmetric_inverse
+from lce_rig.calibrate.features import CaptureFeatures, extract_features, place_features
+from lce_rig.calibrate.motion.board_motion import BoardMotions, PoseSamples, board_time_s, deskew, fit_motions
 from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.plane_and_ends import along_normals, differentiate
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import Observation
-from lce_rig.residuals.features import CaptureFeatures, extract_features, place_features
-from lce_rig.residuals.moments import Problem, Weights
-from lce_rig.residuals.plane_and_ends import along_normals, differentiate
-from lce_rig.solvers.covariance import symmetric_inverse
 
 _REACH_S, _GRID_S = 0.2, 0.04
 _STEP_S = 0.004

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lce_rig.residuals.quadratics import jackknife_scatter, without_prior
+from lce_rig.calibrate.quadratics import jackknife_scatter, without_prior
 
 
 def sample_regressions(n_groups, n_trials, seed=0):

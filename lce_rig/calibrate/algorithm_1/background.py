@@ -11,16 +11,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.covariance import symmetric_inverse
+from lce_rig.calibrate.features import CaptureFeatures
+from lce_rig.calibrate.likelihood.along_rays import describe_background
 from lce_rig.calibrate.local_quadratic import SHIFT
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
+from lce_rig.calibrate.plane_and_ends import end_residuals, end_rows
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
-from lce_rig.residuals.along_rays import describe_background
-from lce_rig.residuals.features import CaptureFeatures
-from lce_rig.residuals.plane_and_ends import end_residuals, end_rows
-from lce_rig.residuals.quadratics import Quadratics, jackknife_scatter
-from lce_rig.solvers.covariance import symmetric_inverse
 
 BACKGROUND_SIGMAS_M = (0.015, 0.01, 0.015)
 """Prior standard deviations of the shifts, in the order of `describe_background`."""

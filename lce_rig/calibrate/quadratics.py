@@ -16,8 +16,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.core.geometry import Array
-from lce_rig.solvers.covariance import symmetric_inverse
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, transform
-from lce_rig.residuals.features import CaptureFeatures
 
 PLANE_FREEDOMS = 3
 """Two planes differ by an offset and two tilts, for any number of points."""

@@ -12,11 +12,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.background import estimate_shifts, move_ends
+from lce_rig.calibrate.algorithm_1.background import estimate_shifts, move_ends
+from lce_rig.calibrate.algorithm_1.certificate import solve_globally
+from lce_rig.calibrate.algorithm_1.moments import Problem, Solutions, Weights
+from lce_rig.calibrate.algorithm_1.registration import (
+    eliminate_linear,
+    linear_unknowns,
+    rotation_from_directions,
+)
+from lce_rig.calibrate.covariance import systematic_covariances
 from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.features import CaptureFeatures, extract_features
 from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.observability import require_observable
 from lce_rig.calibrate.options import Algorithm1Parts, EstimateSettings
+from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS
+from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.report import report_estimate, with_parts
 from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities
 from lce_rig.core.board import Board
@@ -24,14 +36,6 @@ from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose, project_to_so3
 from lce_rig.core.results import Certificate, Observation
-from lce_rig.residuals.features import CaptureFeatures, extract_features
-from lce_rig.residuals.moments import Problem, Solutions, Weights
-from lce_rig.residuals.placements import group_placements
-from lce_rig.residuals.plane_and_ends import PLANE_FREEDOMS
-from lce_rig.residuals.quadratics import Quadratics
-from lce_rig.solvers.certificate import solve_globally
-from lce_rig.solvers.covariance import systematic_covariances
-from lce_rig.solvers.registration import eliminate_linear, linear_unknowns, rotation_from_directions
 
 # First phase of Algorithm 1: extrinsics from the boards' planes alone.
 

@@ -26,12 +26,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.geometry import Array
-from lce_rig.solvers.registration import (
+from lce_rig.calibrate.algorithm_1.registration import (
     cube_rotations,
     minimise_on_so3,
     rotation_cost,
 )
+from lce_rig.core.geometry import Array
 
 RELATIVE_GAP = 1e-6
 _ROUNDING = 1e-11

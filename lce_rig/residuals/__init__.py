@@ -1,1 +1,0 @@
-"""Plane and ring-end residuals, their derivatives, and quadratic costs per capture."""

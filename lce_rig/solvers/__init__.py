@@ -1,1 +1,0 @@
-"""Mathematical solvers: poses from points, planes and corners, with covariance and certificates."""
