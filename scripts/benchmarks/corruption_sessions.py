@@ -10,21 +10,22 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.fault_sessions import nearly_parallel, rig_with_drawing
 from benchmarks.recordings import RecordedSet
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import ProfileError, refusal_of
-from lce_rig.core.geometry import Array, perturb
+from lce_rig.core.geometry import Array, exp_so3, perturb, pose
 from lce_rig.detect.detection import Detections, ImageDetection
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.rig import Rig
+from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
 from lce_rig.simulate.captures import capture_at
+from lce_rig.simulate.poses import can_be_held, count_rings, seen_share
 from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage
 
 SEED = 0
-N_CAPTURES, N_IN_ONE_PLACE = 15, 12
+N_CAPTURES, N_PARALLEL, N_IN_ONE_PLACE = 15, 12, 12
+_N_PLACES = 4000
 PARALLEL, ONE_PLACE = "parallel", "one place"
 # How late the timestamps of a moving board's images are, s.
 LATE_S = (0.02, 0.05, 0.1)
@@ -34,6 +35,13 @@ _PARALLEL, _ONE_PLACE = 90, 91
 _FIRST_PARALLEL, _FIRST_IN_ONE_PLACE = 1000, 2000
 # How still somebody holds the board who never moves it on purpose.
 _JITTER_M, _JITTER_RAD = 0.01, np.radians(1.0)
+
+
+def rig_with_drawing(name: str) -> Rig:
+    """Load a shipped profile as of a user who has a CAD model: it holds the nominal extrinsics."""
+    rig = load_rig(name)
+    drawn = tuple(entry.model_copy(update={"source": "cad"}) for entry in rig.nominal_extrinsics)
+    return rig.model_copy(update={"nominal_extrinsics": drawn})
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,3 +182,32 @@ def _frames_only(rig: Rig) -> Rig:
         frames = {key: channel for key, channel in camera.channels.items() if channel.kind == "frames"}
         cameras[name] = camera.model_copy(update={"channels": frames})
     return rig.model_copy(update={"cameras": cameras})
+
+
+def nearly_parallel(stage: Stage, rng: np.random.Generator) -> Iterator[Array]:
+    """Hold the board at many places with its normal within a few degrees of one direction."""
+    view, spread_deg = stage.views[0], rng.uniform(1.0, 5.0)
+    lean = exp_so3(np.radians(15) * rng.uniform(-1, 1, 3) * [1, 1, 0])
+    n_found = 0
+    for _ in range(_N_PLACES):
+        T_world_board = _facing(stage, lean, spread_deg, rng)
+        if not can_be_held(view, stage.board, stage.room, T_world_board):
+            continue
+        is_seen = seen_share(view, stage.board, T_world_board) > 0.8
+        if is_seen and count_rings(view, stage.board, T_world_board) >= 5:
+            yield T_world_board
+            n_found += 1
+            if n_found == N_PARALLEL:
+                return
+
+
+def _facing(stage: Stage, lean: Array, spread_deg: float, rng: np.random.Generator) -> Array:
+    lens = stage.views[0].intrinsics
+    pixel = rng.uniform(0.15, 0.85, 2) * [lens.width_px, lens.height_px]
+    centre = lens.unproject(pixel) * rng.uniform(*stage.options.distance_m)
+    wobble = exp_so3(np.radians(spread_deg) * rng.standard_normal(3) * [1, 1, 0])
+    mean_deg, half_width_deg = stage.options.roll_deg
+    roll_deg = mean_deg + half_width_deg * rng.uniform(-1, 1)
+    roll = exp_so3(np.radians(roll_deg) * np.array([0.0, 0.0, 1.0]))
+    facing = np.diag([1.0, -1.0, -1.0])
+    return np.asarray(stage.views[0].T_world_cam @ pose(lean @ wobble @ facing @ roll, centre))

@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from benchmarks.kept import kept_folder
 from lce_rig.core.data_sheets import VLP_16
-from lce_rig.core.geometry import Array, invert
+from lce_rig.core.geometry import Array
 from lce_rig.detect.detection import ImageDetection, LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
@@ -39,19 +37,10 @@ class Placement:
     Attributes:
         image: in the picture.
         scans: by level of noise.
-        normal: true (3,) normal of the board, frame lidar.
     """
 
     image: ImageDetection
     scans: dict[int, LidarDetection]
-    normal: Array
-
-    def normal_error_deg(self, level: int) -> float:
-        """Measure by how much the LiDAR's normal is off; NaN where the scan was refused."""
-        found = self.scans[level]
-        if not isinstance(found, list):
-            return float("nan")
-        return float(np.degrees(np.arccos(np.clip(found[0].plane[:3] @ self.normal, -1, 1))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,14 +107,13 @@ class _Maker:
             noise = replace(self._options, noise_level=level).noise_of(VLP_16)
             scan = measure_sweep(sweep, model, noise, stage.rng(index, SCAN, level), sensor=LIDAR)
             scans[level] = BoardFinder(self.rig).scan(scan)
-        normal = (invert(T_world_lidar) @ T_world_board)[:3, 2]
-        return Placement(BoardFinder(self.rig).image(image), scans, normal)
+        return Placement(BoardFinder(self.rig).image(image), scans)
 
 
 def _flatten(placement: Placement) -> tuple[dict[str, Array], dict[str, list[float]]]:
     parts = {"image": placement.image} | {f"scan{level}": scan for level, scan in placement.scans.items()}
     arrays = {f"{name}/{key}": a for name, part in parts.items() for key, a in to_arrays(part).items()}
-    return arrays, {"normal": placement.normal.tolist()}
+    return arrays, {}
 
 
 def _read(path: Path) -> Placement | None:
@@ -143,4 +131,4 @@ def _rebuild(kept: Cached) -> Placement:
         return {key[len(prefix) :]: a for key, a in kept.arrays.items() if key.startswith(prefix)}
 
     scans = {level: from_arrays(part(f"scan{level}")) for level in LEVELS}
-    return Placement(from_arrays(part("image")), scans, np.array(kept.values["normal"]))
+    return Placement(from_arrays(part("image")), scans)

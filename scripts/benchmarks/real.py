@@ -6,18 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.baselines import settings_of
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
 from lce_rig.calibrate import EstimateSettings
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.results import ImageBoard
+from lce_rig.core.results import ImageBoard, Method
 from lce_rig.pipeline import Detections
 from lce_rig.rig import Rig
 
 
-def bench_real(n_splits: int, only: str, method: str) -> None:
+def bench_real(n_splits: int, only: str, method: Method) -> None:
     """Tabulate every recorded set that is there, each channel alone and all together."""
     head = (
         "set, captures, image, LiDAR, used, EGT deg, EGT mm, split deg, split mm, MGE mm, reported deg / mm"
@@ -53,11 +52,11 @@ def _row(
     detections: Detections,
     channels: tuple[str, ...],
     n_splits: int,
-    method: str,
+    method: Method,
 ) -> tuple[object, ...]:
     pairs = [pair for pair in detections.pairs if pair.channel in channels]
     seen = [detections.of(pair, name) for pair in pairs for name in detections.captures(pair)]
-    options = settings_of(method)
+    options = EstimateSettings(method)
     (calibration, *_), _ = pipeline.calibrate_detections(rig, detections, options, channels=channels)
     deg, mm = compare(calibration.T_cam_lidar, recorded.reference())
     split_deg, split_mm = _split_halves(rig, detections, channels, n_splits, method)
@@ -78,7 +77,7 @@ def _row(
 
 
 def _split_halves(
-    rig: Rig, detections: Detections, channels: tuple[str, ...], n_splits: int, method: str
+    rig: Rig, detections: Detections, channels: tuple[str, ...], n_splits: int, method: Method
 ) -> tuple[float, float]:
     """Calibrate random halves of the scans apart and give the rms of their differences, deg and mm."""
     rng = np.random.default_rng(0)
@@ -98,7 +97,7 @@ def _split_halves(
                 pipeline.calibrate_detections(
                     rig,
                     _only(detections, {n for n, key in prints.items() if key in half}),
-                    settings_of(method, EstimateSettings(n_draws=0)),
+                    EstimateSettings(method, n_draws=0),
                     channels=channels,
                 )[0][0].T_cam_lidar
                 for half in halves

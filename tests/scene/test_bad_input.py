@@ -1,12 +1,81 @@
 """Inputs in which nothing can be seen, or everything is wrong: never an all-clear."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
-from benchmarks.drift_inputs import CORRUPTIONS, judge_corrupted
 
-from lce_rig.simulate import truth_extrinsics
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.geometry import Array, exp_so3
+from lce_rig.core.results import Calibration
+from lce_rig.export.result import SavedResult
+from lce_rig.pipeline.drift import PairDrift, judge
+from lce_rig.pipeline.scene_captures import SceneCaptures
+from lce_rig.rig import Rig
+from lce_rig.simulate import SimulatedCapture, truth_extrinsics
+from lce_rig.timing.scan_pairing import Frame
 from tests.scene.conftest import SEED
+
+Corruption = Callable[[Image, Scan, np.random.Generator], tuple[Image, Scan]]
+
+
+def _of_image(change: Callable[[Array, np.random.Generator], Array]) -> Corruption:
+    def corrupt(image: Image, scan: Scan, rng: np.random.Generator) -> tuple[Image, Scan]:
+        pixels = np.clip(change(image.grey.astype(np.float64), rng), 0, 255).astype(np.uint8)
+        return replace(image, pixels=pixels), scan
+
+    return corrupt
+
+
+def _featureless(image: Image, scan: Scan, rng: np.random.Generator) -> tuple[Image, Scan]:
+    """Stand in an empty round room: walls of 6 m radius, a floor without a print."""
+    rays = scan.points / np.linalg.norm(scan.points, axis=1, keepdims=True)
+    range_m = np.minimum(6.0 / np.hypot(rays[:, 0], rays[:, 1]), 1.0 / np.maximum(-rays[:, 2], 1e-3))
+    points = (rays * range_m[:, None]).astype(np.float32)
+    grey = 120 + rng.normal(0, 2, image.grey.shape)
+    even = replace(scan, points=points, intensity=np.full_like(scan.intensity, 40.0))
+    return replace(image, pixels=grey.astype(np.uint8)), even
+
+
+def _rain(image: Image, scan: Scan, rng: np.random.Generator) -> tuple[Image, Scan]:
+    """Let drops return a fifth of the beams from anywhere before what they should meet."""
+    is_drop = rng.random(len(scan.points)) < 0.2
+    share = np.where(is_drop, rng.uniform(0.1, 1.0, len(scan.points)), 1.0)
+    points = (scan.points * share[:, None]).astype(np.float32)
+    return image, replace(scan, points=points)
+
+
+def _tilted(image: Image, scan: Scan, _: np.random.Generator) -> tuple[Image, Scan]:
+    """Let the LiDAR's mount have given way by 6 deg."""
+    turn = exp_so3(np.radians([0.0, 6.0, 0.0])).T
+    return image, replace(scan, points=(scan.points @ turn.T).astype(np.float32))
+
+
+CORRUPTIONS: dict[str, Corruption] = {
+    "featureless walls": _featureless,
+    "night": _of_image(lambda grey, rng: grey / 60 + rng.normal(2, 1, grey.shape)),
+    "covered lens": _of_image(lambda grey, rng: 6 + rng.normal(0, 1, grey.shape)),
+    "lens smeared": _of_image(lambda grey, _: cv2.GaussianBlur(grey, (0, 0), 25)),
+    "rain of outliers": _rain,
+    "LiDAR tilted by 6 deg": _tilted,
+}
+"""What happens to the images and scans of unchanged extrinsics, or changes them beyond the range searched."""
+
+
+def judge_corrupted(
+    rig: Rig, captures: list[SimulatedCapture], deployed: Calibration, corrupt: Corruption
+) -> PairDrift:
+    """Judge extrinsics by corrupted captures."""
+    rng = np.random.default_rng(0)
+    result = SavedResult(rig.name, "a benchmark", (deployed,), {})
+    taken = SceneCaptures(rig, result, "the simulated room")
+    for capture in captures:
+        image, scan = corrupt(capture.images[0], capture.scans[0], rng)
+        taken.take_frame(Frame(scan.stamp_ns or 0, (image,), (scan,)))
+    (pair,) = judge(rig, result, taken).pairs
+    return pair
 
 
 @pytest.mark.long

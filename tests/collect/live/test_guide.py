@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from benchmarks.goes_on import NEW_DEG, NEW_M, follow_guide
 
 from lce_rig.collect.guidance import Person
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, Learned, make_guides
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig, load_rig
+from tests.collect.live.follow import NEW_DEG, NEW_M, follow_guide
 from tests.collect.live.replay import rig
 
 
