@@ -7,7 +7,11 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-settings.register_profile("lce-rig", deadline=None, derandomize=True, max_examples=50)
+# Long runs of the property tests try more examples, and new ones each time (docs/fuzzing.md).
+_EXAMPLES = os.environ.get("LCE_RIG_EXAMPLES")
+settings.register_profile(
+    "lce-rig", deadline=None, derandomize=not _EXAMPLES, max_examples=int(_EXAMPLES or 50)
+)
 settings.load_profile("lce-rig")
 
 # What a shell runs in the background ignores Ctrl-C, and so would processes that tests start to press it for.
