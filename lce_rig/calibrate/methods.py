@@ -6,7 +6,7 @@ from dataclasses import replace
 from lce_rig.calibrate.algorithm_1.algorithm import calibrate_by_algorithm_1
 from lce_rig.calibrate.consensus import Consensus, find_consensus
 from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.likelihood import calibrate_by_likelihood
+from lce_rig.calibrate.likelihood.calibrate_jointly import calibrate_by_likelihood
 from lce_rig.calibrate.options import CaptureCandidates, EstimateSettings, Estimator
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding

@@ -22,9 +22,14 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, transform
+from lce_rig.core.results import LidarBoard
 
 PLANE_FREEDOMS = 3
 """Two planes differ by an offset and two tilts, for any number of points."""
+BLENDS_M = 0.35
+"""Echoes from surfaces nearer to each other than this blend into one."""
+BLENDS = 1
+"""Column of `describe_background` that tells whether the background's echo blends into the board's."""
 # Errors of a board's plane and of its ring ends are at least as large as this.
 _PLANE_FLOOR_M, _END_FLOOR_M = 0.001, 0.002
 
@@ -132,6 +137,22 @@ def end_rows(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple[Arra
     normals = f.edge_normals[edge]
     by_tangent = differentiate(normals, f.edge_points @ T_cam_lidar[:3, :3].T)
     return inside_m, np.column_stack([by_tangent, np.ones(len(edge)), -normals @ f.centre])
+
+
+def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
+    """Return for each ring end (M,) whether an object is close behind the board along the beam."""
+    cosine = np.abs(lidar.edge_points @ lidar.plane[:3]) / np.linalg.norm(lidar.edge_points, axis=1)
+    return np.asarray(lidar.edge_behind_m < BLENDS_M * cosine)
+
+
+def describe_background(lidar: LidarBoard) -> Array:
+    """Describe the background of each ring end (M, 3).
+
+    Columns are the background's share of the power where it is far behind, whether it blends, and its share
+    where it does.
+    """
+    blends = is_blended(lidar)
+    return np.stack([lidar.edge_echo * ~blends, blends, lidar.edge_echo * blends], axis=1)
 
 
 def freedoms_of_plane() -> Array:

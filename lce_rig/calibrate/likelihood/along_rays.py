@@ -54,7 +54,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.plane_and_ends import differentiate, distance_inside, freedoms_of_plane
+from lce_rig.calibrate.plane_and_ends import (
+    BLENDS,
+    describe_background,
+    differentiate,
+    distance_inside,
+    freedoms_of_plane,
+)
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
@@ -79,10 +85,6 @@ N_SHIFTS = len(SHIFTS)
 _OF_END = 6 + N_OF_LASER + N_FIELDS + N_SHIFTS + 1
 # A ring end on an edge parallel to its ring has hardly a step, and determines the edge less accurately.
 _SHORTEST_STEP_M = 2e-4
-BLENDS_M = 0.35
-"""Echoes from surfaces nearer to each other than this blend into one."""
-BLENDS = 1
-"""Column of `describe_background` that tells whether the background's echo blends into the board's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,22 +221,6 @@ def turn_rays(rays: Array) -> Array:
     turned[:, :2, 1] = -rays[:, :2] * (rays[:, 2] / across)[:, None]
     turned[:, 2, 1] = across
     return turned
-
-
-def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
-    """Return for each ring end (M,) whether an object is close behind the board along the beam."""
-    cosine = np.abs(lidar.edge_points @ lidar.plane[:3]) / np.linalg.norm(lidar.edge_points, axis=1)
-    return np.asarray(lidar.edge_behind_m < BLENDS_M * cosine)
-
-
-def describe_background(lidar: LidarBoard) -> Array:
-    """Describe the background of each ring end (M, 3).
-
-    Columns are the background's share of the power where it is far behind, whether it blends, and its share
-    where it does.
-    """
-    blends = is_blended(lidar)
-    return np.stack([lidar.edge_echo * ~blends, blends, lidar.edge_echo * blends], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
