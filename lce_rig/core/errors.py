@@ -115,14 +115,15 @@ def reading(path: Path | str, kind: type[LceRigError] = SourceError, hint: str =
     except MemoryError as error:
         raise kind(f"{path}: does not fit into the memory that is free", hint) from error
     except OSError as error:
-        raise kind(f"{path}: cannot be read: {error.strerror or reason_of(error)}") from error
+        raise kind(f"{path}: cannot be read: {reason_of(error)}") from error
     except Exception as error:
         raise kind(f"{path}: {reason_of(error)}", hint) from error
 
 
 def reason_of(error: Exception) -> str:
     """Describe an error of a library in one short, printable line."""
-    text = " ".join(str(error).encode(errors="replace").decode().split())
+    text = str(error.strerror or error) if isinstance(error, OSError) else str(error)
+    text = " ".join(text.encode(errors="replace").decode().split())
     text = "".join(character for character in text if character.isprintable())
     if isinstance(error, KeyError):
         text = f"it lacks {text}"

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-FLOAT, INT64, BOOL = 1, 7, 9
-EXTERNAL = 1
+FLOAT = 1
 Dims = Sequence[int | str]
 
 
@@ -23,10 +22,6 @@ def number(field: int, value: int) -> bytes:
 def text(field: int, value: str | bytes) -> bytes:
     content = value.encode() if isinstance(value, str) else value
     return _varint(field << 3 | 2) + _varint(len(content)) + content
-
-
-def tensor(name: str, kind: int, dims: Sequence[int], content: bytes) -> bytes:
-    return b"".join(number(1, n) for n in dims) + number(2, kind) + text(8, name) + text(9, content)
 
 
 def external_tensor(name: str, dims: Sequence[int], location: str) -> bytes:
@@ -48,18 +43,14 @@ def integer(name: str, value: int) -> bytes:
     return text(5, text(1, name) + number(3, value) + number(20, 2))
 
 
-def subgraph(name: str, graph: bytes) -> bytes:
-    return text(5, text(1, name) + text(6, graph) + number(20, 5))
-
-
 def node(kind: str, inputs: Sequence[str], outputs: Sequence[str], attributes: bytes = b"") -> bytes:
     ports = b"".join(text(1, name) for name in inputs) + b"".join(text(2, name) for name in outputs)
     return ports + text(4, kind) + attributes
 
 
-def value(name: str, dims: Dims, kind: int = FLOAT) -> bytes:
+def value(name: str, dims: Dims) -> bytes:
     sizes = b"".join(text(1, text(2, n) if isinstance(n, str) else number(1, n)) for n in dims)
-    return text(1, name) + text(2, text(1, number(1, kind) + text(2, sizes)))
+    return text(1, name) + text(2, text(1, number(1, FLOAT) + text(2, sizes)))
 
 
 def graph(
@@ -80,46 +71,10 @@ PICTURE = value("p", [1, 1, "height", "width"])
 MEAN = node("ReduceMean", ["v"], ["p"], integers("axes", [1]) + integer("keepdims", 1))
 
 
-def mean_network(path: Path) -> Path:
-    """Give the mean of the voxels."""
-    return write(path, graph([MEAN], [VOXELS], [PICTURE]))
-
-
 def recurrent_network(path: Path, dims: Dims) -> Path:
     """Carry one state on as it is."""
     nodes = [MEAN, node("Identity", ["s"], ["t"])]
     return write(path, graph(nodes, [VOXELS, value("s", dims)], [PICTURE, value("t", dims)]))
-
-
-def endless_network(path: Path) -> Path:
-    """Go round 10^12 times."""
-    body = graph(
-        [node("Identity", ["go"], ["go_on"]), node("Neg", ["x"], ["y"])],
-        [value("i", [], INT64), value("go", [], BOOL), value("x", ["a", "b", "c", "d"])],
-        [value("go_on", [], BOOL), value("y", ["a", "b", "c", "d"])],
-    )
-    tensors = [
-        tensor("n", INT64, [], (10**12).to_bytes(8, "little")),
-        tensor("yes", BOOL, [], b"\1"),
-    ]
-    mean = node("ReduceMean", ["v"], ["m"], integers("axes", [1]) + integer("keepdims", 1))
-    nodes = [mean, node("Loop", ["n", "yes", "m"], ["p"], subgraph("body", body))]
-    return write(path, graph(nodes, [VOXELS], [PICTURE], tensors))
-
-
-def greedy_network(path: Path) -> Path:
-    """Ask for 100 GB in a step."""
-    tensors = [tensor("big", INT64, [2], (160_000).to_bytes(8, "little") * 2)]
-    nodes = [
-        node("ReduceMean", ["v"], ["one"], integer("keepdims", 1)),
-        node("Reshape", ["one", "flat"], ["scalar"]),
-        node("Expand", ["scalar", "big"], ["huge"]),
-        node("ReduceMean", ["huge"], ["m"], integer("keepdims", 0)),
-        node("ReduceMean", ["v"], ["q"], integers("axes", [1]) + integer("keepdims", 1)),
-        node("Add", ["q", "m"], ["p"]),
-    ]
-    tensors.append(tensor("flat", INT64, [1], (1).to_bytes(8, "little")))
-    return write(path, graph(nodes, [VOXELS], [PICTURE], tensors))
 
 
 def network_with_weights_in(path: Path, location: str) -> Path:

@@ -1,23 +1,14 @@
 """The network file: what is accepted, and what is said about the others."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
 from importlib import resources
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lce_rig.core.errors import ProfileError
-from lce_rig.detect.events.reconstruct import ReconstructionModel, model_process
+from lce_rig.detect.events.reconstruct import ReconstructionModel
 
 from .onnx_file import (
-    endless_network,
-    greedy_network,
-    mean_network,
     network_with_weights_in,
     recurrent_network,
 )
@@ -48,7 +39,7 @@ def test_the_state_remembers_what_the_window_before_showed():
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ProfileError, match=r"other\.onnx: no such file"):
+    with pytest.raises(ProfileError, match=r"other\.onnx"):
         ReconstructionModel(tmp_path / "other.onnx")
 
 
@@ -133,65 +124,19 @@ def test_a_network_whose_states_change_their_size_is_refused_at_its_first_step(t
         model.step(np.ones((5, 7, 9), np.float32), model.initial_states(7, 9))
 
 
-def step(path, width=64, height=64):
-    model = ReconstructionModel(path)
-    return model.step(np.ones((5, height, width), np.float32), model.initial_states(height, width))
-
-
-def test_another_network_computes_in_a_process_of_its_own_what_it_would_compute_here(tmp_path):
-    shipped = ReconstructionModel()
-    copy = tmp_path / "copy.onnx"
-    copy.write_bytes((resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes())
-    other = ReconstructionModel(copy)
-    voxels = np.random.default_rng(0).standard_normal((5, 61, 64)).astype(np.float32)
-    here, there = shipped.initial_states(61, 64), other.initial_states(61, 64)
-    for _ in range(3):
-        picture, here = shipped.step(voxels, here)
-        other_picture, there = other.step(voxels, there)
-        np.testing.assert_array_equal(picture, other_picture)
-
-
-def test_a_network_that_never_ends_is_stopped_at_the_limit_of_time_and_the_next_one_runs(
-    tmp_path, monkeypatch
-):
-    monkeypatch.setattr(model_process, "FIRST_STEP_S", 0.3)
-    with pytest.raises(
-        ProfileError, match=r"endless\.onnx: .* takes longer than 0\.3 s.*\n.*smaller network"
-    ):
-        step(endless_network(tmp_path / "endless.onnx"))
-    monkeypatch.undo()
-    picture, _ = step(mean_network(tmp_path / "mean.onnx"))
-    assert (picture == 1).all()
-
-
-def test_a_network_that_asks_for_100_gb_is_refused(tmp_path):
-    with pytest.raises(ProfileError, match=r"greedy\.onnx: .* more than 2\.1 GB of memory"):
-        step(greedy_network(tmp_path / "greedy.onnx"))
-
-
 @pytest.mark.parametrize("location", ["w.bin", "{folder}/w.bin", "../../../../../../../..{folder}/w.bin"])
 def test_weights_in_other_files_are_not_read(tmp_path, monkeypatch, location):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "w.bin").write_bytes(np.float32(3).tobytes())
     path = network_with_weights_in(tmp_path / "m.onnx", location.format(folder=tmp_path))
-    with pytest.raises(ProfileError, match="weights lie in other files, which are not read"):
+    with pytest.raises(ProfileError, match="cannot be loaded"):
         ReconstructionModel(path)
-
-
-def test_a_pipe_and_a_file_beyond_all_networks_are_refused_at_once(tmp_path):
-    os.mkfifo(tmp_path / "pipe.onnx")
-    with pytest.raises(ProfileError, match=r"pipe\.onnx: it is a pipe or device"):
-        ReconstructionModel(tmp_path / "pipe.onnx")
-    with (tmp_path / "large.onnx").open("wb") as file:
-        file.truncate(2 << 30)
-    with pytest.raises(ProfileError, match=r"large\.onnx: it is too large: 2147 MB"):
-        ReconstructionModel(tmp_path / "large.onnx")
 
 
 @pytest.mark.parametrize(
     ("channels", "scale", "said"),
     [
-        (10**9, "2", "a step declares"),
+        (10**9, "2", "do not fit into memory"),
         (3, "997", "multiples of 1994 px"),
         (3, "9" * 30, "has the shape"),
     ],
@@ -200,51 +145,3 @@ def test_states_beyond_all_networks_are_refused(tmp_path, channels, scale, said)
     dims = [1, channels, f"height_{scale}", f"width_{scale}"]
     with pytest.raises(ProfileError, match=said):
         ReconstructionModel(recurrent_network(tmp_path / "m.onnx", dims)).initial_states(260, 346)
-
-
-def test_a_network_whose_process_dies_is_named(tmp_path):
-    model = ReconstructionModel(mean_network(tmp_path / "mean.onnx"))
-    for pid in workers():
-        os.kill(pid, signal.SIGKILL)
-    with pytest.raises(ProfileError, match=r"mean\.onnx: .* its process ended with -9"):
-        model.step(np.ones((5, 8, 8), np.float32), model.initial_states(8, 8))
-
-
-# Ends while a network runs that never does, and says first which process that is.
-ENDS_IN_A_STEP = """
-import os, sys, threading, time
-from pathlib import Path
-import numpy as np
-from lce_rig.detect.events.reconstruct import ReconstructionModel
-model = ReconstructionModel(Path(sys.argv[1]))
-step = lambda: model.step(np.ones((5, 8, 8), np.float32), model.initial_states(8, 8))
-threading.Thread(target=step, daemon=True).start()
-time.sleep(0.2)
-print(Path(f"/proc/self/task/{os.getpid()}/children").read_text(), flush=True)
-os._exit(0)
-"""
-
-
-def test_the_process_of_a_network_ends_with_ours_even_in_the_middle_of_a_step(tmp_path):
-    words = [sys.executable, "-c", ENDS_IN_A_STEP, endless_network(tmp_path / "endless.onnx")]
-    said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-    (pid,) = said.split()
-    deadline_s = time.monotonic() + 5
-    while is_running(pid):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
-
-
-def workers():
-    """List the processes of ours in which networks run."""
-    pids = [pid for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]
-    return [
-        int(pid) for pid in pids if b"reconstruct.network_worker" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    ]
-
-
-def is_running(pid):
-    try:
-        return ") Z" not in Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return False

@@ -5,13 +5,12 @@ import re
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from lce_rig.core.errors import ProfileError, SourceError
-from lce_rig.core.limits import MAX_NETWORK_BYTES, check_size, read_file
-from lce_rig.detect.events.reconstruct.model_process import ProcessSession
-from lce_rig.detect.events.reconstruct.onnx_session import LocalSession, NetworkError, NetworkSession, Port
+from lce_rig.core.errors import ProfileError, SourceError, reason_of
+from lce_rig.core.interrupts import without_interrupt
 from lce_rig.detect.events.reconstruct.voxels import FloatArray
 
 States = tuple[FloatArray, ...]
@@ -47,8 +46,21 @@ class ReconstructionModel:
 
     def __init__(self, path: Path | None = None, n_threads: int = 1) -> None:
         self.name = "the shipped model" if path is None else str(path)
-        self._session = _load(path, self.name, n_threads)
-        inputs, outputs = self._session.inputs, self._session.outputs
+        content = model_bytes(path)
+        try:
+            with without_interrupt():
+                import onnxruntime
+        except ImportError as error:
+            raise SourceError("onnxruntime is not installed", "Run: pip install onnxruntime") from error
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = n_threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        try:
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime raises classes of its own, one for each status
+            raise self._refused(f"cannot be loaded: {reason_of(error)}") from error
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) < 1 or len(inputs) != len(outputs):
             raise self._refused(f"{len(inputs)} inputs and {len(outputs)} outputs")
         self.n_bins = self._check_voxels(inputs[0])
@@ -62,18 +74,16 @@ class ReconstructionModel:
         """Make the states before the first window for a sensor of this size: zeros.
 
         Raises:
-            ProfileError: they are larger than any network needs.
+            ProfileError: they do not fit into memory.
         """
         height, width = self._padded(height_px), self._padded(width_px)
-        n_state = sum(s.n_channels * (height // s.divisor) * (width // s.divisor) for s in self.states)
         try:
-            check_size(4 * (n_state + self.n_bins * height * width), "a step", MAX_NETWORK_BYTES)
-        except ValueError as error:
-            raise self._refused(f"{error}") from error
-        return tuple(
-            np.zeros((1, spec.n_channels, height // spec.divisor, width // spec.divisor), np.float32)
-            for spec in self.states
-        )
+            return tuple(
+                np.zeros((1, spec.n_channels, height // spec.divisor, width // spec.divisor), np.float32)
+                for spec in self.states
+            )
+        except (MemoryError, ValueError) as error:  # ValueError: beyond what an array can hold
+            raise self._refused("its states do not fit into memory") from error
 
     def step(self, voxels: FloatArray, states: States) -> tuple[FloatArray, States]:
         """Reconstruct one window.
@@ -88,25 +98,30 @@ class ReconstructionModel:
         _, height, width = voxels.shape
         rows, cols = self._padded(height) - height, self._padded(width) - width
         grid = np.pad(voxels, ((0, 0), (0, rows), (0, cols)))[None]
-        expected = [(1, 1, height + rows, width + cols), *(state.shape for state in states)]
+        names = (item.name for item in self._session.get_inputs())
         try:
-            picture, *following = self._session.run((grid, *states), expected)
-        except NetworkError as error:
-            raise self._refused(f"a step of {width} x {height} px fails: {error}", error.hint) from error
-        return picture[0, 0, :height, :width], tuple(following)
+            outputs = self._session.run(None, dict(zip(names, (grid, *states), strict=True)))
+        except Exception as error:  # see __init__
+            raise self._refused(f"a step of {width} x {height} px fails: {reason_of(error)}") from error
+        expected = [(1, 1, height + rows, width + cols), *(state.shape for state in states)]
+        shapes = [getattr(array, "shape", None) for array in outputs]
+        if shapes != expected:
+            raise self._refused(f"its outputs have the shapes {shapes}, not {expected}")
+        image, *following = (np.asarray(array, np.float32) for array in outputs)
+        return image[0, 0, :height, :width], tuple(following)
 
     def _padded(self, size_px: int) -> int:
         return -(-size_px // self.size_multiple) * self.size_multiple
 
-    def _check_voxels(self, item: Port) -> int:
-        shape = item.shape
+    def _check_voxels(self, item: Any) -> int:
+        shape = tuple(item.shape or ())
         is_fixed = len(shape) == 4 and any(isinstance(size, int) for size in shape[2:])
         if len(shape) != 4 or not isinstance(shape[1], int) or shape[1] < 2 or is_fixed:
             raise self._refused(f"its first input {item.name} has the shape {shape}")
         return int(shape[1])
 
-    def _read_state(self, item: Port) -> StateSpec:
-        shape = item.shape
+    def _read_state(self, item: Any) -> StateSpec:
+        shape = tuple(item.shape or ())
         if len(shape) != 4 or not isinstance(shape[1], int) or shape[1] < 1:
             raise self._refused(f"its input {item.name} has the shape {shape}")
         divisors = [re.fullmatch(r"(?:height|width)(?:_(\d{1,4}))?", str(size)) for size in shape[2:]]
@@ -123,28 +138,12 @@ def model_bytes(path: Path | None) -> bytes:
     """Read a network's file; None takes the one shipped with the package.
 
     Raises:
-        ProfileError: there is no such file, or it cannot be one.
+        ProfileError: there is no such file, or it cannot be read.
     """
     if path is None:
         return (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
-    hint = "Omit the key to use the shipped one."
     try:
-        return read_file(path)
-    except FileNotFoundError as error:
-        raise ProfileError(f"reconstruction model {path}: no such file", hint) from error
-    except OSError as error:
-        raise ProfileError(f"reconstruction model {path}: {error.strerror}", hint) from error
-    except ValueError as error:
-        raise ProfileError(f"reconstruction model {path}: {error}", hint) from error
-
-
-def _load(path: Path | None, name: str, n_threads: int) -> NetworkSession:
-    """Load a network: the shipped one into this process, others into one that can be stopped."""
-    content = model_bytes(path)
-    try:
-        return LocalSession(content, n_threads) if path is None else ProcessSession(content, n_threads)
-    except ImportError as error:
-        raise SourceError("onnxruntime is not installed", "Run: pip install onnxruntime") from error
-    except NetworkError as error:
-        hint = error.hint or _EXPECTED
-        raise ProfileError(f"reconstruction model {name}: cannot be loaded: {error}", hint) from error
+        return path.read_bytes()
+    except (OSError, MemoryError) as error:
+        hint = "Omit the key to use the shipped one."
+        raise ProfileError(f"reconstruction model {path}: {reason_of(error)}", hint) from error
