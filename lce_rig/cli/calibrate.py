@@ -222,12 +222,6 @@ if TYPE_CHECKING:
 )
 @robot_option
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
-@click.option(
-    "--registry",
-    metavar="DIR",
-    help="Note where the result differs from the robot's earlier ones or from its siblings', by this "
-    "registry of `lce-rig fleet run`.",
-)
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
 @click.option("--no-report", is_flag=True, help="Do not write report.html.")
 @click.option(
@@ -248,7 +242,6 @@ def calibrate(
     use_scene: bool,
     name: str | None,
     robot: str | None,
-    registry: str | None,
     as_json: bool,
     force: bool,
     no_report: bool,
@@ -314,12 +307,6 @@ def calibrate(
                 use_scene=use_scene,
                 progress=progress,
             )
-        if registry is not None:
-            from lce_rig.fleet.registry import Registry
-            from lce_rig.fleet.siblings import with_registry
-            from lce_rig.fleet.storage import Storage
-
-            result = with_registry(result, Registry(Storage.at(registry)))
         for shortage in result.shortages:
             show.warn(str(not_enough(shortage)))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):

@@ -100,9 +100,6 @@ def _target(name: str, file: Path | None, session: Path, rig: "Rig | None") -> "
 
 
 def _tell_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None:
-    from lce_rig.words import as_json as finding_as_json
-    from lce_rig.words import describe
-
     if as_json:
         show.print_json(
             {
@@ -113,7 +110,7 @@ def _tell_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None
                 "changed": dict(plan.changed),
                 "changed_there": dict(plan.changed_there),
                 "sensors": [_sensor(change) for change in plan.sensors],
-                "objections": [finding_as_json(each) for each in plan.objections],
+                "objections": [each.as_json() for each in plan.objections],
                 "diff": list(plan.text),
             }
         )
@@ -128,7 +125,7 @@ def _tell_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None
     for line in plan.text:
         click.echo(line)
     for each in plan.objections:
-        show.warn(f"would be refused: {describe(each)}")
+        show.warn(f"would be refused: {each.text}")
 
 
 def _moved(change: "SensorChange") -> str:

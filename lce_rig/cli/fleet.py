@@ -10,7 +10,6 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.fleet_deploy import deploy
-from lce_rig.cli.fleet_lidar import lidar
 from lce_rig.cli.fleet_report import report
 from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
 from lce_rig.core.results import DEFAULT_METHOD, Method
@@ -45,7 +44,6 @@ def fleet() -> None:
 
 fleet.add_command(report)
 fleet.add_command(deploy)
-fleet.add_command(lidar)
 
 
 @fleet.command()

@@ -58,13 +58,6 @@ if TYPE_CHECKING:
 @click.option(
     "--reason", default="", metavar="TEXT", help="With --rollback: say why; it is written down there."
 )
-@click.option(
-    "--output",
-    "-o",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Write the state of every robot as an HTML page.",
-)
 @json_option
 def deploy(
     registry: str,
@@ -79,7 +72,6 @@ def deploy(
     status: bool,
     rollback: bool,
     reason: str,
-    output: Path | None,
     as_json: bool,
 ) -> None:
     """Put the newest result of each robot in a registry onto the robot.
@@ -111,11 +103,6 @@ def deploy(
         with show.progress_bar("robots") as progress:
             rolling.run(wanted, canaries, jobs=jobs, only_canaries=canary_only, progress=progress)
     found = rolling.rollout
-    if output is not None:
-        from lce_rig.fleet.rollout_page import page
-        from lce_rig.session.durable import write_atomically
-
-        write_atomically(output, page(found))
     if as_json:
         show.print_json(found.model_dump())
     else:

@@ -1,305 +1,218 @@
-"""The report of a fleet: a page that a manager reads, and the tables behind it."""
+"""The report of a fleet: one page, and the tables behind it."""
 
 import json
-from collections.abc import Callable, Sequence
-from itertools import groupby
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pc_csv
+from markupsafe import Markup
 
 from lce_rig.core.errors import SessionError
-from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import Array
-from lce_rig.fleet.changes import FALSE_ALARMS, FALSE_CUSUMS
-from lce_rig.fleet.history import STATES, History, finding_of
-from lce_rig.fleet.plots import MATRICES, beside_siblings, in_time
-from lce_rig.fleet.siblings import Mounting
-from lce_rig.fleet.tables import FleetTables
-from lce_rig.scene.alignment import AXES, IS_ROTATION
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import difference
+from lce_rig.core.phrasing import as_line
+from lce_rig.fleet.findings import MOVED
+from lce_rig.fleet.moved import FALSE_ALARMS, MOVED_COLUMNS, STATES, History, history_of
+from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.table import covariances, poses
 from lce_rig.session.durable import write_atomically
+from lce_rig.show.report.drawing import BLUE, FAINT, RED, drawing, new_axes, style
 from lce_rig.show.report.page import render
-from lce_rig.words import as_json, as_line, describe, recommend
-from lce_rig.words.extrinsics import motion_words
 
 FORMAT_VERSION = 1
-_MOST_ROWS, _MOST_DRAWINGS, _MOST_MOUNTINGS = 60, 12, 4
-_CODE_WORDS = {
-    "fleet.moved": "Moved",
-    "fleet.moved_last": "Moved before the last session",
-    "fleet.drifts": "Drift slowly",
-    "fleet.creeps": "Small differences add up",
-    "fleet.apart_from_siblings": "Mounted apart from their siblings",
-    "fleet.odd_session": "One session differs",
-}
-_STATE_WORDS = {
-    "moved": "moved",
-    "moved_last": "moved before the last session, to be confirmed",
-    "drifts": "drift slowly",
-    "creeps": "small differences add up",
-    "odd_session": "steady but for an odd session",
-    "steady": "steady",
-    "once": "of one session, nothing to compare with",
-}
+_CAUSE_COLUMNS = ("robot", "status", "cause", "verdict", "findings", "severities")
+_AXES = tuple((f"{kind} {axis}", unit) for kind, unit in (("along", "m"), ("about", "deg")) for axis in "xyz")
+_MOST_ROWS, _MOST_DRAWINGS, _MOST_SESSIONS = 60, 12, 400
+_STATE_WORDS = {"moved": "moved", "steady": "steady", "cannot_tell": "cannot tell yet"}
 
 
-def findings(made: FleetTables) -> list[Finding]:
-    """List what concerns single robots: moved first, then drifts, sums, siblings, odd sessions."""
-    history = made.history
-    named = [finding_of(change) for change in history.changes]
-    creeping = np.flatnonzero(history.state == STATES.index("creeps"))
-    named += [_creeping(history, int(series)) for series in creeping]
-    named += [_apart(mounting, *each) for mounting in made.mountings for each in _one_axis(mounting)]
-    order = ["fleet.moved", "fleet.moved_last", "fleet.drifts", "fleet.creeps", "fleet.apart_from_siblings"]
-    rank = {code: k for k, code in enumerate(order)}
-    return sorted(named, key=lambda each: (rank.get(each.code, len(order)), each.subject))
+@dataclass(frozen=True, eq=False)
+class FleetReport:
+    """The content of a report.
 
-
-def _creeping(history: History, series: int) -> Finding:
-    first, last = history.starts[series], history.starts[series + 1]
-    own = history.cusum[first:last]
-    k, axis = np.unravel_index(np.argmax(np.abs(own)), own.shape)
-    figures: dict[str, Figure] = {
-        "camera": history.names["camera"][series].as_py(),
-        "lidar": history.names["lidar"][series].as_py(),
-        "axis": AXES[int(axis)],
-        "cusum": float(abs(own[k, axis])),
-        "limit_cusum": history.limits.cusum,
-    }
-    return Finding("fleet.creeps", "note", history.names["robot"][series].as_py(), figures)
-
-
-def _one_axis(mounting: Mounting) -> list[tuple[int, int]]:
-    """List each outlier once, by its farthest axis."""
-    seen: dict[int, int] = {}
-    for robot, axis in mounting.outliers:
-        seen.setdefault(robot, axis)
-    return list(seen.items())
-
-
-def _apart(mounting: Mounting, robot: int, axis: int) -> Finding:
-    unit, scale = ("deg", float(np.degrees(1.0))) if IS_ROTATION[axis] else ("m", 1.0)
-    figures: dict[str, Figure] = {
-        "camera": mounting.camera,
-        "lidar": mounting.lidar,
-        "axis": AXES[axis],
-        f"apart_{unit}": scale * float(mounting.apart[robot, axis] - mounting.median[axis]),
-        "sigmas": float(abs(mounting.z[robot, axis])),
-        "limit_sigmas": mounting.limit,
-        "n_siblings": len(mounting.robots) - 1,
-    }
-    return Finding("fleet.apart_from_siblings", "note", mounting.robots[robot], figures)
-
-
-def write_csv(made: FleetTables, folder: Path) -> list[Path]:
-    """Write each table as a file of comma-separated values into a folder.
-
-    Raises:
-        SessionError: it cannot be written.
-    """
-    paths = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, table in (*made.tables.items(), ("sessions", made.sessions())):
-            path = folder / f"{name}.csv"
-            pc_csv.write_csv(table, path)
-            paths.append(path)
-    except OSError as error:
-        raise SessionError(
-            f"{folder}: cannot be written: {error.strerror or error}", "Free space or choose another folder."
-        ) from error
-    return paths
-
-
-def document(made: FleetTables) -> dict[str, Any]:
-    """Build what --json prints: findings, and the tables but that of all sessions."""
-    history = made.history
-    return {
-        "format_version": FORMAT_VERSION,
-        "n_rows": history.n_rows,
-        "n_sessions": len(history.rows),
-        "n_unusable": history.n_failed,
-        "limit_chi2": _finite(history.limits.chi2),
-        "limit_cusum": _finite(history.limits.cusum),
-        "scale": history.scale.tolist(),
-        "findings": [as_json(finding) for finding in findings(made)],
-        "robots": history.robots,
-        "tables": {
-            name: [{k: _finite(v) for k, v in row.items()} for row in table.to_pylist()]
-            for name, table in made.tables.items()
-        },
-    }
-
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def write_json(made: FleetTables, path: Path) -> None:
-    """Write `document` into a file; raises SessionError."""
-    write_atomically(path, json.dumps(document(made), allow_nan=False) + "\n")
-
-
-def page(made: FleetTables, read: Callable[[Sequence[str]], Any], registry: str) -> str:
-    """Write the page.
-
-    Args:
-        made: the tables.
-        read: reads columns of the table that they were made of.
+    Attributes:
         registry: its name.
+        history: results compared in time.
+        findings: robots that moved.
+        tables: by name, for export; units in the names of columns.
+        n_rows: of the registry's table.
     """
-    history, named = made.history, findings(made)
-    states = list(history.robots.values())
-    dates = pc.min_max(history.dates).as_py() if len(history.dates) else {"min": "", "max": ""}
-    drawings = _drawings(history, read(MATRICES)) if history.changes else []
-    robots = {each.subject for each in named if each.code == "fleet.apart_from_siblings"}
-    tables = made.tables
-    return render(
-        "fleet.html",
-        registry=registry,
-        first=(dates["min"] or "")[:10],
-        last=(dates["max"] or "")[:10],
-        n_robots=made.n_robots,
-        n_rows=history.n_rows,
-        n_sessions=len(history.rows),
-        n_unusable=history.n_failed,
-        n_moved=states.count("moved") + states.count("moved_last"),
-        n_drift=states.count("drifts") + states.count("creeps"),
-        n_apart=len(robots),
-        states=[(_STATE_WORDS[state], states.count(state)) for state in STATES if state in states],
-        todo=_todo(named),
-        most=_MOST_ROWS,
-        seen=_seen(history),
-        drawings=drawings,
-        changes=[_change_cells(each) for each in tables["changes"].slice(0, _MOST_ROWS).to_pylist()],
-        n_changes=len(tables["changes"]),
-        mountings=[
-            (each, beside_siblings(each)) for each in made.mountings[:_MOST_MOUNTINGS] if len(each.robots) > 1
-        ],
-        mounting_rows=[_mounting_cells(each) for each in tables["mounting"].slice(0, _MOST_ROWS).to_pylist()],
-        verdicts=[
-            (each["result"], each["rows"], each["robots"], f"{100 * each['share']:.1f} %")
-            for each in tables["verdicts"].to_pylist()
-        ],
-        causes=[
-            (each["code"], each["severity"], each["rows"], each["robots"])
-            for each in tables["causes"].slice(0, _MOST_ROWS).to_pylist()
-        ],
-        lidars=[_lidar_cells(each) for each in tables["lidars"].slice(0, 20).to_pylist()],
-        n_lidars=len(tables["lidars"]),
-        cameras=[_camera_cells(each) for each in tables["cameras"].slice(0, 20).to_pylist()],
-        n_cameras=len(tables["cameras"]),
-        quality=[_quality_cells(each) for each in tables["quality"].slice(0, _MOST_ROWS).to_pylist()],
-        limits=history.limits,
-        scale=[(_short(axis), f"{value:.2f}") for axis, value in zip(AXES, history.scale, strict=True)],
-        n_scale=history.n_scale,
-        false_alarms=f"{100 * (FALSE_ALARMS + FALSE_CUSUMS):.0f} %",
+
+    registry: str
+    history: History
+    findings: tuple[Finding, ...]
+    tables: dict[str, Any]
+    n_rows: int
+
+    @classmethod
+    def of(cls, registry: Registry) -> "FleetReport":
+        """Make the report of a registry.
+
+        Raises:
+            SessionError: the registry has no table, or it cannot be read.
+        """
+        history = history_of(registry.read_table(MOVED_COLUMNS))
+        table = registry.read_table(_CAUSE_COLUMNS)
+        sessions = _sessions(history)
+        tables = {
+            "robots": pa.table({"robot": [*history.robots], "state": [*history.robots.values()]}),
+            "moves": sessions.take(pa.array(history.moves, pa.int64())),
+            "sessions": sessions,
+            "verdicts": _verdicts(table),
+            "causes": _causes(table),
+        }
+        findings = tuple(history.finding(k) for k in history.moves)
+        return cls(registry.place.name, history, findings, tables, len(table))
+
+    def write_csv(self, folder: Path) -> None:
+        """Write each table as a file of comma-separated values into a folder; raises SessionError."""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, table in self.tables.items():
+                pc_csv.write_csv(table, folder / f"{name}.csv")
+        except OSError as error:
+            raise SessionError(
+                f"{folder} cannot be written: {error.strerror or error}", "Choose another folder."
+            ) from error
+
+    def write_json(self, path: Path) -> None:
+        """Write findings and all tables but that of the sessions, which is long; raises SessionError."""
+        document = {
+            "format_version": FORMAT_VERSION,
+            "n_rows": self.n_rows,
+            "n_sessions": len(self.history.rows),
+            "limit_chi2": self.history.limit,
+            "findings": [finding.as_json() for finding in self.findings],
+            "robots": dict(self.history.robots),
+            "tables": {name: table.to_pylist() for name, table in self.tables.items() if name != "sessions"},
+        }
+        write_atomically(path, json.dumps(document, allow_nan=False) + "\n")
+
+    def page(self) -> str:
+        """Write the page, which loads nothing."""
+        history = self.history
+        states = [*history.robots.values()]
+        dates = pc.min_max(history.rows["date"]).as_py() if len(history.rows) else {"min": "", "max": ""}
+        shown = self.findings[:_MOST_ROWS]
+        return render(
+            "fleet.html",
+            registry=self.registry,
+            first=(dates["min"] or "")[:10],
+            last=(dates["max"] or "")[:10],
+            n_robots=len(states),
+            n_rows=self.n_rows,
+            n_sessions=len(history.rows),
+            n_moved=states.count("moved"),
+            n_compared=int(history.is_compared.sum()),
+            states=[(_STATE_WORDS[state], states.count(state)) for state in STATES],
+            moved=[(finding.subject, as_line(finding.text)) for finding in shown],
+            n_moves=len(self.findings),
+            action=as_line(str(MOVED.action)),
+            drawings=_drawings(history),
+            verdicts=[
+                (row["result"], row["rows"], row["robots"], f"{100 * row['share']:.1f} %")
+                for row in self.tables["verdicts"].to_pylist()
+            ],
+            causes=[
+                (row["code"], row["severity"], row["rows"], row["robots"])
+                for row in self.tables["causes"].slice(0, _MOST_ROWS).to_pylist()
+            ],
+            limit=f"{history.limit:.1f}",
+            false_alarms=f"{100 * FALSE_ALARMS:.0f} %",
+        )
+
+
+def _sessions(history: History) -> Any:
+    """List each usable result with its change from the one before; null where there is none."""
+    columns = {name: history.rows[name] for name in ("robot", "camera", "lidar", "date", "folder")}
+    before = pa.array([None, *columns["date"].to_pylist()][: len(history.rows)], pa.string())
+    columns["before"] = pc.if_else(pa.array(history.is_compared), before, None)
+    columns["chi2"] = pa.array(history.chi2, from_pandas=True)
+    for k, (axis, unit) in enumerate(_AXES):
+        factor = float(np.degrees(1.0)) if unit == "deg" else 1.0
+        name = axis.replace(" ", "_")
+        columns[f"change_{name}_{unit}"] = pa.array(factor * history.change[:, k], from_pandas=True)
+        columns[f"sigma_{name}_{unit}"] = pa.array(factor * history.sigma[:, k], from_pandas=True)
+    return pa.table(columns)
+
+
+def _verdicts(table: Any) -> Any:
+    """Count results by verdict, or by the status of those that there are not: result, rows, robots, share."""
+    result = pc.if_else(pc.equal(table["status"], "ok"), table["verdict"], table["status"])
+    counted = _counted(pa.table({"result": result, "robot": table["robot"]}), ["result"])
+    share = pc.divide(pc.cast(counted["rows"], pa.float64()), max(len(table), 1))
+    return counted.append_column("share", share)
+
+
+def _causes(table: Any) -> Any:
+    """Rank the reasons of missing, failed and marginal results: severity, code, rows, robots."""
+    failed = table.filter(pc.is_valid(table["cause"]))
+    severity = pa.array(["no result"] * len(failed), pa.string())
+    missing = pa.table({"severity": severity, "code": failed["cause"], "robot": failed["robot"]})
+    codes, severities = table["findings"].combine_chunks(), table["severities"].combine_chunks()
+    reasons = pa.table(
+        {
+            "severity": pc.list_flatten(severities),
+            "code": pc.list_flatten(codes),
+            "robot": table["robot"].take(pc.list_parent_indices(codes)),
+        }
     )
+    reasons = reasons.filter(pc.is_in(reasons["severity"], value_set=pa.array(["error", "warning"])))
+    return _counted(pa.concat_tables([missing, reasons]), ["severity", "code"])
 
 
-def _todo(named: list[Finding]) -> list[tuple[str, str, list[tuple[str, str]], int]]:
-    """Group findings by their code: (what, action, (robot, sentence) of the first few, number of all)."""
-    groups = []
-    for code, each in groupby(named, key=lambda finding: finding.code):
-        own = list(each)
-        shown = [(finding.subject, as_line(describe(finding))) for finding in own[:_MOST_ROWS]]
-        groups.append((_CODE_WORDS[code], as_line(recommend(own[0])), shown, len(own)))
-    return groups
+def _counted(table: Any, keys: list[str]) -> Any:
+    """Count rows and robots by keys, the most rows first."""
+    counts = [("robot", "count"), ("robot", "count_distinct")]
+    grouped = (
+        table.group_by(keys, use_threads=False).aggregate(counts).rename_columns([*keys, "rows", "robots"])
+    )
+    return grouped.sort_by([("rows", "descending"), *((key, "ascending") for key in keys)])
 
 
-def _seen(history: History) -> list[tuple[str, str, str]]:
-    """State the smallest change that a session would show, of the median robot and of the worst tenth."""
-    lengths = np.diff(history.starts)
-    known: Array = history.smallest[lengths > 1]
-    if not len(known) or not np.isfinite(known).all():
-        return []
-    half, most = np.quantile(known, [0.5, 0.9], axis=0)
-    return [(_short(axis), _size(half[k], k), _size(most[k], k)) for k, axis in enumerate(AXES)]
-
-
-def _short(axis: str) -> str:
-    return f"{'about' if axis.startswith('rotation') else 'along'} {axis[-1]}"
-
-
-def _size(value: float, axis: int) -> str:
-    return f"{np.degrees(value):.2f} deg" if IS_ROTATION[axis] else f"{1e3 * value:.1f} mm"
-
-
-def _drawings(history: History, table: Any) -> list[tuple[str, str, Any]]:
-    """Draw the robots that changed, the first few of them: (title, sentence, drawing)."""
-    order = sorted(history.changes, key=lambda each: (each.found.kind == "odd", each.robot))
-    drawn: dict[int, tuple[str, str, Any]] = {}
-    for change in order:
-        if len(drawn) < _MOST_DRAWINGS and change.series not in drawn:
-            title = f"{change.robot}: {change.camera} and {change.lidar}"
-            note = f"{motion_words(change.found.axes[0].axis)}; below, its cumulative sum".capitalize()
-            drawn[change.series] = (title, note, in_time(history, table, change))
+def _drawings(history: History) -> list[tuple[str, str, Markup]]:
+    """Draw the first few robots that moved along the axis that changed most: (title, note, drawing)."""
+    drawn: dict[tuple[str, ...], tuple[str, str, Markup]] = {}
+    is_start = ~history.is_compared
+    for k in history.moves:
+        robot, camera, lidar = (history.rows[name][k].as_py() for name in ("robot", "camera", "lidar"))
+        if len(drawn) == _MOST_DRAWINGS or (robot, camera, lidar) in drawn:
+            continue
+        starts = np.flatnonzero(is_start[: k + 1])
+        ends = np.flatnonzero(is_start[k + 1 :])
+        first = max(int(starts[-1]), k - _MOST_SESSIONS // 2)
+        last = min(k + 1 + (int(ends[0]) if len(ends) else len(history.rows)), k + _MOST_SESSIONS // 2)
+        axis = int(np.argmax(np.abs(history.change[k] / history.sigma[k])))
+        title, note = f"{robot}: {camera} and {lidar}", f"{_AXES[axis][0]} of the camera"
+        drawn[robot, camera, lidar] = (title, note, _in_time(history, first, last, axis, title))
     return list(drawn.values())
 
 
-def _change_cells(row: dict[str, Any]) -> tuple[Any, ...]:
-    first = row["axes"].split()[0]
-    kind = {"step": "moved", "drift": "drifts", "odd": "odd session"}[row["kind"]]
-    sensor = {"": "either", "lidar": row["lidar"], "camera": row["camera"]}[row["sensor"]]
-    size, sigma = row["axis_change"], row["axis_sigma"]
-    if first.startswith("rotation"):
-        told = f"{size:+.2f} +- {sigma:.2f} deg"
-    else:
-        told = f"{1e3 * size:+.1f} +- {1e3 * sigma:.1f} mm"
-    return (
-        row["robot"], f"{row['camera']}, {row['lidar']}", kind, sensor,
-        ", ".join(map(_short, row["axes"].split())), row["before"][:10], row["after"][:10], told,
-        f"{row['sessions_before']}, {row['sessions_after']}",
-    )  # fmt: skip
+def _in_time(history: History, first: int, last: int, axis: int, label: str) -> Markup:
+    """Draw rows first to last along one axis, with bars of two independent standard deviations."""
+    from matplotlib import dates
 
-
-def _mounting_cells(row: dict[str, Any]) -> tuple[Any, ...]:
-    scale, unit = (1.0, "deg") if row["unit"] == "deg" else (1e3, "mm")
-    places = 2 if unit == "deg" else 1
-    values = [row[name] for name in ("mean", "standard_deviation", "median", "robust_deviation", "largest")]
-    tolerance = row["tolerance"]
-    return (
-        f"{row['rig']}: {row['camera']}, {row['lidar']}",
-        f"{_short(row['axis'])}, {unit}", row["robots"],
-        *(f"{scale * value:.{places}f}" for value in values),
-        "-" if tolerance is None or row["nominal"] != "cad" else f"{scale * tolerance:g}",
-    )  # fmt: skip
-
-
-def _lidar_cells(row: dict[str, Any]) -> tuple[Any, ...]:
-    mm = [f"{1e3 * row[name]:.1f}" for name in ("range_m", "model_m", "sigma_m")]
-    return (
-        row["lidar_serial"] or "-",
-        row["rig"],
-        row["sessions"],
-        row["laser"],
-        *mm,
-        f"{row['sigmas']:.1f}",
-    )
-
-
-def _camera_cells(row: dict[str, Any]) -> tuple[Any, ...]:
-    names = {"focal_length": "focal length", "distortion": "distortion"}
-    error, changed = (names.get(row[key], row[key].replace("_", " ")) for key in ("error", "changed"))
-    if row["error"] == "focal_length":
-        value = f"{100 * row['value']:+.2f} +- {100 * row['sigma']:.2f} %"
-    else:
-        value = f"{row['value']:+.1f} +- {row['sigma']:.1f} px"
-    return (
-        row["camera_serial"] or "-", row["robot"], changed, error, row["sessions"],
-        f"{row['change_sigmas']:.1f}", f"{row['sigmas']:.1f}", value,
-        "-" if row["reprojection_px"] is None else f"{row['reprojection_px']:.2f}",
-    )  # fmt: skip
-
-
-def _quality_cells(row: dict[str, Any]) -> tuple[Any, ...]:
-    shares = [f"{100 * row[name]:.0f} %" for name in ("passed", "marginal", "failed", "no_result")]
-    return (
-        row["collector"] or "-", row["site"] or "-", row["refusal"] or "-", row["sessions"], *shares,
-        *("-" if row[n] is None else f"{row[n]:.1f}" for n in ("captures",)),
-        "-" if row["used"] is None else f"{100 * row['used']:.0f} %",
-        "-" if row["sigma_rotation_deg"] is None else f"{row['sigma_rotation_deg']:.3f}",
-        "-" if row["sigma_translation_m"] is None else f"{1e3 * row['sigma_translation_m']:.1f}",
-    )  # fmt: skip
+    rows = history.rows.slice(first, last - first)
+    T, cov = poses(rows["T_cam_lidar"]), covariances(rows["cov"]) - covariances(rows["cov_shared"])
+    unit = float(np.degrees(1.0)) if _AXES[axis][1] == "deg" else 1e3
+    values = unit * difference(T, np.broadcast_to(T[0], T.shape))[:, axis]
+    sigma = unit * np.sqrt(np.maximum(cov[:, axis, axis], 0.0))
+    days: Any = np.array([date.removesuffix("Z") for date in rows["date"].to_pylist()], dtype="datetime64[s]")
+    module: Any = dates
+    with style():
+        figure, (axes,) = new_axes(2.2, left_in=0.62, top_in=0.08)
+        axes.errorbar(days, values, 2 * sigma, fmt="none", lw=0.8, ecolor=FAINT)
+        axes.plot(days, values, "o", ms=3.5, color=BLUE, mew=0)
+        for k in history.moves:
+            if first < k < last:
+                axes.axvspan(days[k - first - 1], days[k - first], color=RED, alpha=0.25, lw=0)
+        axes.set_ylabel("deg" if _AXES[axis][1] == "deg" else "mm")
+        axes.grid(axis="y")
+        locator = module.AutoDateLocator(maxticks=6)
+        axes.xaxis.set_major_locator(locator)
+        axes.xaxis.set_major_formatter(module.ConciseDateFormatter(locator))
+        return drawing(figure, label)

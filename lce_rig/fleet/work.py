@@ -23,6 +23,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.results import DEFAULT_METHOD, Method
 from lce_rig.detect.detection import Detections
 from lce_rig.export.files import MADE_BY
+from lce_rig.fleet import findings as _kinds  # noqa: F401
 from lce_rig.fleet.jobs import Job, folder_name
 from lce_rig.fleet.process import Ended
 from lce_rig.fleet.registry import Registry, write_rows
@@ -44,7 +45,6 @@ from lce_rig.session.session import (
     REJECTED,
     RESULTS,
 )
-from lce_rig.words import describe
 
 # What no result depends on.
 _NOT_NEEDED = frozenset({CALIBRATION, RESULTS, INTRINSICS, DEBUG, REJECTED, OVERLAYS, LOCK})
@@ -243,7 +243,7 @@ def _failed(row: Row, error: LceRigError | OSError, scratch: Path) -> Row:
 
 def without_result(row: Row, status: Status, cause: Finding) -> Row:
     """Describe a session, or one pair of its sensors, that has no result."""
-    return replace(row, status=status, cause=cause.code, detail=describe(cause))
+    return replace(row, status=status, cause=cause.code, detail=cause.text)
 
 
 def _calibrate(

@@ -12,7 +12,6 @@ __all__ = ["Phrase", "Template", "as_line", "figures_apart"]
 
 FAMILIES = (
     *("detection", "drivers", "doctor", "exports", "extrinsics", "guidance", "recordings", "scene_drift"),
-    *("fleet", "deployment"),
 )
 """Modules of this package with a table PHRASES of their own."""
 

@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.fleet_sessions import BROKEN, TRUTH, break_sessions, make_fleet
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.geometry import perturb
-from lce_rig.fleet.history import COLUMNS, history_of
+from lce_rig.fleet.moved import MOVED_COLUMNS, history_of
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import SCHEMA, TABLE, as_table, merged, table_bytes
@@ -28,7 +28,6 @@ from lce_rig.fleet.table import SCHEMA, TABLE, as_table, merged, table_bytes
 _KILL_EVERY_S, _CLIENT_LIVES_S = 20.0, 45.0
 _FEW_ROBOTS, _FEW_SESSIONS = 10, 30
 _TABLE_ROWS = 1_000_000
-_NAMED = ("moved", "moved_last", "drifts", "creeps")
 # Figures of a run, not of a session.
 _OF_A_RUN = ("duration_s", "cpu_s", "peak_memory_mb", "finished", "source")
 
@@ -106,21 +105,21 @@ def bench_sessions(folder: Path) -> None:
 
 
 def compare_with_truth(root: Path, registry: Path) -> None:
-    """Which robots the report names, with which date and axis, beside those that were nudged."""
+    """Which robots the report names, with which date, beside those that were nudged."""
     truth: dict[str, Any] = json.loads((root / TRUTH).read_text())
-    history = history_of(Registry(Storage.at(registry)).read_table(COLUMNS))
-    named = {robot for robot, state in history.robots.items() if state in _NAMED}
+    history = history_of(Registry(Storage.at(registry)).read_table(MOVED_COLUMNS))
+    named = {robot for robot, state in history.robots.items() if state == "moved"}
     right = set()
-    for change in history.changes:
-        nudge = truth[change.robot]
-        if nudge is not None and change.found.kind == "step" and change.after[:10] == nudge["date"]:
-            right |= {change.robot} if change.found.axes[0].axis == nudge["motion"] else set()
+    for k in history.moves:
+        finding = history.finding(k)
+        nudge = truth[finding.subject]
+        if nudge is not None and str(finding.figures["after"])[:10] == nudge["date"]:
+            right.add(finding.subject)
     nudged = {robot for robot, nudge in truth.items() if nudge is not None}
-    print_head("robots", "nudged", "named", "with date and axis", "unchanged", "named", "odd sessions")
-    odd = sum(change.found.kind == "odd" for change in history.changes)
     unchanged = truth.keys() - nudged
+    print_head("robots", "nudged", "named", "with date", "unchanged", "named")
     print_row(
-        len(truth), len(nudged), len(named & nudged), len(right), len(unchanged), len(named & unchanged), odd
+        len(truth), len(nudged), len(named & nudged), len(right), len(unchanged), len(named & unchanged)
     )
 
 

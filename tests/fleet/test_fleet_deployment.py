@@ -13,7 +13,6 @@ from lce_rig.core.errors import ProfileError, UsageError
 from lce_rig.export.result import layout, to_json_dict
 from lce_rig.fleet.deployment import FleetDeployment, Rollout, newest_results, read_rollout
 from lce_rig.fleet.registry import Registry, write_rows
-from lce_rig.fleet.rollout_page import page
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import Row
 from lce_rig.rig import dump_rig, load_rig
@@ -116,7 +115,6 @@ def test_a_command_that_fails_stops_everything(
     rollout = deploy(registry, targets)
     assert rollout.stopped_by == robot and rollout.robots[robot].state == "command_failed"
     assert 2 <= len(rollout.robots) <= reached and rollout.robots[robot].release
-    assert robot in page(rollout)
     # Mended, the same call goes on; canaries that hold the result are not written again.
     before = (targets.parent / "robots" / "r1" / "calib" / "deployments.log").read_bytes()
     (targets.parent / "robots" / robot / "broken").unlink()
@@ -203,11 +201,9 @@ def test_the_verb_plans_deploys_shows_and_rolls_back(
     assert call("--canary", "2")[0] == 7
     assert held(targets, "r2") is not None and held(targets, "r3") is None
     (targets.parent / "robots" / "r2" / "broken").unlink()
-    output = targets.parent / "page.html"
-    code, said = call("--canary", "r2,r5", "--json", "-o", str(output))
+    code, said = call("--canary", "r2,r5", "--json")
     found = {name: each["state"] for name, each in json.loads(said)["robots"].items()}
     assert code == 0 and found == dict.fromkeys(ROBOTS, "in_place")
-    assert "r5 (canary)" in output.read_text()
     code, shown = call("--status")
     assert code == 0 and all(robot in shown for robot in ROBOTS)
     assert call("--rollback", "--reason", "test")[0] == 0

@@ -7,79 +7,69 @@ import numpy as np
 import pytest
 
 from lce_rig.cli.main import run
-from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import perturb
-from lce_rig.fleet.report import document, findings, page, write_csv
-from lce_rig.fleet.table import Row, as_table, write_table
-from lce_rig.fleet.tables import tables_of
+from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.report import FleetReport
+from lce_rig.fleet.storage import Storage
+from lce_rig.fleet.table import as_table
 
 SIGMA = np.array([2e-3, 2e-3, 3e-3, *np.radians([0.06, 0.06, 0.04])])
 
 
 @pytest.fixture
-def table(row):
+def registry(row, tmp_path):
     """Ten robots with eight sessions each, of which <r1> turned; and a session that crashed."""
     rng = np.random.default_rng(0)
-    rows = [Row("r5", status="crashed", cause="fleet.signal", date="2026-01-09T00:00:00Z")]
+    rows = [row("r5", status="crashed", cause="fleet.signal", T_cam_lidar=None, verdict=None)]
     for robot in ("<r1>", *(f"r{k}" for k in range(9))):
-        mounted = 3 * SIGMA * rng.normal(size=6)
         for k in range(8):
             moved = np.radians(0.8) * np.eye(6)[4] if robot == "<r1>" and k > 4 else np.zeros(6)
-            T = perturb(np.eye(4), mounted + moved + SIGMA * rng.normal(size=6))
             known = {
+                "folder": f"{robot}/{k}",
                 "session_sha256": f"{robot}{k}",
-                "T_cam_lidar": tuple(T.ravel().tolist()),
+                "T_cam_lidar": tuple(perturb(np.eye(4), moved + SIGMA * rng.normal(size=6)).ravel().tolist()),
                 "cov": tuple(np.diag(SIGMA**2)[np.triu_indices(6)].tolist()),
-                "cov_shared": tuple(np.zeros(21).tolist()),
-                "nominal": tuple(np.eye(4).ravel().tolist()),
-                "collector": "Ann & Bo",
+                "cov_shared": (0.0,) * 21,
             }
             rows.append(row(robot, f"2026-01-{k + 1:02d}T10:00:00Z", **known))
-    return as_table(rows)
+    place = Registry(Storage.at(tmp_path))
+    place.write_table(as_table(rows))
+    return place
 
 
-def test_the_page_names_who_moved_and_escapes_what_it_is_told(table):
-    made = tables_of(table.select)
-    text = page(made, table.select, "north")
+def test_the_page_names_the_robot_that_moved_and_escapes_names(registry):
+    text = FleetReport.of(registry).page()
     assert "<b>&lt;r1&gt;</b>" in text and "<r1>" not in text
-    assert "Ann &amp; Bo" in text and "fleet.signal" in text
-    assert text.count("<svg") == 2
+    assert "fleet.signal" in text and text.count("<svg") == 1
     assert "http" not in text.replace("http-equiv", "")
-    assert text == page(tables_of(table.select), table.select, "north")
+    assert text == FleetReport.of(registry).page()
 
 
-def test_findings_and_tables_are_for_programs(table, tmp_path):
-    made = tables_of(table.select)
-    moved = findings(made)[0]
-    assert (moved.code, moved.subject, moved.figures["axes"]) == ("fleet.moved", "<r1>", ("rotation_y",))
-    told = json.loads(json.dumps(document(made), allow_nan=False))
-    assert told["robots"]["<r1>"] == "moved" and told["n_sessions"] == 80
-    assert told["tables"]["changes"][0]["after"] == "2026-01-06T10:00:00Z"
-    assert "sessions" not in told["tables"]
-    written = {path.stem: path for path in write_csv(made, tmp_path / "csv")}
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SessionError, match="file"):
-        write_csv(made, tmp_path / "file")
-    assert set(written) == {*made.tables, "sessions"}
-    rows = list(csv.DictReader(written["sessions"].read_text().splitlines()))
-    assert len(rows) == 80 and rows[0]["chi2"] == "" and float(rows[1]["chi2"]) > 0
+def test_the_dots_of_a_drawing_are_in_it(registry):
+    """Markers are drawn where they are, not by a reference to a definition that the page lacks."""
+    text = FleetReport.of(registry).page()
+    svg = text[text.index("<svg") : text.index("</svg>")]
+    used = [part.split('"')[0] for part in svg.split('href="#')[1:]]
+    assert len(used) >= 8 and all(f'id="{name}"' in svg for name in used)
 
 
-def test_a_page_of_nothing_says_so(row):
-    table = as_table([row("r1", T_cam_lidar=None)])
-    text = page(tables_of(table.select), table.select, "empty")
-    assert "Nothing." in text and "<svg" not in text
-
-
-def test_the_command_writes_what_is_asked_for(table, tmp_path, capsys):
-    registry = tmp_path / "registry"
-    registry.mkdir()
-    write_table(registry / "fleet.parquet", table)
-    out = tmp_path / "out.html"
+def test_the_command_writes_page_tables_and_findings(registry, tmp_path, capsys):
+    out, folder = tmp_path / "out.html", str(tmp_path)
     more = ["--csv", str(tmp_path / "csv"), "--json", str(tmp_path / "out.json")]
-    assert run(["fleet", "report", "--registry", str(registry), "-o", str(out), *more]) == 0
-    assert out.read_text().startswith("<!DOCTYPE html>")
-    assert json.loads((tmp_path / "out.json").read_text())["format_version"] == 1
-    assert (tmp_path / "csv" / "robots.csv").exists()
-    assert "<r1>: " in capsys.readouterr().out
+    assert run(["fleet", "report", "--registry", folder, "-o", str(out), *more]) == 0
+    assert out.read_text().startswith("<!DOCTYPE html>") and "<r1>: " in capsys.readouterr().out
+    document = json.loads((tmp_path / "out.json").read_text())
+    assert document["robots"]["<r1>"] == "moved" and document["n_sessions"] == 80
+    assert [finding["code"] for finding in document["findings"]] == ["fleet.moved"]
+    assert document["tables"]["moves"][0]["date"] == "2026-01-06T10:00:00Z"
+    rows = list(csv.DictReader((tmp_path / "csv" / "sessions.csv").read_text().splitlines()))
+    assert len(rows) == 80 and rows[0]["chi2"] == "" and float(rows[1]["chi2"]) > 0
+    assert run(["fleet", "report", "--registry", folder, "-o", str(out), "--csv", "/proc/csv"]) == 4
     assert run(["fleet", "report", "--registry", str(tmp_path / "none"), "-o", str(out)]) == 4
+
+
+def test_a_page_of_nothing_says_so(row, tmp_path):
+    place = Registry(Storage.at(tmp_path))
+    place.write_table(as_table([row("r1"), row("r2")]))
+    text = FleetReport.of(place).page()
+    assert "Cannot tell yet" in text and "<svg" not in text

@@ -6,9 +6,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
 from lce_rig.export.result import read_result
 
@@ -39,7 +38,7 @@ def sensor_changes(earlier: Path, new: Path) -> list[SensorChange]:
     found = []
     for key in [*after, *(key for key in before if key not in after)]:
         both = key in before and key in after
-        moved = error_to_reference(after[key], before[key]) if both else None
+        moved = tangent_sizes(difference(after[key], before[key])) if both else None
         found.append(SensorChange(*key, moved, key in after))
     return found
 

@@ -35,11 +35,11 @@ from lce_rig.fleet.deploy.releases import (
     to_state,
 )
 from lce_rig.fleet.deploy.shell import CHANGED, COMMIT, PREPARE, RECORD, RUN, SAYS
+from lce_rig.fleet.findings import DEPLOY_FAILED, DEPLOY_OLDER, DEPLOY_OTHER_ROBOT, DEPLOY_OTHER_SERIAL
 from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
 from lce_rig.session.replacing import copy_over
-from lce_rig.words import describe, recommend
 
 _OTHER = "Another deployment came first: look at `--status`, then run the same command again."
 
@@ -291,29 +291,24 @@ def _user() -> str:
 def _objections(saved: SavedResult, target: TargetSettings, current: ReleaseRecord | None) -> list[Finding]:
     """Find what speaks against a deployment."""
     origin = saved.provenance
-    found = [
-        Finding("deploy.failed", "error", f"{c.camera} and {c.lidar}")
-        for c in saved.pairs
-        if c.verdict == "fail"
-    ]
+    found = [DEPLOY_FAILED(f"{c.camera} and {c.lidar}") for c in saved.pairs if c.verdict == "fail"]
     robots = {robot for robot in (target.robot, None if current is None else current.robot) if robot}
     for robot in sorted(robots - {origin.robot}) if origin.robot else ():
-        found.append(Finding("deploy.other_robot", "error", figures={"robot": origin.robot, "there": robot}))
+        found.append(DEPLOY_OTHER_ROBOT(robot=origin.robot, there=robot))
     if current is None:
         return found
     for sensor, serial in sorted(origin.serials.items()):
         there = current.serials.get(sensor, serial)
         if there != serial:
-            figures = {"serial": serial, "there": there}
-            found.append(Finding("deploy.other_serial", "error", sensor, figures))
+            found.append(DEPLOY_OTHER_SERIAL(sensor, serial=serial, there=there))
     if origin.date and current.date and origin.date < current.date:
-        found.append(Finding("deploy.older", "error", figures={"date": origin.date, "there": current.date}))
+        found.append(DEPLOY_OLDER(date=origin.date, there=current.date))
     return found
 
 
 def _refused(target: TargetSettings, planned: Plan) -> ResultRefusedError:
-    told = "; ".join(describe(each) for each in planned.objections)
-    advice = [text for each in planned.objections if (text := recommend(each))]
+    told = "; ".join(each.text for each in planned.objections)
+    advice = [text for each in planned.objections if (text := each.advice)]
     hint = "\n".join([*dict.fromkeys(advice), "To deploy it nevertheless: --force --reason TEXT"])
     return ResultRefusedError(f"not deployed to {target.to}: {told}", hint)
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tests.deploy.conftest import ORIGIN, log_of
 
 from lce_rig.core.errors import CommandError, ResultRefusedError, SessionError, TargetError
 from lce_rig.fleet.deploy import deployment, shell
@@ -18,6 +17,7 @@ from lce_rig.fleet.deploy.place import LocalPlace, Ran
 from lce_rig.fleet.deploy.releases import content_of, set_sha256
 from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
+from tests.fleet.deploy.conftest import ORIGIN, log_of
 
 Result = Callable[..., Path]
 FILES = {"camera_info_davis.yaml", "extrinsics.yaml", "result.json", "rles.urdf", "static_transforms.txt"}

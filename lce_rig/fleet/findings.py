@@ -1,0 +1,63 @@
+"""Findings about fleets: robots that moved, sessions without a result, objections to a deployment."""
+
+from lce_rig.core.findings import Kind
+
+MOVED = Kind(
+    "fleet.moved",
+    "{camera} and {lidar} moved between {before} and {after} by {rotation_deg:deg}, {translation_m:1mm} "
+    "(chi-squared {chi2:.0f}, limit {limit_chi2:.0f})",
+    "use no result from before; check how the sensors are fastened",
+    severity="note",
+)
+
+PROFILE = Kind("fleet.profile", "{what}", "{hint}")
+SESSION = Kind("fleet.session", "{what}", "{hint}")
+SOURCE = Kind("fleet.source", "{what}", "{hint}")
+NOT_ENOUGH_DATA = Kind("fleet.not_enough_data", "{what}", "{hint}")
+REFUSED = Kind("fleet.refused", "{what}", "{hint}")
+USAGE = Kind("fleet.usage", "{what}", "{hint}")
+OTHER_ERROR = Kind("fleet.other_error", "{what}", "{hint}")
+DAMAGED = Kind(
+    "fleet.damaged", "its files in the registry are damaged: {what}", "run the session again with `fleet run`"
+)
+BUG = Kind("fleet.bug", "a bug in lce-rig: {what}", "report it with the session")
+TIMED_OUT = Kind(
+    "fleet.timed_out",
+    "not done after {limit_s:.0f} s (limit)",
+    "set a larger --time-limit and add --retry, or split the session",
+)
+OUT_OF_MEMORY = Kind(
+    "fleet.out_of_memory",
+    "needs more than {limit_mb:.0f} MB of memory (limit)",
+    "set a larger --memory-limit and add --retry, or split the session",
+)
+SIGNAL = Kind(
+    "fleet.signal", "its process was ended by signal {signal}: {what}", "calibrate the session alone"
+)
+EXITED = Kind(
+    "fleet.exited", "its process ended with exit code {code}: {what}", "calibrate the session alone"
+)
+WORKER_LOST = Kind(
+    "fleet.worker_lost",
+    "{n} workers were lost with it",
+    "run it again; if it is lost again, calibrate the session alone",
+)
+
+DEPLOY_FAILED = Kind(
+    "deploy.failed", "the calibration of {subject} failed", "Collect again, see `lce-rig calibrate`."
+)
+DEPLOY_OTHER_ROBOT = Kind(
+    "deploy.other_robot",
+    "the result is of robot {robot}, the target of {there}",
+    "Name the target of the right robot.",
+)
+DEPLOY_OTHER_SERIAL = Kind(
+    "deploy.other_serial",
+    "{subject} has serial number {serial}, the deployed one {there}",
+    "Name the right target. If the sensor was replaced, force it and say so.",
+)
+DEPLOY_OLDER = Kind(
+    "deploy.older",
+    "the result's captures are of {date}, the deployed ones of {there}",
+    "Deploy the newer session, or use `--rollback` to go back.",
+)
