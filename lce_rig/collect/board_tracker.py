@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from lce_rig.calibrate.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
+from lce_rig.collect.findings import IMAGE_NONE, LIDAR_ELSEWHERE, LIDAR_NONE
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, invert
@@ -160,9 +161,9 @@ class BoardTracker:
         if not detection.images:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
             if not detection.is_moving:
-                self.refusals.add(Refusal("image.none"))
+                self.refusals.add(IMAGE_NONE.refusal())
         elif not lidars:
-            self.refusals.add(Refusal("lidar.none"))
+            self.refusals.add(LIDAR_NONE.refusal())
         return replace(detection, lidars=lidars, unscanned=unscanned)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
@@ -281,7 +282,7 @@ def _compare(
         "distance_m": float(distance[best]),
         "rotation_deg": float(np.degrees(angle[best])),
     }
-    return float(misfit[best]), Refusal("lidar.elsewhere", figures=figures)
+    return float(misfit[best]), LIDAR_ELSEWHERE.refusal(**figures)
 
 
 def _apart(T_1: Array, T_2: Array) -> tuple[float, float]:

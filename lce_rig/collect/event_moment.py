@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey, MovedSlowly
+from lce_rig.collect.findings import IMAGE_MADE_FEW_EVENTS, IMAGE_STOOD_STILL, READ_NO_EVENTS_AT_SCAN
 from lce_rig.core.data import Events
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
@@ -47,7 +48,7 @@ def judge_detection(
     """
     cuts = {cut.sensor: cut for cut in detection.frame.events}
     if detection.images and not cuts:
-        return Refusal("read.no_events_at_scan")
+        return READ_NO_EVENTS_AT_SCAN.refusal()
     watched = [key for key in sorted(detection.images) if key[0] in cuts]
     if not watched:
         return _explain_unseen(detection, cuts, rig)
@@ -77,9 +78,9 @@ def _judge_camera(
         return too_fast(speed_mps, limits)
     is_slow = speed_mps < _MIN_SPEED_MPS
     if is_slow and events_px < max(_PLENTY_EVENTS_PX, limits.min_events_px):
-        return Refusal("image.stood_still", figures=made)
+        return IMAGE_STOOD_STILL.refusal(**made)
     if events_px < limits.min_events_px:
-        return Refusal("image.made_few_events", figures={**made, "speed_mps": speed_mps})
+        return IMAGE_MADE_FEW_EVENTS.refusal(**made, speed_mps=speed_mps)
     if is_slow:
         lamps = look_for_flicker(recent)
         if lamps is not None:

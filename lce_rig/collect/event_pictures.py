@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 
+from lce_rig.collect.findings import READ_EVENTS_GONE_BY, READ_EVENTS_NOT_BEGUN
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
@@ -11,8 +12,8 @@ from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns
 from lce_rig.timing.scan_pairing import PATIENCE_NS, middle_of_sweep_ns
 
-_NOT_BEGUN = Refusal("read.events_not_begun")
-_GONE_BY = Refusal("read.events_gone_by")
+_NOT_BEGUN = READ_EVENTS_NOT_BEGUN.refusal()
+_GONE_BY = READ_EVENTS_GONE_BY.refusal()
 
 
 def with_event_pictures(

@@ -11,7 +11,8 @@ and called with its figures: `TOO_DARK("camera", grey_99=12.0)` is a `Finding`,
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, cast
+from importlib import import_module
+from typing import Any, Literal, cast
 
 from lce_rig.core.phrasing import fill
 
@@ -24,6 +25,12 @@ _ORDER: tuple[Severity, ...] = ("note", "warning", "error")
 
 KINDS: dict[str, "Kind"] = {}
 """Every declared kind by its code, as far as its module is imported."""
+
+
+def _kind(code: str) -> "Kind":
+    if code not in KINDS:
+        import_module("lce_rig.words.rendering").phrases()
+    return KINDS[code]
 
 
 class Kind:
@@ -54,13 +61,13 @@ class Kind:
         KINDS[code] = self
 
     def __call__(
-        self, subject: str = "", /, *, severity: Severity | None = None, action: str = "", **figures: Figure
+        self, subject: str = "", /, *, severity: Any = None, action: Any = "", **figures: Figure
     ) -> "Finding":
-        """Make a finding of this kind."""
+        """Make a finding of this kind; severity and action are typed loosely to allow `**figures`."""
         return Finding(self.code, severity or self.severity, subject, figures, action)
 
     def refusal(
-        self, subject: str = "", /, *, severity: Severity | None = None, action: str = "", **figures: Figure
+        self, subject: str = "", /, *, severity: Any = None, action: Any = "", **figures: Figure
     ) -> "Refusal":
         """Make a refusal of this kind; the code begins with the stage."""
         return Refusal(self.code, severity or self.severity, subject, figures, action)
@@ -106,14 +113,14 @@ class Finding:
     @property
     def text(self) -> str:
         """The fact in words, without an action."""
-        return self.stored[0] if self.stored else self._render(KINDS[self.code].text)
+        return self.stored[0] if self.stored else self._render(_kind(self.code).text)
 
     @property
     def advice(self) -> str:
         """The action in words; "" for none."""
         if self.stored:
             return self.stored[1]
-        kind = KINDS[self.code]
+        kind = _kind(self.code)
         return self._render(kind.actions[self.action] if self.action else kind.action)
 
     @property

@@ -13,7 +13,6 @@ from lce_rig.core.data import Image
 from lce_rig.core.documents import parse_json
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import Calibration, EventQuality, ImageBoard, ImageQuality, LidarBoard, LidarQuality
-from lce_rig.words import is_renderable
 
 # Types of the fields of a detection; an entry of a cache may be foreign or outdated.
 
@@ -225,10 +224,7 @@ def _rebuild(index: int, head: dict[str, Any], arrays: Mapping[str, NDArray[Any]
     prefix = f"{index}."
     own = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
     check_fields(kind, {**head, **own})
-    rebuilt = kind(**head, **own)
-    if isinstance(rebuilt, Refusal) and not is_renderable(rebuilt):
-        raise ValueError(f"no words for {rebuilt.code}")
-    return rebuilt
+    return kind(**head, **own)
 
 
 @dataclass(frozen=True)

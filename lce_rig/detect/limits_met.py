@@ -6,6 +6,15 @@ from typing import Literal
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.detect.findings import (
+    IMAGE_NEAR_BORDER,
+    IMAGE_SMALL_SQUARES,
+    IMAGE_TILTED,
+    LIDAR_OTHER_SIZE,
+    LIDAR_RAGGED_EDGES,
+    LIDAR_TOO_FEW_POINTS,
+    TOO_NEAR_OR_FAR,
+)
 from lce_rig.rig import QualitySettings
 
 
@@ -20,14 +29,14 @@ def gate_image_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard |
     if q is not None and q.square_px < limits.min_square_px:
         closer_m = found.distance_m * (1 - q.square_px / limits.min_square_px)
         figures = {"square_px": q.square_px, "min_square_px": limits.min_square_px, "closer_m": closer_m}
-        return Refusal("image.small_squares", figures=figures)
+        return IMAGE_SMALL_SQUARES.refusal(**figures)
     if q is not None and q.border_px < limits.min_border_px:
         figures = {"border_px": q.border_px, "min_border_px": limits.min_border_px}
-        return Refusal("image.near_border", figures=figures)
+        return IMAGE_NEAR_BORDER.refusal(**figures)
     if found.tilt_deg > limits.max_tilt_deg:
         turn_deg = found.tilt_deg - limits.max_tilt_deg + 5
         figures = {"tilt_deg": found.tilt_deg, "max_tilt_deg": limits.max_tilt_deg, "turn_deg": turn_deg}
-        return Refusal("image.tilted", figures=figures)
+        return IMAGE_TILTED.refusal(**figures)
     return _gate_distance("image", found.distance_m, limits) or found
 
 
@@ -50,9 +59,8 @@ def _lidar_problem(found: LidarBoard, board: Board, limits: QualitySettings) -> 
     q = found.quality
     if q.n_points < limits.min_points:
         closer_m = max(0.1, q.distance_m * (1 - (q.n_points / limits.min_points) ** 0.5))
-        return Refusal(
-            "lidar.too_few_points",
-            figures={"n_points": q.n_points, "min_points": limits.min_points, "closer_m": closer_m},
+        return LIDAR_TOO_FEW_POINTS.refusal(
+            n_points=q.n_points, min_points=limits.min_points, closer_m=closer_m
         )
     for side, wanted_m, measured_m, sigma_m in (
         ("width", board.width_m, q.width_m, q.width_sigma_m),
@@ -60,13 +68,12 @@ def _lidar_problem(found: LidarBoard, board: Board, limits: QualitySettings) -> 
     ):
         excess = abs(measured_m - wanted_m) - 3 * sigma_m - limits.max_size_error * wanted_m
         if excess > 0:
-            return Refusal(
-                "lidar.other_size",
-                figures={"side": side, "measured_m": measured_m, "sigma_m": sigma_m, "profile_m": wanted_m},
+            return LIDAR_OTHER_SIZE.refusal(
+                side=side, measured_m=measured_m, sigma_m=sigma_m, profile_m=wanted_m
             )
     if q.edge_rms_m > limits.max_edge_rms_m:
         figures = {"rms_m": q.edge_rms_m, "max_rms_m": limits.max_edge_rms_m}
-        return Refusal("lidar.ragged_edges", figures=figures)
+        return LIDAR_RAGGED_EDGES.refusal(**figures)
     return _gate_distance("lidar", q.distance_m, limits)
 
 
@@ -77,8 +84,8 @@ def _gate_distance(
     low_m, high_m = limits.min_distance_m, limits.max_distance_m
     if distance_m < low_m:
         figures = {"distance_m": distance_m, "min_distance_m": low_m, "move_m": low_m - distance_m + 0.05}
-        return Refusal(f"{stage}.too_near", figures=figures)
+        return TOO_NEAR_OR_FAR[stage][0].refusal(**figures)
     if distance_m > high_m:
         figures = {"distance_m": distance_m, "max_distance_m": high_m, "move_m": distance_m - high_m + 0.05}
-        return Refusal(f"{stage}.too_far", figures=figures)
+        return TOO_NEAR_OR_FAR[stage][1].refusal(**figures)
     return None

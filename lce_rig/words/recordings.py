@@ -2,18 +2,7 @@
 
 from lce_rig.words.rendering import Phrase
 
-_SIZES = (
-    "{width_px}x{height_px} px, the profile's intrinsics belong to {wanted_width_px}x{wanted_height_px} px"
-)
-_OTHER_MODE = "use the intrinsics of this mode, or record in the mode of the intrinsics"
 PHRASES = {
-    "image.size_cut": Phrase(f"{_SIZES}: the readout ended early, used as far as it reaches"),
-    "image.size_canvas": Phrase(f"{_SIZES}: blank beyond the sensor, cropped to it"),
-    "image.size_other": Phrase(
-        f"{_SIZES}: cannot be used",
-        _OTHER_MODE,
-        {"scaled": f"{_OTHER_MODE}; if the image is only scaled, multiply fx, fy, cx, cy by {{factor:.4g}}"},
-    ),
     "recording.broken_packets": Phrase("{n} broken packets skipped (first: {where})"),
     "recording.torn_end": Phrase("{n} torn ends of the file skipped (first: {where})"),
     "recording.trigger_packets": Phrase("{n} packets of triggers skipped"),

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import KINDS, Finding, Kind, Refusal, Template
@@ -10,8 +11,10 @@ from lce_rig.core.phrasing import as_line, figures_apart
 
 __all__ = ["Phrase", "Template", "as_line", "figures_apart"]
 
-FAMILIES = (
-    *("detection", "drivers", "doctor", "exports", "extrinsics", "guidance", "recordings", "scene_drift"),
+FAMILIES = tuple(
+    path.stem
+    for path in sorted(Path(__file__).parent.glob("*.py"))
+    if path.stem not in ("__init__", "rendering")
 )
 """Modules of this package with a table PHRASES of their own."""
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.collect.findings import CALIBRATE_KNOWN_PLACEMENT, CALIBRATE_LITTLE_GAIN
 from lce_rig.collect.guidance.candidates import DIAMOND_DEG, SensorPlace, spread_candidates
 from lce_rig.collect.guidance.evidence import (
     Evidence,
@@ -241,7 +242,7 @@ class Planner:
         if len(alike):
             name = str(alike[0] + 1) if names is None else names[alike[0]]
             figures = {"capture": name, "instruction": instruction}
-            return Refusal("calibrate.known_placement", figures=figures, action=action)
+            return CALIBRATE_KNOWN_PLACEMENT.refusal(action=action, **figures)
         is_asked = asked is not None and is_there(self.view, present, asked)
         if wanted is None or guidance.is_enough or is_asked:
             return None
@@ -249,7 +250,7 @@ class Planner:
         if best < LEAST_GAIN or own >= LEAST_SHARE * best:
             return None
         figures = {"gain": max(float(own), 0.0), "best_gain": float(best), "instruction": instruction}
-        return Refusal("calibrate.little_gain", figures=figures)
+        return CALIBRATE_LITTLE_GAIN.refusal(**figures)
 
     def _gains(self, held: Array, placements: Array) -> Array:
         """Compute by which share each of some placements (N, 4, 4) shrinks what can be shrunk, (N,)."""

@@ -6,6 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, ImageKey
+from lce_rig.collect.findings import (
+    GUIDE_FEW_CAPTURES,
+    GUIDE_NO_BEAMS,
+    GUIDE_NO_NOMINAL,
+    GUIDE_POSITION_ABOVE,
+    GUIDE_PREDICTED,
+    GUIDE_ROTATION_ABOVE,
+)
 from lce_rig.collect.guidance import (
     Coverage,
     Guidance,
@@ -79,16 +87,12 @@ class Guide:
         try:
             self._model = model_sensors(rig, key[0], lidar)
         except ProfileError as error:
-            self.problem = Finding("guide.no_beams", "warning", lidar, {"cause": error.what})
+            self.problem = GUIDE_NO_BEAMS(lidar, cause=error.what)
             self._at_first: tuple[Planner | None, Finding | None] = None, self.problem
             return
         nominal = rig.nominal(key[0], lidar)
         if nominal is None:
-            self.problem = Finding(
-                "guide.no_nominal",
-                "warning",
-                figures={"n_captures": rig.quality.min_captures, "camera": key[0], "lidar": lidar},
-            )
+            self.problem = GUIDE_NO_NOMINAL(n_captures=rig.quality.min_captures, camera=key[0], lidar=lidar)
         else:
             self._planner = Planner(SensorPlace.upright(self._model, nominal.to_matrix()))
         self._at_first = self._planner, self.problem
@@ -200,32 +204,28 @@ class Guide:
             return None
         figures: dict[str, Figure] = {"n_more": guidance.n_more, "n_least": guidance.n_least}
         if guidance.n_captures < guidance.n_least:
-            return Finding("guide.few_captures", "note", self.key[0], figures)
+            return GUIDE_FEW_CAPTURES(self.key[0], **figures)
         rotation_deg, position_m = guidance.stated_rotation_deg, guidance.stated_translation_m
         limit_deg, limit_m = ENOUGH_SHARE * self._target_deg, ENOUGH_SHARE * self._target_mm / 1000
         if rotation_deg / limit_deg > position_m / limit_m:
             figures |= {"rotation_deg": rotation_deg, "limit_deg": limit_deg}
-            return Finding("guide.rotation_above", "note", self.key[0], figures)
+            return GUIDE_ROTATION_ABOVE(self.key[0], **figures)
         figures |= {"position_m": position_m, "limit_m": limit_m}
-        return Finding("guide.position_above", "note", self.key[0], figures)
+        return GUIDE_POSITION_ABOVE(self.key[0], **figures)
 
     def predict(self) -> Finding | None:
         """Give the predicted standard deviations for the captures; None where nothing can be predicted."""
         if self._planner is None or not self._names:
             return None
         guidance = self.guidance or self._planner.guide(self._held_poses())
-        return Finding(
-            "guide.predicted",
-            "note",
+        return GUIDE_PREDICTED(
             f"{self.key[0]}, {self.lidar}",
-            {
-                "n_captures": guidance.n_captures,
-                "rotation_deg": guidance.sigma_rotation_deg,
-                "target_deg": self._target_deg,
-                "position_mm": 1000 * guidance.sigma_translation_m,
-                "target_mm": self._target_mm,
-                "is_enough": guidance.is_enough,
-            },
+            n_captures=guidance.n_captures,
+            rotation_deg=guidance.sigma_rotation_deg,
+            target_deg=self._target_deg,
+            position_mm=1000 * guidance.sigma_translation_m,
+            target_mm=self._target_mm,
+            is_enough=guidance.is_enough,
         )
 
     def instruct(self, present: Array) -> list[Instruction]:

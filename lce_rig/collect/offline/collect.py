@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey
 from lce_rig.collect.event_pictures import with_event_pictures
+from lce_rig.collect.findings import CALIBRATE_SAME_PLACEMENT
 from lce_rig.collect.offline.search_ahead import sight_ahead
 from lce_rig.collect.offline.slow_motion import find_moving_moments
 from lce_rig.collect.offline.stillness import find_still_moments
@@ -330,7 +331,7 @@ class _Collector:
             self._count_known(label, self._names_by_key[key])
             return
         if known.find_like(boards) is not None:
-            self.report.counts.add(Refusal("calibrate.same_placement"))
+            self.report.counts.add(CALIBRATE_SAME_PLACEMENT.refusal())
             return
         self._note_sizes(images)
         self._stored.note(frame.events)

@@ -8,6 +8,17 @@ from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.figures import MEMORY_NS, busiest_events
 from lce_rig.detect.events.flicker import measure_flicker
 from lce_rig.detect.events.reconstruct.filters import hot_pixels
+from lce_rig.detect.findings import (
+    IMAGE_FEW_EVENTS,
+    IMAGE_FLICKER,
+    IMAGE_HARDLY_MOVED,
+    IMAGE_HOT_PIXELS,
+    IMAGE_NO_EVENTS,
+    IMAGE_SMEARED,
+    IMAGE_STILL_SCENE,
+    IMAGE_TOO_FAST,
+    IMAGE_TURNING,
+)
 from lce_rig.rig import QualitySettings
 
 _MAX_HOT_SHARE = 0.5
@@ -32,22 +43,22 @@ def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard |
         return found
     if q.events_px < limits.min_events_px:
         figures = {"events_px": q.events_px, "min_events_px": limits.min_events_px}
-        return Refusal("image.hardly_moved", figures=figures)
+        return IMAGE_HARDLY_MOVED.refusal(**figures)
     # Comparisons with a figure that is not known are false.
     if q.speed_mps - 2 * q.speed_sigma_mps > limits.max_board_speed_mps:
         return too_fast(q.speed_mps, limits)
     if q.turn_deg_s - 2 * q.turn_sigma_deg_s > limits.max_turn_deg_s:
         figures = {"turn_deg_s": q.turn_deg_s, "max_turn_deg_s": limits.max_turn_deg_s}
-        return Refusal("image.turning", figures=figures)
+        return IMAGE_TURNING.refusal(**figures)
     if q.smear_m > limits.max_smear_m:
-        return Refusal("image.smeared", figures={"smear_m": q.smear_m, "max_smear_m": limits.max_smear_m})
+        return IMAGE_SMEARED.refusal(smear_m=q.smear_m, max_smear_m=limits.max_smear_m)
     return found
 
 
 def too_fast(speed_mps: float, limits: QualitySettings) -> Refusal:
     """Refuse a board that moves faster than the profile allows."""
     figures = {"speed_mps": speed_mps, "max_speed_mps": limits.max_board_speed_mps}
-    return Refusal("image.too_fast", figures=figures)
+    return IMAGE_TOO_FAST.refusal(**figures)
 
 
 def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: QualitySettings) -> Refusal:
@@ -67,21 +78,21 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
 def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Refusal | None:
     """Say what about the events before a timestamp keeps a board from being found; None if nothing does."""
     if not len(events):
-        return Refusal("image.no_events")
+        return IMAGE_NO_EVENTS.refusal()
     recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
     n_pixels = events.width_px * events.height_px
     if len(recent) < _MIN_EVENTS_PX * n_pixels:
-        return Refusal("image.few_events", figures={"n_events": len(recent)})
+        return IMAGE_FEW_EVENTS.refusal(n_events=len(recent))
     lamps = look_for_flicker(recent)
     if lamps is not None:
         return lamps
     n_hot, hot_share = _hot(recent)
     if hot_share > _MAX_HOT_SHARE:
-        return Refusal("image.hot_pixels", figures={"n_hot": n_hot, "share": hot_share})
+        return IMAGE_HOT_PIXELS.refusal(n_hot=n_hot, share=hot_share)
     events_px, needed_px = busiest_events(events, stamp_ns), max(_SLOW_EVENTS_PX, limits.min_events_px)
     if events_px < needed_px:
         figures = {"events_px": events_px, "min_events_px": needed_px}
-        return Refusal("image.still_scene", figures=figures)
+        return IMAGE_STILL_SCENE.refusal(**figures)
     return None
 
 
@@ -90,7 +101,7 @@ def look_for_flicker(events: Events) -> Refusal | None:
     flicker = measure_flicker(events)
     if not flicker.is_storm:
         return None
-    return Refusal("image.flicker", figures={"frequency_hz": flicker.frequency_hz})
+    return IMAGE_FLICKER.refusal(frequency_hz=flicker.frequency_hz)
 
 
 def _hot(events: Events) -> tuple[int, float]:

@@ -7,6 +7,20 @@ from lce_rig.core.board import Board
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageQuality
+from lce_rig.detect.findings import (
+    IMAGE_BLURRED,
+    IMAGE_CUT_OFF,
+    IMAGE_FLAT,
+    IMAGE_LOW_CONTRAST,
+    IMAGE_NO_BOARD,
+    IMAGE_NOT_SHARP,
+    IMAGE_OTHER_BOARD,
+    IMAGE_OVEREXPOSED,
+    IMAGE_PART,
+    IMAGE_PART_OF_SMALL,
+    IMAGE_TOO_DARK,
+    IMAGE_UNCLEAR,
+)
 from lce_rig.detect.image.corners import seen_grid, square_size_px, square_values
 from lce_rig.detect.image.saddle import Crossings
 
@@ -88,21 +102,21 @@ def explain_absence(
     """Return why the board was not found, from the grey values and from other checkerboards in the image."""
     low, dark, bright = (float(value) for value in np.percentile(grey, (1, 50, 99)))
     if bright < 50:
-        return Refusal("image.too_dark", figures={"grey_99": bright})
+        return IMAGE_TOO_DARK.refusal(grey_99=bright)
     white_share = float(np.mean(grey >= 250))
     if white_share > 0.5:
-        return Refusal("image.overexposed", figures={"white_share": white_share})
+        return IMAGE_OVEREXPOSED.refusal(white_share=white_share)
     seen = seen_grid(grey)
     if seen is not None:
         return explain_other_grid(grey, board, seen, is_from_events, min_square_px)
     wanted = {"n_cols": board.cols, "n_rows": board.rows}
     action = _action(is_from_events)
     if bright - low < 50:
-        return Refusal("image.flat", figures={**wanted, "grey_1": low, "grey_99": bright}, action=action)
+        return IMAGE_FLAT.refusal(action=action, **wanted, grey_1=low, grey_99=bright)
     width_px = strongest_edge_px(grey, bright - low)
     if width_px > 6:
-        return Refusal("image.blurred", figures={**wanted, "edge_px": width_px}, action=action)
-    return Refusal("image.no_board", figures={**wanted, "grey_50": dark}, action=action)
+        return IMAGE_BLURRED.refusal(action=action, **wanted, edge_px=width_px)
+    return IMAGE_NO_BOARD.refusal(action=action, **wanted, grey_50=dark)
 
 
 def explain_other_grid(
@@ -125,22 +139,22 @@ def explain_other_grid(
     figures = {"n_cols": wanted[0], "n_rows": wanted[1], "n_cols_seen": seen[0], "n_rows_seen": seen[1]}
     action = _action(is_from_events)
     if seen == wanted:
-        return Refusal("image.unclear", figures=figures, action=action)
+        return IMAGE_UNCLEAR.refusal(action=action, **figures)
     is_part = seen[0] <= wanted[0] and seen[1] <= wanted[1]
     side = _side_beyond(grey, seen_px)
     if is_part and side:
-        return Refusal("image.cut_off", figures={**figures, "side": side})
+        return IMAGE_CUT_OFF.refusal(**figures, side=side)
     if is_part:
         least_px = max(LEAST_SQUARE_PX * max(1.0, grey.shape[1] / _SEARCHED_PX), min_square_px)
         square_px = square_size_px(grey, board.cols * board.rows)
         if square_px < least_px:
             closer_share = 1 - square_px / least_px
             size = {"square_px": square_px, "min_square_px": least_px, "closer_share": closer_share}
-            return Refusal("image.part_of_small", figures={**figures, **size})
+            return IMAGE_PART_OF_SMALL.refusal(**figures, **size)
         # A pattern that goes on beyond the corners found is neither covered nor another one.
-        code = "image.unclear" if extent(grey, seen_px)[1] else "image.part"
-        return Refusal(code, figures=figures, action=action)
-    return Refusal("image.other_board", figures=figures)
+        kind = IMAGE_UNCLEAR if extent(grey, seen_px)[1] else IMAGE_PART
+        return kind.refusal(action=action, **figures)
+    return IMAGE_OTHER_BOARD.refusal(**figures)
 
 
 def quality_problem(
@@ -150,7 +164,7 @@ def quality_problem(
     action = _action(is_from_events)
     if quality.contrast < min_contrast:
         figures = {"contrast": quality.contrast, "min_contrast": min_contrast}
-        return Refusal("image.low_contrast", figures=figures, action=action)
+        return IMAGE_LOW_CONTRAST.refusal(action=action, **figures)
     if quality.sharpness < min_sharpness:
         figures = {
             "edge_px": quality.edge_width_px,
@@ -158,7 +172,7 @@ def quality_problem(
             "sharpness": quality.sharpness,
             "min_sharpness": min_sharpness,
         }
-        return Refusal("image.not_sharp", figures=figures, action=action)
+        return IMAGE_NOT_SHARP.refusal(action=action, **figures)
     return None
 
 

@@ -14,6 +14,14 @@ from lce_rig.core.findings import Figure, Finding, Refusal
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.planar_pose import PlanarPose, solve_planar_pose
 from lce_rig.core.results import ImageBoard, ImageQuality
+from lce_rig.detect.findings import (
+    IMAGE_MISFIT,
+    IMAGE_NO_POSE,
+    IMAGE_NOT_AT_FIRST_SIGHT,
+    IMAGE_SIZE_CANVAS,
+    IMAGE_SIZE_CUT,
+    IMAGE_SIZE_OTHER,
+)
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
 from lce_rig.detect.image.quality import (
     explain_absence,
@@ -23,10 +31,9 @@ from lce_rig.detect.image.quality import (
     quality_problem,
 )
 from lce_rig.detect.image.saddle import Crossings, fit_crossings
-from lce_rig.words import describe, recommend
 
 Region = tuple[int, int, int, int]
-NOT_SEEN_AT_ONCE = Refusal("image.not_at_first_sight")
+NOT_SEEN_AT_ONCE = IMAGE_NOT_AT_FIRST_SIGHT.refusal()
 """Of a search that was not thorough."""
 
 # The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
@@ -172,12 +179,12 @@ def compare_size(image: Image, intrinsics: Intrinsics) -> Finding | None:
     subject = f"{image.sensor}.{image.channel}"
     missing_u, missing_v = 1 - width / wanted_width, 1 - height / wanted_height
     if 0 <= missing_u <= _CUT_FRACTION and 0 <= missing_v <= _CUT_FRACTION:
-        return Finding("image.size_cut", "note", subject, figures)
+        return IMAGE_SIZE_CUT(subject, **figures)
     is_canvas = -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0
     if is_canvas and _is_blank_beyond(image.grey, wanted_width, wanted_height):
-        return Finding("image.size_canvas", "note", subject, figures)
+        return IMAGE_SIZE_CANVAS(subject, **figures)
     is_scaled = abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width
-    return Finding("image.size_other", "error", subject, figures, "scaled" if is_scaled else "")
+    return IMAGE_SIZE_OTHER(subject, action="scaled" if is_scaled else "", **figures)
 
 
 def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
@@ -188,7 +195,7 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
     """
     found = compare_size(image, intrinsics)
     if found is not None and found.severity == "error":
-        raise ProfileError(f"{found.subject}: {describe(found)}", recommend(found))
+        raise ProfileError(f"{found.subject}: {found.text}", found.advice)
     return image.grey[: intrinsics.height_px, : intrinsics.width_px]
 
 
@@ -302,6 +309,6 @@ def _errors(T_cam_board: Array, crossings: Crossings, corners_board: Array, intr
 def _misfit(solved: PlanarPose | None, intrinsics: Intrinsics, max_reprojection_px: float) -> Refusal:
     lens = {"model": intrinsics.model, "width_px": intrinsics.width_px, "height_px": intrinsics.height_px}
     if solved is None:
-        return Refusal("image.no_pose", figures=lens)
+        return IMAGE_NO_POSE.refusal(**lens)
     errors = {"rms_px": solved.reprojection_px, "max_rms_px": max_reprojection_px}
-    return Refusal("image.misfit", figures={**lens, **errors})
+    return IMAGE_MISFIT.refusal(**lens, **errors)

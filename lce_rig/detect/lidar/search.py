@@ -9,6 +9,19 @@ from lce_rig.core.data import Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
+from lce_rig.detect.findings import (
+    LIDAR_LOST,
+    LIDAR_NO_PLATE,
+    LIDAR_NO_RETURNS,
+    LIDAR_NOT_WHERE_EXPECTED,
+    LIDAR_NOTHING_WHERE_EXPECTED,
+    LIDAR_OTHER_PLATE,
+    LIDAR_OUTLINE,
+    LIDAR_TOO_FEW_RINGS,
+    LIDAR_TOO_THICK,
+    LIDAR_TOUCHING,
+    LIDAR_TURNED_AWAY,
+)
 from lce_rig.detect.lidar.measurement import Beam, build_board, refine
 from lce_rig.detect.lidar.plates import propose_plates, screen_plates
 from lce_rig.detect.lidar.segments import Indices, OrderedScan, cut_segments, order_scan
@@ -27,21 +40,15 @@ LAYER_M = 0.06  # half the depth in which returns may belong to one warped or mo
 
 def no_returns(n_points: int, min_range_m: float) -> Refusal:
     """Refuse a scan without usable returns."""
-    return Refusal("lidar.no_returns", figures={"n_points": n_points, "min_range_m": min_range_m})
+    return LIDAR_NO_RETURNS.refusal(n_points=n_points, min_range_m=min_range_m)
 
 
 def too_few_rings(found: LidarBoard, min_rings: int) -> Refusal:
     """Refuse a board on which too few rings lie; their number goes with 1 / distance."""
     n_rings, distance_m = found.quality.n_rings, found.quality.distance_m
     closer_m = max(0.1, distance_m * (1.0 - n_rings / min_rings))
-    return Refusal(
-        "lidar.too_few_rings",
-        figures={
-            "n_rings": n_rings,
-            "min_rings": min_rings,
-            "distance_m": distance_m,
-            "closer_m": closer_m,
-        },
+    return LIDAR_TOO_FEW_RINGS.refusal(
+        n_rings=n_rings, min_rings=min_rings, distance_m=distance_m, closer_m=closer_m
     )
 
 
@@ -53,7 +60,7 @@ def too_thick(heights_m: Array, limit_m: float) -> Refusal:
         limit_m: largest rms of them.
     """
     figures = {"plane_rms_m": float(np.sqrt(np.mean(heights_m**2))), "max_plane_rms_m": limit_m}
-    return Refusal("lidar.too_thick", figures=figures)
+    return LIDAR_TOO_THICK.refusal(**figures)
 
 
 def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_limit_m: float) -> Refusal:
@@ -74,16 +81,10 @@ def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_li
         return too_thick(heights_m, rms_limit_m)
     distance_m = float(np.linalg.norm(view.origin))
     if beyond > TOUCHING_SHARE:
-        return Refusal("lidar.touching", figures={"distance_m": distance_m, "beyond_share": beyond})
+        return LIDAR_TOUCHING.refusal(distance_m=distance_m, beyond_share=beyond)
     hidden = float(np.mean(~view.is_on[distance <= -0.03])) if np.any(distance <= -0.03) else 0.0
-    return Refusal(
-        "lidar.outline",
-        figures={
-            "distance_m": distance_m,
-            "error_m": float(placement.error_m),
-            "max_error_m": limit_m,
-            "hidden_share": hidden,
-        },
+    return LIDAR_OUTLINE.refusal(
+        distance_m=distance_m, error_m=float(placement.error_m), max_error_m=limit_m, hidden_share=hidden
     )
 
 
@@ -116,18 +117,13 @@ def no_plate(
     misfit[plates.n_rings < 3] += 1.0
     if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
         best = int(np.argmin(misfit))
-        return Refusal(
-            "lidar.other_plate",
-            figures={
-                "width_m": float(plates.size_m[best, 0]),
-                "height_m": float(plates.size_m[best, 1]),
-                "distance_m": float(np.linalg.norm(plates.centre[best])),
-                **wanted,
-            },
+        return LIDAR_OTHER_PLATE.refusal(
+            width_m=float(plates.size_m[best, 0]),
+            height_m=float(plates.size_m[best, 1]),
+            distance_m=float(np.linalg.norm(plates.centre[best])),
+            **wanted,
         )
-    return Refusal(
-        "lidar.no_plate", figures={**wanted, "min_range_m": min_range_m, "max_range_m": max_range_m}
-    )
+    return LIDAR_NO_PLATE.refusal(**wanted, min_range_m=min_range_m, max_range_m=max_range_m)
 
 
 MAX_CANDIDATES = 4
@@ -351,11 +347,11 @@ def track_lidar_board(
         beam=beam,
     )
     if isinstance(found, Refusal):
-        return Refusal("lidar.lost", figures={**found.figures, "cause": found.code})
+        return LIDAR_LOST.refusal(**found.figures, cause=found.code)
     for candidate in found:
         if candidate.plane[:3] @ previous.plane[:3] > MAX_TURN:
             return candidate
-    return Refusal("lidar.turned_away", figures={"max_turn_deg": float(np.degrees(np.arccos(MAX_TURN)))})
+    return LIDAR_TURNED_AWAY.refusal(max_turn_deg=float(np.degrees(np.arccos(MAX_TURN))))
 
 
 # Look where the board must be.
@@ -413,11 +409,11 @@ def look_for_board(
     if not isinstance(found, Refusal):
         return next((each for each in found if _is_at(each, plane, centre)), _not_there(centre))
     cause = at_once if isinstance(at_once, Refusal) else found
-    return Refusal("lidar.not_where_expected", figures={**cause.figures, "cause": cause.code})
+    return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
 
 
 def _not_there(centre: Array) -> Refusal:
-    return Refusal("lidar.nothing_where_expected", figures={"distance_m": float(np.linalg.norm(centre))})
+    return LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=float(np.linalg.norm(centre)))
 
 
 def _is_at(found: LidarBoard, plane: Array, centre: Array) -> bool:

@@ -16,6 +16,12 @@ from lce_rig.detect.events.reconstruct.filters import NoiseFilter
 from lce_rig.detect.events.reconstruct.model import ReconstructionModel, States
 from lce_rig.detect.events.reconstruct.voxels import FloatArray, event_map, normalise_voxels, voxel_grid
 from lce_rig.detect.events.reconstruct.windows import WindowOptions, WindowRule, active_share, window_rule
+from lce_rig.detect.findings import (
+    READ_AFTER_EVENTS,
+    READ_BEFORE_EVENTS,
+    READ_NETWORK_SETTLING,
+    READ_NO_EVENTS,
+)
 
 # Why there is no image at a timestamp.
 
@@ -23,19 +29,19 @@ from lce_rig.detect.events.reconstruct.windows import WindowOptions, WindowRule,
 def still_cold(n_steps: int, n_warm_up: int, seen_ns: int) -> Refusal:
     """Too little of the stream precedes the timestamp for the network's state to have settled."""
     figures = {"n_steps": n_steps, "n_warm_up": n_warm_up, "seen_s": 1e-9 * seen_ns}
-    return Refusal("read.network_settling", figures=figures)
+    return READ_NETWORK_SETTLING.refusal(**figures)
 
 
 def too_early(stamp_ns: int, first_ns: int) -> Refusal:
     """The timestamp lies before the stream."""
-    return Refusal("read.before_events", figures={"gap_s": 1e-9 * (first_ns - stamp_ns)})
+    return READ_BEFORE_EVENTS.refusal(gap_s=1e-9 * (first_ns - stamp_ns))
 
 
 def too_late(stamp_ns: int, last_ns: int | None) -> Refusal:
     """The timestamp lies after the stream, or there is no stream."""
     if last_ns is None:
-        return Refusal("read.no_events")
-    return Refusal("read.after_events", figures={"gap_s": 1e-9 * (stamp_ns - last_ns)})
+        return READ_NO_EVENTS.refusal()
+    return READ_AFTER_EVENTS.refusal(gap_s=1e-9 * (stamp_ns - last_ns))
 
 
 # From arbitrary scales to 8 bits, without flicker: intensities of the network, sums of polarities.

@@ -1,0 +1,91 @@
+"""Why captures are not taken, why guidance is missing, and why a collection continues."""
+
+from lce_rig.core.findings import Finding, Kind
+from lce_rig.core.phrasing import figures_apart
+
+
+def _few_captures(finding: Finding) -> str:
+    """About {n_more} more (minimum {n_least} captures)."""
+    return f"{_more(finding)} (minimum {finding.figures['n_least']} captures)"
+
+
+def _rotation_above(finding: Finding) -> str:
+    """About {n_more} more (held-out {rotation_deg} > {limit_deg})."""
+    stated, limit = figures_apart(finding.figure("rotation_deg"), finding.figure("limit_deg"))
+    return f"{_more(finding)} (held-out {stated} > {limit} deg)"
+
+
+def _position_above(finding: Finding) -> str:
+    """About {n_more} more (held-out {position_m} > {limit_m})."""
+    figures = 1000 * finding.figure("position_m"), 1000 * finding.figure("limit_m")
+    stated, limit = figures_apart(*figures)
+    return f"{_more(finding)} (held-out {stated} > {limit} mm)"
+
+
+def _more(finding: Finding) -> str:
+    n_more = finding.figures["n_more"]
+    return "more captures" if n_more is None else f"about {n_more} more"
+
+
+GUIDE_NO_BEAMS = Kind("guide.no_beams", "no guidance: {cause}", severity="warning")
+GUIDE_NO_NOMINAL = Kind(
+    "guide.no_nominal",
+    "guidance begins after {n_captures} captures: "
+    "the profile has no nominal extrinsics of {camera} and {lidar}",
+    severity="warning",
+)
+GUIDE_FEW_CAPTURES = Kind("guide.few_captures", _few_captures, severity="note")
+GUIDE_ROTATION_ABOVE = Kind("guide.rotation_above", _rotation_above, severity="note")
+GUIDE_POSITION_ABOVE = Kind("guide.position_above", _position_above, severity="note")
+GUIDE_PREDICTED = Kind(
+    "guide.predicted",
+    "{subject}: predicted standard deviations for {n_captures} captures: rotation {rotation_deg:2deg} "
+    "(target {target_deg:g}), position {position_mm:.0f} mm (target {target_mm:g})",
+    severity="note",
+)
+READ_EVENTS_NOT_BEGUN = Kind(
+    "read.events_not_begun",
+    "no events yet at the time of the scan",
+    "start the event camera first, or check that both sensors' clocks agree",
+)
+READ_EVENTS_GONE_BY = Kind(
+    "read.events_gone_by",
+    "the scan arrived after the events that follow it",
+    "split the recording where the LiDAR's clock was set back",
+)
+READ_NO_EVENTS_AT_SCAN = Kind(
+    "read.no_events_at_scan",
+    "no events at the time of the scan",
+    "record events while the LiDAR runs and check that the clocks agree",
+)
+IMAGE_NONE = Kind("image.none", "no board in any image")
+LIDAR_NONE = Kind("lidar.none", "no board in the scan")
+CALIBRATE_SAME_PLACEMENT = Kind("calibrate.same_placement", "same placement as in an earlier capture")
+IMAGE_STOOD_STILL = Kind(
+    "image.stood_still",
+    "the board stood still: {events_px:.1f} events/px in 1 s",
+    "move it sideways slowly, about 10 cm/s",
+)
+IMAGE_MADE_FEW_EVENTS = Kind(
+    "image.made_few_events",
+    "the board made few events at {speed_mps:.2f} m/s: {events_px:.1f} events/px in 1 s "
+    "(minimum {min_events_px:g})",
+    "move it sideways slowly, about 10 cm/s, in one direction, and in better light",
+)
+LIDAR_ELSEWHERE = Kind(
+    "lidar.elsewhere",
+    "best of {n_candidates} candidates in the scan: {distance_m:.2f} m, {rotation_deg:.0f} deg from the "
+    "pose predicted by the image and the nominal extrinsics",
+    "hold the board clear of other things, where more of the LiDAR's rings meet it",
+)
+CALIBRATE_KNOWN_PLACEMENT = Kind(
+    "calibrate.known_placement",
+    "the board is at the placement of capture {capture}",
+    "{instruction}",
+    actions={"nowhere": "stop the collection: no new placement is left"},
+)
+CALIBRATE_LITTLE_GAIN = Kind(
+    "calibrate.little_gain",
+    "this placement improves the result by {gain:1percent}, another by {best_gain:percent}",
+    "{instruction}",
+)

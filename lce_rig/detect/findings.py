@@ -1,0 +1,281 @@
+"""Reasons for refusing images, events and scans; codes begin with the stage that refuses."""
+
+from dataclasses import replace
+
+from lce_rig.core.findings import Finding, Kind, Stage
+
+MOVE_SLOWLY = "move the board sideways slowly, about 10 cm/s, from 1 s before the capture"
+_SLOWER = "move it slower, about 10 cm/s"
+_CORNERS = "{n_cols}x{n_rows} inner corners"
+_OTHER = _CORNERS + " expected, {n_cols_seen}x{n_rows_seen} detected"
+_WHOLE = "show the whole pattern, uncovered; inner corners are where four squares meet, one less than squares"
+_UNCOVER = "uncover the whole pattern; if it has these corners, correct board.inner_corners in the profile"
+_FOCUS = "hold the board still, expose shorter, come closer, focus the lens"
+_LENS = "check the camera's intrinsics ({model} at {width_px}x{height_px} px) and that the board is flat"
+_CLOCKS = "check that both sensors' clocks agree"
+_NO_FLICKER = "record in daylight or under lamps that do not flicker"
+_PLATE = "{board_width_m:.2f} x {board_height_m:.2f} m"
+
+
+def _flicker(finding: Finding) -> str:
+    """Most events come from light that flickers, at {frequency_hz} Hz."""
+    frequency_hz = finding.figures["frequency_hz"]
+    rhythm = f" at {frequency_hz:.0f} Hz" if frequency_hz else ""
+    return f"most events come from light that flickers{rhythm}"
+
+
+def _lost(finding: Finding) -> str:
+    """Lost near its last place, for the code in {cause}, with its figures."""
+    return f"lost near its last place: {_cause(finding).text}"
+
+
+def _not_there(finding: Finding) -> str:
+    """Not where images and other captures have it, for the code in {cause}, with its figures."""
+    return f"not where the image and the other captures have it: {_cause(finding).text}"
+
+
+def _find_again(finding: Finding) -> str:
+    """The action of that code."""
+    return _cause(finding).advice
+
+
+def _cause(finding: Finding) -> Finding:
+    return replace(finding, code=str(finding.figures["cause"]))
+
+
+READ_NETWORK_SETTLING = Kind(
+    "read.network_settling",
+    "{n_steps} windows of events ({seen_s:.2f} s) precede the image, the network needs {n_warm_up}",
+    "keep the board or the camera moving for a second before the first capture",
+)
+READ_BEFORE_EVENTS = Kind(
+    "read.before_events",
+    "the image is {gap_s:.3f} s before the first event",
+    _CLOCKS + ", or start the event camera first",
+)
+READ_AFTER_EVENTS = Kind(
+    "read.after_events",
+    "the image is {gap_s:.3f} s after the last event",
+    _CLOCKS + ", or record events to the end",
+)
+READ_NO_EVENTS = Kind(
+    "read.no_events", "the recording holds no events", "check the events' topic and the camera"
+)
+IMAGE_NOT_AT_FIRST_SIGHT = Kind(
+    "image.not_at_first_sight", "no board found by the quick search", "search the image thoroughly"
+)
+IMAGE_TOO_DARK = Kind(
+    "image.too_dark", "too dark: 99 % of the image below grey {grey_99:.0f}", "expose longer or add light"
+)
+IMAGE_OVEREXPOSED = Kind(
+    "image.overexposed",
+    "overexposed: {white_share:percent} of the image is white",
+    "expose shorter or turn the board away from the light",
+)
+IMAGE_FLAT = Kind(
+    "image.flat",
+    "contrast too low: grey values {grey_1:.0f} to {grey_99:.0f}, no " + _CORNERS + " detected",
+    "light the board, expose longer",
+    actions={"events": "move the board while events are recorded, only moving edges make them"},
+)
+IMAGE_BLURRED = Kind(
+    "image.blurred",
+    "too blurred: the sharpest edges are {edge_px:.0f} px wide, no " + _CORNERS + " detected",
+    "hold the board still, expose shorter, focus the lens",
+    actions={"events": MOVE_SLOWLY},
+)
+IMAGE_NO_BOARD = Kind(
+    "image.no_board",
+    "no board: " + _CORNERS + " expected, none detected (median grey {grey_50:.0f})",
+    _WHOLE,
+    actions={"events": f"{_WHOLE}; {MOVE_SLOWLY}"},
+)
+IMAGE_UNCLEAR = Kind(
+    "image.unclear",
+    "the " + _CORNERS + " are too unclear to measure",
+    "hold the board still, closer and better lit",
+    actions={"events": f"{MOVE_SLOWLY}; come closer"},
+)
+IMAGE_CUT_OFF = Kind(
+    "image.cut_off",
+    "board cut off by the {side} border: " + _OTHER,
+    "move the board away from the {side} border",
+)
+IMAGE_PART = Kind("image.part", _OTHER, _UNCOVER, actions={"events": f"{MOVE_SLOWLY}; {_UNCOVER}"})
+IMAGE_PART_OF_SMALL = Kind(
+    "image.part_of_small",
+    "squares of {square_px:.1f} px are too small (minimum {min_square_px:g} px): "
+    "{n_cols_seen}x{n_rows_seen} of " + _CORNERS + " detected",
+    "come closer, by {closer_share:percent} of the distance or more",
+)
+IMAGE_OTHER_BOARD = Kind(
+    "image.other_board",
+    _OTHER,
+    "correct board.inner_corners in the profile: one less than squares along each side",
+)
+IMAGE_LOW_CONTRAST = Kind(
+    "image.low_contrast",
+    "contrast too low: black and white differ by {contrast:.0f} grey values (minimum {min_contrast:.0f})",
+    "expose longer or add light",
+    actions={"events": MOVE_SLOWLY},
+)
+IMAGE_NOT_SHARP = Kind(
+    "image.not_sharp",
+    "too blurred: edges {edge_px:.1f} px wide on squares of {square_px:.1f} px "
+    "(minimum {min_sharpness:g} edge widths per square)",
+    _FOCUS,
+    actions={"events": f"{MOVE_SLOWLY}; come closer"},
+)
+IMAGE_NO_POSE = Kind("image.no_pose", "the corners fit no pose of the board in front of the camera", _LENS)
+IMAGE_MISFIT = Kind(
+    "image.misfit", "reprojection error of the corners {rms_px:.2f} px rms (limit {max_rms_px:.2f} px)", _LENS
+)
+IMAGE_SMALL_SQUARES = Kind(
+    "image.small_squares",
+    "squares of {square_px:.1f} px (minimum {min_square_px:g} px)",
+    "come {closer_m:.1f} m closer",
+)
+IMAGE_NEAR_BORDER = Kind(
+    "image.near_border",
+    "a corner lies {border_px:.1f} px from the border (minimum {min_border_px:g} px)",
+    "move the board towards the middle of the image",
+)
+IMAGE_TILTED = Kind(
+    "image.tilted",
+    "tilt {tilt_deg:.0f} deg (limit {max_tilt_deg:g} deg)",
+    "turn the board {turn_deg:.0f} deg towards the camera",
+)
+IMAGE_NO_EVENTS = Kind(
+    "image.no_events", "the capture holds no events", "uncover the lens, switch the event stream on"
+)
+IMAGE_FEW_EVENTS = Kind(
+    "image.few_events",
+    "too few events: {n_events} in the second before the image",
+    f"{MOVE_SLOWLY}; if it moved, uncover the lens",
+)
+IMAGE_FLICKER = Kind("image.flicker", _flicker, _NO_FLICKER)
+IMAGE_HOT_PIXELS = Kind(
+    "image.hot_pixels",
+    "{n_hot} hot pixels make {share:percent} of the events; the board makes too few",
+    f"{MOVE_SLOWLY}; let the camera cool down, or mask them in its driver",
+)
+IMAGE_HARDLY_MOVED = Kind(
+    "image.hardly_moved",
+    "the board hardly moved: {events_px:.1f} events/px in 1 s (minimum {min_events_px:g})",
+    MOVE_SLOWLY,
+)
+IMAGE_STILL_SCENE = Kind(
+    "image.still_scene",
+    "the board hardly moved: {events_px:.1f} events/px in 1 s where most are (minimum {min_events_px:g})",
+    MOVE_SLOWLY,
+)
+IMAGE_TOO_FAST = Kind(
+    "image.too_fast",
+    "the board moved at {speed_mps:.2f} m/s during the scan (limit {max_speed_mps:g} m/s)",
+    _SLOWER,
+)
+IMAGE_TURNING = Kind(
+    "image.turning",
+    "the board turned at {turn_deg_s:.0f} deg/s during the scan (limit {max_turn_deg_s:g} deg/s)",
+    "turn it less, move it sideways only",
+)
+IMAGE_SMEARED = Kind(
+    "image.smeared", "the board moved {smear_m:mm} during the scan (limit {max_smear_m:mm})", _SLOWER
+)
+LIDAR_NO_RETURNS = Kind(
+    "lidar.no_returns",
+    "{n_points} points, none of them finite and farther than {min_range_m:g} m",
+    "check the LiDAR's cable, topic and driver settings",
+)
+LIDAR_TOO_FEW_RINGS = Kind(
+    "lidar.too_few_rings",
+    "{n_rings} rings on the board at {distance_m:.1f} m (minimum {min_rings})",
+    "come {closer_m:.1f} m closer",
+)
+LIDAR_TOO_THICK = Kind(
+    "lidar.too_thick",
+    "plane {plane_rms_m:1mm} rms (limit {max_plane_rms_m:1mm}): "
+    "the board moved during the scan or is not flat",
+    "hold the board still, or put it on a stand",
+)
+LIDAR_TOUCHING = Kind(
+    "lidar.touching",
+    "the board at {distance_m:.1f} m touches another surface: "
+    "{beyond_share:percent} more returns in its plane",
+    "keep walls, tables and hands 0.2 m away from the board's edges and plane",
+)
+LIDAR_OUTLINE = Kind(
+    "lidar.outline",
+    "plate outline at {distance_m:.1f} m: error {error_m:mm} (limit {max_error_m:mm}), "
+    "{hidden_share:percent} of the board occluded",
+    "show the whole board, with nothing in front of it or at its edges",
+)
+LIDAR_OTHER_PLATE = Kind(
+    "lidar.other_plate",
+    "the plate nearest to the board's size is {width_m:.2f} x {height_m:.2f} m, at {distance_m:.1f} m; "
+    "the board is " + _PLATE,
+    "check width_m and height_m of the board in the rig profile, or show the whole board",
+)
+LIDAR_NO_PLATE = Kind(
+    "lidar.no_plate",
+    "no plate of the board's size (" + _PLATE + ") between {min_range_m:g} and {max_range_m:g} m",
+    "hold the board at that distance, in sight of the LiDAR, with nothing at its edges",
+)
+LIDAR_TOO_FEW_POINTS = Kind(
+    "lidar.too_few_points",
+    "{n_points} points on the board (minimum {min_points})",
+    "come {closer_m:.1f} m closer",
+)
+LIDAR_OTHER_SIZE = Kind(
+    "lidar.other_size",
+    "plate {side} {measured_m:.3f} m, in the profile {profile_m:.3f} m",
+    "measure the plate and correct board.{side}_m, or remove what touches it",
+)
+LIDAR_RAGGED_EDGES = Kind(
+    "lidar.ragged_edges",
+    "ring ends {rms_m:mm} rms from a rectangle (limit {max_rms_m:mm})",
+    "keep hands and other things away from the board's border",
+)
+LIDAR_LOST = Kind("lidar.lost", _lost, _find_again)
+LIDAR_NOT_WHERE_EXPECTED = Kind("lidar.not_where_expected", _not_there, _find_again)
+LIDAR_NOTHING_WHERE_EXPECTED = Kind(
+    "lidar.nothing_where_expected",
+    "no plate of the board's size at the {distance_m:.1f} m where image and other captures have it",
+    "move the board clear of other things",
+)
+LIDAR_TURNED_AWAY = Kind(
+    "lidar.turned_away",
+    "the only plate near the board's last place is rotated by over {max_turn_deg:.0f} deg",
+    "move more slowly",
+)
+
+
+def _distance_kinds(stage: Stage, sensor: str) -> tuple[Kind, Kind]:
+    distance = "the board is {distance_m:.2f} m from the " + sensor
+    near = Kind(f"{stage}.too_near", distance + " (minimum {min_distance_m:g} m)", "go {move_m:.1f} m back")
+    far = Kind(f"{stage}.too_far", distance + " (limit {max_distance_m:g} m)", "come {move_m:.1f} m closer")
+    return near, far
+
+
+TOO_NEAR_OR_FAR: dict[Stage, tuple[Kind, Kind]] = {
+    "image": _distance_kinds("image", "camera"),
+    "lidar": _distance_kinds("lidar", "LiDAR"),
+}
+_SIZES = (
+    "{width_px}x{height_px} px, the profile's intrinsics belong to {wanted_width_px}x{wanted_height_px} px"
+)
+_OTHER_MODE = "use the intrinsics of this mode, or record in the mode of the intrinsics"
+IMAGE_SIZE_CUT = Kind(
+    "image.size_cut", f"{_SIZES}: the readout ended early, used as far as it reaches", severity="note"
+)
+IMAGE_SIZE_CANVAS = Kind(
+    "image.size_canvas", f"{_SIZES}: blank beyond the sensor, cropped to it", severity="note"
+)
+IMAGE_SIZE_OTHER = Kind(
+    "image.size_other",
+    f"{_SIZES}: cannot be used",
+    _OTHER_MODE,
+    actions={
+        "scaled": f"{_OTHER_MODE}; if the image is only scaled, multiply fx, fy, cx, cy by {{factor:.4g}}"
+    },
+)
