@@ -217,5 +217,5 @@ def test_the_profile_says_how_pictures_are_made(tmp_path):
     assert (by_time.windows.kind, by_time.windows.duration_s) == ("time", 0.03)
     assert reconstructor_for(ReconstructionSettings(method="map"), "dvs").options.method == "map"
     assert reconstructor_for(ReconstructionSettings(), "dvs", "map").options.method == "map"
-    with pytest.raises(ProfileError, match="no such file"):
+    with pytest.raises(ProfileError):
         reconstructor_for(ReconstructionSettings(model=str(tmp_path / "gone.onnx")), "dvs")
