@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
+from lce_rig.devices import findings as findings
 
 T = TypeVar("T")
 

@@ -7,7 +7,6 @@ import numpy as np
 
 from lce_rig.core.data import Image, Pulse
 from lce_rig.core.findings import Figure, Finding, Severity
-from lce_rig.devices.sync_board.lines import DIALECTS
 from lce_rig.doctor.line import Check, problems_of
 from lce_rig.doctor.observing import ObservedSensor, SensorReport
 from lce_rig.doctor.sensor_sources import driver_of
@@ -28,7 +27,7 @@ _ROOM, _MAX_UNLIKE = 2, 0.01
 def check_pulses_sent(exam: SensorReport) -> Check | None:
     """Count the board's pulses by line, and compare their rates with the profile."""
     board, sync = exam.seen[BOARD], exam.rig.sync
-    if board.status is None or sync is None or not DIALECTS[sync.type]().has_triggers:
+    if board.status is None or sync is None:
         return None
     wanted = {PPS_LINE: 1.0} | {name: trigger.rate_hz for name, trigger in sync.triggers.items()}
     lines = [_judge_line(board, line, expected_hz) for line, expected_hz in wanted.items()]
@@ -45,7 +44,7 @@ def _judge_line(board: ObservedSensor, line: str, expected_hz: float) -> Finding
         if is_off:
             return Finding("pulses.line_off", "warning", figures=figures, action=action)
         return Finding("pulses.line", "note", figures=figures)
-    # Boards of others make no pulse per second; that one of ours is missing, the driver says.
+    # The driver says that it is missing.
     severity: Severity = "note" if line == PPS_LINE else "error"
     return Finding("pulses.line_none", severity, figures=figures, action=action)
 
@@ -56,7 +55,7 @@ def check_frames_of_pulses(exam: SensorReport, sensor: str) -> Check | None:
     is_triggered = sync is not None and sensor in sync.triggers and driver_of(exam.rig, sensor) != "davis"
     if sync is None or board is None or not is_triggered or board.status is None or seen.status is None:
         return None
-    n_frames, n_pulses = _in_common(seen, board, sensor, DIALECTS[sync.type]().has_own_counts)
+    n_frames, n_pulses = _in_common(seen, board, sensor)
     counts = Finding("pulses.frames", "note", figures={"n_frames": n_frames, "n_pulses": n_pulses})
     trigger = sync.triggers[sensor]
     if board.host_clock is not None and trigger.rate_hz * trigger.max_delay_s < 1:
@@ -96,14 +95,10 @@ def _rate_hz(board: ObservedSensor, line: str) -> float:
     return 1e9 * (len(stamps_ns) - 1 + n_lost) / (stamps_ns[-1] - stamps_ns[0])
 
 
-def _in_common(seen: ObservedSensor, board: ObservedSensor, line: str, are_numbered: bool) -> tuple[int, int]:
+def _in_common(seen: ObservedSensor, board: ObservedSensor, line: str) -> tuple[int, int]:
     """Count frames and pulses while both came; by their running numbers, so that lost ones count."""
     frames = [(image.host_ns or 0, image.count) for image in seen.frames]
-    pulses = [
-        (pulse.host_ns, pulse.count if are_numbered else None)
-        for pulse in board.pulses
-        if pulse.sensor == line
-    ]
+    pulses = [(pulse.host_ns, pulse.count) for pulse in board.pulses if pulse.sensor == line]
     if not frames or not pulses:
         return len(frames), len(pulses)
     first_ns, last_ns = max(frames[0][0], pulses[0][0]), min(frames[-1][0], pulses[-1][0])

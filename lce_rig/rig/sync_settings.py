@@ -6,8 +6,6 @@ from pydantic import Field, model_validator
 
 from lce_rig.rig.settings import Name, Settings, problem
 
-_BAUD = {"lce1": 115_200, "nmea": 9_600, "simplesensorsync": 921_600, "tline": 921_600}
-
 BOARD, PPS_LINE = "sync", "pps"
 """Reserved names: the sync board among the sensors, and its pulse per second among the camera lines."""
 
@@ -17,7 +15,7 @@ class TriggerSettings(Settings):
 
     Attributes:
         channel: number of the board's line.
-        rate_hz: pulses per second; not sent to boards that set their own rate.
+        rate_hz: pulses per second.
         phase_us: first pulse of a second after that second's beginning.
         pulse_us: length of a pulse.
         max_delay_s: maximum delay of an image's timestamp after its pulse; as short as the camera allows.
@@ -45,13 +43,13 @@ class SyncSettings(Settings):
     """A board that generates the pulse per second and triggers cameras.
 
     Attributes:
-        type: its protocol: lce-rig's own, plain NMEA, SimpleSensorSync's JSON, or lines `T,n,us`.
+        type: its protocol: lce-rig's own (docs/sync-protocol.md).
         device: its serial port.
-        baud: speed of the port; None for the type's default.
+        baud: speed of the port; None for 115200, any over USB.
         triggers: the trigger lines, by the camera's name.
     """
 
-    type: Literal["lce1", "nmea", "simplesensorsync", "tline"] = "lce1"
+    type: Literal["lce1"] = "lce1"
     device: Annotated[str, Field(min_length=1, max_length=4096)]
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] | None = None
     triggers: dict[Name, TriggerSettings] = Field(default_factory=dict)
@@ -64,11 +62,9 @@ class SyncSettings(Settings):
                 what = f"line {trigger.channel} triggers {seen[trigger.channel]} already"
                 raise problem(what, f"triggers.{camera}.channel")
             seen[trigger.channel] = camera
-        if self.triggers and self.type == "nmea":
-            raise problem("a board of type nmea sends the time only and cannot trigger cameras", "triggers")
         return self
 
     @property
     def port_baud(self) -> int:
         """The speed of the port."""
-        return self.baud or _BAUD[self.type]
+        return self.baud or 115_200

@@ -8,7 +8,7 @@ import time
 import tty
 from types import TracebackType
 
-from lce_rig.devices.sync_board.lines.dialect import split_sentence, write_sentence
+from lce_rig.devices.sync_board.lce1 import read_sentence, write_sentence
 
 _S = 10**9
 _DRIFT = 30e-6
@@ -61,9 +61,10 @@ class WireSyncBoard:
                 due_ns += _S
 
     def _answer(self, line: bytes, came_ns: int) -> None:
-        words = split_sentence(line)
-        if not isinstance(words, list):
+        sentence = read_sentence(line)
+        if not isinstance(sentence, bytes):
             return
+        words = sentence.split(b",")
         if words[0] == b"LCEHI?":
             os.write(self._master, write_sentence("LCEHI,1,1.0,wire,1000000"))
         elif words[0] == b"LCETM?":

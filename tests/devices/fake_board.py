@@ -8,13 +8,13 @@ import threading
 import time
 import tty
 
-from lce_rig.devices.sync_board.lines.dialect import split_sentence, write_sentence
+from lce_rig.devices.sync_board.lce1 import read_sentence, write_sentence
 
 HELLO = "LCEHI,1,1.0,fake,1000000"
 
 
 class FakeBoard:
-    """Talks like the board of a dialect while its block lasts.
+    """Talks like a sync board while its block lasts.
 
     Attributes:
         path: the port that the host opens.
@@ -24,7 +24,6 @@ class FakeBoard:
 
     def __init__(
         self,
-        dialect="lce1",
         drift=40e-6,
         uptime_us=5_000_000,
         period_s=0.01,
@@ -32,7 +31,7 @@ class FakeBoard:
         hello=HELLO,
         is_mute=False,
     ):
-        self.dialect, self.drift, self.uptime_us, self.period_s = dialect, drift, uptime_us, period_s
+        self.drift, self.uptime_us, self.period_s = drift, uptime_us, period_s
         self.garbage_every, self.hello, self.is_mute = garbage_every, hello, is_mute
         self.commands, self.n_sent, self.n_pps = [], 0, 0
         self.started_ns = time.time_ns()
@@ -98,20 +97,16 @@ class FakeBoard:
         *lines, rest = data.split(b"\n")
         for line in lines:
             rx_us = self.board_us()
-            sentence = split_sentence(line.strip())
-            words = sentence if isinstance(sentence, list) else [line.strip()]
+            sentence = read_sentence(line.strip())
+            words = sentence.split(b",") if isinstance(sentence, bytes) else [line.strip()]
             self.commands.append(b",".join(words).decode())
             with self._lock:
                 if self.is_mute or self.is_stalled:
                     continue
-                if words[0] == b"LCEHI?" and self.dialect == "lce1":
+                if words[0] == b"LCEHI?":
                     self._say(write_sentence(self.hello))
                 elif words[0] == b"LCETM?":
                     self._say(write_sentence(f"LCETM,{words[1].decode()},{rx_us},{self.board_us()}"))
-                elif line.startswith(b'{"f":"a"'):
-                    cookie = int(line.split(b":")[-1].rstrip(b"}\r"))
-                    self._say(b'{"f":"a","a":%d,"b":%d}\n' % (cookie, rx_us))
-                    self._say(b'{"f":"b","a":%d}\n' % self.board_us())
         return rest
 
     def _pulse(self):
@@ -124,18 +119,11 @@ class FakeBoard:
             return
         if self.garbage_every and number % self.garbage_every == 0:
             self._say(b"\xff\x00\x80$LCETG,0,1,2,R*00\r\nnoise\xfe\n")
-        if self.dialect == "lce1":
-            self._say(write_sentence(f"LCETG,0,{number},{t_us},R"))
-            self._say(write_sentence(f"LCETG,0,{number},{t_us + 100},F"))
-            if number % 10 == 1:
-                self.n_pps += 1
-                self._say(write_sentence(f"LCEPP,{self.n_pps},{t_us},,I"))
-        elif self.dialect == "simplesensorsync":
-            self._say(b'{"f":"t","s":1,"t":%d,"c":%d}\n' % (t_us, number))
-        elif self.dialect == "tline":
-            self._say(b"T,%d,%d\n" % (number, t_us))
-        elif self.dialect == "nmea" and number % 10 == 1:
-            self._say(write_sentence(time.strftime("GPRMC,%H%M%S,A,,,,,,,%d%m%y,,", time.gmtime())))
+        self._say(write_sentence(f"LCETG,0,{number},{t_us},R"))
+        self._say(write_sentence(f"LCETG,0,{number},{t_us + 100},F"))
+        if number % 10 == 1:
+            self.n_pps += 1
+            self._say(write_sentence(f"LCEPP,{self.n_pps},{t_us},,I"))
 
     def _say(self, data):
         while data and not self.has_gone:

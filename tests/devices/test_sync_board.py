@@ -12,9 +12,9 @@ from lce_rig.devices.sync_board.driver import SyncBoard
 from lce_rig.rig.sync_settings import SyncSettings
 
 
-def settings(path, kind="lce1", **more):
-    triggers = {} if kind == "nmea" else {"cam": {"channel": 0, "rate_hz": 100.0}}
-    return SyncSettings.model_validate({"type": kind, "device": path, "triggers": triggers, **more})
+def settings(path, **more):
+    triggers = {"cam": {"channel": 0, "rate_hz": 100.0}}
+    return SyncSettings.model_validate({"device": path, "triggers": triggers, **more})
 
 
 def take(board, n, line="cam"):
@@ -159,24 +159,6 @@ def test_the_port_is_drained_though_nobody_takes_the_pulses():
         assert board.status().n_lost == 0
 
 
-@pytest.mark.parametrize("kind", ["simplesensorsync", "tline"])
-def test_boards_of_others_give_pulses_and_a_clock(kind):
-    with FakeBoard(kind) as fake, SyncBoard(settings(fake.path, kind)) as board:
-        assert len(take(board, 30)) == 30
-        wait_until(lambda: board.host_clock is not None and board.host_clock.n_used >= 6)
-        model = board.host_clock
-        assert_tells_the_time(model, fake)
-        if kind == "tline":
-            assert "GO" in fake.commands and "arrivals" in model.origin
-
-
-def test_plain_nmea_tells_the_second_and_no_pulses():
-    with FakeBoard("nmea") as fake, SyncBoard(settings(fake.path, "nmea")) as board:
-        status = board.status()
-        assert status.clock is not None and status.clock.finding.code == "clock.receiver"
-        assert status.problems == ()
-
-
 def test_a_silent_board_is_an_error_with_what_to_check():
     with FakeBoard(is_mute=True) as fake:
         with pytest.raises(SourceError, match=r"0\.3 s") as caught:
@@ -186,10 +168,9 @@ def test_a_silent_board_is_an_error_with_what_to_check():
 
 
 def test_a_board_that_talks_otherwise_is_named_for_what_it_is():
-    with FakeBoard("tline") as fake, pytest.raises(SourceError, match="tline"):
+    with FakeBoard(hello="READY") as fake, pytest.raises(SourceError, match=fake.path) as caught:
         SyncBoard(settings(fake.path), hello_s=0.3).__enter__()
-    with FakeBoard("?", garbage_every=2) as fake, pytest.raises(SourceError, match="not lce1"):
-        SyncBoard(settings(fake.path), hello_s=0.3).__enter__()
+    assert "sync.baud" in caught.value.hint
 
 
 def test_a_board_of_another_version_is_refused():

@@ -75,9 +75,5 @@ def test_a_pulse_per_second_that_is_none_is_told() -> None:
     assert (line.figures["line"], line.findings[0].code) == ("pps", "pulses.line_off")
 
 
-def test_a_receiver_that_tells_the_time_only_has_no_pulses_to_count() -> None:
-    assert check_pulses_sent(examination(sync_board(), rig=with_sync(type="nmea"))) is None
-
-
 def test_without_a_board_there_is_no_line() -> None:
     assert check_frames_of_pulses(examination(camera(), rig=make_rig(sync=None)), "cam") is None

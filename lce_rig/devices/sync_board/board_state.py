@@ -2,40 +2,47 @@
 
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import Enum
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lce_rig.core.data import Pulse
 from lce_rig.core.findings import Finding
-from lce_rig.core.losses import Losses
-from lce_rig.devices.sync_board.lines.messages import (
+from lce_rig.devices import findings
+from lce_rig.devices.protocol import ClockState
+from lce_rig.devices.sync_board.lce1 import (
+    PPS_IS_ON,
     BoardError,
     BoardStatus,
-    Exposure,
     Hello,
+    LineFault,
+    LineReader,
     Message,
     PpsEdge,
     TimeReply,
     TriggerEdge,
-    UtcTime,
 )
 from lce_rig.rig.sync_settings import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import fit_arrivals
 from lce_rig.timing.clock_tracker import ClockTracker
 
-# Which times and running numbers of a sync board can be, and which tell that it restarted.
-#
-# A line may be damaged and keep its sum. One odd value is skipped; two in a row that agree with each other
-# are believed: the board, or one of its counters, restarted.
+# Which times and running numbers can be, and which tell that the board restarted: a line may be damaged and
+# keep its sum. One odd value is skipped; two in a row that agree are believed.
 
 # A line is written within milliseconds of what it tells, and read whenever the computer gets to it.
 ROOM_NS = 2 * NS_PER_S
 _MOST_BACK_NS = NS_PER_S
 # Answers may overtake what the board had queued before; a board that has just started is not that far.
 _MOST_BACK_GREETED_NS = NS_PER_S // 10
+
+_N_ARRIVALS = 2048
+_STALLED_S = 3.0
+_DAMAGED = 0.01
+_MIN_DAMAGED = 5
+_PPS_LATE_S = 2.5
+_NO_CLOCK_S = 5.0
 
 
 class Verdict(Enum):
@@ -128,96 +135,113 @@ class RunningNumber:
         self._last, self._last_us, self._odd = number, t_us, None
 
 
-_N_ARRIVALS = 2048
-
-
-@dataclass(frozen=True)
-class Arrival:
-    """When a message came.
-
-    Attributes:
-        host_ns: the computer's time of day, which may be set at any moment.
-        steady_ns: a clock of the computer that is never set.
-    """
+class Arrival(NamedTuple):
+    """When a message came: by the time of day, which may be set at any moment, and by a clock never set."""
 
     host_ns: int
     steady_ns: int
 
 
-PULSE_LOST = "stream.pulse_lines_lost"
-RESTARTED = "device.board_restarted"
-IMPLAUSIBLE = "stream.damaged_lines"
-
-
 class BoardState:
-    """Messages in, pulses out; clocks and counts in between.
+    """Bytes and messages in, pulses out; clocks, counts and problems in between.
 
     Attributes:
+        reader: reads the lines, and counts damaged ones.
         n_pulses: pulses handed on, by line.
-        losses: pulses whose messages never came, by line; restarts; messages whose figures cannot be.
-        reset_steady_ns: when it last restarted; None where it did not.
-        hello, status, utc: the last of each; None before the first.
+        n_lost_by_line: pulses whose messages never came, by line; gaps in the running numbers tell.
+        n_implausible: messages whose figures cannot be.
+        n_restarts, restarted_ns: how often the board restarted, and when it last did, by the steady clock.
+        heard_ns: when the last message came, or the port was opened, by the steady clock.
+        hello, status, error: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
-        error: the last complaint.
-        exposure_us: last measured exposure, by camera.
         round_trip_ns: of the last time request.
         host_tracker, utc_tracker: followers of the computer's time of day and of UTC on the board's clock.
     """
 
-    def __init__(self, lines: Mapping[int, str], has_own_counts: bool = True) -> None:
+    def __init__(self, lines: Mapping[int, str]) -> None:
         """Begin with a board that has said nothing yet.
 
         Args:
             lines: name of the camera on each channel; pulses on others are skipped.
-            has_own_counts: whether each channel counts its own pulses.
         """
+        self.reader = LineReader()
         self.n_pulses: Counter[str] = Counter()
-        self.losses = Losses()
-        self.reset_steady_ns: int | None = None
+        self.n_lost_by_line: Counter[str] = Counter()
+        self.n_implausible = self.n_restarts = self.heard_ns = 0
+        self.restarted_ns: int | None = None
         self.hello: Hello | None = None
         self.status: BoardStatus | None = None
-        self.utc: UtcTime | None = None
         self.pps: tuple[PpsEdge, Arrival] | None = None
         self.error: BoardError | None = None
-        self.exposure_us: dict[str, int] = {}
         self.round_trip_ns: int | None = None
         self.host_tracker = ClockTracker("time requests")
         self.utc_tracker = ClockTracker("pulses per second")
+        self._opened_ns = 0
         self._lines = dict(lines)
-        self._has_own_counts = has_own_counts
         self._time = BoardTime()
         self._numbers: dict[str, RunningNumber] = {}
         self._asked: tuple[int, int] | None = None
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=_N_ARRIVALS)
 
+    def opened(self, steady_ns: int) -> None:
+        """Note that the port was opened: a board that was unplugged knows nothing any more."""
+        self.hello = None
+        self._opened_ns = self.heard_ns = steady_ns
+
     def asked(self, cookie: int, sent_ns: int) -> None:
         """Note that a time request was sent at a time of day."""
         self._asked = (cookie, sent_ns)
 
+    def feed(self, data: bytes, arrival: Arrival) -> list[Pulse]:
+        """Take bytes as they come, and give the pulses that they tell of."""
+        messages = self.reader.feed(data)
+        if messages:
+            self.heard_ns = arrival.steady_ns
+        return [pulse for message in messages for pulse in self.take(message, arrival)]
+
     def take(self, message: Message, arrival: Arrival) -> list[Pulse]:
         """Take a message, and give the pulses that it tells of."""
-        if isinstance(message, Hello):
-            self.hello = message
-            self._time.greeted()
-            return []
-        board_us = _board_time_us(message)
+        board_us: int | None = None
+        match message:
+            case Hello():
+                self._time.greeted()
+            case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | TimeReply(_, _, t_us):
+                board_us = t_us
         if board_us is not None:
             verdict = self._time.judge(board_us * 1000, arrival.steady_ns)
             if verdict is Verdict.ODD:
-                self._count(IMPLAUSIBLE)
+                self.n_implausible += 1
                 return []
             if verdict is Verdict.ANEW:
-                self._begin_anew(arrival)
-        return self._sort(message, arrival)
+                self._restart(arrival)
+        match message:
+            case Hello():
+                self.hello = message
+            case TriggerEdge(channel, number, t_us, True) if channel in self._lines:
+                return self._pulse(self._lines[channel], number, t_us, arrival)
+            case PpsEdge(seq, t_us, utc_s, _):
+                self.pps = (message, arrival)
+                pulses = self._pulse(PPS_LINE, seq, t_us, arrival)
+                if pulses and utc_s is not None:
+                    self.utc_tracker.add(t_us * 1000, utc_s * NS_PER_S)
+                return pulses
+            case TimeReply(cookie, rx_us, tx_us) if self._asked is not None and self._asked[0] == cookie:
+                sent_ns, self._asked = self._asked[1], None
+                self.round_trip_ns = arrival.host_ns - sent_ns - 1000 * (tx_us - rx_us)
+                # A clock that is set between question and answer spoils both.
+                if 0 <= self.round_trip_ns <= ROOM_NS:
+                    middle_ns = sent_ns + (arrival.host_ns - sent_ns) // 2
+                    self.host_tracker.add(500 * (rx_us + tx_us), middle_ns, self.round_trip_ns / 2)
+            case BoardStatus():
+                self.status = message
+            case BoardError():
+                self.error = message
+        return []
 
     @property
     def has_answered(self) -> bool:
         """Whether no time request is under way."""
         return self._asked is None
-
-    def n_lost_by_line(self) -> dict[str, int]:
-        """Count the pulses whose messages never came; gaps in the running numbers tell."""
-        return {each.subject: n for each, n in self.losses.counts() if each.code == PULSE_LOST}
 
     @property
     def host_clock(self) -> ClockModel | None:
@@ -233,58 +257,113 @@ class BoardState:
         """UTC on the board's clock, by the pulses per second; None where it does not know UTC."""
         return self.utc_tracker.model
 
-    def _sort(self, message: Message, arrival: Arrival) -> list[Pulse]:
-        match message:
-            case TriggerEdge(channel, count, t_us, True) if channel in self._lines:
-                return self._pulse(self._lines[channel], count, t_us, arrival)
-            case PpsEdge(seq, t_us, utc_s, _):
-                self.pps = (message, arrival)
-                pulses = self._pulse(PPS_LINE, seq, t_us, arrival)
-                if pulses and utc_s is not None:
-                    self.utc_tracker.add(t_us * 1000, utc_s * NS_PER_S)
-                return pulses
-            case TimeReply():
-                self._reply(message, arrival)
-            case Exposure(channel, _, _, duration_us) if channel in self._lines:
-                self.exposure_us[self._lines[channel]] = duration_us
-            case BoardStatus():
-                self.status = message
-            case BoardError():
-                self.error = message
-            case UtcTime():
-                self.utc = message
-        return []
+    def clock_state(self) -> ClockState:
+        """Say whose clock the timestamps are on, and how it is tied to others."""
+        figures: dict[str, Any] = {}
+        for name, model in (("host", self.host_clock), ("utc", self.utc_clock)):
+            if model is not None:
+                figures |= {
+                    f"{name}_by": model.origin,
+                    f"{name}_drift_ppm": 1e6 * model.drift,
+                    f"{name}_sigma_us": model.sigma_ns(model.last_ns) / 1000,
+                }
+        if self.round_trip_ns is not None:
+            figures["round_trip_ms"] = self.round_trip_ns / 1e6
+        return ClockState(findings.BOARD_CLOCK(**figures))
+
+    def figures(self, now_ns: int) -> dict[str, float]:
+        """Give the board's figures by name at a moment of the steady clock."""
+        faults, host = self.reader.faults, self.host_clock
+        figures: dict[str, float] = {
+            "n_messages": self.reader.n_messages,
+            "n_bad_checksums": faults[LineFault.CHECKSUM],
+            "n_malformed": faults[LineFault.MALFORMED] + faults[LineFault.TOO_LONG],
+            "n_unknown": faults[LineFault.UNKNOWN],
+            "n_implausible": self.n_implausible,
+            "n_resets": self.n_restarts,
+            "line_age_s": (now_ns - self.heard_ns) / NS_PER_S,
+        }
+        figures |= {f"n_pulses.{line}": n_pulses for line, n_pulses in sorted(self.n_pulses.items())}
+        if host is not None:
+            figures["host_rms_us"] = host.rms_ns / 1000
+        if self.pps is not None:
+            figures["pps_age_s"] = (now_ns - self.pps[1].steady_ns) / NS_PER_S
+        return figures
+
+    def problems(self, now_ns: int, n_unwritten: int = 0) -> tuple[Finding, ...]:
+        """Find what is wrong at a moment of the steady clock.
+
+        Args:
+            now_ns: that moment.
+            n_unwritten: commands that the board did not take.
+        """
+        silent_s = (now_ns - self.heard_ns) / NS_PER_S
+        if silent_s > _STALLED_S:
+            return (findings.BOARD_SILENT(silent_s=silent_s),)
+        has_waited = now_ns - self._opened_ns > _NO_CLOCK_S * NS_PER_S
+        problems: list[Finding] = []
+        faults = self.reader.faults
+        n_damaged = sum(faults.values()) - faults[LineFault.UNKNOWN] + self.n_implausible
+        n_lines = n_damaged + self.reader.n_messages
+        if n_damaged >= _MIN_DAMAGED and n_damaged > _DAMAGED * n_lines:
+            problems.append(findings.DAMAGED_LINES(n=n_damaged, n_lines=n_lines))
+        if n_unwritten:
+            problems.append(findings.COMMANDS_NOT_TAKEN(n=n_unwritten))
+        if self.restarted_ns is not None:
+            ago_s = (now_ns - self.restarted_ns) / NS_PER_S
+            problems.append(findings.BOARD_RESTARTED(n=self.n_restarts, ago_s=ago_s))
+        if self.error is not None:
+            problems.append(findings.BOARD_ERROR(message=self.error.text, number=self.error.code))
+        for line in sorted(self._lines.values()):
+            if has_waited and not self.n_pulses[line]:
+                problems.append(findings.NO_PULSES(line=line))
+        if self.n_lost_by_line:
+            by_line = tuple(sorted(self.n_lost_by_line.items()))
+            problems.append(findings.PULSE_LINES_LOST(n=sum(self.n_lost_by_line.values()), by_line=by_line))
+        if self.status is not None and self.status.n_lost:
+            problems.append(findings.LINES_DROPPED_BY_BOARD(n=self.status.n_lost))
+        if self.host_clock is None:
+            problems += [findings.BOARD_NOT_TIED()] if has_waited else []
+        elif self.round_trip_ns is None:
+            problems.append(findings.BOARD_BY_ARRIVALS())
+        steps = self.host_tracker.steps
+        if steps:
+            problems.append(findings.COMPUTER_JUMPED(n=len(steps), last_s=steps[-1].size_ns / NS_PER_S))
+        return (*problems, *self._pps_problems(now_ns, has_waited=has_waited))
+
+    def _pps_problems(self, now_ns: int, *, has_waited: bool) -> list[Finding]:
+        if self.hello is None:
+            return []
+        if self.pps is None:
+            return [findings.NO_PPS()] if has_waited else []
+        problems: list[Finding] = []
+        edge, arrival = self.pps
+        late_s = (now_ns - arrival.steady_ns) / NS_PER_S
+        if late_s > _PPS_LATE_S:
+            problems.append(findings.PPS_STOPPED(silent_s=late_s))
+        elif edge.utc_s is None:
+            problems.append(findings.BOARD_WITHOUT_UTC())
+        if self.status is not None and not self.status.flags & PPS_IS_ON:
+            problems.append(findings.PPS_OUTPUT_OFF())
+        if self.n_lost_by_line[PPS_LINE]:
+            problems.append(findings.PPS_LINES_LOST(n=self.n_lost_by_line[PPS_LINE]))
+        return problems
 
     def _pulse(self, line: str, count: int, t_us: int, arrival: Arrival) -> list[Pulse]:
-        # Where all lines share one running number, its gaps on a line say nothing.
-        number = self._numbers.setdefault(line if self._has_own_counts else "", RunningNumber())
+        number = self._numbers.setdefault(line, RunningNumber())
         n_lost = number.n_lost
-        if self._has_own_counts and number.judge(count, t_us) is Verdict.ODD:
-            self._count(IMPLAUSIBLE)
+        if number.judge(count, t_us) is Verdict.ODD:
+            self.n_implausible += 1
             return []
-        self._count(PULSE_LOST, line, number.n_lost - n_lost)
+        if number.n_lost > n_lost:
+            self.n_lost_by_line[line] += number.n_lost - n_lost
         self.n_pulses[line] += 1
         self._arrivals.append((t_us * 1000, arrival.host_ns))
         return [Pulse(line, t_us * 1000, count, arrival.host_ns)]
 
-    def _reply(self, reply: TimeReply, arrival: Arrival) -> None:
-        if self._asked is None or self._asked[0] != reply.cookie:
-            return
-        sent_ns, turn_ns = self._asked[1], 1000 * (reply.tx_us - reply.rx_us)
-        self._asked = None
-        self.round_trip_ns = arrival.host_ns - sent_ns - turn_ns
-        # A clock that is set between question and answer spoils both.
-        if 0 <= self.round_trip_ns <= ROOM_NS:
-            middle_ns = sent_ns + (arrival.host_ns - sent_ns) // 2
-            board_ns = 500 * (reply.rx_us + reply.tx_us)
-            self.host_tracker.add(board_ns, middle_ns, self.round_trip_ns / 2)
-
-    def _count(self, code: str, line: str = "", n: int = 1) -> None:
-        self.losses.add(Finding(code, "warning", line), n)
-
-    def _begin_anew(self, arrival: Arrival) -> None:
-        self._count(RESTARTED)
-        self.reset_steady_ns = arrival.steady_ns
+    def _restart(self, arrival: Arrival) -> None:
+        self.n_restarts += 1
+        self.restarted_ns = arrival.steady_ns
         for number in self._numbers.values():
             number.begin()
         self._arrivals.clear()
@@ -292,12 +371,3 @@ class BoardState:
         self.host_tracker.restart()
         self.utc_tracker.restart()
         self.pps = self.status = None
-
-
-def _board_time_us(message: Message) -> int | None:
-    match message:
-        case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | Exposure(_, _, t_us, _):
-            return t_us
-        case TimeReply(_, _, tx_us):
-            return tx_us
-    return None

@@ -6,32 +6,34 @@ import threading
 import time
 from collections import deque
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.sync_board.board_report import (
-    BoardSnapshot,
-    clock_state,
-    device_words,
-    figures,
-    problems,
-)
+from lce_rig.devices.sync_board import lce1
 from lce_rig.devices.sync_board.board_state import Arrival, BoardState
-from lce_rig.devices.sync_board.lines import DIALECTS, LineReader
-from lce_rig.devices.sync_board.lines.lce1 import VERSION
-from lce_rig.devices.sync_board.lines.messages import Hello
 from lce_rig.rig.sync_settings import BOARD, SyncSettings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 
-# The serial port of a sync board, opened without resetting it, its failures explained.
+# Opening the port may reset the board, and a VLP-16 takes 2.3 s to lock on its pulses again.
+HELLO_S = 6.0
+SILENCE_S = 30.0
 
 _READ_S = 0.02
 _WRITE_S = 0.2
 _BY_ID = Path("/dev/serial/by-id")
+_N_SLOTS = 4096
+_GREET_AGAIN_NS = NS_PER_S
+_ANSWER_WITHIN_NS = NS_PER_S // 2
+# Often while little is known, then as often as a changing drift needs.
+_ASK_EVERY_NS = (NS_PER_S // 20, NS_PER_S // 5)
+_ASK_OFTEN_NS = 10 * NS_PER_S
+_SET_UTC_EVERY_NS = 10 * NS_PER_S
+_UTC_SIGMA_NS = 1_000_000
+_UTC_MIN_ANSWERS = 8
+_N_HEARD_BYTES = 40
 
 
 class BoardPort:
@@ -51,8 +53,7 @@ class BoardPort:
             SourceError: it is absent, busy, not permitted or no serial port, or pyserial is missing.
         """
         self.n_unwritten = 0
-        self._who = who
-        self._device = device
+        self._who, self._device = who, device
         try:
             import serial
         except ImportError:
@@ -60,13 +61,10 @@ class BoardPort:
         self._failures: tuple[type[Exception], ...] = (serial.SerialException, OSError)
         self._timeouts: type[Exception] = serial.SerialTimeoutException
         self._port: Any = serial.Serial()
-        self._port.port = device
-        self._port.baudrate = baud
-        self._port.timeout = _READ_S
-        self._port.write_timeout = _WRITE_S
+        self._port.port, self._port.baudrate = device, baud
+        self._port.timeout, self._port.write_timeout = _READ_S, _WRITE_S
         self._port.exclusive = True
-        self._port.dtr = False
-        self._port.rts = False
+        self._port.dtr = self._port.rts = False
         try:
             self._port.open()
         except (*self._failures, ValueError) as error:
@@ -105,36 +103,25 @@ class BoardPort:
         except self._failures:
             return
 
-    def __enter__(self) -> "BoardPort":
-        """Use the port until the block ends."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the port."""
-        self.close()
-
     def _gone(self, error: Exception) -> SourceError:
+        number = getattr(error, "errno", None)
+        cause = errno.errorcode.get(number, number) if number else str(error).partition("(")[0].strip()
         return SourceError(
-            f"{self._who} on {self._device} is gone: {_cause(error)}",
+            f"{self._who} on {self._device} is gone: {cause}",
             "Check its plug and cable and its power; what was captured before is safe. Begin again when "
             "`ls -l /dev/serial/by-id` shows it.",
         )
 
 
-def _cause(error: Exception) -> str:
-    number = getattr(error, "errno", None)
-    return f"{errno.errorcode.get(number, number)}" if number else str(error).partition("(")[0].strip()
-
-
 def _explained(who: str, device: str, error: Exception) -> SourceError:
-    """Say why a port cannot be opened, and what to do about it."""
+    """Explain why a port cannot be opened, and what to do about it."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
-        found = sorted(path.name for path in _BY_ID.iterdir()) if _BY_ID.is_dir() else []
-        there = f"there is {', '.join(f'{_BY_ID}/{name}' for name in found)}" if found else "no port is there"
-        return SourceError(f"{who}: there is no {device}", f"Check plug and cable, and sync.device; {there}.")
+        ports = sorted(map(str, _BY_ID.iterdir())) if _BY_ID.is_dir() else []
+        listing = f"choose one of: {', '.join(ports)}" if ports else "no port is there"
+        return SourceError(
+            f"{who}: there is no {device}", f"Check plug and cable, and sync.device; {listing}."
+        )
     if number in (errno.EACCES, errno.EPERM):
         hint = "Run: sudo usermod -aG dialout $USER, then log in again."
         return SourceError(f"{who}: {device} may not be opened by this user", hint)
@@ -142,24 +129,8 @@ def _explained(who: str, device: str, error: Exception) -> SourceError:
         hint = f"Close it: a serial monitor, ModemManager or another lce-rig. `fuser {device}` shows which."
         return SourceError(f"{who}: {device} is in use by another program", hint)
     if number in (errno.ENOTTY, errno.EINVAL) or "configure" in str(error):
-        return SourceError(f"{who}: {device} is no serial port", "Check sync.device in the profile.")
+        return SourceError(f"{who}: {device} is not a serial port", "Check sync.device in the profile.")
     return SourceError(f"{who}: {device} cannot be opened: {error}", "Check sync.device in the profile.")
-
-
-# Opening the port may reset the board, and a VLP-16 takes 2.3 s to lock on its pulses again.
-HELLO_S = 6.0
-SILENCE_S = 30.0
-
-_N_SLOTS = 4096
-_GREET_AGAIN_NS = NS_PER_S
-_ANSWER_WITHIN_NS = NS_PER_S // 2
-# Often while little is known, then as often as a changing drift needs.
-_ASK_EVERY_NS = (NS_PER_S // 20, NS_PER_S // 5)
-_ASK_OFTEN_NS = 10 * NS_PER_S
-_SET_UTC_EVERY_NS = 10 * NS_PER_S
-_UTC_SIGMA_NS = 1_000_000
-_UTC_MIN_ANSWERS = 8
-_N_HEARD_BYTES = 2048
 
 
 class SyncBoard(LiveSource):
@@ -186,19 +157,15 @@ class SyncBoard(LiveSource):
         super().__init__(sensor, f"sync board '{sensor}'", _N_SLOTS, math.inf)
         self._settings = settings
         self._hello_s, self._silence_ns = hello_s, silence_s * NS_PER_S
-        self._reader = LineReader(DIALECTS[settings.type]())
-        lines = {trigger.channel: camera for camera, trigger in settings.triggers.items()}
-        self._state = BoardState(lines, self._reader.dialect.has_own_counts)
+        self._state = BoardState({trigger.channel: camera for camera, trigger in settings.triggers.items()})
         self._lock = threading.Lock()
-        self._is_heard = False
         self._early: list[Pulse] = []
-        self._heard = deque[int](maxlen=_N_HEARD_BYTES)
+        self._heard = b""
         self._outbox: deque[bytes] = deque()
         self._rate_hz: float | None = None
-        self._reset_seen_ns: int | None = None
-        self._cookie = 0
-        self._opened_ns = self._line_ns = self._asked_ns = self._told_utc_ns = self._greeted_ns = 0
-        self._busy_until_ns = 0
+        self._n_restarts = self._cookie = 0
+        self._asked_ns = self._told_utc_ns = self._greeted_ns = self._busy_until_ns = 0
+        self._is_set_up = False
         self._port: BoardPort | None = None
 
     def open(self) -> None:
@@ -208,18 +175,22 @@ class SyncBoard(LiveSource):
             SourceError: the port cannot be opened, or the board is silent or talks otherwise.
         """
         self._port = BoardPort(self._who, self._settings.device, self._settings.port_baud)
+        self._early, self._heard, self._is_set_up = [], b"", False
+        now_ns = time.monotonic_ns()
         with self._lock:
-            # A board that was unplugged knows nothing any more.
-            self._is_heard, self._state.hello = False, None
-        self._early = []
-        self._opened_ns = self._line_ns = self._busy_until_ns = time.monotonic_ns()
-        self._busy_until_ns += _ASK_OFTEN_NS
+            self._state.opened(now_ns)
+        self._busy_until_ns = now_ns + _ASK_OFTEN_NS
         until_s = time.monotonic() + self._hello_s
-        while not self._is_heard and not self.is_stopping:
+        while not self._is_set_up and not self.is_stopping:
             self._early = self.read()
-            if not self._is_heard and time.monotonic() > until_s:
+            if not self._is_set_up and time.monotonic() > until_s:
                 raise self._silent()
-        self._check_version()
+        hello = self._state.hello
+        if hello is not None and hello.version != lce1.VERSION:
+            raise SourceError(
+                f"{self._who} speaks version {hello.version} of LCE1, and this program {lce1.VERSION}",
+                "Flash the firmware of this version of lce-rig.",
+            )
 
     def close(self) -> None:
         """Close the port; the board's pulses go on, so that the LiDAR stays locked."""
@@ -238,23 +209,38 @@ class SyncBoard(LiveSource):
         early, self._early = self._early, []
         data = self._port.read()
         arrival = Arrival(time.time_ns(), time.monotonic_ns())
+        self._heard = (self._heard + data)[:_N_HEARD_BYTES]
         with self._lock:
-            pulses = self._take(data, arrival)
+            pulses = self._state.feed(data, arrival)
+            if self._is_set_up and arrival.steady_ns - self._state.heard_ns > self._silence_ns:
+                raise SourceError(
+                    f"{self._who} fell silent: nothing for {self._silence_ns / NS_PER_S:g} s",
+                    "Check its cable and power, and press its reset.",
+                )
+            has_restarted = self._state.n_restarts != self._n_restarts
+            if has_restarted:
+                self._n_restarts = self._state.n_restarts
+                self._busy_until_ns = arrival.steady_ns + _ASK_OFTEN_NS
+                self._told_utc_ns = 0
+            if has_restarted or (not self._is_set_up and self._state.hello is not None):
+                self._set_lines()
+                self._is_set_up = True
         self._talk(self._port, arrival.steady_ns)
         return early + pulses
 
     def describe(self) -> SourceStatus:
         """Say how the board does."""
+        now_ns = time.monotonic_ns()
         with self._lock:
-            view = self._view()
+            state, hello = self._state, self._state.hello
             return SourceStatus(
                 self.sensor,
-                n_lost=sum(self._state.n_lost_by_line().values()),
-                clock=clock_state(view),
-                problems=problems(view),
-                figures=figures(view),
-                device=device_words(view),
-                n_lost_by_line=self._state.n_lost_by_line(),
+                n_lost=sum(state.n_lost_by_line.values()),
+                clock=state.clock_state(),
+                problems=state.problems(now_ns, self._port.n_unwritten if self._port else 0),
+                figures=state.figures(now_ns),
+                device=f"{hello.board}, firmware {hello.firmware}, LCE{hello.version}" if hello else "",
+                n_lost_by_line=dict(state.n_lost_by_line),
             )
 
     @property
@@ -277,54 +263,26 @@ class SyncBoard(LiveSource):
         """
         with self._lock:
             self._rate_hz = rate_hz
-            self._configure()
+            self._set_lines()
 
-    def _take(self, data: bytes, arrival: Arrival) -> list[Pulse]:
-        self._heard.extend(data)
-        messages = self._reader.feed(data)
-        pulses: list[Pulse] = []
-        for message in messages:
-            pulses += self._state.take(message, arrival)
-        if messages:
-            self._line_ns = arrival.steady_ns
-        elif arrival.steady_ns - self._line_ns > self._silence_ns and self._is_heard:
-            raise SourceError(
-                f"{self._who} fell silent: nothing for {self._silence_ns / NS_PER_S:g} s",
-                "Check its cable and power, and press its reset.",
-            )
-        if not self._is_heard and self._is_introduced(bool(messages)):
-            self._configure()
-            self._is_heard = True
-        if self._state.reset_steady_ns != self._reset_seen_ns:
-            self._reset_seen_ns = self._state.reset_steady_ns
-            self._busy_until_ns = arrival.steady_ns + _ASK_OFTEN_NS
-            self._told_utc_ns = 0
-            self._configure()
-        return pulses
-
-    def _is_introduced(self, has_said_anything: bool) -> bool:
-        return self._state.hello is not None if self._settings.type == "lce1" else has_said_anything
-
-    def _configure(self) -> None:
+    def _set_lines(self) -> None:
         """Queue the commands that set the lines, for a board that knows nothing yet."""
-        dialect = self._reader.dialect
         for trigger in self._settings.triggers.values():
             rate_hz = self._rate_hz or trigger.rate_hz
-            self._outbox.append(
-                dialect.set_trigger(trigger.channel, rate_hz, trigger.phase_us, trigger.pulse_us)
-            )
+            command = lce1.set_trigger(trigger.channel, rate_hz, trigger.phase_us, trigger.pulse_us)
+            self._outbox.append(command)
         if self._settings.triggers:
-            self._outbox.append(dialect.start())
+            self._outbox.append(lce1.START)
 
     def _talk(self, port: BoardPort, now_ns: int) -> None:
         """Send what is due: greetings, commands, UTC, a time request."""
-        if not self._is_heard:
+        if not self._is_set_up:
             if now_ns - self._greeted_ns > _GREET_AGAIN_NS:
                 self._greeted_ns = now_ns
-                self._send(port, self._reader.dialect.greeting())
+                port.write(lce1.ASK_HELLO)
             return
         while self._outbox:
-            self._send(port, self._outbox.popleft())
+            port.write(self._outbox.popleft())
         if now_ns - self._told_utc_ns > _SET_UTC_EVERY_NS:
             self._tell_utc(port, now_ns)
         is_busy = now_ns < self._busy_until_ns
@@ -332,10 +290,8 @@ class SyncBoard(LiveSource):
         if is_free and now_ns - self._asked_ns > _ASK_EVERY_NS[0 if is_busy else 1]:
             self._asked_ns = now_ns
             self._cookie += 1
-            request = self._reader.dialect.time_request(self._cookie)
-            if request:
-                # The answer is read by this same thread: it cannot overtake the note.
-                self._state.asked(self._cookie, port.write(request))
+            # The answer is read by this same thread: it cannot overtake the note.
+            self._state.asked(self._cookie, port.write(lce1.ask_time(self._cookie)))
 
     def _tell_utc(self, port: BoardPort, now_ns: int) -> None:
         """Tell a board that has no receiver when a second begins, by the computer's time of day."""
@@ -347,50 +303,17 @@ class SyncBoard(LiveSource):
         board_clock = model.inverse()
         if board_clock.sigma_ns(utc_s * NS_PER_S) < _UTC_SIGMA_NS:
             self._told_utc_ns = now_ns
-            t_us = round(board_clock.convert(utc_s * NS_PER_S) / 1000)
-            self._send(port, self._reader.dialect.set_utc(t_us, utc_s))
-
-    def _send(self, port: BoardPort, data: bytes) -> None:
-        if data:
-            port.write(data)
-
-    def _view(self) -> BoardSnapshot:
-        return BoardSnapshot(
-            self._state,
-            self._reader,
-            time.monotonic_ns(),
-            self._opened_ns,
-            self._line_ns,
-            tuple(sorted(self._settings.triggers)),
-            self._port.n_unwritten if self._port else 0,
-        )
-
-    def _check_version(self) -> None:
-        hello = self._state.hello
-        if self._settings.type == "lce1" and isinstance(hello, Hello) and hello.version != VERSION:
-            raise SourceError(
-                f"{self._who} speaks version {hello.version} of LCE1, and this program {VERSION}",
-                "Flash the firmware of this version of lce-rig.",
-            )
+            port.write(lce1.set_utc(round(board_clock.convert(utc_s * NS_PER_S) / 1000), utc_s))
 
     def _silent(self) -> SourceError:
-        """Say what is wrong with a board that has not introduced itself: silent, or of another kind."""
+        """Explain why a board has not introduced itself: it is silent, or of another kind."""
         device, baud = self._settings.device, self._settings.port_baud
-        with self._lock:
-            heard = bytes(self._heard)
-        if not heard:
+        if not self._heard:
             return SourceError(
                 f"{self._who} on {device} is silent: nothing for {self._hello_s:g} s",
                 "Check its power and firmware, and that sync.device is its port.",
             )
-        for name, make in DIALECTS.items():
-            other = LineReader(make())
-            if name != self._settings.type and other.feed(heard + b"\n"):
-                return SourceError(
-                    f"{self._who} on {device} does not talk {self._settings.type}, but {name}",
-                    f"Set sync.type to {name}.",
-                )
         return SourceError(
-            f"{self._who} on {device} talks, but not {self._settings.type}: {heard[:40]!r}",
-            f"Check sync.type and sync.baud (now {baud}), and that this is the board's port.",
+            f"{self._who} on {device} does not talk LCE1: {self._heard!r}",
+            f"Check sync.baud (now {baud}), that this is the board's port, and its firmware.",
         )

@@ -1,0 +1,337 @@
+"""Kinds of findings on attached sensors: the device, its stream, its clock, its settings."""
+
+from lce_rig.core.findings import Figure, Finding, Kind
+
+_RAISE_LIMIT = (
+    "raise the receive buffer limit, now {buffer_kib} KiB: sudo sysctl -w net.core.rmem_max=4194304"
+)
+
+
+def _mid_exposure(finding: Finding) -> str:
+    """The timestamps are of mid exposure, from {mark} by {clock}; images arrive {delay_ms} old."""
+    mark = str(finding.figures["mark"]).replace("_", " ")
+    moved = f"{mark} by clock {finding.figures['clock']}, as this computer's UTC, corrected to mid exposure"
+    return moved + _delay(finding)
+
+
+def _davis(finding: Finding) -> str:
+    """The timestamps are the camera's own clock, set on opening; events arrive {delay_ms} old."""
+    clock = (
+        "the camera's own clock, set to this computer's UTC on opening; drifts until fitted to trigger edges"
+    )
+    return clock + _delay(finding)
+
+
+def _delay(finding: Finding) -> str:
+    delay_ms = finding.figures.get("delay_ms")
+    return "" if delay_ms is None else f"; {finding.figure('delay_ms'):.0f} ms old on arrival"
+
+
+def _board_clock(finding: Finding) -> str:
+    """The timestamps are the board's clock, synchronised with the computer and UTC by {host_by}, {utc_by}."""
+    parts = []
+    for name, to in (("host", "the computer's"), ("utc", "UTC")):
+        if f"{name}_by" in finding.figures:
+            sigma_us = finding.figure(f"{name}_sigma_us")
+            sigma = f"{sigma_us / 1000:.1f} ms" if sigma_us >= 1000 else f"{sigma_us:.3g} us"
+            drift = f"drift {finding.figure(f'{name}_drift_ppm'):+.1f} ppm, standard deviation {sigma}"
+            parts.append(f"synchronised with {to} by {finding.figures[f'{name}_by']}: {drift}")
+    synchronised = "; ".join(parts) or "not yet synchronised with the computer's"
+    text = f"the board's own clock, {synchronised}"
+    has_asked = "round_trip_ms" in finding.figures
+    return text + (f"; round trip {finding.figure('round_trip_ms'):.1f} ms" if has_asked else "")
+
+
+def _pairs(figure: Figure, unit: str = "") -> str:
+    """List pairs of a name and a number."""
+    assert isinstance(figure, tuple)
+    texts = []
+    for pair in figure:
+        assert isinstance(pair, tuple)
+        name, number = pair
+        texts.append(f"{name} {number:.3g}{unit}" if isinstance(number, float) else f"{name} {number}{unit}")
+    return ", ".join(texts)
+
+
+def _none_fits(finding: Finding) -> str:
+    """No clock of this computer fits the timestamps, {delays_ms} by clock; the arrival is used."""
+    ages = _pairs(finding.figures["delays_ms"], " ms")
+    return f"no clock fits the timestamps (image age by {ages}); arrival times are used"
+
+
+def _ambiguous_clock(finding: Finding) -> str:
+    """Several clocks fit the timestamps, {delays_ms}; they are uncertain by {spread_ms}."""
+    ages, spread_ms = _pairs(finding.figures["delays_ms"], " ms"), finding.figure("spread_ms")
+    return f"the clock of the timestamps is uncertain by {spread_ms:.3g} ms (image age by {ages})"
+
+
+def _pulse_lines_lost(finding: Finding) -> str:
+    """Messages of {n} pulses were lost, {by_line}."""
+    return f"messages of {finding.figures['n']} pulses lost ({_pairs(finding.figures['by_line'])})"
+
+
+CONTROL_DIFFERS = Kind(
+    "device.control_differs",
+    "control {control} is {given}, the profile's value is {expected}",
+    severity="warning",
+)
+ROW_PADDING = Kind(
+    "device.row_padding",
+    "rows of {row_bytes} bytes, GStreamer pads them to {padded_bytes}",
+    "if the image is slanted, let the command write JPEG (jpegenc)",
+    severity="warning",
+)
+RECORDING_STOPPED = Kind(
+    "device.recording_stopped",
+    "recording to {path} stopped: {cause}",
+    "free some space",
+    severity="warning",
+)
+RECORDING_INCOMPLETE = Kind(
+    "device.recording_incomplete",
+    "{n} samples missing in {path}: the disk is too slow",
+    "record to a faster disk",
+    severity="warning",
+)
+BOARD_SILENT = Kind(
+    "device.board_silent",
+    "no message from the board for {silent_s:.0f} s",
+    "check its cable and power, press its reset",
+    severity="warning",
+)
+COMMANDS_NOT_TAKEN = Kind(
+    "device.commands_not_taken",
+    "the board did not accept {n} commands",
+    "press its reset",
+    severity="warning",
+)
+BOARD_RESTARTED = Kind(
+    "device.board_restarted",
+    "the board restarted {n} times, last {ago_s:.0f} s ago",
+    "check its power, and that no other program opens its port",
+    severity="warning",
+)
+BOARD_ERROR = Kind("device.board_error", "the board reports: {message} (error {number})", severity="warning")
+
+PACKETS_LOST = Kind(
+    "stream.packets_lost",
+    "{share:1percent} of the packets lost (limit 1 %)",
+    "check cable and switch, and that the LiDAR's field of view is 0 to 359",
+    severity="warning",
+)
+COMPUTER_TOO_SLOW = Kind(
+    "stream.computer_too_slow",
+    "this computer was too slow for {n} packets",
+    f"close other programs, and {_RAISE_LIMIT}",
+    severity="warning",
+)
+ROTOR_RATE = Kind(
+    "stream.rotor_rate",
+    "rotor at {rotor_hz:.1f} Hz ({expected_hz:g} expected)",
+    "set rate_hz in the profile, or rpm {expected_rpm:.0f} on the web page",
+    severity="warning",
+)
+RATE_REFUSED = Kind(
+    "stream.rate_refused",
+    "the camera sends {rate_hz:.4g} images/s ({expected_hz:g} expected)",
+    "choose a rate that `v4l2-ctl --list-formats-ext` lists",
+    severity="warning",
+)
+FEW_BUFFERS = Kind(
+    "stream.few_buffers",
+    "the driver grants {n} buffers ({expected} expected): images may be lost",
+    severity="warning",
+)
+DAMAGED_IMAGES = Kind(
+    "stream.damaged_images",
+    "{n} damaged images",
+    "check the camera's cable and `dmesg | tail`",
+    severity="warning",
+    actions={"command": "check the command"},
+)
+MESSAGES_SKIPPED = Kind(
+    "stream.messages_skipped",
+    "{n} messages damaged, repeated or late",
+    "record a bag: `lce-rig collect --from` names the cause",
+    severity="warning",
+)
+DAMAGED_LINES = Kind(
+    "stream.damaged_lines",
+    "{n} of {n_lines} messages damaged",
+    "check cable, ground and sync.baud, and that nothing else reads the port",
+    severity="warning",
+)
+NO_PULSES = Kind(
+    "stream.no_pulses",
+    "no pulses for {line}",
+    "check sync.triggers.{line}.channel and that triggers are on",
+    severity="warning",
+)
+PULSE_LINES_LOST = Kind(
+    "stream.pulse_lines_lost", _pulse_lines_lost, "use a USB port of its own", severity="warning"
+)
+PPS_LINES_LOST = Kind(
+    "stream.pps_lines_lost",
+    "messages of {n} pulses per second lost; the LiDAR received the pulses",
+    severity="warning",
+)
+LINES_DROPPED_BY_BOARD = Kind(
+    "stream.lines_dropped_by_board",
+    "the board dropped {n} messages: the computer read too slowly",
+    "close other programs",
+    severity="warning",
+)
+BUFFER_SMALL = Kind(
+    "buffer.small",
+    "the receive buffer holds {buffer_s:0ms} (minimum 250 ms)",
+    _RAISE_LIMIT,
+    severity="warning",
+)
+
+ARRIVAL = Kind(
+    "clock.arrival",
+    "arrival at this computer, later than the exposure by an unknown time",
+    severity="note",
+)
+HEADER = Kind(
+    "clock.header",
+    "headers of the ROS 2 messages, {delay_ms:.3g} ms before their arrival",
+    severity="note",
+)
+MID_EXPOSURE = Kind("clock.mid_exposure", _mid_exposure, severity="note")
+DAVIS_CLOCK = Kind("clock.davis", _davis, severity="note")
+CLOCK_MISSING = Kind(
+    "clock.missing",
+    "this computer has no clock {clock}; arrival times are used",
+    "set driver.frame_timing.clock",
+    severity="warning",
+)
+CLOCK_DOES_NOT_FIT = Kind(
+    "clock.does_not_fit",
+    "by clock {clock} images are {delay_ms:.3g} ms old",
+    "correct driver.frame_timing.clock",
+    severity="warning",
+)
+NO_CLOCK_FITS = Kind(
+    "clock.none_fits", _none_fits, "set driver.frame_timing.clock if you know it", severity="warning"
+)
+CLOCK_AMBIGUOUS = Kind(
+    "clock.ambiguous", _ambiguous_clock, "set driver.frame_timing.clock if you know it", severity="warning"
+)
+CLOCK_CHANGED = Kind(
+    "clock.changed",
+    "the timestamps changed clock {n} times",
+    "check the camera's driver (dmesg)",
+    severity="warning",
+)
+EXPOSURE_UNKNOWN = Kind(
+    "clock.exposure_unknown",
+    "the camera does not report its exposure: timestamps are wrong by half of it",
+    "set driver.frame_timing.exposure_us",
+    severity="warning",
+)
+TRIGGER_INPUT_OFF = Kind(
+    "clock.trigger_input_off",
+    "the trigger input cannot be switched on: no edges are detected, and the clock drifts",
+    "update the camera's firmware",
+    severity="warning",
+)
+FOLLOWS_OTHER_CAMERA = Kind(
+    "clock.follows_other_camera",
+    "it follows another camera's clock",
+    "unplug the sync cable, or wire the trigger to that camera",
+    severity="warning",
+)
+CLOCK_DIFFERS = Kind(
+    "clock.differs_from_computer",
+    "its clock and this computer's differ by {difference_s:.3g} s (limit 0.5 s)",
+    "open the camera again; stop programs that set this computer's clock",
+    severity="warning",
+)
+CLOCK_RESTARTED = Kind(
+    "clock.restarted",
+    "its clock restarted {n} times: a sync cable sent a reset",
+    "open the camera again",
+    severity="warning",
+)
+
+BOARD_CLOCK = Kind("clock.board", _board_clock, severity="note")
+BOARD_NOT_TIED = Kind(
+    "clock.board_not_tied",
+    "the board's clock is not synchronised with the computer's: no answers to time requests, no pulses",
+    "check its firmware",
+    severity="warning",
+)
+BOARD_BY_ARRIVALS = Kind(
+    "clock.board_by_arrivals",
+    "the board answers no time requests: its clock is synchronised by arrivals only, to about 1 ms",
+    severity="warning",
+)
+COMPUTER_JUMPED = Kind(
+    "clock.computer_jumped",
+    "the computer's clock jumped {n} times, last by {last_s:+.3f} s",
+    "do not set it while you collect (chrony slews, ntpdate jumps)",
+    severity="warning",
+)
+NO_PPS = Kind(
+    "clock.no_pps",
+    "no pulse per second: the LiDAR cannot be synchronised",
+    "press the board's reset",
+    severity="warning",
+)
+PPS_STOPPED = Kind(
+    "clock.pps_stopped",
+    "no pulse per second for {silent_s:.0f} s",
+    "press the board's reset",
+    severity="warning",
+)
+BOARD_WITHOUT_UTC = Kind(
+    "clock.board_without_utc",
+    "the board does not know UTC yet: the LiDAR's hour is unknown",
+    severity="warning",
+)
+PPS_OUTPUT_OFF = Kind(
+    "clock.pps_output_off",
+    "its output of pulses per second is off",
+    "press the board's reset",
+    severity="warning",
+)
+
+OTHER_MODEL = Kind(
+    "settings.other_model",
+    "the LiDAR is a {model}, the profile says {expected}: its packets are not read",
+    "correct the model in the profile",
+    severity="warning",
+)
+MOTOR_OFF = Kind("settings.motor_off", "the motor is off", "switch it on (rpm 600)", severity="warning")
+LASER_OFF = Kind("settings.laser_off", "the laser is off", "switch it on", severity="warning")
+ROTOR_SETTING = Kind(
+    "settings.rotor_rate",
+    "rotor set to {set_hz:.1f} Hz ({expected_hz:g} expected)",
+    "set rpm to {expected_rpm:.0f}, or rate_hz in the profile",
+    severity="warning",
+)
+FOV_CUT = Kind(
+    "settings.fov_cut",
+    "field of view cut to {start_deg:.0f} to {end_deg:.0f} deg",
+    "set it to 0 to 359",
+    severity="warning",
+)
+DATA_PORT = Kind(
+    "settings.data_port",
+    "data sent to port {port} ({expected_port} expected)",
+    "set either of them to the other",
+    severity="warning",
+)
+POSITION_PORT = Kind(
+    "settings.position_port",
+    "telemetry sent to port {port} ({expected_port} expected): PPS is unknown",
+    "set driver.controls.position_port",
+    severity="warning",
+)
+PPS_SETTING = Kind(
+    "settings.pps",
+    "PPS is {pps}: the LiDAR's clock is not UTC",
+    "check pulse and NMEA",
+    severity="warning",
+)

@@ -1,0 +1,79 @@
+"""Kinds of findings on the sensors' clocks: images and pulses, edges, synchronisation."""
+
+from lce_rig.core.findings import Kind
+
+NOTHING_YET = Kind("pulses.nothing_yet", "no images and pulses yet")
+IMAGES_NOT_NUMBERED = Kind(
+    "pulses.images_not_numbered", "its images carry no numbers: they cannot be matched to pulses"
+)
+CLOCK_NOT_TIED = Kind(
+    "pulses.clock_not_tied", "its clock is not synchronised yet: images cannot be matched to pulses"
+)
+NO_PULSES = Kind("pulses.none", "images and no pulses", "check the board's line to the computer")
+IMAGES_WITHOUT_PULSES = Kind(
+    "pulses.images_without", "images without pulses", "set the camera to trigger mode, and check its line"
+)
+AMBIGUOUS_PULSES = Kind(
+    "pulses.ambiguous",
+    "more than one pulse in {window_ms:.0f} ms could have triggered an image",
+    "begin with slower pulses, or lower sync.triggers.{subject}.max_delay_s",
+)
+PULSES_NOT_FOLLOWED = Kind(
+    "pulses.not_followed", "its images do not follow the pulses", "set the camera to trigger mode"
+)
+BOARD_RESTARTED = Kind("pulses.board_restarted", "the board restarted its count")
+CAMERA_RESTARTED = Kind("pulses.camera_restarted", "the camera restarted its count")
+IMAGE_UNMATCHED = Kind("pulses.image_unmatched", "{n} images match no pulse", severity="note")
+IMAGE_LOST = Kind("pulses.image_lost", "{n} images lost, by the camera's numbers", severity="note")
+MESSAGE_LOST = Kind("pulses.message_lost", "messages of {n} pulses lost, whose images came", severity="note")
+MISSED_BY_CAMERA = Kind("pulses.missed_by_camera", "{n} pulses made no image", severity="note")
+REPEATED = Kind("pulses.repeated", "{n} images and pulses came twice", severity="note")
+SLIP = Kind("pulses.slip", "the camera's count slipped {n} times", severity="note")
+RESTART = Kind("pulses.restart", "the camera or the board restarted its count {n} times", severity="note")
+SLIPPED = Kind(
+    "pulses.slipped",
+    "its count slipped against the pulses {n_slips} times and restarted {n_restarts} times; "
+    "{n_matched} images matched, {n_unmatched} not",
+    severity="note",
+)
+
+NO_EDGES = Kind("edges.none_seen", "no edges detected yet", "wire its trigger input, and switch it on")
+EDGES_TOO_CLOSE = Kind(
+    "edges.too_close",
+    "its clock is uncertain by {sigma_ms:.0f} ms, too much for pulses every {period_ms:.0f} ms",
+    "wire the pulse per second, or begin slower",
+)
+EDGES_NOT_THE_PULSES = Kind(
+    "edges.not_the_pulses", "the detected edges are not the board's pulses", "check the wire"
+)
+
+BOARDS_MAY_MOVE = Kind("sync.boards_may_move", "boards may move while they are captured", severity="note")
+BOARDS_MUST_STAND = Kind(
+    "sync.boards_must_stand",
+    "boards must stand still while they are captured",
+    severity="note",
+    actions={
+        "add_board": "add `sync` to the profile (docs/wiring-and-sync.md) to let boards move",
+        "see_lines": "see the lines of these sensors and of the sync board",
+    },
+)
+NO_BOARD = Kind(
+    "sync.no_board",
+    "no sync board synchronises the cameras with the LiDAR",
+    severity="warning",
+    actions={"named": ""},
+)
+NONE_IN_PROFILE = Kind("sync.none_in_profile", "{key} is none", severity="warning", actions={"named": ""})
+NOT_TIED = Kind(
+    "sync.not_tied",
+    "the clock of {subject} is not synchronised with the rig's",
+    "run `lce-rig doctor`",
+    severity="warning",
+    actions={"named": ""},
+)
+TOO_UNCERTAIN = Kind(
+    "sync.too_uncertain",
+    "time of {subject}: standard deviation {sigma_ms:.1f} ms (limit {limit_ms:.1f} ms)",
+    severity="warning",
+    actions={"named": ""},
+)
