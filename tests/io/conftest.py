@@ -13,7 +13,7 @@ Message = tuple[str, str, int, dict[str, Any]]
 """Topic, type ("Image"), time of receipt in ns, fields."""
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def rig() -> Rig:
     return load_rig("rlfs")
 
@@ -60,7 +60,7 @@ def _build(store: Any, msgtype: str, fields: dict[str, Any]) -> Any:
     return types[f"sensor_msgs/msg/{msgtype}"](header=header, **fields)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def write_bag() -> Callable[[Path, str, Iterable[Message]], Path]:
     """Write a bag: kind "ros1", "sqlite3" or "mcap"; returns the file, or the folder for ROS 2."""
 

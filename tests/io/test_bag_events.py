@@ -1,17 +1,20 @@
 """Raw events in bags beside pictures and scans: topics, order, clocks, and what may be wrong with them."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image, Sample, Scan, Stream
+from lce_rig.core import limits
+from lce_rig.core.data import Events, Image, Sample, Scan, Stream, join_events
 from lce_rig.core.errors import SourceError
+from lce_rig.core.losses import Losses
 from lce_rig.io import SourceOptions, open_recording
+from lce_rig.io.events.word_codec import EVT3, WordDecoder
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import open_bag_writer
+from lce_rig.io.ros.event_messages import BagEvents, PacketDecoder, parse_packet
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.rig_time import rig_time_ns
 from tests.io.events import encoders
@@ -224,24 +227,6 @@ def test_events_that_cover_a_part_of_the_scans_only_are_used_and_it_is_noted(
     assert len(events_of(list(recording.samples()))) == 5000
 
 
-@pytest.mark.parametrize("kept", [0.4, 0.8])
-def test_a_bag_torn_in_a_packet_gives_everything_before_and_then_says_so(
-    tmp_path: Path, rig: Rig, kept: float
-) -> None:
-    given = one_second(400)
-    path = record(tmp_path / "r.bag", rig, given)
-    os.truncate(path, int(kept * path.stat().st_size))
-    recording = opened(path, rig)
-    samples = []
-    with pytest.raises(SourceError, match=r"r\.bag is damaged"):
-        for sample in recording.samples():
-            samples.append(sample)
-    found = events_of(samples)
-    assert len(found) > (kept - 0.3) * 20_000 and found == events_of(given)[: len(found)]
-    assert any(isinstance(sample, Scan) for sample in samples)
-    assert has_note(recording.notes, "places", "torn")
-
-
 def test_pictures_stamped_at_the_start_of_an_exposure_that_is_not_told_are_said(
     tmp_path: Path, rig: Rig
 ) -> None:
@@ -275,3 +260,29 @@ def test_real_drivers_bags_open_with_a_profile_that_fits(
     samples = list(recording.samples())
     assert sum(len(s) for s in samples if isinstance(s, Events)) == n
     assert recording.streams[Stream("davis", "events", "events")] is not None
+
+
+def test_a_packet_that_holds_more_events_than_any_camera_sends_is_left_out(tmp_path: Path) -> None:
+    words = np.array([0x8000, 0x6001, 0x0005, 0x2007], "<u2").tobytes()
+    sizes = 1, limits.MAX_PACKET_BYTES // 8 + 1, 1
+    messages = [
+        ("/davis/events", T0_NS + k, encoders.packet(words * n, "evt3", is_ros1=True))
+        for k, n in enumerate(sizes)
+    ]
+    losses = Losses()
+    events = list(BagEvents(write_packet_bag(tmp_path / "a.bag", messages), None).stretches(losses))
+    assert sum(map(len, events)) == 2
+    assert losses.by_code() == {"recording.broken_packets": 1}
+
+
+def test_a_packet_whose_words_hold_many_events_each_is_decoded_in_pieces() -> None:
+    rng = np.random.default_rng(0)
+    words = np.tile(np.array([0x8000, 0x6001, 0x0005, 0x3000, 0x4FFF, 0x4FFF, 0x50FF], "<u2"), 40_000)
+    words[1::7] = 0x6000 | np.sort(rng.integers(0, 4096, 40_000))
+    decoder = PacketDecoder()
+    packet = parse_packet(encoders.packet(words.tobytes(), "evt3", is_ros1=True), "ros1")
+    pieces = [*decoder.decode(packet), *decoder.finish()]
+    whole = WordDecoder(EVT3).decode(words.astype(np.uint16))
+    assert len(pieces) > 2 and max(map(len, pieces)) < len(whole) / 2
+    together = join_events(pieces)
+    assert np.array_equal(together.t_ns, whole.t_ns) and np.array_equal(together.x, whole.x)

@@ -1,4 +1,4 @@
-"""A kill, an interrupt or a full disk costs a recording its end, and nothing before it."""
+"""A kill, an interrupt or a full disk ends a recording with one error."""
 
 import resource
 import shutil
@@ -27,7 +27,7 @@ def rles() -> Rig:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_recorder_that_was_killed_leaves_what_it_had_written(tmp_path: Path, rles: Rig, name: str) -> None:
+def test_the_bag_of_a_killed_recorder_is_named_with_its_repair(tmp_path: Path, rles: Rig, name: str) -> None:
     with BagRecorder(tmp_path / name, rles) as recorder:
         samples = [*map(picture, range(40)), *map(sweep, range(20))]
         for sample in samples:
@@ -36,12 +36,9 @@ def test_a_recorder_that_was_killed_leaves_what_it_had_written(tmp_path: Path, r
         left = tmp_path / f"left{on_disk.suffix}"
         # The files as they are at this moment are what a SIGKILL leaves.
         (shutil.copytree if on_disk.is_dir() else shutil.copy)(on_disk, left)
-    recording = open_recording(left, rles)
-    assert isinstance(recording, ContinuousRecording)
-    found = []
-    with pytest.raises(SourceError, match="damaged"):
-        found.extend(recording.samples())
-    assert 35 <= sum(isinstance(sample, Image) for sample in found) <= 40
+    with pytest.raises(SourceError) as caught:
+        open_recording(left, rles)
+    assert ("rosbag reindex" if name.endswith(".bag") else "mcap recover") in caught.value.hint
 
 
 @contextmanager
@@ -56,26 +53,19 @@ def files_up_to(n_bytes: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_full_disk_stops_the_recording_and_what_was_written_is_read(
-    tmp_path: Path, rles: Rig, name: str
-) -> None:
+def test_a_full_disk_stops_the_recording(tmp_path: Path, rles: Rig, name: str) -> None:
     samples = [*map(sweep, range(5)), *map(picture, range(50))]
     n_taken = 0
     with files_up_to(3_000_000), BagRecorder(tmp_path / name, rles) as recorder:
-        with pytest.raises(SourceError, match=f"{name} cannot be written: File too large") as caught:
+        with pytest.raises(SourceError, match=f"{name} cannot be written: File too large"):
             for sample in samples:
                 recorder.write(sample)
                 n_taken += 1
         with pytest.raises(SourceError, match="cannot be written"):
             recorder.write(samples[0])
-    assert "recorded before" in caught.value.hint
     assert 10 < n_taken < 50
-    recording = open_recording(tmp_path / name, rles)
-    assert isinstance(recording, ContinuousRecording)
-    found = []
-    with pytest.raises(SourceError, match="damaged"):
-        found.extend(recording.samples())
-    assert len(found) >= n_taken - 15
+    with pytest.raises(SourceError, match=name):
+        open_recording(tmp_path / name, rles)
 
 
 def test_a_disk_that_is_full_at_the_end_is_named_too(tmp_path: Path, rles: Rig) -> None:

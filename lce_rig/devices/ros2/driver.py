@@ -11,8 +11,8 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
+from lce_rig.io.ros.bag_file import RawMessage
 from lce_rig.io.ros.rosbag import TopicDecoder
-from lce_rig.io.ros.storage import RawMessage
 from lce_rig.io.ros.topics import Target
 from lce_rig.rig import CameraSettings, LidarSettings
 

@@ -1,24 +1,37 @@
-"""Bags as streams of raw messages: ROS 1, ROS 2 sqlite3 and mcap, whole or torn."""
+"""Bags of ROS 1 and ROS 2 as raw messages, read by rosbags.
 
-import re
+rosbags' readers of single files are used, not its AnyReader: that one parses every message definition of a
+bag, and refuses the whole bag for one that it cannot parse or for older bags without any.
+"""
+
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from heapq import merge
 from pathlib import Path
-from shutil import rmtree
-from tempfile import mkdtemp
-from weakref import finalize
+from typing import Any, NamedTuple
 
-from lce_rig.core import limits, unpacking
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.io.fingerprint import fingerprint
-from lce_rig.io.ros.mcap import McapBag
-from lce_rig.io.ros.ros1 import Ros1Bag
-from lce_rig.io.ros.sqlite import SqliteBag
-from lce_rig.io.ros.storage import BagStorage, Damages, RawMessage
 
 SUFFIXES = (".bag", ".db3", ".mcap")
-_PACKED = ".zstd"
 _MAX_LISTED = 40
-_LISTED_FILE = re.compile(r"^\s*-\s*[\"']?([^\"'\n]+\.(?:db3|mcap)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE)
+_END_WINDOWS_NS = (10**9, 10**11)
+
+
+class RawMessage(NamedTuple):
+    """A message as it lies in a bag, or as a topic brings it.
+
+    Attributes:
+        msgtype: "sensor_msgs/PointCloud2", without ROS 2's "/msg".
+        encoding: "ros1" or "cdr".
+        log_ns: when the recorder received it.
+    """
+
+    topic: str
+    msgtype: str
+    encoding: str
+    log_ns: int
+    data: bytes
 
 
 class BagFile:
@@ -26,8 +39,9 @@ class BagFile:
 
     Attributes:
         path: the file or folder.
+        files: those of the bag that hold messages.
         topics: (message type, number of messages) by topic.
-        damage: what is wrong with the bag, "" where nothing is; what can be read is read all the same.
+        damages: errors of files that cannot be opened, beside others that can.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,128 +52,94 @@ class BagFile:
         """
         self.path = path
         self.topics: dict[str, tuple[str, int]] = {}
-        self._ends_ns: dict[str, int | None] = {}
-        self._damages = Damages()
-        self._readable: list[Path] = []
-        self._parts = self._open_parts()
-        for part in self._parts:
-            for number, (topic, msgtype, _) in part.contents.connections.items():
-                n_before = self.topics.get(topic, ("", 0))[1]
-                self.topics[topic] = msgtype, n_before + part.contents.counts[number]
-        if not self.topics and self._damages.n_places:
-            raise SourceError(
-                f"{self.path} cannot be read: {self.damage}",
-                "Record again, or try to reindex it.",
-            )
-
-    @property
-    def damage(self) -> str:
-        """What is wrong with the bag, as far as it was read; "" where nothing is."""
-        return str(self._damages)
+        self.damages: list[SourceError] = []
+        self.files = sorted(file for file in path.iterdir() if is_bag_file(file)) if path.is_dir() else [path]
+        self._end_ns = 0
+        with self._readers() as readers:
+            for reader in readers:
+                self._end_ns = max(self._end_ns, reader.end_time)
+                for connection in reader.connections:
+                    n_before = self.topics.get(connection.topic, ("", 0))[1]
+                    self.topics[connection.topic] = _type_of(connection), n_before + connection.msgcount
+            if not readers:
+                raise self.damages[0]
 
     def fingerprint(self) -> str:
         """Hash names, sizes and both ends of the files: enough to know a recording again."""
-        return fingerprint(self._readable)
-
-    def unmerged_journals(self) -> list[Path]:
-        """List write-ahead journals of sqlite that a recorder left behind when it was killed."""
-        journals = (file.with_name(file.name + "-wal") for file in self._files())
-        return [journal for journal in journals if journal.exists() and journal.stat().st_size > 0]
+        return fingerprint(file for file in self.files if file.is_file())
 
     def end_ns(self, topic: str) -> int | None:
         """Find when the recorder received a topic's last message, from the back; None where it has none."""
-        if topic not in self._ends_ns:
-            ends_ns = (_end_ns(part, topic) for part in reversed(self._parts))
-            self._ends_ns[topic] = next((end_ns for end_ns in ends_ns if end_ns is not None), None)
-        return self._ends_ns[topic]
+        for start_ns in [*(self._end_ns - window_ns for window_ns in _END_WINDOWS_NS), None]:
+            try:
+                times_ns = [message.log_ns for message in self.messages({topic}, start_ns)]
+            except SourceError:  # Reported when the bag is read.
+                return None
+            if times_ns:
+                return max(times_ns)
+        return None
 
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+    def messages(self, topics: Collection[str], start_ns: int | None = None) -> Iterator[RawMessage]:
         """Yield the messages of some topics in the order the recorder received them.
 
         Raises:
-            SourceError: the bag is damaged; after everything that can be read.
+            SourceError: the bag is damaged; after everything before the damage.
         """
-        n_read, first_ns, last_ns = 0, 0, 0
-        damages = Damages(self._damages.n_places, self._damages.first)
-        for part in self._parts:
+        n_read = 0
+        with self._readers() as readers:
             try:
-                for message in part.messages(topics, damages):
-                    n_read, last_ns = n_read + 1, message.log_ns
-                    first_ns = message.log_ns if n_read == 1 else first_ns
-                    yield message
-            except (OSError, ValueError) as error:  # The file was there when the bag was opened.
-                damages.add(_describe(part.path, error))
-        if damages.n_places:
-            length_s = (last_ns - first_ns) * 1e-9
-            raise SourceError(
-                f"{self.path} is damaged ({damages}): {n_read} messages over {length_s:.1f} s were read",
-                "What was captured from them is kept. Reindexing with ROS's own tools may bring back more.",
-            )
+                passes = []
+                for reader in readers:
+                    wanted = [c for c in reader.connections if c.topic in topics]
+                    passes += [reader.messages(wanted, start_ns)] if wanted else []
+                for connection, log_ns, data in merge(*passes, key=lambda entry: int(entry[1])):
+                    encoding = getattr(connection.ext, "serialization_format", "ros1")
+                    yield RawMessage(
+                        connection.topic, _type_of(connection), encoding, int(log_ns), bytes(data)
+                    )
+                    n_read += 1
+            except Exception as error:
+                raise SourceError(
+                    f"{self.path} is damaged: {reason_of(error)}; {n_read} messages were read before",
+                    f"What was captured from them is kept. {_repair(self.path)}",
+                ) from error
+        if self.damages:
+            raise self.damages[0]
 
-    def _open_parts(self) -> list[BagStorage]:
-        """Open the files, in the order of time; one that cannot be read is damage."""
-        parts: list[BagStorage] = []
-        for file in self._files():
-            try:
-                part = self._open(file)
-            except (OSError, ValueError) as error:
-                self._damages.add(_describe(file, error))
-                continue
-            if part.contents.damages.n_places:
-                where = f"{file.name}: " if file != self.path else ""
-                self._damages.add(f"{where}{part.contents.damages}")
-            parts.append(part)
-            self._readable.append(file)
-        for name in self._missing():
-            self._damages.add(f"metadata.yaml lists {limits.describe(name)}, which is missing")
-        return sorted(parts, key=lambda part: part.contents.start_ns or 0)
+    @contextmanager
+    def _readers(self) -> Iterator[list[Any]]:
+        """Open the bag's files; one that cannot be opened is noted in `damages`."""
+        from rosbags.rosbag1 import Reader as Ros1Reader
+        from rosbags.rosbag2 import Reader as Ros2Reader
 
-    def _open(self, file: Path) -> BagStorage:
-        if file.suffix.lower() == _PACKED:
-            file = self._unpack(file)
-        if file.suffix.lower() == ".bag":
-            return Ros1Bag(file)
-        return McapBag(file) if file.suffix.lower() == ".mcap" else SqliteBag(file)
-
-    def _unpack(self, file: Path) -> Path:
-        """Unpack a file that was compressed as a whole, for as long as the bag is open."""
-        folder = mkdtemp(prefix="lce-rig-")
-        finalize(self, rmtree, folder, ignore_errors=True)
-        unpacked = Path(folder) / file.stem
-        with limits.open_regular(file) as packed, unpacked.open("wb") as into:
-            unpacking.unpack_file("zstd", packed, into)
-        return unpacked
-
-    def _files(self) -> list[Path]:
-        if not self.path.is_dir():
-            return [self.path]
-        return sorted(file for file in self.path.iterdir() if is_bag_file(file))
-
-    def _missing(self) -> list[str]:
-        """List the files that a folder's metadata.yaml names and that are not there."""
-        metadata = self.path / "metadata.yaml"
-        if not self.path.is_dir() or not metadata.exists():
-            return []
-        try:
-            text = limits.read_file(metadata, limits.MAX_DOCUMENT_BYTES).decode(errors="replace")
-        except (OSError, ValueError) as error:
-            self._damages.add(_describe(metadata, error))
-            return []
-        there = {file.name for file in self._files()}
-        return sorted({Path(name).name for name in _LISTED_FILE.findall(text)} - there)
+        # A folder's metadata.yaml names its files; without it each file is opened for itself.
+        is_described = self.path.is_dir() and (self.path / "metadata.yaml").is_file()
+        self.damages.clear()
+        with ExitStack() as stack:
+            readers: list[Any] = []
+            for file in [self.path] if is_described else self.files:
+                try:
+                    with reading(file, hint=_repair(file)):
+                        if not (is_described or file.is_file()):
+                            raise ValueError("it is not a file")
+                        reader = Ros1Reader(file) if file.suffix.lower() == ".bag" else Ros2Reader(file)
+                        readers.append(stack.enter_context(reader))
+                except SourceError as error:
+                    self.damages.append(error)
+            yield readers
 
 
 def is_bag_file(path: Path) -> bool:
-    """Return whether a file's name is that of a bag, or of one that was compressed as a whole."""
-    suffixes = [suffix.lower() for suffix in path.suffixes[-2:]]
-    return suffixes[-1:] != [] and (suffixes[-1] in SUFFIXES or _is_packed(suffixes))
+    """Return whether a file's name is that of a bag."""
+    return path.suffix.lower() in SUFFIXES
 
 
 def kind_of(path: Path) -> str:
     """Name the kind of a recording: its suffix, ".bag" for a folder with bag files, else "folder"."""
     if not path.is_dir():
         return path.suffix.lower()
-    return ".bag" if any(is_bag_file(file) for file in path.iterdir()) else "folder"
+    is_bag = (path / "metadata.yaml").is_file() or any(is_bag_file(file) for file in path.iterdir())
+    return ".bag" if is_bag else "folder"
 
 
 def list_topics(topics: Mapping[str, tuple[str, int]]) -> str:
@@ -168,23 +148,18 @@ def list_topics(topics: Mapping[str, tuple[str, int]]) -> str:
     Args:
         topics: (message type, number of messages) by topic.
     """
-    shown = sorted(topics.items())[:_MAX_LISTED]
-    listed = [f"{limits.shorten(name)} ({limits.shorten(kind)}, {n})" for name, (kind, n) in shown]
-    listed += [f"and {len(topics) - len(shown)} more"] if len(topics) > len(shown) else []
+    listed = [f"{name} ({kind}, {n})" for name, (kind, n) in sorted(topics.items())[:_MAX_LISTED]]
+    listed += [f"and {len(topics) - _MAX_LISTED} more"] if len(topics) > _MAX_LISTED else []
     return f"topics: {', '.join(listed) or 'none'}"
 
 
-def _is_packed(suffixes: list[str]) -> bool:
-    return len(suffixes) == 2 and suffixes[0] in SUFFIXES and suffixes[1] == _PACKED
+def _type_of(connection: Any) -> str:
+    return str(connection.msgtype).replace("/msg/", "/")
 
 
-def _end_ns(part: BagStorage, topic: str) -> int | None:
-    try:
-        return part.end_ns(topic)
-    except (OSError, ValueError):
-        return None  # Reported when the bag is read.
-
-
-def _describe(path: Path, error: Exception) -> str:
-    text = (error.strerror if isinstance(error, OSError) else str(error)) or type(error).__name__
-    return f"{path.name}: {text}"
+def _repair(path: Path) -> str:
+    """Name the tool that restores the index of a bag whose recorder was killed."""
+    commands = {".bag": f"rosbag reindex {path.name}", ".mcap": f"mcap recover {path.name}"}
+    folder = path if path.is_dir() else path.parent
+    command = commands.get(path.suffix.lower(), f"ros2 bag reindex {folder.name}")
+    return f"If its recorder was killed, repair it: {command}"

@@ -178,8 +178,7 @@ class BagRecorder:
     """A bag open for writing; a context manager.
 
     Samples go to the disk a megabyte at a time and are not kept. A bag that was never closed, because the
-    program was killed or the disk is full, lacks its index; readers here find the messages all the same, and
-    `rosbag reindex` or `ros2 bag reindex` puts the index back.
+    program was killed or the disk is full, lacks its index: `rosbag reindex` or `mcap recover` restores it.
 
     Attributes:
         path: a ROS 1 bag where it ends in .bag, else the folder of a ROS 2 bag (mcap).
@@ -237,7 +236,7 @@ class BagRecorder:
         """Write the index; does nothing the second time, or after a failure.
 
         Raises:
-            SourceError: the disk is full; what was written before can be read.
+            SourceError: the disk is full.
         """
         if self._writer is not None and self._failure is None:
             with self._disk():
@@ -313,5 +312,5 @@ def not_writable(path: Path, error: BaseException) -> SourceError:
     """Say that a recording cannot be written, and that what was written before is not lost."""
     return SourceError(
         f"{path} cannot be written: {getattr(error, 'strerror', '') or str(error) or type(error).__name__}",
-        "Make room or record elsewhere; what was recorded before can be read.",
+        "Make room or record elsewhere; `rosbag reindex` or `mcap recover` restores what was recorded.",
     )

@@ -14,10 +14,9 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
 from lce_rig.io.events.stream import NS_PER_US, damage, seconds_in
 from lce_rig.io.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
-from lce_rig.io.ros.bag_file import BagFile, list_topics
+from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_array import decode_event_array
 from lce_rig.io.ros.message_fields import EventHeader, MessageReader, read_header
-from lce_rig.io.ros.storage import RawMessage
 
 # event_camera_msgs/EventPacket: the sensor's own encodings inside a ROS message.
 #

@@ -21,10 +21,9 @@ from lce_rig.io.folder.image_file import decode_image, to_8_bit
 from lce_rig.io.merging import merge_by_time
 from lce_rig.io.overlap import check_overlap
 from lce_rig.io.protocol import SourceOptions, Span
-from lce_rig.io.ros.bag_file import BagFile, list_topics
+from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import BagEvents
 from lce_rig.io.ros.message_fields import MessageReader, read_header, typestore
-from lce_rig.io.ros.storage import RawMessage
 from lce_rig.io.ros.topics import CLOUD_TYPES, PACKET_TYPES, Target, choose_topics
 from lce_rig.io.velodyne.points import OFFSETS_NOTE
 from lce_rig.io.velodyne.stream import Vlp16Stream
@@ -337,11 +336,12 @@ class BagRecording:
             {s: span for s, span in self.streams.items() if s.kind == kind} for kind in ("events", "scans")
         )
         self.notes += check_overlap(scans, events, rig)
-        for journal in self._bag.unmerged_journals():
-            hint = "its last messages are not read; opening the bag once with sqlite3 merges them"
-            self.notes.append(f"{journal.name} lies beside the bag: {hint}")
-        if self._bag.damage:
-            self.notes.append(f"{path.name}: damaged ({self._bag.damage}); read as far as it goes")
+        for file in self._bag.files:
+            journal = file.with_name(f"{file.name}-wal")
+            if journal.exists() and journal.stat().st_size:
+                hint = "its last messages are not read; opening the bag once with sqlite3 merges them"
+                self.notes.append(f"{journal.name} lies beside the bag: {hint}")
+        self.notes += [f"skipped: {error.what}" for error in self._bag.damages]
 
     def samples(self) -> Iterator[Sample]:
         """Yield images and scans in the order the recorder received them, and events by their timestamps.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SourceError
-from lce_rig.io.ros.bag_file import BagFile, list_topics
+from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import EVENT_TYPES
 from lce_rig.io.ros.message_fields import MessageReader, read_header
 from lce_rig.io.ros.rosbag import (
@@ -19,7 +19,6 @@ from lce_rig.io.ros.rosbag import (
     decode_ros_image,
     deserialize,
 )
-from lce_rig.io.ros.storage import RawMessage
 from lce_rig.io.ros.topics import CLOUD_TYPES, IMAGE_TYPES, PACKET_TYPES
 
 _INFO = "sensor_msgs/CameraInfo"
