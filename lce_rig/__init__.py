@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lce_rig.calibrate import CalibrateOptions
     from lce_rig.collect import CollectOptions
+    from lce_rig.core.calibration import Calibration, ResultFile, read_result
     from lce_rig.core.data import Events, Image, Scan
     from lce_rig.core.errors import (
         LceRigError,
@@ -31,11 +32,9 @@ if TYPE_CHECKING:
         UsageError,
     )
     from lce_rig.core.findings import Finding, Refusal
-    from lce_rig.core.results import Calibration
     from lce_rig.detect.detection import Detections
     from lce_rig.export import export
     from lce_rig.export.reference import Reference, read_reference
-    from lce_rig.export.result import SavedResult, read_result
     from lce_rig.io.protocol import SourceOptions
     from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
@@ -64,9 +63,9 @@ __all__ = [
     "Refusal",
     "Repeat",
     "Result",
+    "ResultFile",
     "ResultRefusedError",
     "Rig",
-    "SavedResult",
     "Scan",
     "Session",
     "SessionError",
@@ -99,14 +98,13 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
 _HOMES = {
     "lce_rig.calibrate": ("CalibrateOptions",),
     "lce_rig.collect": ("CollectOptions",),
+    "lce_rig.core.calibration": ("Calibration", "ResultFile", "read_result"),
     "lce_rig.core.data": ("Events", "Image", "Scan"),
     "lce_rig.core.errors": tuple(name for name in __all__ if name.endswith("Error")),
     "lce_rig.core.findings": ("Finding", "Refusal"),
-    "lce_rig.core.results": ("Calibration",),
     "lce_rig.detect.detection": ("Detections",),
     "lce_rig.export": ("export",),
     "lce_rig.export.reference": ("Reference", "read_reference"),
-    "lce_rig.export.result": ("SavedResult", "read_result"),
     "lce_rig.pipeline.collect_recordings": ("collect_from",),
     "lce_rig.pipeline.detect_session": ("detect",),
     "lce_rig.pipeline.drift": ("DriftReport", "drift"),

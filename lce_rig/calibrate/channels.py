@@ -34,9 +34,10 @@ from lce_rig.calibrate.shared_scans import (
     time_sigmas_s,
 )
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import ChannelResult
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference
-from lce_rig.core.results import ChannelResult, Observation
+from lce_rig.core.results import Observation
 
 # Fewer captures with known motion do not determine time offsets.
 _MIN_MOVING = 6

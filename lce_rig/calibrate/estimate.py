@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from lce_rig.calibrate.known_lidar import KnownLidar
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.tolerances import Sensitivity
+from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Metrics
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import CaptureResidual, Certificate, ChannelResult, Metrics, Observation
+from lce_rig.core.results import Observation
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,9 @@ from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.likelihood.calibrate_jointly import calibrate_by_likelihood
 from lce_rig.calibrate.options import CaptureCandidates, EstimateSettings, Estimator
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import Method
 from lce_rig.core.findings import Finding
-from lce_rig.core.results import Method, Observation
+from lce_rig.core.results import Observation
 from lce_rig.words import not_enough
 
 Progress = Callable[[int, int], None]

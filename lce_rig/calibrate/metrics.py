@@ -7,8 +7,9 @@ import numpy as np
 from lce_rig.calibrate.features import AS_MEASURED, extract_features
 from lce_rig.calibrate.plane_and_ends import ends_on_board, plane_residuals
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import CaptureResidual, Metrics
 from lce_rig.core.geometry import Array, rotation_angle
-from lce_rig.core.results import CaptureResidual, Metrics, Observation
+from lce_rig.core.results import Observation
 
 
 def capture_residual(

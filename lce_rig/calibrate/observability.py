@@ -8,9 +8,9 @@ from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.algorithm_1.registration import vec_rotation, with_one
 from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS
+from lce_rig.core.calibration import MOTIONS, Motion, WeakestMotion
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import MOTIONS, Motion, WeakestMotion
 from lce_rig.words import not_enough
 
 # Standard deviation of one capture's board plane between camera and LiDAR.

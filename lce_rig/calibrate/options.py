@@ -8,7 +8,8 @@ from lce_rig.calibrate.features import AS_FITTED, FeatureSettings
 from lce_rig.calibrate.known_lidar import KnownLidar
 from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.board import Board
-from lce_rig.core.results import DEFAULT_METHOD, ImageBoard, LidarBoard, Method, Observation
+from lce_rig.core.calibration import DEFAULT_METHOD, Method
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.rig import LidarSettings
 
 EDGE_SHIFT_SIGMA_M = 0.015

@@ -11,10 +11,11 @@ from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.observability import lever_arm
 from lce_rig.calibrate.placements import group_placements
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import Certificate
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, sigma_sizes
-from lce_rig.core.results import Certificate, Observation
+from lce_rig.core.results import Observation
 
 # For methods without a certificate.
 NO_CERTIFICATE = Certificate(is_optimal=False, gap=float("inf"))

@@ -17,10 +17,16 @@ from lce_rig.cli.options import (
     robot_option,
     split_names,
 )
+from lce_rig.core.calibration import (
+    DEFAULT_METHOD,
+    AxisOpinion,
+    Calibration,
+    Method,
+    OtherCamera,
+    SceneOpinion,
+)
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, sigma_sizes
-from lce_rig.core.results import DEFAULT_METHOD, Calibration, Method, OtherCamera
-from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
 from lce_rig.detect.detection import Pair
 from lce_rig.words import not_enough, sentence
 from lce_rig.words.extrinsics import motion_words, weakest_words
@@ -184,7 +190,7 @@ def _camera_lines(camera: str, other: OtherCamera) -> list[str]:
 
 
 if TYPE_CHECKING:
-    from lce_rig.pipeline.result_files import WrittenResults
+    from lce_rig.pipeline.result_files import WrittenResult
 
 
 @click.command()
@@ -353,7 +359,7 @@ def _earlier_result_named(folder: Path) -> Iterator[None]:
         raise
 
 
-def _tell_earlier(written: "WrittenResults") -> None:
+def _tell_earlier(written: "WrittenResult") -> None:
     """Say where the earlier run's files are, and which are usable."""
     has_exports = len(written.files) > 1
     if written.previous is None:

@@ -117,7 +117,7 @@ def _used(stored: Sequence["StoredResult"]) -> dict[str, list[str]]:
 
     used: dict[str, list[str]] = {}
     for result in stored:
-        for calibration in result.saved.pairs if result.name == CURRENT and result.saved else ():
+        for calibration in result.file.pairs if result.name == CURRENT and result.file else ():
             for name in calibration.captures_used:
                 used.setdefault(name, []).append(calibration.camera)
     return used

@@ -11,7 +11,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, json_option
 
 if TYPE_CHECKING:
-    from lce_rig.export.result import SavedResult
+    from lce_rig.core.calibration import ResultFile
     from lce_rig.pipeline.drift import DriftReport, PairDrift
     from lce_rig.rig import Rig
     from lce_rig.scene.drift import AxisDrift
@@ -58,8 +58,8 @@ def drift(
     Exits with 0 if no axis has changed, with 7 if one has, and with 6 if neither the scene nor the board can
     tell; of several cameras the worst counts.
     """
+    from lce_rig.core.calibration import read_result
     from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
-    from lce_rig.export.result import read_result
     from lce_rig.pipeline.drift import drift as watch_drift
     from lce_rig.rig import load_rig
     from lce_rig.words import as_line, describe, recommend
@@ -102,7 +102,7 @@ def drift(
 _JUDGING_S = 120.0
 
 
-def _watch_live(rig: "Rig", saved: "SavedResult", seconds: float | None) -> "DriftReport":
+def _watch_live(rig: "Rig", saved: "ResultFile", seconds: float | None) -> "DriftReport":
     """Watch attached sensors until the time is over, or a signal or q asks to stop."""
     from lce_rig.core.interrupts import patience
     from lce_rig.devices.opening import open_live

@@ -7,7 +7,6 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import session_argument, split_names
-from lce_rig.words import sentence
 
 if TYPE_CHECKING:
     from lce_rig.export.robot_tree import JointChange
@@ -102,13 +101,13 @@ def export(
 
         robot = None if tree is None else read_robot(tree)
         output.mkdir(parents=True, exist_ok=True)
-        exported = export_formats(
+        files, findings = export_formats(
             pairs, opened.rig, output, formats=formats, is_forced=force, session=opened, robot=robot
         )
-        for file in exported.files:
+        for file in files:
             show.say(str(file))
-        for finding in exported.findings:
-            (show.note if finding.severity == "note" else show.warn)(sentence(finding))
+        for finding in findings:
+            (show.note if finding.severity == "note" else show.warn)(finding.sentence)
         return
     from lce_rig.export import require_usable
     from lce_rig.export.robot_urdf import write_into_urdf

@@ -12,7 +12,7 @@ from lce_rig.cli import show
 from lce_rig.cli.fleet_deploy import deploy
 from lce_rig.cli.fleet_report import report
 from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
-from lce_rig.core.results import DEFAULT_METHOD, Method
+from lce_rig.core.calibration import DEFAULT_METHOD, Method
 
 if TYPE_CHECKING:
     from lce_rig.fleet.run import FleetRun

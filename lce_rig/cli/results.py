@@ -11,7 +11,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
 
 if TYPE_CHECKING:
-    from lce_rig.core.results import Calibration
+    from lce_rig.core.calibration import Calibration
     from lce_rig.pipeline.result_files import StoredResult
 
 
@@ -50,11 +50,11 @@ def _tables(stored: list["StoredResult"]) -> list[Any]:
     for each in stored:
         written = datetime.fromtimestamp(each.written_s).strftime("%Y-%m-%d %H:%M")
         name = show.escape(each.name)
-        for calibration in () if each.saved is None else each.saved.pairs:
+        for calibration in () if each.file is None else each.file.pairs:
             sensors = f"{calibration.camera} and {calibration.lidar}"
             table = tables.setdefault(sensors, _empty_table(show.escape(sensors)))
             table.add_row(name, *_cells(calibration), written)
-        if each.saved is None:
+        if each.file is None:
             tables.setdefault("", show.plain_table("", "result", "")).add_row(name, "[red]unreadable[/]")
     return list(tables.values())
 
@@ -94,7 +94,7 @@ def _document(stored: "StoredResult", session: Path) -> dict[str, Any]:
         "written_s": stored.written_s,
         "is_outdated": stored.is_outdated,
         "problem": stored.problem or None,
-        "pairs": [] if stored.saved is None else [_pair(each) for each in stored.saved.pairs],
+        "pairs": [] if stored.file is None else [_pair(each) for each in stored.file.pairs],
     }
 
 

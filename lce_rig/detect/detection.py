@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image
 from lce_rig.core.documents import parse_json
 from lce_rig.core.findings import Refusal
-from lce_rig.core.results import Calibration, EventQuality, ImageBoard, ImageQuality, LidarBoard, LidarQuality
+from lce_rig.core.results import EventQuality, ImageBoard, ImageQuality, LidarBoard, LidarQuality
 
 Arrays = dict[str, NDArray[Any]]
 LidarDetection = list[LidarBoard] | Refusal

@@ -7,15 +7,15 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, reading
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import difference, tangent_sizes
-from lce_rig.core.results import Calibration
+from lce_rig.export.findings import MOUNT_UNUSED
 from lce_rig.export.frames import require_known
 from lce_rig.export.job import ExportJob
 from lce_rig.export.robot_tree import RobotTree
 from lce_rig.rig import Rig
-from lce_rig.words import sentence
 
 if TYPE_CHECKING:
     from lce_rig.session import Session
@@ -90,19 +90,6 @@ EXPORTS: dict[str, Format] = {
 }
 
 
-@dataclass(frozen=True)
-class Exported:
-    """What was written.
-
-    Attributes:
-        files: in the order of the formats; those of a bag lie in a folder of their own.
-        findings: what is left out or in another form, and why.
-    """
-
-    files: tuple[Path, ...]
-    findings: tuple[Finding, ...]
-
-
 def load_exporter(name: str) -> Exporter:
     """Import the function of a format, from `ExportJob` to the files written.
 
@@ -131,10 +118,10 @@ def export(
     robot: RobotTree | None = None,
 ) -> list[Path]:
     """Write formats into a folder, each read back and checked; see `export_formats`, which also says more."""
-    exported = export_formats(
+    files, _ = export_formats(
         calibrations, rig, folder, formats=formats, is_forced=is_forced, session=session, robot=robot
     )
-    return list(exported.files)
+    return files
 
 
 def export_formats(
@@ -146,7 +133,7 @@ def export_formats(
     is_forced: bool = False,
     session: "Session | None" = None,
     robot: RobotTree | None = None,
-) -> Exported:
+) -> tuple[list[Path], list[Finding]]:
     """Write formats into a folder, each read back and checked by probe points.
 
     Exports of an earlier run are removed first, even if this one is refused, so that they are not mistaken
@@ -160,6 +147,10 @@ def export_formats(
         is_forced: write failed calibrations too; every file then says so.
         session: with images and scans, for formats that show them.
         robot: its own tree of frames, into which the outputs are to fit.
+
+    Returns:
+        The files in the order of the formats (those of a bag lie in a folder of their own), and findings
+        about content that is left out or in another form.
 
     Raises:
         LceRigError: a calibration names sensors that the rig does not have.
@@ -181,7 +172,7 @@ def export_formats(
     except BaseException:
         remove_exports(folder)
         raise
-    return Exported(tuple(paths), tuple(job.findings))
+    return paths, job.findings
 
 
 def _unused_mount(rig: Rig, robot: RobotTree | None) -> list[Finding]:
@@ -192,13 +183,7 @@ def _unused_mount(rig: Rig, robot: RobotTree | None) -> list[Finding]:
     angle_deg, distance_m = tangent_sizes(difference(joint.T_parent_child, rig.mount.to_matrix()))
     if joint.parent != rig.mount.parent or (angle_deg < 1e-4 and distance_m < 1e-6):
         return []
-    figures: dict[str, Figure] = {
-        "source": robot.source,
-        "frame": rig.mount.of,
-        "angle_deg": angle_deg,
-        "distance_m": distance_m,
-    }
-    return [Finding("export.mount_unused", "note", figures=figures)]
+    return [MOUNT_UNUSED(source=robot.source, frame=rig.mount.of, angle_deg=angle_deg, distance_m=distance_m)]
 
 
 def require_usable(calibrations: Sequence[Calibration], *, is_forced: bool = False) -> None:
@@ -210,7 +195,7 @@ def require_usable(calibrations: Sequence[Calibration], *, is_forced: bool = Fal
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed and not is_forced:
         pairs = ", ".join(f"{c.camera}/{c.channel} and {c.lidar}" for c in failed)
-        reasons = "; ".join(sentence(finding) for c in failed for finding in c.findings)
+        reasons = "; ".join(finding.sentence for c in failed for finding in c.findings)
         raise ResultRefusedError(f"not exported: the calibration of {pairs} failed", reasons)
 
 

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, pose
 from lce_rig.export.files import header, number, quoted, reads_back
+from lce_rig.export.findings import NO_FRAME
 from lce_rig.export.frames import T_BODY_OPTICAL, FrameTree
 from lce_rig.export.job import ExportJob
 from lce_rig.export.probes import check_pose
@@ -74,7 +74,7 @@ def export_autoware(job: ExportJob) -> list[Path]:
             paths.append(path)
         else:
             figures = {"format": "autoware", "file": BASE_FILE, "frame": BASE, "root": tree.root}
-            job.findings.append(Finding("export.no_frame", "note", tree.root, figures))
+            job.findings.append(NO_FRAME(tree.root, severity="note", **figures))
     return paths
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.findings import Finding
-from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, reads_back
+from lce_rig.export.findings import NO_IMAGES, NO_SESSION
 from lce_rig.export.job import ExportJob
 from lce_rig.scene.colouring import colour_points
 from lce_rig.session.capture import Capture
@@ -46,7 +46,7 @@ def export_ply_captures(job: ExportJob) -> list[Path]:
 
 def _write(job: ExportJob, name: str, *, is_split: bool) -> list[Path]:
     if job.session is None:
-        job.findings.append(Finding("export.no_session", "warning", figures={"format": name}))
+        job.findings.append(NO_SESSION(format=name))
         return []
     paths = []
     for calibration in job.chosen:
@@ -56,7 +56,7 @@ def _write(job: ExportJob, name: str, *, is_split: bool) -> list[Path]:
             if (cloud := _coloured(capture, calibration, job)) is not None
         }
         if not clouds:
-            job.findings.append(Finding("export.no_images", "warning", calibration.camera, {"format": name}))
+            job.findings.append(NO_IMAGES(calibration.camera, format=name))
             continue
         stem = f"coloured_{job.name_of(calibration)}"
         parts = {f"{stem}_{capture}": cloud for capture, cloud in clouds.items()}

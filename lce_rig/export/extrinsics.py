@@ -6,25 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, pose, transform
-from lce_rig.core.results import Calibration
-from lce_rig.export.files import (
-    MADE_BY,
-    header,
-    number,
-    numbers,
-    quoted,
-    reads_back,
-    rows,
-    texts,
-)
+from lce_rig.export.files import header, number, numbers, quoted, reads_back, rows, texts
 from lce_rig.export.job import ExportJob
 from lce_rig.export.probes import TOLERANCE, check_pose
 from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
 from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
-from lce_rig.words import sentence
 
 FILE_NAME = "extrinsics.yaml"
 
@@ -66,7 +56,7 @@ def _pair(calibration: Calibration, rig: Rig) -> list[str]:
         f"    camera_frame: {quoted(camera.optical_frame)}",
         f"    lidar_frame: {quoted(lidar.frame)}",
         f"    verdict: {calibration.verdict}",
-        f"    reasons: {texts(map(sentence, calibration.findings))}",
+        f"    reasons: {texts(finding.sentence for finding in calibration.findings)}",
     ]
     lines += _pose_block("T_cam_lidar", forward, calibration.T_cam_lidar)
     lines += [

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import pose
-from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, number, numbers, quoted, reads_back
 from lce_rig.export.job import ExportJob
 from lce_rig.export.lens import FittedLens, lens_for, lens_lines

@@ -9,12 +9,10 @@ from typing import Concatenate, ParamSpec, TypeVar
 import numpy as np
 import yaml
 
-import lce_rig
+from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import LceRigError, ResultRefusedError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
-from lce_rig.words import sentence
 
 _Arguments = ParamSpec("_Arguments")
 _Read = TypeVar("_Read")
@@ -23,7 +21,6 @@ _DAMAGE = (
     *(OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError),
     yaml.YAMLError,
 )
-MADE_BY = f"lce-rig {lce_rig.__version__}"
 
 
 def number(value: float) -> str:
@@ -78,7 +75,7 @@ def header(
         deg, mm = calibration.sigma_rotation_deg, 1e3 * calibration.sigma_translation_m
         lines.append(f"{pair}: {calibration.verdict}, standard deviation {deg:.3f} deg, {mm:.2f} mm")
         if calibration.verdict == "fail":
-            reasons = "; ".join(map(sentence, calibration.findings)) or "no reason given"
+            reasons = "; ".join(finding.sentence for finding in calibration.findings) or "no reason given"
             lines.append(f"NOT FOR USE: the calibration of {pair} failed: {' '.join(reasons.split())}")
     held = {calibration.camera for calibration in calibrations}
     lacking = [camera for camera in rig.cameras if camera not in held]

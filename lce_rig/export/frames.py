@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, pose
-from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
 
 # REP-103: z forward, x right, y down in the optical frame; x forward, y left, z up in the camera's own.

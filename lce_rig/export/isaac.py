@@ -6,7 +6,7 @@ References:
 
 from pathlib import Path
 
-from lce_rig.core.findings import Finding
+from lce_rig.export.findings import NO_FRAME
 from lce_rig.export.job import ExportJob
 from lce_rig.export.urdf import write_urdf
 
@@ -25,6 +25,7 @@ def export_isaac(job: ExportJob) -> list[Path]:
         if tree.root == _BASE:
             paths.append(write_urdf(job.folder / FILE_NAME, tree, job))
         else:
-            figures = {"format": "isaac", "file": FILE_NAME, "frame": _BASE, "root": tree.root}
-            job.findings.append(Finding("export.no_frame", "warning", tree.root, figures))
+            job.findings.append(
+                NO_FRAME(tree.root, format="isaac", file=FILE_NAME, frame=_BASE, root=tree.root)
+            )
     return paths

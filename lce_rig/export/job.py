@@ -6,8 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding
-from lce_rig.core.results import Calibration
 from lce_rig.export.frames import FrameTree, choose_channels
 from lce_rig.export.robot_tree import RobotTree, build_trees
 from lce_rig.rig import Rig

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert
-from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, numbers, quoted, reads_back, rows
 from lce_rig.export.job import ExportJob
 from lce_rig.export.lens import FittedLens, lens_for, lens_lines

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.core.geometry import Array
+from lce_rig.export.findings import LENS_FITTED
 from lce_rig.export.job import ExportJob
 
 # Points of the grid over the image to which another model is fitted.
@@ -84,10 +84,15 @@ def lens_for(job: ExportJob, name: str, camera: str, n_coefficients: int) -> Fit
     """
     lens = fit_coefficients(job.rig.cameras[camera].to_intrinsics(), n_coefficients)
     if lens.max_px:
-        figures: dict[str, Figure] = {"format": name, "n_coefficients": n_coefficients}
-        figures |= {"rms_px": lens.rms_px, "max_px": lens.max_px}
-        severity: Severity = "note" if lens.max_px < _COARSE_PX else "warning"
-        job.findings.append(Finding("export.lens_fitted", severity, camera, figures))
+        fitted = LENS_FITTED(
+            camera,
+            severity="note" if lens.max_px < _COARSE_PX else "warning",
+            format=name,
+            n_coefficients=n_coefficients,
+            rms_px=lens.rms_px,
+            max_px=lens.max_px,
+        )
+        job.findings.append(fitted)
     return lens
 
 

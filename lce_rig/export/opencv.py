@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, pose
-from lce_rig.core.results import Calibration
 from lce_rig.export.files import header, numbers, quoted, reads_back
 from lce_rig.export.job import ExportJob
 from lce_rig.export.probes import check_projection

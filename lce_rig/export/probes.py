@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
 
 TOLERANCE = 1e-6

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.geometry import Array, difference, invert, tangent_sizes
-from lce_rig.core.results import Calibration
 from lce_rig.export.frames import T_BODY_OPTICAL, FrameTree, Joint, check_tree, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.rig import Rig

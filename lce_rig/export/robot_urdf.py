@@ -12,9 +12,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import SessionError, SourceError, reading
-from lce_rig.core.results import Calibration
-from lce_rig.export.files import MADE_BY
 from lce_rig.export.frames import Joint, choose_channels
 from lce_rig.export.probes import check_pose
 from lce_rig.export.robot_tree import JointChange, RobotJoint, RobotTree, fit_tree

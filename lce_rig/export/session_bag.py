@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.findings import Finding
-from lce_rig.core.results import Calibration
+from lce_rig.export.findings import NO_IMAGES, NO_SESSION
 from lce_rig.export.job import ExportJob
 from lce_rig.export.ros_bag import bag_writer, camera_info, check_bag, ros_header, write_tf_static
 from lce_rig.io.ros.bag_recorder import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan
@@ -51,7 +51,7 @@ def export_mcap(job: ExportJob) -> list[Path]:
         SessionError: a capture is damaged, or the disk is full.
     """
     if job.session is None:
-        job.findings.append(Finding("export.no_session", "warning", figures={"format": "mcap"}))
+        job.findings.append(NO_SESSION(format="mcap"))
         return []
     captures = job.session.captures
     folder = job.folder / f"{job.rig.name}_session"
@@ -76,7 +76,7 @@ def export_mcap(job: ExportJob) -> list[Path]:
                 _write_projected(topics, calibration, scans, images, time_ns, limits_m, job)
     for name in dict.fromkeys(c.camera for c in job.chosen):
         if name not in seen:
-            job.findings.append(Finding("export.no_images", "warning", name, {"format": "mcap"}))
+            job.findings.append(NO_IMAGES(name, format="mcap"))
     check_bag(folder, job)
     return sorted(folder.iterdir())
 

@@ -21,9 +21,9 @@ except ModuleNotFoundError as error:
 
     raise SourceError(f"{error.name} is not installed", "pip install 'lce-rig[fleet]'") from error
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration
 from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import lce_rig as lce
+from lce_rig.core.calibration import DEFAULT_METHOD, MADE_BY, Method, Provenance
 from lce_rig.core.errors import (
     LceRigError,
     NotEnoughDataError,
@@ -20,9 +21,7 @@ from lce_rig.core.errors import (
     UsageError,
 )
 from lce_rig.core.findings import Finding
-from lce_rig.core.results import DEFAULT_METHOD, Method
 from lce_rig.detect.detection import Detections
-from lce_rig.export.files import MADE_BY
 from lce_rig.fleet import findings as _kinds  # noqa: F401
 from lce_rig.fleet.jobs import Job, folder_name
 from lce_rig.fleet.process import Ended
@@ -35,7 +34,7 @@ from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import Session
 from lce_rig.session.durable import replace_file
 from lce_rig.session.identity import MARKER
-from lce_rig.session.provenance import Provenance, provenance_of
+from lce_rig.session.provenance import provenance_of
 from lce_rig.session.session import (
     CALIBRATION,
     DEBUG,

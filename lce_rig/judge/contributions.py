@@ -16,10 +16,10 @@ import numpy as np
 
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.tolerances import Sensitivity, Source
+from lce_rig.core.calibration import Contribution
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, sigma_sizes, tangent_sizes
-from lce_rig.core.results import Contribution
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck
 from lce_rig.judge.nuisances import Nuisances
 from lce_rig.judge.split_consistency import Contrast, objections

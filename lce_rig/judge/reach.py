@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lce_rig.core.calibration import PointUncertainty
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, skew
-from lce_rig.core.results import PointUncertainty
 
 DISTANCES_M = (5.0, 10.0, 20.0)
 # Beyond some radius the distortion is undefined; corners are moved to that radius.

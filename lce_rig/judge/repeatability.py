@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 
 from lce_rig.calibrate.relative_pose import mean_pose
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, difference, log_so3
-from lce_rig.core.results import Calibration
 
 # Calibrations disagree if correct ones spread this far with less than this probability.
 _CHANCE = 0.01

@@ -9,10 +9,10 @@ from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.local_quadratic import SCALE, expand
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.tolerances import Sensitivity
+from lce_rig.core.calibration import Contribution
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Contribution
 from lce_rig.judge.contributions import (
     KnownBetter,
     channels_contradiction,

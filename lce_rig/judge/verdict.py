@@ -7,10 +7,9 @@ import numpy as np
 
 from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion, WeakestMotion
 from lce_rig.core.findings import Figure, Finding, ranked
 from lce_rig.core.geometry import Array, largest_sizes, rotation_angle, sigma_sizes, tangent_sizes
-from lce_rig.core.results import MOTIONS, Calibration, Metrics, WeakestMotion
-from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.judge.contributions import largest, measure_action, uncertainty_notes
 from lce_rig.judge.intrinsics_check import explain
 from lce_rig.judge.negative_control import control_findings

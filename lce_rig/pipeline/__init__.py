@@ -13,7 +13,7 @@ from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection,
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.pipeline.detect_session import detect, detection_digest, event_picture
 from lce_rig.pipeline.matching import refusals_of
-from lce_rig.pipeline.result_files import Result, inputs_sha256, write_results
+from lce_rig.pipeline.result_files import Result, inputs_sha256
 from lce_rig.pipeline.union import calibrate
 from lce_rig.pipeline.verification import verify, write_debug_images
 
@@ -32,5 +32,4 @@ __all__ = [
     "refusals_of",
     "verify",
     "write_debug_images",
-    "write_results",
 ]

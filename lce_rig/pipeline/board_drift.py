@@ -9,9 +9,10 @@ from lce_rig.calibrate.local_quadratic import SCALE, expand
 from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb
-from lce_rig.core.results import Calibration, ImageBoard, LidarBoard, Metrics, Observation
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.rig import LidarSettings, Rig

@@ -25,11 +25,12 @@ from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.observability import find_weakest
 from lce_rig.calibrate.relative_pose import relative_pose
 from lce_rig.calibrate.tolerances import Tolerances
+from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Figure, Finding, Refusal
 from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
-from lce_rig.core.results import Calibration, ImageBoard, OtherCamera, SceneShare
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.camera_pairs import CameraPair, camera_findings, relate

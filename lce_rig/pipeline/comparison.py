@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
-from lce_rig.core.results import Calibration
-from lce_rig.export.result import SavedResult, read_result
 from lce_rig.judge.repeatability import Repeatability, compare_calibrations
 from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detect_session import Progress, silent
@@ -266,7 +265,7 @@ def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
     return f"{name}: {sensors or 'its result holds no sensors'}"
 
 
-def _read(session: Session, folder: Path) -> SavedResult:
+def _read(session: Session, folder: Path) -> ResultFile:
     path = folder / RESULT
     saved = read_result(path)
     if saved.rig != session.rig.name:

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration, ImageBoard, LidarBoard
+from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.devices.reading import LiveSource
-from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.board_drift import BoardDrift, board_finding, watch_boards
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
@@ -167,7 +167,7 @@ class DriftReport:
 
 def drift(
     source: Path | str | Sequence[Path | str],
-    result: SavedResult | None = None,
+    result: ResultFile | None = None,
     *,
     rig: Rig | None = None,
     progress: Progress = silent,
@@ -207,7 +207,7 @@ def drift(
 
 def drift_live(
     rig: Rig,
-    result: SavedResult,
+    result: ResultFile,
     sources: Sequence[LiveSource],
     *,
     is_over: Callable[[int], bool],
@@ -229,7 +229,7 @@ def drift_live(
     return judge(rig, result, captures)
 
 
-def judge(rig: Rig, result: SavedResult, captures: SceneCaptures) -> DriftReport:
+def judge(rig: Rig, result: ResultFile, captures: SceneCaptures) -> DriftReport:
     """Judge a result by captures of a scene.
 
     Raises:

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.documents import read_json
 from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
 from lce_rig.core.findings import Refusal
 from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
-from lce_rig.export.files import MADE_BY, number, numbers
+from lce_rig.export.files import number, numbers
 from lce_rig.judge.weighing import verdict_of
 from lce_rig.lens.difference import lens_errors
 from lce_rig.pipeline.lens import MeasuredIntrinsics

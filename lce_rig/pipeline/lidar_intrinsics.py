@@ -7,9 +7,9 @@ import numpy as np
 
 from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, EstimateSettings, calibrate_channels
 from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors, estimate_lidar
+from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.export.files import MADE_BY
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.intrinsics_files import profile_text

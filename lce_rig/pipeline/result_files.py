@@ -6,22 +6,21 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
+from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.core.limits import read_file
-from lce_rig.core.results import Calibration
+from lce_rig.export import export_formats, is_export, remove_exports
 from lce_rig.pipeline.report_file import REPORT, report_text
 from lce_rig.session import Session
 from lce_rig.session.capture import SAFE_NAME
 from lce_rig.session.capture_files import MANIFEST
-from lce_rig.session.provenance import Provenance, provenance_of
+from lce_rig.session.durable import write_atomically
+from lce_rig.session.provenance import provenance_of
 from lce_rig.session.replacing import check_folder, copy_over
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
-
-if TYPE_CHECKING:
-    from lce_rig.export.result import SavedResult
 
 RESULT, OVERLAYS, PREVIOUS = "result.json", "overlays", "previous"
 UNION = "union"
@@ -29,6 +28,30 @@ UNION = "union"
 CURRENT = "current"
 """How the result in calibration/ is called beside those with names."""
 _LONGEST_NAME = 64
+
+
+class WrittenResult(NamedTuple):
+    """The files of a result after they were written.
+
+    Attributes:
+        files: result.json and the exports.
+        findings: what exports leave out or put differently, and why.
+        report: the page; None if it was not asked for.
+        previous: the folder with the earlier run's files; None if there was none.
+        has_usable_previous: whether that run had a usable result.
+        only_previous: cameras and LiDARs with a usable result there and no result in this run.
+        is_same: whether this result is identical byte for byte to the earlier one.
+        had_overlays: whether overlays of the earlier result moved to `previous`, and this one has none.
+    """
+
+    files: tuple[Path, ...]
+    findings: tuple[Finding, ...]
+    report: Path | None
+    previous: Path | None = None
+    has_usable_previous: bool = False
+    only_previous: tuple[str, ...] = ()
+    is_same: bool = False
+    had_overlays: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,29 +82,27 @@ class Result:
                 return pair
         raise NotEnoughDataError(f"no extrinsic of camera {camera}", "Collect more captures.")
 
-    @property
-    def provenance(self) -> Provenance:
-        """Where the result comes from: robot, sensors, date.
+    def file(self) -> ResultFile:
+        """Build result.json; other sessions are named by their path from the first.
 
         Raises:
-            SessionError: captures are of different robots, or of different units of a sensor.
+            SessionError: a capture that was used is missing; or captures are of different robots, or of
+                different units of a sensor.
         """
-        return provenance_of([*self.sessions.values()] or [self.session])
+        main = self.session.path.resolve()
+        return ResultFile(
+            rig=self.session.rig.name,
+            provenance=provenance_of([*self.sessions.values()] or [self.session]),
+            inputs_sha256=inputs_sha256(self.session, self.pairs, self.sessions),
+            sessions={
+                name: os.path.relpath(session.path.resolve(), main) for name, session in self.sessions.items()
+            },
+            pairs=self.pairs,
+        )
 
     def document(self) -> dict[str, Any]:
-        """Build the content of result.json from plain types.
-
-        Raises:
-            SessionError: a capture that was used is missing, or `provenance` raises it.
-            ResultRefusedError: a pose or covariance is not finite.
-        """
-        return _document(self.session, self.pairs, self.sessions)
-
-    def text(self) -> str:
-        """Write the content of result.json; raises like `document`."""
-        from lce_rig.export.result import layout
-
-        return layout(self.document())
+        """List the content of result.json as plain types; raises like `file` and `ResultFile.document`."""
+        return self.file().document()
 
     def write(
         self,
@@ -90,59 +111,84 @@ class Result:
         name: str | None = None,
         force: bool = False,
         report: bool = True,
-    ) -> "WrittenResults":
-        """Write result.json, the report and, unless a verdict is fail, all exports.
+    ) -> WrittenResult:
+        """Write result.json, the report and, unless a verdict is fail, all exports in place of earlier ones.
+
+        In the session all files of a run appear together. Those of the earlier run move to
+        calibration/previous/, except that neither a failed run nor one without a camera's only usable result
+        replaces a usable run there. If the result is identical byte for byte, overlays and
+        calibration/previous/ stay. Files that lce-rig did not write stay, too.
 
         Args:
-            folder: None, or the session's calibration/: the files there are replaced in one step, and the
-                earlier ones kept in calibration/previous/. In any other folder files are replaced one by one.
+            folder: None for the session's calibration/; in any other folder files are replaced one by one.
                 Several sessions' result goes into results/union/ of the first instead.
             name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched.
             force: export failed results too; each file then says so.
             report: write report.html, too; an earlier one does not stay beside another result.
 
         Raises:
-            SessionError: a capture that was used is missing, or the disk is full.
-            ResultRefusedError: a pose or covariance is not finite.
+            UsageError: the name is not valid.
+            SessionError: a capture that was used is missing, or the disk is full; the earlier files are
+                unchanged.
+            ResultRefusedError: a pose or covariance is not finite; the same.
         """
-        own = self.session.path / CALIBRATION
-        if folder is None or Path(folder).resolve() == own.resolve():
-            name = UNION if self.sessions and name is None else name
-            return write_results(
-                self.session, self.pairs, force=force, name=name, sessions=self.sessions, report=report
-            )
-        folder = Path(folder)
-        names, lacking = _write_files(
-            folder, self.session, self.pairs, self.sessions, force=force, report=report
+        if folder is not None and Path(folder).resolve() != (self.session.path / CALIBRATION).resolve():
+            folder = Path(folder)
+            names, findings = self._write_into(folder, force=force, report=report)
+            page = folder / REPORT if report else None
+            return WrittenResult(tuple(folder / file for file in names), findings, page)
+        parts = new_result_parts(UNION if self.sessions and name is None else name)
+        place = self.session.path.joinpath(*parts)
+        previous = place / PREVIOUS
+        is_same = had_overlays = False
+
+        def finish(earlier: Path, draft: Path) -> None:
+            nonlocal is_same, had_overlays
+            usable, kept = _usable(earlier), _usable(earlier / PREVIOUS)
+            deserves = (bool(usable) or not kept) and kept <= usable | _usable(draft)
+            is_same = keep_earlier(earlier, draft, RESULT, _is_of_a_result, deserves=deserves)
+            if is_same and (earlier / OVERLAYS).is_dir():
+                copy_over(earlier / OVERLAYS, draft / OVERLAYS)
+            # Also those of the result before: a run that was killed had no time to draw them.
+            has_drawn = any((folder / OVERLAYS).is_dir() for folder in (earlier, earlier / PREVIOUS))
+            had_overlays = has_drawn and not (draft / OVERLAYS).is_dir()
+
+        with self.session.replacing(*parts, finish=finish) as draft:
+            names, findings = self._write_into(draft, force=force, report=report)
+        usable = _usable(previous)
+        return WrittenResult(
+            tuple(place / file for file in names),
+            findings,
+            place / REPORT if report else None,
+            previous if (previous / RESULT).exists() else None,
+            bool(usable),
+            tuple(sorted(usable - {f"{c.camera} and {c.lidar}" for c in self.pairs})),
+            is_same,
+            had_overlays,
         )
-        files = tuple(folder / name for name in names)
-        page = _report_in(folder, report)
-        return WrittenResults(files, None, False, (), False, findings=lacking, report=page)
 
+    def _write_into(
+        self, folder: Path, *, force: bool, report: bool
+    ) -> tuple[list[str], tuple[Finding, ...]]:
+        """Write result.json, the report and the exports of usable results.
 
-@dataclass(frozen=True)
-class WrittenResults:
-    """The files in the session's calibration/ after a run.
-
-    Attributes:
-        files: the result.json and exports of this run.
-        previous: the folder with the earlier run's files; None if there was none.
-        has_usable_previous: whether that run had a usable result.
-        only_previous: cameras and LiDARs with a usable result there and no result in this run.
-        is_same: whether this result is identical byte for byte to the earlier one.
-        had_overlays: whether overlays of the earlier result moved to `previous`, and this one has none.
-        findings: what exports leave out or put differently, and why.
-        report: the page; None if it was not asked for.
-    """
-
-    files: tuple[Path, ...]
-    previous: Path | None
-    has_usable_previous: bool
-    only_previous: tuple[str, ...]
-    is_same: bool
-    had_overlays: bool = False
-    findings: tuple[Finding, ...] = ()
-    report: Path | None = None
+        Returns:
+            The files' names without the report's, and what exports lack.
+        """
+        file = self.file()
+        text = file.text()
+        write_atomically(folder / RESULT, text)
+        # Also in a folder whose files are replaced one by one, no report stays beside another result.
+        (folder / REPORT).unlink(missing_ok=True)
+        if report:
+            write_atomically(folder / REPORT, report_text(self.session, self.sessions, file, text, OVERLAYS))
+        usable = [c for c in self.pairs if force or c.verdict != "fail"]
+        if not usable:
+            remove_exports(folder)
+            return [RESULT], ()
+        rig = self.session.rig
+        files, findings = export_formats(usable, rig, folder, is_forced=force, session=self.session)
+        return [RESULT, *(str(path.relative_to(folder)) for path in files)], tuple(findings)
 
 
 def result_parts(name: str | None) -> tuple[str, ...]:
@@ -172,119 +218,6 @@ def new_result_parts(name: str | None) -> tuple[str, ...]:
     if name == CURRENT or parts[-1] == PREVIOUS:
         raise UsageError(f"no new result can be named {name!r}", "Choose another name.")
     return parts
-
-
-def write_results(
-    session: Session,
-    calibrations: Sequence[Calibration],
-    *,
-    force: bool,
-    name: str | None = None,
-    sessions: Mapping[str, Session] | None = None,
-    report: bool = True,
-) -> WrittenResults:
-    """Write result.json, the report and, unless a verdict is fail, all exports, replacing an earlier run's.
-
-    All files of a run appear together. Those of the earlier run move to calibration/previous/, except that
-    neither a failed run nor one without a camera's only usable result replaces a usable run there. If the
-    result is identical byte for byte, overlays and calibration/previous/ stay. Files that lce-rig did not
-    write stay, too.
-
-    Args:
-        session: whose result it is.
-        calibrations: the result.
-        force: export failed results too.
-        name: writes results/NAME/ instead of calibration/.
-        sessions: of an estimate from several, as in `Result`.
-        report: write report.html, too.
-
-    Raises:
-        UsageError: the name is not valid.
-        SessionError: a capture that was used is missing, or the disk is full; the earlier files are
-            unchanged.
-        ResultRefusedError: a pose or covariance is not finite; the same.
-    """
-    parts = new_result_parts(name)
-    folder = session.path.joinpath(*parts)
-    is_same = had_overlays = False
-
-    def finish(earlier: Path, draft: Path) -> None:
-        nonlocal is_same, had_overlays
-        is_same = _keep_earlier_results(earlier, draft)
-        # Also those of the result before: a run that was killed had no time to draw them.
-        has_drawn = any((folder / OVERLAYS).is_dir() for folder in (earlier, earlier / PREVIOUS))
-        had_overlays = has_drawn and not (draft / OVERLAYS).is_dir()
-
-    with session.replacing(*parts, finish=finish) as draft:
-        names, lacking = _write_files(
-            draft, session, calibrations, sessions or {}, force=force, report=report
-        )
-    previous = folder / PREVIOUS
-    return WrittenResults(
-        tuple(folder / name for name in names),
-        previous if (previous / RESULT).exists() else None,
-        is_usable(previous),
-        tuple(sorted(_usable(previous) - {f"{c.camera} and {c.lidar}" for c in calibrations})),
-        is_same,
-        had_overlays,
-        lacking,
-        _report_in(folder, report),
-    )
-
-
-def _report_in(folder: Path, is_written: bool) -> Path | None:
-    return folder / REPORT if is_written else None
-
-
-def _write_files(
-    folder: Path,
-    session: Session,
-    calibrations: Sequence[Calibration],
-    sessions: Mapping[str, Session],
-    *,
-    force: bool,
-    report: bool,
-) -> tuple[list[str], tuple[Finding, ...]]:
-    """Write result.json, the report and the exports of usable results.
-
-    Returns:
-        The files' names without the report's, and what exports lack.
-    """
-    from lce_rig.export import export_formats, remove_exports
-    from lce_rig.export.result import layout
-    from lce_rig.session.durable import write_atomically
-
-    usable = [c for c in calibrations if force or c.verdict != "fail"]
-    document = _document(session, calibrations, sessions)
-    text = layout(document)
-    write_atomically(folder / RESULT, text)
-    # Also in a folder whose files are replaced one by one, no report stays beside another result.
-    (folder / REPORT).unlink(missing_ok=True)
-    if report:
-        page = report_text(session, calibrations, sessions, document, text, OVERLAYS)
-        write_atomically(folder / REPORT, page)
-    if not usable:
-        remove_exports(folder)
-        return [RESULT], ()
-    exported = export_formats(usable, session.rig, folder, is_forced=force, session=session)
-    return [RESULT, *(str(path.relative_to(folder)) for path in exported.files)], exported.findings
-
-
-def _document(
-    session: Session, calibrations: Sequence[Calibration], sessions: Mapping[str, Session]
-) -> dict[str, Any]:
-    """Build the content of result.json; other sessions are named by their path from the first."""
-    from lce_rig.export.result import to_json_dict
-
-    own = session.path.resolve()
-    paths = {name: os.path.relpath(each.path.resolve(), own) for name, each in sessions.items()}
-    return to_json_dict(
-        session.rig.name,
-        calibrations,
-        inputs_sha256(session, calibrations, sessions),
-        paths,
-        provenance_of([*sessions.values()] or [session]),
-    )
 
 
 def inputs_sha256(
@@ -368,19 +301,11 @@ def _inputs(session: Session, used: Sequence[str]) -> dict[str, str]:
     return {PROFILE: profile, **manifests}
 
 
-def is_usable(folder: Path) -> bool:
-    """Return whether a folder holds the result of a calibration that did not fail."""
-    return bool(_usable(folder))
-
-
 def _usable(folder: Path) -> set[str]:
     """Name the cameras and LiDARs with a result in a folder that did not fail."""
-    from lce_rig.export.result import read_result
-
     with suppress(LceRigError):
-        return {
-            f"{c.camera} and {c.lidar}" for c in read_result(folder / RESULT).pairs if c.verdict != "fail"
-        }
+        pairs = read_result(folder / RESULT).pairs
+        return {f"{c.camera} and {c.lidar}" for c in pairs if c.verdict != "fail"}
     return set()
 
 
@@ -432,14 +357,13 @@ def keep_foreign(earlier: Path, draft: Path, is_ours: Callable[[Path], bool]) ->
             copy_over(entry, draft / entry.name)
 
 
-@dataclass(frozen=True, eq=False)
-class StoredResult:
+class StoredResult(NamedTuple):
     """A result of a session on the disk.
 
     Attributes:
         name: "current" and "previous" for those in calibration/, else the name of `calibrate --name`.
         folder: with its result.json.
-        saved: its content; None if it cannot be read.
+        file: its content; None if it cannot be read.
         problem: why it cannot be read; "" if it can.
         written_s: when it was written, seconds since 1970.
         is_outdated: whether the profile or a capture that it used has changed or is missing.
@@ -447,7 +371,7 @@ class StoredResult:
 
     name: str
     folder: Path
-    saved: "SavedResult | None"
+    file: ResultFile | None
     problem: str
     written_s: float
     is_outdated: bool
@@ -459,40 +383,39 @@ def stored_results(session: Session) -> list[StoredResult]:
     Raises:
         SessionError: their folders cannot be read.
     """
-    named = session.path / RESULTS
+    root = session.path / RESULTS
     try:
-        own = sorted(entry.name for entry in named.iterdir()) if named.is_dir() else []
+        entries = sorted(entry.name for entry in root.iterdir()) if root.is_dir() else []
     except OSError as error:
-        raise SessionError(f"{named} cannot be read: {error.strerror or error}") from error
+        raise SessionError(f"{root} cannot be read: {error.strerror or error}") from error
     names = [CURRENT, PREVIOUS]
-    for name in own:
+    for name in entries:
         if SAFE_NAME.fullmatch(name):
             names += [name, f"{name}/{PREVIOUS}"]
-    return [found for name in names if (found := _stored(session, name)) is not None]
+    results = []
+    for name in names:
+        folder = session.path.joinpath(*result_parts(name))
+        file, problem, written_s, is_outdated = None, "", 0.0, False
+        try:
+            written_s = (folder / RESULT).stat().st_mtime
+            file = read_result(folder / RESULT)
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError as error:
+            problem = f"{folder}: {error.strerror or error}"
+        except LceRigError as error:
+            problem = error.what
+        else:
+            is_outdated = _is_outdated(session, file)
+        results.append(StoredResult(name, folder, file, problem, written_s, is_outdated))
+    return results
 
 
-def _stored(session: Session, name: str) -> StoredResult | None:
-    from lce_rig.export.result import read_result
-
-    folder = session.path.joinpath(*result_parts(name))
-    try:
-        written_s = (folder / RESULT).stat().st_mtime
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except OSError as error:
-        return StoredResult(name, folder, None, f"{folder}: {error.strerror or error}", 0.0, False)
-    try:
-        saved = read_result(folder / RESULT)
-    except LceRigError as error:
-        return StoredResult(name, folder, None, error.what, written_s, False)
-    return StoredResult(name, folder, saved, "", written_s, _is_outdated(session, saved))
-
-
-def _is_outdated(session: Session, saved: "SavedResult") -> bool:
+def _is_outdated(session: Session, file: ResultFile) -> bool:
     """Return whether a result's inputs in its session have changed."""
     try:
-        sessions = {name: Session.open(session.path / path) for name, path in saved.sessions.items()}
-        return dict(saved.inputs_sha256) != inputs_sha256(session, saved.pairs, sessions)
+        sessions = {name: Session.open(session.path / path) for name, path in file.sessions.items()}
+        return dict(file.inputs_sha256) != inputs_sha256(session, file.pairs, sessions)
     except LceRigError:
         return True
 
@@ -510,19 +433,7 @@ def result_content(session: Session, name: str | None = None) -> bytes | None:
         raise SessionError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
-def _keep_earlier_results(earlier: Path, draft: Path) -> bool:
-    """Keep the last usable result, and overlays with their result; return whether both results are equal."""
-    usable, kept = _usable(earlier), _usable(earlier / PREVIOUS)
-    deserves = (bool(usable) or not kept) and kept <= usable | _usable(draft)
-    is_same = keep_earlier(earlier, draft, RESULT, _is_of_a_result, deserves=deserves)
-    if is_same and (earlier / OVERLAYS).is_dir():
-        copy_over(earlier / OVERLAYS, draft / OVERLAYS)
-    return is_same
-
-
 def _is_of_a_result(path: Path) -> bool:
-    from lce_rig.export import is_export
-
     return path.name in (RESULT, REPORT, OVERLAYS) or is_export(path)
 
 

@@ -9,14 +9,13 @@ from typing import TypeVar
 import numpy as np
 
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
+from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import transform
 from lce_rig.core.losses import Losses
-from lce_rig.core.results import Calibration
 from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
-from lce_rig.export.result import SavedResult
 from lce_rig.io import open_recordings
 from lce_rig.io.joining import join_recordings, require_sensors
 from lce_rig.io.protocol import ContinuousRecording, PairedRecording
@@ -91,7 +90,7 @@ class SceneCaptures:
         SessionError: the result belongs to another rig.
     """
 
-    def __init__(self, rig: Rig, result: SavedResult, source: str) -> None:
+    def __init__(self, rig: Rig, result: ResultFile, source: str) -> None:
         if result.rig != rig.name or not result.pairs:
             what = f"the result belongs to rig {result.rig!r}" if result.pairs else "the result holds no pair"
             raise SessionError(f"{what}; {source} belongs to rig {rig.name!r}")

@@ -8,10 +8,10 @@ import numpy as np
 from lce_rig.calibrate import CalibrationEstimate
 from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import Calibration, Extrinsics, SceneShare
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
-from lce_rig.core.results import Calibration, Extrinsics, SceneShare
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.weighing import reason
 from lce_rig.pipeline.witness import scene_views

@@ -12,10 +12,9 @@ from functools import partial
 from typing import TypeVar
 
 from lce_rig.calibrate import CalibrateOptions
+from lce_rig.core.calibration import Calibration, SceneOpinion
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.results import Calibration
-from lce_rig.core.scene_opinion import SceneOpinion
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.repeatability import Repeatability

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Refusal
-from lce_rig.core.results import Calibration, LidarBoard
+from lce_rig.core.results import LidarBoard
 from lce_rig.detect.detection import Detections, LidarDetection, Pair
 from lce_rig.detect.events.search import EventImage
-from lce_rig.export.result import SavedResult, read_result
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import Progress, detect, event_channels, event_picture, silent
 from lce_rig.pipeline.matching import match_sensors
@@ -114,7 +114,7 @@ class Verification:
 
 def verify(
     session: Session,
-    result: Result | SavedResult | None = None,
+    result: Result | ResultFile | None = None,
     detections: Detections | None = None,
     *,
     name: str | None = None,
@@ -158,7 +158,7 @@ def verify(
 
 
 def _extrinsics(
-    session: Session, result: Result | SavedResult | None, name: str | None
+    session: Session, result: Result | ResultFile | None, name: str | None
 ) -> tuple[Sequence[Calibration], bytes | None]:
     """Return the extrinsics to check, and the content of the session's result.json if it holds them."""
     content = result_content(session, name)
@@ -168,7 +168,7 @@ def _extrinsics(
     if isinstance(result, Result):
         rig, calibrations = result.session.rig.name, result.pairs
         is_own = result.session.path.resolve() == session.path.resolve()
-        content = content if is_own and result.text().encode() == content else None
+        content = content if is_own and result.file().text().encode() == content else None
         sessions: Iterable[str] = result.sessions
         inputs: Mapping[str, str] = inputs_sha256(result.session, result.pairs, result.sessions)
     else:

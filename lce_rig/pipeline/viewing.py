@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration, read_result
 from lce_rig.core.errors import SessionError
-from lce_rig.core.results import Calibration
-from lce_rig.export.result import read_result
 from lce_rig.pipeline.result_files import RESULT, result_parts
 from lce_rig.scene.colouring import colour_points
 from lce_rig.session import Capture, Session

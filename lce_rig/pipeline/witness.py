@@ -5,10 +5,9 @@ from contextlib import suppress
 
 import numpy as np
 
+from lce_rig.core.calibration import AxisOpinion, Calibration, Extrinsics, OpinionState, SceneOpinion
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SessionError
-from lce_rig.core.results import Calibration, Extrinsics
-from lce_rig.core.scene_opinion import AxisOpinion, OpinionState, SceneOpinion
 from lce_rig.detect.detection import Detections
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import evenly

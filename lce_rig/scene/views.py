@@ -7,10 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.calibration import Extrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, transform
-from lce_rig.core.results import Extrinsics, ImageBoard
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.rig import Rig

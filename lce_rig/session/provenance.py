@@ -2,13 +2,13 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from lce_rig.core.calibration import Provenance
 from lce_rig.core.errors import SessionError
 from lce_rig.core.limits import read_file
 from lce_rig.rig import Rig
@@ -18,23 +18,6 @@ from lce_rig.session.session import CAPTURED, Session
 # Timestamps before 2000 count from somewhere else than 1970, most often from when the sensor was switched on.
 _FIRST_UTC_NS = 946_684_800 * 10**9
 _LAST_UTC_NS = 4_102_444_800 * 10**9
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """Where a result comes from; a field is empty where nothing tells.
-
-    Attributes:
-        robot: its name, by the profile or `--robot`.
-        serials: serial numbers by sensor, as the devices told when captures were taken, else the profile's.
-        date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": when the sensors were so mounted.
-        session_sha256: fingerprint of captures and profile, see `content_sha256`.
-    """
-
-    robot: str = ""
-    serials: Mapping[str, str] = field(default_factory=dict)
-    date: str = ""
-    session_sha256: str = ""
 
 
 def provenance_of(sessions: Sequence[Session]) -> Provenance:

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Mapping
 
+from lce_rig.core.calibration import WeakestMotion
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.results import WeakestMotion
 from lce_rig.words.rendering import Phrase, Template, as_line, figures_apart
 
 _AXES = ("x right", "y down", "z forward")

@@ -11,9 +11,9 @@ from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
+from lce_rig.core.calibration import Calibration, Method
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration, Method
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.weighing import Verdict
 from lce_rig.rig import Rig

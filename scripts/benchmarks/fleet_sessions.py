@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 
 from benchmarks.kept import kept_folder
+from lce_rig.core.calibration import MOTIONS
 from lce_rig.core.geometry import Array, perturb
-from lce_rig.core.results import MOTIONS
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.session import Session

@@ -9,7 +9,7 @@ from benchmarks.still_sessions import still_session
 from benchmarks.tables import print_head, print_row
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
-from lce_rig.core.results import Method
+from lce_rig.core.calibration import Method
 from lce_rig.rig import load_rig
 from lce_rig.simulate import SimulationOptions
 

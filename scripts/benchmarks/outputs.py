@@ -20,9 +20,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from benchmarks.tables import print_head, print_row
+from lce_rig.core.calibration import Calibration, Certificate, Metrics
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, pose, transform
-from lce_rig.core.results import Calibration, Certificate, Metrics
 from lce_rig.export import EXPORTS, export_formats
 from lce_rig.export.lens import fit_coefficients
 from lce_rig.export.probes import probe_points
@@ -371,11 +371,19 @@ def outputs_case(rig_name: str, folder: Path, *, model: str = "radtan", seed: in
     T_cam_lidar = pose(
         exp_so3(np.array([1.2, -1.2, 1.2]) + 0.1 * rng.normal(size=3)), 0.1 * rng.normal(size=3)
     )
-    certificate, metrics = Certificate(True, 1e-9), Metrics(0.01, 0.01, 0.2)
-    cov = 1e-6 * np.eye(6)
     calibration = Calibration(
-        *(camera, (next(iter(settings.channels)),), lidar, T_cam_lidar, cov, certificate, metrics, 1, 1),
-        *(("000000",), {}, "pass"),
+        camera=camera,
+        channels=(next(iter(settings.channels)),),
+        lidar=lidar,
+        T_cam_lidar=T_cam_lidar,
+        cov=1e-6 * np.eye(6),
+        certificate=Certificate(True, 1e-9),
+        metrics=Metrics(0.01, 0.01, 0.2),
+        n_captures=1,
+        n_detected=1,
+        captures_used=("000000",),
+        captures_refused={},
+        verdict="pass",
     )
     intrinsics = cameras[camera].to_intrinsics()
     lens = "fisheye" if model == "fisheye" else model, intrinsics.matrix, np.array(intrinsics.distortion)

@@ -13,7 +13,8 @@ import numpy as np
 from benchmarks.paper_sets import LEVELS, LIDAR, PaperSet, paper_rig, paper_set
 from benchmarks.tables import compare, print_head, print_row, rms
 from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
-from lce_rig.core.results import ImageBoard, Method
+from lce_rig.core.calibration import Method
+from lce_rig.core.results import ImageBoard
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
 
 # Of the paper's Algorithm 1 on one set, by level.

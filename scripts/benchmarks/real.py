@@ -10,8 +10,9 @@ from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig import pipeline
 from lce_rig.calibrate import EstimateSettings
+from lce_rig.core.calibration import Method
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.results import ImageBoard, Method
+from lce_rig.core.results import ImageBoard
 from lce_rig.pipeline import Detections
 from lce_rig.rig import Rig
 

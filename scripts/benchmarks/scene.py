@@ -12,12 +12,11 @@ from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import print_head, print_row
 from lce_rig import pipeline
+from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, difference, perturb
-from lce_rig.core.results import Calibration
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.export.result import SavedResult
 from lce_rig.pipeline.drift import PairDrift, judge
 from lce_rig.pipeline.scene_captures import SceneCaptures, Seen
 from lce_rig.rig import Rig
@@ -104,7 +103,7 @@ class _Watched:
 
     def drift(self, views: list[SceneView], deployed: Calibration) -> PairDrift:
         """Judge a result by some captures as `lce-rig drift` does, by scene and boards."""
-        result = SavedResult(self.rig.name, "", (deployed,), {})
+        result = ResultFile(rig=self.rig.name, pairs=(deployed,))
         captures = SceneCaptures(self.rig, result, "a part")
         names = {view.capture for view in views}
         for each in self.samples:

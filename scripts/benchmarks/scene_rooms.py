@@ -11,9 +11,9 @@ from pathlib import Path
 from benchmarks.kept import kept_folder
 from benchmarks.recordings import RIGS
 from lce_rig import pipeline
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration
 from lce_rig.detect.detection import Detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.nominal import NominalExtrinsic

@@ -12,9 +12,9 @@ from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.scene_rooms import ROOMS, FurnishedRoom, furnished_room, only, with_few
 from benchmarks.tables import print_head, print_row
 from lce_rig import pipeline
+from lce_rig.core.calibration import Calibration, SceneShare
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, perturb, sigma_sizes, tangent_sizes
-from lce_rig.core.results import Calibration, SceneShare
 from lce_rig.pipeline.sharpening import share_of
 from lce_rig.pipeline.witness import scene_views
 from lce_rig.rig import Rig

@@ -31,9 +31,9 @@ from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.refine import to_extrinsic
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, Terms, assemble, linearise
 from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
+from lce_rig.core.calibration import Method
 from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, difference, invert
-from lce_rig.core.results import Method
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions
 

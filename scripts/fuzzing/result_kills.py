@@ -20,9 +20,9 @@ from pathlib import Path
 
 from fuzzing.report import Report
 from fuzzing.started import PATIENCE_S, must_end_well, said, start
+from lce_rig.core.calibration import read_result
 from lce_rig.core.errors import LceRigError
 from lce_rig.export import export
-from lce_rig.export.result import read_result
 from lce_rig.rig import load_rig
 
 _N_CAPTURES = 8

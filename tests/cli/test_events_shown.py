@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from lce_rig import pipeline
+from lce_rig.core.calibration import Calibration, Certificate, Metrics
 from lce_rig.core.geometry import invert
-from lce_rig.core.results import Calibration, Certificate, Metrics
-from lce_rig.export.result import write_result
 from lce_rig.rig import find_profile, load_rig
 from lce_rig.session import Session
 from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER
 from lce_rig.simulate import SimulationOptions, simulate_captures
+from tests.saved_results import write_result
 
 
 @pytest.fixture(scope="module")

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.core.calibration import Calibration, Certificate, Metrics, read_result
 from lce_rig.core.data import Image
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import perturb
-from lce_rig.core.results import Calibration, Certificate, Metrics
-from lce_rig.export.result import read_result, write_result
-from lce_rig.pipeline.result_files import write_results
+from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
+from tests.saved_results import write_result
 
 RLES = find_profile("rles").read_text(encoding="utf-8")
 BENT = Finding("verdict.few_used", figures={"n_used": 3, "n_captures": 20})
@@ -124,7 +124,7 @@ def test_results_that_contain_the_same_session_are_not_compared(lce_rig, made):
         (own,) = read_result(paths[name] / "calibration" / "result.json").pairs
         both = {name: opened[name], "tuesday": opened["tuesday"]}
         union = replace(own, captures_used=(f"{name}/000000", "tuesday/000000"))
-        write_results(opened[name], [union], force=False, name="union", sessions=both)
+        Result(opened[name], (union,), sessions=both).write(name="union")
     outcome = lce_rig("repeat", paths["monday"], paths["wednesday"], "--name", "union")
     assert outcome.code == 4
     assert "monday and wednesday share 1 captures" in outcome.err

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.cli.calibrate import uncertainty_lines
-from lce_rig.core.results import Calibration, Certificate, Metrics, PointUncertainty, WeakestMotion
+from lce_rig.core.calibration import Calibration, Certificate, Metrics, PointUncertainty, WeakestMotion
 
 WEAK = "translation along the camera's z axis (line of sight), sigma 104.9 mm"
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lce_rig.core.calibration import Calibration, Certificate, Metrics
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, exp_so3, pose
-from lce_rig.core.results import Calibration, Certificate, Metrics
 from lce_rig.rig import Rig, load_rig
 
 Make = Callable[..., Calibration]

@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
-from lce_rig.core.results import Calibration
 from lce_rig.export import EXPORTS, export, export_formats, load_exporter
 from lce_rig.export.camera_info import read_camera_info
 from lce_rig.export.frames import T_BODY_OPTICAL, check_tree
@@ -302,16 +302,16 @@ def test_kalibrs_chain_leads_from_each_camera_to_the_next(
 ) -> None:
     names = ("davis", "left", "fish")
     calibrations = [make(random_pose(i), camera=name, lidar="front") for i, name in enumerate(names)]
-    exported = export_formats(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"])
-    chain = yaml.safe_load(exported.files[0].read_text(encoding="utf-8"))
+    files, findings = export_formats(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"])
+    chain = yaml.safe_load(files[0].read_text(encoding="utf-8"))
     assert [block["distortion_model"] for block in chain.values()] == ["radtan", "radtan", "equidistant"]
     for index in (1, 2):
         T_cn_cnm1 = calibrations[index].T_cam_lidar @ np.linalg.inv(calibrations[index - 1].T_cam_lidar)
         np.testing.assert_allclose(chain[f"cam{index}"]["T_cn_cnm1"], T_cn_cnm1, atol=1e-12)
     # Kalibr's radtan ends at p2: the camera with eight coefficients gets four others, and that is told.
-    (finding,) = exported.findings
+    (finding,) = findings
     assert (finding.code, finding.subject) == ("export.lens_fitted", "left")
-    assert f"{finding.figure('max_px'):.3g} px at most" in exported.files[0].read_text(encoding="utf-8")
+    assert f"{finding.figure('max_px'):.3g} px at most" in files[0].read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("n_coefficients", [4, 5])

@@ -11,9 +11,9 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, SessionError, SourceError
 from lce_rig.core.geometry import Array, pose
-from lce_rig.core.results import Calibration
 from lce_rig.export import export, export_formats
 from lce_rig.export.frames import R_BODY_OPTICAL
 from lce_rig.export.robot_bag import read_robot_bag
@@ -162,8 +162,8 @@ def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles: Rig, make: Make
         build_trees([make()], elsewhere, whole)
     # The robot's own pose counts, and that is told.
     rig = rles.model_copy(update={"mount": mount})
-    exported = export_formats([make()], rig, tmp_path / "out", formats=["urdf"], robot=whole)
-    (finding,) = exported.findings
+    _, findings = export_formats([make()], rig, tmp_path / "out", formats=["urdf"], robot=whole)
+    (finding,) = findings
     assert finding.code == "export.mount_unused"
     assert (finding.figures["angle_deg"], finding.figures["distance_m"]) == pytest.approx(
         (90, np.hypot(0.1, 0.2))

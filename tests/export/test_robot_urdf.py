@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, exp_so3, pose
-from lce_rig.core.results import Calibration
 from lce_rig.export import export
 from lce_rig.export.robot_tree import fit_tree
 from lce_rig.export.robot_urdf import read_robot_urdf, write_into_urdf

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from lce_rig.cli.main import run
+from lce_rig.core.calibration import Provenance
 from lce_rig.core.errors import ProfileError, UsageError
-from lce_rig.export.result import layout, to_json_dict
 from lce_rig.fleet.deployment import FleetDeployment, Rollout, newest_results, read_rollout
 from lce_rig.fleet.registry import Registry, write_rows
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import Row
 from lce_rig.rig import dump_rig, load_rig
-from lce_rig.session.provenance import Provenance
 from tests.export.conftest import calibration, some_pose
+from tests.saved_results import result_file
 
 ROBOTS = tuple(f"r{k}" for k in range(1, 6))
 Add = Callable[..., None]
@@ -39,8 +39,8 @@ def add(registry: Registry) -> Add:
         with registry.result(row.folder) as draft:
             rig = load_rig("rles")
             origin = Provenance(robot, {}, date, "0f" * 32)
-            document = to_json_dict("rles", [calibration(some_pose(t=(x_m, 0, 0)))], provenance=origin)
-            (draft / "result.json").write_text(layout(document))
+            saved = result_file("rles", [calibration(some_pose(t=(x_m, 0, 0)))], provenance=origin)
+            (draft / "result.json").write_text(saved.text())
             (draft / "rig.yaml").write_text(dump_rig(rig))
             written = write_rows(draft, [row])
         registry.consolidate(written)

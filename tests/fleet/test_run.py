@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from lce_rig.export.result import read_result
+from lce_rig.core.calibration import read_result
 from lce_rig.fleet.jobs import Job, find_jobs
 from lce_rig.fleet.query import query
 from lce_rig.fleet.run import cluster, run_fleet, run_job

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.core.calibration import Calibration, Certificate, Metrics
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import exp_so3, perturb, pose
-from lce_rig.core.results import Calibration, Certificate, Metrics
 from lce_rig.judge.repeatability import compare_calibrations
 
 TRUTH = pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.1, -0.06, -0.08]))

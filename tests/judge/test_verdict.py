@@ -8,9 +8,9 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.report import NO_CERTIFICATE
+from lce_rig.core.calibration import Certificate
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import perturb
-from lce_rig.core.results import Certificate
 from lce_rig.judge.validate import validate
 from lce_rig.judge.verdict import judge
 from lce_rig.lens.lens_estimate import BoardView

@@ -6,7 +6,7 @@ import pytest
 
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
-from lce_rig.core.results import Method
+from lce_rig.core.calibration import Method
 from lce_rig.detect.detection import Detections
 from lce_rig.rig import find_profile, parse_rig, set_value
 from tests.calibrate.boards import simulate

@@ -9,15 +9,16 @@ import pytest
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.cli.calibrate import camera_lines, together_lines
+from lce_rig.core.calibration import read_result
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, invert
 from lce_rig.detect.detection import Detections
 from lce_rig.export import export
-from lce_rig.export.result import read_result, write_result
 from lce_rig.export.urdf import read_urdf
 from lce_rig.rig import load_rig
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
+from tests.saved_results import write_result
 
 RIG = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
 ML, PAPER = CalibrateOptions(method="ml", n_draws=0), CalibrateOptions("paper", n_draws=0)

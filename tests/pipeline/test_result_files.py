@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from lce_rig.core.calibration import read_result
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError
-from lce_rig.export.result import read_result
-from lce_rig.pipeline import result_files
-from lce_rig.pipeline.result_files import Result, is_usable, keep_earlier, result_content
+from lce_rig.pipeline.result_files import Result, keep_earlier, result_content
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from tests.export.conftest import calibration, reason, some_pose
@@ -19,9 +18,9 @@ OTHER = calibration(some_pose((1.2, -1.3, 1.0)), captures_used=())
 FAILED = calibration(verdict="fail", findings=(reason("too few"),), captures_used=())
 
 
-def write_results(session, calibrations, *, report=False, **options):
+def write(session, *calibrations, report=False, force=False):
     """Most of these tests need no page, which takes longer than all other files."""
-    return result_files.write_results(session, calibrations, report=report, **options)
+    return Result(session, calibrations).write(report=report, force=force)
 
 
 @pytest.fixture
@@ -44,12 +43,12 @@ def pose_in(folder):
 
 
 def test_the_earlier_result_becomes_the_previous_one_with_its_exports(session, folder):
-    first = write_results(session, [GOOD], force=False)
+    first = write(session, GOOD)
     assert first.previous is None and not first.is_same
     (folder / "overlays").mkdir()
     (folder / "overlays" / "000000.png").write_bytes(b"drawn")
     exported = (folder / "extrinsics.yaml").read_bytes()
-    second = write_results(session, [OTHER], force=False)
+    second = write(session, OTHER)
     assert second.has_usable_previous and second.previous == folder / "previous"
     assert (pose_in(folder) == OTHER.T_cam_lidar).all()
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
@@ -61,15 +60,15 @@ def test_the_earlier_result_becomes_the_previous_one_with_its_exports(session, f
 
 
 def test_no_number_of_failures_takes_the_last_usable_result_away(session, folder):
-    write_results(session, [GOOD], force=False)
+    write(session, GOOD)
     for k in range(3):
         failed = calibration(verdict="fail", findings=(reason(f"{k}"),), captures_used=())
-        written = write_results(session, [failed], force=False)
+        written = write(session, failed)
         assert written.has_usable_previous
         assert names(folder) == {"result.json", "previous"}
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
     assert (folder / "previous" / "extrinsics.yaml").exists()
-    write_results(session, [OTHER], force=False)
+    write(session, OTHER)
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
 
 
@@ -84,51 +83,49 @@ def test_no_number_of_runs_of_one_camera_takes_the_other_ones_result_away(tmp_pa
     session.path.mkdir()
     (session.path / "rig.yaml").touch()
     left, right = replace(GOOD, camera="left"), replace(GOOD, camera="right")
-    assert write_results(session, [left, right], force=False).only_previous == ()
+    assert write(session, left, right).only_previous == ()
     for k in range(3):
         again = replace(OTHER, camera="left", findings=(reason(f"{k}"),))
-        (only,) = write_results(session, [again], force=False).only_previous
+        (only,) = write(session, again).only_previous
         assert only.startswith("right ")
         kept = read_result(folder / "previous" / "result.json").pairs
         assert [c.camera for c in kept] == ["left", "right"]
-    assert write_results(session, [left, right], force=False).only_previous == ()
+    assert write(session, left, right).only_previous == ()
     assert [c.camera for c in read_result(folder / "previous" / "result.json").pairs] == ["left"]
 
 
 def test_without_a_usable_result_the_last_failed_one_is_kept(session, folder):
-    write_results(session, [FAILED], force=False)
-    written = write_results(session, [calibration(verdict="fail", captures_used=())], force=True)
+    write(session, FAILED)
+    written = write(session, calibration(verdict="fail", captures_used=()), force=True)
     assert written.previous is not None and not written.has_usable_previous
     assert read_result(folder / "previous" / "result.json").pairs[0].findings == (reason("too few"),)
 
 
 def test_a_forced_failure_does_not_count_as_usable(session, folder):
-    write_results(session, [GOOD], force=False)
+    write(session, GOOD)
     for k in range(2):
-        write_results(
-            session, [calibration(verdict="fail", findings=(reason(f"{k}"),), captures_used=())], force=True
-        )
+        write(session, calibration(verdict="fail", findings=(reason(f"{k}"),), captures_used=()), force=True)
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
 
 
 def test_the_same_result_again_keeps_overlays_and_the_previous_one(session, folder):
-    write_results(session, [GOOD], force=False)
-    write_results(session, [OTHER], force=False)
+    write(session, GOOD)
+    write(session, OTHER)
     (folder / "overlays").mkdir()
     (folder / "overlays" / "000000.png").write_bytes(b"drawn")
-    written = write_results(session, [OTHER], force=False)
+    written = write(session, OTHER)
     assert written.is_same
     assert (folder / "overlays" / "000000.png").read_bytes() == b"drawn"
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
 
 
 def test_what_the_user_put_there_stays(session, folder):
-    write_results(session, [GOOD], force=False)
+    write(session, GOOD)
     (folder / "notes.txt").write_text("on Tuesday")
     (folder / "photos").mkdir()
     (folder / "photos" / "rig.jpg").write_bytes(b"x")
-    write_results(session, [OTHER], force=False)
-    write_results(session, [FAILED], force=False)
+    write(session, OTHER)
+    write(session, FAILED)
     assert (folder / "notes.txt").read_text() == "on Tuesday"
     assert (folder / "photos" / "rig.jpg").read_bytes() == b"x"
     assert "notes.txt" not in names(folder / "previous")
@@ -137,35 +134,35 @@ def test_what_the_user_put_there_stays(session, folder):
 def test_what_the_user_put_beside_the_previous_result_stays(session, folder):
     (folder / "previous").mkdir(parents=True)
     (folder / "previous" / "notes.txt").write_text("on Tuesday")
-    assert write_results(session, [GOOD], force=False).previous is None
+    assert write(session, GOOD).previous is None
     for result in (OTHER, GOOD, GOOD, FAILED):
-        assert write_results(session, [result], force=False).previous == folder / "previous"
+        assert write(session, result).previous == folder / "previous"
         assert (folder / "previous" / "notes.txt").read_text() == "on Tuesday"
 
 
 @pytest.mark.parametrize("name", ["calibration", "calibration/previous"])
 def test_a_file_in_place_of_a_folder_is_refused_and_stays(session, folder, name):
     if name != "calibration":
-        write_results(session, [GOOD], force=False)
+        write(session, GOOD)
     (session.path / name).write_text("mine")
     with pytest.raises(SessionError, match=f"{Path(name).name} is a file, not a folder"):
-        write_results(session, [OTHER], force=False)
+        write(session, OTHER)
     assert (session.path / name).read_text() == "mine"
     assert not list(session.path.glob(".new-*"))
 
 
 def test_a_result_that_cannot_be_written_leaves_the_earlier_one(session, folder):
-    write_results(session, [GOOD], force=False)
+    write(session, GOOD)
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(ResultRefusedError, match="not finite"):
-        write_results(session, [calibration(OTHER.T_cam_lidar * float("nan"), captures_used=())], force=False)
+        write(session, calibration(OTHER.T_cam_lidar * float("nan"), captures_used=()))
     with pytest.raises(SessionError, match="no capture '000000'"):
-        write_results(session, [calibration()], force=False)
+        write(session, calibration())
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:
         with pytest.raises(SessionError, match="cannot be written"):
-            write_results(session, [OTHER], force=False)
+            write(session, OTHER)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
@@ -176,16 +173,14 @@ def test_a_link_in_place_of_the_folder_is_refused(session, folder, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     folder.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(SessionError, match="it is a link"):
-        write_results(session, [GOOD], force=False)
+        write(session, GOOD)
     assert not names(tmp_path / "elsewhere")
 
 
 def test_a_damaged_result_is_not_usable(folder, session):
-    write_results(session, [GOOD], force=False)
-    assert is_usable(folder)
+    write(session, GOOD)
     (folder / "result.json").write_text("{")
-    assert not is_usable(folder)
-    assert not is_usable(session.path / "nowhere")
+    assert not write(session, OTHER).has_usable_previous
 
 
 def test_nothing_becomes_previous_where_there_was_no_result(tmp_path):
@@ -200,7 +195,7 @@ def test_a_folder_in_place_of_the_result_is_no_result_and_is_kept(session, folde
     (folder / "result.json").mkdir(parents=True)
     (folder / "result.json" / "note").write_text("mine")
     assert result_content(session) is None
-    write_results(session, [GOOD], force=False)
+    write(session, GOOD)
     assert (pose_in(folder) == GOOD.T_cam_lidar).all()
     assert (folder / "previous" / "result.json" / "note").read_text() == "mine"
 
@@ -213,7 +208,7 @@ def test_a_result_in_a_folder_elsewhere_leaves_the_session_as_it_is(session, tmp
         assert names(tmp_path / "elsewhere") == {*(path.name for path in written.files), "report.html"}
     assert not (session.path / "calibration").exists()
     in_session = result.write(str(session.path / "calibration"))
-    assert result_content(session) == result.text().encode()
+    assert result_content(session) == result.file().text().encode()
     assert in_session.files[0].parent == session.path / "calibration"
 
 
@@ -225,12 +220,12 @@ def test_the_extrinsic_of_a_camera_is_given_by_its_name(session):
 
 
 def test_the_report_stays_with_its_result(session, folder):
-    first = write_results(session, [GOOD], force=False, report=True)
+    first = write(session, GOOD, report=True)
     assert first.report == folder / "report.html"
     page = first.report.read_bytes()
-    write_results(session, [OTHER], force=False, report=True)
+    write(session, OTHER, report=True)
     assert (folder / "previous" / "report.html").read_bytes() == page != first.report.read_bytes()
-    without = write_results(session, [OTHER], force=False)
+    without = write(session, OTHER)
     assert without.report is None and not first.report.exists()
 
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lce_rig.core.results import Calibration, Certificate, Metrics
-from lce_rig.export.result import write_result
+from lce_rig.core.calibration import Calibration, Certificate, Metrics
 from lce_rig.rig import Rig, find_profile, parse_rig, set_value
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import build_view
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, simulate_captures, truth_extrinsics
+from tests.saved_results import write_result
 
 COV = np.diag([0.003] * 3 + [0.0015] * 3) ** 2
 SEED = 2

@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3
-from lce_rig.core.results import Calibration
-from lce_rig.export.result import SavedResult
 from lce_rig.pipeline.drift import PairDrift, judge
 from lce_rig.pipeline.scene_captures import SceneCaptures
 from lce_rig.rig import Rig
@@ -69,7 +68,7 @@ def judge_corrupted(
 ) -> PairDrift:
     """Judge extrinsics by corrupted captures."""
     rng = np.random.default_rng(0)
-    result = SavedResult(rig.name, "a benchmark", (deployed,), {})
+    result = ResultFile(rig=rig.name, pairs=(deployed,))
     taken = SceneCaptures(rig, result, "the simulated room")
     for capture in captures:
         image, scan = corrupt(capture.images[0], capture.scans[0], rng)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.geometry import difference, perturb
-from lce_rig.core.results import Calibration
 from lce_rig.scene.alignment import AXES, Alignment
 from lce_rig.scene.depth_edges import CHANNELS
 from lce_rig.scene.drift import watch

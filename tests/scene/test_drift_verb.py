@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from lce_rig.cli.main import run
+from lce_rig.core.calibration import ResultFile, read_result
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
-from lce_rig.export.result import SavedResult, read_result, write_result
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.io.velodyne.datagrams import build_frame
 from lce_rig.pipeline.drift import drift, judge
@@ -30,6 +30,7 @@ from tests.doctor.attached import Attached, attach
 from tests.io.events.aedat4_files import RawFrame, write_davis
 from tests.io.test_pcap import to_datagram, write_pcap
 from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of
+from tests.saved_results import write_result
 
 
 @pytest.fixture
@@ -144,7 +145,7 @@ def test_of_several_cameras_the_worst_counts(seen, two_cameras, tmp_path, capsys
 
 def test_a_camera_that_was_not_recorded_costs_only_itself(seen, two_cameras, tmp_path) -> None:
     bag = record(tmp_path / "one.bag", seen.rig, seen.captures)
-    result = SavedResult(seen.rig.name, "a test", (seen.truth, replace(seen.truth, camera="cam2")), {})
+    result = ResultFile(rig=seen.rig.name, pairs=(seen.truth, replace(seen.truth, camera="cam2")))
     first, second = drift(bag, result, rig=two_cameras).pairs
     assert (first.state, second.state) == ("unchanged", "unknown")
     assert second.summary.code == "scene.no_samples" and second.summary.subject == "cam2"
@@ -152,7 +153,7 @@ def test_a_camera_that_was_not_recorded_costs_only_itself(seen, two_cameras, tmp
 
 def test_a_recording_without_the_result_s_camera_is_an_error(seen, two_cameras, tmp_path) -> None:
     bag = record(tmp_path / "one.bag", seen.rig, seen.captures[:1])
-    result = SavedResult(seen.rig.name, "a test", (replace(seen.truth, camera="cam2"),), {})
+    result = ResultFile(rig=seen.rig.name, pairs=(replace(seen.truth, camera="cam2"),))
     with pytest.raises(SourceError, match="cam2"):
         drift(bag, result, rig=two_cameras)
     with pytest.raises(SessionError, match="cam3"):
@@ -221,14 +222,14 @@ def test_packets_of_a_lidar_and_a_file_of_a_davis_are_compared(seen, turned, tmp
     document = seen.rig.model_dump()
     document["cameras"]["cam"]["channels"]["events"] = {"kind": "events", "topic": "/cam/events"}
     rig = Rig.model_validate(document)
-    deployed = SavedResult(seen.rig.name, "a test", (seen.truth,), {})
+    deployed = ResultFile(rig=seen.rig.name, pairs=(seen.truth,))
     for result, state in ((deployed, "unchanged"), (read_result(turned), "changed")):
         (pair,) = drift([pcap, davis], result, rig=rig).pairs
         assert (pair.state, pair.drift.n_captures) == (state, len(scans))
 
 
 def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen) -> None:
-    result = SavedResult(seen.rig.name, "a test", (seen.truth,), {})
+    result = ResultFile(rig=seen.rig.name, pairs=(seen.truth,))
     captures = SceneCaptures(seen.rig, result, "a standing rig")
     rng = np.random.default_rng(0)
     for capture in seen.captures:

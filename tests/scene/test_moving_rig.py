@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.core.calibration import ResultFile
 from lce_rig.core.geometry import perturb
-from lce_rig.export.result import SavedResult
 from lce_rig.pipeline.drift import judge
 from lce_rig.pipeline.scene_captures import SceneCaptures
 from lce_rig.scene.alignment import AXES
@@ -38,7 +38,7 @@ def driven():
 def watch_captures(driven, late_ns=0, change=lambda scan: scan, T_cam_lidar=None):
     rig = driven[0][0]
     T = rig.truth("cam", "lidar") if T_cam_lidar is None else T_cam_lidar
-    result = SavedResult(rig.stage.rig.name, "a test", (deployed(T),), {})
+    result = ResultFile(rig=rig.stage.rig.name, pairs=(deployed(T),))
     captures = SceneCaptures(rig.stage.rig, result, "the drive")
     for _, before, scan, image in driven:
         stamped = replace(image, stamp_ns=image.stamp_ns - late_ns)

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from lce_rig import pipeline
+from lce_rig.core.calibration import Calibration, SceneShare, read_result
 from lce_rig.core.geometry import Array, difference, invert, perturb, transform
-from lce_rig.core.results import Calibration, SceneShare
-from lce_rig.export.result import read_result, write_result
 from lce_rig.pipeline.sharpening import share_of
 from lce_rig.pipeline.witness import scene_views
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import without_movers
 from lce_rig.session import Session
+from tests.saved_results import write_result
 
 from .conftest import Seen, deployed
 

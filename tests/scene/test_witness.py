@@ -9,15 +9,14 @@ import pytest
 
 from lce_rig.cli.calibrate import scene_texts
 from lce_rig.cli.main import run
+from lce_rig.core.calibration import AxisOpinion, ChannelResult, SceneOpinion, read_result
 from lce_rig.core.geometry import perturb
-from lce_rig.core.results import ChannelResult
-from lce_rig.core.scene_opinion import AxisOpinion, SceneOpinion
-from lce_rig.export.result import read_result, write_result
 from lce_rig.judge.verdict import with_opinion
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.verification import verify
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.session import Session
+from tests.saved_results import write_result
 
 
 @pytest.fixture(scope="module")

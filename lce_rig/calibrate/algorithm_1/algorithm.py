@@ -32,10 +32,11 @@ from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.report import report_estimate, with_parts
 from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import Certificate
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose, project_to_so3
-from lce_rig.core.results import Certificate, Observation
+from lce_rig.core.results import Observation
 
 # First phase of Algorithm 1: extrinsics from the boards' planes alone.
 

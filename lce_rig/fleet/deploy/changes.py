@@ -6,10 +6,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from lce_rig.core.calibration import read_result
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
-from lce_rig.export.result import read_result
 
 RESULT = "result.json"
 # Whose lines people read; others only differ or not.

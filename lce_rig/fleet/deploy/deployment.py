@@ -16,11 +16,10 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from lce_rig.core.calibration import MADE_BY, ResultFile, read_result
 from lce_rig.core.errors import CommandError, LceRigError, ResultRefusedError, SessionError, TargetError
 from lce_rig.core.findings import Finding
 from lce_rig.export import export_formats
-from lce_rig.export.files import MADE_BY
-from lce_rig.export.result import SavedResult, read_result
 from lce_rig.fleet.deploy.changes import RESULT, SensorChange, sensor_changes, text_changes
 from lce_rig.fleet.deploy.place import LostError, Place, open_place
 from lce_rig.fleet.deploy.releases import (
@@ -235,7 +234,7 @@ def _plan(
 
 def _stage(
     result: Path, rig: Rig, target: TargetSettings, session: Session | None, folder: Path
-) -> SavedResult:
+) -> ResultFile:
     """Write the files of the set: result.json, the exports, and what else the target names."""
     saved = read_result(result / RESULT)
     folder.mkdir()
@@ -260,7 +259,7 @@ def _matching(result: Path, pattern: str) -> list[Path]:
     return []
 
 
-def _record(saved: SavedResult, files: Mapping[str, str], state: TargetState) -> ReleaseRecord:
+def _record(saved: ResultFile, files: Mapping[str, str], state: TargetState) -> ReleaseRecord:
     time = datetime.now(timezone.utc).replace(microsecond=0)
     # In order of time, even if this computer's clock is behind that of who deployed before.
     newest = max((each.name[:16] for each in state.releases), default="")
@@ -288,7 +287,7 @@ def _user() -> str:
     return ""
 
 
-def _objections(saved: SavedResult, target: TargetSettings, current: ReleaseRecord | None) -> list[Finding]:
+def _objections(saved: ResultFile, target: TargetSettings, current: ReleaseRecord | None) -> list[Finding]:
     """Find what speaks against a deployment."""
     origin = saved.provenance
     found = [DEPLOY_FAILED(f"{c.camera} and {c.lidar}") for c in saved.pairs if c.verdict == "fail"]

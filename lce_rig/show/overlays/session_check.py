@@ -16,12 +16,12 @@ from lce_rig.calibrate.motion.time_offsets import at_scan_time, deskew_points
 from lce_rig.calibrate.options import CaptureCandidates
 from lce_rig.calibrate.shared_scans import SharedScan, sample_scans
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import Calibration, CaptureResidual, Metrics, SceneOpinion
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.core.results import Calibration, CaptureResidual, ImageBoard, LidarBoard, Metrics, Observation
-from lce_rig.core.scene_opinion import SceneOpinion
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.verdict import residuals_beyond, scene_findings
 from lce_rig.rig import Rig
@@ -202,7 +202,7 @@ class SessionCheck:
             "metrics": None
             if self.metrics is None
             else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
-            "scene": self.scene.document(),
+            "scene": {"state": self.scene.state, **asdict(self.scene)},
             "captures": {r.capture: _figures(r, self.calibration.captures_used) for r in self.residuals},
             "pictures": [str(path) for path in self.pictures],
             "contact_sheets": [str(path) for path in self.contact_sheets],

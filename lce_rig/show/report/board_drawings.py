@@ -7,9 +7,9 @@ import numpy as np
 from markupsafe import Markup
 
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.core.results import Calibration
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.show.report.drawing import BLUE, FAINT, INK, ORANGE, QUIET, WIDTH_IN, drawing, new_axes
 from lce_rig.show.report.evidence import Evidence

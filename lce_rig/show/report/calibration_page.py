@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
+from lce_rig.core.calibration import Calibration, CaptureResidual
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
-from lce_rig.core.results import Calibration, CaptureResidual
 from lce_rig.export.frames import T_BODY_OPTICAL
 from lce_rig.export.rotations import rpy
 from lce_rig.rig import Rig

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.features import AS_MEASURED, extract_features
 from lce_rig.calibrate.plane_and_ends import plane_residuals
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.planar_pose import refine_pose
-from lce_rig.core.results import Calibration, Observation
+from lce_rig.core.results import Observation
 
 
 @dataclass(frozen=True, eq=False)

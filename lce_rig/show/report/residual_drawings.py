@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration
 from lce_rig.show.report.board_drawings import image_axes
 from lce_rig.show.report.drawing import BLUE, FAINT, INK, ORANGE, QUIET, drawing, new_axes
 from lce_rig.show.report.evidence import Evidence

@@ -1,6 +1,6 @@
 """The sentences at the head of a report: what the result is good for, and what to do next."""
 
-from lce_rig.core.results import Calibration, PointUncertainty
+from lce_rig.core.calibration import Calibration, PointUncertainty
 from lce_rig.words import as_line, describe, recommend
 
 _USUAL_M = 10.0

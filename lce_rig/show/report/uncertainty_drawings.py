@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration
 from lce_rig.judge.reach import point_uncertainties
 from lce_rig.show.report.drawing import BLUE, INK, ORANGE, drawing, new_axes
 from lce_rig.words.extrinsics import cause_words

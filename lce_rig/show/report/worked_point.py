@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Calibration
 from lce_rig.show.report.evidence import Evidence
 
 

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from wire.sshd import NoServerError, Sshd
 
-from lce_rig.export.result import layout, to_json_dict
+from lce_rig.core.calibration import Provenance
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.target_settings import TargetSettings
-from lce_rig.session.provenance import Provenance
 from tests.export.conftest import calibration, some_pose
+from tests.saved_results import result_file
 
 ORIGIN = Provenance("kestrel", {"lidar": "AG1", "davis": "499"}, "2026-11-20T10:22:03Z", "0f" * 32)
 
@@ -30,7 +30,7 @@ def result(tmp_path: Path) -> Callable[..., Path]:
         folder = tmp_path / f"result-{name}"
         folder.mkdir()
         pair = calibration(some_pose(t=(x_m, -0.07, -0.08)), **changes)
-        (folder / "result.json").write_text(layout(to_json_dict("rles", [pair], provenance=origin)))
+        (folder / "result.json").write_text(result_file("rles", [pair], provenance=origin).text())
         return folder
 
     return write

@@ -1,6 +1,6 @@
 """When captures contradict an extrinsic."""
 
-from lce_rig.core.results import Metrics
+from lce_rig.core.calibration import Metrics
 from lce_rig.rig import load_rig
 from lce_rig.show.overlays.session_check import contradictions
 

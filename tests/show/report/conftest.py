@@ -6,7 +6,7 @@ import pytest
 
 from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
-from lce_rig.core.results import Calibration
+from lce_rig.core.calibration import Calibration
 from lce_rig.detect.detection import Detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.show.report.calibration_page import calibration_page

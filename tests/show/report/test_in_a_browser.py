@@ -6,7 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tests.page.browser import Browser
+
+from tests.show.phone.browser import Browser
 
 pytestmark = pytest.mark.long
 

@@ -1,0 +1,680 @@
+"""The result of a calibration: `Calibration`, one camera and one LiDAR, and `ResultFile`, result.json.
+
+The fields of both are the keys of the file, in the order of the file. pydantic reads and writes them by their
+annotations; a record that the program makes is not checked again. A further figure is one further field with
+a default, so that files of earlier versions stay readable.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol
+
+import numpy as np
+from pydantic import (
+    BeforeValidator,
+    Field,
+    GetPydanticSchema,
+    PlainSerializer,
+    TypeAdapter,
+    ValidationError,
+    WrapSerializer,
+)
+from pydantic_core import PydanticSerializationError, core_schema
+from typing_extensions import NotRequired, TypedDict
+
+import lce_rig
+from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
+from lce_rig.core.errors import ResultRefusedError, SessionError, reading
+from lce_rig.core.findings import Figure, Finding, Refusal, Severity, Stage
+from lce_rig.core.geometry import Array, parse_pose, sigma_sizes
+from lce_rig.core.limits import read_file
+from lce_rig.core.results import Observation
+
+MADE_BY = f"lce-rig {lce_rig.__version__}"
+_MOST = 1e100
+"""Products of figures up to this one stay far from overflow."""
+
+
+def _kept_as(record: Any, read: Callable[[Any], Any], write: Callable[[Any], Any]) -> GetPydanticSchema:
+    """Keep a value in the file as a record: `read` makes the value of it, `write` the record."""
+    return GetPydanticSchema(
+        lambda _, schema_of: core_schema.no_info_after_validator_function(
+            read,
+            schema_of.generate_schema(record),
+            serialization=core_schema.plain_serializer_function_ser_schema(write),
+        )
+    )
+
+
+def _array(record: Any, read: Callable[[Any], Array] = np.array) -> GetPydanticSchema:
+    """Keep an array as lists of numbers with all their digits."""
+
+    def write(array: Array) -> Any:
+        if not np.isfinite(array).all():
+            raise ValueError("not finite")
+        return (array.astype(np.float64) + 0.0).tolist()
+
+    return _kept_as(record, lambda rows: np.asarray(read(rows), dtype=np.float64), write)
+
+
+def _number(lowest: float, otherwise: float) -> GetPydanticSchema:
+    """Keep a number as null where it is not finite, and read null as `otherwise`."""
+    return _kept_as(
+        Annotated[float, Field(ge=lowest, le=_MOST)] | None,
+        lambda number: otherwise if number is None else number,
+        lambda number: float(number) if math.isfinite(number) else None,
+    )
+
+
+def _pose(rows: Any) -> Array:
+    parse_pose(rows)  # which also removes rounding: the file's own digits stay
+    return np.array(rows)
+
+
+def _covariance(rows: list[list[float]]) -> Array:
+    cov = np.array(rows)
+    if not np.allclose(cov, cov.T, rtol=1e-6, atol=1e-18):
+        raise ValueError("not symmetric")
+    if np.diag(cov).min() < 0:
+        raise ValueError("a variance is negative")
+    return cov
+
+
+_Six = Annotated[list[Annotated[float, Field(ge=-_MOST, le=_MOST)]], Field(min_length=6, max_length=6)]
+Pose = Annotated[Array, _array(Any, _pose)]
+"""(4, 4), a rigid transform."""
+Covariance = Annotated[Array, _array(Annotated[list[_Six], Field(min_length=6, max_length=6)], _covariance)]
+"""(6, 6), tangent (translation m, rotation rad), axes of the camera."""
+Tangent = Annotated[Array, _array(_Six)]
+"""(6,), translation m, rotation rad."""
+Number = Annotated[float, _number(-_MOST, math.nan)]
+"""null in the file where it is not known."""
+Size = Annotated[float, _number(0.0, math.nan)]
+"""A number that is not negative."""
+Count = Annotated[int, Field(ge=0)]
+
+
+class _FindingRecord(TypedDict):
+    code: str
+    severity: Severity
+    subject: str
+    figures: dict[str, Any]
+    action_code: str
+    text: str
+    action: str
+
+
+class _RefusalRecord(TypedDict):
+    """Files of earlier versions hold stage, cause and action only."""
+
+    stage: Stage
+    code: NotRequired[str]
+    figures: NotRequired[dict[str, Any]]
+    action_code: NotRequired[str]
+    cause: str
+    action: str
+
+
+def _figure(value: Any) -> Figure:
+    return tuple(map(_figure, value)) if isinstance(value, list) else value
+
+
+def _read_finding(record: _FindingRecord) -> Finding:
+    figures = {name: _figure(value) for name, value in record["figures"].items()}
+    kind = record["code"], record["severity"], record["subject"], figures, record["action_code"]
+    return Finding(*kind, stored=(record["text"], record["action"]))
+
+
+def _read_refusal(record: _RefusalRecord) -> Refusal:
+    code = record.get("code", "")
+    return Refusal(
+        code if code.startswith(f"{record['stage']}.") else f"{record['stage']}.text",
+        figures={name: _figure(value) for name, value in record.get("figures", {}).items()},
+        action=record.get("action_code", ""),
+        stored=(record["cause"], record["action"]),
+    )
+
+
+StoredFinding = Annotated[Finding, _kept_as(_FindingRecord, _read_finding, Finding.as_json)]
+StoredRefusal = Annotated[Refusal, _kept_as(_RefusalRecord, _read_refusal, Refusal.as_json)]
+_ANY, _IN_MEMORY = GetPydanticSchema(lambda *_: core_schema.any_schema()), Field(exclude=True)
+"""Of fields that the file does not keep."""
+
+
+Method = Literal["ml", "paper"]
+DEFAULT_METHOD: Method = "ml"
+"""How extrinsics are estimated: the joint maximum likelihood, or Algorithm 1 of LCE-Calib."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Proof that a pose is the global minimum of its cost.
+
+    Attributes:
+        is_optimal: whether the gap is below the tolerance.
+        gap: bound on (cost - global minimum) / cost; infinite where the method has none.
+    """
+
+    is_optimal: bool
+    gap: Annotated[float, _number(0.0, math.inf)]
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Errors of the extrinsics; docs/conventions.md defines them.
+
+    Attributes:
+        mpe_m: mean over captures of the mean distance of LiDAR board points from the camera's board plane.
+        mee_m: mean over captures of the mean distance of ring ends from the board's edges.
+        mge_m: mpe_m + mee_m.
+        reprojection_px: rms corner residual of the board poses.
+    """
+
+    mpe_m: Size
+    mee_m: Size
+    reprojection_px: Size
+
+    @property
+    def mge_m(self) -> float:
+        """Mean geometric error, the paper's summary figure."""
+        return self.mpe_m + self.mee_m
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelResult:
+    """The result of one channel of a camera alone, with its time offset.
+
+    Attributes:
+        channel: its name.
+        n_captures: captures in which it shows the board and agrees with the others.
+        noise_px: corner noise per coordinate, from the residuals of all its images.
+        T_cam_lidar: (4, 4) extrinsic from this channel's images; from others' only how boards moved.
+        cov: (6, 6) of it, as `Calibration.cov`.
+        depth_scatter_m: standard deviation over captures of the LiDAR's distance from the board's plane.
+        depth_scatter_still_m: the same if boards are taken to have stood still.
+        time_offset_s: what to add to its timestamps beyond the profile's expected offset to come to the
+            LiDAR's time; images without timestamps count from the scan's first firing. None if nothing moved.
+        time_offset_sigma_s: standard deviation of that.
+    """
+
+    channel: str
+    n_captures: Count
+    noise_px: Size
+    T_cam_lidar: Pose
+    cov: Covariance
+    depth_scatter_m: Size
+    depth_scatter_still_m: Size
+    time_offset_s: Number | None = None
+    time_offset_sigma_s: Size | None = None
+
+
+@dataclass(frozen=True)
+class PointUncertainty:
+    """Errors of the LiDAR's points in the camera: standard deviations of the error's size.
+
+    Attributes:
+        distance_m: of the point from the camera.
+        centre_px, centre_m: in the middle of the image; in it, and in space.
+        corner_px, corner_m: in the least certain corner.
+    """
+
+    distance_m: Size
+    centre_px: Size
+    centre_m: Size
+    corner_px: Size
+    corner_m: Size
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """One cause of the standard deviations of extrinsics; the squares of all causes add up.
+
+    Attributes:
+        source: "captures" (their scatter), "lidar_ranges", an error of the profile's lens or board such as
+            "focal_length" or "square_size", or "contradiction_" with the check that contradicts.
+        sigma_rotation_deg, sigma_translation_m: what it contributes.
+    """
+
+    source: str
+    sigma_rotation_deg: Size
+    sigma_translation_m: Size
+
+
+@dataclass(frozen=True, eq=False)
+class OtherCamera:
+    """The pose of a camera relative to another one that saw the same boards in the same scans.
+
+    Attributes:
+        camera: name of the other one.
+        n_captures: that both used.
+        T_cam_other: (4, 4) to which the extrinsics of both with the LiDAR compose, p_cam = R p_other + t.
+        cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the camera; None if the
+            extrinsics were not estimated together.
+        T_cam_other_pictures: (4, 4) from the images of both alone; None if too few boards tell.
+        apart_rotation_deg, apart_translation_m: how far that lies from what the extrinsics compose to, each
+            estimated separately.
+        board_rms_m: how far apart those put the middle of the same board, rms.
+    """
+
+    camera: str
+    n_captures: Count
+    T_cam_other: Pose
+    cov: Covariance | None
+    T_cam_other_pictures: Pose | None
+    apart_rotation_deg: Size | None
+    apart_translation_m: Size | None
+    board_rms_m: Size
+
+
+@dataclass(frozen=True)
+class CaptureResidual:
+    """How well one capture fits extrinsics.
+
+    Attributes:
+        capture: its name.
+        plane_mean_m, plane_rms_m: distance of the LiDAR's board points from the camera's board plane.
+        edge_mean_m, edge_rms_m: distance in the board's plane of ring ends from the board's edges.
+        held_out_m: rms of both where the capture was not fitted; NaN without draws.
+        reprojection_px: rms corner residual of the board's pose.
+    """
+
+    capture: str
+    plane_mean_m: float
+    plane_rms_m: float
+    edge_mean_m: float
+    edge_rms_m: float
+    held_out_m: float
+    reprojection_px: float
+
+
+Motion = Literal["translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z"]
+MOTIONS: tuple[Motion, ...] = (
+    "translation_x",
+    "translation_y",
+    "translation_z",
+    "rotation_x",
+    "rotation_y",
+    "rotation_z",
+)
+"""Motions along and about the camera's axes, in the order of a tangent (6,)."""
+
+
+@dataclass(frozen=True)
+class WeakestMotion:
+    """The motion of an extrinsic that its captures determine least.
+
+    Attributes:
+        motion: its main component, axes of the camera.
+        sigma: standard deviation of that, m or rad.
+    """
+
+    motion: Motion
+    sigma: float
+
+    @property
+    def is_rotation(self) -> bool:
+        """Whether the motion is a rotation."""
+        return MOTIONS.index(self.motion) >= 3
+
+    def figures(self) -> dict[str, Figure]:
+        """Give motion and standard deviation as figures of a finding."""
+        if self.is_rotation:
+            return {"weakest": self.motion, "weakest_sigma_deg": math.degrees(self.sigma)}
+        return {"weakest": self.motion, "weakest_sigma_m": self.sigma}
+
+
+@dataclass(frozen=True, eq=False)
+class SceneShare:
+    """What the edges of the scene did to extrinsics that boards gave.
+
+    Attributes:
+        state: "used", or why the extrinsics are those of the boards alone: the scene "contradicts" them
+            beyond what both claim, or is "unknown", showing nothing that the boards do not show better.
+        n_captures, n_edges: of the scene.
+        T_cam_lidar, cov: (4, 4), (6, 6) by boards and scene, used or not.
+        T_cam_lidar_boards, cov_boards: by the boards alone.
+        change: (6,) tangent from the boards' extrinsics to those of both, m and rad, axes of the camera.
+        change_sigma: (6,) standard deviation that it should have.
+        surprise: its square in units of that, over `n_directions`: chi-squared if both are right.
+        n_directions: in which the scene knows anything, of six.
+    """
+
+    state: Literal["used", "contradicts", "unknown"]
+    n_captures: Count
+    n_edges: Count
+    T_cam_lidar: Pose
+    cov: Covariance
+    T_cam_lidar_boards: Pose
+    cov_boards: Covariance
+    change: Tangent
+    change_sigma: Tangent
+    surprise: Size
+    n_directions: Count
+
+
+OpinionState = Literal["agrees", "contradicts", "unknown"]
+
+
+@dataclass(frozen=True)
+class AxisOpinion:
+    """What the scene says about one axis, the others as estimated.
+
+    Attributes:
+        axis: "translation_x" to "rotation_z", axes of the camera.
+        state: "unknown" where the scene cannot tell.
+        unit: of the figures.
+        change: from the extrinsics to where the scene's edges fit best.
+        sigma: standard deviation of `change`, that of the extrinsics included.
+        smallest: the smallest change that would contradict in 95 % of trials; None if none within reach.
+    """
+
+    axis: str
+    state: OpinionState
+    unit: Literal["deg", "m"]
+    change: Number
+    sigma: Size
+    smallest: Size | None
+
+
+@dataclass(frozen=True)
+class SceneOpinion:
+    """The scene's opinion on the extrinsics of a camera and a LiDAR, without the edges at the board.
+
+    Attributes:
+        n_captures: compared; 0 if none has an image of the camera's frames and a scan.
+        n_edges: depth edges in or near their images.
+        axes: one opinion each, order of a tangent; empty if there are too few edges to compare.
+    """
+
+    n_captures: Count
+    n_edges: Count
+    axes: tuple[AxisOpinion, ...] = ()
+
+    @property
+    def state(self) -> OpinionState:
+        """Contradicts if any axis does; agrees if at least one is known and none contradicts."""
+        states = {axis.state for axis in self.axes}
+        return "contradicts" if "contradicts" in states else "agrees" if "agrees" in states else "unknown"
+
+    def of(self, state: OpinionState) -> tuple[AxisOpinion, ...]:
+        """List the axes of a state."""
+        return tuple(axis for axis in self.axes if axis.state == state)
+
+    @property
+    def strongest(self) -> AxisOpinion | None:
+        """The axis that contradicts by most standard deviations; None if none does."""
+        return max(self.of("contradicts"), key=lambda axis: abs(axis.change) / axis.sigma, default=None)
+
+
+class Extrinsics(Protocol):
+    """What other evidence needs of extrinsics that boards gave, judged or not; fields as of `Calibration`."""
+
+    @property
+    def camera(self) -> str:
+        """Name of the camera."""
+
+    @property
+    def lidar(self) -> str:
+        """Name of the LiDAR."""
+
+    @property
+    def T_cam_lidar(self) -> Array:
+        """(4, 4)."""
+
+    @property
+    def cov(self) -> Array:
+        """(6, 6)."""
+
+    @property
+    def cov_shared(self) -> Array:
+        """(6, 6)."""
+
+
+def _with_state(opinion: SceneOpinion, write: Callable[[SceneOpinion], Any]) -> Any:
+    return {"state": opinion.state, **write(opinion)}
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
+
+    result.json keeps all of it but the last eight attributes, which are empty if it is read back.
+
+    Attributes:
+        channels: of the camera, names.
+        channel_results: what each of these says alone.
+        T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
+        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
+        cov_shared: (6, 6) the part of it that all sessions of one lens and board have in common, as the
+            profile states these; zero if unknown.
+        contributions: the causes of `cov`, the largest first.
+        egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
+        verdict: "pass", "marginal" or "fail".
+        findings: the reasons for it, worst first, and notes.
+        captures_used: names of the captures behind the estimate.
+        captures_refused: why each other capture is not.
+        diagnostics: further figures.
+        method: that found the extrinsics, as `CalibrateOptions.method`.
+        uncertainty: what `cov` means for points at several distances; empty if no lens was at hand.
+        estimated_with: cameras whose extrinsics were estimated together with this one.
+        other_cameras: those that saw the same boards held still.
+        scene_share: what the scene did to them; None if it was not asked.
+        scene: what the edges of the scene say of it; None if they were not compared.
+        weakest: the least determined motion; None if it is read back.
+        held_out_m: rms residual of captures where they were not fitted; NaN if no method knows it.
+        residuals: of each capture used.
+        observations: capture -> the boards that were paired, as measured, for each capture used.
+        lens_error, lens_error_sigma: errors of the profile's intrinsics as the boards see them, given less
+            seen: focal length (relative), principal point x and y (px), distortion (px in the image's
+            corner); their standard deviations.
+        laser_range_m, laser_range_sigma_m: range offset of each of the LiDAR's lasers, by ring; its standard
+            deviation about their mean. Empty where the method knows none, the boards moved, or the profile
+            states them.
+    """
+
+    _: KW_ONLY
+    camera: str
+    channels: Annotated[
+        tuple[str, ...],
+        Field(alias="channel"),
+        BeforeValidator(lambda names: names.split("+") if isinstance(names, str) else names),
+        PlainSerializer("+".join),
+    ]
+    lidar: str
+    T_cam_lidar: Pose
+    cov: Covariance
+    n_captures: Count
+    n_detected: Count
+    captures_used: tuple[str, ...]
+    captures_refused: Mapping[str, StoredRefusal]
+    metrics: Metrics
+    certificate: Certificate
+    egt_rotation_deg: Size | None = None
+    egt_translation_m: Size | None = None
+    verdict: Literal["pass", "marginal", "fail"]
+    findings: tuple[StoredFinding, ...] = ()
+    diagnostics: Annotated[
+        Diagnostics, _kept_as(dict[str, float | None], Diagnostics.of, Diagnostics.figures)
+    ] = NO_DIAGNOSTICS
+    channel_results: Annotated[tuple[ChannelResult, ...], Field(alias="channels")] = ()
+    method: str = "paper"
+    uncertainty: tuple[PointUncertainty, ...] = ()
+    estimated_with: tuple[str, ...] = ()
+    other_cameras: tuple[OtherCamera, ...] = ()
+    cov_shared: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
+    contributions: tuple[Contribution, ...] = ()
+    scene_share: SceneShare | None = None
+    scene: Annotated[SceneOpinion, WrapSerializer(_with_state)] | None = None
+    weakest: Annotated[WeakestMotion | None, _ANY, _IN_MEMORY] = None
+    held_out_m: Annotated[float, _ANY, _IN_MEMORY] = math.nan
+    residuals: Annotated[tuple[CaptureResidual, ...], _ANY, _IN_MEMORY] = ()
+    observations: Annotated[Mapping[str, Observation], _ANY, _IN_MEMORY] = field(default_factory=dict)
+    lens_error: Annotated[tuple[float, ...], _ANY, _IN_MEMORY] = ()
+    lens_error_sigma: Annotated[tuple[float, ...], _ANY, _IN_MEMORY] = ()
+    laser_range_m: Annotated[tuple[float, ...], _ANY, _IN_MEMORY] = ()
+    laser_range_sigma_m: Annotated[tuple[float, ...], _ANY, _IN_MEMORY] = ()
+
+    @property
+    def is_start_certified(self) -> bool:
+        """Whether the certificate is of Algorithm 1's solution, where the estimate starts, not of its own."""
+        return self.method != "paper"
+
+    @property
+    def channel(self) -> str:
+        """Names of the channels for people: several are joined by "+"."""
+        return "+".join(self.channels)
+
+    @property
+    def sigma_rotation_deg(self) -> float:
+        """Root of the summed rotation variances, deg."""
+        return sigma_sizes(self.cov)[0]
+
+    @property
+    def sigma_translation_m(self) -> float:
+        """Root of the summed translation variances, m."""
+        return sigma_sizes(self.cov)[1]
+
+
+def _from_pair(pair: Any) -> Any:
+    """Read a pair of result.json, which holds the metrics side by side with the rest.
+
+    Files of earlier versions hold reasons in place of findings.
+    """
+    if not isinstance(pair, dict):
+        return pair
+    severity = "error" if pair.get("verdict") == "fail" else "warning"
+    reason = {"code": "verdict.text", "severity": severity, "subject": "", "figures": {}, "action_code": ""}
+    reasons = [{**reason, "text": text, "action": ""} for text in pair.get("reasons") or ()]
+    return {**pair, "metrics": pair, "findings": pair.get("findings") or reasons}
+
+
+def _as_pair(calibration: Calibration, write: Callable[[Calibration], dict[str, Any]]) -> dict[str, Any]:
+    """Write a pair of result.json: the fields, and the figures that scripts read beside them."""
+    pair: dict[str, Any] = {}
+    for name, value in write(calibration).items():
+        if name == "metrics":
+            mpe_m, mee_m = value["mpe_m"], value["mee_m"]
+            mge_m = None if None in (mpe_m, mee_m) else calibration.metrics.mge_m
+            pair |= {"mpe_m": mpe_m, "mee_m": mee_m, "mge_m": mge_m, **value}
+        else:
+            pair[name] = dict(sorted(value.items())) if name == "captures_refused" else value
+        if name == "cov":
+            pair["sigma_rotation_deg"] = calibration.sigma_rotation_deg
+            pair["sigma_translation_m"] = calibration.sigma_translation_m
+        elif name == "verdict":
+            pair["reasons"] = [finding.sentence for finding in calibration.findings]
+    return pair
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result comes from; a field is empty where it is not known.
+
+    Attributes:
+        robot: its name, by the profile or `--robot`.
+        serials: serial numbers by sensor, as the devices told when captures were taken, else the profile's.
+        date: of the last capture, UTC, such as "2026-11-20T10:22:03Z": when the sensors were so mounted.
+        session_sha256: fingerprint of captures and profile, see `content_sha256`.
+    """
+
+    robot: str = ""
+    serials: Mapping[str, str] = field(default_factory=dict)
+    date: Annotated[str, Field(pattern="^([0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z)?$")] = ""
+    session_sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")] = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ResultFile:
+    """result.json.
+
+    Attributes:
+        rig: its name.
+        made_by: the program and its version.
+        provenance: robot, sensors and date; empty in files of earlier versions.
+        inputs_sha256: SHA-256 of the result's input files, by their path in the session.
+        sessions: of an estimate from several, by name: their paths from the one that holds the result.
+        pairs: one for each camera and LiDAR.
+    """
+
+    _: KW_ONLY
+    format_version: Literal[1] = 1
+    rig: str
+    made_by: str = MADE_BY
+    provenance: Provenance = field(default_factory=Provenance)
+    inputs_sha256: Mapping[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = field(default_factory=dict)
+    sessions: Mapping[str, str] = field(default_factory=dict)
+    pairs: tuple[Annotated[Calibration, BeforeValidator(_from_pair), WrapSerializer(_as_pair)], ...]
+
+    def document(self) -> dict[str, Any]:
+        """List the content as plain types, keys in a fixed order; figures that are not known are null.
+
+        Raises:
+            ResultRefusedError: a pose or covariance is not finite.
+        """
+        try:
+            document: dict[str, Any] = _file().dump_python(self, mode="json", by_alias=True)
+        except PydanticSerializationError as error:
+            raise ResultRefusedError(
+                "a pose or covariance of the result is not finite",
+                "Add captures: they leave a direction undetermined.",
+            ) from error
+        document["inputs_sha256"] = dict(sorted(document["inputs_sha256"].items()))
+        if self.provenance == Provenance():
+            del document["provenance"]
+        else:
+            document["provenance"]["serials"] = dict(sorted(document["provenance"]["serials"].items()))
+        if not self.sessions:
+            del document["sessions"]
+        return document
+
+    def text(self) -> str:
+        """Write the content: the same result gives the same bytes; floats with all digits, a row per line.
+
+        Raises:
+            ResultRefusedError: a pose or covariance is not finite.
+        """
+        return _layout(self.document(), "") + "\n"
+
+
+@cache
+def _file() -> TypeAdapter[ResultFile]:
+    return TypeAdapter(ResultFile)
+
+
+def _layout(value: Any, indent: str) -> str:
+    """Format JSON like json.dumps(indent=2), but lists of plain values on one line."""
+    deeper = indent + "  "
+    if isinstance(value, dict) and value:
+        items = (
+            f"{deeper}{json.dumps(key, ensure_ascii=False)}: {_layout(item, deeper)}"
+            for key, item in value.items()
+        )
+        return "{\n" + ",\n".join(items) + f"\n{indent}}}"
+    if isinstance(value, list) and any(isinstance(item, list | dict) for item in value):
+        return "[\n" + ",\n".join(deeper + _layout(item, deeper) for item in value) + f"\n{indent}]"
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def read_result(path: Path | str) -> ResultFile:
+    """Read result.json back, exactly as it was written; keys that later versions may add are ignored.
+
+    Raises:
+        SessionError: no such file, or not a valid result; with the key at fault.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SessionError(f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it")
+    again = "Run `lce-rig calibrate SESSION` again."
+    with reading(path, SessionError, again):
+        data = read_file(path)
+    try:
+        return _file().validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in first["loc"] if part != "metrics")
+        message = first["msg"].removeprefix("Value error, ")
+        raise SessionError(f"{path}: {key + ': ' if key else ''}{message}", again) from error

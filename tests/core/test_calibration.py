@@ -1,0 +1,264 @@
+"""result.json: exact, deterministic, and refused where it cannot be trusted."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lce_rig.core.calibration import (
+    AxisOpinion,
+    Calibration,
+    Certificate,
+    ChannelResult,
+    Contribution,
+    Metrics,
+    OtherCamera,
+    PointUncertainty,
+    Provenance,
+    SceneOpinion,
+    SceneShare,
+    read_result,
+)
+from lce_rig.core.errors import ResultRefusedError, SessionError
+from lce_rig.core.findings import Refusal
+from lce_rig.core.geometry import exp_so3, pose
+from tests.export.conftest import calibration, reason
+from tests.saved_results import result_file
+
+FIELDS = [
+    *("camera", "channel", "lidar", "T_cam_lidar", "cov", "sigma_rotation_deg", "sigma_translation_m"),
+    *("n_captures", "n_detected", "captures_used", "captures_refused", "mpe_m", "mee_m", "mge_m"),
+    *("reprojection_px", "certificate", "egt_rotation_deg", "egt_translation_m", "verdict", "reasons"),
+    *("findings", "diagnostics", "channels", "method", "uncertainty", "estimated_with", "other_cameras"),
+    *("cov_shared", "contributions", "scene_share", "scene"),
+]
+REQUIRED = [
+    *("camera", "channel", "lidar", "T_cam_lidar", "cov", "n_captures", "n_detected", "captures_used"),
+    *("captures_refused", "mpe_m", "mee_m", "reprojection_px", "certificate", "verdict"),
+]
+Edit = Callable[[dict[str, Any]], Any]
+
+
+def full() -> Calibration:
+    """Fill every field that the file keeps."""
+    T, cov = calibration().T_cam_lidar, calibration().cov
+    return calibration(
+        channels=("events", "frames"),
+        method="ml",
+        channel_results=(
+            ChannelResult("events", 3, 0.2, T, cov, 0.01, 0.02, -0.003, 0.001),
+            ChannelResult("frames", 2, 0.1, T, cov, 0.01, 0.02),
+        ),
+        egt_rotation_deg=0.5,
+        egt_translation_m=0.01,
+        uncertainty=(PointUncertainty(5.0, 1.25, 0.0125, 1.5, 0.015),),
+        estimated_with=("right",),
+        other_cameras=(
+            OtherCamera("right", 2, T, cov, T, 0.1, 0.001, 0.002),
+            OtherCamera("left", 2, T, None, None, None, None, 0.002),
+        ),
+        cov_shared=0.1 * cov,
+        contributions=(Contribution("captures", 0.1, 0.01), Contribution("lidar_ranges", np.nan, 0.01)),
+        scene_share=SceneShare("used", 2, 50, T, cov, T, 2 * cov, np.arange(6.0), np.ones(6), 3.0, 4),
+        scene=SceneOpinion(2, 70, (AxisOpinion("rotation_x", "agrees", "deg", -0.1, 0.2, None),)),
+    )
+
+
+def as_text(*calibrations: Calibration) -> str:
+    return result_file("rles", calibrations).text()
+
+
+def edited(path: Path, edit: Edit) -> Path:
+    """Write a result after a change to its document."""
+    document = result_file("rles", [full()]).document()
+    edit(document)
+    path.write_text(json.dumps(document), encoding="utf-8")
+    return path
+
+
+def test_the_published_keys_are_there_in_order() -> None:
+    document = result_file("rles", [full()]).document()
+    assert list(document) == ["format_version", "rig", "made_by", "inputs_sha256", "pairs"]
+    assert (document["format_version"], document["rig"]) == (1, "rles")
+    pair = document["pairs"][0]
+    assert list(pair) == FIELDS
+    assert pair["channel"] == "events+frames" == "+".join(c["channel"] for c in pair["channels"])
+    assert pair["mge_m"] == pair["mpe_m"] + pair["mee_m"]
+    assert pair["reasons"] == [finding.sentence for finding in full().findings]
+    refused = pair["captures_refused"]
+    assert list(refused) == ["000001", "000003"]
+    assert list(refused["000001"]) == ["stage", "code", "figures", "action_code", "cause", "action"]
+    assert pair["scene"]["state"] == "agrees"
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    phi=st.tuples(*[st.floats(-3, 3)] * 3),
+    t=st.tuples(*[st.floats(-20, 20)] * 3),
+    scale=st.floats(1e-9, 1e-1),
+    cause=st.text(max_size=20),
+)
+def test_every_field_is_read_back_to_the_last_digit(
+    tmp_path: Path, phi: Any, t: Any, scale: float, cause: str
+) -> None:
+    T, cov = pose(exp_so3(np.array(phi)), np.array(t)) + 0.0, calibration().cov * scale
+    written = replace(full(), T_cam_lidar=T, cov=cov, findings=(reason(cause),))
+    path = tmp_path / "result.json"
+    path.write_text(as_text(written, calibration()), encoding="utf-8")
+    read = read_result(path)
+    assert read.rig == "rles" and read.text() == path.read_text(encoding="utf-8")
+    assert np.array_equal(read.pairs[0].T_cam_lidar, T) and np.array_equal(read.pairs[0].cov, cov)
+    blank = {"captures_refused": {}, "findings": ()}
+    assert repr(replace(read.pairs[0], **blank)) == repr(replace(written, **blank))
+    assert read.pairs[0].findings == written.findings
+    assert read.pairs[0].captures_refused == written.captures_refused
+
+
+def test_the_order_of_mappings_does_not_change_the_bytes() -> None:
+    turned = calibration(captures_refused=dict(reversed(calibration().captures_refused.items())))
+    assert as_text(turned) == as_text(calibration())
+
+
+def test_figures_that_are_not_known_are_null(tmp_path: Path) -> None:
+    unknown = calibration(metrics=Metrics(np.nan, 0.1, 0.2), certificate=Certificate(False, np.inf))
+    path = tmp_path / "result.json"
+    path.write_text(as_text(unknown))
+    pair = json.loads(path.read_text())["pairs"][0]
+    assert (pair["mpe_m"], pair["mge_m"], pair["certificate"]["gap"], pair["egt_rotation_deg"]) == (None,) * 4
+    read = read_result(path).pairs[0]
+    assert np.isnan(read.metrics.mpe_m) and read.certificate.gap == np.inf and read.egt_rotation_deg is None
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["T_cam_lidar", "cov", "cov_shared"])
+def test_an_array_that_is_not_finite_is_refused(name: str, bad: float) -> None:
+    array = np.array(getattr(calibration(), name))
+    array[0, 3] = bad
+    with pytest.raises(ResultRefusedError):
+        as_text(calibration(**{name: array}))
+
+
+def test_provenance_and_hashes_of_inputs_are_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    origin = Provenance("kestrel", {"lidar": "AG1", "cam": "7"}, "2026-11-20T10:22:03Z", "0f" * 32)
+    inputs = {"rig.yaml": "0f" * 32, "captures/000000/meta.json": "a1" * 32}
+    path.write_text(result_file("rles", [calibration()], inputs, origin).text())
+    read = read_result(path)
+    assert read.provenance == origin and read.inputs_sha256 == inputs
+    assert list(json.loads(path.read_text())["inputs_sha256"]) == sorted(inputs)
+
+
+def pair_edit(**changes: Any) -> Edit:
+    return lambda document: document["pairs"][0].update(changes)
+
+
+@pytest.mark.parametrize(
+    ("edit", "key"),
+    [
+        (lambda d: d.update(format_version=2), "format_version"),
+        (lambda d: d.update(rig=None), "rig"),
+        (lambda d: d.update(pairs={}), "pairs"),
+        (lambda d: d.update(inputs_sha256={"rig.yaml": "0f"}), "inputs_sha256.rig.yaml"),
+        (lambda d: d.update(provenance={"date": "yesterday"}), "provenance.date"),
+        (pair_edit(T_cam_lidar=[[1, 0, 0, 0]]), "pairs.0.T_cam_lidar"),
+        (pair_edit(T_cam_lidar=(2 * np.eye(4)).tolist()), "pairs.0.T_cam_lidar"),
+        (pair_edit(cov=np.triu(np.ones((6, 6))).tolist()), "pairs.0.cov"),
+        (pair_edit(cov=(-np.eye(6)).tolist()), "pairs.0.cov"),
+        (pair_edit(cov=np.eye(3).tolist()), "pairs.0.cov"),
+        (pair_edit(mpe_m=-1.0), "pairs.0.mpe_m"),
+        (pair_edit(verdict="great"), "pairs.0.verdict"),
+        (pair_edit(captures_refused={"1": {"stage": "moon"}}), "pairs.0.captures_refused.1.stage"),
+        *(
+            (lambda d, k=k: d["pairs"][0].pop(k), f"pairs.0.{k}")
+            for k in REQUIRED
+            if k[-2:] not in ("_m", "px")
+        ),
+    ],
+)
+def test_a_tampered_result_is_refused_with_its_key(tmp_path: Path, edit: Edit, key: str) -> None:
+    path = edited(tmp_path / "result.json", edit)
+    with pytest.raises(SessionError) as caught:
+        read_result(path)
+    assert caught.value.what.startswith(f"{path}: {key}")
+
+
+def test_keys_of_later_versions_are_ignored(tmp_path: Path) -> None:
+    def of_tomorrow(document: dict[str, Any]) -> None:
+        document["later"] = document["pairs"][0]["later"] = {"x": 1}
+
+    assert len(read_result(edited(tmp_path / "result.json", of_tomorrow)).pairs) == 1
+
+
+def test_files_of_earlier_versions_are_read(tmp_path: Path) -> None:
+    """They hold no provenance, hashes or findings, and refusals in words only."""
+
+    def as_before(document: dict[str, Any]) -> None:
+        del document["inputs_sha256"]
+        pair = document["pairs"][0]
+        for key in FIELDS[FIELDS.index("reasons") + 1 :]:
+            del pair[key]
+        pair["reasons"] = ["the board was bent: use another"]
+        pair["captures_refused"] = {"000001": {"stage": "lidar", "cause": "2 rings", "action": "come closer"}}
+
+    file = read_result(edited(tmp_path / "result.json", as_before))
+    assert file.inputs_sha256 == {} and file.provenance == Provenance()
+    (pair,) = file.pairs
+    assert pair.channels == ("events", "frames") and pair.method == "paper" and not pair.cov_shared.any()
+    (refusal,) = pair.captures_refused.values()
+    assert refusal == Refusal("lidar.text")
+    assert (refusal.text, refusal.advice) == ("2 rings", "come closer")
+    (finding,) = pair.findings
+    assert (finding.severity, finding.sentence) == ("warning", "the board was bent: use another")
+    assert file.document()["pairs"][0]["reasons"] == ["the board was bent: use another"]
+
+
+def test_findings_of_another_version_keep_their_words(tmp_path: Path) -> None:
+    def of_tomorrow(document: dict[str, Any]) -> None:
+        finding = document["pairs"][0]["findings"][1]
+        finding |= {"code": "verdict.of_tomorrow", "text": "too uncertain", "action": "collect more"}
+        document["pairs"][0]["captures_refused"]["000003"]["code"] = "calibrate.of_tomorrow"
+
+    path = edited(tmp_path / "result.json", of_tomorrow)
+    (pair,) = read_result(path).pairs
+    assert (pair.findings[1].code, pair.findings[1].sentence) == (
+        "verdict.of_tomorrow",
+        "too uncertain: collect more",
+    )
+    assert pair.captures_refused["000003"].text == full().captures_refused["000003"].text
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_any_prefix_or_flipped_bit_gives_an_error_or_a_result(tmp_path: Path, data: st.DataObject) -> None:
+    whole = bytearray(as_text(full()).encode())
+    place = data.draw(st.integers(0, len(whole) - 2))
+    if data.draw(st.booleans()):
+        whole = whole[:place]
+    else:
+        whole[place] ^= 1 << data.draw(st.integers(0, 7))
+    path = tmp_path / "result.json"
+    path.write_bytes(whole)
+    try:
+        read_result(path).text()
+    except SessionError as error:
+        assert str(path) in error.what
+
+
+@pytest.mark.parametrize("content", [b"", b"[1]", b"null", b"\xff\xfe", b"[" * 100_000])
+def test_a_file_that_is_no_result_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "result.json"
+    path.write_bytes(content)
+    with pytest.raises(SessionError):
+        read_result(path)
+
+
+def test_a_missing_result_tells_the_command_that_writes_it(tmp_path: Path) -> None:
+    with pytest.raises(SessionError) as caught:
+        read_result(tmp_path / "result.json")
+    assert "lce-rig calibrate" in caught.value.hint
