@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.core.errors import SessionError
 from lce_rig.devices.disk_writer import DiskWriter
-from lce_rig.io.velodyne.datagrams import Datagram, PcapWriter
+from lce_rig.io.network import Datagram, PcapWriter
 
 HERE = Path("somewhere")
 

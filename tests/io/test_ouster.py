@@ -14,10 +14,10 @@ import pytest
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
+from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.ouster.packets import PROFILES, OusterMetadata, read_metadata
 from lce_rig.io.ouster.pcap import OusterRecording
 from lce_rig.io.protocol import SourceOptions
-from lce_rig.io.velodyne.datagrams import Datagram, PcapWriter
 from lce_rig.rig import Rig, load_rig
 
 KEPT = np.load(Path(__file__).parent / "ouster_packets.npz")

@@ -10,8 +10,9 @@ from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.folder.cloud_file import read_cloud
+from lce_rig.io.network import PcapFile
 from lce_rig.io.protocol import SourceOptions
-from lce_rig.io.velodyne.pcap import PcapFile, PcapRecording
+from lce_rig.io.velodyne.pcap import PcapRecording
 from lce_rig.io.velodyne.points import Vlp16Decoder, keep_brighter
 from lce_rig.rig import Rig
 

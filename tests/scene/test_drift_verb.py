@@ -17,8 +17,8 @@ from lce_rig.core.calibration import ResultFile, read_result
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
+from lce_rig.io.network import build_frame
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.io.velodyne.datagrams import build_frame
 from lce_rig.pipeline.drift import drift, judge
 from lce_rig.pipeline.scene_captures import SceneCaptures, Thinned
 from lce_rig.rig import Rig, dump_rig

@@ -17,7 +17,7 @@ from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
 from lce_rig.devices.vlp16.socket import PACKET_COST_BYTES, UdpPort
 from lce_rig.devices.vlp16.web import VelodyneWeb, WebReport, find_problems
-from lce_rig.io.velodyne.datagrams import Datagram, PcapWriter
+from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.velodyne.driver_controls import read_controls
 from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from typing import Any, TypeAlias
 
 from lce_rig.core.errors import SourceError
-from lce_rig.io.velodyne.datagrams import Datagram
+from lce_rig.io.network import Datagram
 
 # Many datagrams in one system call: recvmmsg, which Python does not offer.
 #

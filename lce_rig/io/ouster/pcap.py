@@ -11,10 +11,10 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.core.losses import Losses
 from lce_rig.io.fingerprint import fingerprint
+from lce_rig.io.network import PcapFile
 from lce_rig.io.ouster.packets import PROFILES, OusterMetadata, read_metadata
 from lce_rig.io.protocol import SourceOptions, Span
 from lce_rig.io.sensor_choice import choose_lidar
-from lce_rig.io.velodyne.pcap import PcapFile
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.words import describe
 

@@ -1,0 +1,168 @@
+"""UDP datagrams in recordings of a network (pcap, pcapng), read and written by dpkt."""
+
+import socket
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import dpkt  # type: ignore[import-untyped]
+
+from lce_rig.core.errors import SourceError, reading, reason_of
+
+_NS_PER_S = 1_000_000_000
+_MAX_FRAME_BYTES = 65535
+# The sensor's own maker; what the sensor broadcasts goes to every card.
+_SENSOR_CARD, _EVERY_CARD = bytes.fromhex("607688000000"), b"\xff" * 6
+# Class of a frame by link type, https://www.tcpdump.org/linktypes.html.
+_FRAMES: dict[int, Any] = {
+    0: dpkt.loopback.Loopback,
+    1: dpkt.ethernet.Ethernet,
+    **dict.fromkeys((12, 14, 101, 228), dpkt.ip.IP),
+    108: dpkt.loopback.Loopback,
+    113: dpkt.sll.SLL,
+    276: dpkt.sll2.SLL2,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Datagram:
+    """One UDP datagram.
+
+    Attributes:
+        host_ns: arrival at the host; 0 where unknown.
+        source: IP address of the sender.
+        source_port, port: UDP ports it was sent from and to.
+        payload: its content.
+    """
+
+    host_ns: int
+    source: str
+    source_port: int
+    port: int
+    payload: bytes
+
+
+class PcapFile:
+    """A recording of a network.
+
+    Attributes:
+        path: the file.
+        flaws: datagrams that are not whole, by the code of their flaw; grows while the file is read.
+        damage: the reason for which the file could not be read to its end; "" where it could.
+        n_bytes_read: position of the last reading in the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Check the format and the type of the recorded link.
+
+        Raises:
+            SourceError: not a recording of a network, or of a link that is not read.
+        """
+        self.path = path
+        self.flaws: Counter[str] = Counter()
+        self.damage = ""
+        self.n_bytes_read = 0
+        if not path.is_file():
+            raise SourceError(f"{path}: not a file")
+        hint = "Record the card that the LiDAR is on (tcpdump -i eth0 -w FILE); unpack a packed file first."
+        with reading(path, hint=hint), path.open("rb") as file:
+            self._link = dpkt.pcap.UniversalReader(file).datalink()
+            if self._link not in _FRAMES:
+                raise ValueError(f"recorded from a link of type {self._link}, which is not read")
+
+    def datagrams(self) -> Iterator[Datagram]:
+        """Yield the whole UDP datagrams in the order of recording, up to where the file is damaged."""
+        self.flaws.clear()
+        self.damage = ""
+        with self.path.open("rb") as file:
+            try:
+                for stamp_s, raw in dpkt.pcap.UniversalReader(file):
+                    self.n_bytes_read = file.tell()
+                    # dpkt gives stamps of ns as exact decimals and others as floats, which hold a us.
+                    is_exact = isinstance(stamp_s, Decimal)
+                    host_ns = int(stamp_s * _NS_PER_S) if is_exact else round(stamp_s * 1e6) * 1000
+                    datagram = self._read(raw, host_ns)
+                    if datagram is not None:
+                        yield datagram
+            except Exception as error:  # dpkt's own, struct's, and others that damage leads to.
+                self.damage = f"{reason_of(error)}; read up to byte {self.n_bytes_read}"
+
+    def _read(self, raw: bytes, host_ns: int) -> Datagram | None:
+        """Take the UDP datagram out of a frame; None where there is no whole one."""
+        try:
+            packet = _FRAMES[self._link](raw)
+        except dpkt.Error:
+            return None
+        ip = packet if isinstance(packet, dpkt.ip.IP) else packet.data
+        if not isinstance(ip, dpkt.ip.IP) or ip.p != dpkt.ip.IP_PROTO_UDP:
+            return None
+        if ip.mf or ip.offset:
+            self.flaws["datagram.fragmented"] += 1
+            return None
+        udp = ip.data
+        if not isinstance(udp, dpkt.udp.UDP) or not 8 <= udp.ulen <= 8 + len(udp.data):
+            self.flaws["datagram.cut_short"] += 1
+            return None
+        return Datagram(
+            host_ns, socket.inet_ntoa(ip.src), udp.sport, udp.dport, bytes(udp.data[: udp.ulen - 8])
+        )
+
+
+def build_frame(datagram: Datagram) -> bytes:
+    """Build the Ethernet frame of a datagram that was broadcast, as the sensor sends it when new."""
+    udp = dpkt.udp.UDP(
+        sport=datagram.source_port, dport=datagram.port, ulen=8 + len(datagram.payload), data=datagram.payload
+    )
+    ip = dpkt.ip.IP(
+        src=socket.inet_aton(datagram.source), dst=b"\xff" * 4, p=dpkt.ip.IP_PROTO_UDP, df=1, data=udp
+    )
+    return bytes(dpkt.ethernet.Ethernet(src=_SENSOR_CARD, dst=_EVERY_CARD, data=bytes(ip)))
+
+
+class PcapWriter:
+    """A pcap file that tcpdump, Wireshark and VeloView open, with arrivals in ns; a context manager.
+
+    Every second it is handed to the operating system. Torn off anywhere, it is read up to there.
+
+    Raises:
+        FileExistsError: the file is there already.
+        OSError: it cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file: BinaryIO = path.open("xb")
+        self._writer = dpkt.pcap.Writer(self._file, snaplen=_MAX_FRAME_BYTES, nano=True)
+        self._flushed_ns = 0
+
+    def write(self, datagram: Datagram) -> None:
+        """Append a datagram.
+
+        Raises:
+            OSError: it cannot be written; the disk may be full.
+        """
+        self._writer.writepkt_time(build_frame(datagram), Decimal(datagram.host_ns).scaleb(-9))
+        if datagram.host_ns - self._flushed_ns > _NS_PER_S:
+            self._file.flush()
+            self._flushed_ns = datagram.host_ns
+
+    def close(self) -> None:
+        """Write what waits, and close the file.
+
+        Raises:
+            OSError: it cannot be written; the disk may be full.
+        """
+        self._file.close()
+
+    def __enter__(self) -> "PcapWriter":
+        """Write within a `with` block."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the file."""
+        self.close()
