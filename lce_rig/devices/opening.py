@@ -10,12 +10,12 @@ from lce_rig.rig import DriverSettings, Rig
 from lce_rig.rig.sensors import CAMERA_DRIVERS, LIDAR_DRIVERS
 
 LIVE = {
-    "vlp16": "lce_rig.devices.vlp16.driver:Vlp16Source",
-    "v4l2": "lce_rig.devices.v4l2.driver:V4l2Source",
-    "command": "lce_rig.devices.pipe.driver:ImagePipeSource",
-    "davis": "lce_rig.devices.davis.driver:DavisSource",
-    "ros2": "lce_rig.devices.ros2.driver:Ros2Source",
-    "sync_board": "lce_rig.devices.sync_board.driver:SyncBoard",
+    "vlp16": "lce_rig.devices.vlp16:Vlp16Source",
+    "v4l2": "lce_rig.devices.v4l2:V4l2Source",
+    "command": "lce_rig.devices.pipe:ImagePipeSource",
+    "davis": "lce_rig.devices.davis:DavisSource",
+    "ros2": "lce_rig.devices.ros2:Ros2Source",
+    "sync_board": "lce_rig.devices.sync_board:SyncBoard",
 }
 """Source by type of driver."""
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from lce_rig.core import velodyne
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.devices.vlp16.socket import PACKET_COST_BYTES, WANTED_BUFFER_BYTES
+from lce_rig.devices.udp_port import PACKET_COST_BYTES, WANTED_BUFFER_BYTES
 from lce_rig.doctor.line import Check
 from lce_rig.doctor.sensor_sources import uses_driver
 from lce_rig.rig import Rig

@@ -10,7 +10,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding, Refusal, Severity
 from lce_rig.detect.events.event_limits import events_problem
 from lce_rig.detect.image.quality import strongest_edge_px
-from lce_rig.devices.vlp16.web import VelodyneWeb, WebReport, find_problems
+from lce_rig.devices.velodyne_web import VelodyneWeb, WebReport, find_problems
 from lce_rig.doctor.line import Check, problems_of
 from lce_rig.doctor.observing import ObservedSensor, SensorReport
 from lce_rig.doctor.sensor_sources import driver_of

@@ -11,7 +11,7 @@ from lce_rig.core.errors import LceRigError, SourceError, refusal_of
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.detect.events.search import find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.devices.vlp16.web import WebReport
+from lce_rig.devices.velodyne_web import WebReport
 from lce_rig.doctor import Check
 from lce_rig.doctor.clocks import (
     check_clock,

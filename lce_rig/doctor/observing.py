@@ -14,8 +14,8 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.sync_board.driver import SyncBoard
-from lce_rig.devices.vlp16.web import WebReport
+from lce_rig.devices.sync_board import SyncBoard
+from lce_rig.devices.velodyne_web import WebReport
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 

@@ -24,8 +24,7 @@ from benchmarks.tables import print_head, print_row
 from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.state import Key, LiveOptions, LiveReport, LiveState
 from lce_rig.core.geometry import Array
-from lce_rig.devices.davis.driver import DavisSource
-from lce_rig.devices.davis.opened import OpenedCamera
+from lce_rig.devices.davis import DavisSource, OpenedCamera
 from lce_rig.devices.opening import open_live
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource

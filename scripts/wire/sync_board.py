@@ -8,7 +8,7 @@ import time
 import tty
 from types import TracebackType
 
-from lce_rig.devices.sync_board.lce1 import read_sentence, write_sentence
+from lce_rig.devices.lce1 import read_sentence, write_sentence
 
 _S = 10**9
 _DRIFT = 30e-6

@@ -8,7 +8,7 @@ import threading
 import time
 import tty
 
-from lce_rig.devices.sync_board.lce1 import read_sentence, write_sentence
+from lce_rig.devices.lce1 import read_sentence, write_sentence
 
 HELLO = "LCEHI,1,1.0,fake,1000000"
 

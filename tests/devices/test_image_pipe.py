@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.pipe.driver import ImagePipeSource
-from lce_rig.devices.pipe.image_streams import (
+from lce_rig.devices.image_streams import (
     ImageStream,
     JpegImages,
     PnmImages,
@@ -24,6 +23,7 @@ from lce_rig.devices.pipe.image_streams import (
     Y4mImages,
     find_stream,
 )
+from lce_rig.devices.pipe import ImagePipeSource
 from lce_rig.rig import CameraSettings, load_rig
 
 WIDTH, HEIGHT = 32, 18

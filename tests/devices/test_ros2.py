@@ -24,7 +24,7 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.opening import open_live
 from lce_rig.devices.reading import AttachedSensors
-from lce_rig.devices.ros2.driver import Ros2Source
+from lce_rig.devices.ros2 import Ros2Source
 from lce_rig.io.ros.bag_recorder import encode_image, encode_scan
 from lce_rig.rig import Rig, load_rig
 
@@ -142,7 +142,7 @@ def with_topic(rig: Rig, topic: str | None) -> Ros2Source:
 def test_topics_that_do_not_serve_are_refused_with_those_that_would(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lce_rig.devices.ros2.driver._DISCOVERY_S", 0.2)
+    monkeypatch.setattr("lce_rig.devices.ros2._DISCOVERY_S", 0.2)
     absent, wrong, unnamed = (refusal(with_topic(rig, topic)) for topic in ("/velodyne", IMAGES, None))
     assert "/velodyne" in absent.what and POINTS in absent.hint
     assert IMAGES in wrong.what and "PointCloud2" in wrong.what and POINTS in wrong.hint

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.sync_board.board_state import Arrival, BoardState, RunningNumber, Verdict
-from lce_rig.devices.sync_board.lce1 import (
+from lce_rig.devices.board_state import Arrival, BoardState, RunningNumber, Verdict
+from lce_rig.devices.lce1 import (
     BoardError,
     BoardStatus,
     Hello,

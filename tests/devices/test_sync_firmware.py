@@ -14,8 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from lce_rig.devices.sync_board.driver import SyncBoard
-from lce_rig.devices.sync_board.lce1 import (
+from lce_rig.devices.lce1 import (
     BoardError,
     BoardStatus,
     Hello,
@@ -28,6 +27,7 @@ from lce_rig.devices.sync_board.lce1 import (
     read_sentence,
     write_sentence,
 )
+from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig.sync_settings import SyncSettings
 
 FIRMWARE = Path(__file__).parents[2] / "scripts" / "firmware"

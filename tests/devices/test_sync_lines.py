@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.sync_board import lce1
-from lce_rig.devices.sync_board.lce1 import (
+from lce_rig.devices import lce1
+from lce_rig.devices.lce1 import (
     MAX_COUNT,
     MAX_LINE,
     MAX_US,

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.v4l2 import abi
-from lce_rig.devices.v4l2.driver import V4l2Source
-from lce_rig.devices.v4l2.video_device import serial_number
+from lce_rig.devices import v4l2_abi as abi
+from lce_rig.devices.v4l2 import V4l2Source
+from lce_rig.devices.video_device import serial_number
 from lce_rig.rig import CameraSettings, load_rig
 from tests.notes import has_note
 
@@ -51,7 +51,7 @@ def test_what_is_no_device_is_not_opened(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     os.mkfifo(tmp_path / "fifo")
     for path in (tmp_path / "file", tmp_path / "fifo", tmp_path):
-        assert has_note([refusal(str(path)).what], "'cam'", str(path), "device file")
+        assert has_note([refusal(str(path)).what], "'cam'", str(path))
 
 
 def test_a_device_of_another_kind_is_refused() -> None:
@@ -82,9 +82,6 @@ STRUCTURES = {
     "v4l2_fmtdesc": abi.FormatDescription,
     "v4l2_frmsizeenum": abi.FrameSize,
     "v4l2_pix_format": abi.PixFormat,
-    "v4l2_plane_pix_format": abi.PlaneFormat,
-    "v4l2_pix_format_mplane": abi.PlanesFormat,
-    "v4l2_plane": abi.Plane,
     "v4l2_format": abi.Format,
     "v4l2_streamparm": abi.CaptureParameters,
     "v4l2_requestbuffers": abi.BufferRequest,
@@ -96,8 +93,6 @@ STRUCTURES = {
 }
 NUMBERS = {
     "V4L2_BUF_TYPE_VIDEO_CAPTURE": abi.VIDEO_CAPTURE,
-    "V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE": abi.VIDEO_CAPTURE_MPLANE,
-    "VIDEO_MAX_PLANES": abi.MAX_PLANES,
     "VIDIOC_QUERYCAP": abi.QUERY_CAPABILITY,
     "VIDIOC_ENUM_FMT": abi.ENUMERATE_FORMATS,
     "VIDIOC_S_FMT": abi.SET_FORMAT,
@@ -132,10 +127,6 @@ OFFSETS = {
     "v4l2_buffer, sequence": abi.Buffer.sequence.offset,
     "v4l2_buffer, m": abi.Buffer.m.offset,
     "v4l2_buffer, length": abi.Buffer.length.offset,
-    "v4l2_pix_format_mplane, plane_fmt": abi.PlanesFormat.plane_fmt.offset,
-    "v4l2_pix_format_mplane, num_planes": abi.PlanesFormat.num_planes.offset,
-    "v4l2_plane, m": abi.Plane.m.offset,
-    "v4l2_plane, data_offset": abi.Plane.data_offset.offset,
     "v4l2_format, fmt": abi.Format.fmt.offset,
     "v4l2_streamparm, parm.capture.timeperframe": abi.CaptureParameters.numerator.offset,
     "v4l2_query_ext_ctrl, minimum": abi.ControlQuery.minimum.offset,

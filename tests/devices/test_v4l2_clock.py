@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from lce_rig.devices.v4l2.kernel_clock import CLOCKS, StampClock, choose_clock, read_clocks
+from lce_rig.devices.stamp_clock import CLOCKS, StampClock, choose_clock, read_clocks
 
 MS = 1_000_000
 # As read on a rig: UTC, time since boot with a night of suspend, and Jetson's counter 29 s ahead of raw time.

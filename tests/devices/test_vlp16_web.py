@@ -11,8 +11,8 @@ from urllib.parse import parse_qs
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.vlp16.driver import Reception, explain_silence
-from lce_rig.devices.vlp16.web import VelodyneWeb, find_problems
+from lce_rig.devices.velodyne_web import VelodyneWeb, find_problems
+from lce_rig.devices.vlp16 import Reception, explain_silence
 from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.rig.sensors import DriverSettings
 from tests.io.vlp16_room import settings

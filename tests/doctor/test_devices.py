@@ -4,7 +4,7 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices.vlp16.web import WebReport
+from lce_rig.devices.velodyne_web import WebReport
 from lce_rig.doctor.devices import check_device, check_stream, wanted_rate_hz
 from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.doctor.sensor_sources import driver_of, sensors, source_of

@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.sync_board.driver import SyncBoard
+from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.doctor.observing import observe
 from lce_rig.rig import load_rig
 from lce_rig.rig.sync_settings import SyncSettings
@@ -57,7 +57,7 @@ def test_other_work_is_done_meanwhile_and_its_failure_is_not_hidden() -> None:
 
 def test_a_davis_over_the_network_has_its_events_counted(tmp_path: Path) -> None:
     pytest.importorskip("dv_processing")
-    from lce_rig.devices.davis.driver import DavisSource
+    from lce_rig.devices.davis import DavisSource
     from tests.devices.test_davis import only_events, over_network, sender
 
     assert load_rig("rles").cameras["davis"].model == "DAVIS346"

@@ -7,7 +7,7 @@ import pytest
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices.protocol import ClockState
-from lce_rig.devices.vlp16.web import WebReport
+from lce_rig.devices.velodyne_web import WebReport
 from lce_rig.doctor.devices import check_pulse, check_settings
 from lce_rig.rig import Rig
 

@@ -16,7 +16,7 @@ READ = """
 import json, sys
 from itertools import islice
 import numpy as np
-from lce_rig.devices.v4l2.driver import V4l2Source
+from lce_rig.devices.v4l2 import V4l2Source
 from lce_rig.rig import load_rig
 
 settings = load_rig("rlfs").cameras["cam"]
@@ -51,12 +51,9 @@ def read(kernel: Path, form: str, n_planes: int) -> subprocess.CompletedProcess[
     )
 
 
-@pytest.mark.parametrize(
-    ("form", "n_planes"),
-    [("NV12", 0), ("UYVY", 0), ("UYVY", 1), ("NV12", 1), ("NM12", 2), ("YM12", 3)],
-)
-def test_images_of_one_or_several_planes_come_whole(kernel: Path, form: str, n_planes: int) -> None:
-    ran = read(kernel, form, n_planes)
+@pytest.mark.parametrize("form", ["NV12", "UYVY"])
+def test_images_come_whole_counted_and_stamped(kernel: Path, form: str) -> None:
+    ran = read(kernel, form, 0)
     assert ran.returncode == 0, ran.stderr
     said: dict[str, Any] = json.loads(ran.stdout)
     assert (
@@ -74,6 +71,6 @@ def test_images_of_one_or_several_planes_come_whole(kernel: Path, form: str, n_p
         assert np.abs(np.array(pixels) - grey[None, :, None]).max() <= 2
 
 
-def test_planes_that_do_not_belong_to_the_format_are_refused(kernel: Path) -> None:
-    ran = read(kernel, "NM12", 3)  # of three planes, the third has no place in it
-    assert ran.returncode != 0 and "SourceError" in ran.stderr and "pixel_format" in ran.stderr
+def test_a_camera_that_delivers_planes_only_is_refused_with_the_way_to_read_it(kernel: Path) -> None:
+    ran = read(kernel, "NM12", 2)
+    assert ran.returncode != 0 and "SourceError" in ran.stderr and "gst-launch" in ran.stderr

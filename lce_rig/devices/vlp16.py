@@ -15,8 +15,8 @@ from lce_rig.core.findings import Finding
 from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.vlp16.socket import PACKET_COST_BYTES, UdpPort
-from lce_rig.devices.vlp16.web import VelodyneWeb, WebReport, find_problems
+from lce_rig.devices.udp_port import PACKET_COST_BYTES, UdpPort
+from lce_rig.devices.velodyne_web import VelodyneWeb, WebReport, find_problems
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.velodyne.driver_controls import read_controls
 from lce_rig.io.velodyne.stream import Vlp16Stream

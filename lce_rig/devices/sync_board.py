@@ -10,10 +10,10 @@ from typing import Any
 
 from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
+from lce_rig.devices import lce1
+from lce_rig.devices.board_state import Arrival, BoardState
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.sync_board import lce1
-from lce_rig.devices.sync_board.board_state import Arrival, BoardState
 from lce_rig.rig.sync_settings import BOARD, SyncSettings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 

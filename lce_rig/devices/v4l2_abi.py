@@ -13,7 +13,6 @@ from ctypes import (
     c_int64,
     c_long,
     c_uint8,
-    c_uint16,
     c_uint32,
     c_uint64,
     c_ulong,
@@ -21,8 +20,7 @@ from ctypes import (
     sizeof,
 )
 
-VIDEO_CAPTURE, VIDEO_CAPTURE_MPLANE = 1, 9
-MAX_PLANES = 8
+VIDEO_CAPTURE = 1
 MEMORY_MMAP = 1
 FIELD_NONE = 1
 
@@ -32,7 +30,6 @@ CAP_STREAMING = 0x0400_0000
 CAP_DEVICE_CAPS = 0x8000_0000
 
 BUFFER_ERROR = 0x40
-STAMP_CLOCK_MASK, STAMP_CLOCK_UNKNOWN, STAMP_CLOCK_MONOTONIC = 0xE000, 0x0000, 0x2000
 STAMP_SOURCE_MASK, STAMP_SOURCE_SOE = 0x7_0000, 0x1_0000
 
 NEXT_CONTROL = 0x8000_0000
@@ -103,43 +100,9 @@ class PixFormat(Structure):
     )
 
 
-class PlaneFormat(Structure):
-    """Size of one of the planes in which an image lies."""
-
-    _pack_ = 1
-    _layout_ = "ms"
-    _fields_ = (("sizeimage", c_uint32), ("bytesperline", c_uint32), ("reserved", c_uint16 * 6))
-
-
-class PlanesFormat(Structure):
-    """Size and layout of images of several planes."""
-
-    _pack_ = 1
-    _layout_ = "ms"
-    _fields_ = (
-        ("width", c_uint32),
-        ("height", c_uint32),
-        ("pixelformat", c_char * 4),
-        ("field", c_uint32),
-        ("colorspace", c_uint32),
-        ("plane_fmt", PlaneFormat * MAX_PLANES),
-        ("num_planes", c_uint8),
-        ("flags", c_uint8),
-        ("ycbcr_enc", c_uint8),
-        ("quantization", c_uint8),
-        ("xfer_func", c_uint8),
-        ("reserved", c_uint8 * 7),
-    )
-
-
 class _FormatUnion(Union):
     # The kernel's union also holds pointers, which align it to 8 bytes.
-    _fields_ = (
-        ("pix", PixFormat),
-        ("pix_mp", PlanesFormat),
-        ("raw", c_uint8 * 200),
-        ("aligned", c_void_p),
-    )
+    _fields_ = (("pix", PixFormat), ("raw", c_uint8 * 200), ("aligned", c_void_p))
 
 
 class Format(Structure):
@@ -180,31 +143,12 @@ class _TimeValue(Structure):
     _fields_ = (("seconds", c_long), ("microseconds", c_long))
 
 
-class _PlaneMemory(Union):
-    _fields_ = (("mem_offset", c_uint32), ("userptr", c_ulong))
-
-
-class Plane(Structure):
-    """One plane of a buffer: where it lies, and how much of it is filled."""
-
-    _fields_ = (
-        ("bytesused", c_uint32),
-        ("length", c_uint32),
-        ("m", _PlaneMemory),
-        ("data_offset", c_uint32),
-        ("reserved", c_uint32 * 11),
-    )
-
-
 class _Memory(Union):
-    _fields_ = (("offset", c_uint32), ("userptr", c_ulong), ("planes", POINTER(Plane)))
+    _fields_ = (("offset", c_uint32), ("userptr", c_ulong))
 
 
 class Buffer(Structure):
-    """One buffer: where it lies, and what the kernel says about the image in it.
-
-    Of images in several planes, `m.planes` points to these and `length` is their number.
-    """
+    """One buffer: where it lies, and what the kernel says about the image in it."""
 
     _fields_ = (
         ("index", c_uint32),

@@ -10,8 +10,7 @@ import numpy as np
 from lce_rig.core.data import Pulse
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
-from lce_rig.devices.protocol import ClockState
-from lce_rig.devices.sync_board.lce1 import (
+from lce_rig.devices.lce1 import (
     PPS_IS_ON,
     BoardError,
     BoardStatus,
@@ -23,6 +22,7 @@ from lce_rig.devices.sync_board.lce1 import (
     TimeReply,
     TriggerEdge,
 )
+from lce_rig.devices.protocol import ClockState
 from lce_rig.rig.sync_settings import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import fit_arrivals

@@ -12,28 +12,12 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
-from lce_rig.core.findings import Figure, Finding
-from lce_rig.devices.v4l2 import abi
+from lce_rig.core.findings import Finding
+from lce_rig.devices import findings
+from lce_rig.devices import v4l2_abi as abi
 from lce_rig.rig import DriverSettings
-
-# From the moment a driver timestamps to the middle of the exposure, for the middle row of an image.
-#
-# A row of a rolling shutter is exposed and then read; the next one follows a line time later. With rows 0
-# to
-# H-1, exposure e and line time l, the middle row m = (H-1)/2 is half exposed at
-#
-#     t_start of exposure + m l + e/2
-#     (1)
-#     t_start of frame    + m l - e/2          the first row is exposed, its reading begins
-#     (2)
-#     t_end of frame      - (H-m) l - e/2      the last row is read
-#     (3)
-#     t_trigger + delay   + m l + e/2
-#     (4)
-#
-# A global shutter has l = 0.
 
 Mark = Literal["start_of_exposure", "start_of_frame", "end_of_frame", "trigger"]
 # Their flags say end of frame; the timestamp is what the video input saw of the first row (devices' forums).
@@ -44,10 +28,18 @@ _JETSON_DRIVERS = ("tegra", "nv_", "vi5", "vi6")
 class FrameTiming:
     """How the rows of an image are exposed and read.
 
+    A row of a rolling shutter is exposed and then read; the next one follows a line time later. With rows 0
+    to H-1, exposure e and line time l (0 for a global shutter), the middle row m = (H-1)/2 is half exposed at
+
+        t_start of exposure + m l + e/2                                                                    (1)
+        t_start of frame    + m l - e/2          the first row is exposed, its reading begins              (2)
+        t_end of frame      - (H-m) l - e/2      the last row is read                                      (3)
+        t_trigger + delay   + m l + e/2                                                                    (4)
+
     Attributes:
         n_rows: of the image.
         exposure_ns: of a row; None where unknown.
-        line_time_ns: from row to row; 0 for a global shutter.
+        line_time_ns: from row to row.
         trigger_delay_ns: from the trigger's edge to the start of the first row's exposure.
     """
 
@@ -117,8 +109,7 @@ CLOCKS = ("monotonic", "monotonic_raw", "tsc", "tsc_minus", "boottime", "realtim
 """Candidates, in the order in which equally good ones are taken."""
 
 
-@dataclass(frozen=True)
-class ClockChoice:
+class ClockChoice(NamedTuple):
     """The clock that a timestamp was made with.
 
     Attributes:
@@ -135,10 +126,6 @@ class ClockChoice:
     def is_ambiguous(self) -> bool:
         """Whether clocks fit that differ by more than is harmless."""
         return self.spread_ns > HARMLESS_NS
-
-    def delays_ms(self) -> tuple[Figure, ...]:
-        """List how old the timestamp would be by each clock, (clock, ms)."""
-        return tuple((name, delay_ns * 1e-6) for name, delay_ns in self.delays_ns.items())
 
 
 def read_clocks() -> dict[str, int]:
@@ -187,7 +174,15 @@ class StampClock:
 
     def to_utc_ns(self, stamp_ns: int) -> int | None:
         """Convert the timestamp of an image that has just arrived; None where no clock fits."""
-        now_ns, utc_ns = _read_with_utc()
+        # Between two readings of UTC; the closest of a few tries, without interruption.
+        brackets = []
+        for _ in range(_N_BRACKETS):
+            before_ns = time.time_ns()
+            readings = read_clocks()
+            brackets.append((time.time_ns() - before_ns, before_ns, readings))
+        # A negative width: UTC was set back meanwhile.
+        width_ns, before_ns, now_ns = min(brackets, key=lambda bracket: (bracket[0] < 0, bracket[0]))
+        utc_ns = before_ns + width_ns // 2
         delay_ns = now_ns[self.clock] - stamp_ns if self.clock in now_ns else -1
         if not self._is_fixed and not 0 <= delay_ns <= _MAX_STALL_NS:
             self.n_changes += self.clock is not None
@@ -207,34 +202,19 @@ class StampClock:
     def problems(self) -> list[Finding]:
         """Find what is doubtful about the timestamps."""
         if self._is_missing:
-            return [Finding("clock.missing", "warning", figures={"clock": self.clock})]
+            return [findings.CLOCK_MISSING(clock=self.clock)]
         if self._is_fixed:
-            figures: dict[str, Figure] = {"clock": self.clock, "delay_ms": self.delay_ns * 1e-6}
             is_right = 0 <= self.delay_ns <= _MAX_STALL_NS
-            return [] if is_right else [Finding("clock.does_not_fit", "warning", figures=figures)]
-        found, choice = [], self.choice
-        if choice is not None and choice.clock is None:
-            found.append(Finding("clock.none_fits", "warning", figures={"delays_ms": choice.delays_ms()}))
-        elif choice is not None and choice.is_ambiguous:
-            spread: dict[str, Figure] = {
-                "spread_ms": choice.spread_ns * 1e-6,
-                "delays_ms": choice.delays_ms(),
-            }
-            found.append(Finding("clock.ambiguous", "warning", figures=spread))
+            wrong = findings.CLOCK_DOES_NOT_FIT(clock=self.clock, delay_ms=self.delay_ns * 1e-6)
+            return [] if is_right else [wrong]
+        problems: list[Finding] = []
+        if self.choice is not None:
+            delays_ms = tuple((name, delay_ns * 1e-6) for name, delay_ns in self.choice.delays_ns.items())
+            if self.choice.clock is None:
+                problems.append(findings.NO_CLOCK_FITS(delays_ms=delays_ms))
+            elif self.choice.is_ambiguous:
+                spread_ms = self.choice.spread_ns * 1e-6
+                problems.append(findings.CLOCK_AMBIGUOUS(spread_ms=spread_ms, delays_ms=delays_ms))
         if self.n_changes:
-            found.append(Finding("clock.changed", "warning", figures={"n": self.n_changes}))
-        return found
-
-
-def _read_with_utc() -> tuple[dict[str, int], int]:
-    """Read the candidates between two readings of UTC; the closest of a few tries, without interruption."""
-    best: tuple[int, dict[str, int], int] | None = None
-    for _ in range(_N_BRACKETS):
-        before_ns = time.time_ns()
-        readings = read_clocks()
-        width_ns = time.time_ns() - before_ns
-        if width_ns >= 0 and (best is None or width_ns < best[0]):
-            best = width_ns, readings, before_ns + width_ns // 2
-    if best is None:  # UTC was set back in every try
-        return read_clocks(), time.time_ns()
-    return best[1], best[2]
+            problems.append(findings.CLOCK_CHANGED(n=self.n_changes))
+        return problems

@@ -14,7 +14,7 @@ from typing import IO
 from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices.pipe.image_streams import ImageStream, JpegImages, RawImages, find_stream
+from lce_rig.devices.image_streams import ImageStream, JpegImages, RawImages, find_stream
 from lce_rig.devices.pixel_formats import FORMATS, find_format
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource

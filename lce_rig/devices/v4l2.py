@@ -6,13 +6,20 @@ from pathlib import Path
 
 from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Finding
+from lce_rig.devices import findings
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.v4l2.controls import apply_controls, list_controls, read_exposure_us
-from lce_rig.devices.v4l2.kernel_clock import FrameTiming, Mark, StampClock, frame_timing, stamped_moment
-from lce_rig.devices.v4l2.video_device import Layout, RawFrame, VideoDevice, serial_number, video_devices
+from lce_rig.devices.stamp_clock import FrameTiming, Mark, StampClock, frame_timing, stamped_moment
+from lce_rig.devices.video_device import (
+    VideoDevice,
+    apply_controls,
+    list_controls,
+    read_exposure_us,
+    serial_number,
+    video_devices,
+)
 from lce_rig.rig import CameraSettings
 
 # Two buffers drop images as soon as the computer stalls for one; eight ride out a quarter of a second.
@@ -52,19 +59,40 @@ class V4l2Source(LiveSource):
         self._mark: Mark = "start_of_frame"
         self._timing = FrameTiming(settings.resolution_px[1], None)
 
-    @property
-    def timing(self) -> FrameTiming:
-        """How the rows are exposed; `to_mid_ns("trigger")` is the time from a pulse to mid exposure."""
-        return self._timing
-
     def open(self) -> None:
         """Open, set up and start the camera.
 
         Raises:
             SourceError: it is absent, busy, or cannot do what the profile wants.
         """
+        driver = self._settings.driver
+        if driver.device is None:
+            devices = ", ".join(video_devices()) or "none"
+            line = "driver: {type: v4l2, device: /dev/video0}"
+            hint = f"Add to cameras.{self.sensor}: {line}\nVideo devices of this computer: {devices}."
+            raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
+        self._last_sequence = None
         with ExitStack() as stack:
-            self._open_device(stack)
+            self._device = VideoDevice(driver.device, self.sensor)
+            stack.callback(self._device.close)
+            self._serial = serial_number(Path(driver.device).resolve().name)
+            self._decoder = self._set_up_images()
+            self._device_in_words = (
+                f"{self._device.card} at {self._device.path} ({self._device.driver}, {self._device.bus}), "
+                f"{self._decoder.code.strip()}"
+            )
+            self._known = list_controls(self._device)
+            self._notes = apply_controls(self._device, self.sensor, driver.controls)
+            if driver.frame_rate_hz is not None:
+                rate_hz = self._device.set_rate(driver.frame_rate_hz)
+                if rate_hz is not None and abs(rate_hz / driver.frame_rate_hz - 1) > 0.01:
+                    self._notes.append(
+                        findings.RATE_REFUSED(rate_hz=rate_hz, expected_hz=driver.frame_rate_hz)
+                    )
+            self._read_exposure()
+            n_buffers = self._device.start(N_BUFFERS)
+            if n_buffers < N_BUFFERS:
+                self._notes.append(findings.FEW_BUFFERS(n=n_buffers, expected=N_BUFFERS))
             self._stack = stack.pop_all()
 
     def close(self) -> None:
@@ -80,46 +108,29 @@ class V4l2Source(LiveSource):
         }
         if self._timing.exposure_ns is not None:
             figures["exposure_ms"] = self._timing.exposure_ns * 1e-6
+        problems = self._notes + self._clock.problems()
+        if self._n_damaged:
+            problems.append(findings.DAMAGED_IMAGES(n=self._n_damaged))
+        clock = None
+        if self._has_sent and self._clock.used is None:
+            clock = ClockState(findings.ARRIVAL())
+        elif self._has_sent:
+            delay_ms = self._clock.delay_ns * 1e-6
+            moved = findings.MID_EXPOSURE(clock=self._clock.used, mark=self._mark, delay_ms=delay_ms)
+            clock = ClockState(moved)
+            if self._timing.exposure_ns is None:
+                problems.append(findings.EXPOSURE_UNKNOWN())
         return SourceStatus(
             self.sensor,
             n_lost=self._n_lost,
-            clock=self._clock_state(),
-            problems=tuple(self._problems()),
+            clock=clock,
+            problems=tuple(problems),
             figures=figures,
             device=self._device_in_words,
             serial=self._serial,
         )
 
-    def _open_device(self, stack: ExitStack) -> None:
-        driver = self._settings.driver
-        if driver.device is None:
-            found = ", ".join(video_devices()) or "none"
-            line = "driver: {type: v4l2, device: /dev/video0}"
-            hint = f"Add to cameras.{self.sensor}: {line}\nVideo devices of this computer: {found}."
-            raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
-        self._last_sequence = None
-        self._device = VideoDevice(driver.device, self.sensor)
-        stack.callback(self._device.close)
-        self._serial = serial_number(Path(driver.device).resolve().name)
-        self._decoder = self._set_up_pictures()
-        self._device_in_words = (
-            f"{self._device.card} at {self._device.path} ({self._device.driver}, {self._device.bus}), "
-            f"{self._decoder.code.strip()}"
-        )
-        self._known = list_controls(self._device)
-        self._notes = apply_controls(self._device, self.sensor, driver.controls)
-        if driver.frame_rate_hz is not None:
-            given_hz = self._device.set_rate(driver.frame_rate_hz)
-            if given_hz is not None and abs(given_hz / driver.frame_rate_hz - 1) > 0.01:
-                rates = {"rate_hz": given_hz, "expected_hz": driver.frame_rate_hz}
-                self._notes.append(Finding("stream.rate_refused", "warning", figures=rates))
-        self._read_exposure()
-        n_buffers = self._device.start(N_BUFFERS)
-        if n_buffers < N_BUFFERS:
-            buffers = {"n": n_buffers, "expected": N_BUFFERS}
-            self._notes.append(Finding("stream.few_buffers", "warning", figures=buffers))
-
-    def _set_up_pictures(self) -> PixelDecoder:
+    def _set_up_images(self) -> PixelDecoder:
         """Agree on the form of the images.
 
         Raises:
@@ -149,28 +160,7 @@ class V4l2Source(LiveSource):
                 f"{where} sends {layout.code.strip()}, not {code.strip()} as it was asked for",
                 f"Set driver.pixel_format to {layout.code.strip()}.",
             )
-        self._check_planes(where, layout)
-        return PixelDecoder(code, width, height, layout.strides[0])
-
-    def _check_planes(self, where: str, layout: Layout) -> None:
-        """Make sure that the device lays the planes of an image out as their pixel format has them.
-
-        Raises:
-            SourceError: it does not.
-        """
-        form = FORMATS[layout.code]
-        share = max(
-            form.n_chroma_planes, 1
-        )  # Rows of two chroma planes are half as long, that of one as long.
-        expected = [layout.strides[0]] + [layout.strides[0] // share] * (form.n_memory_planes - 1)
-        if list(layout.strides) != expected:
-            strides = ", ".join(map(str, layout.strides))
-            raise SourceError(
-                f"{where} lays {layout.code.strip()} out in planes with rows of {strides} bytes, "
-                "which is not read here",
-                "Set driver.pixel_format to another of its formats, or read it through a pipe "
-                "(driver.type command, with gst-launch-1.0 v4l2src).",
-            )
+        return PixelDecoder(code, width, height, layout.stride)
 
     def read(self) -> list[LiveSample]:
         """Give what came; see `LiveSource`."""
@@ -183,53 +173,28 @@ class V4l2Source(LiveSource):
             return []
         if frame is None:
             return []
-        image = self._to_image(frame)
-        return [] if image is None else [image]
-
-    def _to_image(self, frame: RawFrame) -> Image | None:
         host_ns = time.time_ns()
         utc_ns = self._clock.to_utc_ns(frame.stamp_ns)
-        self._count(frame.sequence)
+        if self._last_sequence is not None and frame.sequence > self._last_sequence:
+            self._n_lost += frame.sequence - self._last_sequence - 1
+        self._last_sequence = frame.sequence
         self._has_sent = True
-        if frame.is_damaged:
-            self._n_damaged += 1
-            return None
         try:
-            pixels = self._decoder.decode(self._decoder.join(frame.planes))
+            if frame.is_damaged:
+                raise ValueError("the driver says so")
+            pixels = self._decoder.decode(frame.data)
         except ValueError:
             self._n_damaged += 1
-            return None
+            return []
         if time.monotonic() - self._exposure_read_s > _EXPOSURE_EVERY_S:
             self._read_exposure()
         self._mark = stamped_moment(self._settings.driver, frame.flags, self._device.driver)
         stamp_ns = host_ns if utc_ns is None else utc_ns + self._timing.to_mid_ns(self._mark)
-        return Image(self.sensor, self._channel, stamp_ns, pixels, host_ns, frame.sequence)
-
-    def _count(self, sequence: int) -> None:
-        if self._last_sequence is not None and sequence > self._last_sequence:
-            self._n_lost += sequence - self._last_sequence - 1
-        self._last_sequence = sequence
+        return [Image(self.sensor, self._channel, stamp_ns, pixels, host_ns, frame.sequence)]
 
     def _read_exposure(self) -> None:
         """Ask for the exposure, which automatics may change at any time."""
         self._exposure_read_s = time.monotonic()
-        given = self._settings.driver.frame_timing.exposure_us
-        asked = read_exposure_us(self._device, self._known) if given is None else None
-        self._timing = frame_timing(self._settings.driver, self._settings.resolution_px[1], asked)
-
-    def _clock_state(self) -> ClockState | None:
-        if not self._has_sent:
-            return None
-        if self._clock.used is None:
-            return ClockState(Finding("clock.arrival", "note"))
-        delay_ms = self._clock.delay_ns * 1e-6
-        figures: dict[str, Figure] = {"clock": self._clock.used, "mark": self._mark, "delay_ms": delay_ms}
-        return ClockState(Finding("clock.mid_exposure", "note", figures=figures))
-
-    def _problems(self) -> list[Finding]:
-        found = self._notes + self._clock.problems()
-        if self._n_damaged:
-            found.append(Finding("stream.damaged_images", "warning", figures={"n": self._n_damaged}))
-        if self._clock.used is not None and self._timing.exposure_ns is None and self._has_sent:
-            found.append(Finding("clock.exposure_unknown", "warning"))
-        return found
+        is_given = self._settings.driver.frame_timing.exposure_us is not None
+        exposure_us = None if is_given else read_exposure_us(self._device, self._known)
+        self._timing = frame_timing(self._settings.driver, self._settings.resolution_px[1], exposure_us)

@@ -1,1 +1,0 @@
-"""DAVIS event cameras through dv-processing."""

@@ -1,1 +1,0 @@
-"""Images from a command's standard output."""

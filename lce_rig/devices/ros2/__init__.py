@@ -1,1 +1,0 @@
-"""Sensors whose drivers publish ROS 2 topics."""

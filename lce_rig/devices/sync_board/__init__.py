@@ -1,1 +1,0 @@
-"""The sync board on a serial port."""

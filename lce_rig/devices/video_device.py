@@ -1,0 +1,419 @@
+"""One video device of the kernel: the form of its images, its memory-mapped buffers, and its settings.
+
+Settings have the names that v4l2-ctl shows; they are set from the profile, read back, and compared.
+"""
+
+import errno
+import os
+import re
+import select
+import stat
+from collections.abc import Mapping
+from contextlib import suppress
+from ctypes import Structure, c_int32, pointer
+from difflib import get_close_matches
+from fcntl import ioctl
+from mmap import MAP_SHARED, PROT_READ, PROT_WRITE, mmap
+from pathlib import Path
+from typing import NamedTuple
+
+from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
+from lce_rig.devices import findings
+from lce_rig.devices import v4l2_abi as abi
+
+_US_NS = 1000
+_S_NS = 1_000_000_000
+Value = bool | int | float | str
+_NUMBERS = (abi.INTEGER, abi.BOOLEAN, abi.MENU, abi.INTEGER64, abi.BITMASK, abi.INTEGER_MENU)
+_MENUS = (abi.MENU, abi.INTEGER_MENU)
+_EXPOSURE_UNIT_US = 100
+
+
+class Layout(NamedTuple):
+    """How a device lays its images out: pixel format, px, bytes from row to row (0: compressed)."""
+
+    code: str
+    width: int
+    height: int
+    stride: int
+
+
+class RawFrame(NamedTuple):
+    """One image as the kernel hands it over.
+
+    Attributes:
+        data: its bytes.
+        stamp_ns: on the driver's clock.
+        sequence: running number; gaps are lost images.
+        flags: the kernel's, see `v4l2_abi`.
+    """
+
+    data: bytes
+    stamp_ns: int
+    sequence: int
+    flags: int
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether the driver says that part of it is missing or wrong."""
+        return bool(self.flags & abi.BUFFER_ERROR)
+
+
+class VideoDevice:
+    """An opened video device.
+
+    Args:
+        path: the device file.
+        sensor: name of the camera, for messages.
+
+    Raises:
+        SourceError: it is absent, forbidden, or no camera.
+    """
+
+    def __init__(self, path: str, sensor: str) -> None:
+        self.path = path
+        self._sensor = sensor
+        self._buffers: list[mmap] = []
+        try:
+            if not stat.S_ISCHR(Path(path).stat().st_mode):
+                raise SourceError(f"camera {sensor!r}: {path} is not a device file", _attached())
+            self._fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise self._explain(error, "cannot be opened") from None
+        try:
+            self._check_capabilities()
+        except BaseException:
+            self.close()
+            raise
+
+    def ioctl(self, code: int, what: Structure | c_int32) -> None:
+        """Ask the kernel; the answer stands in `what`.
+
+        Raises:
+            OSError: as the kernel says.
+        """
+        ioctl(self._fd, code, what, True)
+
+    def grants(self, code: int, what: Structure | c_int32) -> bool:
+        """Ask the kernel for something that it may refuse; says whether it did not."""
+        try:
+            self.ioctl(code, what)
+        except OSError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Stop, give the buffers back and close."""
+        if self._fd >= 0:
+            self.stop()
+            os.close(self._fd)
+            self._fd = -1
+
+    def formats(self) -> list[str]:
+        """List the pixel formats it offers, in its own order."""
+        codes = []
+        ask = abi.FormatDescription(type=abi.VIDEO_CAPTURE)
+        while self.grants(abi.ENUMERATE_FORMATS, ask):
+            codes.append(ask.pixelformat.decode("ascii", "replace").ljust(4))
+            ask.index += 1
+        return codes
+
+    def sizes(self, code: str) -> list[str]:
+        """List the image sizes it offers in a pixel format, in words: "1280x720"."""
+        sizes = []
+        ask = abi.FrameSize(pixel_format=code.encode())
+        while self.grants(abi.ENUMERATE_SIZES, ask):
+            if ask.type != abi.DISCRETE_SIZES:
+                return [f"any from {ask.sizes[0]}x{ask.sizes[3]} to {ask.sizes[1]}x{ask.sizes[4]}"]
+            sizes.append(f"{ask.sizes[0]}x{ask.sizes[1]}")
+            ask.index += 1
+        return sizes
+
+    def set_layout(self, code: str, width: int, height: int) -> Layout:
+        """Ask for a form of images; gives what the device will deliver instead if it must.
+
+        Raises:
+            SourceError: another program streams from it.
+        """
+        ask = abi.Format(type=abi.VIDEO_CAPTURE)
+        pix = ask.fmt.pix
+        pix.width, pix.height = width, height
+        pix.pixelformat, pix.field = code.encode(), abi.FIELD_NONE
+        try:
+            self.ioctl(abi.SET_FORMAT, ask)
+        except OSError as error:
+            raise self._explain(error, "does not take an image format") from None
+        granted = pix.pixelformat.decode("ascii", "replace").ljust(4)
+        return Layout(granted, pix.width, pix.height, pix.bytesperline)
+
+    def set_rate(self, rate_hz: float) -> float | None:
+        """Ask for images a second; gives what they will be, None where the device does not say."""
+        ask = abi.CaptureParameters(type=abi.VIDEO_CAPTURE, numerator=1000, denominator=round(1000 * rate_hz))
+        if not self.grants(abi.SET_PARAMETERS, ask) or not ask.numerator:
+            return None
+        return float(ask.denominator / ask.numerator)
+
+    def start(self, n_buffers: int) -> int:
+        """Map buffers and start; gives how many buffers there are.
+
+        Raises:
+            SourceError: another program streams from it, or the device fails.
+        """
+        request = abi.BufferRequest(count=n_buffers, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        try:
+            self.ioctl(abi.REQUEST_BUFFERS, request)
+            for index in range(request.count):
+                buffer = _buffer(index)
+                self.ioctl(abi.QUERY_BUFFER, buffer)
+                protection = PROT_READ | PROT_WRITE
+                memory = mmap(self._fd, buffer.length, MAP_SHARED, protection, offset=buffer.m.offset)
+                self._buffers.append(memory)
+                self.ioctl(abi.QUEUE_BUFFER, buffer)
+            self.ioctl(abi.STREAM_ON, c_int32(abi.VIDEO_CAPTURE))
+        except OSError as error:
+            raise self._explain(error, "does not start") from None
+        return int(request.count)
+
+    def stop(self) -> None:
+        """Stop and give the buffers back; never raises."""
+        # A device that was pulled out answers nothing any more.
+        self.grants(abi.STREAM_OFF, c_int32(abi.VIDEO_CAPTURE))
+        while self._buffers:
+            self._buffers.pop().close()
+        request = abi.BufferRequest(count=0, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        self.grants(abi.REQUEST_BUFFERS, request)
+
+    def read(self, timeout_s: float) -> RawFrame | None:
+        """Wait for an image; None where none came in time.
+
+        Raises:
+            SourceError: the device is gone.
+            OSError: it failed this once (EIO).
+        """
+        poll = select.poll()
+        poll.register(self._fd, select.POLLIN)
+        if not poll.poll(1000 * timeout_s):
+            return None
+        buffer = _buffer(0)
+        try:
+            self.ioctl(abi.DEQUEUE_BUFFER, buffer)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            if error.errno == errno.EIO and Path(self.path).exists():
+                raise
+            raise self._explain(error, "stopped") from None
+        data = self._buffers[buffer.index][: buffer.bytesused or buffer.length]
+        stamp_ns = buffer.timestamp.seconds * _S_NS + buffer.timestamp.microseconds * _US_NS
+        frame = RawFrame(data, stamp_ns, buffer.sequence, buffer.flags)
+        try:
+            self.ioctl(abi.QUEUE_BUFFER, _buffer(buffer.index))
+        except OSError as error:
+            raise self._explain(error, "stopped") from None
+        return frame
+
+    def _check_capabilities(self) -> None:
+        said = abi.Capability()
+        try:
+            self.ioctl(abi.QUERY_CAPABILITY, said)
+        except OSError:
+            what = f"camera {self._sensor!r}: {self.path} is no video device"
+            raise SourceError(what, _attached()) from None
+        self.card = said.card.decode("utf-8", "replace")
+        self.driver = said.driver.decode("utf-8", "replace")
+        self.bus = said.bus_info.decode("utf-8", "replace")
+        able = said.device_caps if said.capabilities & abi.CAP_DEVICE_CAPS else said.capabilities
+        where = f"camera {self._sensor!r}: {self.path} ({self.card})"
+        if (
+            able & abi.CAP_STREAMING
+            and able & abi.CAP_VIDEO_CAPTURE_MPLANE
+            and not able & abi.CAP_VIDEO_CAPTURE
+        ):
+            # Image processors of many boards (Rockchip, Qualcomm, NXP).
+            hint = "Read it through a pipe: driver.type command, with gst-launch-1.0 v4l2src."
+            raise SourceError(f"{where} delivers images in several planes, which are not read here", hint)
+        if not able & abi.CAP_VIDEO_CAPTURE or not able & abi.CAP_STREAMING:
+            raise SourceError(f"{where} delivers no images; it is another end of some device", _attached())
+
+    def _explain(self, error: OSError, what: str) -> SourceError:
+        """Say what a failure of the device means and what to check."""
+        where = f"camera {self._sensor!r}: {self.path}"
+        if error.errno in (errno.ENODEV, errno.ENXIO) or not Path(self.path).exists():
+            if self._buffers:
+                hint = "Was it unplugged? Check cable and power, `dmesg | tail`; then start again."
+                return SourceError(f"{where} is gone", hint)
+            return SourceError(f"{where} is not there", _attached())
+        if error.errno in (errno.EACCES, errno.EPERM):
+            hint = "Add yourself to the group of the device: sudo usermod -aG video $USER, then log in again."
+            return SourceError(f"{where} may not be opened by you", hint)
+        if error.errno == errno.EBUSY:
+            return SourceError(
+                f"{where} is busy", f"Another program reads it: fuser -v {self.path} names it."
+            )
+        return SourceError(f"{where} {what}: {error.strerror}", "Check `dmesg | tail` and the cable.")
+
+
+def _buffer(index: int) -> abi.Buffer:
+    return abi.Buffer(index=index, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+
+
+def video_devices() -> list[str]:
+    """Name the video devices of this computer: "/dev/video0 (vivid)"."""
+    devices = []
+    for path in sorted(Path("/dev").glob("video*"), key=lambda path: (len(path.name), path.name)):
+        name = Path("/sys/class/video4linux") / path.name / "name"
+        devices.append(f"{path} ({name.read_text().strip()})" if name.exists() else str(path))
+    return devices
+
+
+def serial_number(name: str, system: Path = Path("/sys/class/video4linux")) -> str:
+    """Give the serial number of the USB device behind a video device; "" where the kernel knows none.
+
+    Args:
+        name: of the video device: "video0".
+        system: where the kernel lists video devices.
+    """
+    try:
+        device = (system / name / "device").resolve(strict=True)
+    except (OSError, RuntimeError):
+        return ""
+    # The interface of a USB device lies in the device's folder, whose `serial` is its own.
+    for folder in (device, device.parent):
+        if (folder / "idVendor").exists() and (folder / "serial").exists():
+            with suppress(OSError, UnicodeDecodeError):
+                return (folder / "serial").read_text().strip()
+    return ""
+
+
+def _attached() -> str:
+    devices = video_devices()
+    if not devices:
+        return "This computer has no video device: check the camera's cable, power and kernel driver (dmesg)."
+    return f"Set driver.device to one of: {', '.join(devices)}."
+
+
+class ControlInfo(NamedTuple):
+    """One setting of a device: number, kind and flags as in `v4l2_abi`, range, a menu's names by value."""
+
+    id: int
+    type: int
+    minimum: int
+    maximum: int
+    flags: int
+    choices: Mapping[int, str]
+
+
+def list_controls(device: VideoDevice) -> dict[str, ControlInfo]:
+    """List the settings that hold one number, by name."""
+    controls = {}
+    ask = abi.ControlQuery(id=abi.NEXT_CONTROL)
+    while device.grants(abi.QUERY_CONTROL, ask):
+        if ask.type in _NUMBERS and not ask.flags & abi.CONTROL_DISABLED and ask.nr_of_dims == 0:
+            choices = {}
+            for index in range(ask.minimum, ask.maximum + 1) if ask.type in _MENUS else ():
+                menu = abi.MenuQuery(id=ask.id, index=index)
+                if device.grants(abi.QUERY_MENU, menu):
+                    is_name = ask.type == abi.MENU
+                    value = menu.item.name.decode("utf-8", "replace") if is_name else str(menu.item.value)
+                    choices[index] = value
+            name = _plain_name(ask.name.decode("utf-8", "replace"))
+            controls[name] = ControlInfo(ask.id, ask.type, ask.minimum, ask.maximum, ask.flags, choices)
+        ask.id |= abi.NEXT_CONTROL
+    return controls
+
+
+def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]) -> list[Finding]:
+    """Set what the profile wants: choices first, since automatic modes lock other settings.
+
+    Returns:
+        What the device set otherwise than asked.
+
+    Raises:
+        SourceError: it has no such setting, or cannot take the value.
+    """
+    known = list_controls(device)
+    for name in wanted:
+        if name not in known:
+            nearest = get_close_matches(name, known, 1, 0.5)
+            guess = f"Did you mean {nearest[0]}? " if nearest else ""
+            hint = f"{guess}It has: {', '.join(sorted(known)) or 'none'}."
+            raise SourceError(f"{_where(sensor, name)}: {device.card} has no such setting", hint)
+    deviations = []
+    for name in sorted(wanted, key=lambda name: known[name].type in (abi.INTEGER, abi.INTEGER64)):
+        info = known[name]
+        value = _to_number(sensor, name, info, wanted[name])
+        _set(device, sensor, name, info, value)
+        given = read_control(device, info)
+        if given is not None and given != value:
+            deviations.append(findings.CONTROL_DIFFERS(control=name, given=given, expected=value))
+    return deviations
+
+
+def read_control(device: VideoDevice, info: ControlInfo) -> int | None:
+    """Read one setting; None where the device does not say."""
+    control = abi.V4l2Control(id=info.id)
+    if not device.grants(abi.GET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control))):
+        return None
+    return int(control.value.value64 if info.type == abi.INTEGER64 else control.value.value)
+
+
+def read_exposure_us(device: VideoDevice, known: Mapping[str, ControlInfo]) -> float | None:
+    """Read how long a row is exposed; None where no setting says so in a known unit.
+
+    V4L2_CID_EXPOSURE counts in units of the driver's choice; Jetson's 64-bit setting of that name in us.
+    """
+    for name, info in known.items():
+        if info.id == abi.EXPOSURE_ABSOLUTE_ID:
+            value = read_control(device, info)
+            return None if value is None else float(value * _EXPOSURE_UNIT_US)
+        if name == "exposure" and info.type == abi.INTEGER64:
+            value = read_control(device, info)
+            return None if value is None else float(value)
+    return None
+
+
+def _set(device: VideoDevice, sensor: str, name: str, info: ControlInfo, value: int) -> None:
+    control = abi.V4l2Control(id=info.id)
+    if info.type == abi.INTEGER64:
+        control.value.value64 = value
+    else:
+        control.value.value = value
+    try:
+        device.ioctl(abi.SET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control)))
+    except OSError as error:
+        hint = "Remove it from driver.controls, or see `v4l2-ctl --list-ctrls-menus`."
+        if info.flags & abi.CONTROL_READ_ONLY:
+            hint = "It can only be read: remove it from driver.controls."
+        elif info.flags & abi.CONTROL_INACTIVE or error.errno in (errno.EACCES, errno.EBUSY):
+            hint = (
+                "An automatic mode or a running stream locks it: turn the automatic off in driver.controls."
+            )
+        raise SourceError(f"{_where(sensor, name)}: {value} is refused: {error.strerror}", hint) from None
+
+
+def _to_number(sensor: str, name: str, info: ControlInfo, value: Value) -> int:
+    where = _where(sensor, name)
+    choices = ", ".join(f"{number} ({choice})" for number, choice in info.choices.items())
+    if isinstance(value, str):
+        by_name = {_plain_name(choice): number for number, choice in info.choices.items()}
+        if _plain_name(value) not in by_name:
+            raise SourceError(f"{where}: {value!r} is not a choice", f"Choices: {choices or 'numbers'}.")
+        return by_name[_plain_name(value)]
+    if value != int(value):
+        raise SourceError(f"{where}: {value:g} is not a whole number", "The camera takes whole numbers.")
+    if info.type in _MENUS and int(value) not in info.choices:
+        raise SourceError(f"{where}: {int(value)} is not a choice", f"Choices: {choices}.")
+    if info.type != abi.BITMASK and not info.minimum <= value <= info.maximum:
+        hint = f"It takes {info.minimum} to {info.maximum}."
+        raise SourceError(f"{where}: {int(value)} is out of range", hint)
+    return int(value)
+
+
+def _plain_name(name: str) -> str:
+    """Write a name as v4l2-ctl does: "Exposure Time, Absolute" is exposure_time_absolute."""
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+
+
+def _where(sensor: str, name: str) -> str:
+    return f"camera {sensor!r}: driver.controls.{name}"

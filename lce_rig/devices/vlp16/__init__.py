@@ -1,1 +1,0 @@
-"""The VLP-16: packets from the network, its web page, its status."""
