@@ -27,9 +27,10 @@ from lce_rig.core.calibration import (
 )
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, sigma_sizes
+from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
+from lce_rig.judge.findings import weakest_words
 from lce_rig.words import not_enough, sentence
-from lce_rig.words.extrinsics import motion_words, weakest_words
 
 # The uncertainty in the report: by axis, and for points at several distances.
 
@@ -348,7 +349,7 @@ def calibrate(
 def _earlier_result_named(folder: Path) -> Iterator[None]:
     """Say that the files are those of an earlier run if this one ends without a result."""
     from lce_rig.core.errors import LceRigError
-    from lce_rig.pipeline.result_files import RESULT
+    from lce_rig.fleet.deploy.changes import RESULT
 
     try:
         yield

@@ -30,7 +30,8 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
     """
     import lce_rig as lce
     from lce_rig.core.errors import NotEnoughDataError
-    from lce_rig.pipeline import refusals_of, write_debug_images
+    from lce_rig.pipeline.matching import refusals_of
+    from lce_rig.pipeline.verification import write_debug_images
 
     opened = lce.Session.open(session)
     if not opened.captures:

@@ -130,7 +130,7 @@ _COLOURS = {"unchanged": "none", "changed": "red", "unknown": "yellow"}
 
 
 def _table(pair: "PairDrift") -> Any:
-    from lce_rig.words.scene_drift import STATES
+    from lce_rig.scene.findings import STATES
 
     opinions = [("scene", pair.drift.axes if pair.drift.curves else None)]
     if pair.board is not None:

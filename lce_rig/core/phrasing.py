@@ -22,7 +22,9 @@ _MOST_DIGITS = 4
 
 
 def _format(value: Any, spec: str, more: int = 0) -> str:
-    """Format a figure; {rms_m:mm}, {tilt_deg:1deg}, {share:percent} scale and add the unit.
+    """Format a figure; {rms_m:mm}, {tilt_deg:1deg}, {change_m:+mm}, {share:percent} scale and add the unit.
+
+    {axis:motion} names a motion by its code.
 
     Args:
         value: the figure; those of a tuple are listed.
@@ -33,15 +35,28 @@ def _format(value: Any, spec: str, more: int = 0) -> str:
         return "unknown"
     if isinstance(value, tuple):
         return ", ".join(_format(each, spec, more) for each in value)
+    if spec == "motion":
+        return motion_words(str(value))
     unit = next((unit for unit in _UNITS if spec.endswith(unit)), None)
     if unit is None:
         fixed = re.fullmatch(r"\.(\d)f", spec)
         return str(format(value, f".{int(fixed[1]) + more}f" if fixed else spec))
     factor, decimals, printed = _UNITS[unit]
-    digits = spec.removesuffix(unit)
+    sign, digits = "+" if spec.startswith("+") else "", spec.removesuffix(unit).lstrip("+")
     number = factor * float(value)
     places = (int(digits) if digits else decimals) + more
-    return (f"{number:.{places}f}" if math.isfinite(number) else "unknown") + printed
+    return (f"{number:{sign}.{places}f}" if math.isfinite(number) else "unknown") + printed
+
+
+_CAMERA_AXES = {"x": "x axis (right)", "y": "y axis (down)", "z": "z axis (line of sight)"}
+
+
+def motion_words(motion: str) -> str:
+    """Name a motion by its code, "translation_x" to "rotation_z"; other text is returned unchanged."""
+    kind, _, axis = motion.partition("_")
+    if axis not in _CAMERA_AXES:
+        return motion
+    return f"{kind} {'along' if kind == 'translation' else 'about'} the camera's {_CAMERA_AXES[axis]}"
 
 
 def fill(template: str, figures: Mapping[str, Any]) -> str:

@@ -5,7 +5,7 @@ extrinsics of both cameras with one LiDAR give the same pose independently.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,8 +20,9 @@ from lce_rig.calibrate.shared_scans import scan_key
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
+from lce_rig.judge.findings import CAMERAS_DIFFER, CAMERAS_SCATTER, failing
 from lce_rig.judge.split_consistency import contrast_halves, split_findings
-from lce_rig.judge.weighing import SURPRISING_CHI2, reason
+from lce_rig.judge.weighing import SURPRISING_CHI2
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 
 # Fewer placements do not determine the scatter.
@@ -32,11 +33,6 @@ _MIN_JACKKNIFE = 10
 _STUDENT = 5.0
 # Scatter of boards above this multiple of the typical value has a cause.
 _MAX_SCATTER = 2.0
-
-_BY_IMAGES = {
-    "verdict.changed": "verdict.camera_changed",
-    "verdict.shares_differ": "verdict.camera_shares_differ",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,39 +190,22 @@ def camera_findings(
     # Images are accurate enough to show any relevant change.
     strict = limits.model_copy(update={"max_change": limits.max_camera_difference})
     halves = contrast_halves(pair.from_images.expansion, pair.from_images.centres)
-    changed = split_findings(halves, pair.from_images.captures, target, strict)
-    by_images = [replace(each, code=_BY_IMAGES[each.code], subject=" to ".join(names)) for each in changed]
-    return [
-        *by_images,
-        *_scattered(pair.from_images, names, limits),
-        *_elsewhere(pair, pair.from_images, pair.apart, names, target, limits),
-    ]
-
-
-def _scattered(from_images: RelativePose, names: tuple[str, str], limits: VerdictSettings) -> list[Finding]:
-    if from_images.scatter <= _MAX_SCATTER or from_images.board_rms_m <= limits.max_plane_misfit_m:
-        return []
-    figures = {"rms_m": from_images.board_rms_m, "scatter": from_images.scatter}
-    return [reason("verdict.cameras_scatter", figures, is_fail=False, subject=" to ".join(names))]
-
-
-def _elsewhere(
-    pair: CameraPair,
-    from_images: RelativePose,
-    apart: Array,
-    names: tuple[str, str],
-    target: CalibrationSettings,
-    limits: VerdictSettings,
-) -> list[Finding]:
-    rotation_deg, translation_m = tangent_sizes(apart)
+    cameras = " to ".join(names)
+    findings = split_findings(halves, pair.from_images.captures, target, strict, cameras)
+    scatter, images_rms_m = pair.from_images.scatter, pair.from_images.board_rms_m
+    if scatter > _MAX_SCATTER and images_rms_m > limits.max_plane_misfit_m:
+        findings.append(CAMERAS_SCATTER(cameras, rms_m=images_rms_m, scatter=scatter))
+    rotation_deg, translation_m = tangent_sizes(pair.apart)
     excess = target.in_targets(rotation_deg, translation_m) / limits.max_camera_difference
-    if pair.surprise <= SURPRISING_CHI2 or excess <= 1:
-        return []
-    figures = {
-        "rms_m": pair.board_rms_m,
-        "images_rms_m": from_images.board_rms_m,
-        "rotation_deg": rotation_deg,
-        "translation_m": translation_m,
-    }
-    is_fail = excess > limits.fail_factor
-    return [reason("verdict.cameras_differ", figures, is_fail=is_fail, subject=" to ".join(names))]
+    if pair.surprise > SURPRISING_CHI2 and excess > 1:
+        findings.append(
+            CAMERAS_DIFFER(
+                cameras,
+                severity=failing(excess > limits.fail_factor),
+                rms_m=pair.board_rms_m,
+                images_rms_m=images_rms_m,
+                rotation_deg=rotation_deg,
+                translation_m=translation_m,
+            )
+        )
+    return findings

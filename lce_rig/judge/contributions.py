@@ -10,7 +10,7 @@ deviations, widens the claim until it holds both.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -18,8 +18,9 @@ from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.tolerances import Sensitivity, Source
 from lce_rig.core.calibration import Contribution
 from lce_rig.core.diagnostics import Diagnostics
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes, tangent_sizes
+from lce_rig.judge.findings import KNOWN_BETTER, LARGEST_CAUSE
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck
 from lce_rig.judge.nuisances import Nuisances
 from lce_rig.judge.split_consistency import Contrast, objections
@@ -209,12 +210,12 @@ def uncertainty_notes(
         size, unit = ("sigma_rotation_deg", "deg") if is_rotation else ("sigma_translation_m", "m")
         source, total = largest(causes, size), total_deg if is_rotation else total_m
         part = next(float(getattr(each, size)) for each in causes if each.source == source)
-        figures: dict[str, Figure] = {
+        figures: dict[str, Any] = {
             "source": source,
             f"sigma_{unit}": part,
             f"total_{unit}": total,
             "share": (part / total) ** 2,
         }
-        yield Finding("verdict.largest_cause", "note", figures=figures, action=measure_action(source))
+        yield LARGEST_CAUSE(action=measure_action(source), **figures)
     for each in better:
-        yield Finding("verdict.known_better", "note", figures=asdict(each))
+        yield KNOWN_BETTER(**asdict(each))

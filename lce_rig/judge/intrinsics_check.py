@@ -8,14 +8,22 @@ the profile's in units of their uncertainty.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.findings import Figure, Finding
-from lce_rig.judge.weighing import Verdict, reason
+from lce_rig.core.findings import Finding
+from lce_rig.judge.findings import (
+    INTRINSICS,
+    INTRINSICS_BETTER,
+    INTRINSICS_FIT,
+    INTRINSICS_UNDETERMINED,
+    failing,
+)
+from lce_rig.judge.weighing import Verdict
 from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
 from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses, lens_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
@@ -225,12 +233,15 @@ def judge_lens(
     """
     error_px = np.inf if check is None else check.displacement_px
     limit_px = float(np.clip(error_px, *_KNOWN_PX))
-    figures: dict[str, Figure] = {"covered": covered, "image_sigma_px": image_sigma_px, "limit_px": limit_px}
+    figures: dict[str, Any] = {"covered": covered, "image_sigma_px": image_sigma_px, "limit_px": limit_px}
     if check is not None and check.verdict(target_deg) == "pass":
-        return Finding("intrinsics.fit", "note", figures=figures)
-    if image_sigma_px > limit_px:
-        return Finding("intrinsics.undetermined", "warning", figures=figures)
-    return Finding("intrinsics.better", "note", figures=figures)
+        return INTRINSICS_FIT(**figures)
+    return INTRINSICS_UNDETERMINED(**figures) if image_sigma_px > limit_px else INTRINSICS_BETTER(**figures)
+
+
+def lens_findings(check: IntrinsicsCheck | None, target_deg: float) -> list[Finding]:
+    """Find given intrinsics that do not fit; none where they pass or were not compared."""
+    return [] if check is None or check.verdict(target_deg) == "pass" else [explain(check, target_deg)]
 
 
 def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
@@ -241,7 +252,7 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
         target_deg: target standard deviation of the extrinsics' rotation.
     """
     judgement = judge_lens(check.covered, check.image_sigma_px, check, target_deg)
-    figures: dict[str, Figure] = {
+    figures: dict[str, Any] = {
         **{name: value for name, value in asdict(check).items() if not name.startswith("errors")},
         **judgement.figures,
         "is_visible": check.rms_px >= _VISIBLE * check.possible_px,
@@ -252,4 +263,4 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
     action = "refocused" if check.is_focal_off else ""
     if judgement.code == "intrinsics.undetermined":
         action = "collect"
-    return reason("verdict.intrinsics", figures, is_fail=check.verdict(target_deg) == "fail", action=action)
+    return INTRINSICS(severity=failing(check.verdict(target_deg) == "fail"), action=action, **figures)

@@ -14,10 +14,10 @@ from lce_rig.calibrate.observability import lever_arm, main_motion
 from lce_rig.calibrate.plane_and_ends import capture_costs, feature_sigmas
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
-from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import Array, perturb
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array, perturb, tangent_sizes
 from lce_rig.core.results import Observation
-from lce_rig.judge.weighing import reason
+from lce_rig.judge.findings import CONTROL, failing
 from lce_rig.rig import CalibrationSettings
 
 # A gain in the wrong direction of this many standard errors is significant.
@@ -129,16 +129,21 @@ def _compare(moves: Array, increases: Array) -> NegativeControl:
     return NegativeControl(moves, increases.mean(axis=0), increases.std(axis=0, ddof=1) / np.sqrt(n_captures))
 
 
-def control_findings(control: NegativeControl) -> list[Finding]:
+def control_findings(control: NegativeControl | None) -> list[Finding]:
     """Find a result that held-out captures do not distinguish from a wrong one."""
+    if control is None:
+        return []
     worst = int(np.argmin(control.worse / control.worse_sigma))
     if control.worse[worst] > 0:
         return []
     move = control.moves[worst]
-    figures: dict[str, Figure] = {
-        "rotation_deg": float(np.degrees(np.linalg.norm(move[3:]))),
-        "translation_m": float(np.linalg.norm(move[:3])),
-        "direction": main_motion(move),
-    }
+    rotation_deg, translation_m = tangent_sizes(move)
     is_fail = bool(control.worse[worst] < -_SURE * control.worse_sigma[worst])
-    return [reason("verdict.control", figures, is_fail=is_fail)]
+    return [
+        CONTROL(
+            severity=failing(is_fail),
+            rotation_deg=rotation_deg,
+            translation_m=translation_m,
+            direction=main_motion(move),
+        )
+    ]

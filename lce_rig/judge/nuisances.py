@@ -12,7 +12,7 @@ from lce_rig.calibrate.local_quadratic import FIRST_RING, SCALE, SHIFT
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
-from lce_rig.judge.weighing import reason
+from lce_rig.judge.findings import EDGE_SHIFT, LASER_OFFSET, SCALE_OFF, failing
 from lce_rig.rig import LidarSettings, VerdictSettings
 
 # A scale error of this many times the limit fails.
@@ -71,21 +71,26 @@ def _sigma(expansion: Quadratics, unknown: int) -> float:
 
 
 def nuisance_findings(
-    found: Nuisances, board: Board, lidar: LidarSettings, limits: VerdictSettings
+    found: Nuisances | None, board: Board, lidar: LidarSettings, limits: VerdictSettings
 ) -> list[Finding]:
     """Find implausible nuisance parameters: a scale error, edges beyond the beam, large range errors."""
+    if found is None:
+        return []
     findings = []
     off = abs(found.scale) - _SURE * found.scale_sigma
     if off > 0 and abs(found.scale) > limits.max_scale_error:
-        square_m = board.square_m
-        figures = {"scale": found.scale, "scale_sigma": found.scale_sigma}
-        figures |= {"square_m": square_m / (1 + found.scale), "profile_square_m": square_m}
-        findings.append(reason("verdict.scale", figures, is_fail=off > _SCALE_FAIL * limits.max_scale_error))
+        findings.append(
+            SCALE_OFF(
+                severity=failing(off > _SCALE_FAIL * limits.max_scale_error),
+                scale=found.scale,
+                scale_sigma=found.scale_sigma,
+                square_m=board.square_m / (1 + found.scale),
+                profile_square_m=board.square_m,
+            )
+        )
     if abs(found.edge_shift_m) - _SURE * found.edge_shift_sigma_m > limits.max_edge_shift_m:
-        figures = {"shift_m": found.edge_shift_m, "limit_m": limits.max_edge_shift_m}
-        findings.append(reason("verdict.edge_shift", figures, is_fail=False))
+        findings.append(EDGE_SHIFT(shift_m=found.edge_shift_m, limit_m=limits.max_edge_shift_m))
     allowed_m = limits.max_prior_sigmas * max(lidar.laser_bias_sigma_m, _HARMLESS_M)
     if abs(found.laser_offset_m) > allowed_m:
-        figures = {"ring": found.laser, "offset_m": found.laser_offset_m, "limit_m": allowed_m}
-        findings.append(reason("verdict.laser_offset", figures, is_fail=False))
+        findings.append(LASER_OFFSET(ring=found.laser, offset_m=found.laser_offset_m, limit_m=allowed_m))
     return findings

@@ -3,13 +3,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from lce_rig.calibrate.relative_pose import mean_pose
 from lce_rig.core.calibration import Calibration
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, log_so3
+from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE, RESULTS_AGREE, RESULTS_DISAGREE
 
 # Calibrations disagree if correct ones spread this far with less than this probability.
 _CHANCE = 0.01
@@ -100,7 +102,7 @@ class Repeatability:
     @property
     def finding(self) -> Finding:
         """Whether they agree, "repeat.agree" or "repeat.disagree", with its figures."""
-        figures: dict[str, Figure] = {
+        figures: dict[str, Any] = {
             "camera": self.camera,
             "lidar": self.lidar,
             "n_sessions": len(self.names),
@@ -112,15 +114,11 @@ class Repeatability:
         if not self.are_independent:
             worst = min(self.differences, key=lambda pair: pair.p)
             figures |= {"first": worst.first, "second": worst.second}
-            if self.agrees:
-                return Finding("results.agree", "note", figures=figures)
-            return Finding("results.disagree", "error", figures=figures)
+            return RESULTS_AGREE(**figures) if self.agrees else RESULTS_DISAGREE(**figures)
         if self.agrees:
-            figures["is_generous"] = self.p > _GENEROUS
-            return Finding("repeat.agree", "note", figures=figures)
-        figures |= {"ratio": self.ratio, "odd_one": self.odd_one}
+            return REPEAT_AGREE(is_generous=self.p > _GENEROUS, **figures)
         action = "" if self.odd_one is None else "odd_one"
-        return Finding("repeat.disagree", "error", figures=figures, action=action)
+        return REPEAT_DISAGREE(action=action, ratio=self.ratio, odd_one=self.odd_one, **figures)
 
 
 def compare_calibrations(

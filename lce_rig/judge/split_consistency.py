@@ -7,14 +7,22 @@ looked for: those of a sensor that moved to and fro.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.quadratics import Quadratics
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, tangent_sizes
-from lce_rig.judge.weighing import reason
+from lce_rig.judge.findings import (
+    CAMERA_CHANGED,
+    CAMERA_SHARES_DIFFER,
+    CHANGED,
+    SHARES_DIFFER,
+    TWO_GROUPS,
+    failing,
+)
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 
 # Fewer placements are not split.
@@ -239,6 +247,7 @@ def split_findings(
     captures: Sequence[str],
     target: CalibrationSettings,
     limits: VerdictSettings,
+    of_cameras: str = "",
 ) -> list[Finding]:
     """Find subsets that differ by more than the target and significantly more than random ones.
 
@@ -247,19 +256,32 @@ def split_findings(
         captures: names, in the order in which they were taken.
         target: standard deviations to reach.
         limits: of the profile.
+        of_cameras: names of two cameras where their relative pose is compared, not extrinsics.
     """
     findings = []
     for c in objections(contrasts, target, limits):
-        excess = c.excess(target, limits)
-        apart = {"rotation_deg": c.rotation_deg, "translation_m": c.translation_m, "chance": c.chance}
+        severity = failing(c.excess(target, limits) > _FAIL)
+        apart: dict[str, Any] = {
+            "rotation_deg": c.rotation_deg,
+            "translation_m": c.translation_m,
+            "chance": c.chance,
+        }
         if c.is_change:
-            figures: dict[str, Figure] = {"capture": captures[c.n_first], **apart}
-            findings.append(reason("verdict.changed", figures, is_fail=excess > _FAIL))
+            kind = CAMERA_CHANGED if of_cameras else CHANGED
+            findings.append(kind(of_cameras, severity=severity, capture=captures[c.n_first], **apart))
         elif c.group:
-            figures = {"captures": tuple(captures[k] for k in c.group), "n_captures": c.n_first, **apart}
-            findings.append(reason("verdict.two_groups", figures, is_fail=False))
+            names = tuple(captures[k] for k in c.group)
+            findings.append(TWO_GROUPS(captures=names, n_captures=c.n_first, **apart))
         else:
-            figures = {"first": c.first, "second": c.second, **apart}
-            action = "near" if c.first == "near" else ""
-            findings.append(reason("verdict.shares_differ", figures, is_fail=excess > _FAIL, action=action))
+            kind = CAMERA_SHARES_DIFFER if of_cameras else SHARES_DIFFER
+            findings.append(
+                kind(
+                    of_cameras,
+                    severity=severity,
+                    action="near" if c.first == "near" else "",
+                    first=c.first,
+                    second=c.second,
+                    **apart,
+                )
+            )
     return findings

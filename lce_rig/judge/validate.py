@@ -23,6 +23,7 @@ from lce_rig.judge.contributions import (
     scale_contradiction,
     split_contradictions,
 )
+from lce_rig.judge.findings import WIDENED
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.judge.negative_control import NegativeControl, run_control, run_control_with_constants
 from lce_rig.judge.nuisances import Nuisances, estimate_nuisances
@@ -126,7 +127,7 @@ def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float
     ratio, way = spread.ratio_to(cov)
     if ratio <= limits.max_spread_ratio:
         return 1.0, None
-    return ratio, Finding("verdict.widened", "note", figures={"ratio": ratio, "spread": way})
+    return ratio, WIDENED(ratio=ratio, spread=way)
 
 
 # Fewer placements do not allow leave-one-out.

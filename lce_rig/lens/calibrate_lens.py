@@ -12,6 +12,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.planar_pose import solve_planar_pose
+from lce_rig.lens.findings import OTHER_LENS
 from lce_rig.lens.fit import N_MODES, LensState, Setup, corners_of, fit, reduced, refine_poses, residuals_px
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import MODELS, LensModel, convert, model_of
@@ -151,7 +152,7 @@ def _refusals(distances_px: Array, kept: NDArray[np.bool_], views: Sequence[Boar
     """State for each rejected view the error of its corners under the intrinsics from the others."""
     usual = float(np.median(distances_px[kept]))
     return {
-        view.name: Refusal("calibrate.other_lens", figures={"rms_px": float(px), "median_px": usual})
+        view.name: OTHER_LENS.refusal(rms_px=float(px), median_px=usual)
         for view, px, is_kept in zip(views, distances_px, kept, strict=True)
         if not is_kept
     }

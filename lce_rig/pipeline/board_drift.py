@@ -18,6 +18,7 @@ from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State
+from lce_rig.scene.findings import BOARD_CHANGED, BOARD_UNSURE
 from lce_rig.show.overlays.session_check import find_meetings
 
 # What results of one rig differ by from session to session, m and rad, order of AXES.
@@ -130,6 +131,5 @@ def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:
 
 def board_finding(axis: AxisDrift) -> Finding:
     """Tell an axis that the boards find changed, or cannot tell."""
-    if axis.state == "changed":
-        return Finding("scene.board_changed", "error", axis.axis, axis.figures)
-    return Finding("scene.board_unsure", "note", axis.axis, axis.figures)
+    kind = BOARD_CHANGED if axis.state == "changed" else BOARD_UNSURE
+    return kind(axis.axis, **axis.figures)

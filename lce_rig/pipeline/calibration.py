@@ -28,7 +28,7 @@ from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-from lce_rig.core.findings import Figure, Finding, Refusal
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, Pair
@@ -36,12 +36,13 @@ from lce_rig.export.reference import Reference
 from lce_rig.judge.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.judge.reach import point_uncertainties
 from lce_rig.judge.validate import Validation, validate
-from lce_rig.judge.verdict import judge, with_opinion
+from lce_rig.judge.verdict import judge, share_findings, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import Progress, detect, silent
+from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE
 from lce_rig.pipeline.matching import candidates_of
 from lce_rig.pipeline.result_files import Result
-from lce_rig.pipeline.sharpening import Sharpen, by_boards, fuse, share_findings, sharpen
+from lce_rig.pipeline.sharpening import Sharpen, by_boards, fuse, sharpen
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
 from lce_rig.session import Session
@@ -229,8 +230,7 @@ def _nothing_solved(shortages: Sequence[Finding], cameras: Sequence[str] | None)
 
 def _shortage(pairs: Sequence[Pair], error: NotEnoughDataError) -> Finding:
     """Name the sensors that lack captures, if the error does not."""
-    figures = {"text": error.what, "advice": error.hint}
-    found = error.finding or Finding("shortage.text", "warning", figures=figures)
+    found = error.finding or SHORTAGE(text=error.what, advice=error.hint)
     return found if found.subject else replace(found, subject=f"{pairs[0].camera} and {pairs[0].lidar}")
 
 
@@ -299,13 +299,13 @@ def _sensors(rig: Rig, detections: Detections, pairs: Sequence[Pair], options: C
 def _few_detected(pair: Pair, n_detected: int, refused: Mapping[str, Refusal], n_needed: int) -> Finding:
     """State in how many captures both sensors found the board, and the most frequent causes of refusal."""
     counts = Counter((why.code, f"{why.stage}: {sentence(why)}") for why in refused.values())
-    figures: dict[str, Figure] = {
-        "n_detected": n_detected,
-        "n_captures": n_detected + len(refused),
-        "n_needed": n_needed,
-        "causes": tuple((n, code, text) for (code, text), n in counts.most_common(3)),
-    }
-    return Finding("shortage.few_detected", "warning", str(pair), figures)
+    return FEW_DETECTED(
+        str(pair),
+        n_detected=n_detected,
+        n_captures=n_detected + len(refused),
+        n_needed=n_needed,
+        causes=tuple((n, code, text) for (code, text), n in counts.most_common(3)),
+    )
 
 
 def _links(rig: Rig, solved: Sequence[_Solved]) -> Iterator[_Link]:

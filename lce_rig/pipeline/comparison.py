@@ -14,6 +14,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.judge.repeatability import Repeatability, compare_calibrations
 from lce_rig.pipeline.calibration import calibrate
 from lce_rig.pipeline.detect_session import Progress, silent
+from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, ONLY_ONE, OTHER_BOARD, OUTDATED
 from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
 from lce_rig.session import Session
 from lce_rig.session.identity import DifferingKey, differing_keys
@@ -75,7 +76,7 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
     results = {name: list(_read(session, stored[name].folder).pairs) for name in chosen}
     comparisons, lonely = compare_sensors(results, are_independent=False)
     _require_some(comparisons, results, "results")
-    outdated = [Finding("results.outdated", "warning", name) for name in chosen if stored[name].is_outdated]
+    outdated = [OUTDATED(name) for name in chosen if stored[name].is_outdated]
     return Repeat(session.rig.name, comparisons, (), (*outdated, *lonely, *_failures(results)))
 
 
@@ -137,7 +138,7 @@ def _require_some(
 
 def _failures(results: dict[str, list[Calibration]]) -> list[Finding]:
     return [
-        Finding("repeat.failed", "error", name, {"camera": c.camera, "lidar": c.lidar})
+        FAILED(name, camera=c.camera, lidar=c.lidar)
         for name, own in results.items()
         for c in own
         if c.verdict == "fail"
@@ -228,7 +229,7 @@ def _require_apart(captures: Mapping[str, frozenset[str]]) -> None:
 def _other_boards(sessions: dict[str, Session]) -> list[Finding]:
     (first_name, first), *others = sessions.items()
     return [
-        Finding("repeat.other_board", "warning", name, {"first": first_name})
+        OTHER_BOARD(name, first=first_name)
         for name, session in others
         if session.rig.board != first.rig.board
     ]
@@ -245,16 +246,12 @@ def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[Fin
     except NotEnoughDataError as error:
         raise NotEnoughDataError(f"{name}: {error.what}", error.hint) from None
     return list(result.pairs), [
-        Finding(
-            "repeat.not_calibrated",
-            "warning",
+        NOT_CALIBRATED(
             name,
-            {
-                "sensors": shortage.subject,
-                "cause": shortage.code,
-                "what": describe(shortage),
-                "hint": recommend(shortage),
-            },
+            sensors=shortage.subject,
+            cause=shortage.code,
+            what=describe(shortage),
+            hint=recommend(shortage),
         )
         for shortage in result.shortages
     ]
@@ -302,7 +299,7 @@ def compare_sensors(
         if len(group) > 1
     ]
     lonely = [
-        Finding("repeat.only_one", "warning", next(iter(group)), {"camera": camera, "lidar": lidar})
+        ONLY_ONE(next(iter(group)), camera=camera, lidar=lidar)
         for (camera, lidar), group in sorted(groups.items())
         if len(group) == 1
     ]

@@ -11,7 +11,7 @@ from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SessionError
-from lce_rig.core.findings import Figure, Finding, Severity
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
@@ -24,6 +24,16 @@ from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.drift import AxisDrift, Drift, State, overall, watch
+from lce_rig.scene.findings import (
+    CHANGED_WITH_BOARD,
+    CLOCKS_APART,
+    CLOCKS_INSTEAD,
+    EVENTS_OF_STANDING_RIG,
+    NO_FIRING_TIMES,
+    NO_SAMPLES,
+    UNCHANGED_WITH_BOARD,
+    UNKNOWN_WITH_BOARD,
+)
 from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
 from lce_rig.scene.views import build_view, without_board, without_movers
 from lce_rig.session import Session
@@ -34,7 +44,6 @@ from lce_rig.words import as_json
 
 _MIN_MOVING = 3
 _MAX_BOARDS = 20
-_SEVERITIES: dict[State, Severity] = {"changed": "error", "unknown": "warning", "unchanged": "note"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,19 +80,17 @@ class PairDrift:
         """The verdict as a finding."""
         if self.board is None:
             return self.drift.findings[0]
-        axes = {each: tuple(a for a, state in self.states.items() if state == each) for each in _SEVERITIES}
-        figures: dict[str, Figure] = {
-            "n_captures": self.drift.n_captures,
-            "n_boards": self.board.n_boards,
-            "changed": axes["changed"],
-            "unknown": axes["unknown"],
-        }
-        code = {
-            "changed": "scene.changed_with_board",
-            "unknown": "scene.unknown_with_board",
-            "unchanged": "scene.unchanged_with_board",
-        }
-        return Finding(code[self.state], _SEVERITIES[self.state], figures=figures)
+        kind = {
+            "changed": CHANGED_WITH_BOARD,
+            "unknown": UNKNOWN_WITH_BOARD,
+            "unchanged": UNCHANGED_WITH_BOARD,
+        }[self.state]
+        return kind(
+            n_captures=self.drift.n_captures,
+            n_boards=self.board.n_boards,
+            changed=tuple(axis for axis, state in self.states.items() if state == "changed"),
+            unknown=tuple(axis for axis, state in self.states.items() if state == "unknown"),
+        )
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -278,14 +285,12 @@ class _Judge:
             views = without_movers(views)
         judged = watch(views, lens, c.T_cam_lidar, c.cov)
         if not kept:
-            lacking = Finding("scene.no_samples", "error", c.camera, {"lidar": c.lidar})
-            judged = replace(judged, findings=(lacking,))
+            judged = replace(judged, findings=(NO_SAMPLES(c.camera, lidar=c.lidar),))
         elif n_untimed:
-            untimed = Finding("scene.no_firing_times", "warning", c.lidar, {"n_captures": n_untimed})
+            untimed = NO_FIRING_TIMES(c.lidar, n_captures=n_untimed)
             judged = replace(judged, findings=(*judged.findings, untimed))
         if judged.state == "unknown" and not moving and any(isinstance(each.image, Events) for each in kept):
-            standing = Finding("scene.events_of_standing_rig", "warning", c.camera)
-            judged = replace(judged, findings=(*judged.findings, standing))
+            judged = replace(judged, findings=(*judged.findings, EVENTS_OF_STANDING_RIG(c.camera)))
         if len(moving) >= _MIN_MOVING and judged.curves:
             judged = _with_clocks(judged, moving, lens, c.camera)
         return PairDrift(c, judged, self._boards(c, boards), _example(kept, whole))
@@ -353,10 +358,9 @@ def _with_clocks(judged: Drift, moving: Sequence[MovingView], lens: Intrinsics, 
     apart_s = clocks_apart_s(moving, lens, judged.T_cam_lidar, judged.T_changed if is_changed else None)
     if apart_s is None:
         return judged
-    code = "scene.clocks_instead" if is_changed else "scene.clocks_apart"
-    found = Finding(code, "warning", camera, {"apart_s": apart_s})
+    found = (CLOCKS_INSTEAD if is_changed else CLOCKS_APART)(camera, apart_s=apart_s)
     axes = tuple(
-        replace(axis, state="unknown", reason=code) if axis.state == "unchanged" else axis
+        replace(axis, state="unknown", reason=found.code) if axis.state == "unchanged" else axis
         for axis in judged.axes
     )
     first, *rest = judged.findings

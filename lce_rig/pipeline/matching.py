@@ -8,6 +8,7 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.detection import Detections, Pair
+from lce_rig.pipeline.findings import NO_AGREEMENT
 from lce_rig.rig import Rig
 
 
@@ -42,7 +43,7 @@ def match_sensors(
     candidates, refused = candidates_of(detections, pair)
     if len(candidates) >= 3:
         consensus = find_consensus(candidates, rig.board.to_board())
-        nowhere = Refusal("pair.no_agreement", figures={"n_captures": len(candidates)})
+        nowhere = NO_AGREEMENT.refusal(n_captures=len(candidates))
         refused |= consensus.refused if consensus else {item.capture: nowhere for item in candidates}
         chosen = {each.capture: each.lidar for each in consensus.observations} if consensus else {}
     return dict(sorted(refused.items())), chosen

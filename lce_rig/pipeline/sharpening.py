@@ -10,10 +10,8 @@ from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, Extrinsics, SceneShare
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.findings import Figure, Finding
-from lce_rig.core.geometry import Array, difference, tangent_sizes
+from lce_rig.core.geometry import Array, difference
 from lce_rig.detect.detection import Detections
-from lce_rig.judge.weighing import reason
 from lce_rig.pipeline.witness import scene_views
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.estimate import estimate
@@ -124,21 +122,3 @@ def by_boards(calibration: Calibration) -> Calibration:
     if share is None:
         return calibration
     return replace(calibration, T_cam_lidar=share.T_cam_lidar_boards, cov=share.cov_boards)
-
-
-def share_findings(share: SceneShare) -> list[Finding]:
-    """Tell what the scene did to the extrinsics."""
-    rotation_deg, translation_m = tangent_sizes(share.change)
-    sigma_deg, sigma_m = tangent_sizes(share.change_sigma)
-    figures: dict[str, Figure] = {
-        "rotation_deg": rotation_deg,
-        "translation_m": translation_m,
-        "rotation_sigma_deg": sigma_deg,
-        "translation_sigma_m": sigma_m,
-        "n_captures": share.n_captures,
-        "n_edges": share.n_edges,
-    }
-    if share.state == "contradicts":
-        return [reason("verdict.scene_not_used", figures, is_fail=False)]
-    code = "verdict.scene_used" if share.state == "used" else "verdict.scene_unknown"
-    return [Finding(code, "note", figures=figures)]

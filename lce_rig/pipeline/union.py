@@ -14,7 +14,7 @@ from typing import TypeVar
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration, SceneOpinion
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Finding
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.repeatability import Repeatability
@@ -23,6 +23,7 @@ from lce_rig.pipeline.calibration import calibrate as calibrate_one
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.pipeline.comparison import compare_sensors, require_independent, require_one_rig, session_names
 from lce_rig.pipeline.detect_session import Progress, detect, silent
+from lce_rig.pipeline.findings import MOVED
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.sharpening import by_boards, sharpen
 from lce_rig.pipeline.witness import hear_scene
@@ -191,14 +192,14 @@ def _moved(comparison: Repeatability) -> Finding:
     odd = comparison.odd_one
     pairs = [each for each in comparison.differences if odd in (None, each.first, each.second)]
     worst = min(pairs, key=lambda pair: (pair.p, -pair.distance))
-    figures: dict[str, Figure] = {
-        "camera": comparison.camera,
-        "lidar": comparison.lidar,
-        "first": worst.first,
-        "second": worst.second,
-        "rotation_deg": worst.rotation_deg,
-        "translation_m": worst.translation_m,
-        "p": comparison.p,
-        "odd_one": odd,
-    }
-    return Finding("union.moved", "error", figures=figures, action="" if odd is None else "odd_one")
+    return MOVED(
+        action="" if odd is None else "odd_one",
+        camera=comparison.camera,
+        lidar=comparison.lidar,
+        first=worst.first,
+        second=worst.second,
+        rotation_deg=worst.rotation_deg,
+        translation_m=worst.translation_m,
+        p=comparison.p,
+        odd_one=odd,
+    )

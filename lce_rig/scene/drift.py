@@ -2,15 +2,28 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import KINDS, Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.scene.alignment import AXES, IS_ROTATION, Alignment, Curve, SceneView
 from lce_rig.scene.estimate import BIAS, estimate
+from lce_rig.scene.findings import (
+    AXIS_CHANGED,
+    AXIS_UNCHANGED,
+    BEST_UNCERTAIN,
+    CHANGED,
+    FEW_EDGES,
+    FLAT,
+    LARGE_SCATTER,
+    NO_PEAK,
+    SIDE_WITHOUT_EDGES,
+    UNCHANGED,
+    UNKNOWN,
+)
 
 State = Literal["unchanged", "changed", "unknown"]
 
@@ -65,7 +78,7 @@ class AxisDrift:
         return "deg" if self.is_rotation else "m"
 
     @property
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, Any]:
         """The figures by their names with the unit, as findings hold them."""
         return {f"{name}_{self.unit}": getattr(self, name) for name in ("change", "sigma", "smallest")}
 
@@ -137,9 +150,8 @@ def watch(
         n_edges = len(alignment)
         missing = _sides_without_edges(alignment)
     if n_edges < _MIN_EDGES * max(len(views), 1) ** 0.5 or _n_parts(alignment) < _MIN_PARTS:
-        figures: dict[str, Figure] = {"n_edges": n_edges, "n_captures": len(views)}
-        few = Finding("scene.few_edges", "error", figures=figures)
-        axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, "scene.few_edges") for axis in AXES)
+        few = FEW_EDGES(n_edges=n_edges, n_captures=len(views))
+        axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, few.code) for axis in AXES)
         return Drift(axes, (few, *missing), T_cam_lidar, T_cam_lidar, None, {}, len(views), n_edges)
 
     sigma_deployed = np.sqrt(np.diag(cov))
@@ -192,17 +204,17 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     mean_score = float(curve.total.max() / alignment.weight_of_parts.sum() * alignment.n_captures)
     reason = ""
     if abs(peak) > 0.95 * curve.offsets[-1]:
-        reason = "scene.no_peak"
+        reason = NO_PEAK.code
     elif (
         mean_score < _MIN_SCORE
         or curve.significance(peak) < _MIN_SIGNIFICANCE
         or np.median(curve.total) > (1 - _MIN_CONTRAST) * curve.total.max()
     ):
-        reason = "scene.flat"
+        reason = FLAT.code
     is_beyond = abs(peak) > THRESHOLD_SIGMAS * sigma
     is_changed = is_beyond and not reason and curve.significance(peak, 0.0) > _MIN_GAIN
     if not reason and (smallest > LARGEST[axis] or is_beyond):
-        reason = "scene.large_scatter"
+        reason = LARGE_SCATTER.code
     state: State = "changed" if is_changed else "unknown" if reason else "unchanged"
     figures = (unit * peak, unit * sigma, unit * smallest)
     return AxisDrift(AXES[axis], state, *figures, "" if is_changed else reason)
@@ -211,20 +223,15 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
 def _summary(axes: tuple[AxisDrift, ...], n_captures: int) -> Finding:
     changed = tuple(axis.axis for axis in axes if axis.state == "changed")
     unknown = tuple(axis.axis for axis in axes if axis.state == "unknown")
-    figures: dict[str, Figure] = {"n_captures": n_captures, "changed": changed, "unknown": unknown}
-    if changed:
-        return Finding("scene.changed", "error", figures=figures)
-    if unknown:
-        return Finding("scene.unknown", "warning", figures=figures)
-    return Finding("scene.unchanged", "note", figures=figures)
+    kind = CHANGED if changed else UNKNOWN if unknown else UNCHANGED
+    return kind(n_captures=n_captures, changed=changed, unknown=unknown)
 
 
 def _of_axis(axis: AxisDrift) -> Finding:
     if axis.state == "changed":
-        return Finding("scene.axis_changed", "error", axis.axis, {**axis.figures, "instead": axis.instead})
-    if axis.state == "unchanged":
-        return Finding("scene.axis_unchanged", "note", axis.axis, axis.figures)
-    return Finding(axis.reason, "warning", axis.axis, axis.figures)
+        return AXIS_CHANGED(axis.axis, instead=axis.instead, **axis.figures)
+    kind = AXIS_UNCHANGED if axis.state == "unchanged" else KINDS[axis.reason]
+    return kind(axis.axis, **axis.figures)
 
 
 def _open_axes(cov_best: Array | None) -> list[Finding]:
@@ -233,7 +240,7 @@ def _open_axes(cov_best: Array | None) -> list[Finding]:
         return []
     is_open = np.sqrt(np.diag(cov_best)) > LARGEST
     axes = tuple(axis for axis, each in zip(AXES, is_open, strict=True) if each)
-    return [Finding("scene.best_uncertain", "warning", figures={"axes": axes})] if axes else []
+    return [BEST_UNCERTAIN(axes=axes)] if axes else []
 
 
 def _sides_without_edges(alignment: Alignment) -> list[Finding]:
@@ -242,7 +249,7 @@ def _sides_without_edges(alignment: Alignment) -> list[Finding]:
     thirds = [part.sum() for part in np.array_split(columns, 3)]
     total = max(sum(thirds), 1e-12)
     return [
-        Finding("scene.side_without_edges", "note", side, {"share": float(third / total)})
+        SIDE_WITHOUT_EDGES(side, share=float(third / total))
         for side, third in zip(("left", "middle", "right"), thirds, strict=True)
         if third < 0.05 * total
     ]

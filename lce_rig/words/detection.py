@@ -34,10 +34,6 @@ PHRASES: dict[str, Phrase] = {
     "pair.no_candidate": Phrase(
         "no surface in the scan fits the board", "move the board clear of other things"
     ),
-    "pair.no_agreement": Phrase(
-        "no three of {n_captures} captures agree with one set of extrinsics",
-        "check the board's size, the intrinsics and the pairing of images with scans",
-    ),
     "pair.elsewhere": Phrase(
         _candidates,
         "come closer or tilt the board more, so that both sensors see its tilt well",
@@ -51,9 +47,5 @@ PHRASES: dict[str, Phrase] = {
         "outlier: plane {plane_m:mm}, edges {edges_m:mm} rms from the other captures' prediction "
         "(median {plane_median_m:mm}, {edges_median_m:mm})",
         _HOLD_STILL,
-    ),
-    "calibrate.other_lens": Phrase(
-        "corners {rms_px:.2f} px rms from the intrinsics of the other boards (median {median_px:.2f} px)",
-        "check with `lce-rig check --debug-images` whether the board is bent, cut off or moving",
     ),
 }

@@ -9,13 +9,13 @@ from benchmarks.corruption_kinds import Corruption, corruptions
 from benchmarks.corruption_sessions import Detector, Samples, recorded_samples, simulated_samples
 from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.tables import compare, print_head, print_row
-from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration, Method
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.weighing import Verdict
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig
 from lce_rig.words import sentence
 
@@ -188,7 +188,7 @@ def _judge(
 
 
 def _calibrate(rig: Rig, found: Detections, method: Method) -> Calibration:
-    calibration, *_ = pipeline.calibrate_detections(rig, found, CalibrateOptions(method=method))[0]
+    calibration, *_ = calibrate_detections(rig, found, CalibrateOptions(method=method))[0]
     return calibration
 
 

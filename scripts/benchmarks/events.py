@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+import lce_rig as lce
 from benchmarks.tables import compare, print_head, print_row, rms
-from lce_rig import pipeline
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, transform
 from lce_rig.core.results import ImageBoard
-from lce_rig.pipeline import Detections
+from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import (
@@ -110,8 +111,8 @@ def _session(seed: int, n_captures: int) -> tuple[SessionRun, SessionRun]:
             for capture in simulate_captures(rig, n_captures=n_captures, seed=seed, options=options):
                 name = session.add_capture(capture.images, capture.scans, {}, events=capture.events)
                 captures[name] = capture
-            network = _assess(rig, pipeline.detect(session, n_threads=1), captures, truth, CHOICES)
-            by_map = pipeline.detect(session, event_image="map", n_threads=1)
+            network = _assess(rig, lce.detect(session, n_threads=1), captures, truth, CHOICES)
+            by_map = lce.detect(session, event_image="map", n_threads=1)
             return network, _assess(rig, by_map, captures, truth, (("events",),))
 
 
@@ -128,7 +129,7 @@ def _assess(
         run.corner_px[channel] = list(_corner_errors(rig, channel, found, captures))
     for channels in choices:
         try:
-            (calibration, *_), _ = pipeline.calibrate_detections(rig, detections, channels=channels)
+            (calibration, *_), _ = calibrate_detections(rig, detections, channels=channels)
         except NotEnoughDataError:
             continue
         deg, mm = compare(calibration.T_cam_lidar, truth)

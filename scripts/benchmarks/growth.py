@@ -7,9 +7,10 @@ from pathlib import Path
 
 from benchmarks.still_sessions import still_session
 from benchmarks.tables import print_head, print_row
-from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Method
+from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import load_rig
 from lce_rig.simulate import SimulationOptions
 
@@ -36,12 +37,12 @@ def _measure(n_captures: int, method: Method, folder: Path) -> tuple[str, str, s
     options = SimulationOptions.for_rig(_RIG)
     session = still_session(rig, 0, options, max(_SIZES), _CORNER_SIGMA_PX, folder)
     chosen = session.candidates[:n_captures]
-    detections = pipeline.Detections(
+    detections = Detections(
         {(next(iter(rig.cameras)), "frames"): {each.capture: each.image for each in chosen}},
         {next(iter(rig.lidars)): {each.capture: list(each.lidar) for each in chosen}},
     )
     start = time.process_time()
-    (calibration, *_), _ = pipeline.calibrate_detections(rig, detections, CalibrateOptions(method))
+    (calibration, *_), _ = calibrate_detections(rig, detections, CalibrateOptions(method))
     seconds = time.process_time() - start
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return str(len(calibration.captures_used)), f"{seconds:.1f}", f"{peak_mb:.0f}"

@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 import lce_rig
-from lce_rig import pipeline
+from lce_rig.pipeline.detect_session import detection_digest
 from lce_rig.rig import Rig
 
 
@@ -25,7 +25,7 @@ def kept_folder(
         packages: of lce_rig that make the sessions.
         is_detected: whether the content depends on the detectors.
     """
-    source = pipeline.detection_digest(rig) if is_detected else rig.model_dump_json()
+    source = detection_digest(rig) if is_detected else rig.model_dump_json()
     digest = hashlib.sha256(f"{source} {what!r}".encode())
     for package in packages:
         for file in sorted((Path(lce_rig.__file__).parent / package).rglob("*.py")):

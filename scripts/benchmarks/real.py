@@ -8,12 +8,12 @@ import numpy as np
 
 from benchmarks.recordings import SETS, RecordedSet, detect
 from benchmarks.tables import compare, print_head, print_row
-from lce_rig import pipeline
 from lce_rig.calibrate import EstimateSettings
 from lce_rig.core.calibration import Method
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import ImageBoard
-from lce_rig.pipeline import Detections
+from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig
 
 
@@ -58,7 +58,7 @@ def _row(
     pairs = [pair for pair in detections.pairs if pair.channel in channels]
     seen = [detections.of(pair, name) for pair in pairs for name in detections.captures(pair)]
     options = EstimateSettings(method)
-    (calibration, *_), _ = pipeline.calibrate_detections(rig, detections, options, channels=channels)
+    (calibration, *_), _ = calibrate_detections(rig, detections, options, channels=channels)
     deg, mm = compare(calibration.T_cam_lidar, recorded.reference())
     split_deg, split_mm = _split_halves(rig, detections, channels, n_splits, method)
     return (
@@ -95,7 +95,7 @@ def _split_halves(
         halves = [{keys[i] for i in part} for part in np.array_split(order, 2)]
         try:
             T = [
-                pipeline.calibrate_detections(
+                calibrate_detections(
                     rig,
                     _only(detections, {n for n, key in prints.items() if key in half}),
                     EstimateSettings(method, n_draws=0),
@@ -118,7 +118,7 @@ def _only(detections: Detections, names: set[str]) -> Detections:
 
 
 def _clock_rows(recorded: RecordedSet, rig: Rig, detections: Detections) -> Iterator[tuple[object, ...]]:
-    (calibration, *_), _ = pipeline.calibrate_detections(rig, detections)
+    (calibration, *_), _ = calibrate_detections(rig, detections)
     figures = calibration.diagnostics
     apart = f"{figures.channels_rotation_deg:.2f} / {1000 * figures.channels_translation_m:.1f}"
     for result in calibration.channel_results:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lce_rig import pipeline
+import lce_rig as lce
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
+from lce_rig.detect.detection import Detections
 from lce_rig.rig import Rig
 
 RIGS = Path(__file__).resolve().parents[2] / "tests" / "rigs"
@@ -73,9 +74,9 @@ def recordings() -> Path:
     return Path(folder)
 
 
-def detect(path: Path) -> tuple[Rig, pipeline.Detections]:
+def detect(path: Path) -> tuple[Rig, Detections]:
     """Detect the boards of a session."""
     from lce_rig.session import Session
 
     session = Session.open(path)
-    return session.rig, pipeline.detect(session)
+    return session.rig, lce.detect(session)

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from lce_rig.export.result import SavedResult
 
+import lce_rig as lce
 from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import print_head, print_row
-from lce_rig import pipeline
-from lce_rig.core.calibration import Calibration, ResultFile
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, difference, perturb
@@ -57,7 +58,7 @@ class _Watched:
         with tempfile.TemporaryDirectory() as folder:
             recorded.collect(Path(folder) / "session")
             session = Session.open(Path(folder) / "session")
-            (c,) = pipeline.calibrate(session).pairs
+            (c,) = lce.calibrate(session).pairs
             samples = _samples(session, c)
             start = time.perf_counter()
             views = [build_view(session.rig, c, each.name, each.image, each.scan) for each in samples]
@@ -103,7 +104,7 @@ class _Watched:
 
     def drift(self, views: list[SceneView], deployed: Calibration) -> PairDrift:
         """Judge a result by some captures as `lce-rig drift` does, by scene and boards."""
-        result = ResultFile(rig=self.rig.name, pairs=(deployed,))
+        result = SavedResult(self.rig.name, "", (deployed,), {})
         captures = SceneCaptures(self.rig, result, "a part")
         names = {view.capture for view in views}
         for each in self.samples:

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import lce_rig as lce
 from benchmarks.kept import kept_folder
 from benchmarks.recordings import RIGS
-from lce_rig import pipeline
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
 from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.nominal import NominalExtrinsic
 from lce_rig.scene.alignment import SceneView
@@ -62,7 +63,7 @@ class FurnishedRoom:
     @cached_property
     def detections(self) -> Detections:
         """The boards of all captures."""
-        return pipeline.detect(self.session, n_threads=1)
+        return lce.detect(self.session, n_threads=1)
 
     def calibrate(self, names: Sequence[str]) -> Calibration:
         """Calibrate on the boards of some captures alone, three at least.
@@ -70,7 +71,7 @@ class FurnishedRoom:
         Raises:
             NotEnoughDataError: they are too few.
         """
-        (calibration,), _ = pipeline.calibrate_detections(with_few(self.rig), only(self.detections, names))
+        (calibration,), _ = calibrate_detections(with_few(self.rig), only(self.detections, names))
         return calibration
 
     def views(

@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
+import lce_rig as lce
 from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.scene_rooms import ROOMS, FurnishedRoom, furnished_room, only, with_few
 from benchmarks.tables import print_head, print_row
-from lce_rig import pipeline
 from lce_rig.core.calibration import Calibration, SceneShare
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, perturb, sigma_sizes, tangent_sizes
+from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.pipeline.sharpening import share_of
 from lce_rig.pipeline.witness import scene_views
 from lce_rig.rig import Rig
@@ -136,9 +138,9 @@ def _bench_recording(recorded: RecordedSet, n_splits: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         recorded.collect(Path(folder) / "session")
         session = Session.open(Path(folder) / "session")
-        detections = pipeline.detect(session)
+        detections = lce.detect(session)
         rig = with_few(session.rig)
-        (every,), _ = pipeline.calibrate_detections(rig, detections)
+        (every,), _ = calibrate_detections(rig, detections)
         lens = rig.cameras[every.camera].to_intrinsics()
         views = scene_views(session, detections, every, 60)
         whole = share_of(without_movers(views), lens, every)
@@ -153,7 +155,7 @@ def _bench_recording(recorded: RecordedSet, n_splits: int) -> None:
 
 
 def _print_choices(
-    rig: Rig, detections: pipeline.Detections, views: list[SceneView], every: Calibration, n: int
+    rig: Rig, detections: Detections, views: list[SceneView], every: Calibration, n: int
 ) -> None:
     lens = rig.cameras[every.camera].to_intrinsics()
     apart: list[tuple[Array, Array]] = []
@@ -161,7 +163,7 @@ def _print_choices(
         chosen = np.random.default_rng(k).choice(len(views), 5, replace=False)
         names = [views[index].capture for index in sorted(chosen)]
         try:
-            (calibration,), _ = pipeline.calibrate_detections(rig, only(detections, names))
+            (calibration,), _ = calibrate_detections(rig, only(detections, names))
         except NotEnoughDataError:
             print_row(k, "boards nearly parallel", "", "", "", "")
             continue

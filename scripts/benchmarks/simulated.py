@@ -5,10 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.geometry import difference
+from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import load_rig
 
 
@@ -38,14 +39,14 @@ def _simulated_runs(name: str, n_seeds: int, n_captures: int) -> Iterator[tuple[
     rig = load_rig(name)
     options = SimulationOptions.for_rig(name)
     for seed in range(n_seeds):
-        images: dict[str, pipeline.ImageDetection] = {}
-        scans: dict[str, pipeline.LidarDetection] = {}
+        images: dict[str, ImageDetection] = {}
+        scans: dict[str, LidarDetection] = {}
         for capture in simulate_captures(rig, n_captures=n_captures, seed=seed, options=options):
             images[f"{capture.index:06d}"] = BoardFinder(rig).image(capture.images[0])
             scans[f"{capture.index:06d}"] = BoardFinder(rig).scan(capture.scans[0])
         camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
-        detections = pipeline.Detections({(camera, "frames"): images}, {lidar: scans})
-        (calibration, *_), _ = pipeline.calibrate_detections(rig, detections, CalibrateOptions(seed=seed))
+        detections = Detections({(camera, "frames"): images}, {lidar: scans})
+        (calibration, *_), _ = calibrate_detections(rig, detections, CalibrateOptions(seed=seed))
         error = difference(calibration.T_cam_lidar, truth_extrinsics(rig, seed, options)[camera, lidar])
         nees = float(error @ np.linalg.solve(calibration.cov, error))
         yield (

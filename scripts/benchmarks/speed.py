@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+import lce_rig as lce
 from benchmarks.recordings import SETS
 from benchmarks.tables import print_head, print_row
-from lce_rig import pipeline
 from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.finder import BoardFinder
@@ -51,7 +51,7 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
     seen = [finder.search_image(picture).board for picture in pictures]
     lasts = [board if isinstance(board, ImageBoard) else None for board in seen]
     yield "tracked, median", milliseconds(lambda k: finder.search_image(pictures[k], lasts[k]))
-    detections = pipeline.detect(session)
+    detections = lce.detect(session)
     pair = detections.pairs[0]
     both = ((name, *detections.of(pair, name)) for name in detections.captures(pair))
     candidates = [

@@ -14,7 +14,6 @@ from scipy.stats import chi2
 from benchmarks.profile_errors import with_profile_errors
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.likelihood.along_rays import (
     N_FIELDS,
@@ -34,6 +33,7 @@ from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.calibration import Method
 from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, difference, invert
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions
 
@@ -176,7 +176,7 @@ def _runs_in_error(
         session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
         profile, found = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
         options = CalibrateOptions(method=method, n_draws=0)
-        (calibration,), _ = pipeline.calibrate_detections(profile, found, options)
+        (calibration,), _ = calibrate_detections(profile, found, options)
         error = difference(calibration.T_cam_lidar, session.T_cam_lidar)
         yield JudgedRun(error, calibration.cov, calibration.verdict)
 

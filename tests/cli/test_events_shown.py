@@ -7,15 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from lce_rig.export.result import write_result
 
-from lce_rig import pipeline
+import lce_rig as lce
 from lce_rig.core.calibration import Calibration, Certificate, Metrics
 from lce_rig.core.geometry import invert
 from lce_rig.rig import find_profile, load_rig
 from lce_rig.session import Session
 from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER
 from lce_rig.simulate import SimulationOptions, simulate_captures
-from tests.saved_results import write_result
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_check_as_json_has_every_figure_of_events_and_motion(lce_rig, moving):
 def test_every_detection_carries_the_stamp_of_its_sample(lce_rig, moving):
     session = Session.open(moving)
     (capture,) = session.captures
-    detections = pipeline.detect(session)
+    detections = lce.detect(session)
     frame = detections.images["davis", "frames"]["000000"]
     assert frame.stamp_ns == capture.image("davis", "frames").stamp_ns
     boards = detections.lidars["lidar"]["000000"]

@@ -4,10 +4,10 @@ from typing import get_args
 
 import pytest
 
-from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Method
 from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import find_profile, parse_rig, set_value
 from tests.calibrate.boards import simulate
 
@@ -17,7 +17,7 @@ RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 def systematic_sigma_m(*lines: str) -> float:
     """Calibrate simulated boards for an RLFS whose LiDAR has these lines in its profile."""
     rig = parse_rig(RLFS.replace("    rate_hz: 10\n", "".join(f"    {line}\n" for line in lines), 1))
-    (calibration,), _ = pipeline.calibrate_detections(rig, found(), CalibrateOptions("paper", n_draws=0))
+    (calibration,), _ = calibrate_detections(rig, found(), CalibrateOptions("paper", n_draws=0))
     return calibration.diagnostics.sigma_systematic_translation_m
 
 
@@ -44,7 +44,7 @@ def test_a_profile_that_says_that_all_is_exact_is_believed(method: Method) -> No
     for key in ("focal_sigma_px", "principal_point_sigma_px", "distortion_sigma_px"):
         text = set_value(text, f"cameras.cam.intrinsics.{key}", "0.0")
     options = CalibrateOptions(method, n_draws=0)
-    (calibration,), _ = pipeline.calibrate_detections(parse_rig(text), found(), options)
+    (calibration,), _ = calibrate_detections(parse_rig(text), found(), options)
     # What checks contradict may widen the claim; lens and board add nothing to it.
     assert not calibration.cov_shared.any()
     assert 0 < calibration.sigma_translation_m < 0.02

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.cli.calibrate import camera_lines, together_lines
 from lce_rig.core.calibration import read_result
@@ -16,6 +15,7 @@ from lce_rig.core.geometry import difference, invert
 from lce_rig.detect.detection import Detections
 from lce_rig.export import export
 from lce_rig.export.urdf import read_urdf
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import load_rig
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
 from tests.saved_results import write_result
@@ -39,7 +39,7 @@ def detections(session, **kept):
 
 
 def calibrated(seen, options, rig=RIG):
-    pairs, shortages = pipeline.calibrate_detections(rig, seen, options)
+    pairs, shortages = calibrate_detections(rig, seen, options)
     assert not shortages
     return {calibration.camera: calibration for calibration in pairs}
 
@@ -135,7 +135,7 @@ def test_cameras_without_a_common_board_stay_by_themselves(session):
 
 
 def test_the_camera_asked_for_is_calibrated_as_if_there_were_no_other(session):
-    (asked,), _ = pipeline.calibrate_detections(RIG, detections(session), ML, cameras=[RIGHT])
+    (asked,), _ = calibrate_detections(RIG, detections(session), ML, cameras=[RIGHT])
     (alone,) = calibrated(detections({RIGHT: session[RIGHT]}), ML, only(RIGHT)).values()
     assert asked.camera == RIGHT
     assert np.array_equal(asked.T_cam_lidar, alone.T_cam_lidar)
@@ -144,7 +144,7 @@ def test_the_camera_asked_for_is_calibrated_as_if_there_were_no_other(session):
 
 def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
     with pytest.raises(NotEnoughDataError) as caught:
-        pipeline.calibrate_detections(RIG, detections(session, left=range(3), right=range(4)), PAPER)
+        calibrate_detections(RIG, detections(session, left=range(3), right=range(4)), PAPER)
     assert "left.frames" in caught.value.what and "3 of 12" in caught.value.what
     (other,) = (line for line in caught.value.hint.splitlines() if "right.frames" in line)
     assert "4 of 12" in other

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig import pipeline
+import lce_rig as lce
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard
-from lce_rig.pipeline.detect_session import picture_stamp_ns
+from lce_rig.pipeline.detect_session import event_picture, picture_stamp_ns
 from lce_rig.rig import Rig, load_rig, parse_rig
 from lce_rig.session import Session
 from tests.calibrate.boards import simulate
@@ -57,7 +57,7 @@ def session_of(folder: Path, events: Events, profile: str = PROFILE, **more) -> 
 
 
 def found_in(session: Session, **more) -> ImageBoard | Refusal:
-    return pipeline.detect(session, **more).images["dvs", "events"]["000000"]
+    return lce.detect(session, **more).images["dvs", "events"]["000000"]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_what_was_found_and_its_picture_are_remembered(seen):
     kinds = sorted(file.name.split(".", 1)[1] for file in files)
     assert kinds == ["dvs.events.npz", "dvs.events.picture.npz", "lidar.npz"]
     changed = [file.stat().st_mtime_ns for file in files]
-    picture = pipeline.event_picture(seen, seen.captures[0], "dvs", "events")
+    picture = event_picture(seen, seen.captures[0], "dvs", "events")
     assert isinstance(picture, Image)
     assert (picture.sensor, picture.channel, picture.stamp_ns) == ("dvs", "events", SCAN_NS + 50 * MS)
     found_in(seen)
@@ -89,19 +89,17 @@ def test_what_was_found_and_its_picture_are_remembered(seen):
 
 def test_a_picture_that_is_not_remembered_is_made_again_the_same(seen):
     capture = seen.captures[0]
-    first = pipeline.event_picture(seen, capture, "dvs", "events")
+    first = event_picture(seen, capture, "dvs", "events")
     for file in (seen.path / "detections").rglob("*.picture.npz"):
         file.unlink()
-    np.testing.assert_array_equal(pipeline.event_picture(seen, capture, "dvs", "events").pixels, first.pixels)
+    np.testing.assert_array_equal(event_picture(seen, capture, "dvs", "events").pixels, first.pixels)
 
 
 def test_the_event_map_can_be_asked_for_and_does_not_pass_for_the_networks_picture(seen):
     assert isinstance(found_in(seen, event_image="map"), Refusal)
     assert isinstance(found_in(seen), ImageBoard)
     capture = seen.captures[0]
-    pictures = [
-        pipeline.event_picture(seen, capture, "dvs", "events", which).pixels for which in (None, "map")
-    ]
+    pictures = [event_picture(seen, capture, "dvs", "events", which).pixels for which in (None, "map")]
     assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 20
 
 
@@ -180,7 +178,7 @@ def test_another_network_is_found_beside_the_profile_and_makes_its_own_pictures(
     middle = len(changed) // 2
     changed[middle : middle + 4000] = bytes(4000)
     (tmp_path / "mine.onnx").write_bytes(bytes(changed))
-    pipeline.detect(Session.open(tmp_path / "session"))
+    lce.detect(Session.open(tmp_path / "session"))
     assert len(list((tmp_path / "session" / "detections").rglob("*.picture.npz"))) == n_before + 1
 
 

@@ -4,8 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from lce_rig.export.result import write_result
 
-from lce_rig import pipeline
+import lce_rig as lce
 from lce_rig.core.calibration import Calibration, SceneShare, read_result
 from lce_rig.core.geometry import Array, difference, invert, perturb, transform
 from lce_rig.pipeline.sharpening import share_of
@@ -13,7 +14,6 @@ from lce_rig.pipeline.witness import scene_views
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import without_movers
 from lce_rig.session import Session
-from tests.saved_results import write_result
 
 from .conftest import Seen, deployed
 
@@ -78,7 +78,7 @@ def test_without_edges_the_boards_decide(seen: Seen) -> None:
 
 def test_the_board_is_left_out(seen: Seen, room: Path) -> None:
     session = Session.open(room)
-    views = scene_views(session, pipeline.detect(session), seen.truth, 60)
+    views = scene_views(session, lce.detect(session), seen.truth, 60)
     assert [view.capture for view in views] == [capture.name for capture in session.captures]
     size_m = np.array([seen.rig.board.width_m, seen.rig.board.height_m])
     for view, capture in zip(views, seen.captures, strict=True):

@@ -8,13 +8,13 @@ import numpy as np
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, transform
+from lce_rig.core.phrasing import motion_words
 from lce_rig.scene.alignment import AXES
 from lce_rig.scene.depth_edges import DepthEdges
 from lce_rig.scene.drift import AxisDrift, Drift, State
+from lce_rig.scene.findings import STATES
 from lce_rig.show.overlays import canvas
 from lce_rig.show.overlays.canvas import BLACK, INK, MAGENTA, Picture
-from lce_rig.words.extrinsics import motion_words
-from lce_rig.words.scene_drift import STATES
 
 _PAGE_PX = 1600
 _COLOURS = {"unchanged": "#2a7d3f", "changed": "#c0392b", "unknown": "#7a7f85"}

@@ -23,6 +23,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
+from lce_rig.judge.findings import ELSEWHERE, UNSEEN
 from lce_rig.judge.verdict import residuals_beyond, scene_findings
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
@@ -336,10 +337,9 @@ def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: 
     """
     found = [] if metrics is None else residuals_beyond(metrics, rig.quality)
     if 4 * n_elsewhere > n_seen:
-        figures = {"n_elsewhere": n_elsewhere, "n_captures": n_seen}
-        found.append(Finding("verify.elsewhere", "error", figures=figures))
+        found.append(ELSEWHERE(n_elsewhere=n_elsewhere, n_captures=n_seen))
     if n_seen == 0:
-        found.append(Finding("verify.unseen", "error"))
+        found.append(UNSEEN())
     return tuple(found)
 
 

@@ -12,6 +12,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
 from lce_rig.export.frames import T_BODY_OPTICAL
 from lce_rig.export.rotations import rpy
+from lce_rig.judge.findings import cause_words, weakest_words
 from lce_rig.rig import Rig
 from lce_rig.show.report.board_drawings import draw_from_above, draw_in_image, draw_ranges_and_angles
 from lce_rig.show.report.drawing import style
@@ -33,7 +34,6 @@ from lce_rig.show.report.uncertainty_drawings import (
 )
 from lce_rig.show.report.worked_point import WorkedPoint, work_point
 from lce_rig.words import describe, recommend, sentence
-from lce_rig.words.extrinsics import cause_words, weakest_words
 
 Overlays = Callable[[Calibration, str], Sequence[str]]
 """Gives the paths of a capture's overlays, from the folder of the page."""

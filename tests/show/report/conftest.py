@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from lce_rig import pipeline
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration
 from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.show.report.calibration_page import calibration_page
 from tests.calibrate.boards import simulate
@@ -32,7 +32,7 @@ def one() -> Calibration:
     images = {item.capture: item.image for item in captures}
     scans = {item.capture: list(item.lidar) for item in captures}
     seen = Detections({("cam", "frames"): images}, {"lidar": scans})
-    (calibration,), _ = pipeline.calibrate_detections(RLFS, seen, CalibrateOptions(n_draws=0))
+    (calibration,), _ = calibrate_detections(RLFS, seen, CalibrateOptions(n_draws=0))
     return calibration
 
 
@@ -42,7 +42,7 @@ def two() -> list[Calibration]:
     session = simulate_two(12, 0)
     images = {(name, "frames"): {c.capture: c.image for c in own} for name, own in session.items()}
     seen = Detections(images, {"lidar": {c.capture: list(c.lidar) for c in next(iter(session.values()))}})
-    calibrations, _ = pipeline.calibrate_detections(TWO, seen, CalibrateOptions("ml", n_draws=0))
+    calibrations, _ = calibrate_detections(TWO, seen, CalibrateOptions("ml", n_draws=0))
     return calibrations
 
 

@@ -1,0 +1,424 @@
+"""Kinds of findings against extrinsics and intrinsics: reasons and notes of a verdict."""
+
+import math
+
+from lce_rig.core.calibration import WeakestMotion
+from lce_rig.core.findings import Finding, Kind, Severity
+from lce_rig.core.phrasing import as_line, figures_apart, fill
+
+_APART = "{rotation_deg:deg}, {translation_m:mm}"
+_LENS = "check that the intrinsics belong to this lens and that the board is flat"
+_NEAR = {"near": "check the squares' size and the focal length, and that the board is flat"}
+_CORNERS_TOO = "collect captures with the board in all four corners of the image, tilted by 30 to 45 deg"
+_SAVE = "Write a profile with the session's intrinsics: `lce-rig intrinsics --save-profile FILE`"
+_LOOK = "`lce-rig drift SESSION -o FOLDER` draws the edges"
+_STILL = "hold the board still, check board size and intrinsics"
+_RANGES = (
+    "measure the LiDAR's constant range errors, which alone exceed the target, correct them in its driver "
+    "and lower range_offset_sigma_m and laser_bias_sigma_m in the profile, or put more rings on the board"
+)
+_MEASURE_LENS = (
+    "measure the intrinsics (`lce-rig intrinsics --save-profile FILE`), or enter their standard deviations "
+    "in the profile"
+)
+_MEASURE = {
+    "resolve": "resolve what contradicts first: more captures do not reduce this",
+    "measure_focal_length": _MEASURE_LENS,
+    "measure_principal_point": _MEASURE_LENS,
+    "measure_distortion": _MEASURE_LENS,
+    "measure_square_size": "measure across all squares, divide, and enter square_m and square_sigma_m",
+    "measure_pattern_offset": (
+        "measure the pattern's margins on all four sides of the plate, and enter pattern_offset_m and "
+        "pattern_offset_sigma_m"
+    ),
+    "measure_plate_size": "measure the plate, and enter width_m, height_m and plate_sigma_m",
+    "measure_board_bow": "lay a straight edge across the board, and enter bow_sigma_m",
+}
+_CAUSES = {
+    "captures": "the scatter of the captures",
+    "lidar_ranges": "the LiDAR's constant range errors",
+    "focal_length": "the focal length",
+    "principal_point": "the principal point",
+    "distortion": "the lens distortion",
+    "square_size": "the size of the squares",
+    "pattern_offset": "the pattern's place on the plate",
+    "plate_size": "the plate's size",
+    "board_bow": "the board's bow",
+}
+_CONTRADICTIONS = {
+    "intrinsics": "the profile's intrinsics and those of the session's boards",
+    "scale": "the camera's distances and the LiDAR's",
+    "channels": "the camera's channels",
+    "cameras": "the cameras",
+    "group_rest": "two groups of captures",
+}
+_LEAST_ROTATION = "{weakest:motion}, sigma {weakest_sigma_deg:3deg}"
+_LEAST_TRANSLATION = "{weakest:motion}, sigma {weakest_sigma_m:1mm}"
+
+
+def failing(is_fail: bool) -> Severity:
+    """Return the severity of a finding that prevents a pass: an error if the result fails by it."""
+    return "error" if is_fail else "warning"
+
+
+def weakest_words(weakest: WeakestMotion) -> str:
+    """Name the least determined motion with its standard deviation."""
+    return fill(_LEAST_ROTATION if weakest.is_rotation else _LEAST_TRANSLATION, weakest.figures())
+
+
+def cause_words(source: str) -> str:
+    """Name a cause of standard deviations, as `Contribution.source`."""
+    if source in _CAUSES:
+        return _CAUSES[source]
+    check = source.removeprefix("contradiction_")
+    subsets = check.replace("_", " and ")
+    return f"the contradiction of {_CONTRADICTIONS.get(check, f'{subsets} captures')}"
+
+
+def _size(finding: Finding, name: str, sign: str = "") -> str:
+    """Print a figure that is an angle in deg or a length in m."""
+    if f"{name}_deg" in finding.figures:
+        return f"{finding.figure(f'{name}_deg'):{sign}.2f} deg"
+    return f"{1000 * finding.figure(f'{name}_m'):{sign}.1f} mm"
+
+
+def _intrinsics(finding: Finding) -> str:
+    """Intrinsics do not fit: {rms_px}, {possible_px}, {displacement_px}, {turn_deg}, {focal_ratio}."""
+    q = finding.figures
+    parts = ["corners fit, but only with wrong board poses"]
+    if q["is_visible"]:
+        parts = [fill("reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px", q)]
+    displacement_px = q["displacement_px"]
+    if not isinstance(displacement_px, float) or not math.isfinite(displacement_px):
+        parts.append("they project to no pixels where boards were seen")
+    elif q["is_bent"]:
+        parts.append(fill("pixels displaced by {displacement_px:.1f} +- {displacement_sigma_px:.1f} px", q))
+    if q["is_turned"]:
+        parts.append(fill("that alone rotates the extrinsics by {turn_deg:.2f} +- {turn_sigma_deg:deg}", q))
+    if q["is_focal_off"]:
+        percent, sigma = 100 * (finding.figure("focal_ratio") - 1), 100 * finding.figure("focal_sigma")
+        larger = "larger" if percent > 0 else "smaller"
+        parts.append(f"focal length {abs(percent):.1f} +- {sigma:.1f} % {larger}")
+    how = "do not fit" if finding.severity == "error" else "fit only roughly"
+    return f"the profile's intrinsics {how}: {'; '.join(parts)}"
+
+
+def _reach(finding: Finding) -> str:
+    """The session covers {covered}, determines pixels near the border to {image_sigma_px}, {limit_px}."""
+    sigma_px, known = finding.figures["image_sigma_px"], "does not determine pixels near its border"
+    if isinstance(sigma_px, float) and math.isfinite(sigma_px):
+        sigma_text, limit_text = figures_apart(sigma_px, finding.figure("limit_px"))
+        known = f"determines pixels near its border to {sigma_text} px (limit {limit_text} px)"
+    return f"the session covers {100 * finding.figure('covered'):.0f} % of the image and {known}"
+
+
+def _collect_first(finding: Finding) -> str:
+    """Collect in all four corners, as {covered}, {image_sigma_px}, {limit_px} say; then run intrinsics."""
+    return (
+        f"check whether lens, focus or resolution were changed. {as_line(_reach(finding))} "
+        f"{as_line(_CORNERS_TOO)} Then run `lce-rig intrinsics --save-profile FILE`"
+    )
+
+
+def _scale(finding: Finding) -> str:
+    """Camera distances differ by {scale} +- {scale_sigma}: squares {square_m}, not {profile_square_m}."""
+    scale, sigma = 100 * finding.figure("scale"), 100 * finding.figure("scale_sigma")
+    squares = fill("the squares measure {square_m:1mm} instead of {profile_square_m:1mm}", finding.figures)
+    return (
+        f"camera distances are {abs(scale):.1f} +- {sigma:.1f} % {'longer' if scale > 0 else 'shorter'} than "
+        f"the LiDAR's: {squares}, or the intrinsics belong to another lens"
+    )
+
+
+def _widened(finding: Finding) -> str:
+    """Standard deviations are {ratio} times the method's, as {spread} vary."""
+    ways = {
+        "bootstrap": "bootstrap samples",
+        "left_out": "leave-one-out results",
+        "halves": "random halves of the captures",
+    }
+    way = ways[str(finding.figures["spread"])]
+    return f"standard deviations widened {finding.figure('ratio'):.1f} times: {way} vary that much"
+
+
+def _largest_cause(finding: Finding) -> str:
+    """Of the standard deviation {total_m} or {total_deg}, {share} is {source}: {sigma_m} or {sigma_deg}."""
+    what = "translation" if "sigma_m" in finding.figures else "rotation"
+    source, share = cause_words(str(finding.figures["source"])), 100 * finding.figure("share")
+    part, total = _size(finding, "sigma"), _size(finding, "total")
+    return (
+        f"largest cause of the {what}'s uncertainty: {source}, {part.split()[0]} of {total} "
+        f"({share:.0f} % of the variance)"
+    )
+
+
+def _known_better(finding: Finding) -> str:
+    """The session's boards determine {source} to {error_sigma}, the profile to {profile_sigma}: {error}."""
+    source = str(finding.figures["source"])
+    scale, unit = (1.0, "px") if source == "principal_point" else (100.0, "%")
+    error, sigma, of_profile = (
+        scale * finding.figure(name) for name in ("error", "error_sigma", "profile_sigma")
+    )
+    return (
+        f"the session's boards determine {cause_words(source)} better than the profile: {error:+.2f} +- "
+        f"{sigma:.2f} {unit} from it, which has +- {of_profile:.2f} {unit}"
+    )
+
+
+def _plate(finding: Finding) -> str:
+    """The plate's {side} is {measured_m} in the scans, {profile_m} in the profile."""
+    percent = 100 * (finding.figure("measured_m") / finding.figure("profile_m") - 1)
+    sizes = fill("{side} {measured_m:.3f} m in the scans, {profile_m:.3f} m in the profile", finding.figures)
+    return f"plate {sizes}: {abs(percent):.1f} % {'larger' if percent > 0 else 'smaller'}"
+
+
+def _sensors_disagree(finding: Finding) -> str:
+    """The sensors disagree in {n_refused} of {n_captures} captures, {captures}."""
+    names = finding.figures["captures"]
+    assert isinstance(names, tuple)
+    shown = ", ".join(map(str, names[:4])) + (" ..." if len(names) > 4 else "")
+    return (
+        fill("the sensors disagree in {n_refused} of {n_captures} captures", finding.figures) + f" ({shown})"
+    )
+
+
+def _agree(finding: Finding) -> str:
+    """The {n_sessions} calibrations of {camera} and {lidar} agree: {rotation_deg}, {translation_m} apart.
+
+    {p} is the chance to differ more; {is_generous}: the standard deviations predict more than is seen.
+    """
+    apart = fill(
+        "the {n_sessions} calibrations of {camera} and {lidar} agree: they differ by at most "
+        "{rotation_deg:3deg} and {translation_m:1mm}",
+        finding.figures,
+    )
+    how = "less than" if finding.figures["is_generous"] else "as"
+    return f"{apart}, {how} their standard deviations predict"
+
+
+def _scene(finding: Finding) -> str:
+    """The scene contradicts {axis} by {change_deg} or {change_m}; {sigma_deg}, {sigma_m}, {sigmas}.
+
+    In {n_captures} captures, {n_axes} axes contradict.
+    """
+    change, sigma = _size(finding, "change", "+"), _size(finding, "sigma")
+    axis = fill("{axis:motion}", finding.figures)
+    return f"the edges of the scene contradict the extrinsics: {axis} by {change.split()[0]} +- {sigma}"
+
+
+_SCENE_CHANGE = (
+    "{rotation_deg:deg}, {translation_m:mm} "
+    "(expected {rotation_sigma_deg:deg}, {translation_sigma_m:mm}; {n_captures} captures, {n_edges} edges)"
+)
+
+NO_CERTIFICATE = Kind(
+    "verdict.no_certificate",
+    "not certified: method {method} has no certificate",
+    "use --method paper",
+    severity="warning",
+)
+NOT_CERTIFIED = Kind(
+    "verdict.not_certified", "not certified as the global minimum (gap {gap:.1e})", "collect more captures"
+)
+ROTATION_UNCERTAIN = Kind(
+    "verdict.rotation_uncertain",
+    "rotation standard deviation {sigma_deg:deg}, target {target_deg:deg} "
+    "(x right, y down, z forward {by_axis_deg:.2g} deg)",
+    f"collect more captures; least determined: {_LEAST_ROTATION}",
+    actions={"measure_ranges": f"{_RANGES}; least determined: {_LEAST_ROTATION}", **_MEASURE},
+)
+TRANSLATION_UNCERTAIN = Kind(
+    "verdict.translation_uncertain",
+    "translation standard deviation {sigma_m:1mm}, target {target_m:1mm} "
+    "(x right, y down, z forward {by_axis_m:1mm})",
+    f"collect more captures; least determined: {_LEAST_TRANSLATION}",
+    actions={"measure_ranges": f"{_RANGES}; least determined: {_LEAST_TRANSLATION}", **_MEASURE},
+)
+PLANE_RESIDUAL = Kind(
+    "verdict.plane_residual",
+    "LiDAR points {mean_m:mm} on average from the camera's board planes (limit {limit_m:mm})",
+    _STILL,
+)
+EDGE_RESIDUAL = Kind(
+    "verdict.edge_residual",
+    "ring ends {mean_m:mm} on average from the board's edges (limit {limit_m:mm})",
+    _STILL,
+)
+HELD_OUT = Kind(
+    "verdict.held_out",
+    "held-out captures fit worse ({held_out_m:1mm}) than captures used ({fitted_m:1mm})",
+    "collect more captures",
+    severity="warning",
+)
+PLANES_APART = Kind(
+    "verdict.planes_apart",
+    "camera and LiDAR board planes differ by {rms_m:mm} rms (still boards: under 10 mm)",
+    "hold the board still and check the image-scan matching",
+    severity="warning",
+    actions={"compensated": "move the board more slowly and evenly, about 10 cm/s"},
+)
+CHANNELS_DIFFER = Kind(
+    "verdict.channels_differ",
+    "{first} and {second} of one camera differ by " + _APART + ", beyond their uncertainty",
+    "calibrate each alone (--channels) and find the captures that contradict it",
+)
+SENSORS_DISAGREE = Kind(
+    "verdict.sensors_disagree",
+    _sensors_disagree,
+    "look for a moving board, a second board, or wrong matching",
+)
+FEW_USED = Kind(
+    "verdict.few_used",
+    "{n_used} of {n_captures} captures could be used",
+    "run `lce-rig check` for the causes",
+    severity="warning",
+)
+FEW_PLACEMENTS = Kind(
+    "verdict.few_placements",
+    "{n_used} captures show {n_placements} different placements (minimum {n_needed})",
+    "move the board between captures",
+    severity="warning",
+)
+FAR_FROM_NOMINAL = Kind(
+    "verdict.far_from_nominal",
+    "{rotation_deg:1deg}, {translation_m:mm} from the nominal extrinsics "
+    "(tolerance {tolerance_deg:g} deg, {tolerance_m:mm})",
+    "check nominal_extrinsics and the frames in the profile, and that these sensors were used",
+)
+PLATE_SIZE = Kind("verdict.plate_size", _plate, "measure the plate")
+INTRINSICS = Kind(
+    "verdict.intrinsics",
+    _intrinsics,
+    "check whether lens or resolution were changed. " + _SAVE,
+    actions={"refocused": "check whether the lens was refocused. " + _SAVE, "collect": _collect_first},
+)
+INTRINSICS_BETTER = Kind(
+    "intrinsics.better",
+    "the session determines the intrinsics better than the profile: it covers {covered:percent} of the image "
+    "and determines pixels near its border to {image_sigma_px:.2f} px (limit {limit_px:.2f} px)",
+    "put them into the profile",
+    severity="note",
+)
+INTRINSICS_FIT = Kind(
+    "intrinsics.fit", "the profile's intrinsics fit the boards of the session", "keep them", severity="note"
+)
+INTRINSICS_UNDETERMINED = Kind("intrinsics.undetermined", _reach, _CORNERS_TOO, severity="warning")
+CHANGED = Kind(
+    "verdict.changed",
+    "extrinsics change significantly at capture {capture}, by " + _APART,
+    "fasten the sensors, one may have moved, and collect again",
+)
+TWO_GROUPS = Kind(
+    "verdict.two_groups",
+    "{n_captures} captures ({captures}) fit other extrinsics than the rest, significantly, by " + _APART,
+    "fasten the sensors, one may have moved to and fro, and collect again",
+    severity="warning",
+)
+SHARES_DIFFER = Kind(
+    "verdict.shares_differ",
+    "{first} and {second} boards differ significantly, by " + _APART,
+    _LENS,
+    actions=_NEAR,
+)
+CONTROL = Kind(
+    "verdict.control",
+    "control failed: moved by "
+    + _APART
+    + " ({direction:motion}), the result fits held-out captures no worse",
+    "collect more captures; if this persists, re-measure the board",
+)
+SCALE_OFF = Kind("verdict.scale", _scale, "measure the squares")
+EDGE_SHIFT = Kind(
+    "verdict.edge_shift",
+    "ring ends {shift_m:mm} beyond the plate's edges (limit {limit_m:mm}, the beam's width)",
+    "measure the plate",
+    severity="warning",
+)
+LASER_OFFSET = Kind(
+    "verdict.laser_offset",
+    "ranges of laser ring {ring} {offset_m:mm} too long (limit {limit_m:mm}, from the profile)",
+    "correct them in the LiDAR's driver",
+    severity="warning",
+)
+CAMERA_CHANGED = Kind(
+    "verdict.camera_changed",
+    "{subject}: relative pose from the images changes significantly at capture {capture}, by " + _APART,
+    "fasten the cameras, one may have moved, and collect again",
+)
+CAMERA_SHARES_DIFFER = Kind(
+    "verdict.camera_shares_differ",
+    "{subject}: relative poses from images of {first} and {second} boards differ significantly, by " + _APART,
+    _LENS,
+    actions=_NEAR,
+)
+CAMERAS_SCATTER = Kind(
+    "verdict.cameras_scatter",
+    "{subject}: board positions from the images differ by {rms_m:mm} rms for any relative pose "
+    "({scatter:.1f} times the typical value)",
+    "hold the board still between the images and check the intrinsics",
+    severity="warning",
+)
+CAMERAS_DIFFER = Kind(
+    "verdict.cameras_differ",
+    "{subject}: board positions differ by {rms_m:mm} rms ({images_rms_m:mm} from the images alone), "
+    "relative poses from extrinsics and images by " + _APART,
+    "check whether a camera has moved, and the intrinsics",
+)
+WIDENED = Kind("verdict.widened", _widened, severity="note")
+LARGEST_CAUSE = Kind("verdict.largest_cause", _largest_cause, severity="note", actions=_MEASURE)
+KNOWN_BETTER = Kind("verdict.known_better", _known_better, severity="note")
+MAY_BE_OFF = Kind(
+    "verdict.may_be_off",
+    "with 95 % probability each, the rotation is off by less than {rotation_deg:deg} and the translation by "
+    "less than {translation_m:mm}",
+    severity="note",
+)
+SCENE = Kind(
+    "verdict.scene",
+    _scene,
+    f"check the intrinsics, squares and plate. {_LOOK}",
+    actions={
+        "deployed": f"check whether a sensor has moved since. {_LOOK}",
+        "distances": f"measure the squares and check the focal length. {_LOOK}",
+        "times": f"hold the board still and check the image-scan matching. {_LOOK}",
+    },
+)
+SCENE_USED = Kind(
+    "verdict.scene_used", "the scene moved the boards' extrinsics by " + _SCENE_CHANGE, severity="note"
+)
+SCENE_UNKNOWN = Kind(
+    "verdict.scene_unknown",
+    "the scene shows nothing that the boards do not show better; {n_edges} edges, {n_captures} captures",
+    severity="note",
+)
+SCENE_NOT_USED = Kind(
+    "verdict.scene_not_used",
+    "the scene contradicts the boards and is not used: it would move them by " + _SCENE_CHANGE,
+    f"check the intrinsics and the board's size. {_LOOK}",
+    severity="warning",
+)
+ELSEWHERE = Kind(
+    "verify.elsewhere",
+    "in {n_elsewhere} of {n_captures} captures the scan has no surface where the extrinsics place the board",
+)
+UNSEEN = Kind("verify.unseen", "both sensors detect the board in no capture")
+RESULTS_AGREE = Kind(
+    "results.agree",
+    "the {n_sessions} results of {camera} and {lidar} agree: they differ by up to {rotation_deg:3deg} and "
+    "{translation_m:1mm}; common errors stay hidden, as they share captures",
+    severity="note",
+)
+RESULTS_DISAGREE = Kind(
+    "results.disagree",
+    "{first} and {second} of {camera} and {lidar} disagree: results differ by up to {rotation_deg:3deg} and "
+    "{translation_m:1mm}, more than their uncertainties allow",
+    "compare the overlays of both (`lce-rig verify --name NAME`) and collect more captures",
+)
+REPEAT_AGREE = Kind("repeat.agree", _agree, severity="note")
+REPEAT_DISAGREE = Kind(
+    "repeat.disagree",
+    "the {n_sessions} calibrations of {camera} and {lidar} disagree: they differ by up to "
+    "{rotation_deg:3deg} and {translation_m:1mm}, {ratio:.1f} times as much as predicted",
+    "do not use any of them until the cause is known",
+    actions={"odd_one": "find the fault in {odd_one}, without it the others agree"},
+)

@@ -1,0 +1,52 @@
+"""Kinds of findings of the verbs: sensors without a result, and results that cannot be compared."""
+
+from lce_rig.core.findings import Finding, Kind
+
+
+def _commonest(finding: Finding) -> str:
+    """The commonest of {causes} of refusal with their counts, or: collect more captures."""
+    causes = finding.figures["causes"]
+    assert isinstance(causes, tuple)
+    lines = [f"{cause[0]} x {cause[2]}" for cause in causes if isinstance(cause, tuple)]
+    return "\n".join(lines) or "collect more captures"
+
+
+FEW_DETECTED = Kind(
+    "shortage.few_detected",
+    "both sensors found the board in {n_detected} of {n_captures} captures (minimum {n_needed})",
+    _commonest,
+    severity="warning",
+)
+SHORTAGE = Kind("shortage.text", "{text}", "{advice}", severity="warning")
+NO_AGREEMENT = Kind(
+    "pair.no_agreement",
+    "no three of {n_captures} captures agree with one set of extrinsics",
+    "check the board's size, the intrinsics and the pairing of images with scans",
+)
+OUTDATED = Kind(
+    "results.outdated",
+    "{subject}: the profile or the captures that it used have changed since",
+    "run `lce-rig calibrate` again with the same options",
+    severity="warning",
+)
+FAILED = Kind(
+    "repeat.failed",
+    "the calibration of {subject} ({camera} and {lidar}) failed",
+    "run `lce-rig calibrate` for its reasons",
+)
+NOT_CALIBRATED = Kind("repeat.not_calibrated", "{subject}: {sensors}: {what}", "{hint}", severity="warning")
+ONLY_ONE = Kind(
+    "repeat.only_one", "{camera} and {lidar} are calibrated in {subject} only", severity="warning"
+)
+OTHER_BOARD = Kind(
+    "repeat.other_board", "{first} and {subject} were taken with different boards", severity="warning"
+)
+MOVED = Kind(
+    "union.moved",
+    "the extrinsics of {camera} and {lidar} from {first} and {second} differ by {rotation_deg:3deg} and "
+    "{translation_m:1mm}, more than their uncertainties allow (chance {p:.2g})",
+    "the sensors were moved in between, or one of the sessions is wrong: calibrate them separately",
+    actions={
+        "odd_one": "leave out {odd_one}: the sensors were moved, or the session is wrong; the others agree"
+    },
+)
