@@ -71,7 +71,10 @@ def _judge_camera(
     if motion is None:
         return None
     recent, stamp_ns = _events_before(key, detection, cut, rig)
-    (speed_mps, unsteady_m), events_px = motion, _events_on_board(key, detection, recent, stamp_ns, rig)
+    # Count the events a pixel of the board in the second before its image.
+    camera, board = rig.cameras[key[0]], detection.images[key]
+    outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
+    (speed_mps, unsteady_m), events_px = motion, event_quality(recent, stamp_ns, outline).events_px
     limits = rig.quality
     made = {"events_px": events_px, "min_events_px": limits.min_events_px}
     if speed_mps > limits.max_board_speed_mps:
@@ -112,15 +115,6 @@ def _events_before(key: ImageKey, detection: BoardDetection, cut: EventCut, rig:
     time_ns = rig_time_ns(image, rig)
     stamp_ns = (detection.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
     return cut.events.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
-
-
-def _events_on_board(
-    key: ImageKey, detection: BoardDetection, recent: Events, stamp_ns: int, rig: Rig
-) -> float:
-    """Count the events a pixel of the board in the second before its image."""
-    camera, board = rig.cameras[key[0]], detection.images[key]
-    outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
-    return event_quality(recent, stamp_ns, outline).events_px
 
 
 def _explain_unseen(detection: BoardDetection, cuts: Mapping[str, EventCut], rig: Rig) -> Refusal | None:

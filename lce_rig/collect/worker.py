@@ -156,11 +156,6 @@ def _pack(request: object, shared: memoryview) -> tuple[bytes, _Spans]:
     return data, spans
 
 
-def _unpack(data: bytes, spans: _Spans, shared: memoryview) -> Any:
-    """Undo `_pack`; what was shared is copied, for the next request to overwrite it."""
-    return pickle.loads(data, buffers=[bytearray(shared[start:end]) for start, end in spans])
-
-
 def _serve(
     connection: Connection,
     array: Any,
@@ -177,7 +172,7 @@ def _serve(
         subject = make(*arguments)
         while True:
             data, spans = connection.recv()
-            method, given = _unpack(data, spans, shared)
+            method, given = pickle.loads(data, buffers=[bytearray(shared[start:end]) for start, end in spans])
             answer: object
             try:
                 answer = getattr(subject, method)(*given)

@@ -165,18 +165,15 @@ class EventCamera:
         n = n_more + 1
         number = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
         t_s = np.repeat(first_s, n) + number * np.repeat(apart_s, n)
-        self._redraw_thresholds(pixel)
-        self._raw.append(_Raw(np.minimum(t_s, now_s), np.repeat(pixel, n), np.repeat(is_on, n)))
-        released_s = first_s + n_more * apart_s + self._noise.refractory_s
-        self._released_s[pixel] = released_s
-        self._reference[pixel] = output[pixel] - slope * np.maximum(now_s - released_s, 0.0)
-
-    def _redraw_thresholds(self, pixel: NDArray[np.intp]) -> None:
-        """Draw the change that triggers the next event of pixels (M,)."""
+        # Draw the change that triggers the next event of pixels (M,).
         if self._noise.event_sigma > 0:
             change = self._noise.event_sigma * self._rng.standard_normal((2, len(pixel)))
             self._on[pixel] = np.maximum(self._pixels.threshold_on[pixel] + change[0], _LEAST_THRESHOLD)
             self._off[pixel] = np.maximum(self._pixels.threshold_off[pixel] + change[1], _LEAST_THRESHOLD)
+        self._raw.append(_Raw(np.minimum(t_s, now_s), np.repeat(pixel, n), np.repeat(is_on, n)))
+        released_s = first_s + n_more * apart_s + self._noise.refractory_s
+        self._released_s[pixel] = released_s
+        self._reference[pixel] = output[pixel] - slope * np.maximum(now_s - released_s, 0.0)
 
     def take(self) -> Events:
         """Return the events since the last call, in order of time, noise included."""

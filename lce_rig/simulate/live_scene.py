@@ -112,14 +112,13 @@ class LiveScene:
     def _take_image(self, camera: str, stamp_ns: int) -> Image:
         stage = self.stage
         if self._is_held and camera not in self._light:
-            self._light[camera] = self._expose(focus(self._radiance(camera), stage.options.camera))
+            self._light[camera] = self._expose(
+                focus(render_radiance(self._render(), self.stage.backdrops[camera]), stage.options.camera)
+            )
         is_held = self._is_held
         pixels = develop(self._with_noise(camera, self._light[camera])) if is_held else self._glance(camera)
         channel = stage.rig.cameras[camera].first_channel("frames") or "frames"
         return Image(camera, channel, stamp_ns, pixels, stamp_ns)
-
-    def _radiance(self, camera: str) -> Array:
-        return render_radiance(self._render(), self.stage.backdrops[camera])
 
     def _glance(self, camera: str) -> NDArray[np.uint8]:
         """Take an image of a board on its way."""

@@ -108,7 +108,8 @@ class Raycaster:
             with_normals: False leaves the normals zero and halves the time.
         """
         if not self.surfaces:
-            return _nothing(len(directions))
+            n = len(directions)
+            return Hits(np.full(n, np.inf), np.full(n, -1, dtype=np.int32), np.zeros((n, 3)))
         answer = self._engine.cast_rays(self._rays(origins, directions), nthreads=1)
         range_m = answer["t_hit"].numpy().astype(np.float64)
         hit = np.flatnonzero(np.isfinite(range_m))
@@ -130,10 +131,6 @@ class Raycaster:
         rays = self._rays(origins, targets - origins)
         blocked = self._engine.test_occlusions(rays, tnear=1e-3, tfar=0.999, nthreads=1)
         return np.asarray(blocked.numpy(), dtype=np.bool_)
-
-
-def _nothing(n: int) -> Hits:
-    return Hits(np.full(n, np.inf), np.full(n, -1, dtype=np.int32), np.zeros((n, 3)))
 
 
 def _unit_towards(normals: Array, directions: Array) -> Array:

@@ -5,7 +5,7 @@ board is drawn analytically, and its carrier is a cut-out that shifts. Edges are
 in units of the pixel's own spread, not by sampling: intensities change without steps as the board moves.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -194,7 +194,13 @@ class MovingView:
             seen[window] += both[..., 0] - both[..., 1] * seen[window]
         board_window = self._board_window(T_world_board)
         if board_window is not None:
-            radiance, cover = self._board(board_window, T_world_board, self._light(t_ns))
+            k, weight = divmod(t_ns, _KEY_NS)
+            before, after = self._key(k).light, self._key(k + 1).light
+            radiance, cover = self._board(
+                board_window,
+                T_world_board,
+                np.asarray(before + (weight / _KEY_NS) * (after - before), dtype=np.float32),
+            )
             seen[board_window] += cover * (radiance - seen[board_window])
         if layers is not None:
             seen[window] += both[..., 2] - both[..., 3] * seen[window]
@@ -279,11 +285,6 @@ class MovingView:
         share = np.float32(weight / _KEY_NS)
         return window, before + share * (after - before)
 
-    def _light(self, t_ns: int) -> Array:
-        k, weight = divmod(t_ns, _KEY_NS)
-        before, after = self._key(k).light, self._key(k + 1).light
-        return np.asarray(before + (weight / _KEY_NS) * (after - before), dtype=np.float32)
-
     def _key(self, k: int) -> _Key:
         if k not in self._keys:
             for old in [j for j in self._keys if j < k - 1]:
@@ -317,7 +318,10 @@ def speed_px_s(trajectory: Trajectory, board: Board, backdrop: Backdrop, t_ns: i
 def _light_on_board(scene: Scene, backdrop: Backdrop) -> Array:
     """Fit the light (4,) on the side of the board that the camera sees, unshadowed."""
     x, y = (
-        grid.ravel() for grid in np.meshgrid(*(np.linspace(-0.5, 0.5, 3) * s for s in _size(scene.board)))
+        grid.ravel()
+        for grid in np.meshgrid(
+            *(np.linspace(-0.5, 0.5, 3) * s for s in (scene.board.width_m, scene.board.height_m))
+        )
     )
     points = transform(scene.T_world_board, np.stack([x, y, np.zeros(9)], axis=1))
     side = np.sign((backdrop.origin - scene.T_world_board[:3, 3]) @ scene.T_world_board[:3, 2])
@@ -325,10 +329,6 @@ def _light_on_board(scene: Scene, backdrop: Backdrop) -> Array:
     light = irradiance(backdrop.lamps, points, normals) @ GREY
     terms = np.stack([np.ones(9), x, y, x * y], axis=1)
     return np.asarray(np.linalg.lstsq(terms, light, rcond=None)[0])
-
-
-def _size(board: Board) -> Sequence[float]:
-    return board.width_m, board.height_m
 
 
 def _slope(values: Float) -> Float:

@@ -49,18 +49,17 @@ class Trajectory:
         T_world_board = self._carried(t_ns)
         if not len(self.frequency_hz):
             return T_world_board
-        return perturb(T_world_board, self._sway(t_ns) - self.centre)
+        t_s = 1e-9 * (t_ns - self.arrival_ns[0])
+        angle = 2 * np.pi * self.frequency_hz[:, None] * t_s[..., None, None] + self.phase_rad
+        return perturb(
+            T_world_board, np.asarray(np.sum(self.amplitude * np.sin(angle), axis=-2)) - self.centre
+        )
 
     def speed_mps(self, t_ns: int | NDArray[np.int64]) -> Array:
         """Compute the speed (...) of the board's middle."""
         t_ns = np.asarray(t_ns, dtype=np.int64)
         way = self.at(t_ns + _PROBE_NS)[..., :3, 3] - self.at(t_ns - _PROBE_NS)[..., :3, 3]
         return np.asarray(np.linalg.norm(way, axis=-1) / (2e-9 * _PROBE_NS))
-
-    def _sway(self, t_ns: NDArray[np.int64]) -> Array:
-        t_s = 1e-9 * (t_ns - self.arrival_ns[0])
-        angle = 2 * np.pi * self.frequency_hz[:, None] * t_s[..., None, None] + self.phase_rad
-        return np.asarray(np.sum(self.amplitude * np.sin(angle), axis=-2))
 
     def _carried(self, t_ns: NDArray[np.int64]) -> Array:
         """Interpolate the placements: s = 10 u^3 - 15 u^4 + 6 u^5, minimum jerk from rest to rest.

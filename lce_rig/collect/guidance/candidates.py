@@ -61,7 +61,11 @@ def spread_candidates(view: SensorPlace, n_places: int = 60, n_tilts: int = 8) -
     far_m = view.model.limits.max_distance_m
     # Equal steps in 1/distance: near boards differ more from one another.
     distance_m = 1 / (1 / NEAREST_M + (1 / far_m - 1 / NEAREST_M) * even[:, 2])
-    tilts = _tilts()
+    # List all tilts (T, 2) about the level axis and the upward one, rad.
+    straight, *tilted = np.radians(TILTS_DEG)
+    direction = 2 * np.pi * np.arange(N_TILT_DIRECTIONS) / N_TILT_DIRECTIONS
+    circle = np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    tilts = np.concatenate([[[straight, straight]], *(each * circle for each in tilted)])
     which = np.arange(n_places * n_tilts)
     tilt = tilts[(which * 5) % len(tilts)]
     roll = np.radians(DIAMOND_DEG + np.array(ROLLS_DEG)[(which // len(tilts)) % len(ROLLS_DEG)])
@@ -129,11 +133,3 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
     ok &= (height_m > REACH_M[0]) & (height_m < REACH_M[1])
     # People do not hold a board flat.
     return np.asarray(ok & (np.abs(normal @ view.up) < 0.7))
-
-
-def _tilts() -> Array:
-    """List all tilts (T, 2) about the level axis and the upward one, rad."""
-    straight, *tilted = np.radians(TILTS_DEG)
-    direction = 2 * np.pi * np.arange(N_TILT_DIRECTIONS) / N_TILT_DIRECTIONS
-    circle = np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    return np.concatenate([[[straight, straight]], *(each * circle for each in tilted)])

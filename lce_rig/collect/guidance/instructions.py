@@ -213,13 +213,8 @@ class Person:
         instructions = instruct(view, present, wanted)
         if instructions and rng.random() < self.ignored_share:
             ignored = rng.choice([each.kind for each in instructions])
-            aim = _without(aim, describe_pose(view, present), ignored)
+            aim = replace(aim, **{_FIGURE[ignored]: getattr(describe_pose(view, present), _FIGURE[ignored])})
         aimed = build_pose(view, aim)
         turn = exp_so3(np.radians(self.turn_sigma_deg) * rng.standard_normal(3))
         place = aimed[:3, 3] + self.place_sigma_m * rng.standard_normal(3)
         return pose(turn @ aimed[:3, :3], place)
-
-
-def _without(aim: HeldPose, present: HeldPose, kind: str) -> HeldPose:
-    """Leave one instruction out."""
-    return replace(aim, **{_FIGURE[kind]: getattr(present, _FIGURE[kind])})

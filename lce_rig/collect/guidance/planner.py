@@ -187,7 +187,10 @@ class Planner:
         after = combine_with_each(evidence, self._evidence, model.errors)
         cost = shortfall(model, after.improvable)
         if present is not None:
-            cost = cost * (1 + _EFFORT * _effort(present, self.candidates))
+            # Measure the way and the turn from one pose (4, 4) to others (N, 4, 4), m and rad together.
+            way_m = np.linalg.norm(self.candidates[:, :3, 3] - present[:3, 3], axis=1)
+            turn = np.arccos(np.clip(self.candidates[:, :3, 2] @ present[:3, 2], -1.0, 1.0))
+            cost = cost * (1 + _EFFORT * np.asarray(way_m + turn))
         if avoid is not None:
             cost[_way_m(avoid, self.candidates).min(axis=0, initial=np.inf) < AVOIDED_M] = np.inf
         best, spacing = self._choose(cost, held, present)
@@ -246,18 +249,16 @@ class Planner:
         is_asked = asked is not None and is_there(self.view, present, asked)
         if wanted is None or guidance.is_enough or is_asked:
             return None
-        own, best = self._gains(held, np.stack([present, wanted]))
+        # Compute by which share each of some placements (N, 4, 4) shrinks what can be shrunk, (N,).
+        placements = np.stack([present, wanted])
+        model, evidence = self.view.model, self._weigh(held)
+        now = shortfall(model, combine(evidence, model.errors).improvable)
+        after = combine_with_each(evidence, self._weigh(placements), model.errors)
+        own, best = np.asarray(1 - shortfall(model, after.improvable) / now)
         if best < LEAST_GAIN or own >= LEAST_SHARE * best:
             return None
         figures = {"gain": max(float(own), 0.0), "best_gain": float(best), "instruction": instruction}
         return CALIBRATE_LITTLE_GAIN.refusal(**figures)
-
-    def _gains(self, held: Array, placements: Array) -> Array:
-        """Compute by which share each of some placements (N, 4, 4) shrinks what can be shrunk, (N,)."""
-        model, evidence = self.view.model, self._weigh(held)
-        now = shortfall(model, combine(evidence, model.errors).improvable)
-        after = combine_with_each(evidence, self._weigh(placements), model.errors)
-        return np.asarray(1 - shortfall(model, after.improvable) / now)
 
     def _weigh(self, poses: Array) -> Evidence:
         return weigh_placements(self.view.model, poses, self.view.T_cam_lidar)
@@ -323,10 +324,3 @@ class Planner:
 def _way_m(held: Array, others: Array) -> Array:
     """Measure the distances (N, M) between boards (N, 4, 4) and others (M, 4, 4)."""
     return np.asarray(np.linalg.norm(held[:, None, :3, 3] - others[None, :, :3, 3], axis=-1))
-
-
-def _effort(present: Array, candidates: Array) -> Array:
-    """Measure the way and the turn from one pose (4, 4) to others (N, 4, 4), m and rad together."""
-    way_m = np.linalg.norm(candidates[:, :3, 3] - present[:3, 3], axis=1)
-    turn = np.arccos(np.clip(candidates[:, :3, 2] @ present[:3, 2], -1.0, 1.0))
-    return np.asarray(way_m + turn)

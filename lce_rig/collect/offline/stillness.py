@@ -83,7 +83,10 @@ class StillnessGate:
             window.clear()
         if is_seen:
             window.append(detection)
-        while len(window) > 2 and _span_s(window) - _step_s(window) >= _WINDOW_S:
+        while (
+            len(window) > 2
+            and _span_s(window) - ((window[1].frame.time_ns - window[0].frame.time_ns) * 1e-9) >= _WINDOW_S
+        ):
             window.popleft()
         is_full = len(window) > 2 and _span_s(window) >= _WINDOW_S * 0.999
         return _motion_m(window, self._board, self._max_motion_m) if is_full else np.inf
@@ -95,10 +98,6 @@ def _is_gap(window: deque[BoardDetection], detection: BoardDetection) -> bool:
 
 def _span_s(window: deque[BoardDetection]) -> float:
     return (window[-1].frame.time_ns - window[0].frame.time_ns) * 1e-9
-
-
-def _step_s(window: deque[BoardDetection]) -> float:
-    return (window[1].frame.time_ns - window[0].frame.time_ns) * 1e-9
 
 
 def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) -> float:

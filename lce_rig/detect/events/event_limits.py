@@ -86,7 +86,12 @@ def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Re
     lamps = look_for_flicker(recent)
     if lamps is not None:
         return lamps
-    n_hot, hot_share = _hot(recent)
+    # Count hot pixels and measure their share of the events.
+    shape = recent.height_px, recent.width_px
+    index = recent.y.astype(np.intp) * recent.width_px + recent.x
+    counts = np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
+    is_hot = hot_pixels(np.minimum(counts, 65535).astype(np.uint16))
+    n_hot, hot_share = int(is_hot.sum()), float(counts[is_hot].sum() / max(counts.sum(), 1))
     if hot_share > _MAX_HOT_SHARE:
         return IMAGE_HOT_PIXELS.refusal(n_hot=n_hot, share=hot_share)
     events_px, needed_px = busiest_events(events, stamp_ns), max(_SLOW_EVENTS_PX, limits.min_events_px)
@@ -102,12 +107,3 @@ def look_for_flicker(events: Events) -> Refusal | None:
     if not flicker.is_storm:
         return None
     return IMAGE_FLICKER.refusal(frequency_hz=flicker.frequency_hz)
-
-
-def _hot(events: Events) -> tuple[int, float]:
-    """Count hot pixels and measure their share of the events."""
-    shape = events.height_px, events.width_px
-    index = events.y.astype(np.intp) * events.width_px + events.x
-    counts = np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
-    is_hot = hot_pixels(np.minimum(counts, 65535).astype(np.uint16))
-    return int(is_hot.sum()), float(counts[is_hot].sum() / max(counts.sum(), 1))

@@ -1,10 +1,8 @@
 """Flicker of lamps in a stream of events: regular bursts of one polarity that drown the scene."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.data import Events
 
@@ -61,7 +59,9 @@ def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
     begins = (ends - counts)[is_filled]
     n_brighter[is_filled] = np.add.reduceat(events.polarity[: ends[-1]], begins, dtype=np.int64)
     signed = 2.0 * n_brighter - counts
-    coherence = _coherence(signed, counts)
+    # Mean product of the polarities of two events in one bin, as a root: few events do not look coherent.
+    n_pairs = float((counts * (counts - 1)).sum())
+    coherence = float(np.sqrt(max((signed**2 - counts).sum() / n_pairs, 0.0))) if n_pairs else 0.0
     power = np.abs(np.fft.rfft(signed - signed.mean())) ** 2
     duration_s = len(signed) * bin_ns * 1e-9
     slowest = int(np.ceil(_MIN_FLICKER_HZ * duration_s))
@@ -72,9 +72,3 @@ def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
     # A line that falls between two frequencies leaks into both.
     lines = np.unique(np.clip(np.arange(peak, len(power), peak)[:, None] + (-1, 0, 1), 1, len(power) - 1))
     return Flicker(peak / duration_s, coherence, float(power[lines].sum() / power.sum()))
-
-
-def _coherence(signed: NDArray[Any], counts: NDArray[np.intp]) -> float:
-    """Mean product of the polarities of two events in one bin, as a root: few events do not look coherent."""
-    n_pairs = float((counts * (counts - 1)).sum())
-    return float(np.sqrt(max((signed**2 - counts).sum() / n_pairs, 0.0))) if n_pairs else 0.0

@@ -36,7 +36,7 @@ def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
     """Measure the corners' surroundings."""
     grid = crossings.grid_px
     height, width = grey.shape
-    square_px = _square_px(grid)
+    square_px = float(min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)))
     edge_width_px = _EDGE_WIDTH_PER_SIGMA * float(np.median(crossings.edge_sigma_px[crossings.is_fitted]))
     alternating = crossings.contrast * (-1.0) ** np.indices(crossings.contrast.shape).sum(axis=0)
     alternating *= -1.0 if np.median(alternating) < 0 else 1.0
@@ -188,11 +188,6 @@ def _sizes(board: Board, seen_px: Array) -> tuple[tuple[int, int], tuple[int, in
     either = ((cols, rows), (rows, cols))
     seen = min(either, key=lambda size: abs(size[0] - wanted[0]) + abs(size[1] - wanted[1]))
     return wanted, seen
-
-
-def _square_px(grid_px: Array) -> float:
-    """Measure the shortest side of a square."""
-    return float(min(np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).min() for axis in (0, 1)))
 
 
 def _side_beyond(grey: NDArray[np.uint8], grid_px: Array) -> str:

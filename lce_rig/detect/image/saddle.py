@@ -70,7 +70,7 @@ def _fit_patches(
     grey: NDArray[np.uint8], grid_px: Array, most_samples: int, start: Array | None, n_steps: int = _STEPS
 ) -> tuple[Crossings, Array]:
     """Fit patches of at most so many samples a side; the parameters (K, 8) serve finer patches as start."""
-    e1, e2 = _sides(grid_px)
+    e1, e2 = np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0)
     area = np.abs(e1[..., 0] * e2[..., 1] - e1[..., 1] * e2[..., 0])
     # Width of a square across its edges: what one unit of a and of b is in px.
     height_px = np.stack([area / np.linalg.norm(e2, axis=-1), area / np.linalg.norm(e1, axis=-1)], axis=-1)
@@ -132,11 +132,6 @@ def _sample_smooth(grey: NDArray[np.uint8], pixels: Array, blur_px: float) -> Ar
         dtype=np.float32,
     )
     return sample(smooth, pixels - low)
-
-
-def _sides(grid_px: Array) -> tuple[Array, Array]:
-    """Measure the local side vectors along rows and columns, (rows, cols, 2) each."""
-    return np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0)
 
 
 def _fit(

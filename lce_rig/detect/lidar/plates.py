@@ -76,7 +76,12 @@ def propose_plates(
         is_kept[np.unique(plates.centre[:, 0], return_index=True)[1]] = True
         is_kept &= (plates.n_rings >= 2) & _faces_lidar(plates) & (plates.size_m[:, 0] < 2.0 * diagonal_m)
     if not is_any_size:
-        is_kept &= _is_plausible(plates, board)
+        # Find which plates (K,) can be the board, part of which may be hidden or outside the rings.
+        long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
+        ratio = plates.size_m / [long_m, short_m]
+        is_kept &= np.asarray(
+            (ratio[:, 0] > 0.5) & (ratio[:, 0] < 1.5) & (ratio[:, 1] > 0.25) & (ratio[:, 1] < 1.5)
+        )
     best = _different(plates, np.flatnonzero(is_kept), board, n_plates)
     ends = [_ring_ends(scan, segments, column[row == k]) for k in best]
     padded = np.full((len(best), max((len(e) for e in ends), default=1), 3), np.nan)
@@ -224,13 +229,6 @@ def _faces_lidar(plates: Plates) -> NDArray[np.bool_]:
     """Find which planes (K,) the beams meet at less than the largest incidence; d = distance of the plane."""
     distance = np.linalg.norm(plates.centre, axis=1)
     return np.asarray(plates.plane[:, 3] > np.cos(MAX_INCIDENCE_RAD) * distance)
-
-
-def _is_plausible(plates: Plates, board: Board) -> NDArray[np.bool_]:
-    """Find which plates (K,) can be the board, part of which may be hidden or outside the rings."""
-    long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
-    ratio = plates.size_m / [long_m, short_m]
-    return np.asarray((ratio[:, 0] > 0.5) & (ratio[:, 0] < 1.5) & (ratio[:, 1] > 0.25) & (ratio[:, 1] < 1.5))
 
 
 def _different(plates: Plates, candidates: Indices, board: Board, n_plates: int) -> Indices:

@@ -407,13 +407,12 @@ def look_for_board(
         beam=beam,
     )
     if not isinstance(found, Refusal):
-        return next((each for each in found if _is_at(each, plane, centre)), _not_there(centre))
+        return next(
+            (each for each in found if _is_at(each, plane, centre)),
+            LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=float(np.linalg.norm(centre))),
+        )
     cause = at_once if isinstance(at_once, Refusal) else found
     return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
-
-
-def _not_there(centre: Array) -> Refusal:
-    return LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=float(np.linalg.norm(centre)))
 
 
 def _is_at(found: LidarBoard, plane: Array, centre: Array) -> bool:

@@ -99,9 +99,16 @@ def order_scan(scan: Scan, min_range_m: float) -> OrderedScan:
     turn, jump = _since_previous(azimuth, starts), np.abs(_since_previous(range_m, starts))
     turn[starts] = np.mod(turn[starts], 2 * np.float32(np.pi))
     step_rad, sigma_m = _azimuth_step(turn), _range_noise(turn, range_m, ring)
-    limit = _max_range_jump(range_m, turn, sigma_m)
+    # Compute the largest change of range in m between neighbours on one tilted plane, with its noise.
+    slope = float(np.tan(MAX_INCIDENCE_RAD))
+    limit = np.asarray(range_m * np.minimum(turn, 0.02) * slope + 6.0 * sigma_m)
     is_break = (turn > MAX_STEPS * step_rad) | (jump > limit)
-    turned = _from_first_break(is_break, starts)
+    # List the returns (N,) so that each ring begins at its first break; rings begin at `starts`.
+    pieces = []
+    for start, end in zip(starts, [*starts[1:], len(is_break)], strict=True):
+        first = start + int(np.argmax(is_break[start:end]))
+        pieces += [np.arange(first, end), np.arange(start, first)]
+    turned = np.concatenate(pieces)
     is_break = is_break[turned]
     is_break[starts] = True
     order, range_m, azimuth = order[turned], range_m[turned], azimuth[turned]
@@ -121,15 +128,6 @@ def _since_previous(values: Floats, starts: Indices) -> Floats:
     return change
 
 
-def _from_first_break(is_break: NDArray[np.bool_], starts: Indices) -> Indices:
-    """List the returns (N,) so that each ring begins at its first break; rings begin at `starts`."""
-    pieces = []
-    for start, end in zip(starts, [*starts[1:], len(is_break)], strict=True):
-        first = start + int(np.argmax(is_break[start:end]))
-        pieces += [np.arange(first, end), np.arange(start, first)]
-    return np.concatenate(pieces)
-
-
 def _by_azimuth(order: Indices, ring: NDArray[np.int16], azimuth: Floats) -> Indices:
     """Sort the returns of each ring, given in order of firing, by azimuth; drop those of a second turn.
 
@@ -139,7 +137,9 @@ def _by_azimuth(order: Indices, ring: NDArray[np.int16], azimuth: Floats) -> Ind
     if len(order) == 0:
         return order
     starts = _starts(ring)
-    turn = _wrap(np.diff(azimuth, prepend=azimuth[:1]))
+    # Bring differences of two azimuths, rad, to -pi..pi.
+    angle = np.diff(azimuth, prepend=azimuth[:1])
+    turn = np.asarray(angle - 2 * np.float32(np.pi) * np.rint(angle / (2 * np.float32(np.pi))))
     turn[starts] = 0.0
     is_ordered = not 0.05 < np.count_nonzero(turn > 0) / len(turn) < 0.95
     if is_ordered and np.abs(np.add.reduceat(turn, starts)).max() >= 2 * np.pi:
@@ -148,17 +148,6 @@ def _by_azimuth(order: Indices, ring: NDArray[np.int16], azimuth: Floats) -> Ind
         is_first_turn = np.abs(total) < 2 * np.pi
         order, ring, azimuth = order[is_first_turn], ring[is_first_turn], azimuth[is_first_turn]
     return order[np.argsort(ring * 8.0 + azimuth, kind="stable")]
-
-
-def _wrap(angle: Floats) -> Floats:
-    """Bring differences of two azimuths, rad, to -pi..pi."""
-    return np.asarray(angle - 2 * np.float32(np.pi) * np.rint(angle / (2 * np.float32(np.pi))))
-
-
-def _max_range_jump(range_m: Floats, turn: Floats, sigma_m: float) -> Floats:
-    """Compute the largest change of range in m between neighbours on one tilted plane, with its noise."""
-    slope = float(np.tan(MAX_INCIDENCE_RAD))
-    return np.asarray(range_m * np.minimum(turn, 0.02) * slope + 6.0 * sigma_m)
 
 
 def _azimuth_step(turn: Floats) -> float:

@@ -85,15 +85,11 @@ def without_background_activity(events: Events, support_ns: int = _SUPPORT_NS) -
     for index in range(n_slices):
         cut = slice(bounds[index], bounds[index + 1])
         near = active[index] | active[index + 1] | active[index + 2]
-        keep[cut] = _has_neighbour(near)[events.y[cut], events.x[cut]]
+        wide = np.pad(near.astype(np.uint8), 1)
+        rows = wide[:-2] + wide[1:-1] + wide[2:]
+        total = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+        keep[cut] = np.asarray(total > near)[events.y[cut], events.x[cut]]
     return _select(events, keep)
-
-
-def _has_neighbour(is_active: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    wide = np.pad(is_active.astype(np.uint8), 1)
-    rows = wide[:-2] + wide[1:-1] + wide[2:]
-    total = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
-    return np.asarray(total > is_active)
 
 
 def _select(events: Events, keep: NDArray[np.bool_]) -> Events:
