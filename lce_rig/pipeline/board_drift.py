@@ -14,12 +14,12 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections
+from lce_rig.judge.session_check import find_meetings
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State
 from lce_rig.scene.findings import BOARD_CHANGED, BOARD_UNSURE
-from lce_rig.show.overlays.session_check import find_meetings
 
 # What results of one rig differ by from session to session, m and rad, order of AXES.
 _BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.12, 0.10, 0.12])])

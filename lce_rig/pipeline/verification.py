@@ -11,6 +11,7 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.detection import Detections, LidarDetection, Pair
 from lce_rig.detect.events.search import EventImage
+from lce_rig.judge.session_check import SessionCheck, check_session
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import Progress, detect, event_channels, event_picture, silent
 from lce_rig.pipeline.matching import match_sensors
@@ -29,9 +30,9 @@ from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import DEBUG
+from lce_rig.show.overlays.check_pictures import draw_check
 from lce_rig.show.overlays.event_picture import ImageWithEvents
 from lce_rig.show.overlays.overlay_files import is_overlay
-from lce_rig.show.overlays.session_check import SessionCheck, check_session, draw_check
 
 
 @dataclass(frozen=True, eq=False)

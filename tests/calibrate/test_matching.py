@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.core.geometry import perturb
-from lce_rig.show.overlays.session_check import match_candidates
+from lce_rig.judge.session_check import match_candidates
 from tests.calibrate.boards import BOARD, T_FORWARD, simulate
 
 

@@ -1,8 +1,7 @@
-"""Compare extrinsics with every capture of a session: residuals, one image each, one contact sheet."""
+"""Compare extrinsics with the boards in every capture of a session."""
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,6 @@ from lce_rig.calibrate.options import CaptureCandidates
 from lce_rig.calibrate.shared_scans import SharedScan, sample_scans
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, CaptureResidual, Metrics, SceneOpinion
-from lce_rig.core.data import Scan
-from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
@@ -26,13 +23,9 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.findings import ELSEWHERE, UNSEEN
 from lce_rig.judge.verdict import residuals_beyond, scene_findings
 from lce_rig.rig import Rig
-from lce_rig.session import Capture, Session
-from lce_rig.show.overlays.event_picture import ImageWithEvents
-from lce_rig.show.overlays.overlay import camera_part, draw_overlay, range_limits
-from lce_rig.show.overlays.overlay_files import Overlay, SheetHead, write_overlays
-from lce_rig.words import as_json, sentence
 
-# Boards that moved between image and scan, motion-compensated as in the calibration.
+# Boards displaced by slightly wrong extrinsics are measured; farther surfaces are other objects.
+_ELSEWHERE_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +67,19 @@ def bring_together(
     timed = {name: items for name, items in observations.items() if name in results}
     if channel not in timed or any(results[name].time_offset_s is None for name in timed):
         return {o.capture: Meeting(o, o, o.lidar) for o in observations.get(channel, ())}
-    scans, own = _join(timed, channel, sorted(timed, key=lambda name: results[name].noise_px))
+    # Images of all channels by scan, those of the channel with the least noise first.
+    by_scan: dict[bytes, dict[str, ImageBoard]] = {}
+    for name in sorted(timed, key=lambda name: results[name].noise_px):
+        for o in timed[name]:
+            by_scan.setdefault(o.lidar.points.tobytes(), {}).setdefault(name, o.image)
+    own = list(timed[channel])
     if not own:
         return {}
+    # A capture's own image counts, if several hold the same scan.
+    scans = [
+        SharedScan((o.capture,), {**by_scan[o.lidar.points.tobytes()], channel: o.image}, o.lidar)
+        for o in own
+    ]
     samples = sample_scans(scans, clocks, {name: results[name].noise_px for name in timed})
     offset_s = np.array([results[name].time_offset_s for name in samples.channels], dtype=np.float64)
     only = channel if len(samples.channels) > 1 else None
@@ -86,23 +89,6 @@ def bring_together(
         o.capture: Meeting(o, moved, _at_image_time(moved, o.image, calibration.T_cam_lidar))
         for o, moved in zip(own, swept, strict=True)
     }
-
-
-def _join(
-    observations: Mapping[str, Sequence[Observation]], channel: str, steadiest_first: Sequence[str]
-) -> tuple[list[SharedScan], list[Observation]]:
-    """Collect, for each of a channel's observations, the images of all channels with the same scan."""
-    by_scan: dict[bytes, dict[str, ImageBoard]] = {}
-    for name in steadiest_first:
-        for o in observations[name]:
-            by_scan.setdefault(o.lidar.points.tobytes(), {}).setdefault(name, o.image)
-    own = list(observations[channel])
-    scans = []
-    for o in own:
-        # This capture's own image, if several hold the same scan.
-        images = {**by_scan[o.lidar.points.tobytes()], channel: o.image}
-        scans.append(SharedScan((o.capture,), images, o.lidar))
-    return scans, own
 
 
 def _at_image_time(swept: Observation, image: ImageBoard, T_cam_lidar: Array) -> LidarBoard:
@@ -115,9 +101,6 @@ def _at_image_time(swept: Observation, image: ImageBoard, T_cam_lidar: Array) ->
         edge_points=transform(moved, lidar.edge_points),
         T_lidar_board=moved @ lidar.T_lidar_board,
     )
-
-
-# Matching of a capture's LiDAR candidates and camera poses under given extrinsics.
 
 
 def match_candidates(candidates: CaptureCandidates, board: Board, T_cam_lidar: Array) -> Observation:
@@ -150,13 +133,6 @@ def match_candidates(candidates: CaptureCandidates, board: Board, T_cam_lidar: A
     return Observation(candidates.capture, image, candidates.lidar[lidar_index])
 
 
-Progress = Callable[[int, int], None]
-# Boards displaced by slightly wrong extrinsics are measured; farther surfaces are other objects.
-_ELSEWHERE_M = 0.5
-# Scans that choose the range scale of a session's images.
-_SCANS_OF_SCALE = 8
-
-
 @dataclass(frozen=True, eq=False)
 class SessionCheck:
     """Residuals of extrinsics for one channel and the LiDAR on the captures of a session.
@@ -186,33 +162,33 @@ class SessionCheck:
     def moved(self, old: Path, new: Path) -> "SessionCheck":
         """Update the files' paths to a new folder."""
 
-        def renamed(path: Path) -> Path:
-            return new / path.relative_to(old)
-
-        pictures, sheets = (tuple(map(renamed, paths)) for paths in (self.pictures, self.contact_sheets))
+        pictures, sheets = (
+            tuple(new / path.relative_to(old) for path in paths)
+            for paths in (self.pictures, self.contact_sheets)
+        )
         return replace(self, pictures=pictures, contact_sheets=sheets)
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
+        names = ("plane_mean_m", "plane_rms_m", "edge_mean_m", "edge_rms_m", "reprojection_px")
+        used = self.calibration.captures_used
         return {
             "camera": self.pair.camera,
             "channel": self.pair.channel,
             "lidar": self.pair.lidar,
             "verdict": self.calibration.verdict,
-            "doubts": [as_json(doubt) for doubt in self.findings],
+            "doubts": [doubt.as_json() for doubt in self.findings],
             "metrics": None
             if self.metrics is None
             else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
             "scene": {"state": self.scene.state, **asdict(self.scene)},
-            "captures": {r.capture: _figures(r, self.calibration.captures_used) for r in self.residuals},
+            "captures": {
+                r.capture: {"was_used": r.capture in used, **{name: getattr(r, name) for name in names}}
+                for r in self.residuals
+            },
             "pictures": [str(path) for path in self.pictures],
             "contact_sheets": [str(path) for path in self.contact_sheets],
         }
-
-
-def _figures(residual: CaptureResidual, used: tuple[str, ...]) -> dict[str, Any]:
-    names = ("plane_mean_m", "plane_rms_m", "edge_mean_m", "edge_rms_m", "reprojection_px")
-    return {"was_used": residual.capture in used, **{name: getattr(residual, name) for name in names}}
 
 
 def check_session(
@@ -243,86 +219,13 @@ def check_session(
         for meeting in meetings.values()
     ]
     metrics = summarise(residuals) if residuals else None
-    n_seen = sum(_sees_board(detections, pair, name) for name in detections.captures(pair))
+    both = (detections.of(pair, name) for name in detections.captures(pair))
+    n_seen = sum(isinstance(image, ImageBoard) and isinstance(lidar, list) for image, lidar in both)
     findings = contradictions(metrics, rig, n_seen - len(residuals), n_seen)
     # A result of this session has been judged by its scene; that of another may have been deployed since.
     action = "" if calibration.captures_used else "deployed"
     findings = (*findings, *scene_findings(scene, calibration, action))
     return SessionCheck(pair, calibration, findings, tuple(residuals), metrics, scene, meetings)
-
-
-def draw_check(
-    session: Session,
-    detections: Detections,
-    check: SessionCheck,
-    folder: Path,
-    *,
-    view_of: Callable[[Capture], ImageWithEvents | None],
-    progress: Progress,
-) -> SessionCheck:
-    """Project the point cloud of every capture into its image, and return the images' paths.
-
-    Args:
-        session: the source of the captures.
-        detections: of the session.
-        check: of one channel on these captures.
-        folder: receives `<capture>.png` and contact sheets.
-        view_of: returns the channel's image in a capture; None if it cannot be read.
-        progress: called with (done, total).
-
-    Raises:
-        SessionError: an image cannot be written.
-    """
-    residuals = {residual.capture: residual for residual in check.residuals}
-    names = detections.captures(check.pair)
-    limits_m = _range_limits(session, check.pair.lidar, names)
-
-    def overlays() -> Iterator[Overlay]:
-        for done, name in enumerate(names, start=1):
-            capture = session.capture(name)
-            view = view_of(capture)
-            if view is not None:
-                seen = detections.of(check.pair, name)[0]
-                image = seen if isinstance(seen, ImageBoard) else None
-                yield from _draw(capture, session.rig, check, view, image, residuals.get(name), limits_m)
-            progress(done, len(names))
-
-    head = SheetHead(
-        f"{session.rig.name}  {check.pair}",
-        check.calibration.verdict,
-        _head_lines(check, len(names)),
-        limits_m,
-    )
-    pictures, sheets = write_overlays(folder, overlays(), head)
-    return replace(check, pictures=tuple(pictures), contact_sheets=tuple(sheets))
-
-
-def _range_limits(session: Session, lidar: str, names: Sequence[str]) -> tuple[float, float]:
-    """Choose one range scale for all images of a session from scans throughout it."""
-    scans = []
-    for name in names[:: max(1, len(names) // _SCANS_OF_SCALE)]:
-        with suppress(SessionError):
-            scans.append(session.capture(name).scan(lidar))
-    return range_limits(scans)
-
-
-def _head_lines(check: SessionCheck, n_captures: int) -> list[str]:
-    """State the figures of all captures, and what speaks against the extrinsics."""
-    c, m = check.calibration, check.metrics
-    lines = [
-        f"{n_captures} captures, {len(c.captures_used)} used; "
-        f"uncertainty {c.sigma_rotation_deg:.2g} deg, {1000 * c.sigma_translation_m:.2g} mm (1 sigma)"
-        + (
-            ""
-            if m is None
-            else f"; mean over captures: {_residual_words(m.mpe_m, m.mee_m, m.reprojection_px)}"
-        )
-    ]
-    return lines + [sentence(finding) for finding in (*c.findings, *check.findings)]
-
-
-def _residual_words(plane_m: float, edge_m: float, corner_px: float) -> str:
-    return f"planes {1000 * plane_m:.1f} mm, edges {1000 * edge_m:.1f} mm, corners {corner_px:.2f} px"
 
 
 def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: int) -> tuple[Finding, ...]:
@@ -343,11 +246,6 @@ def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: 
     return tuple(found)
 
 
-def _sees_board(detections: Detections, pair: Pair, name: str) -> bool:
-    image, lidar = detections.of(pair, name)
-    return isinstance(image, ImageBoard) and isinstance(lidar, list)
-
-
 def find_meetings(
     rig: Rig, detections: Detections, channel: str, calibration: Calibration, clocks: Clocks
 ) -> dict[str, Meeting]:
@@ -363,98 +261,21 @@ def find_meetings(
     Returns:
         By name of the capture.
     """
-    observations = {}
+    board = rig.board.to_board()
+    observations: dict[str, list[Observation]] = {}
     for name in calibration.channels:
         pair = Pair(calibration.camera, name, calibration.lidar)
-        if pair in detections.pairs:
-            captures = detections.captures(pair)
-            found = (_observe(rig, detections, pair, capture, calibration) for capture in captures)
-            observations[name] = [observation for observation in found if observation is not None]
+        if pair not in detections.pairs:
+            continue
+        observations[name] = []
+        for capture in detections.captures(pair):
+            image, lidar = detections.of(pair, capture)
+            if not isinstance(image, ImageBoard) or not isinstance(lidar, list):
+                continue
+            matched = match_candidates(
+                CaptureCandidates(capture, image, lidar), board, calibration.T_cam_lidar
+            )
+            middle = calibration.T_cam_lidar @ matched.lidar.T_lidar_board[:, 3]
+            if np.linalg.norm(middle[:3] - matched.image.T_cam_board[:3, 3]) < _ELSEWHERE_M:
+                observations[name].append(matched)
     return bring_together(observations, channel, calibration, clocks)
-
-
-def _observe(
-    rig: Rig, detections: Detections, pair: Pair, name: str, calibration: Calibration
-) -> Observation | None:
-    """Pair both sensors' detections; None if no surface in the scan is near the camera's board."""
-    image, lidar = detections.of(pair, name)
-    if not isinstance(image, ImageBoard) or not isinstance(lidar, list):
-        return None
-    candidates = CaptureCandidates(name, image, lidar)
-    matched = match_candidates(candidates, rig.board.to_board(), calibration.T_cam_lidar)
-    middle = calibration.T_cam_lidar @ matched.lidar.T_lidar_board[:, 3]
-    apart_m = float(np.linalg.norm(middle[:3] - matched.image.T_cam_board[:3, 3]))
-    return matched if apart_m < _ELSEWHERE_M else None
-
-
-def _draw(
-    capture: Capture,
-    rig: Rig,
-    check: SessionCheck,
-    view: ImageWithEvents,
-    seen: ImageBoard | None,
-    residual: CaptureResidual | None,
-    limits_m: tuple[float, float],
-) -> Iterator[Overlay]:
-    """Draw one capture; none if its scan cannot be read."""
-    try:
-        scan = capture.scan(check.pair.lidar)
-    except SessionError:
-        return
-    name, calibration, meeting = capture.name, check.calibration, check.meetings.get(capture.name)
-    warning = _warning(name, calibration)
-    picture = draw_overlay(
-        view.image,
-        scan if meeting is None else _without(scan, meeting.measured.lidar),
-        rig.cameras[calibration.camera].to_intrinsics(),
-        calibration.T_cam_lidar,
-        lidar_board=None if meeting is None else meeting.lidar_at_image_time,
-        image_board=seen if meeting is None else meeting.measured.image,
-        board=rig.board.to_board(),
-        residuals=_legend(name, residual, meeting, calibration),
-        title=f"{rig.name}  {check.pair}  {name}",
-        limits_m=limits_m,
-        warning=warning,
-        events=view.events,
-    )
-    r = residual
-    words = "" if r is None else _residual_words(r.plane_mean_m, r.edge_mean_m, r.reprojection_px)
-    yield Overlay(name, picture, camera_part(picture, view.image), words, warning)
-
-
-def _warning(name: str, calibration: Calibration) -> str:
-    """Say why a capture was not used; empty if it was, or if the extrinsics come from another session."""
-    if name in calibration.captures_used or not calibration.captures_used:
-        return ""
-    refusal = calibration.captures_refused.get(name)
-    return "not used" if refusal is None else f"refused, {refusal.stage}: {sentence(refusal)}"
-
-
-def _without(scan: Scan, lidar: LidarBoard) -> Scan:
-    """Remove a board's points, which are drawn separately, moved to the image's time."""
-    points, on_board = (np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, lidar.points))
-    row = np.dtype((np.void, points.dtype.itemsize * 3))
-    return scan.select(~np.isin(points.view(row).ravel(), on_board.view(row).ravel()))
-
-
-def _legend(
-    name: str, residual: CaptureResidual | None, meeting: Meeting | None, calibration: Calibration
-) -> dict[str, float | str]:
-    figures: dict[str, float | str] = {}
-    if residual is not None:
-        figures = {
-            "planes (mm)": round(1000 * residual.plane_mean_m, 1),
-            "edges (mm)": round(1000 * residual.edge_mean_m, 1),
-            "corners (px)": round(residual.reprojection_px, 2),
-        }
-    if meeting is not None and meeting.way_m > 0:
-        figures["moved (mm)"] = round(1000 * meeting.way_m, 1)
-    refusal = calibration.captures_refused.get(name)
-    if calibration.captures_used:
-        is_used = name in calibration.captures_used
-        figures["capture"] = "used" if is_used else f"refused, {refusal.stage}" if refusal else "not used"
-    figures["sigma"] = (
-        f"{calibration.sigma_rotation_deg:.2g} deg, {1000 * calibration.sigma_translation_m:.2g} mm"
-    )
-    figures["verdict"] = calibration.verdict
-    return figures

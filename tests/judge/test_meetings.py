@@ -8,7 +8,7 @@ from lce_rig.calibrate.metrics import capture_residual
 from lce_rig.core.calibration import Calibration, Certificate, ChannelResult, Metrics
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import Observation
-from lce_rig.show.overlays.session_check import bring_together, match_candidates
+from lce_rig.judge.session_check import bring_together, match_candidates
 from tests.calibrate.boards import BOARD, T_FORWARD
 from tests.calibrate.moving_boards import Moving, simulate_moving
 

@@ -1,8 +1,8 @@
 """When captures contradict an extrinsic."""
 
 from lce_rig.core.calibration import Metrics
+from lce_rig.judge.session_check import contradictions
 from lce_rig.rig import load_rig
-from lce_rig.show.overlays.session_check import contradictions
 
 RIG = load_rig("rlfs")
 GOOD = Metrics(mpe_m=0.008, mee_m=0.006, reprojection_px=0.1)
