@@ -7,6 +7,9 @@ from typing import Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+MAX_TIME_NS = 1 << 62
+"""No valid timestamp is so far from zero: year 2116 on clocks counted from 1970. Differences fit 64 bits."""
+
 
 @dataclass(frozen=True, eq=False)
 class Image:

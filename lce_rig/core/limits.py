@@ -9,6 +9,8 @@ import stat
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from lce_rig.core.data import MAX_TIME_NS as MAX_TIME_NS
+
 MAX_PIXELS = 1 << 26
 """Of one image: 67 megapixels."""
 MAX_POINTS = 1 << 23
@@ -29,8 +31,6 @@ MAX_NETWORK_BYTES = 1 << 29
 """Voxels and states of one step of a network: E2VID's at 1280 x 720 take 220 MB."""
 MAX_EVENT_PIXELS = 1 << 22
 """Of one event camera: four times the largest on sale."""
-MAX_TIME_NS = 1 << 62
-"""No valid timestamp is so far from zero: year 2116 on clocks counted from 1970. Differences fit 64 bits."""
 MAX_PACKET_BYTES = 1 << 24
 """Of events in one message: drivers send some ms at a time."""
 MAX_TOPICS = 1 << 14

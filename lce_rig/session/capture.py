@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.documents import read_json
-from lce_rig.core.errors import SessionError
+from lce_rig.core.errors import LceRigError, SessionError, reason_of
 from lce_rig.core.event_file import decode_events
 from lce_rig.core.image_codec import decode_pixels
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, MAX_FILE_BYTES, MAX_TIME_NS, describe, read_file
@@ -323,10 +323,10 @@ class Capture:
         """Report what is wrong with a file of the capture as damage."""
         try:
             yield
-        except OSError as error:
-            raise self._damaged(f"{name}: {error.strerror}") from None
-        except ValueError as error:
-            raise self._damaged(f"{name}: {error}") from None
+        except LceRigError:
+            raise
+        except Exception as error:  # of a library, about a damaged file
+            raise self._damaged(f"{name}: {reason_of(error)}") from None
 
     def _damaged(self, what: str) -> SessionError:
         hint = f"Remove {self.path} and collect again; the other captures are not affected."

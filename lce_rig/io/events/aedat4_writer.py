@@ -19,8 +19,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from lce_rig.core.data import Events
-from lce_rig.io.events.aedat4 import EVENT
-from lce_rig.io.events.aedat4_file import MAGIC
+from lce_rig.io.events.aedat4 import EVENT, MAGIC
 from lce_rig.io.events.stream import NS_PER_US
 
 # DV's own packets hold 10 ms; smaller ones are read slowly, larger ones late.

@@ -1,32 +1,102 @@
-"""Streams of 16-bit words, 4 bits of code and 12 of payload: Prophesee's EVT3, the ROS driver's libcaer_cmp.
+"""Events in words of 16 or 32 bits: Prophesee's EVT2 and EVT3, and the ROS driver's libcaer_cmp.
 
-Both are state machines: words set the time, the row (or column) and a polarity; others emit events from that
-state. Here a whole block is decoded at once: what a word sets is repeated up to the next of its kind, and a
-single event is a vector with one bit, so that both expand alike and keep their order.
+All are state machines: some words set the time, the row (or column) or a base; others emit events from that
+state. A whole block is decoded at once: what a word sets is repeated up to the next word of its kind, and the
+words that hold the state at a block's end are put before the next block.
 
 References:
+    https://docs.prophesee.ai/stable/data/encoding_formats/evt2.html
     https://docs.prophesee.ai/stable/data/encoding_formats/evt3.html
     https://github.com/ros-event-camera/event_camera_codecs (libcaer_cmp: rows and columns exchanged)
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import EventColumns
-from lce_rig.io.events.counter import WrappingCounter
 from lce_rig.io.events.stream import NS_PER_US
 
-# Time-high words count 4.096 ms each, wrap every 16.8 s, and may step back a little without having wrapped.
-_HIGH_BITS = 12
-_MAX_STEP_BACK = 10
+
+@dataclass
+class WrappingCounter:
+    """Follows the high part of a camera's clock, which wraps, from block to block.
+
+    Attributes:
+        n_bits: the counter wraps at 2**n_bits.
+        max_step_back: smaller steps back are not wraps; cameras mix their words a little.
+        last: value of the last word, wraps included; None before the first.
+        n_repaired: words that did not fit those around them and were replaced by the one before.
+    """
+
+    n_bits: int
+    max_step_back: int
+    last: int | None = None
+    n_repaired: int = 0
+
+    def unwrap(self, values: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Add the wraps to the next values (N,) of the counter."""
+        if not len(values):
+            return values
+        # A single word that leaps out of a steady row would add a wrap for good.
+        before, word, after = values[:-2], values[1:-1], values[2:]
+        is_steady = (after >= before) & (after - before <= self.max_step_back)
+        is_odd = is_steady & (np.abs(word - before) > self.max_step_back)
+        self.n_repaired += int(np.count_nonzero(is_odd))
+        values = np.concatenate((values[:1], np.where(is_odd, before, word), values[1:][-1:]))
+        last = int(values[0]) if self.last is None else self.last
+        previous = np.concatenate(([last % (1 << self.n_bits)], values[:-1]))
+        wraps = np.cumsum(values + self.max_step_back < previous) + (last >> self.n_bits)
+        unwrapped = values + (wraps << self.n_bits)
+        self.last = int(unwrapped[-1])
+        return np.asarray(unwrapped, dtype=np.int64)
+
+
+class Evt2Decoder:
+    """Decodes EVT2, block by block.
+
+    Attributes:
+        n_untimed: events before any timestamp, skipped.
+        n_unknown: words of no known code, skipped.
+        clock: the high part of the time: 28 bits of 64 us.
+    """
+
+    _OFF, _ON, _TIME_HIGH = 0, 1, 8
+    _KNOWN = (_OFF, _ON, _TIME_HIGH, 0xA, 0xE, 0xF)
+
+    def __init__(self) -> None:
+        self.n_untimed = self.n_unknown = 0
+        self.clock = WrappingCounter(28, 1 << 10)
+        self._state = np.empty(0, np.uint32)
+
+    @property
+    def n_repaired(self) -> int:
+        """Time words that did not fit those around them and were replaced by the one before."""
+        return self.clock.n_repaired
+
+    def decode(self, words: NDArray[np.uint32]) -> EventColumns:
+        """Decode a block of words (N,)."""
+        words = np.concatenate((self._state, words))
+        code = words >> 28
+        self.n_unknown += int(np.count_nonzero(~np.isin(code, self._KNOWN)))
+        at_high = np.flatnonzero(code == self._TIME_HIGH)
+        high = _held(at_high, self.clock.unwrap((words[at_high] & 0xFFFFFFF).astype(np.int64)), len(words))
+        self._state = words[at_high[-1:]]
+        emitting = np.flatnonzero(code <= self._ON)
+        n_untimed = int(np.searchsorted(emitting, at_high[0])) if len(at_high) else len(emitting)
+        self.n_untimed += n_untimed
+        emitting = emitting[n_untimed:]
+        event = words[emitting]
+        t_us = (high[emitting] << 6) | ((event >> 22) & 0x3F)
+        x, y = ((event >> 11) & 0x7FF).astype(np.uint16), (event & 0x7FF).astype(np.uint16)
+        return EventColumns(t_us * NS_PER_US, x, y, code[emitting] == self._ON)
 
 
 @dataclass(frozen=True)
 class WordLayout:
-    """Which code means what.
+    """Meaning of the codes: the upper 4 of 16 bits.
 
     Attributes:
         time_high, time_low: bits 12 to 23 and 0 to 11 of the time in us.
@@ -52,160 +122,93 @@ EVT3 = WordLayout(8, 6, 0, 2, 3, {4: 12, 5: 8}, frozenset({7, 9, 10, 14, 15}), i
 LIBCAER_CMP = WordLayout(0, 1, 2, 3, 4, {5: 8}, frozenset(), is_line_x=True)
 
 
-@dataclass
 class WordDecoder:
-    """Decodes a stream block by block; the state continues from one to the next.
+    """Decodes a stream of 16-bit words, block by block.
 
     Attributes:
-        layout: what the codes mean.
-        n_untimed: events met before any timestamp, skipped.
+        n_untimed: events before any timestamp, skipped.
         n_unknown: words of no known code, skipped.
+        clock: the high part of the time: 12 bits of 4.096 ms.
     """
 
-    layout: WordLayout
-    n_untimed: int = 0
-    n_unknown: int = 0
-    _clock: WrappingCounter = field(default_factory=lambda: WrappingCounter(_HIGH_BITS, _MAX_STEP_BACK))
-    _low: int | None = None
-    _line: int = 0
-    _next: int = 0
-    _polarity: int = 0
-    _tables: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        width = np.zeros(16, np.uint8)
-        width[self.layout.single] = 1
-        for code, n_bits in self.layout.vectors.items():
-            width[code] = n_bits
-        unknown = np.ones(16, np.uint8)
-        named = (*_named_codes(self.layout), *self.layout.known)
-        unknown[list(named)] = 0
-        self._tables = {"width": width, "unknown": unknown}
+    def __init__(self, layout: WordLayout) -> None:
+        self.n_untimed = self.n_unknown = 0
+        self.clock = WrappingCounter(12, 10)
+        self._layout = layout
+        self._time = self._place = np.empty(0, np.uint16)
+        # By code: the bits of a vector, 0 of other words; whether the code is unknown.
+        self._n_bits = np.zeros(16, np.int64)
+        self._n_bits[list(layout.vectors)] = list(layout.vectors.values())
+        self._is_unknown = np.ones(16, np.bool_)
+        named = (layout.time_high, layout.time_low, layout.line, layout.single, layout.base)
+        self._is_unknown[[*named, *layout.vectors, *layout.known]] = False
 
     @property
     def n_repaired(self) -> int:
-        """Time words that did not fit those around them, for which the one before was taken."""
-        return self._clock.n_repaired
+        """Time words that did not fit those around them and were replaced by the one before."""
+        return self.clock.n_repaired
 
     def start_packet(self) -> None:
         """Begin a packet that counts its time from zero."""
-        self._clock.last, self._low = 0, 0
+        layout = self._layout
+        self._time = np.array([layout.time_high << 12, layout.time_low << 12], np.uint16)
+        self.clock.last = 0
 
     def decode(self, words: NDArray[np.uint16]) -> EventColumns:
         """Decode a block of words (N,), of any length."""
-        code = (words >> 12).astype(np.uint8)
-        payload = words & np.uint16(0xFFF)
-        self.n_unknown += int(self._tables["unknown"][code].sum())
-        width = self._tables["width"][code]
-        emitting = np.flatnonzero(width > 0)
-        t_us, is_timed = self._times(code, payload, emitting)
-        line = self._lines(code, payload, emitting)
-        is_vector = code[emitting] != self.layout.single
-        start, polarity, bits = self._spans(code, payload, emitting, is_vector)
-        word, bit = _expand(bits, is_vector)
-        if not is_timed.all():
-            keep = is_timed[word]
-            self.n_untimed += int(np.count_nonzero(~keep))
-            word, bit = word[keep], bit[keep]
-        along = (start[word] + bit).astype(np.uint16)
-        across = line[word]
-        x, y = (across, along) if self.layout.is_line_x else (along, across)
-        return EventColumns(t_us[word] * NS_PER_US, x, y, polarity[word])
+        layout = self._layout
+        words = np.concatenate((self._time, self._place, words))
+        code, payload = (words >> 12).astype(np.uint8), (words & 0xFFF).astype(np.int64)
+        self.n_unknown += int(np.count_nonzero(self._is_unknown[code]))
+        at_high, at_low, at_line, at_base = (
+            np.flatnonzero(code == c) for c in (layout.time_high, layout.time_low, layout.line, layout.base)
+        )
+        t_us = _held(at_high, self.clock.unwrap(payload[at_high]) << 12, len(words))
+        t_us |= _held(at_low, payload[at_low], len(words))
+        line = _held(at_line, payload[at_line] & 0x7FF, len(words))
+        # Every vector moves the base on by its width, until a word sets it again.
+        n_bits = self._n_bits[code]
+        moved = np.cumsum(n_bits) - n_bits
+        base = _held(at_base, (payload[at_base] & 0x7FF) - moved[at_base], len(words)) + moved
+        base_is_on = _held(at_base, payload[at_base] >> 11, len(words))
+        is_single = code == layout.single
+        start = np.where(is_single, payload & 0x7FF, base)
+        is_on = np.where(is_single, payload >> 11, base_is_on) > 0
 
-    def _times(
-        self, code: NDArray[np.uint8], payload: NDArray[np.uint16], emitting: NDArray[np.intp]
-    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Give timestamp (M,) us of every emitting word, and whether it has one."""
-        at_high = np.flatnonzero(code == self.layout.time_high)
-        at_low = np.flatnonzero(code == self.layout.time_low)
-        timed_from = len(code)
-        last = self._clock.last
-        if last is not None and self._low is not None:
-            timed_from = 0
-        elif last is not None and len(at_low):
-            timed_from = int(at_low[0])
-        elif len(at_high) and len(at_low[at_low > at_high[0]]):
-            timed_from = int(at_low[at_low > at_high[0]][0])
-        high = self._clock.unwrap(payload[at_high].astype(np.int64))
-        low = payload[at_low]
-        t_us = _held(at_high, high, last or 0, len(code))[emitting] << 12
-        t_us |= _held(at_low, low, self._low or 0, len(code))[emitting]
+        word, bit = _expand(payload, is_single, n_bits)
         # A timestamp needs its low part after its high one.
-        if len(low) and timed_from < len(code):
-            self._low = int(low[-1])
-        return t_us, emitting >= timed_from
+        timed = at_low[at_low > at_high[0]] if len(at_high) else at_low[:0]
+        n_untimed = int(np.searchsorted(word, timed[0])) if len(timed) else len(word)
+        self.n_untimed += n_untimed
+        word, bit = word[n_untimed:], bit[n_untimed:]
 
-    def _lines(
-        self, code: NDArray[np.uint8], payload: NDArray[np.uint16], emitting: NDArray[np.intp]
-    ) -> NDArray[np.uint16]:
-        at = np.flatnonzero(code == self.layout.line)
-        line = payload[at] & np.uint16(0x7FF)
-        held = _held(at, line, self._line, len(code))[emitting]
-        if len(line):
-            self._line = int(line[-1])
-        return held.astype(np.uint16)
-
-    def _spans(
-        self,
-        code: NDArray[np.uint8],
-        payload: NDArray[np.uint16],
-        emitting: NDArray[np.intp],
-        is_vector: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.uint16]]:
-        """Give first coordinate, polarity and bits (M,) of every emitting word."""
-        words = payload[emitting]
-        start = (words & np.uint16(0x7FF)).astype(np.int64)
-        polarity = (words >> 11).astype(bool)
-        bits = np.ones(len(words), np.uint16)
-        at_base = np.flatnonzero(code == self.layout.base)
-        if len(at_base) or is_vector.any():
-            vectors = emitting[is_vector]
-            steps = self._tables["width"][code[vectors]].astype(np.int64)
-            base = payload[at_base]
-            # Every vector moves the base on by its width, until a word sets it again.
-            moved = np.concatenate(([0], np.cumsum(steps)))
-            group = _held(at_base, np.arange(1, len(base) + 1), 0, len(code))[vectors]
-            begins = np.concatenate(([self._next], base & np.uint16(0x7FF))).astype(np.int64)
-            moved_at_base = np.concatenate(([0], moved[np.searchsorted(vectors, at_base)]))
-            signs = np.concatenate(([self._polarity], base >> 11)).astype(bool)
-            start[is_vector] = begins[group] + moved[:-1] - moved_at_base[group]
-            polarity[is_vector] = signs[group]
-            bits[is_vector] = words[is_vector] & ((1 << steps) - 1).astype(np.uint16)
-            self._next = int(begins[-1] + moved[-1] - moved_at_base[-1])
-            self._polarity = int(signs[-1])
-        return start, polarity, bits
+        if len(words):
+            self._time = words[np.concatenate((at_high[-1:], timed[-1:]))]
+            next_base = (base[-1] + n_bits[-1]) & 0x7FF | base_is_on[-1] << 11
+            place = (layout.line << 12 | line[-1], layout.base << 12 | next_base)
+            self._place = np.array(place, np.uint16)
+        along, across = (start[word] + bit).astype(np.uint16), line[word].astype(np.uint16)
+        x, y = (across, along) if layout.is_line_x else (along, across)
+        return EventColumns(t_us[word] * NS_PER_US, x, y, is_on[word])
 
 
-def _named_codes(layout: WordLayout) -> tuple[int, ...]:
-    return (
-        layout.time_high,
-        layout.time_low,
-        layout.line,
-        layout.single,
-        layout.base,
-        *layout.vectors,
-    )
-
-
-def _held(at: NDArray[np.intp], values: NDArray[np.generic], initial: int, n: int) -> NDArray[np.int64]:
-    """Hold each value (K,) from its place on until the next: (n,)."""
-    filled = np.empty(len(at) + 1, np.int64)
-    filled[0], filled[1:] = initial, values
+def _held(at: NDArray[np.intp], values: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Hold each value (K,) from its place to the next; (n,), 0 before the first."""
     lengths = np.diff(at, prepend=0, append=n)
-    return np.repeat(filled, lengths)
+    return np.repeat(np.concatenate((np.zeros(1, np.int64), values)), lengths)
 
 
 def _expand(
-    bits: NDArray[np.uint16], is_vector: NDArray[np.bool_]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """List word and place of every event, in order: each single's one, and a vector's bits that are set."""
-    vectors = np.flatnonzero(is_vector)
-    # Vectors alone are unpacked: 16 places a word are many where nearly all events are single.
-    flags = np.unpackbits(bits[vectors].astype("<u2").view(np.uint8), bitorder="little").view(np.bool_)
-    at = np.flatnonzero(flags)
-    n_events = np.ones(len(bits), np.intp)
-    n_events[vectors] = np.bincount(at >> 4, minlength=len(vectors))
-    word = np.repeat(np.arange(len(bits)), n_events)
-    bit = np.zeros(len(word), np.intp)
-    bit[is_vector[word]] = at & 15
+    payload: NDArray[np.int64], is_single: NDArray[np.bool_], n_bits: NDArray[np.int64]
+) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """List the word and the bit of every event, in order: one of each single, the set bits of each vector."""
+    vectors = np.flatnonzero(n_bits)
+    masks = (payload[vectors] & ((1 << n_bits[vectors]) - 1)).astype("<u2")
+    # Only vectors are unpacked: 16 places per word are many if nearly all events are single.
+    set_bits = np.flatnonzero(np.unpackbits(masks.view(np.uint8), bitorder="little"))
+    n_events = is_single.astype(np.intp)
+    n_events[vectors] = np.bincount(set_bits >> 4, minlength=len(vectors))
+    word = np.repeat(np.arange(len(payload)), n_events)
+    bit = np.zeros(len(word), np.int64)
+    bit[~is_single[word]] = set_bits & 15
     return word, bit

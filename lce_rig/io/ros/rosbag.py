@@ -13,8 +13,7 @@ from lce_rig.core import limits
 from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
-from lce_rig.io.events.choice import CameraEvents
-from lce_rig.io.events.event_recording import EventRecording
+from lce_rig.io.events.event_recording import CameraEvents, EventRecording
 from lce_rig.io.events.stream import NoEventsError, damage, worded
 from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.folder.image_file import decode_image, to_8_bit

@@ -44,16 +44,6 @@ def evt2(events: Iterable[Event]) -> bytes:
     return struct.pack(f"<{len(words)}I", *words)
 
 
-def evt21(events: Sequence[Event]) -> bytes:
-    words, high = [], -1
-    for (t, x, y, p), mask in _spans(events, 32):
-        if t >> 6 != high:
-            high = t >> 6
-            words.append(8 << 60 | (high & 0xFFFFFFF) << 32)
-        words.append(int(p) << 60 | (t & 0x3F) << 54 | x << 43 | y << 32 | mask)
-    return struct.pack(f"<{len(words)}Q", *words)
-
-
 def evt3(events: Sequence[Event], with_vectors: bool = True) -> bytes:
     """Prophesee's EVT3; runs in a row become a base and vectors of 12 and 8."""
     words: list[int] = []

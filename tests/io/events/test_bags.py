@@ -75,7 +75,7 @@ def test_a_packet_whose_time_base_is_beyond_any_clock_is_skipped_and_named(tmp_p
 def test_a_sensor_of_more_pixels_than_any_event_camera_has_is_damage(tmp_path: Path) -> None:
     data = encoders.packet(encoders.mono(TRUTH, 0), "mono", is_ros1=True, size=(2**32 - 688, 60))
     path = write_packet_bag(tmp_path / "a.bag", [(TOPIC, 10**9, data)])
-    with pytest.raises(SourceError, match="declares a sensor of 4294966608x60 pixels"):
+    with pytest.raises(SourceError, match="4294966608x60"):
         open_events(path)
 
 

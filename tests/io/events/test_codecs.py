@@ -6,14 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.data import EventColumns, Events, join_events
-from lce_rig.io.events.prophesee_raw import Evt2Decoder
-from lce_rig.io.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
+from lce_rig.io.events.word_codec import EVT3, LIBCAER_CMP, Evt2Decoder, WordDecoder
 from lce_rig.io.ros.event_array import decode_event_array, encode_event_array
 from lce_rig.io.ros.event_messages import PacketDecoder, parse_packet
 from tests.io.events import encoders
 from tests.io.events.encoders import Event, listed, random_events
 
-WORDS = {"evt2": (encoders.evt2, "<u4"), "evt21": (encoders.evt21, "<u8"), "evt3": (encoders.evt3, "<u2")}
+WORDS = {"evt2": (encoders.evt2, "<u4"), "evt3": (encoders.evt3, "<u2")}
 
 
 def columns_listed(columns: EventColumns) -> list[Event]:
@@ -21,7 +20,7 @@ def columns_listed(columns: EventColumns) -> list[Event]:
 
 
 def decoder_of(name: str) -> WordDecoder | Evt2Decoder:
-    return WordDecoder(EVT3) if name == "evt3" else Evt2Decoder(has_vectors=name == "evt21")
+    return WordDecoder(EVT3) if name == "evt3" else Evt2Decoder()
 
 
 @pytest.mark.parametrize("name", sorted(WORDS))
@@ -71,7 +70,7 @@ def test_a_damaged_time_word_is_repaired_and_counted(name: str) -> None:
     words = np.frombuffer(encode(truth), dtype).copy()
     code_at = words.dtype.itemsize * 8 - 4
     high = np.flatnonzero(words >> words.dtype.type(code_at) == 8)
-    words[high[50]] ^= words.dtype.type(1 << {"evt2": 20, "evt21": 52, "evt3": 10}[name])
+    words[high[50]] ^= words.dtype.type(1 << {"evt2": 20, "evt3": 10}[name])
     decoder = decoder_of(name)
     found = columns_listed(decoder.decode(words))
     assert decoder.n_repaired == 1
@@ -83,7 +82,7 @@ def test_events_before_the_first_stamp_are_left_out_and_counted() -> None:
     truth = listed(random_events(50, 2))
     for name, (encode, dtype) in WORDS.items():
         words = np.frombuffer(encode(truth), dtype)
-        event = {"evt2": 1 << 28, "evt21": 1 << 60 | 1, "evt3": 2 << 12 | 1}[name]
+        event = {"evt2": 1 << 28, "evt3": 2 << 12 | 1}[name]
         decoder = decoder_of(name)
         events = decoder.decode(np.concatenate((np.array([event, event], words.dtype), words)))
         assert columns_listed(events) == truth

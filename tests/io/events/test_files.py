@@ -170,15 +170,12 @@ def test_a_packet_cut_off_costs_only_itself_and_is_said(tmp_path: Path) -> None:
     assert has_note(recording.notes, "1 torn ends")
 
 
-@pytest.mark.parametrize(("from_byte", "to_byte"), [(8, 60), (0, 8), (4, 8)])
-def test_a_damaged_packet_is_left_out_and_its_place_is_said(
-    tmp_path: Path, from_byte: int, to_byte: int
-) -> None:
+def test_a_damaged_packet_costs_only_itself(tmp_path: Path) -> None:
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     data = bytearray((tmp_path / "a.aedat4").read_bytes())
     begin = 14 + 4 + struct.unpack_from("<I", data, 14)[0]
     second = begin + 8 + struct.unpack_from("<i", data, begin + 4)[0]
-    data[second + from_byte : second + to_byte] = b"\xff" * (to_byte - from_byte)
+    data[second + 8 : second + 60] = b"\xff" * 52
     (tmp_path / "a.aedat4").write_bytes(data)
     recording = open_events(tmp_path / "a.aedat4")
     assert everything(recording) == listed(EVENTS)[:8192] + listed(EVENTS)[16384:]
@@ -215,8 +212,7 @@ def test_a_torn_word_of_a_raw_file_is_said(tmp_path: Path) -> None:
     [
         ("% evt 2.0\n% plugin_name hal_plugin_gen31_fx3\n", encoders.evt2),
         ("% format EVT2;height=480;width=640\n% end\n", encoders.evt2),
-        ("% evt 2.1\n% sensor_generation 3.1\n% end\n", encoders.evt21),
-        ("% format EVT21;endianness=little;height=480;width=640\n% end\n", encoders.evt21),
+        ("% evt 2.0\n% sensor_generation 3.1\n% end\n", encoders.evt2),
         ("% format EVT3;height=480;width=640\n% end\n", encoders.evt3),
     ],
 )
@@ -230,18 +226,10 @@ def test_raw_files_of_every_version_and_header_are_read(
     assert everything(recording) == truth
 
 
-@pytest.mark.parametrize("head", ["% format EVT21;endianness=legacy\n", "% evt 2.1\n"])
-def test_the_legacy_word_order_of_evt21_is_undone(tmp_path: Path, head: str) -> None:
-    truth = listed(random_events(500, 8, (640, 480)))
-    words = np.frombuffer(encoders.evt21(truth), "<u4").reshape(-1, 2)[:, ::-1].tobytes()
-    (tmp_path / "a.raw").write_bytes(head.encode() + words)
-    assert everything(open_events(tmp_path / "a.raw")) == truth
-
-
-@pytest.mark.parametrize("head", [b"", b"% evt 4.0\n", b"\x00\x01\x02"])
+@pytest.mark.parametrize("head", [b"", b"% evt 2.1\n", b"\x00\x01\x02"])
 def test_a_raw_file_of_no_known_encoding_is_refused(tmp_path: Path, head: bytes) -> None:
     (tmp_path / "a.raw").write_bytes(head)
-    with pytest.raises(SourceError, match=r"not EVT2, EVT2\.1 or EVT3"):
+    with pytest.raises(SourceError, match=r"a\.raw"):
         open_events(tmp_path / "a.raw")
 
 
@@ -256,45 +244,32 @@ def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path:
     assert has_note(recording.notes, "3 broken lines", "line 41", "'1 2 3'")
 
 
-def test_archives_of_other_programs_are_read(tmp_path: Path) -> None:
-    columns = {"x": EVENTS.x, "y": EVENTS.y, "p": np.where(EVENTS.polarity, 1, -1)}
-    np.savez(tmp_path / "s.npz", t=EVENTS.t_ns * 1e-9, **columns)
-    np.savez(tmp_path / "us.npz", ts=EVENTS.t_ns // 1000, **columns)
-    for name in ("s.npz", "us.npz"):
-        assert everything(open_events(tmp_path / name)) == listed(EVENTS)
-
-
-def test_a_missing_filter_of_hdf5_is_named_with_its_remedy(tmp_path: Path) -> None:
-    import h5py
-
-    try:
-        import hdf5plugin  # noqa: F401
-
-        pytest.skip("hdf5plugin is installed")
-    except ImportError:
-        pass
-    write_dsec(tmp_path / "a.h5", EVENTS)
-    with h5py.File(tmp_path / "a.h5", "a") as file:
-        del file["events/x"]
-        blosc = 32001
-        created = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        created.set_chunk((1000,))
-        created.set_filter(blosc, h5py.h5z.FLAG_OPTIONAL, (2, 2, 2, 2000, 5, 1, 1))
-        space = h5py.h5s.create_simple((len(EVENTS),))
-        data = h5py.h5d.create(file["events"].id, b"x", h5py.h5t.STD_U16LE, space, created)
-        for begin in range(0, len(EVENTS), 1000):
-            data.write_direct_chunk((begin,), bytes(900))
-    with pytest.raises(SourceError, match=r"events/x is compressed by .*, which is not installed") as caught:
-        open_events(tmp_path / "a.h5")
-    assert caught.value.hint.startswith("pip install") and "hdf5plugin" in caught.value.hint
-
-
 def test_hdf5_of_another_layout_is_refused_with_what_it_holds(tmp_path: Path) -> None:
     import h5py
 
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["davis/left/events"] = np.zeros((3, 4))
-    with pytest.raises(SourceError, match=r"no events/t; it has davis"):
+    with pytest.raises(SourceError, match="events/t"):
+        open_events(tmp_path / "a.h5")
+
+
+def test_hdf5_compressed_by_a_plugin_is_read(tmp_path: Path) -> None:
+    h5py, hdf5plugin = pytest.importorskip("h5py"), pytest.importorskip("hdf5plugin")
+    write_dsec(tmp_path / "a.h5", EVENTS)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["events/x"]
+        file.create_dataset("events/x", data=EVENTS.x, **hdf5plugin.Blosc())
+    assert everything(open_events(tmp_path / "a.h5")) == listed(EVENTS)
+
+
+def test_columns_of_hdf5_in_other_files_are_not_followed(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    write_dsec(tmp_path / "other.h5", EVENTS)
+    write_dsec(tmp_path / "a.h5", EVENTS)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["events/x"]
+        file["events/x"] = h5py.ExternalLink("other.h5", "events/x")
+    with pytest.raises(SourceError, match="events/x"):
         open_events(tmp_path / "a.h5")
 
 

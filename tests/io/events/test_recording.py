@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.core.data import EventColumns
+from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
 from lce_rig.io.events.event_recording import REORDER_NS, EventRecording
+from lce_rig.io.events.stream import parse_size, to_ns
 from tests.io.events.encoders import random_events
 from tests.notes import has_note
 
@@ -166,6 +167,32 @@ def test_the_host_clock_is_taken_from_the_packet_that_waited_least() -> None:
     ]
     assert record(*stretches).host_offset_ns() == 10**18 + 3_000_000
     assert record(columns([1])).host_offset_ns() is None
+
+
+def test_stamps_at_the_ends_of_64_bits_are_left_out_and_the_others_kept() -> None:
+    stretch = columns(range(1000))
+    stretch.t_ns[[100, 200, 300, 400]] = MAX_TIME_NS, -MAX_TIME_NS, (1 << 63) - 1, -(1 << 63)
+    recording = record(stretch)
+    assert stamps_us(recording) == [i for i in range(1000) if i not in (100, 200, 300, 400)]
+    assert has_note(recording.notes, "4 events", "any clock")
+    with pytest.raises(SourceError):
+        _ = record(replace(columns([1]), t_ns=np.array([MAX_TIME_NS]))).start_ns
+
+
+@pytest.mark.parametrize("dtype", ["i8", "u8", "f8", "i4", "u4", "f4"])
+def test_times_beyond_any_clock_are_told_from_others(dtype: str) -> None:
+    info = np.finfo(dtype) if dtype[0] == "f" else np.iinfo(dtype)
+    ends = [int(info.min), int(info.max)]
+    t_ns = to_ns(np.array([ends[0], 5, ends[1]], dtype), 7)
+    assert t_ns[1] == 12_000
+    limit_us = MAX_TIME_NS // 1000
+    assert t_ns[[0, 2]].tolist() == [MAX_TIME_NS if abs(t) > limit_us else (t + 7) * 1000 for t in ends]
+
+
+@pytest.mark.parametrize("size", [("", "1"), ("0", "5"), ("2x0", "1"), ("-3", "4"), ("9999", "9999")])
+def test_sizes_that_no_camera_has_are_none(size: tuple[str, str]) -> None:
+    assert parse_size("346", "260") == (346, 260)
+    assert parse_size(*size) is None
 
 
 def test_findings_of_many_passes_are_said_once() -> None:

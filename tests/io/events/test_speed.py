@@ -27,7 +27,6 @@ PAYLOADS: dict[str, Callable[[list[Event]], bytes]] = {
 }
 RAW: dict[str, Callable[[list[Event]], bytes]] = {
     "EVT2": encoders.evt2,
-    "EVT21": encoders.evt21,
     "EVT3": encoders.evt3,
 }
 
