@@ -9,33 +9,33 @@ References:
 
 import json
 import math
-from dataclasses import dataclass
 from http.client import HTTPException
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.error import HTTPError, URLError
 from urllib.request import ProxyHandler, build_opener
 
 from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
+from lce_rig.devices import findings
 from lce_rig.rig import LidarSettings
 
 _TIMEOUT_S = 2.0
 _MAX_BODY_BYTES = 1 << 20
-# A sensor in the field of a proxy is still a neighbour on the cable.
+_MAX_OFF_RATE = 0.02
+_SWITCH = {"on": True, "true": True, "1": True, "off": False, "false": False, "0": False}
+# Bypass proxies: the sensor is on the local network.
 _OPENER = build_opener(ProxyHandler({}))
 
 
-@dataclass(frozen=True)
-class WebReport:
-    """What the web page says; fields are "" or None where it does not.
+class WebReport(NamedTuple):
+    """The contents of the web page; fields are "" or None where it lacks them.
 
     Attributes:
         model, serial, firmware: of the sensor.
         pps: "absent", "synchronizing", "locked" or "error".
         is_motor_on, is_laser_on: whether they run.
-        rotor_hz: measured speed.
-        wanted_rotor_hz: speed that is set.
+        rotor_hz, wanted_rotor_hz: measured speed, and the speed that is set.
         returns: "strongest", "last" or "dual".
         fov_deg: first and last azimuth that is sent.
         host: address that packets are sent to; 255.255.255.255 is everybody.
@@ -78,16 +78,40 @@ class VelodyneWeb:
         Raises:
             SourceError: nothing answers, or what answers is no Velodyne.
         """
-        info, status = self._get("info"), self._get("status")
-        settings = self._get("settings")
+        info, status, settings = self._get("info"), self._get("status"), self._get("settings")
         try:
             diagnostics = self._get("diag")
         except SourceError:  # Not every firmware has them.
             diagnostics = {}
-        return to_report(info, status, settings, diagnostics)
+        start, end = _number(settings, "fov", "start"), _number(settings, "fov", "end")
+        rpm, wanted_rpm = _number(status, "motor", "rpm"), _number(settings, "rpm")
+        data_port = _number(settings, "host", "dport")
+        position_port = _number(settings, "host", "tport")
+        boards = [_number(diagnostics, "volt_temp", board, "lm20_temp") for board in ("top", "bot")]
+        # The version of the application, wherever this firmware keeps it.
+        version = info.get("version")
+        for key in ("application", "firmware", "version", "id"):
+            version = version.get(key, version) if isinstance(version, dict) else version
+        laser = _SWITCH.get(_text(status, "laser", "state").lower())
+        return WebReport(
+            model=_text(info, "model"),
+            serial=_text(info, "serial"),
+            firmware=str(version) if isinstance(version, str | int | float) else "",
+            pps=_text(status, "gps", "pps_state").lower(),
+            is_motor_on=_SWITCH.get(_text(status, "motor", "state").lower()),
+            is_laser_on=laser if laser is not None else _SWITCH.get(_text(settings, "laser").lower()),
+            rotor_hz=None if rpm is None else rpm / 60,
+            wanted_rotor_hz=None if wanted_rpm is None else wanted_rpm / 60,
+            returns=_text(settings, "returns").lower(),
+            fov_deg=None if start is None or end is None else (start, end),
+            host=_text(settings, "host", "addr"),
+            data_port=None if data_port is None else int(data_port),
+            position_port=None if position_port is None else int(position_port),
+            temperature_c=max((_celsius(counts) for counts in boards if counts is not None), default=None),
+        )
 
     def read_serial(self) -> str:
-        """Read the serial number alone; "" where the page does not tell it.
+        """Read the serial number alone; "" where the page lacks it.
 
         Raises:
             SourceError: nothing answers, or what answers is no Velodyne.
@@ -95,56 +119,26 @@ class VelodyneWeb:
         return _text(self._get("info"), "serial")
 
     def _get(self, page: str) -> dict[str, Any]:
-        body = self._request(f"/cgi/{page}.json")
+        url = f"{self.url}/cgi/{page}.json"
+        try:
+            with _OPENER.open(url, timeout=self._timeout_s) as response:
+                body = bytes(response.read(_MAX_BODY_BYTES))
+        except (URLError, HTTPException, OSError, ValueError) as error:
+            if isinstance(error, HTTPError):
+                error.close()  # it is an open answer, too
+            raise SourceError(
+                f"{url} does not answer: {getattr(error, 'reason', None) or error}",
+                "Check cable and power, and that this computer has an address in the LiDAR's network "
+                "(192.168.1.x, mask 255.255.255.0).",
+            ) from None
         try:
             content = json.loads(body)
         except (ValueError, RecursionError):  # Also where it is no UTF-8.
             content = None
         if not isinstance(content, dict):
             hint = "Is driver.address the LiDAR's? Another device may have that address."
-            raise SourceError(f"{self.url}/cgi/{page}.json is not what a Velodyne answers", hint)
+            raise SourceError(f"{url} is not what a Velodyne answers", hint)
         return content
-
-    def _request(self, path: str) -> bytes:
-        try:
-            with _OPENER.open(self.url + path, timeout=self._timeout_s) as response:
-                return bytes(response.read(_MAX_BODY_BYTES))
-        except (URLError, HTTPException, OSError, ValueError) as error:
-            if isinstance(error, HTTPError):
-                error.close()  # it is an open answer, too
-            cause = getattr(error, "reason", None) or error
-            raise SourceError(
-                f"{self.url}{path} does not answer: {cause}",
-                "Check cable and power, and that this computer has an address in the LiDAR's network "
-                "(192.168.1.x, mask 255.255.255.0).",
-            ) from None
-
-
-def to_report(
-    info: dict[str, Any], status: dict[str, Any], settings: dict[str, Any], diagnostics: dict[str, Any]
-) -> WebReport:
-    """Understand the four pages' contents, as far as they go."""
-    start, end = _number(settings, "fov", "start"), _number(settings, "fov", "end")
-    wanted_rpm, rpm = _number(settings, "rpm"), _number(status, "motor", "rpm")
-    ports = _number(settings, "host", "dport"), _number(settings, "host", "tport")
-    boards = [_number(diagnostics, "volt_temp", board, "lm20_temp") for board in ("top", "bot")]
-    laser = _switch(status, "laser", "state")
-    return WebReport(
-        _text(info, "model"),
-        _text(info, "serial"),
-        _firmware(info),
-        _text(status, "gps", "pps_state").lower(),
-        _switch(status, "motor", "state"),
-        laser if laser is not None else _switch(settings, "laser"),
-        None if rpm is None else rpm / 60,
-        None if wanted_rpm is None else wanted_rpm / 60,
-        _text(settings, "returns").lower(),
-        None if start is None or end is None else (start, end),
-        _text(settings, "host", "addr"),
-        None if ports[0] is None else int(ports[0]),
-        None if ports[1] is None else int(ports[1]),
-        max((_celsius(counts) for counts in boards if counts is not None), default=None),
-    )
 
 
 def find_problems(report: WebReport, settings: LidarSettings) -> list[Finding]:
@@ -153,47 +147,32 @@ def find_problems(report: WebReport, settings: LidarSettings) -> list[Finding]:
     product = velodyne.product_of(settings.model)
     reported = velodyne.product_of(report.model.replace(" ", "-")) or velodyne.product_of(report.model)
     if report.model and reported != product:
-        models = {"model": report.model, "expected": settings.model}
-        problems.append(Finding("settings.other_model", "warning", figures=models))
+        problems.append(findings.OTHER_MODEL(model=report.model, expected=settings.model))
     if report.is_motor_on is False:
-        problems.append(Finding("settings.motor_off", "warning"))
+        problems.append(findings.MOTOR_OFF())
     if report.is_laser_on is False:
-        problems.append(Finding("settings.laser_off", "warning"))
-    wanted_hz = report.wanted_rotor_hz
-    if wanted_hz is not None and not _is_near(wanted_hz, settings.rate_hz):
-        figures = {
-            "set_hz": wanted_hz,
-            "expected_hz": settings.rate_hz,
-            "expected_rpm": 60 * settings.rate_hz,
-        }
-        problems.append(Finding("settings.rotor_rate", "warning", figures=figures))
+        problems.append(findings.LASER_OFF())
+    set_hz, rate_hz = report.wanted_rotor_hz, settings.rate_hz
+    if set_hz is not None and abs(set_hz - rate_hz) > _MAX_OFF_RATE * rate_hz:
+        rotor = findings.ROTOR_SETTING(set_hz=set_hz, expected_hz=rate_hz, expected_rpm=60 * rate_hz)
+        problems.append(rotor)
     if report.fov_deg is not None and (report.fov_deg[1] - report.fov_deg[0]) % 360 < 359:
-        start_deg, end_deg = report.fov_deg
-        problems.append(
-            Finding("settings.fov_cut", "warning", figures={"start_deg": start_deg, "end_deg": end_deg})
-        )
+        problems.append(findings.FOV_CUT(start_deg=report.fov_deg[0], end_deg=report.fov_deg[1]))
     port = settings.driver.port or velodyne.DATA_PORT
     if report.data_port is not None and report.data_port != port:
-        ports = {"port": report.data_port, "expected_port": port}
-        problems.append(Finding("settings.data_port", "warning", figures=ports))
+        problems.append(findings.DATA_PORT(port=report.data_port, expected_port=port))
     position_port = int(settings.driver.controls.get("position_port", velodyne.POSITION_PORT))
     if report.position_port is not None and report.position_port != position_port:
-        ports = {"port": report.position_port, "expected_port": position_port}
-        problems.append(Finding("settings.position_port", "warning", figures=ports))
+        problems.append(findings.POSITION_PORT(port=report.position_port, expected_port=position_port))
     if settings.timestamps.clock == "utc" and report.pps and report.pps != "locked":
-        problems.append(Finding("settings.pps", "warning", figures={"pps": report.pps}))
+        problems.append(findings.PPS_SETTING(pps=report.pps))
     return problems
 
 
-def _find(content: Any, *keys: str) -> Any:
+def _text(content: Any, *keys: str) -> str:
     for key in keys:
         content = content.get(key) if isinstance(content, dict) else None
-    return content
-
-
-def _text(content: dict[str, Any], *keys: str) -> str:
-    found = _find(content, *keys)
-    return str(found).strip() if isinstance(found, str | int | float) else ""
+    return str(content).strip() if isinstance(content, str | int | float) else ""
 
 
 def _number(content: dict[str, Any], *keys: str) -> float | None:
@@ -204,25 +183,6 @@ def _number(content: dict[str, Any], *keys: str) -> float | None:
     return number if math.isfinite(number) and abs(number) < 1e9 else None
 
 
-def _switch(content: dict[str, Any], *keys: str) -> bool | None:
-    return {"on": True, "true": True, "1": True, "off": False, "false": False, "0": False}.get(
-        _text(content, *keys).lower()
-    )
-
-
-def _firmware(info: dict[str, Any]) -> str:
-    """Find the version of the application, wherever this firmware keeps it."""
-    found = _find(info, "version")
-    for key in ("application", "firmware", "version", "id"):
-        if isinstance(found, dict):
-            found = found.get(key, found)
-    return str(found) if isinstance(found, str | int | float) else ""
-
-
 def _celsius(counts: float) -> float:
     """Convert a reading of the LM20 on a board; VLP-16 User Manual, appendix on diagnostics."""
     return -1481.96 + math.sqrt(2.1962e6 + max(-5e5, (1.8639 - 5 * counts / 4096) / 3.88e-6))
-
-
-def _is_near(value: float | None, wanted: float) -> bool:
-    return value is not None and abs(value - wanted) <= 0.02 * wanted

@@ -11,25 +11,33 @@ from pathlib import Path
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Finding
+from lce_rig.core.phrasing import as_line
+from lce_rig.devices import findings
 from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
 from lce_rig.devices.udp_port import PACKET_COST_BYTES, UdpPort
-from lce_rig.devices.velodyne_web import VelodyneWeb, WebReport, find_problems
+from lce_rig.devices.velodyne_web import VelodyneWeb, find_problems
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.velodyne.driver_controls import read_controls
 from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings
-from lce_rig.words import as_line, describe, sentence
+from lce_rig.words import describe
 
-# How an attached VLP-16 does, as figures and findings.
+SILENCE_S = 2.0
+# Half a second of scans: whoever is slower wants the newest.
+N_SLOTS = 5
 
 # A computer that is busy elsewhere for longer than this is too slow anyhow.
 _MIN_BUFFER_S = 0.25
 _MAX_LOST_SHARE = 0.01
 _MAX_OFF_RATE = 0.05
 _N_STRANGERS = 8
+_WAIT_S = 0.1
+_GATHER_S = 0.005
+_WEB_TIMEOUT_S = 1.0
+_EVERYBODY = "255.255.255.255"
+_MAX_SHOWN = 3
 
 
 @dataclass
@@ -81,7 +89,23 @@ def to_status(
         "receive_buffer_bytes": float(reception.granted_bytes),
         "is_dual": float(stream.mode == velodyne.DUAL),
     }
-    problems = _find_problems(settings, stream, reception)
+    problems = [] if state.severity == "note" else [state]
+    buffer_kib = reception.granted_bytes // 2048
+    n_lost_on_way = losses.n("packet.lost") - reception.n_overflowed
+    if n_lost_on_way > _MAX_LOST_SHARE * max(stream.n_data, 1):
+        share = n_lost_on_way / (stream.n_data + n_lost_on_way)
+        problems.append(findings.PACKETS_LOST(share=share))
+    if reception.n_overflowed:
+        problems.append(findings.COMPUTER_TOO_SLOW(n=reception.n_overflowed, buffer_kib=buffer_kib))
+    packet_s = 1e-9 * stream.product.packet_ns(stream.mode == velodyne.DUAL)
+    buffer_s = reception.granted_bytes / PACKET_COST_BYTES * packet_s
+    if 0 < buffer_s < _MIN_BUFFER_S:
+        problems.append(findings.BUFFER_SMALL(buffer_s=buffer_s, buffer_kib=buffer_kib))
+    problems += [flaw for flaw in stream.flaws() if flaw.figure("n") > _MAX_LOST_SHARE * stream.n_data]
+    rotor_hz, rate_hz = stream.rotor_hz, settings.rate_hz
+    if rotor_hz and abs(rotor_hz / rate_hz - 1) > _MAX_OFF_RATE:
+        rotor = findings.ROTOR_RATE(rotor_hz=rotor_hz, expected_hz=rate_hz, expected_rpm=60 * rate_hz)
+        problems.append(rotor)
     if recorder is not None:
         figures["recorded_packets"] = float(recorder.n_written)
         figures["unrecorded_packets"] = float(recorder.n_dropped)
@@ -97,40 +121,6 @@ def to_status(
         rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
         n_packets=stream.n_data,
     )
-
-
-def _find_problems(settings: LidarSettings, stream: Vlp16Stream, reception: Reception) -> list[Finding]:
-    state, n_data = stream.clock.state(), stream.n_data
-    problems = [] if state.severity == "note" else [state]
-    buffer_kib = reception.granted_bytes // 2048
-    n_lost_on_way = stream.losses.n("packet.lost") - reception.n_overflowed
-    if n_lost_on_way > _MAX_LOST_SHARE * max(n_data, 1):
-        share = n_lost_on_way / (n_data + n_lost_on_way)
-        problems.append(Finding("stream.packets_lost", "warning", figures={"share": share}))
-    if reception.n_overflowed:
-        overflow = {"n": reception.n_overflowed, "buffer_kib": buffer_kib}
-        problems.append(Finding("stream.computer_too_slow", "warning", figures=overflow))
-    packets_per_s = 1e9 / stream.product.packet_ns(stream.mode == velodyne.DUAL)
-    buffer_s = reception.granted_bytes / PACKET_COST_BYTES / packets_per_s
-    if 0 < buffer_s < _MIN_BUFFER_S:
-        figures = {"buffer_s": buffer_s, "buffer_kib": buffer_kib}
-        problems.append(Finding("buffer.small", "warning", figures=figures))
-    problems += [flaw for flaw in stream.flaws() if flaw.figure("n") > _MAX_LOST_SHARE * n_data]
-    if stream.rotor_hz and abs(stream.rotor_hz / settings.rate_hz - 1) > _MAX_OFF_RATE:
-        rates = {
-            "rotor_hz": stream.rotor_hz,
-            "expected_hz": settings.rate_hz,
-            "expected_rpm": 60 * settings.rate_hz,
-        }
-        problems.append(Finding("stream.rotor_rate", "warning", figures=rates))
-    return problems
-
-
-# Why no packets of a VLP-16 come: what can be found from here, and what is left to check.
-
-_WEB_TIMEOUT_S = 1.0
-_EVERYBODY = "255.255.255.255"
-_MAX_SHOWN = 3
 
 
 def explain_silence(
@@ -161,32 +151,20 @@ def explain_silence(
     if reception.strangers:
         there = ", ".join(sorted(reception.strangers))
         return SourceError(what, f"Packets come from {there}: set driver.address in the profile.")
-    return SourceError(what, _ask_the_web_page(address or velodyne.FACTORY_ADDRESS, port, settings, web_port))
-
-
-def _ask_the_web_page(address: str, port: int, settings: LidarSettings, web_port: int) -> str:
+    address = address or velodyne.FACTORY_ADDRESS
     try:
         report = VelodyneWeb(address, web_port, _WEB_TIMEOUT_S).read()
     except SourceError:
-        return (
+        return SourceError(
+            what,
             f"Its web page http://{address} does not answer either. Check its power and cable; that this "
-            "computer has an address in its network (192.168.1.x, mask 255.255.255.0); and driver.address."
+            "computer has an address in its network (192.168.1.x, mask 255.255.255.0); and driver.address.",
         )
-    return " ".join([f"Its web page http://{address} answers.", *_advise(report, port, settings)])
-
-
-def _advise(report: WebReport, port: int, settings: LidarSettings) -> list[str]:
-    problems = [as_line(sentence(problem)) for problem in find_problems(report, settings)]
+    advice = [as_line(problem.sentence) for problem in find_problems(report, settings)]
     if report.host and report.host != _EVERYBODY:
-        problems.append(f"Data go to {report.host} only: check that this is this computer.")
-    return problems or [f"Open UDP port {port} in this computer's firewall (sudo ufw allow {port}/udp)."]
-
-
-SILENCE_S = 2.0
-_WAIT_S = 0.1
-# Half a second of scans: whoever is slower wants the newest.
-N_SLOTS = 5
-_GATHER_S = 0.005
+        advice.append(f"Data go to {report.host} only: check that this is this computer.")
+    firewall = f"Open UDP port {port} in this computer's firewall (sudo ufw allow {port}/udp)."
+    return SourceError(what, " ".join([f"Its web page http://{address} answers.", *(advice or [firewall])]))
 
 
 class Vlp16Source(LiveSource):
@@ -265,14 +243,15 @@ class Vlp16Source(LiveSource):
             if not self._stream.n_data and time.monotonic() > until_s:
                 raise self.explain_silence(has_sent=False)
         # Packets hold no serial number, and must not wait until a web page has answered.
-        threading.Thread(target=self._ask_serial, args=(self._reception,), daemon=True).start()
-
-    def _ask_serial(self, reception: Reception) -> None:
-        """Ask the web page once for the serial number; it is left empty where nothing answers."""
+        reception = self._reception
         address = self._settings.driver.address or reception.address
-        if address:
+
+        def ask_serial() -> None:
             with suppress(SourceError):
                 reception.serial = VelodyneWeb(address, self._web_port, _WEB_TIMEOUT_S).read_serial()
+
+        if address:
+            threading.Thread(target=ask_serial, daemon=True).start()
 
     def read(self) -> list[Scan]:
         """Take the packets that came, and give the scans that they complete.

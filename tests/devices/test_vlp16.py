@@ -279,7 +279,7 @@ def test_a_sensor_that_falls_silent_is_an_error_after_what_it_sent(lidar: LidarS
     with streaming(lidar, lambda _: packets_of(room_scans(3)), silence_s=1.0, web_port=9) as source:
         scans = source.samples()
         assert len([next(scans) for _ in range(2)]) == 2
-        with pytest.raises(SourceError, match="have stopped"):
+        with pytest.raises(SourceError, match=str(lidar.driver.port)):
             list(scans)
 
 
@@ -370,19 +370,19 @@ def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken() -> None:
         sender.sendto(b"x", (HERE, port.port))
         time.sleep(late_s)
         taken_ns = time.time_ns()
-        datagram = port.receive()
-        assert datagram is not None and (datagram.source, datagram.payload) == (HERE, b"x")
+        (datagram,) = port.receive_many()
+        assert (datagram.source, datagram.payload) == (HERE, b"x")
         assert datagram.host_ns >= before_ns - 1_000_000
         return datagram.host_ns < taken_ns - 0.5 * late_s * 1e9
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         # The kernel takes a moment to begin; datagrams before that are stamped when they are taken.
         wait_for(is_stamped_before_taken)
-    assert port.receive() is None
+    assert port.receive_many() == []
     port.close()
 
 
-def test_datagrams_taken_at_once_are_those_taken_one_by_one() -> None:
+def test_datagrams_taken_at_once_are_those_that_were_sent() -> None:
     port = UdpPort(free_ports()[0], "test")
     wanted = [b"%d" % k * (k % 5) for k in range(N_AT_ONCE + 6)]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -391,9 +391,8 @@ def test_datagrams_taken_at_once_are_those_taken_one_by_one() -> None:
         for payload in wanted:
             sender.sendto(payload, (HERE, port.port))
         came = port.receive_many()
-        one = port.receive()
-        assert len(came) == N_AT_ONCE and one is not None
-        came += [one, *port.receive_many()]
+        assert len(came) == N_AT_ONCE
+        came += port.receive_many()
         assert [each.payload for each in came] == wanted
         assert {(each.source, each.source_port, each.port) for each in came} == {
             (*sender.getsockname(), port.port)

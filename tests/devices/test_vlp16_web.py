@@ -1,4 +1,4 @@
-"""The sensor's web page, over HTTP: whatever firmware answers, and settings that are read back."""
+"""The sensor's web page, over HTTP: whatever firmware answers."""
 
 import json
 import threading
@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
-from urllib.parse import parse_qs
 
 import pytest
 
@@ -41,21 +40,15 @@ PAGES: dict[str, Any] = {"info": INFO, "status": STATUS, "settings": SETTINGS, "
 
 
 class FakeSensor:
-    """A sensor's web server; `pages` are what it answers, and settings change as on the real one.
+    """A sensor's web server; `pages` are what it answers.
 
     Attributes:
         pages: contents by name; bytes are sent as they are.
-        is_deaf: whether settings are acknowledged and not made.
     """
 
     def __init__(self, pages: dict[str, Any]) -> None:
         self.pages = json.loads(json.dumps({k: v for k, v in pages.items() if not isinstance(v, bytes)}))
         self.pages.update({k: v for k, v in pages.items() if isinstance(v, bytes)})
-        self.is_deaf = False
-
-    def set(self, fields: dict[str, list[str]]) -> None:
-        if not self.is_deaf:
-            self.pages["settings"].update({key: values[0] for key, values in fields.items()})
 
 
 @contextmanager
@@ -72,13 +65,6 @@ def serving(pages: dict[str, Any]) -> Iterator[tuple[FakeSensor, VelodyneWeb]]:
             self.send_response(200)
             self.end_headers()
             self.wfile.write(content if isinstance(content, bytes) else json.dumps(content).encode())
-
-        def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["Content-Length"])).decode()
-            assert self.path == "/cgi/setting"
-            sensor.set(parse_qs(body))
-            self.send_response(204)
-            self.end_headers()
 
         def log_message(self, format: str, *arguments: Any) -> None:
             return
