@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 
 from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.findings import Finding
-from lce_rig.core.losses import Losses
+from lce_rig.devices import findings
 
 #: What may wait for the disk, captures apart.
 MOST_WAITING_BYTES = 512 * 2**20
@@ -50,14 +50,12 @@ class Sink(Generic[T]):
 
     def findings(self) -> list[Finding]:
         """List what is missing in what was written, and why."""
-        losses = Losses()
-        path = str(self.path)
-        losses.add(Finding("device.recording_incomplete", "warning", figures={"path": path}), self.n_dropped)
-        found = losses.findings()
+        path, missing = str(self.path), list[Finding]()
+        if self.n_dropped:
+            missing.append(findings.RECORDING_INCOMPLETE(n=self.n_dropped, path=path))
         if self.failure is not None:
-            figures = {"path": path, "cause": self.failure.what}
-            found.append(Finding("device.recording_stopped", "warning", figures=figures))
-        return found
+            missing.append(findings.RECORDING_STOPPED(path=path, cause=self.failure.what))
+        return missing
 
 
 class DiskWriter:
@@ -141,7 +139,7 @@ class DiskWriter:
     def is_writing(self, sink: Sink[T]) -> bool:
         """Whether an item of a sink is not written yet."""
         with self._changed:
-            return self._current is sink or any(each is sink for each, _, _ in (*self._vital, *self._others))
+            return sink in (self._current, *(other for other, _, _ in (*self._vital, *self._others)))
 
     def _run(self) -> None:
         while True:

@@ -85,8 +85,7 @@ class RawImages(ImageStream):
 
     def __init__(self, code: str, width: int, height: int) -> None:
         super().__init__()
-        form = FORMATS[code]
-        self.row_bytes = width * form.n_channels * (2 if form.bits > 8 else 1)
+        self.row_bytes = FORMATS[code].row_bytes(width)
         self._decoder = PixelDecoder(code, width, height)
 
     def _cut(self) -> bytes | None:
@@ -124,17 +123,13 @@ class Y4mImages(ImageStream):
                 )
                 raise ValueError(f"a Y4M frame was expected, {line[:20]!r} came{known}")
             self._is_in_frame = True
-        n_bytes = self._n_bytes()
+        n_pixels = self._size[0] * self._size[1]
+        finer = {"444": 3 * n_pixels, "422": 2 * n_pixels}
+        n_bytes = finer.get(self._colour, self._decoder.n_bytes)
         if len(self._rest) < n_bytes:
             return None
         self._is_in_frame = False
         return self._take(n_bytes)
-
-    def _n_bytes(self) -> int:
-        n_pixels = self._size[0] * self._size[1]
-        finer = {"444": 3 * n_pixels, "422": 2 * n_pixels}
-        assert self._decoder is not None  # frames follow the header
-        return finer.get(self._colour, self._decoder.n_bytes)
 
     def _decode(self, payload: bytes) -> Pixels:
         assert self._decoder is not None  # frames follow the header

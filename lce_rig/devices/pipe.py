@@ -13,7 +13,7 @@ from typing import IO
 
 from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Finding
+from lce_rig.devices import findings
 from lce_rig.devices.image_streams import ImageStream, JpegImages, RawImages, find_stream
 from lce_rig.devices.pixel_formats import FORMATS, find_format
 from lce_rig.devices.protocol import ClockState, SourceStatus
@@ -55,7 +55,7 @@ class ImagePipeSource(LiveSource):
         self._stream: ImageStream | None = None
         self._begin = b""
         self._complaints = b""
-        self._n_pictures = self._n_damaged_before = 0
+        self._n_images = self._n_damaged_before = 0
 
     def open(self) -> None:
         """Start the command.
@@ -69,7 +69,18 @@ class ImagePipeSource(LiveSource):
             hint = f"Add to cameras.{self.sensor}: {line}\nAn example of a command: {_EXAMPLE}"
             raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
         self._n_damaged_before += self._stream.n_damaged if self._stream else 0
-        self._stream, self._begin, self._complaints, self._n_pictures = self._raw_stream(), b"", b"", 0
+        self._begin, self._complaints, self._n_images = b"", b"", 0
+        # Raw images where the profile names their format; else their first bytes tell.
+        self._stream = None
+        wanted = self._settings.driver.pixel_format
+        if wanted is not None:
+            code = find_format(wanted)
+            if code is None:
+                what = f"{self._who}: driver.pixel_format {wanted!r} is not read here"
+                known = ", ".join(code.strip() for code in FORMATS)
+                raise SourceError(what, f"It can be {known}, or missing for Y4M, PGM, PPM and JPEG.")
+            size = self._settings.resolution_px
+            self._stream = JpegImages() if FORMATS[code].is_compressed else RawImages(code, *size)
         with ExitStack() as stack:
             try:
                 self._process = subprocess.Popen(
@@ -84,7 +95,7 @@ class ImagePipeSource(LiveSource):
                 hint = "Is the program installed? Give its full path."
                 what = f"{self._who}: {command[0]} cannot be started: {error.strerror}"
                 raise SourceError(what, hint) from None
-            stack.callback(self._end_process)
+            stack.callback(_end_process, self._process)
             self._selector = stack.enter_context(selectors.DefaultSelector())
             for pipe in self._pipes():
                 os.set_blocking(pipe.fileno(), False)
@@ -102,31 +113,17 @@ class ImagePipeSource(LiveSource):
         n_damaged = self._n_damaged_before + (self._stream.n_damaged if self._stream else 0)
         problems = []
         if n_damaged:
-            figures = {"n": n_damaged}
-            problems.append(Finding("stream.damaged_images", "warning", figures=figures, action="command"))
+            problems.append(findings.DAMAGED_IMAGES(n=n_damaged, action="command"))
         if isinstance(self._stream, RawImages) and self._stream.row_bytes % 4:
             n_row = self._stream.row_bytes
-            figures = {"row_bytes": n_row, "padded_bytes": n_row + -n_row % 4}
-            problems.append(Finding("device.row_padding", "warning", figures=figures))
+            problems.append(findings.ROW_PADDING(row_bytes=n_row, padded_bytes=n_row + -n_row % 4))
         return SourceStatus(
             self.sensor,
             n_lost=n_damaged,
-            clock=ClockState(Finding("clock.arrival", "note")),
+            clock=ClockState(findings.ARRIVAL()),
             problems=tuple(problems),
             device=" ".join(self._settings.driver.command),
         )
-
-    def _raw_stream(self) -> ImageStream | None:
-        """Prepare for raw images where the profile names their format."""
-        wanted = self._settings.driver.pixel_format
-        if wanted is None:
-            return None
-        code = find_format(wanted)
-        if code is None:
-            known = ", ".join(code.strip() for code in FORMATS)
-            what = f"{self._who}: driver.pixel_format {wanted!r} is not read here"
-            raise SourceError(what, f"It can be {known}, or missing for Y4M, PGM, PPM and JPEG.")
-        return JpegImages() if FORMATS[code].is_compressed else RawImages(code, *self._settings.resolution_px)
 
     def _begin_stream(self) -> None:
         """Find out by its first bytes what the command writes, and whether it is what the profile says.
@@ -178,23 +175,18 @@ class ImagePipeSource(LiveSource):
         try:
             for pixels in self._stream.feed(data):
                 host_ns = time.time_ns()
-                self._check_size(pixels.shape[1], pixels.shape[0])
-                count = self._n_pictures + self._stream.n_damaged
-                self._n_pictures += 1
+                size, wanted = pixels.shape[1::-1], self._settings.resolution_px
+                if size != wanted:
+                    raise SourceError(
+                        f"{self._who}: its command writes {size[0]}x{size[1]} px, the intrinsics belong to "
+                        f"{wanted[0]}x{wanted[1]} px",
+                        "Set the size in the command, or measure intrinsics at this size.",
+                    )
+                count = self._n_images + self._stream.n_damaged
+                self._n_images += 1
                 yield Image(self.sensor, self._channel, host_ns, pixels, host_ns, count)
         except ValueError as error:
-            raise SourceError(
-                f"{self._who}: what its command writes went wrong: {error}", self._said()
-            ) from None
-
-    def _check_size(self, width: int, height: int) -> None:
-        wanted = self._settings.resolution_px
-        if (width, height) != wanted:
-            raise SourceError(
-                f"{self._who}: its command writes {width}x{height} px, the intrinsics belong to "
-                f"{wanted[0]}x{wanted[1]} px",
-                "Set the size in the command, or measure intrinsics at this size.",
-            )
+            raise SourceError(f"{self._who}: its command's images: {error}", self._complaint()) from None
 
     def _raise_end(self, pictures: IO[bytes]) -> None:
         """Say how the command ended.
@@ -213,24 +205,24 @@ class ImagePipeSource(LiveSource):
             how = f"was ended by {signal.Signals(-code).name}"
         n_left = self._stream.n_left if self._stream else len(self._begin)
         torn = f"; {n_left} bytes of an unfinished image were skipped" if n_left else ""
-        what = f"{self._who}: its command {how} after {self._n_pictures} images{torn}"
-        raise SourceError(what, self._said())
+        what = f"{self._who}: its command {how} after {self._n_images} images{torn}"
+        raise SourceError(what, self._complaint())
 
-    def _said(self) -> str:
+    def _complaint(self) -> str:
         lines = self._complaints.decode("utf-8", "replace").strip().splitlines()[-3:]
         if lines:
             return f"It said: {' | '.join(line.strip() for line in lines)}"
         return f"Run it in a shell: {' '.join(self._settings.driver.command)}"
 
-    def _end_process(self) -> None:
-        """Stop the command and all it has started, by force if need be."""
+
+def _end_process(process: "subprocess.Popen[bytes]") -> None:
+    """Stop the command and all it has started, by force if need be."""
+    for number in (signal.SIGTERM, signal.SIGKILL):
         with suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGTERM)
-        try:
-            self._process.wait(_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            with suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.wait()
-        for pipe in self._pipes():
+            os.killpg(process.pid, number)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_PATIENCE_S)
+            break
+    for pipe in (process.stdout, process.stderr):
+        if pipe is not None:
             pipe.close()

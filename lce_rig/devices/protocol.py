@@ -8,7 +8,6 @@ from typing import Generic, TypeVar
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices import findings as findings
 
 T = TypeVar("T")
 
@@ -88,7 +87,7 @@ class Waiting(Generic[T]):
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._is_closed, timeout_s)
             if self._items:
-                return self._take_oldest()
+                return self._items.popleft()
             if self._error is not None:
                 raise self._error
             return None
@@ -98,10 +97,6 @@ class Waiting(Generic[T]):
         """Whether the queue was closed and everything taken."""
         with self._changed:
             return self._is_closed and not self._items
-
-    def _take_oldest(self) -> T:
-        """Take an item out; the lock is held."""
-        return self._items.popleft()
 
 
 class Mailbox(Waiting[T]):

@@ -82,22 +82,26 @@ class Inbox(Waiting[tuple[str, LiveSample]]):
         with self._changed:
             for sample in samples:
                 if self._n_waiting[sensor] >= n_slots:
-                    self._drop_oldest(sensor)
+                    place = next(k for k, (name, _) in enumerate(self._items) if name == sensor)
+                    del self._items[place]
+                    self._n_waiting[sensor] -= 1
+                    self.n_dropped[sensor] += 1
                 self._items.append((sensor, sample))
                 self._n_waiting[sensor] += 1
                 self.n_put[sensor] += 1
             self._changed.notify()
 
-    def _take_oldest(self) -> tuple[str, LiveSample]:
-        sensor, sample = super()._take_oldest()
-        self._n_waiting[sensor] -= 1
-        return sensor, sample
+    def take(self, timeout_s: float) -> tuple[str, LiveSample] | None:
+        """Take the oldest sample with its sensor; None where nothing came in time, or the queue has ended.
 
-    def _drop_oldest(self, sensor: str) -> None:
-        place = next(k for k, (name, _) in enumerate(self._items) if name == sensor)
-        del self._items[place]
-        self._n_waiting[sensor] -= 1
-        self.n_dropped[sensor] += 1
+        Raises:
+            SourceError: the reader failed, and all that it read before has been taken.
+        """
+        with self._changed:
+            came = super().take(timeout_s)
+            if came is not None:
+                self._n_waiting[came[0]] -= 1
+            return came
 
 
 class LiveSource(ABC):
@@ -254,51 +258,47 @@ class LiveSource(ABC):
             raise
 
     def _run(self) -> None:
+        """Read until asked to stop; what is lost is opened again where others feed the queue, too."""
         while True:
-            failure = self._read_on()
+            try:
+                failure = self._read_on()
+            except SourceError as error:
+                failure = error
+            except Exception as error:  # A bug must not look like the end of the stream.
+                failure = SourceError(
+                    f"{self._who}: its reader failed: {error!r}", "This is a bug: report it."
+                )
+                failure.__cause__ = error
             if not self._is_shared:
                 self._inbox.close(failure)
-            if failure is None or not self._is_shared or not self._reopen(failure):
+            if failure is None or not self._is_shared:
                 return
+            self._lost = failure, self._lost[1] if self._lost is not None else time.monotonic()
+            self.close()
+            while True:
+                if self._stopping.wait(self._reopen_every_s):
+                    return
+                try:
+                    self._open()
+                    break
+                except SourceError as error:
+                    self._lost = error, self._lost[1]
 
     def _read_on(self) -> SourceError | None:
-        """Read until asked to stop, and give what else ended it."""
+        """Read until asked to stop, or until the device is silent for too long: then explain that."""
         heard_s, has_sent = time.monotonic(), False
-        try:
-            while not self._stopping.is_set():
-                came = list(self.read())
-                now_s = time.monotonic()
-                if came:
-                    self._inbox.put(self.sensor, came, self._n_slots)
-                    self._rate.add(len(came))
-                    heard_s, has_sent = now_s, True
-                    self._note_back()
-                elif now_s - max(heard_s, self._heard_s) > self._silence_s:
-                    return self.explain_silence(has_sent=has_sent)
-        except SourceError as error:
-            return error
-        except Exception as error:  # A bug must not look like the end of the stream.
-            failure = SourceError(f"{self._who}: its reader failed: {error!r}", "This is a bug: report it.")
-            failure.__cause__ = error
-            return failure
+        while not self._stopping.is_set():
+            came = list(self.read())
+            now_s = time.monotonic()
+            if came:
+                self._inbox.put(self.sensor, came, self._n_slots)
+                self._rate.add(len(came))
+                heard_s, has_sent = now_s, True
+                # Back only now: a program that can be started may still find no camera.
+                self._lost = None
+            elif now_s - max(heard_s, self._heard_s) > self._silence_s:
+                return self.explain_silence(has_sent=has_sent)
         return None
-
-    def _note_back(self) -> None:
-        """Call a sensor back when it sends: a program that can be started may still find no camera."""
-        self._lost = None
-
-    def _reopen(self, failure: SourceError) -> bool:
-        """Open the device again; False where reading is to end before that."""
-        self._lost = failure, self._lost[1] if self._lost is not None else time.monotonic()
-        self.close()
-        while not self._stopping.wait(self._reopen_every_s):
-            try:
-                self._open()
-            except SourceError as error:
-                self._lost = error, self._lost[1]
-                continue
-            return True
-        return False
 
 
 class AttachedSensors:
@@ -331,7 +331,9 @@ class AttachedSensors:
                 except SourceError as error:
                     failures.append(error)
             if failures:
-                raise _join(failures)
+                hints = [failures[0].hint, *(f"Also: {other.what}" for other in failures[1:])]
+                hints.append("`lce-rig doctor` looks at every device.")
+                raise SourceError(failures[0].what, "\n  ".join(hint for hint in hints if hint))
             self._stack = stack.pop_all()
         self._inbox.n_dropped.clear()  # What came too soon, while others were being opened, is no loss.
         return self
@@ -355,10 +357,3 @@ class AttachedSensors:
     def statuses(self) -> dict[str, SourceStatus]:
         """Ask every sensor how it does."""
         return {name: source.status() for name, source in self.sources.items()}
-
-
-def _join(failures: Sequence[SourceError]) -> SourceError:
-    """Make one error of several: the first, with the others in its hint."""
-    first, *others = failures
-    hint = "\n  ".join(text for text in (first.hint, *(f"Also: {other.what}" for other in others)) if text)
-    return SourceError(first.what, f"{hint}\n  `lce-rig doctor` looks at every device.".strip())

@@ -3,12 +3,11 @@
 import re
 import time
 from contextlib import ExitStack
-from types import ModuleType
 from typing import Any
 
 from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.devices import findings
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource
 from lce_rig.io.ros.bag_file import RawMessage
@@ -63,22 +62,32 @@ class Ros2Source(LiveSource):
             block = "cameras" if self._target.channel is not None else "lidars"
             hint = f"Set topic in {block}.{self.sensor}; `ros2 topic list -t` lists what is published."
             raise SourceError(f"{self._who}: the profile names no topic", hint)
-        rclpy = _import_rclpy(self._who)
+        try:
+            import rclpy
+        except ImportError:
+            what = f"{self._who}: driver.type ros2 needs rclpy, which cannot be imported"
+            hint = (
+                "Source ROS 2 first (source /opt/ros/humble/setup.bash) and use its Python; pip has no rclpy."
+            )
+            raise SourceError(what, hint) from None
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import qos_profile_sensor_data
+        from sensor_msgs import msg
 
         with ExitStack() as stack:
             context = rclpy.Context()
             # With a context of its own, rclpy leaves Ctrl-C to this program.
             rclpy.init(context=context)
             stack.callback(rclpy.try_shutdown, context=context)
-            node = rclpy.create_node(_node_name(self.sensor), context=context)
+            # ROS 2 allows letters, digits and underscores of ASCII.
+            name = "lce_rig_" + re.sub(r"[^A-Za-z0-9_]", "_", self.sensor)
+            node = rclpy.create_node(name, context=context)
             stack.callback(node.destroy_node)
             self._executor = SingleThreadedExecutor(context=context)
             self._executor.add_node(node)
             stack.callback(self._executor.shutdown)
             self._msgtype = self._find_type(node)
-            kind = _message_class(self._msgtype)
+            kind = getattr(msg, self._msgtype.partition("/")[2])
             node.create_subscription(kind, self._topic, self._receive, qos_profile_sensor_data, raw=True)
             self._waiting.clear()
             self._stack = stack.pop_all()
@@ -103,16 +112,14 @@ class Ros2Source(LiveSource):
     def describe(self) -> SourceStatus:
         """Say how the topic does."""
         n_lost = sum(
-            int(str(found.figures["n"]))
-            for found in self._decoder.losses.findings()
-            if found.code != "recording.points_without_return"
+            int(str(loss.figures["n"]))
+            for loss in self._decoder.losses.findings()
+            if loss.code != "recording.points_without_return"
         )
         clock = None
         if self._delay_ms is not None:
-            figures: dict[str, Figure] = {"delay_ms": self._delay_ms}
-            clock = ClockState(Finding("clock.header", "note", figures=figures))
-        skipping = Finding("stream.messages_skipped", "warning", figures={"n": n_lost})
-        problems = (skipping,) if n_lost else ()
+            clock = ClockState(findings.HEADER(delay_ms=self._delay_ms))
+        problems = (findings.MESSAGES_SKIPPED(n=n_lost),) if n_lost else ()
         device = f"{self._topic} ({self._msgtype})" if self._msgtype else self._topic
         return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, problems=problems, device=device)
 
@@ -148,26 +155,3 @@ class Ros2Source(LiveSource):
                 f"{self._who}: {self._topic} is {', '.join(types[self._topic])}, not {wanted}", hint
             )
         raise SourceError(f"{self._who}: nothing publishes {self._topic}", hint)
-
-
-def _node_name(sensor: str) -> str:
-    """Name a node; ROS 2 allows letters, digits and underscores of ASCII."""
-    return "lce_rig_" + re.sub(r"[^A-Za-z0-9_]", "_", sensor)
-
-
-def _import_rclpy(who: str) -> ModuleType:
-    try:
-        import rclpy
-    except ImportError:
-        raise SourceError(
-            f"{who}: driver.type ros2 needs rclpy, which cannot be imported",
-            "Source ROS 2 first (source /opt/ros/humble/setup.bash) and use its Python; pip has no rclpy.",
-        ) from None
-    module: ModuleType = rclpy
-    return module
-
-
-def _message_class(msgtype: str) -> Any:
-    from sensor_msgs import msg
-
-    return getattr(msg, msgtype.partition("/")[2])
