@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from lce_rig.export.result import SavedResult
 
 import lce_rig as lce
 from benchmarks.recordings import RIGS, SETS, RecordedSet
@@ -104,7 +103,7 @@ class _Watched:
 
     def drift(self, views: list[SceneView], deployed: Calibration) -> PairDrift:
         """Judge a result by some captures as `lce-rig drift` does, by scene and boards."""
-        result = SavedResult(self.rig.name, "", (deployed,), {})
+        result = ResultFile(rig=self.rig.name, pairs=(deployed,))
         captures = SceneCaptures(self.rig, result, "a part")
         names = {view.capture for view in views}
         for each in self.samples:

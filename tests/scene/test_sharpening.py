@@ -4,10 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from lce_rig.export.result import write_result
 
 import lce_rig as lce
-from lce_rig.core.calibration import Calibration, SceneShare, read_result
+from lce_rig.core.calibration import Calibration, ResultFile, SceneShare, read_result
 from lce_rig.core.geometry import Array, difference, invert, perturb, transform
 from lce_rig.pipeline.sharpening import share_of
 from lce_rig.pipeline.witness import scene_views
@@ -91,7 +90,7 @@ def test_the_share_is_written_and_read_back(seen: Seen, tmp_path: Path) -> None:
     calibration = boards_alone(seen, np.zeros(6), WEAK)
     found = share(seen, calibration)
     fused = replace(calibration, T_cam_lidar=found.T_cam_lidar, cov=found.cov, scene_share=found)
-    write_result(tmp_path / "result.json", seen.rig.name, [fused])
+    (tmp_path / "result.json").write_text(ResultFile(rig=seen.rig.name, pairs=(fused,)).text())
     saved = read_result(tmp_path / "result.json").pairs[0].scene_share
     assert saved is not None and saved.state == found.state
     assert np.array_equal(saved.cov_boards, WEAK) and np.allclose(saved.change, found.change)

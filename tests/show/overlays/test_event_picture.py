@@ -6,7 +6,15 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.verify.test_pictures import (
+
+from lce_rig.core.data import Events, Image
+from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Refusal
+from lce_rig.rig import QualitySettings
+from lce_rig.show.overlays.animation import write_gif, write_video
+from lce_rig.show.overlays.debug_image import draw_debug
+from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER, ImageWithEvents, draw_events
+from tests.show.overlays.test_pictures import (
     BOARD,
     FOLDING,
     count,
@@ -17,14 +25,6 @@ from tests.verify.test_pictures import (
     scan_of,
     wall,
 )
-
-from lce_rig.core.data import Events, Image
-from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Refusal
-from lce_rig.rig import QualitySettings
-from lce_rig.show.overlays.animation import write_gif, write_video
-from lce_rig.show.overlays.debug_image import draw_debug
-from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER, ImageWithEvents, draw_events
 
 MS = 1_000_000
 IMAGE = Image("cam", "events", 500 * MS, grey(FOLDING))
