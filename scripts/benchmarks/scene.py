@@ -12,7 +12,7 @@ import lce_rig as lce
 from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import print_head, print_row
-from lce_rig.core.calibration import Calibration
+from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, difference, perturb
