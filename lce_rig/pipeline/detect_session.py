@@ -4,9 +4,8 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError, SessionError, refusal_of
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.events.search import EventImage, EventSighting, find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
@@ -23,6 +21,7 @@ from lce_rig.rig import ReconstructionSettings, Rig
 from lce_rig.session import Capture, Session, check_capture
 
 Key = tuple[str, str]
+_Found = TypeVar("_Found", ImageDetection, LidarDetection, Image | Refusal)
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
@@ -62,13 +61,19 @@ def detect(
     total = len(scan_jobs) + len(image_jobs) + len(event_jobs)
     images: dict[Key, dict[str, ImageDetection]] = {}
     lidars: dict[str, dict[str, LidarDetection]] = {}
+
+    def find_in_events(job: tuple[Capture, str, str]) -> ImageDetection:
+        name = job[0].name
+        scans = {lidar: found[name] for lidar, found in lidars.items() if name in found}
+        return finder.events(*job, scans=scans)
+
     with ThreadPoolExecutor(n_threads) as pool:
         scanned = pool.map(lambda job: finder.scan(*job), scan_jobs)
         for (capture, lidar), scan in _counted(scan_jobs, scanned, progress, 0, total):
             lidars.setdefault(lidar, {})[capture.name] = scan
         # The LiDAR's detection gives the time for the images from events.
         pictured = pool.map(lambda job: finder.image(*job), image_jobs)
-        developed = pool.map(lambda job: finder.events(*job, scans=_in_capture(lidars, job[0])), event_jobs)
+        developed = pool.map(find_in_events, event_jobs)
         for jobs, seen, n_before in (
             (image_jobs, pictured, len(scan_jobs)),
             (event_jobs, developed, len(scan_jobs) + len(image_jobs)),
@@ -108,12 +113,6 @@ def event_picture(
     return finder.picture(capture, camera, channel, scans=scans)
 
 
-def _in_capture(
-    lidars: Mapping[str, Mapping[str, LidarDetection]], capture: Capture
-) -> dict[str, LidarDetection]:
-    return {lidar: found[capture.name] for lidar, found in lidars.items() if capture.name in found}
-
-
 def _counted(
     jobs: list[Any], results: Iterable[Any], progress: Progress, n_before: int, total: int
 ) -> Iterator[tuple[Any, Any]]:
@@ -122,8 +121,7 @@ def _counted(
         progress(done, total)
 
 
-@dataclass(frozen=True)
-class _Held:
+class _Held(NamedTuple):
     """What a capture holds: images and raw events by (camera, channel), and scans by LiDAR."""
 
     capture: Capture
@@ -136,8 +134,7 @@ class _Finder:
     """Detects boards and stores the detections in the session's cache."""
 
     def __init__(self, session: Session, event_image: EventImage | None) -> None:
-        self._session = session
-        self._event_image = event_image
+        self._session, self._event_image = session, event_image
         self._boards = BoardFinder(session.rig)
         self._digest = detection_digest(session.rig)
         self._event_digests: dict[Key, str] = {}
@@ -171,19 +168,11 @@ class _Finder:
             except ProfileError as error:
                 return refusal_of("image", error)
 
-        found: ImageDetection = self._remembered(
-            self._digest, capture, f"{camera}.{channel}", ImageBoard, find
-        )
-        return found
+        return self._remembered(self._digest, capture, f"{camera}.{channel}", find)
 
     def scan(self, capture: Capture, lidar: str) -> LidarDetection:
         """Find the surfaces of the board's size in a scan."""
-
-        def find() -> LidarDetection:
-            return self._boards.scan(capture.scan(lidar))
-
-        found: LidarDetection = self._remembered(self._digest, capture, lidar, list, find)
-        return found
+        return self._remembered(self._digest, capture, lidar, lambda: self._boards.scan(capture.scan(lidar)))
 
     def look(self, capture: Capture, lidar: str, poses: Sequence[Array]) -> LidarDetection:
         """Find the board in a scan about one of the predicted poses T_lidar_board (4, 4)."""
@@ -195,8 +184,7 @@ class _Finder:
             return boards[:1] or next(each for each in found if isinstance(each, Refusal))
 
         where = hashlib.sha256(np.round(np.stack(poses), 3).tobytes()).hexdigest()[:12]
-        found: LidarDetection = self._remembered(self._digest, capture, f"{lidar}.at-{where}", list, find)
-        return found
+        return self._remembered(self._digest, capture, f"{lidar}.at-{where}", find)
 
     def events(
         self, capture: Capture, camera: str, channel: str, *, scans: Mapping[str, LidarDetection]
@@ -209,8 +197,7 @@ class _Finder:
             self._keep(_cache_key(digest, capture, f"{camera}.{channel}.picture"), seen.picture)
             return seen.board
 
-        found: ImageDetection = self._remembered(digest, capture, f"{camera}.{channel}", ImageBoard, find)
-        return found
+        return self._remembered(digest, capture, f"{camera}.{channel}", find)
 
     def picture(
         self, capture: Capture, camera: str, channel: str, *, scans: Mapping[str, LidarDetection]
@@ -218,12 +205,10 @@ class _Finder:
         """Return the image reconstructed from raw events."""
 
         def find() -> Image | Refusal:
-            seen = see_events(self._session, capture, camera, channel, scans, self._event_image)
-            return seen.picture
+            return see_events(self._session, capture, camera, channel, scans, self._event_image).picture
 
         digest = self._event_digest(camera, channel)
-        found: Image | Refusal = self._remembered(digest, capture, f"{camera}.{channel}.picture", Image, find)
-        return found
+        return self._remembered(digest, capture, f"{camera}.{channel}.picture", find)
 
     def _event_digest(self, camera: str, channel: str) -> str:
         if (camera, channel) not in self._event_digests:
@@ -233,13 +218,8 @@ class _Finder:
         return self._event_digests[camera, channel]
 
     def _remembered(
-        self,
-        digest: str,
-        capture: Capture,
-        sensor: str,
-        kind: type,
-        find: Callable[[], ImageDetection | LidarDetection | Image],
-    ) -> Any:
+        self, digest: str, capture: Capture, sensor: str, find: Callable[[], _Found]
+    ) -> _Found | Refusal:
         """Read a detection from the session's cache, or make and store it; a damaged sample is a refusal."""
         try:
             check_capture(self._session.rig, capture)
@@ -248,20 +228,11 @@ class _Finder:
             cached = self._session.load_cached(key)
             if cached is not None:
                 with suppress(ValueError):
-                    return self._require(from_arrays(cached.arrays), kind)
+                    return cast(_Found, from_arrays(cached.arrays))
             detection = find()
         except SessionError as error:
             return refusal_of("read", error)
         self._keep(key, detection)
-        return detection
-
-    def _require(self, detection: Any, kind: type) -> Any:
-        """Raise a ValueError for a cached detection of another kind of sample or of another board."""
-        if not isinstance(detection, (kind, Refusal)):
-            raise ValueError(f"not a detection of kind {kind.__name__}")
-        board = self._session.rig.board.to_board()
-        if isinstance(detection, ImageBoard) and len(detection.corners_px) != board.cols * board.rows:
-            raise ValueError("a detection of another board")
         return detection
 
     def _keep(self, key: str, detection: ImageDetection | LidarDetection | Image) -> None:
@@ -321,6 +292,8 @@ def see_events(
         ProfileError: the network cannot be used; with file and key.
         SessionError: the capture is damaged.
     """
+    from lce_rig.detect.events.figures import sweep_time_s
+
     rig, events = session.rig, capture.events(camera)
     stamp_ns = picture_stamp_ns(rig, capture, camera, channel, lidars)
     if stamp_ns is None:
@@ -334,10 +307,17 @@ def see_events(
             rig.board.to_board(),
             rig.cameras[camera].to_intrinsics(),
             rig.quality,
-            sweep_s=_sweep_s(rig, lidars),
+            sweep_s=next(
+                (
+                    sweep_time_s(found[0], 1 / rig.lidars[name].rate_hz)
+                    for name, found in lidars.items()
+                    if isinstance(found, list) and found
+                ),
+                None,
+            ),
         )
     except ProfileError as error:
-        raise _in_profile(_profile_of(session), camera, channel, error) from error
+        raise _in_profile(str(session.path / "rig.yaml"), camera, channel, error) from error
 
 
 def picture_stamp_ns(
@@ -386,7 +366,7 @@ def event_digest(
         try:
             digest.update(model_bytes(None if settings.model is None else Path(settings.model)))
         except ProfileError as error:
-            raise _in_profile(_profile_of(session), camera, channel, error) from error
+            raise _in_profile(str(session.path / "rig.yaml"), camera, channel, error) from error
     return digest.hexdigest()[:12]
 
 
@@ -409,21 +389,7 @@ def check_networks(rig: Rig, source: str) -> None:
                     raise _in_profile(source, camera, channel, error) from error
 
 
-def _sweep_s(rig: Rig, lidars: Mapping[str, LidarDetection]) -> float | None:
-    """Measure how long the LiDAR saw the board; None if it did not."""
-    from lce_rig.detect.events.figures import sweep_time_s
-
-    for name, found in lidars.items():
-        if isinstance(found, list) and found:
-            return sweep_time_s(found[0], 1 / rig.lidars[name].rate_hz)
-    return None
-
-
 def _in_profile(source: str, camera: str, channel: str, error: ProfileError) -> ProfileError:
     """Add the file and the key to an error about a network."""
     key = f"cameras.{camera}.channels.{channel}.reconstruction.model"
     return ProfileError(f"{source}: {key}: {error.what}", error.hint)
-
-
-def _profile_of(session: Session) -> str:
-    return str(session.path / "rig.yaml")

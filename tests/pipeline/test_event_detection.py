@@ -184,7 +184,7 @@ def test_another_network_is_found_beside_the_profile_and_makes_its_own_pictures(
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(None, "no such file"), (b"hxight_2", "its input .* has the shape"), (b"", "cannot be loaded")],
+    [(None, "o such file"), (b"hxight_2", "its input .* has the shape"), (b"", "cannot be loaded")],
 )
 def test_a_network_that_cannot_be_used_is_named_with_file_and_key(tmp_path, stream, content, said):
     path = tmp_path / "mine.onnx"
