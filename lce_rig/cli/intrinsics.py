@@ -10,7 +10,7 @@ from lce_rig.cli.options import cameras_option, require_sensors, session_argumen
 from lce_rig.words import describe, sentence
 
 if TYPE_CHECKING:
-    from lce_rig.pipeline.lens import MeasuredIntrinsics
+    from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
 
 _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
 
@@ -54,9 +54,9 @@ def intrinsics(
     7 if --save-profile has nothing to write, as the session determines no intrinsics better than the profile.
     """
     from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
+    from lce_rig.pipeline.intrinsics import measure_intrinsics
     from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
     from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
-    from lce_rig.pipeline.lens import measure_intrinsics
     from lce_rig.session import Session
 
     opened = Session.open(session)

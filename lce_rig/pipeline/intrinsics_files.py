@@ -1,7 +1,8 @@
 """Write measured intrinsics as files: a block for the profile, a new profile, camera_info, plots."""
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,13 @@ import numpy as np
 from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.documents import read_json
-from lce_rig.core.errors import LceRigError, ResultRefusedError, UsageError
-from lce_rig.core.findings import Refusal
-from lce_rig.export.camera_info import camera_info_text, read_camera_info, ros_distortion
+from lce_rig.core.errors import ResultRefusedError, UsageError
+from lce_rig.core.phrasing import as_line
+from lce_rig.export.camera_info import camera_info_text
 from lce_rig.export.files import number, numbers
 from lce_rig.judge.weighing import verdict_of
 from lce_rig.lens.difference import lens_errors
-from lce_rig.pipeline.lens import MeasuredIntrinsics
+from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_earlier
 from lce_rig.rig import (
     Rig,
@@ -33,7 +34,6 @@ from lce_rig.session import Session
 from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import copy_over
 from lce_rig.session.session import INTRINSICS
-from lce_rig.words import as_json, as_line, describe, recommend, refusal_as_json
 
 DOCUMENT = "intrinsics.json"
 FORMAT_VERSION = 1
@@ -51,58 +51,44 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
         The files of this run.
 
     Raises:
-        LceRigError: a file cannot be written or reads back differently; earlier ones are unchanged.
+        LceRigError: a file cannot be written; earlier ones are unchanged.
     """
-    names = [DOCUMENT]
-
-    def finish(earlier: Path, draft: Path) -> None:
-        others = _other_cameras(earlier / DOCUMENT, {one.camera for one in measured})
-        for camera in others:
-            for name in filter(lambda each: (earlier / each).is_file(), _file_names(camera)):
-                copy_over(earlier / name, draft / name)
-        content = document(session.rig, measured, list(others.values()))
-        write_atomically(draft / DOCUMENT, json.dumps(content, indent=2) + "\n")
-        known = {name for camera in session.rig.cameras for name in _file_names(camera)}
-        keep_earlier(earlier, draft, DOCUMENT, lambda path: path.name in {DOCUMENT, *known})
-
-    with session.replacing(INTRINSICS, finish=finish) as draft:
-        for one in measured:
-            names += _write_camera(draft, session.rig, one)
-    return [session.path / INTRINSICS / name for name in names]
-
-
-def _write_camera(folder: Path, rig: Rig, one: MeasuredIntrinsics) -> tuple[str, ...]:
-    """Write the files of one camera and return their names."""
     from lce_rig.show.overlays.intrinsics_plot import draw_intrinsics
     from lce_rig.show.overlays.overlay_files import write_picture
 
-    names = _file_names(one.camera)
-    block, info, page = (folder / name for name in names)
-    write_atomically(block, profile_block(rig, one))
-    write_atomically(info, camera_info_text(one.camera, final(one), _head(rig, one)))
-    _check(info, final(one))
-    drawn = draw_intrinsics(
-        one.estimate,
-        one.certainty,
-        one.difference,
-        title=f"Intrinsics of camera {one.camera}, rig {rig.name}",
-        weaknesses=one.weaknesses,
-    )
-    write_picture(page, drawn)
-    return names
+    names = [DOCUMENT]
+
+    def finish(earlier: Path, draft: Path) -> None:
+        # Entries of cameras that were not measured again; none if damaged.
+        others: dict[str, dict[str, Any]] = {}
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            known = {str(each["camera"]): each for each in read_json(earlier / DOCUMENT)["cameras"]}
+            others = {name: known[name] for name in known if name not in {one.camera for one in measured}}
+        for camera in others:
+            for name in _file_names(camera):
+                if (earlier / name).is_file():
+                    copy_over(earlier / name, draft / name)
+        content = document(session.rig, measured, list(others.values()))
+        write_atomically(draft / DOCUMENT, json.dumps(content, indent=2) + "\n")
+        ours = {DOCUMENT, *(name for camera in session.rig.cameras for name in _file_names(camera))}
+        keep_earlier(earlier, draft, DOCUMENT, lambda path: path.name in ours)
+
+    with session.replacing(INTRINSICS, finish=finish) as draft:
+        for one in measured:
+            names += (own := _file_names(one.camera))
+            block, info, page = (draft / name for name in own)
+            write_atomically(block, profile_block(session.rig, one))
+            write_atomically(info, camera_info_text(one.camera, final(one), _head(session.rig, one)))
+            title = f"Intrinsics of camera {one.camera}, rig {session.rig.name}"
+            plot = draw_intrinsics(
+                one.estimate, one.certainty, one.difference, title=title, weaknesses=one.weaknesses
+            )
+            write_picture(page, plot)
+    return [session.path / INTRINSICS / name for name in names]
 
 
 def _file_names(camera: str) -> tuple[str, str, str]:
     return f"{camera}.yaml", f"camera_info_{camera}.yaml", f"{camera}.png"
-
-
-def _other_cameras(path: Path, measured: Collection[str]) -> dict[str, dict[str, Any]]:
-    """Read an earlier run's entries of cameras that were not measured again; none if damaged."""
-    try:
-        cameras = read_json(path)["cameras"]
-        return {str(each["camera"]): each for each in cameras if each["camera"] not in measured}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
 
 
 def final(measured: MeasuredIntrinsics) -> Intrinsics:
@@ -177,8 +163,8 @@ def save_profile(
     refused = [one for one in measured if one.judgement.code != "intrinsics.better" and not is_forced]
     measured = [one for one in measured if one not in refused]
     if not measured:
-        why = "; ".join(f"{one.camera}: {describe(one.judgement)}" for one in refused)
-        actions = dict.fromkeys(as_line(recommend(one.judgement)) for one in refused)
+        why = "; ".join(f"{one.camera}: {one.judgement.text}" for one in refused)
+        actions = dict.fromkeys(as_line(one.judgement.advice) for one in refused)
         raise ResultRefusedError(f"{path} not written. {why}", " ".join([*actions, _FORCE]))
     text = profile_text(session.rig)
     for one in measured:
@@ -215,13 +201,6 @@ def _head(rig: Rig, measured: MeasuredIntrinsics) -> list[str]:
     ]
 
 
-def _check(path: Path, wanted: Intrinsics) -> None:
-    """Read a camera_info file back and compare it."""
-    given, read = ros_distortion(wanted)[1], read_camera_info(path)
-    if read != replace(wanted, distortion=given):
-        raise LceRigError(f"{path}: reads back with different intrinsics")
-
-
 def document(
     rig: Rig, measured: Sequence[MeasuredIntrinsics], others: Sequence[Mapping[str, Any]] = ()
 ) -> dict[str, Any]:
@@ -241,8 +220,21 @@ def document(
 
 
 def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
+    """List one camera's intrinsics; its profile's are null if they are for another resolution."""
     estimate, lens = measured.estimate, final(measured)
-    choice = measured.choice
+    choice, check, difference = measured.choice, measured.check, measured.difference
+    profile = None
+    if check is not None and difference is not None:
+        profile = {
+            "intrinsics": _settings(measured.given),
+            **{
+                name: value if isinstance(value, tuple) else _figure(value)
+                for name, value in asdict(check).items()
+            },
+            "displacement_max_px": _figure(difference.max_px),
+            "turn_rad": np.asarray(difference.turn_rad).tolist(),
+            "verdict": verdict_of([] if measured.misfit is None else [measured.misfit]),
+        }
     return {
         "camera": measured.camera,
         "channels": list(measured.channels),
@@ -264,11 +256,11 @@ def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
         "covered": float(measured.certainty.is_covered.mean()),
         "models": None if choice is None else [asdict(score) for score in choice.scores],
         "reason": None if choice is None else choice.reason,
-        "judgement": as_json(measured.judgement),
+        "judgement": measured.judgement.as_json(),
         "weaknesses": list(measured.weaknesses),
         "views_used": [view.name for view in estimate.views],
-        "views_refused": _refusals(measured.refused),
-        "profile": _comparison(measured),
+        "views_refused": {name: why.as_json() for name, why in measured.refused.items()},
+        "profile": profile,
     }
 
 
@@ -280,24 +272,3 @@ def _settings(lens: Intrinsics) -> dict[str, Any]:
 def _figure(value: float | None) -> float | None:
     """Return null for a figure that is not finite, as when the profile's intrinsics project nothing."""
     return value if value is not None and np.isfinite(value) else None
-
-
-def _refusals(refused: Mapping[str, Refusal]) -> dict[str, Any]:
-    return {name: refusal_as_json(why) for name, why in refused.items()}
-
-
-def _comparison(measured: MeasuredIntrinsics) -> dict[str, Any] | None:
-    """Compare the profile's intrinsics; null if they are for another resolution."""
-    check, difference = measured.check, measured.difference
-    if check is None or difference is None:
-        return None
-    return {
-        "intrinsics": _settings(measured.given),
-        **{
-            name: value if isinstance(value, tuple) else _figure(value)
-            for name, value in asdict(check).items()
-        },
-        "displacement_max_px": _figure(difference.max_px),
-        "turn_rad": np.asarray(difference.turn_rad).tolist(),
-        "verdict": verdict_of([] if measured.misfit is None else [measured.misfit]),
-    }

@@ -1,0 +1,253 @@
+"""Estimate the intrinsics of a session's cameras from its images of the board."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, UsageError, refusal_of
+from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.results import ImageBoard
+from lce_rig.detect.detection import ImageDetection
+from lce_rig.detect.finder import BoardFinder
+from lce_rig.detect.image.search import crop_to_intrinsics
+from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
+from lce_rig.lens.calibrate_lens import MIN_CAPTURES, Choice, choose_model, estimate_intrinsics
+from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of
+from lce_rig.lens.lens_coverage import find_weaknesses
+from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
+from lce_rig.lens.models import MODELS, model_of
+from lce_rig.pipeline.detect_session import Progress, detect, silent
+from lce_rig.rig import Rig
+from lce_rig.session import Capture, Session
+
+AUTO = "auto"
+Key = tuple[str, str]
+"""Capture and channel of an image."""
+# A typical field of view, 64 deg, if the profile's intrinsics are unusable.
+_GUESSED_FOCAL = 0.8
+_ANY_REPROJECTION_PX = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredIntrinsics:
+    """A camera's intrinsics from the boards of a session, compared with the profile's.
+
+    Attributes:
+        camera: its name.
+        channels: the channels whose images were used.
+        given: the profile's intrinsics, scaled to the images if their resolution differs.
+        estimate: the intrinsics from the boards.
+        choice: the chosen model and why, if models were compared.
+        check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
+        difference: per pixel; None likewise.
+        certainty: of the estimate, per pixel.
+        judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`.
+        misfit: how the profile's do not fit; None if they do, or are for another resolution.
+        weaknesses: what the captures do not determine, and what to do.
+        refused: name of an image -> why the estimate does not use it.
+    """
+
+    camera: str
+    channels: tuple[str, ...]
+    given: Intrinsics
+    estimate: IntrinsicsEstimate
+    choice: Choice | None
+    check: IntrinsicsCheck | None
+    difference: LensDifference | None
+    certainty: LensCertainty
+    judgement: Finding
+    misfit: Finding | None
+    weaknesses: tuple[str, ...]
+    refused: Mapping[str, Refusal]
+
+
+def measure_intrinsics(
+    session: Session,
+    camera: str,
+    *,
+    channels: Sequence[str] = (),
+    model: str | None = None,
+    progress: Progress = silent,
+) -> MeasuredIntrinsics:
+    """Fit a camera's intrinsics to the boards in its images.
+
+    The profile's intrinsics only decide which corners look misplaced. If they turn out to be wrong, corners
+    are detected again with the fitted ones.
+
+    Args:
+        session: open for reading is enough.
+        camera: its name.
+        channels: the channels whose images to use, as they share the lens; by default those of kind frames,
+            or of events if there are no frames.
+        model: name of a lens model, or "auto" to compare all; the profile's if None.
+        progress: called with (done, total).
+
+    Raises:
+        UsageError: no such channel or model.
+        NotEnoughDataError: too few images show the board, or the focal length is undetermined.
+    """
+    rig = session.rig
+    if model not in (None, AUTO, *MODELS):
+        raise UsageError(f"there is no lens model {model!r}; there is {', '.join(MODELS)} and {AUTO}")
+    have = rig.cameras[camera].channels
+    unknown = sorted(set(channels) - set(have))
+    if unknown:
+        raise UsageError(f"camera {camera} has no channel {unknown[0]!r}; it has {', '.join(have)}")
+    frames = tuple(name for name, settings in have.items() if settings.kind == "frames")
+    chosen = tuple(dict.fromkeys(channels)) or frames or tuple(have)
+    given = rig.cameras[camera].to_intrinsics()
+    jobs = _images(session, camera, chosen)
+    start = _at_size_of_images(given, jobs, camera)
+    seen_in_events = _seen_in_events(session, camera, chosen, {channel for _, channel in jobs})
+    found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
+    if _n_captures(found) < MIN_CAPTURES:
+        width, height, focal = start.width_px, start.height_px, _GUESSED_FOCAL * start.width_px
+        start = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, start.model)
+        found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
+    estimate, choice = _fit(camera, found, rig, start, model)
+    # Wrong intrinsics may have caused a detection to fail: board, pose or single corners.
+    limit_px = rig.quality.max_reprojection_px
+    doubtful = {
+        key
+        for key, board in found.items()
+        if isinstance(board, Refusal)
+        or board.reprojection_px > limit_px
+        or (board.quality is not None and board.quality.n_corners < len(board.corners_px))
+    }
+    if doubtful:
+        again = [(capture, channel) for capture, channel in jobs if (capture.name, channel) in doubtful]
+        found |= _look(rig, camera, again, estimate.intrinsics, limit_px, progress)
+        estimate, choice = _fit(camera, found, rig, estimate.intrinsics, model)
+    lens, target_deg = estimate.intrinsics, rig.calibration.target_sigma_deg
+    certainty = certainty_of(lens, estimate.corners_px.reshape(-1, 2), estimate.cov, estimate.model)
+    check, difference = None, None
+    if (given.width_px, given.height_px) == (lens.width_px, lens.height_px):
+        check, difference = compare_with_given(estimate, given, rig.board.to_board())
+    refused = {f"{name}.{channel}": why for (name, channel), why in found.items() if isinstance(why, Refusal)}
+    return MeasuredIntrinsics(
+        camera=camera,
+        channels=chosen,
+        given=given,
+        estimate=estimate,
+        choice=choice,
+        check=check,
+        difference=difference,
+        certainty=certainty,
+        judgement=judge_lens(certainty.covered, certainty.image_sigma_px, check, target_deg),
+        misfit=next(iter(lens_findings(check, target_deg)), None),
+        weaknesses=find_weaknesses(estimate, certainty),
+        refused=dict(sorted({**refused, **estimate.refused}.items())),
+    )
+
+
+def _images(session: Session, camera: str, channels: Sequence[str]) -> list[tuple[Capture, str]]:
+    """List the images of the channels; every channel reports a capture with a damaged manifest."""
+    jobs = []
+    for capture in session.captures:
+        try:
+            held = capture.image_keys
+        except SessionError:
+            held = [(camera, channel) for channel in channels]
+        jobs += [(capture, channel) for channel in channels if (camera, channel) in held]
+    return jobs
+
+
+def _at_size_of_images(given: Intrinsics, jobs: Sequence[tuple[Capture, str]], camera: str) -> Intrinsics:
+    """Scale intrinsics to the size of the first readable image, if it differs."""
+    for capture, channel in jobs:
+        try:
+            image = capture.image(camera, channel)
+            crop_to_intrinsics(image, given)
+        except SessionError:
+            continue
+        except ProfileError:
+            height, width = image.pixels.shape[:2]
+            return replace(
+                given,
+                fx_px=given.fx_px * width / given.width_px,
+                fy_px=given.fy_px * width / given.width_px,
+                cx_px=(width - 1) / 2,
+                cy_px=(height - 1) / 2,
+                width_px=width,
+                height_px=height,
+            )
+        break
+    return given
+
+
+def _look(
+    rig: Rig,
+    camera: str,
+    jobs: Sequence[tuple[Capture, str]],
+    lens: Intrinsics,
+    max_reprojection_px: float,
+    progress: Progress,
+) -> dict[Key, ImageDetection]:
+    """Find the board in images."""
+    finder = BoardFinder(rig)
+
+    def find(job: tuple[Capture, str]) -> ImageDetection:
+        capture, channel = job
+        try:
+            image = capture.image(camera, channel)
+            return finder.corners(image, lens, max_reprojection_px=max_reprojection_px)
+        except SessionError as error:
+            return refusal_of("read", error)
+        except ProfileError as error:
+            return refusal_of("image", error)
+
+    found: dict[Key, ImageDetection] = {}
+    with ThreadPoolExecutor(2) as pool:
+        for (capture, channel), detection in zip(jobs, pool.map(find, jobs), strict=True):
+            found[capture.name, channel] = detection
+            progress(len(found), len(jobs))
+    return found
+
+
+def _seen_in_events(
+    session: Session, camera: str, channels: Sequence[str], pictured: set[str]
+) -> dict[Key, ImageDetection]:
+    """List the session's detections in events, for channels without images."""
+    settings = session.rig.cameras[camera].channels
+    of_events = [name for name in channels if settings[name].kind == "events" and name not in pictured]
+    images = detect(session).images if of_events else {}
+    return {
+        (capture, channel): detection
+        for channel in of_events
+        for capture, detection in images.get((camera, channel), {}).items()
+    }
+
+
+def _n_captures(found: Mapping[Key, ImageDetection]) -> int:
+    return len({name for (name, _), board in found.items() if isinstance(board, ImageBoard)})
+
+
+def _fit(
+    camera: str, found: Mapping[Key, ImageDetection], rig: Rig, start: Intrinsics, model: str | None
+) -> tuple[IntrinsicsEstimate, Choice | None]:
+    """Fit intrinsics to the boards.
+
+    Raises:
+        NotEnoughDataError: too few captures show one; the most frequent causes are named.
+    """
+    if _n_captures(found) < MIN_CAPTURES:
+        causes = Counter(why.text for why in found.values() if isinstance(why, Refusal))
+        hint = "\n".join(f"{count} x {cause}" for cause, count in causes.most_common(3))
+        n, total = _n_captures(found), len({name for name, _ in found})
+        raise NotEnoughDataError(
+            f"camera {camera}: the board is in {n} of {total} captures, intrinsics need {MIN_CAPTURES} at "
+            "least and 15 for a good result",
+            hint or "collect captures with images of the board first",
+        )
+    views = [
+        BoardView(capture, channel, board)
+        for (capture, channel), board in sorted(found.items())
+        if isinstance(board, ImageBoard)
+    ]
+    board = rig.board.to_board()
+    if model == AUTO:
+        return choose_model(views, board, start)
+    lens_model = model_of(start) if model is None else MODELS[model]
+    return estimate_intrinsics(views, board, start, lens_model), None
