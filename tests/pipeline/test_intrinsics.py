@@ -12,8 +12,8 @@ from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageErr
 from lce_rig.export.camera_info import read_camera_info
 from lce_rig.judge.intrinsics_check import judge_lens
 from lce_rig.lens.models import MODELS
-from lce_rig.pipeline.intrinsics_files import final, profile_block, save_profile, write_intrinsics
 from lce_rig.pipeline.intrinsics import measure_intrinsics
+from lce_rig.pipeline.intrinsics_files import final, profile_block, save_profile, write_intrinsics
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
 from tests.detect.test_image_board import draw, looking
