@@ -6,6 +6,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 
 from lce_rig.core.errors import SourceError
+from lce_rig.io import findings as findings  # Readers may name their kinds by code.
 from lce_rig.io.folder.recorded_folder import list_parts
 from lce_rig.io.protocol import Recording, SourceOptions
 from lce_rig.io.ros.bag_file import kind_of

@@ -1,7 +1,6 @@
 """UDP datagrams in recordings of a network (pcap, pcapng), read and written by dpkt."""
 
 import socket
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal
@@ -12,6 +11,8 @@ from typing import Any, BinaryIO
 import dpkt  # type: ignore[import-untyped]
 
 from lce_rig.core.errors import SourceError, reading, reason_of
+from lce_rig.core.losses import Losses
+from lce_rig.io import findings
 
 _NS_PER_S = 1_000_000_000
 _MAX_FRAME_BYTES = 65535
@@ -51,7 +52,7 @@ class PcapFile:
 
     Attributes:
         path: the file.
-        flaws: datagrams that are not whole, by the code of their flaw; grows while the file is read.
+        losses: datagrams that are not whole; grows while the file is read.
         damage: the reason for which the file could not be read to its end; "" where it could.
         n_bytes_read: position of the last reading in the file.
     """
@@ -63,7 +64,7 @@ class PcapFile:
             SourceError: not a recording of a network, or of a link that is not read.
         """
         self.path = path
-        self.flaws: Counter[str] = Counter()
+        self.losses = Losses()
         self.damage = ""
         self.n_bytes_read = 0
         if not path.is_file():
@@ -76,7 +77,7 @@ class PcapFile:
 
     def datagrams(self) -> Iterator[Datagram]:
         """Yield the whole UDP datagrams in the order of recording, up to where the file is damaged."""
-        self.flaws.clear()
+        self.losses = Losses()
         self.damage = ""
         with self.path.open("rb") as file:
             try:
@@ -91,6 +92,11 @@ class PcapFile:
             except Exception as error:  # dpkt's own, struct's, and others that damage leads to.
                 self.damage = f"{reason_of(error)}; read up to byte {self.n_bytes_read}"
 
+    def account(self) -> list[str]:
+        """List the losses in words."""
+        lines = [loss.text for loss in self.losses.findings()]
+        return [*lines, self.damage] if self.damage else lines
+
     def _read(self, raw: bytes, host_ns: int) -> Datagram | None:
         """Take the UDP datagram out of a frame; None where there is no whole one."""
         try:
@@ -101,11 +107,11 @@ class PcapFile:
         if not isinstance(ip, dpkt.ip.IP) or ip.p != dpkt.ip.IP_PROTO_UDP:
             return None
         if ip.mf or ip.offset:
-            self.flaws["datagram.fragmented"] += 1
+            self.losses.add(findings.FRAGMENTED())
             return None
         udp = ip.data
         if not isinstance(udp, dpkt.udp.UDP) or not 8 <= udp.ulen <= 8 + len(udp.data):
-            self.flaws["datagram.cut_short"] += 1
+            self.losses.add(findings.CUT_SHORT())
             return None
         return Datagram(
             host_ns, socket.inet_ntoa(ip.src), udp.sport, udp.dport, bytes(udp.data[: udp.ulen - 8])

@@ -1,6 +1,5 @@
 """Points of a VLP-16 are those of the manual."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +8,7 @@ from wire.vlp16_packets import SensorPacket, Vlp16Packets
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
-from lce_rig.core.errors import SourceError
-from lce_rig.io.velodyne.points import Vlp16Decoder, keep_brighter
+from lce_rig.io.velodyne.stream import Vlp16Decoder, keep_brighter
 
 from .vlp16_room import (
     T0_NS,
@@ -38,15 +36,15 @@ def test_points_are_those_of_the_manual(mode: int) -> None:
     if mode == velodyne.DUAL:
         keep_brighter(fields)
     starts_ns = [1000 * int(us) for us in fields["us"]]
-    batch = Vlp16Decoder(0.1, 200.0).decode(fields, starts_ns)
+    points, intensity, ring, offset_ns = Vlp16Decoder(0.1, 200.0).decode(fields, starts_ns)
     manual = decode_by_manual(fields)
     ring_of_laser = np.array([0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15])
-    np.testing.assert_array_equal(batch.ring, ring_of_laser[manual["laser"]])
-    np.testing.assert_array_equal(batch.intensity, manual["reflectivity"])
+    np.testing.assert_array_equal(ring, ring_of_laser[manual["laser"]])
+    np.testing.assert_array_equal(intensity, manual["reflectivity"])
     time_ns = np.array(starts_ns)[manual["packet"]] + manual["time_ns"] - starts_ns[0]
-    assert np.abs(batch.offset_ns - time_ns).max() <= 50
+    assert np.abs(offset_ns - time_ns).max() <= 50
     # The library rounds azimuths to 0.01 deg and takes the mean speed over a packet.
-    assert (np.linalg.norm(batch.points - manual["points"], axis=1) / manual["range_m"]).max() < 3e-4
+    assert (np.linalg.norm(points - manual["points"], axis=1) / manual["range_m"]).max() < 3e-4
 
 
 def test_ranges_beyond_the_profiles_limits_give_no_points(packets: list[SensorPacket]) -> None:
@@ -75,10 +73,3 @@ def test_of_two_returns_the_brighter_one_is_kept() -> None:
 def packets_of_dual(front: Scan, behind: Scan) -> list[SensorPacket]:
     sender = Vlp16Packets(velodyne.DUAL)
     return sender.feed(front, behind) + sender.finish()
-
-
-def test_without_velodyne_decoder_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "velodyne_decoder", None)
-    with pytest.raises(SourceError, match="velodyne-decoder is not installed") as caught:
-        stream_of()
-    assert "pip install" in caught.value.hint

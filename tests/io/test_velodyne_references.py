@@ -13,7 +13,7 @@ from lce_rig.io.folder.cloud_file import read_cloud
 from lce_rig.io.network import PcapFile
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.velodyne.pcap import PcapRecording
-from lce_rig.io.velodyne.points import Vlp16Decoder, keep_brighter
+from lce_rig.io.velodyne.stream import Vlp16Decoder, keep_brighter
 from lce_rig.rig import Rig
 
 from .vlp16_room import (
@@ -30,12 +30,10 @@ def einride(recordings: Path) -> np.ndarray:
 @pytest.mark.dataset
 def test_every_point_of_the_einride_payloads_is_that_of_the_manual(recordings: Path) -> None:
     fields = einride(recordings)
-    batch = Vlp16Decoder(0.0, 200.0).decode(fields, [1000 * int(us) for us in fields["us"]])
+    points, *_ = Vlp16Decoder(0.0, 200.0).decode(fields, [1000 * int(us) for us in fields["us"]])
     manual = decode_by_manual(fields)
-    assert (
-        len(batch.points) == len(manual["points"]) == np.count_nonzero(fields["blocks"]["returns"]["range"])
-    )
-    off = np.linalg.norm(batch.points - manual["points"], axis=1) / manual["range_m"]
+    assert len(points) == len(manual["points"]) == np.count_nonzero(fields["blocks"]["returns"]["range"])
+    off = np.linalg.norm(points - manual["points"], axis=1) / manual["range_m"]
     assert off.max() < 4.5e-4  # 0.025 deg
 
 
@@ -71,11 +69,11 @@ def nebula_packets(recordings: Path) -> list[tuple[int, bytes]]:
 def test_every_point_of_nebulas_packets_is_that_of_the_manual(recordings: Path) -> None:
     fields = np.frombuffer(b"".join(p for _, p in nebula_packets(recordings)), velodyne.DATA_PACKET).copy()
     keep_brighter(fields)
-    batch = Vlp16Decoder(0.0, 200.0).decode(fields, [1000 * int(us) for us in fields["us"]])
+    points, *_ = Vlp16Decoder(0.0, 200.0).decode(fields, [1000 * int(us) for us in fields["us"]])
     manual = decode_by_manual(fields)
     order = np.argsort(manual["packet"] * 10**7 + manual["time_ns"])
-    assert len(batch.points) == len(order) == 58_706
-    off = np.linalg.norm(batch.points - manual["points"][order], axis=1) / manual["range_m"][order]
+    assert len(points) == len(order) == 58_706
+    off = np.linalg.norm(points - manual["points"][order], axis=1) / manual["range_m"][order]
     assert off.max() < 4.5e-4  # 0.025 deg
 
 
@@ -137,13 +135,11 @@ def test_every_point_of_mrpts_recording_is_that_of_the_manual(recordings: Path) 
     file = PcapFile(recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_vlp16_gps.pcap")
     payloads = [d.payload for d in file.datagrams() if d.port == velodyne.DATA_PORT]
     fields = np.frombuffer(b"".join(payloads), velodyne.DATA_PACKET)
-    batch = Vlp16Decoder(0.0, 200.0).decode(fields, [1000 * int(us) for us in fields["us"]])
+    points, *_ = Vlp16Decoder(0.0, 200.0).decode(fields, [1000 * int(us) for us in fields["us"]])
     manual = decode_by_manual(fields)
     assert len(payloads) == 293
-    assert (
-        len(batch.points) == len(manual["points"]) == np.count_nonzero(fields["blocks"]["returns"]["range"])
-    )
-    off = np.linalg.norm(batch.points - manual["points"], axis=1) / manual["range_m"]
+    assert len(points) == len(manual["points"]) == np.count_nonzero(fields["blocks"]["returns"]["range"])
+    off = np.linalg.norm(points - manual["points"], axis=1) / manual["range_m"]
     assert off.max() < 4.5e-4  # 0.025 deg
 
 

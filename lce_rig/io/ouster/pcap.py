@@ -8,19 +8,17 @@ import numpy as np
 
 from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Finding
 from lce_rig.core.losses import Losses
+from lce_rig.io import findings
 from lce_rig.io.fingerprint import fingerprint
 from lce_rig.io.network import PcapFile
 from lce_rig.io.ouster.packets import PROFILES, OusterMetadata, read_metadata
 from lce_rig.io.protocol import SourceOptions, Span
 from lce_rig.io.sensor_choice import choose_lidar
 from lce_rig.rig import LidarSettings, Rig
-from lce_rig.words import describe
 
 # A scan with more of its columns lost is not worth looking at.
 _MIN_COVERAGE = 0.5
-_THIN = Finding("scan.thin", "warning")
 _N_SURVEYED, _MAX_SHOWN = 5000, 6
 
 
@@ -66,7 +64,7 @@ class OusterStream:
         number = columns["column"].astype(np.int64)
         columns = columns[(columns["status"] & 1 == 1) & (number < metadata.n_columns)]
         if len(columns) < _MIN_COVERAGE * metadata.n_columns:
-            self.losses.add(_THIN)
+            self.losses.add(findings.SCAN_THIN())
             return None
         pixels = columns["pixels"]
         range_m = (pixels["range"].astype(np.int64) & profile.range_mask) * profile.unit_m
@@ -134,8 +132,7 @@ class OusterRecording:
         last = stream.finish()
         if last is not None:
             yield last
-        lines = [describe(each) for each in stream.losses.findings()]
-        lines += [self._file.damage] if self._file.damage else []
+        lines = [loss.text for loss in stream.losses.findings()] + self._file.account()
         self.notes += [f"{self.path.name}: {line}" for line in lines]
         if stream.n_scans == 0:
             raise SourceError(f"{self.path}: no whole revolution in it", "Record at least 1 s.")

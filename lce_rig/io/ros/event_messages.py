@@ -12,7 +12,8 @@ from lce_rig.core import limits
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
-from lce_rig.io.events.stream import NS_PER_US, damage, seconds_in
+from lce_rig.io import findings
+from lce_rig.io.events.stream import NS_PER_US, seconds_in
 from lce_rig.io.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_array import decode_event_array
@@ -136,11 +137,11 @@ class PacketDecoder:
 
     def account(self, losses: Losses) -> None:
         """Count what was skipped, and what could not be decoded inside packets."""
-        losses.add(damage("recording.trigger_packets"), self._n_trigger_packets)
-        losses.add(damage("recording.events_untimed"), self._evt3.n_untimed)
+        losses.add(findings.TRIGGER_PACKETS(), self._n_trigger_packets)
+        losses.add(findings.EVENTS_UNTIMED(), self._evt3.n_untimed)
         n_repaired = self._evt3.n_repaired + self._compressed.n_repaired
-        losses.add(damage("recording.time_words_repaired"), n_repaired)
-        losses.add(damage("recording.unknown_words"), self._evt3.n_unknown + self._compressed.n_unknown)
+        losses.add(findings.TIME_WORDS_REPAIRED(), n_repaired)
+        losses.add(findings.UNKNOWN_WORDS(), self._evt3.n_unknown + self._compressed.n_unknown)
 
 
 def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
@@ -225,11 +226,11 @@ class BagEvents:
                 yield from decoder.decode(packet)
             except ValueError as error:
                 where = f"message {index}, received {seconds_in(message.log_ns, first_ns)}: {error}"
-                losses.add(damage("recording.broken_packets", where))
+                losses.add(findings.BROKEN_PACKETS(where=where))
                 continue
             if last_number is not None and packet.number > last_number + 1:
                 lost = packet.number - last_number - 1
-                losses.add(damage("recording.packets_lost", f"before message {index}"), lost)
+                losses.add(findings.PACKETS_LOST(where=f"before message {index}"), lost)
             last_number = packet.number
         yield from decoder.finish()
         decoder.account(losses)
@@ -258,7 +259,7 @@ def _messages(bag: BagFile, topic: str, losses: Losses) -> Iterator[tuple[int, R
         try:
             message = next(messages, None)
         except SourceError as error:
-            losses.add(damage("recording.bag_torn", error.what))
+            losses.add(findings.BAG_TORN(where=error.what))
             return
         if message is None:
             return

@@ -13,8 +13,9 @@ from lce_rig.core import limits
 from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
+from lce_rig.io import findings
 from lce_rig.io.events.event_recording import CameraEvents, EventRecording
-from lce_rig.io.events.stream import NoEventsError, damage, worded
+from lce_rig.io.events.stream import NoEventsError, worded
 from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.folder.image_file import decode_image, to_8_bit
 from lce_rig.io.merging import merge_by_time
@@ -24,8 +25,7 @@ from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import BagEvents
 from lce_rig.io.ros.message_fields import MessageReader, read_header, typestore
 from lce_rig.io.ros.topics import CLOUD_TYPES, PACKET_TYPES, Target, choose_topics
-from lce_rig.io.velodyne.points import OFFSETS_NOTE
-from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.io.velodyne.stream import OFFSETS_NOTE, Vlp16Stream
 from lce_rig.rig import CameraSettings, LidarSettings, Rig
 
 # sensor_msgs/Image and CompressedImage as grey or BGR images.
@@ -229,7 +229,7 @@ class TopicDecoder:
         except (SourceError, ValueError) as error:
             cause = error.what if isinstance(error, SourceError) else str(error)
             self.hint = (error.hint or "") if isinstance(error, SourceError) else ""
-            self.losses.add(damage("recording.not_decoded", cause))
+            self.losses.add(findings.NOT_DECODED(where=cause))
             return None
         if not self._is_in_order(sample.stamp_ns):
             return None
@@ -286,7 +286,7 @@ class TopicDecoder:
         reading = to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns)
         self.notes.update(reading.notes)
         n_without_return = reading.n_not_finite + reading.n_zero_range
-        self.losses.add(damage("recording.points_without_return"), n_without_return)
+        self.losses.add(findings.POINTS_WITHOUT_RETURN(), n_without_return)
         return reading.scan
 
     def _is_in_order(self, stamp_ns: int | None) -> bool:
@@ -295,12 +295,12 @@ class TopicDecoder:
             self._last_ns = stamp_ns
             return True
         if stamp_ns == self._last_ns:
-            self.losses.add(damage("recording.sent_twice"))
+            self.losses.add(findings.SENT_TWICE())
             return False
         if self._last_ns - stamp_ns < CLOCK_JUMP_NS:
-            self.losses.add(damage("recording.out_of_order"))
+            self.losses.add(findings.OUT_OF_ORDER())
             return False
-        self.losses.add(damage("recording.clock_set_back"))
+        self.losses.add(findings.CLOCK_SET_BACK())
         self._last_ns = stamp_ns
         return True
 

@@ -1,0 +1,135 @@
+"""Findings about recordings and packets: parts that were skipped, repaired, lost or assumed."""
+
+from lce_rig.core.findings import Finding, Kind
+
+
+def _loss(name: str, text: str) -> Kind:
+    return Kind(f"recording.{name}", text, severity="warning")
+
+
+BROKEN_PACKETS = _loss("broken_packets", "{n} broken packets skipped (first: {where})")
+TORN_END = _loss("torn_end", "{n} torn ends of the file skipped (first: {where})")
+TRIGGER_PACKETS = _loss("trigger_packets", "{n} packets of triggers skipped")
+EVENTS_UNTIMED = _loss("events_untimed", "{n} events before the first timestamp skipped")
+TIME_WORDS_REPAIRED = _loss("time_words_repaired", "{n} inconsistent time words repaired")
+UNKNOWN_WORDS = _loss("unknown_words", "{n} words of no known code skipped")
+PACKETS_LOST = _loss("packets_lost", "{n} packets lost in recording (first: {where})")
+BAG_TORN = _loss("bag_torn", "{n} places where the bag is torn (first: {where})")
+EVENTS_BEYOND_CLOCKS = _loss("events_beyond_clocks", "{n} events with timestamps beyond any clock skipped")
+EVENTS_BEFORE_CLOCK_SET = _loss(
+    "events_before_clock_set", "{n} events before the clock was set skipped (first: {where})"
+)
+EVENTS_STRAY = _loss("events_stray", "{n} events with stray timestamps skipped (first: {where})")
+EVENTS_LATE = _loss("events_late", "{n} events that came too late skipped")
+EVENTS_SORTED = _loss("events_sorted", "{n} places where timestamps decrease by up to 20 ms, sorted")
+EVENTS_OFF_SENSOR = _loss("events_off_sensor", "{n} events off the sensor skipped (first: {where})")
+BROKEN_LINES = _loss("broken_lines", "{n} broken lines skipped (first: {where})")
+EVENTS_BEYOND_SENSORS = _loss("events_beyond_sensors", "{n} events beyond any sensor skipped")
+TORN_WORD = _loss("torn_word", "{n} bytes of a torn last word skipped")
+FRAMES_OUT_OF_ORDER = _loss("frames_out_of_order", "{n} out of order skipped")
+POINTS_WITHOUT_RETURN = _loss("points_without_return", "{n} points without a return")
+SENT_TWICE = _loss("sent_twice", "{n} sent twice (equal timestamps)")
+OUT_OF_ORDER = _loss("out_of_order", "{n} out of order (timestamps decrease)")
+CLOCK_SET_BACK = _loss("clock_set_back", "{n} jumps of the clock back by more than 1 s")
+NOT_DECODED = _loss("not_decoded", "{n} could not be decoded (first: {where})")
+CLOCK_WRAPPED_31 = _loss("clock_wrapped_31", "{n} wraps of a 35.8 min clock undone")
+CLOCK_WRAPPED_32 = _loss("clock_wrapped_32", "{n} wraps of a 71.6 min clock undone")
+
+
+def _flaw(name: str, text: str) -> Kind:
+    """Declare a flaw of single packets, of kind `of`: data or position."""
+    return Kind(f"packet.{name}", f"{{n}} {{of}} packets {text}", severity="warning")
+
+
+WRONG_LENGTH = _flaw("wrong_length", "of wrong length skipped")
+WRONG_FLAG = _flaw("wrong_flag", "with a wrong block flag skipped")
+TIME_BEYOND_HOUR = _flaw("time_beyond_hour", "with a time beyond the hour skipped")
+AZIMUTH_BEYOND_360 = _flaw("azimuth_beyond_360", "with an azimuth beyond 360 deg skipped")
+UNKNOWN_FACTORY_BYTES = _flaw(
+    "unknown_factory_bytes", "with unknown factory bytes skipped (firmware before 3.0.29 sends none)"
+)
+UNEVEN_AZIMUTHS = _flaw("uneven_azimuths", "with uneven azimuths skipped")
+UNKNOWN_PPS = _flaw("unknown_pps", "with an unknown PPS state skipped")
+OTHER_MODEL = _flaw("other_model", "of another LiDAR model skipped")
+
+LOST = Kind("packet.lost", "{n} data packets lost", severity="warning")
+LATE = Kind("packet.late", "{n} data packets late or sent twice, skipped", severity="warning")
+CLOCK_SET = Kind("packet.clock_set", "the LiDAR's clock was set {n} times", severity="note")
+SCAN_PARTIAL = Kind(
+    "scan.partial", "{n} revolutions skipped: cut off at an end, or where the clock was set", severity="note"
+)
+SCAN_THIN = Kind(
+    "scan.thin", "{n} revolutions skipped: more than half of their packets are lost", severity="warning"
+)
+SCAN_EMPTY = Kind("scan.empty", "{n} revolutions without a return", severity="warning")
+SCAN_NOT_RISING = Kind(
+    "scan.not_rising", "{n} scans skipped: their timestamps do not rise", severity="warning"
+)
+FRAGMENTED = Kind("datagram.fragmented", "{n} datagrams sent in fragments skipped", severity="warning")
+CUT_SHORT = Kind("datagram.cut_short", "{n} datagrams cut short by the recorder skipped", severity="warning")
+
+_BY_ARRIVAL = "scans are timestamped by arrival: "
+
+
+def _lidar_utc(finding: Finding) -> str:
+    """The timestamps are the LiDAR's UTC by PPS and NMEA, {ahead_s} ahead of this computer's clock."""
+    ahead_s = finding.figures.get("ahead_s")
+    offset = f", {1000 * finding.figure('ahead_s'):+.1f} ms from this computer's clock" if ahead_s else ""
+    return f"UTC by PPS and NMEA{offset}"
+
+
+def _nmea_of_other_second(finding: Finding) -> str:
+    """The sentences' time is {nmea_past_hour_s} past the hour, not the LiDAR's."""
+    minute, second = divmod(round(finding.figure("nmea_past_hour_s")), 60)
+    return f"{_BY_ARRIVAL}NMEA time {minute:02d}:{second:02d} past the hour is not the LiDAR's"
+
+
+LIDAR_UTC = Kind("clock.lidar_utc", _lidar_utc, severity="note")
+HOST_WANTED = Kind("clock.host_wanted", f"{_BY_ARRIVAL}timestamps.clock is host", severity="note")
+ARRIVALS_UNKNOWN = Kind(
+    "clock.arrivals_unknown",
+    "scans are not timestamped: their arrivals and so the hour are unknown",
+    severity="note",
+)
+NO_POSITION_PACKETS = Kind(
+    "clock.no_position_packets",
+    f"{_BY_ARRIVAL}no position packets, which report PPS",
+    "open port 8308 in the firewall, and record it beside the data",
+    severity="warning",
+)
+POSITION_PACKETS_STOPPED = Kind(
+    "clock.position_packets_stopped",
+    f"{_BY_ARRIVAL}position packets have stopped, or their time differs",
+    "check the network and the sensor",
+    severity="warning",
+)
+PPS_NOT_LOCKED = Kind(
+    "clock.pps_not_locked",
+    f"{_BY_ARRIVAL}PPS is {{pps}}",
+    "check the pulse at the LiDAR's interface box: 1 Hz, 3 to 15 V, rising edge",
+    severity="warning",
+)
+NO_NMEA = Kind(
+    "clock.no_nmea",
+    f"{_BY_ARRIVAL}no NMEA",
+    "send $GPRMC at 9600 baud with RS-232 polarity",
+    severity="warning",
+)
+NMEA_DAMAGED = Kind(
+    "clock.nmea_damaged",
+    f"{_BY_ARRIVAL}NMEA is damaged",
+    "send $GPRMC at 9600 baud with RS-232 polarity",
+    severity="warning",
+)
+NMEA_OF_OTHER_SECOND = Kind(
+    "clock.nmea_of_other_second",
+    _nmea_of_other_second,
+    "send each sentence after its pulse, within a second",
+    severity="warning",
+)
+LIDAR_UTC_DIFFERS = Kind(
+    "clock.lidar_utc_differs",
+    f"{_BY_ARRIVAL}the LiDAR's UTC differs by {{ahead_s:+.2f}} s from this computer's",
+    "set this computer's clock by the same source (chrony with gpsd, or NTP)",
+    severity="warning",
+)
