@@ -25,8 +25,7 @@ from lce_rig.devices.lce1 import (
 from lce_rig.devices.protocol import ClockState
 from lce_rig.rig.sync_settings import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S, ClockModel
-from lce_rig.timing.clock_fit import fit_arrivals
-from lce_rig.timing.clock_tracker import ClockTracker
+from lce_rig.timing.clock_fit import ClockTracker, fit_arrivals
 
 # Which times and running numbers can be, and which tell that the board restarted: a line may be damaged and
 # keep its sum. One odd value is skipped; two in a row that agree are believed.

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
-from lce_rig.timing import findings as findings
 
 NS_PER_S = 1_000_000_000
 HOUR_NS = 3600 * NS_PER_S

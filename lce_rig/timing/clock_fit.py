@@ -1,6 +1,11 @@
-"""Clock models from readings: time requests and replies, edges timestamped by two clocks, arrivals."""
+"""Clock models from readings: time requests and replies, edges timestamped by two clocks, arrivals.
 
+`ClockTracker` keeps the model of a running clock's last minute, and reports when one of the clocks jumps.
+"""
+
+from collections import deque
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +23,16 @@ _MAX_GROUP = 5
 _WANTED_GROUPS = 12
 _QUICK = 0.4
 
-Stamps = NDArray[np.int64]
 _SHARP = 0.1
 _OUTLIER_SIGMAS = 3.5
 _N_ROUNDS = 10
 _N_STRETCHES = 8
 _MIN_INLIERS = 3
+_MAX_PAIRS = 2048
+_N_WITNESSES = 3
+_STEP_SIGMAS = 8.0
+
+Stamps = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +112,10 @@ def fit_arrivals(
     elapsed_s = (stamp_ns - stamp_ns[0]) / NS_PER_S
     # Without its drift, the lateness of messages seconds apart can be compared.
     late_ns = late_ns - median_slope(elapsed_s, late_ns) * elapsed_s
-    pairs = TimePairs.from_edges(stamp_ns, arrival_ns).select(_quickest(late_ns))
+    size = int(np.clip(len(late_ns) // _WANTED_GROUPS, 1, _MAX_GROUP))
+    groups = late_ns[: len(late_ns) // size * size].reshape(-1, size)
+    least_late = np.asarray(np.arange(len(groups)) * size + groups.argmin(axis=1))
+    pairs = TimePairs.from_edges(stamp_ns, arrival_ns).select(least_late)
     return _model(pairs, np.zeros(len(pairs)), f"{len(stamp_ns)} {what}", RESOLUTION_NS, bias_sigma_ns)
 
 
@@ -140,14 +152,6 @@ def _nearest(these_ns: Stamps, those_ns: Stamps) -> NDArray[np.intp]:
     left = right - 1
     right = np.minimum(right, len(those_ns) - 1)
     return np.where(these_ns - those_ns[left] <= those_ns[right] - these_ns, left, right)
-
-
-def _quickest(late: Array) -> NDArray[np.intp]:
-    """Find the least late (G,) of every few successive readings (N,)."""
-    size = int(np.clip(len(late) // _WANTED_GROUPS, 1, _MAX_GROUP))
-    whole = len(late) // size * size
-    groups = late[:whole].reshape(-1, size)
-    return np.asarray(np.arange(len(groups)) * size + groups.argmin(axis=1))
 
 
 def _model(
@@ -259,10 +263,10 @@ class LineFit:
         keep = np.ones(len(residual), dtype=np.bool_)
         for _ in range(_N_ROUNDS):
             scale = max(1.4826 * float(np.median(np.abs(residual))), 1.0)
-            found = np.abs(residual) <= _OUTLIER_SIGMAS * scale
-            if found.sum() < _MIN_INLIERS or np.ptp(self.x_s[found]) == 0 or np.array_equal(found, keep):
+            near = np.abs(residual) <= _OUTLIER_SIGMAS * scale
+            if near.sum() < _MIN_INLIERS or np.ptp(self.x_s[near]) == 0 or np.array_equal(near, keep):
                 break
-            keep = found
+            keep = near
             line, _ = self.select(keep).solve()
             residual = (self.y_ns - line[0] - line[1] * self.x_s - line[2] * self.excess_ns) / sigma_ns
         return keep
@@ -282,3 +286,123 @@ def median_slope(x: Array, y: Array) -> float:
     half = len(x) // 2
     dx = x[half:] - x[: len(x) - half]
     return float(np.median((y[half:] - y[: len(y) - half])[dx > 0] / dx[dx > 0])) if (dx > 0).any() else 0.0
+
+
+class ClockStep(NamedTuple):
+    """A jump of one clock relative to the other.
+
+    Attributes:
+        source_ns: first reading of the source's clock after it.
+        size_ns: by how much the reference, seen from the source, went ahead.
+    """
+
+    source_ns: int
+    size_ns: int
+
+
+class _Pair(NamedTuple):
+    source_ns: int
+    reference_ns: int
+    bound_ns: float
+
+
+class ClockTracker:
+    """Incoming readings of two clocks, and the model fitted to the latest ones.
+
+    A reading far off the model is held back. One alone is forgotten as an outlier; three in a row that agree
+    with each other mean that a clock has jumped, and begin a new model.
+
+    Args:
+        what: what the readings are, in words: "time requests".
+        window_s: how long readings count: drift changes with temperature.
+        min_step_ns: what is smaller is not a jump, however exact the readings are.
+        resolution_ns: step of the coarser clock.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        window_s: float = 60.0,
+        min_step_ns: float = 200_000.0,
+        resolution_ns: float = RESOLUTION_NS,
+    ) -> None:
+        self.steps: list[ClockStep] = []
+        self._what = what
+        self._window_ns = window_s * NS_PER_S
+        self._min_step_ns = min_step_ns
+        self._resolution_ns = resolution_ns
+        self._pairs: deque[_Pair] = deque(maxlen=_MAX_PAIRS)
+        self._suspects: list[_Pair] = []
+        self._model: ClockModel | None = None
+        self._n_new = 0
+
+    def add(self, source_ns: int, reference_ns: int, bound_ns: float = 0.0) -> ClockStep | None:
+        """Take a reading of both clocks; gives the jump that it proves, if it does.
+
+        Args:
+            source_ns: on the source's clock.
+            reference_ns: on the reference's.
+            bound_ns: by how much the two may lie apart in truth.
+        """
+        pair = _Pair(source_ns, reference_ns, bound_ns)
+        if self._pairs:
+            last = self._pairs[-1]
+            # Requests that overtake each other are out of order by no more than their round trips.
+            room_ns = self._min_step_ns + 2 * (last.bound_ns + bound_ns)
+            if source_ns < last.source_ns - room_ns:
+                size_ns = (reference_ns - source_ns) - (last.reference_ns - last.source_ns)
+                return self._step([pair], size_ns)
+        model = self._latest(max_new=max(1, len(self._pairs) // 8))
+        if model is not None:
+            sigma_ns = float(np.hypot(model.rms_ns, model.sigma_ns(source_ns)))
+            limit_ns = max(_STEP_SIGMAS * sigma_ns, self._min_step_ns) + bound_ns
+            if abs(reference_ns - model.convert(source_ns)) > limit_ns:
+                return self._suspect(pair, model)
+        self._suspects.clear()
+        self._pairs.append(pair)
+        self._n_new += 1
+        while self._pairs[0].source_ns < source_ns - self._window_ns:
+            self._pairs.popleft()
+        return None
+
+    @property
+    def model(self) -> ClockModel | None:
+        """The model of the readings so far; None while there are too few."""
+        return self._latest(max_new=1)
+
+    def restart(self) -> None:
+        """Forget all readings: the device restarted."""
+        self._pairs.clear()
+        self._suspects.clear()
+        self._model = None
+        self._n_new = 0
+
+    def _latest(self, max_new: int) -> ClockModel | None:
+        if self._n_new >= max_new and len(self._pairs) >= MIN_PAIRS:
+            source, reference, bound = zip(*self._pairs, strict=True)
+            pairs = TimePairs(np.array(source, np.int64), np.array(reference, np.int64), np.array(bound))
+            self._model = fit_clock(pairs, self._what, self._resolution_ns)
+            self._n_new = 0
+        return self._model
+
+    def _suspect(self, pair: _Pair, model: ClockModel) -> ClockStep | None:
+        """Hold a reading back; with two before it that agree, it proves a jump."""
+        self._suspects = [*self._suspects, pair][-_N_WITNESSES:]
+        if len(self._suspects) < _N_WITNESSES:
+            return None
+        sizes_ns = [suspect.reference_ns - model.convert(suspect.source_ns) for suspect in self._suspects]
+        room_ns = max(_STEP_SIGMAS * model.rms_ns, self._min_step_ns) + 2 * max(
+            suspect.bound_ns for suspect in self._suspects
+        )
+        if max(sizes_ns) - min(sizes_ns) > room_ns:
+            return None
+        return self._step(self._suspects, round(float(np.median(sizes_ns))))
+
+    def _step(self, pairs: list[_Pair], size_ns: int) -> ClockStep:
+        """Begin a new model with the readings that prove a jump."""
+        step = ClockStep(pairs[0].source_ns, size_ns)
+        self.restart()
+        self._pairs.extend(pairs)
+        self._n_new = len(pairs)
+        self.steps.append(step)
+        return step

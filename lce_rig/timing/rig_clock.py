@@ -8,33 +8,155 @@ and the board's answers. Without one everything stays on the computer's clock.
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from lce_rig.core.data import Image, LiveSample, Pulse, Sample
+from lce_rig.core.data import Events, Image, LiveSample, Pulse, Sample, Scan
 from lce_rig.core.findings import Finding
 from lce_rig.rig import Rig
-from lce_rig.rig.sync_settings import BOARD, PPS_LINE, TriggerSettings
+from lce_rig.rig.sync_settings import BOARD, PPS_LINE
+from lce_rig.timing import findings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import MIN_PAIRS, RESOLUTION_NS, Stamps, fit_clock, match_edges
-from lce_rig.timing.sync import CommonClock, SyncVerdict, judge_sync
+from lce_rig.timing.rig_time import rig_time_ns
+from lce_rig.timing.scan_pairing import Frame, middle_of_sweep_ns, tolerance_ns
 from lce_rig.timing.triggers import TriggerMatcher
-
-# The clock of a sensor that sees the sync board's pulses, fitted to the board's by them.
-#
-# A DAVIS346 stamps the edges at its trigger input and does not number them. Which edge is which pulse
-# follows
-# from a coarse model of its clock; once a fit is made, the fit itself decides.
 
 _N_EDGES = 2048
 _WINDOW_NS = 60 * NS_PER_S
 # Of the least time between two pulses: an edge farther from its pulse could be the next one's.
 _NEAR = 0.4
 _MIN_MATCHED = 0.5
+#: Pulses a second at which the first images are matched.
+SLOW_TRIGGERS_HZ = 4.0
+# A DAVIS takes the computer's time when it is opened.
+_COARSE_EDGE_NS = 100_000_000.0
+# A locked VLP-16 counts whole microseconds.
+_LOCKED_SIGMA_NS = 1_000.0
+# A board that a person moves by hand, in haste.
+BOARD_SPEED_MPS = 1.0
+
+
+class SyncVerdict(NamedTuple):
+    """Whether boards must stand still while they are captured; `reasons` are empty where they may move."""
+
+    reasons: tuple[Finding, ...]
+
+    @property
+    def requires_still_boards(self) -> bool:
+        """Whether they must."""
+        return bool(self.reasons)
+
+    @property
+    def finding(self) -> Finding:
+        """The verdict itself, without the reasons."""
+        return findings.BOARDS_MUST_STAND() if self.reasons else findings.BOARDS_MAY_MOVE()
+
+
+class CommonClock:
+    """The rig's clock, and the models from the sensors' clocks to it.
+
+    Attributes:
+        models: by the sensor's name, from its clock to the rig's; what was placed before keeps its time.
+    """
+
+    def __init__(self, models: Mapping[str, ClockModel] | None = None) -> None:
+        self.models = dict(models or {})
+
+    def place(self, sample: LiveSample) -> LiveSample:
+        """Give a sample with its timestamps on the rig's clock; as it is where its sensor is not tied."""
+        model = self.models.get(sample.sensor)
+        if model is None:
+            return sample
+        if isinstance(sample, Events):
+            return replace(sample, t_ns=model.convert_all(sample.t_ns))
+        if sample.stamp_ns is None:
+            return sample
+        return replace(sample, stamp_ns=model.convert(sample.stamp_ns))
+
+    def sigma_ns(self, sensor: str, time_ns: int) -> float | None:
+        """Give a timestamp's standard deviation at a time of the rig's clock; None where not tied."""
+        model = self.models.get(sensor)
+        return None if model is None else model.inverse().sigma_ns(time_ns)
+
+
+def pair_times(frame: Frame, rig: Rig, clock: CommonClock) -> list[dict[str, object]]:
+    """Measure how far the images and further scans of a frame lie from its first scan.
+
+    Args:
+        frame: its samples' timestamps are on the rig's clock.
+        rig: says what to add to timestamps, and how far pairs may lie apart.
+        clock: how the timestamps came there.
+
+    Returns:
+        An entry of the capture's manifest for each: `stream` ("cam.frames", or a second LiDAR), `lidar`,
+        `difference_s` of its time minus the middle of the scan, `sigma_s` of that by the clock models, None
+        where a clock is not tied, `tolerance_s` of the profile, and the models in words, `clock`.
+    """
+    anchor, pairs = frame.scans[0], list[dict[str, object]]()
+    parts: list[Image | Scan] = [*frame.images, *frame.scans[1:]]
+    for part in parts:
+        if isinstance(part, Image):
+            stream, time_ns = f"{part.sensor}.{part.channel}", rig_time_ns(part, rig)
+        else:
+            stream, time_ns = part.sensor, middle_of_sweep_ns(part, rig)
+        if time_ns is None:
+            continue
+        sensors = (part.sensor, anchor.sensor)
+        sigmas = [clock.sigma_ns(sensor, frame.time_ns) for sensor in sensors]
+        known = [sigma for sigma in sigmas if sigma is not None]
+        sigma_ns = sum(sigma**2 for sigma in known) ** 0.5
+        words = [f"{sensor}: {clock.models.get(sensor) or 'its own timestamps'}" for sensor in sensors]
+        pair = {
+            "stream": stream,
+            "lidar": anchor.sensor,
+            "difference_s": round((time_ns - frame.time_ns) * 1e-9, 9),
+            "sigma_s": round(sigma_ns * 1e-9, 9) if len(known) == len(sigmas) else None,
+            "tolerance_s": round(tolerance_ns(part, anchor, rig)) * 1e-9,
+            "clock": "; ".join(words),
+        }
+        pairs.append(pair)
+    return pairs
+
+
+def judge_sync(rig: Rig, clock: CommonClock | None = None) -> SyncVerdict:
+    """Judge whether the sensors' times are good enough for boards that move.
+
+    A board that is carried moves by a metre in a second: the times must be known to within
+    quality.max_motion_m / (1 m/s).
+
+    Args:
+        rig: says which sensors are synchronised.
+        clock: how well they are; None where only the profile is known.
+    """
+    limit_ns = rig.quality.max_motion_m / BOARD_SPEED_MPS * 1e9
+    sensors = [(name, f"lidars.{name}", lidar.timestamps) for name, lidar in rig.lidars.items()]
+    for name, camera in rig.cameras.items():
+        for channel, settings in camera.channels.items():
+            sensors.append((name, f"cameras.{name}.channels.{channel}", settings.timestamps))
+    reasons: list[Finding] = []
+    for name, key, timestamps in sensors:
+        model = None if clock is None else clock.models.get(name)
+        reason: Finding | None = None
+        if timestamps.sync == "none":
+            reason = findings.NONE_IN_PROFILE(name, key=f"{key}.timestamps.sync")
+        elif clock is not None and model is None:
+            reason = findings.NOT_TIED(name)
+        elif model is not None and model.sigma_ns(model.last_ns) > limit_ns:
+            sigma_ms = model.sigma_ns(model.last_ns) / 1e6
+            reason = findings.TOO_UNCERTAIN(name, sigma_ms=sigma_ms, limit_ms=limit_ns / 1e6)
+        # Channels of one camera share its clock.
+        if reason is not None and reason not in reasons:
+            reasons.append(reason)
+    return SyncVerdict(tuple(reasons))
 
 
 class EdgeClock:
     """Pulses of the board and edges that a sensor saw, and the board's time on that sensor's clock.
+
+    A DAVIS346 stamps the edges at its trigger input and does not number them. Which edge is which pulse
+    follows from a coarse model of its clock; once a fit is made, the fit itself decides.
 
     Attributes:
         problem: why there is no model; None while there is one.
@@ -47,7 +169,7 @@ class EdgeClock:
             sensor: its name in the profile.
             coarse_error_ns: how far off the coarse model may be.
         """
-        self.problem: Finding | None = Finding("edges.none_seen", "error", sensor)
+        self.problem: Finding | None = findings.NO_EDGES(sensor)
         self._sensor = sensor
         self._coarse_error_ns = coarse_error_ns
         self._coarse: ClockModel | None = None
@@ -83,41 +205,29 @@ class EdgeClock:
         if start is None or len(self._sent_ns) < MIN_PAIRS or not self._seen_ns:
             return None
         sent_ns = _recent(self._sent_ns)
-        seen_ns = self._seen_during(sent_ns, start)
+        # Edges whose pulses are known; others say nothing.
+        back, seen_ns = start.inverse(), _recent(self._seen_ns)
+        first_ns = back.convert(int(sent_ns[0])) - self._coarse_error_ns
+        last_ns = back.convert(int(sent_ns[-1])) + self._coarse_error_ns
+        seen_ns = seen_ns[(seen_ns >= first_ns) & (seen_ns <= last_ns)]
         if len(seen_ns) < MIN_PAIRS:
             return None
         least_ns = float(np.diff(sent_ns).min())
         if self._model is None and self._coarse_error_ns > _NEAR * least_ns:
-            figures = {"sigma_ms": self._coarse_error_ns / 1e6, "period_ms": least_ns / 1e6}
-            self.problem = Finding("edges.too_close", "error", self._sensor, figures)
+            sigma_ms, period_ms = self._coarse_error_ns / 1e6, least_ns / 1e6
+            self.problem = findings.EDGES_TOO_CLOSE(self._sensor, sigma_ms=sigma_ms, period_ms=period_ms)
             return None
         pairs = match_edges(seen_ns, sent_ns, start, min(self._coarse_error_ns, _NEAR * least_ns))
         if pairs is None or len(pairs) < max(MIN_PAIRS, _MIN_MATCHED * len(seen_ns)):
-            self.problem = Finding("edges.not_the_pulses", "error", self._sensor)
+            self.problem = findings.EDGES_NOT_THE_PULSES(self._sensor)
             return None
         self._model, self.problem = fit_clock(pairs, "edges", RESOLUTION_NS), None
         return self._model
-
-    def _seen_during(self, sent_ns: Stamps, start: ClockModel) -> Stamps:
-        """Give the edges whose pulses are known; others say nothing."""
-        back = start.inverse()
-        first_ns = back.convert(int(sent_ns[0])) - self._coarse_error_ns
-        last_ns = back.convert(int(sent_ns[-1])) + self._coarse_error_ns
-        seen_ns = _recent(self._seen_ns)
-        return np.asarray(seen_ns[(seen_ns >= first_ns) & (seen_ns <= last_ns)])
 
 
 def _recent(times_ns: deque[int]) -> Stamps:
     times = np.array(times_ns, dtype=np.int64)
     return np.asarray(times[times >= times[-1] - _WINDOW_NS])
-
-
-#: Pulses a second at which the first images are matched.
-SLOW_TRIGGERS_HZ = 4.0
-# A DAVIS takes the computer's time when it is opened.
-_COARSE_EDGE_NS = 100_000_000.0
-# A locked VLP-16 counts whole microseconds.
-_LOCKED_SIGMA_NS = 1_000.0
 
 
 class RigClock:
@@ -144,17 +254,15 @@ class RigClock:
         self._edges: dict[str, EdgeClock] = {}
         self._edge_models: dict[str, ClockModel | None] = {}
         self._is_slow = False
-        if has_board and rig.sync is not None:
-            self._set_up(rig.sync.triggers, edge_cameras)
-
-    def _set_up(self, triggers: Mapping[str, TriggerSettings], edge_cameras: Collection[str]) -> None:
-        for name in self._rig.cameras:
+        is_tied = has_board and rig.sync is not None
+        triggers = rig.sync.triggers if rig.sync is not None else {}
+        for name in rig.cameras if is_tied else ():
             if name in edge_cameras:
                 self._edges[name] = EdgeClock(name, _COARSE_EDGE_NS)
             elif name in triggers:
-                self._matchers[name] = TriggerMatcher(name, round(1e9 * triggers[name].max_delay_s))
-        fast = [triggers[name] for name in self._matchers]
-        self._is_slow = any(trigger.rate_hz * trigger.max_delay_s >= 1 for trigger in fast)
+                trigger = triggers[name]
+                self._matchers[name] = TriggerMatcher(name, round(1e9 * trigger.max_delay_s))
+                self._is_slow |= trigger.rate_hz * trigger.max_delay_s >= 1
 
     @property
     def needs_slow_triggers(self) -> bool:
@@ -185,14 +293,25 @@ class RigClock:
             locked: LiDARs whose timestamps are UTC by the board's pulses.
         """
         self._host, self._utc = host_clock, utc_clock
-        host = self._rig_from_host()
+        # For timestamps of the computer's time; None where it is the rig's clock itself.
+        host = host_clock.inverse().then(utc_clock) if host_clock and utc_clock else None
         for name in self._rig.lidars:
             own = ClockModel.identity(_LOCKED_SIGMA_NS, "UTC by PPS and NMEA")
             self._tie(name, own if name in locked else host)
         for name in self._rig.cameras:
             if name not in self._edges:
                 self._tie(name, host)
-        self._refresh_board()
+        board_clock = self._utc or self._host
+        if board_clock is None or self._host is None:
+            return
+        for matcher in self._matchers.values():
+            matcher.set_clock(self._host.inverse())
+        for name, edges in self._edges.items():
+            edges.set_clock(self._host.inverse())
+            model = self._edge_models[name] = edges.fit()
+            self._tie(name, None if model is None else model.then(board_clock))
+        if all(matcher.problem is None for matcher in self._matchers.values()):
+            self._is_slow = False
 
     def edge_clock(self, camera: str) -> tuple[ClockModel | None, Finding | None]:
         """Give the board's time on the clock of a camera that stamps its edges; or why there is none."""
@@ -207,7 +326,7 @@ class RigClock:
     def account(self) -> list[Finding]:
         """List the cameras whose counts slipped against their pulses so far."""
         return [
-            Finding("pulses.slipped", "note", name, matcher.figures())
+            Finding(findings.SLIPPED.code, findings.SLIPPED.severity, name, matcher.figures())
             for name, matcher in self._matchers.items()
             if matcher.losses.n("pulses.slip", "pulses.restart")
         ]
@@ -215,7 +334,7 @@ class RigClock:
     def verdict(self) -> SyncVerdict:
         """Judge whether boards must stand still while they are captured."""
         if not self._has_board:
-            return SyncVerdict(True, (Finding("sync.no_board", "warning"),))
+            return SyncVerdict((findings.NO_BOARD(),))
         return judge_sync(self._rig, self.common)
 
     def _take_pulse(self, source: str, pulse: Pulse) -> list[Sample]:
@@ -246,30 +365,11 @@ class RigClock:
         assert not isinstance(placed, Pulse)
         return placed
 
-    def _refresh_board(self) -> None:
-        clock = self._utc or self._host
-        if clock is None or self._host is None:
-            return
-        for matcher in self._matchers.values():
-            matcher.set_clock(self._host.inverse())
-        for name, edges in self._edges.items():
-            edges.set_clock(self._host.inverse())
-            model = self._edge_models[name] = edges.fit()
-            self._tie(name, None if model is None else model.then(clock))
-        if all(matcher.problem is None for matcher in self._matchers.values()):
-            self._is_slow = False
-
-    def _rig_from_host(self) -> ClockModel | None:
-        """Give the model for timestamps of the computer's time; None where it is the rig's clock itself."""
-        if self._host is None or self._utc is None:
-            return None
-        return self._host.inverse().then(self._utc)
-
     def _tie(self, sensor: str, model: ClockModel | None) -> None:
         if model is None:
-            self.common.untie(sensor)
+            self.common.models.pop(sensor, None)
         else:
-            self.common.tie(sensor, model)
+            self.common.models[sensor] = model
 
 
 def edge_line(rig: Rig, camera: str) -> str:

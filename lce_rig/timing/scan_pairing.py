@@ -137,7 +137,7 @@ class _Pairing:
             apart_ns, sample = abs(buffer[0][0] - time_ns), buffer[0][1]
             if isinstance(sample, Image):
                 nearest_ns = apart_ns if nearest_ns is None else min(apart_ns, nearest_ns)
-            if apart_ns > _tolerance_ns(sample, scan, self._rig):
+            if apart_ns > tolerance_ns(sample, scan, self._rig):
                 continue
             if isinstance(sample, Image):
                 images.append(sample)
@@ -170,7 +170,8 @@ def _half_sweep_ns(scan: Scan, rig: Rig) -> int:
     return int(scan.offset_ns.max()) // 2
 
 
-def _tolerance_ns(sample: Image | Scan, scan: Scan, rig: Rig) -> float:
+def tolerance_ns(sample: Image | Scan, scan: Scan, rig: Rig) -> float:
+    """Return how far a sample may lie from a scan, by the wider tolerance of the two streams."""
     lidar = rig.lidars[scan.sensor].timestamps.tolerance_s
     if isinstance(sample, Image):
         other = rig.cameras[sample.sensor].channels[sample.channel].timestamps.tolerance_s

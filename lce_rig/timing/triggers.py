@@ -9,12 +9,13 @@ missed, or a frame that its driver did not number, shifts every later image by w
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from statistics import median
+from typing import NamedTuple
 
 from lce_rig.core.data import Image, Pulse
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Figure, Finding, Kind
 from lce_rig.core.losses import Losses
+from lce_rig.timing import findings
 from lce_rig.timing.clock import ClockModel
 
 # VersaVIS, too, asks for four in a row.
@@ -32,18 +33,17 @@ _N_PULSES = 1024
 _N_RECENT = 8
 _MAX_INTERPOLATED = 8
 _LOSSES = {
-    "n_unmatched": "pulses.image_unmatched",
-    "n_lost_frames": "pulses.image_lost",
-    "n_lost_pulses": "pulses.message_lost",
-    "n_missed": "pulses.missed_by_camera",
-    "n_repeated": "pulses.repeated",
-    "n_slips": "pulses.slip",
-    "n_restarts": "pulses.restart",
+    "n_unmatched": findings.IMAGE_UNMATCHED,
+    "n_lost_frames": findings.IMAGE_LOST,
+    "n_lost_pulses": findings.MESSAGE_LOST,
+    "n_missed": findings.MISSED_BY_CAMERA,
+    "n_repeated": findings.REPEATED,
+    "n_slips": findings.SLIP,
+    "n_restarts": findings.RESTART,
 }
 
 
-@dataclass(frozen=True, eq=False)
-class TriggeredImage:
+class TriggeredImage(NamedTuple):
     """An image and the pulse that made it.
 
     Attributes:
@@ -61,8 +61,7 @@ class TriggeredImage:
     is_interpolated: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _Waiting:
+class _Waiting(NamedTuple):
     image: Image
     number: int
     board_ns: int
@@ -87,7 +86,7 @@ class TriggerMatcher:
         """
         self.n_matched = 0
         self.losses = Losses()
-        self.problem: Finding | None = Finding("pulses.nothing_yet", "error", camera)
+        self.problem: Finding | None = findings.NOTHING_YET(camera)
         self._camera = camera
         self._window_ns = (min_delay_ns, max_delay_ns)
         self._clock: ClockModel | None = None
@@ -111,7 +110,7 @@ class TriggerMatcher:
             if pulse.stamp_ns <= self._pulses.last_ns and pulse.stamp_ns in self._pulses:
                 self._lose("n_repeated")
                 return []
-            self._begin_anew("pulses.board_restarted")
+            self._restart(findings.BOARD_RESTARTED)
             self._pulses.clear()
         self._pulses.add(pulse.count, pulse.stamp_ns)
         return list(self._proceed())
@@ -120,21 +119,22 @@ class TriggerMatcher:
         """Take an image, and give those whose pulses are now known."""
         if image.count is None or image.stamp_ns is None or self._clock is None:
             self._lose("n_unmatched")
-            code = "pulses.images_not_numbered" if image.count is None else "pulses.clock_not_tied"
-            self.problem = Finding(code, "error", self._camera)
+            is_numbered = image.count is not None
+            kind = findings.CLOCK_NOT_TIED if is_numbered else findings.IMAGES_NOT_NUMBERED
+            self.problem = kind(self._camera)
             return []
         if self._last is not None and image.count <= self._last[0]:
             if image.stamp_ns <= self._last[1]:
                 self._lose("n_repeated")
                 return []
-            self._begin_anew("pulses.camera_restarted")
+            self._restart(findings.CAMERA_RESTARTED)
         elif self._last is not None:
             self._lose("n_lost_frames", image.count - self._last[0] - 1)
         self._last = image.count, image.stamp_ns
         if len(self._waiting) == _N_WAITING:
             self._waiting.popleft()
             self._lose("n_unmatched")
-            self.problem = Finding("pulses.none", "error", self._camera)
+            self.problem = findings.NO_PULSES(self._camera)
         self._waiting.append(_Waiting(image, image.count, self._clock.convert(image.stamp_ns)))
         return list(self._proceed())
 
@@ -159,26 +159,25 @@ class TriggerMatcher:
         is_ambiguous = len(possible) > 1 or self._pulses.least_period_ns() < most_ns - least_ns
         constant = frame.number - possible[0] if len(possible) == 1 and not is_ambiguous else None
         if is_ambiguous:
-            window = {"window_ms": (most_ns - least_ns) / 1e6}
-            self.problem = Finding("pulses.ambiguous", "error", self._camera, window)
+            self.problem = findings.AMBIGUOUS_PULSES(self._camera, window_ms=(most_ns - least_ns) / 1e6)
         elif not possible:
-            self.problem = Finding("pulses.images_without", "error", self._camera)
+            self.problem = findings.IMAGES_WITHOUT_PULSES(self._camera)
         if constant is None or constant != self._candidate:
             self._drop(self._agreeing)
             self._candidate = constant
         if constant is None:
             self._lose("n_unmatched")
             return
-        self._agreeing = [*self._agreeing, frame]
+        self._agreeing.append(frame)
         if len(self._agreeing) == N_AGREE:
             self._constant, self.problem = constant, None
             agreeing, self._agreeing = self._agreeing, []
-            for known in agreeing:
-                found = self._pulses.time_of(known.number - constant)
-                assert found is not None
-                self._delays_ns.append(known.board_ns - found[0])
-            for known in agreeing:
-                yield from self._emit(known)
+            for image in agreeing:
+                pulse = self._pulses.time_of(image.number - constant)
+                assert pulse is not None
+                self._delays_ns.append(image.board_ns - pulse[0])
+            for image in agreeing:
+                yield from self._emit(image)
 
     def _follow(self, frame: _Waiting) -> Iterator[TriggeredImage]:
         """Match by number, and keep an eye on the time."""
@@ -190,63 +189,58 @@ class TriggerMatcher:
         if shift == 0:
             # What looked like a slip was an image with a late timestamp.
             doubtful, self._doubtful = self._doubtful, []
-            for known in (*doubtful, frame):
-                yield from self._emit(known)
-            found = self._pulses.time_of(frame.number - self._constant)
-            if found is not None:
-                self._delays_ns.append(frame.board_ns - found[0])
+            for image in (*doubtful, frame):
+                yield from self._emit(image)
+            pulse = self._pulses.time_of(frame.number - self._constant)
+            if pulse is not None:
+                self._delays_ns.append(frame.board_ns - pulse[0])
             return
         self._doubtful.append(frame)
-        if len(self._doubtful) == N_AGREE:
-            doubtful, self._doubtful = self._doubtful, []
-            yield from self._settle(doubtful)
-
-    def _settle(self, doubtful: list[_Waiting]) -> Iterator[TriggeredImage]:
-        """Decide on several images in a row that are at odds with their pulses' times."""
-        shifts = {self._shift(frame) for frame in doubtful}
-        shift = shifts.pop()
-        if shifts or shift is None or self._is_slipping(doubtful[-1].number):
-            self._drop(doubtful)
-            self._begin_anew("pulses.not_followed")
+        if len(self._doubtful) < N_AGREE:
             return
-        assert self._constant is not None
+        # Several images in a row are at odds with their pulses' times.
+        doubtful, self._doubtful = self._doubtful, []
+        shifts = {self._shift(image) for image in doubtful}
+        shift = shifts.pop()
+        slips = self._slipped_at
+        is_slipping = len(slips) == _N_SLIPS_DOUBTFUL and frame.number - slips[0] < _SLIP_WINDOW
+        if shifts or shift is None or is_slipping:
+            self._drop(doubtful)
+            self._restart(findings.PULSES_NOT_FOLLOWED)
+            return
         self._constant -= shift
         self._lose("n_slips")
         self._lose("n_missed", max(shift, 0))
         self._slipped_at.append(doubtful[-1].number)
-        for frame in doubtful:
-            yield from self._emit(frame)
-
-    def _is_slipping(self, number: int) -> bool:
-        is_full = len(self._slipped_at) == _N_SLIPS_DOUBTFUL
-        return is_full and number - self._slipped_at[0] < _SLIP_WINDOW
+        for image in doubtful:
+            yield from self._emit(image)
 
     def _shift(self, frame: _Waiting) -> int | None:
-        """Tell by how many pulses an image's time is off its number's; None where it is between pulses."""
+        """Return by how many pulses an image's time is off its number's; None where it is between pulses."""
         assert self._constant is not None
         number = frame.number - self._constant
         made_ns = frame.board_ns - round(median(self._delays_ns))
-        found = self._pulses.time_of(number)
-        if found is None:
+        pulse = self._pulses.time_of(number)
+        if pulse is None:
             return 0
-        off = (made_ns - found[0]) / self._pulses.period_ns(number)
+        off = (made_ns - pulse[0]) / self._pulses.period_ns(number)
         return round(off) if abs(off - round(off)) < _NEAR and abs(off) < _MAX_SLIP else None
 
     def _emit(self, frame: _Waiting) -> Iterator[TriggeredImage]:
         assert self._constant is not None
         number = frame.number - self._constant
-        found = self._pulses.time_of(number)
-        if found is None:
+        pulse = self._pulses.time_of(number)
+        if pulse is None:
             self._lose("n_unmatched")
             return
-        time_ns, is_interpolated = found
+        time_ns, is_interpolated = pulse
         self._lose("n_lost_pulses", is_interpolated)
         self.n_matched += 1
         stamp_ns = time_ns + round(median(self._delays_ns))
         yield TriggeredImage(frame.image, number, time_ns, stamp_ns, is_interpolated)
 
-    def _begin_anew(self, code: str) -> None:
-        self.problem = Finding(code, "error", self._camera)
+    def _restart(self, reason: Kind) -> None:
+        self.problem = reason(self._camera)
         self._lose("n_restarts")
         for frames in (self._waiting, self._agreeing, self._doubtful):
             self._drop(frames)
@@ -256,10 +250,13 @@ class TriggerMatcher:
 
     def figures(self) -> dict[str, Figure]:
         """Give how matching went: n_matched, and what was lost by its name."""
-        return {"n_matched": self.n_matched, **{name: self.losses.n(code) for name, code in _LOSSES.items()}}
+        return {
+            "n_matched": self.n_matched,
+            **{name: self.losses.n(kind.code) for name, kind in _LOSSES.items()},
+        }
 
     def _lose(self, name: str, n: int = 1) -> None:
-        self.losses.add(Finding(_LOSSES[name], "note", self._camera), n)
+        self.losses.add(_LOSSES[name](self._camera), n)
 
     def _drop(self, frames: list[_Waiting] | deque[_Waiting]) -> None:
         self._lose("n_unmatched", len(frames))
@@ -329,14 +326,14 @@ class PulseLog:
         return self._times_ns[after - 1] + span_ns * (count - self._counts[after - 1]) // n_apart, True
 
     def period_ns(self, count: int) -> float:
-        """Tell the time between two pulses about a number; infinite where there is but one pulse."""
+        """Return the time between two pulses about a number; infinite where there is but one pulse."""
         if len(self._counts) < 2:
             return float("inf")
         after = min(max(bisect_left(self._counts, count), 1), len(self._counts) - 1)
         return self._period_before(after)
 
     def least_period_ns(self) -> float:
-        """Tell the shortest time between two pulses among the last few."""
+        """Return the shortest time between two pulses among the last few."""
         recent = range(max(1, len(self._counts) - _N_RECENT), len(self._counts))
         return min((self._period_before(after) for after in recent), default=float("inf"))
 

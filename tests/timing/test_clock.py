@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.timing.clock import HOUR_NS, ClockModel, resolve_hour
-from lce_rig.timing.clock_fit import TimePairs, fit_arrivals, fit_clock, match_edges
-from lce_rig.timing.clock_tracker import ClockTracker
+from lce_rig.timing.clock_fit import ClockTracker, TimePairs, fit_arrivals, fit_clock, match_edges
 
 START_NS = 1_753_000_000_123_456_789
 S = 1_000_000_000

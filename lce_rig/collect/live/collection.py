@@ -38,9 +38,8 @@ from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
-from lce_rig.timing.rig_clock import RigClock
+from lce_rig.timing.rig_clock import RigClock, pair_times
 from lce_rig.timing.scan_pairing import Frame
-from lce_rig.timing.sync import pair_times
 from lce_rig.words import describe, sentence
 
 # The board searched for in a process of its own, while this one reads sensors.
@@ -323,7 +322,7 @@ class _Loop:
     def _capture(self, moment: CaptureMoment) -> None:
         detection, gate = moment.detection, self._find_gate()
         frame = detection.frame
-        pairs = [pair.to_meta() for pair in pair_times(frame, self._rig, self._clock.common)]
+        pairs = pair_times(frame, self._rig, self._clock.common)
         verdict = self._clock.verdict()
         meta: dict[str, object] = {
             "source": {"key": f"live:{frame.time_ns}", "label": f"live, at {frame.time_ns} ns"},
