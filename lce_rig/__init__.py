@@ -89,10 +89,8 @@ __all__ = [
 ]
 __version__ = "0.1.0"
 
-# OpenCV reads this once, when it is first loaded: images that declare more are refused before any
-# memory is taken.
-# `core/image_codec.py` does the same in words, wherever OpenCV was loaded before. The figure is MAX_PIXELS of
-# `core/limits.py`.
+# OpenCV reads this once, when it is first loaded: images that declare more are refused before any memory is
+# taken.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
 
 _HOMES = {

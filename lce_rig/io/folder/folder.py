@@ -8,7 +8,6 @@ from pathlib import Path
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError, reading
-from lce_rig.core.limits import read_file
 from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.folder.cloud_file import DECODERS, read_cloud
 from lce_rig.io.folder.file_pairs import Pairing, natural_order, pair_names, parse_times
@@ -134,8 +133,8 @@ class PairOnDisk:
         sensors = [f"{image.camera} {image.channel}" for image in self.images]
         digest = hashlib.sha256(" ".join([*sensors, self.lidar]).encode())
         for path in (*(image.path for image in self.images), self.cloud_path):
-            with reading(path, SourceError):
-                digest.update(hashlib.sha256(read_file(path)).digest())
+            with reading(path):
+                digest.update(hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 
     def read(self) -> RecordedPair:

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.errors import SourceError, reading
+from lce_rig.core.errors import reading
 from lce_rig.core.image_codec import decode_pixels
-from lce_rig.core.limits import read_file
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 
@@ -24,8 +23,8 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         SourceError: the file is missing, empty, truncated or no image.
     """
-    with reading(path, SourceError):
-        return decode_image(read_file(path))
+    with reading(path):
+        return decode_image(path.read_bytes())
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8]:
