@@ -1,21 +1,21 @@
-"""Extrinsic calibration of one camera and one LiDAR from pairs of detected boards."""
+"""Extrinsic calibration of one camera and one LiDAR from pairs of detected boards.
 
-from lce_rig.calibrate.channels import calibrate_channels
-from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.methods import fit_extrinsic
-from lce_rig.calibrate.metrics import capture_residual, error_to_reference
-from lce_rig.calibrate.options import Algorithm1Parts, CalibrateOptions, CaptureCandidates, EstimateSettings
-from lce_rig.calibrate.shared_scans import Clocks
+`estimate` tells the method. Read `observations`, `consensus`, `motion/`, `algorithm_1/`, `likelihood/` and
+`uncertainty` in this order.
+"""
+
+from lce_rig.calibrate.estimate import estimate_extrinsics, fit_extrinsic
+from lce_rig.calibrate.observations import Clocks
+from lce_rig.calibrate.options import CalibrateOptions, EstimateSettings
+from lce_rig.calibrate.result import CalibrationEstimate, capture_residual, error_to_reference
 
 __all__ = [
-    "Algorithm1Parts",
     "CalibrateOptions",
     "CalibrationEstimate",
-    "CaptureCandidates",
     "Clocks",
     "EstimateSettings",
-    "calibrate_channels",
     "capture_residual",
     "error_to_reference",
+    "estimate_extrinsics",
     "fit_extrinsic",
 ]

@@ -17,12 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.registration import rotation_from_directions
-from lce_rig.calibrate.options import CaptureCandidates
+from lce_rig.calibrate.findings import ELSEWHERE, FEW_AGREE, FEW_CAPTURES
 from lce_rig.core.board import Board
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose
-from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+from lce_rig.core.results import ImageBoard, Observation
 
+# Three planes determine six unknowns.
+_MIN_CAPTURES = 3
 NORMAL_TOLERANCE_RAD = np.radians(12.0)
 CENTRE_TOLERANCE_M = 0.15
 _N_PROPOSALS = 400
@@ -68,38 +71,54 @@ class _Pairs:
     centre_lidar: Array
 
 
-def find_consensus(candidates: Sequence[CaptureCandidates], board: Board) -> Consensus | None:
+def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus:
     """Choose the pairs that agree with one rigid transform.
 
     Args:
-        candidates: of each capture.
+        candidates: of each capture, in any order, with all places in the scan where the board may be.
         board: its size sets the scale at which an angle weighs as much as a distance.
 
-    Returns:
-        The consensus; None if no three captures agree with any extrinsics.
+    Raises:
+        NotEnoughDataError: too few captures, or captures that agree with no extrinsics.
     """
+    n_captures, needed = len(candidates), _MIN_CAPTURES
+    if n_captures < needed:
+        raise NotEnoughDataError.of(FEW_CAPTURES(n_captures=n_captures, n_needed=needed))
     candidates = sorted(candidates, key=lambda item: item.capture)
     pairs = _list_pairs(candidates)
-    agreement = _agreement(pairs)
-    proposals = _propose(pairs, agreement, scale_m=np.hypot(board.width_m, board.height_m) / 2)
+    proposals = _propose(pairs, _agreement(pairs), scale_m=np.hypot(board.width_m, board.height_m) / 2)
     if proposals is None:
-        return None
+        raise NotEnoughDataError.of(FEW_AGREE(n_agreeing=0, n_captures=n_captures, n_needed=needed))
     R, t = proposals
     scores = np.concatenate([_score(pairs, R[i : i + 64], t[i : i + 64])[0] for i in range(0, len(R), 64)])
     best = int(np.argmax(scores))
-    R_best, t_best, chosen = _refine(pairs, R[best], t[best], len(candidates))
-    agreeing = np.flatnonzero(chosen >= 0)
-    if len(agreeing) < 3:
-        return None
-    observations = tuple(_observation(candidates[k], pairs, chosen[k]) for k in agreeing)
-    refused = {
-        candidates[k].capture: _explain(
-            candidates[k], pairs, np.flatnonzero(pairs.capture == k), R_best, t_best
-        )
-        for k in np.flatnonzero(chosen < 0)
-    }
-    n_alternative = int(np.sum(pairs.pose[chosen[agreeing]] == 1))
-    return Consensus(pose(R_best, t_best), observations, refused, n_alternative)
+    R_best, t_best, chosen = _refine(pairs, R[best], t[best], n_captures)
+    n_agreeing = int(np.count_nonzero(chosen >= 0))
+    if n_agreeing < needed:
+        raise NotEnoughDataError.of(FEW_AGREE(n_agreeing=n_agreeing, n_captures=n_captures, n_needed=needed))
+
+    observations, refused, n_alternative = [], {}, 0
+    angle, distance = (values[0] for values in _misfit(pairs, R_best[None], t_best[None]))
+    r2 = (angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2
+    for k, item in enumerate(candidates):
+        if chosen[k] >= 0:
+            is_alternative = pairs.pose[chosen[k]] == 1
+            n_alternative += int(is_alternative)
+            T_cam_board = camera_poses(item.image)[pairs.pose[chosen[k]]]
+            image = replace(item.image, T_cam_board=T_cam_board) if is_alternative else item.image
+            lidar = item.places[pairs.candidate[chosen[k]]]
+            observations.append(replace(item, image=image, lidar=lidar, others=()))
+        else:
+            rows = np.flatnonzero(pairs.capture == k)
+            nearest = rows[np.argmin(r2[rows])]
+            refused[item.capture] = ELSEWHERE.refusal(
+                n_candidates=len(item.places),
+                candidate=int(pairs.candidate[nearest]),
+                distance_m=float(distance[nearest]),
+                rotation_deg=float(np.degrees(angle[nearest])),
+                action="hold_still" if distance[nearest] > _MOVED_M else "",
+            )
+    return Consensus(pose(R_best, t_best), tuple(observations), refused, n_alternative)
 
 
 def camera_poses(image: ImageBoard) -> list[Array]:
@@ -109,29 +128,25 @@ def camera_poses(image: ImageBoard) -> list[Array]:
     return [image.T_cam_board, image.T_cam_board_alternative]
 
 
-def _list_pairs(candidates: Sequence[CaptureCandidates]) -> _Pairs:
+def _list_pairs(candidates: Sequence[Observation]) -> _Pairs:
     index = [
         (k, p, c)
         for k, item in enumerate(candidates)
         for p in range(len(camera_poses(item.image)))
-        for c in range(len(item.lidar))
+        for c in range(len(item.places))
     ]
-    T_cam = np.array([camera_poses(candidates[k].image)[p] for k, p, _ in index]).reshape(-1, 4, 4)
-    lidars = [candidates[k].lidar[c] for k, _, c in index]
-    columns = np.array(index, dtype=np.intp).reshape(-1, 3)
+    T_cam = np.array([camera_poses(candidates[k].image)[p] for k, p, _ in index])
+    lidars = [candidates[k].places[c] for k, _, c in index]
+    columns = np.array(index, dtype=np.intp)
     return _Pairs(
         capture=columns[:, 0],
         pose=columns[:, 1],
         candidate=columns[:, 2],
         normal_cam=T_cam[:, :3, 2],
-        normal_lidar=np.array([board.plane[:3] for board in lidars]).reshape(-1, 3),
+        normal_lidar=np.array([board.plane[:3] for board in lidars]),
         centre_cam=T_cam[:, :3, 3],
-        centre_lidar=np.array([_centre(board) for board in lidars]).reshape(-1, 3),
+        centre_lidar=np.array([board.T_lidar_board[:3, 3] for board in lidars]),
     )
-
-
-def _centre(board: LidarBoard) -> Array:
-    return board.T_lidar_board[:3, 3]
 
 
 def _agreement(pairs: _Pairs) -> NDArray[np.float32]:
@@ -212,25 +227,3 @@ def _refine(pairs: _Pairs, R: Array, t: Array, n_captures: int) -> tuple[Array, 
         )
         t = mean_cam - R @ mean_lidar
     return R, t, chosen
-
-
-def _observation(item: CaptureCandidates, pairs: _Pairs, index: int) -> Observation:
-    T_cam_board = camera_poses(item.image)[pairs.pose[index]]
-    image = item.image if pairs.pose[index] == 0 else replace(item.image, T_cam_board=T_cam_board)
-    return Observation(item.capture, image, item.lidar[pairs.candidate[index]], item.session)
-
-
-def _explain(item: CaptureCandidates, pairs: _Pairs, rows: NDArray[np.intp], R: Array, t: Array) -> Refusal:
-    """State the deviation of a capture's best pair from the consensus."""
-    if len(rows) == 0:
-        return Refusal("pair.no_candidate")
-    angle, distance = (values[0, rows] for values in _misfit(pairs, R[None], t[None]))
-    best = int(np.argmin((angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2))
-    figures = {
-        "n_candidates": len(item.lidar),
-        "candidate": int(pairs.candidate[rows[best]]),
-        "distance_m": float(distance[best]),
-        "rotation_deg": float(np.degrees(angle[best])),
-    }
-    action = "hold_still" if distance[best] > _MOVED_M else ""
-    return Refusal("pair.elsewhere", figures=figures, action=action)

@@ -1,73 +1,244 @@
-"""The result of a calibration."""
+"""The method, from the boards that both sensors saw to extrinsics with their uncertainty.
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+    find_consensus       the captures of each channel that agree on one rigid transform
+    join_scans           the images of all channels that share a scan
+    estimate_motion      time offsets and motion of the boards: one pose of the board at the time of each scan
+    solve                Algorithm 1: extrinsics from planes and ring ends, certified, without outliers
+    refine               method "ml": extrinsics, board poses and constant errors of maximum likelihood
+    by_scatter,
+    by_likelihood        uncertainty
 
-from lce_rig.calibrate.known_lidar import KnownLidar
-from lce_rig.calibrate.quadratics import Quadratics
-from lce_rig.calibrate.tolerances import Sensitivity
-from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Metrics
-from lce_rig.core.diagnostics import Diagnostics
-from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array
+Channels of one camera, frames and events, share pixels and lens, not their times. Together they give one set
+of extrinsics; each is also calibrated alone, and two are compared by Algorithm 1, as a camera has one pose.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lce_rig.calibrate.algorithm_1.algorithm import Progress, solve
+from lce_rig.calibrate.consensus import Consensus, find_consensus
+from lce_rig.calibrate.likelihood.levels import what_is_known
+from lce_rig.calibrate.likelihood.refine import refine
+from lce_rig.calibrate.motion.board_motion import sample_poses
+from lce_rig.calibrate.motion.time_offsets import MIN_MOVING, Motion, estimate_motion
+from lce_rig.calibrate.observations import Clocks, join_scans, pooled_noise_px
+from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.plane_and_ends import along_normals
+from lce_rig.calibrate.result import CalibrationEstimate
+from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter
+from lce_rig.core.board import Board
+from lce_rig.core.calibration import ChannelResult
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import Observation
 
+_N_SHARES = 7
 
-@dataclass(frozen=True, eq=False)
-class CalibrationEstimate:
-    """Extrinsics with their uncertainty, certificate and residuals.
 
-    Attributes:
-        T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
-        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: from the noise of the captures
-            and from the sensors' errors that are common to all of them. Errors of the profile's lens
-            and board are not in it, but in `sensitivities`.
-        certificate: of Algorithm 1's final cost over all captures used, from whose solution other methods
-            start; its gap is infinite if there is none.
-        metrics: errors over all captures used, of the boards as measured.
-        used: names of the captures used, sorted; one stands for all that hold the same scan.
-        refused: why each other capture is not used.
-        observations: capture -> the boards that were paired, as measured, for each capture used.
-        fitted: the same as used in the method's cost: Algorithm 1 moves ring ends by the background's shift.
-        residuals: one per capture used, in the order of `used`.
-        held_out_m: mean over captures of `CaptureResidual.held_out_m`.
-        lever_m: rms distance of the boards from the camera.
-        diagnostics: further figures.
-        method: that found it, as `CalibrateOptions.method`.
-        sensitivities: how far errors of the profile's lens and board move the result; empty without
-            `EstimateSettings.tolerances`.
-        cost: the method's own cost about its result, capture by capture, in the extrinsics (and those of
-            cameras estimated with it) alone, boards' poses eliminated; None if the method has none.
-        lidar: constant errors of the LiDAR that were estimated with it; None if the method knows none.
-        estimated_with: cameras whose extrinsics were estimated together with this one.
-        same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
-        channels: the result of each channel of the camera alone; empty if they were not separated.
-        channel_difference: (6,) tangent between the extrinsics of two channels; None with one channel.
-        channel_difference_cov: (6, 6) of it.
+def estimate_extrinsics(
+    candidates: Mapping[str, Sequence[Observation]],
+    board: Board,
+    settings: EstimateSettings,
+    clocks: Clocks,
+    progress: Progress | None = None,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar from detections of the channels of one camera and a LiDAR.
+
+    Args:
+        candidates: by channel, of each capture with detections of both sensors; channels whose captures agree
+            on no extrinsics are skipped.
+        board: its specification.
+        settings: method, priors and tolerances.
+        clocks: of the sensors.
+        progress: called with (subsets done, subsets in all).
+
+    Raises:
+        NotEnoughDataError: no channel has enough captures, or they leave a direction undetermined.
     """
+    agreed, noise_px = _agree(candidates, board)
+    matched = {name: consensus.observations for name, consensus in agreed.items()}
+    scans, conflicts = join_scans(matched, candidates)
+    samples = sample_poses(scans, clocks, noise_px)
+    if len(agreed) == 1 and np.count_nonzero(samples.tells_motion) < MIN_MOVING:
+        ((name, of_channel),) = matched.items()
+        estimate = estimate_observations(of_channel, board, settings, progress)
+        scatter_m = depth_scatter_m(estimate.T_cam_lidar, list(estimate.observations.values()))
+        alone = ChannelResult(
+            name,
+            len(of_channel),
+            noise_px[name],
+            estimate.T_cam_lidar,
+            estimate.cov,
+            scatter_m,
+            scatter_m,
+        )
+        return _with_consensus(replace(estimate, channels=(alone,)), list(agreed.values()))
 
-    T_cam_lidar: Array
-    cov: Array
-    certificate: Certificate
-    metrics: Metrics
-    used: tuple[str, ...]
-    refused: Mapping[str, Refusal]
-    observations: Mapping[str, Observation]
-    fitted: Mapping[str, Observation]
-    residuals: tuple[CaptureResidual, ...]
-    held_out_m: float
-    lever_m: float
-    diagnostics: Diagnostics
-    method: str = "paper"
-    sensitivities: tuple[Sensitivity, ...] = ()
-    cost: Quadratics | None = None
-    lidar: KnownLidar | None = None
-    estimated_with: tuple[str, ...] = ()
-    same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    channels: tuple[ChannelResult, ...] = ()
-    channel_difference: Array | None = None
-    channel_difference_cov: Array | None = None
+    still = {name: solve(observations, board) for name, observations in matched.items()}
+    motion = estimate_motion(scans, samples, board, next(iter(still.values())), clocks)
+    estimate = estimate_observations(motion.observations(), board, settings, progress)
+    estimate = _with_consensus(estimate, list(agreed.values()))
 
-    def captures_of(self, names: Iterable[str]) -> set[str]:
-        """Name every capture that holds the scan of one of the captures named."""
-        return {each for name in names for each in self.same_scan.get(name, (name,))}
+    fast = replace(settings, n_draws=0, tolerances=None)
+    by_channel = {name: motion.observations(name if len(agreed) > 1 else None) for name in sorted(agreed)}
+    channels = []
+    for name, observations in by_channel.items():
+        own = estimate_observations(observations, board, fast)
+        result = ChannelResult(
+            name,
+            len(matched[name]),
+            noise_px[name],
+            own.T_cam_lidar,
+            motion.widened(own.cov),
+            depth_scatter_m(own.T_cam_lidar, list(own.observations.values())),
+            depth_scatter_m(still[name].T_cam_lidar, still[name].observations),
+        )
+        if motion.offsets is not None:
+            index = motion.offsets.channels.index(name)
+            time_offset_sigma_s = float(np.sqrt(motion.offsets.cov[index, index]))
+            result = replace(
+                result,
+                time_offset_s=float(motion.offsets.offset_s[index]),
+                time_offset_sigma_s=time_offset_sigma_s,
+            )
+        channels.append(result)
+    apart, cov = _difference(motion, tuple(by_channel.values()), board, settings.seed)
+    return replace(
+        estimate,
+        cov=motion.widened(estimate.cov),
+        refused={**conflicts, **estimate.refused},
+        same_scan={scan.capture: scan.captures for scan in scans if len(scan.captures) > 1},
+        channels=tuple(channels),
+        channel_difference=apart,
+        channel_difference_cov=cov,
+    )
+
+
+def fit_extrinsic(
+    candidates: Sequence[Observation],
+    board: Board,
+    settings: EstimateSettings | None = None,
+    progress: Progress | None = None,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar from both sensors' detections of boards that stood still.
+
+    Args:
+        candidates: of each capture with detections of both sensors, in any order.
+        board: its specification.
+        settings: method, priors and tolerances.
+        progress: called with (subsets done, subsets in all).
+
+    Raises:
+        NotEnoughDataError: too few captures, captures that agree with no extrinsics, or captures that leave a
+            direction undetermined, which is named.
+    """
+    consensus = find_consensus(candidates, board)
+    settings = settings or EstimateSettings()
+    estimate = estimate_observations(consensus.observations, board, settings, progress)
+    return _with_consensus(estimate, [consensus])
+
+
+def estimate_observations(
+    observations: Sequence[Observation],
+    board: Board,
+    settings: EstimateSettings,
+    progress: Progress | None = None,
+) -> CalibrationEstimate:
+    """Estimate T_cam_lidar by the settings' method from matched boards.
+
+    Args:
+        observations: one per capture.
+        board: its specification.
+        settings: method, priors and tolerances.
+        progress: called with (subsets done, subsets in all).
+
+    Raises:
+        NotEnoughDataError: the captures leave a direction undetermined, which is named.
+    """
+    start = solve(observations, board, settings.n_drawn, settings.seed, progress)
+    if settings.method == "paper":
+        return by_scatter(start, board, settings)
+    priors, usual = what_is_known(settings)
+    joint = refine([start.observations], board, [start.T_cam_lidar], priors, usual)
+    return by_likelihood(start, joint, board, settings)
+
+
+def _agree(
+    candidates: Mapping[str, Sequence[Observation]], board: Board
+) -> tuple[dict[str, Consensus], dict[str, float]]:
+    """Find each channel's consensus and corner noise, px; the channel with the steadiest corners first."""
+    agreed: dict[str, Consensus] = {}
+    troubles: list[NotEnoughDataError] = []
+    for channel, items in candidates.items():
+        try:
+            agreed[channel] = find_consensus(items, board)
+        except NotEnoughDataError as error:
+            troubles.append(error)
+    if not agreed:
+        raise troubles[0]
+    noise = {name: pooled_noise_px([o.image for o in c.observations]) for name, c in agreed.items()}
+    return {name: agreed[name] for name in sorted(agreed, key=lambda name: noise[name])}, noise
+
+
+def _with_consensus(estimate: CalibrationEstimate, agreed: Sequence[Consensus]) -> CalibrationEstimate:
+    """Add the refusals of the channels' consensus to an estimate."""
+    refused = dict(estimate.refused)
+    for consensus in agreed:
+        refused = {**consensus.refused, **refused}
+    n_alternative = float(sum(consensus.n_alternative_poses for consensus in agreed))
+    return replace(
+        estimate,
+        refused=dict(sorted(refused.items())),
+        diagnostics=replace(estimate.diagnostics, n_alternative_poses=n_alternative),
+    )
+
+
+def depth_scatter_m(T_cam_lidar: Array, observations: Sequence[Observation]) -> float:
+    """Compute the standard deviation over captures of the LiDAR's mean distance from the camera's plane."""
+    T_cam_board = np.array([observation.image.T_cam_board for observation in observations])
+    middles = np.array([observation.lidar.points.mean(axis=0) for observation in observations])
+    depths = along_normals(T_cam_board[:, :3, 2], T_cam_board[:, :3, 3], middles, T_cam_lidar)
+    return float(np.std(depths))
+
+
+def _difference(
+    motion: Motion, by_channel: Sequence[Sequence[Observation]], board: Board, seed: int
+) -> tuple[Array | None, Array | None]:
+    """Compare two channels' extrinsics: the tangent (6,) between them and its covariance.
+
+    If only the two channels together show how boards moved, each pose depends on both; then one channel's
+    extrinsic from half of the scans is compared with the other's from the other half, and of several ways to
+    share them out the median counts.
+
+    Args:
+        motion: of the boards.
+        by_channel: observations of each channel, positioned by it alone.
+        board: its specification.
+        seed: of the shares.
+    """
+    if len(by_channel) != 2:
+        return None, None
+    if motion.is_seen_by_each:
+        first, second = (solve(observations, board) for observations in by_channel)
+        covs = [motion.widened(each.cost.jackknife_covariance()[:6, :6]) for each in (first, second)]
+        return difference(first.T_cam_lidar, second.T_cam_lidar), covs[0] + covs[1]
+    rng = np.random.default_rng(seed)
+    ways: list[tuple[float, Array, Array]] = []
+    for _ in range(_N_SHARES):
+        mine = set(rng.permutation(len(motion.scans))[: len(motion.scans) // 2].tolist())
+        names = {motion.scans[k].capture for k in mine}
+        try:
+            halves = [
+                solve([o for o in observations if (o.capture in names) == is_first], board)
+                for observations, is_first in zip(by_channel, (True, False), strict=True)
+            ]
+        except NotEnoughDataError:
+            continue  # This split of few scans leaves a direction undetermined; others may not.
+        apart = difference(halves[0].T_cam_lidar, halves[1].T_cam_lidar)
+        cov = sum(half.cost.jackknife_covariance()[:6, :6] for half in halves)
+        ways.append((float(apart @ np.linalg.solve(cov, apart)), apart, np.asarray(cov)))
+    if not ways:
+        return None, None
+    return sorted(ways, key=lambda way: way[0])[len(ways) // 2][1:]

@@ -11,9 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.features import CaptureFeatures, extract_features
-from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
-from lce_rig.calibrate.placements import group_placements
-from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, end_rows, feature_sigmas, plane_rows
+from lce_rig.calibrate.observations import group_placements
+from lce_rig.calibrate.plane_and_ends import (
+    EDGE_SHIFT_SIGMA_M,
+    PLANE_FREEDOMS,
+    end_rows,
+    feature_sigmas,
+    plane_rows,
+)
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array

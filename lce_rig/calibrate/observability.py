@@ -7,16 +7,16 @@ import numpy as np
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.algorithm_1.registration import vec_rotation, with_one
 from lce_rig.calibrate.features import CaptureFeatures
+from lce_rig.calibrate.findings import UNDETERMINED
 from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS
 from lce_rig.core.calibration import MOTIONS, Motion, WeakestMotion
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array
-from lce_rig.words import not_enough
 
 # Standard deviation of one capture's board plane between camera and LiDAR.
-PLANE_SIGMA_M = 0.005
+_PLANE_SIGMA_M = 0.005
 # A motion that moves the board by more than this without changing the planes counts as undetermined.
-MAX_WEAK_SIGMA_M = 0.1
+_MAX_WEAK_SIGMA_M = 0.1
 
 
 def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_cam_lidar: Array) -> None:
@@ -32,37 +32,24 @@ def require_observable(features: Sequence[CaptureFeatures], problem: Problem, T_
     Raises:
         NotEnoughDataError: a direction is undetermined; it is named.
     """
-    x = with_one(
-        np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(problem.n_shift)])
-    )
-    planes = Weights(PLANE_FREEDOMS / PLANE_SIGMA_M**2, 0.0, problem.weights.shift_prior)
+    x = with_one(np.concatenate([vec_rotation(T_cam_lidar[:3, :3]), T_cam_lidar[:3, 3], np.zeros(1)]))
+    planes = Weights(PLANE_FREEDOMS / _PLANE_SIGMA_M**2, 0.0)
     hessians = problem.quadratics(x, problem.associate(x[None])[0], weights=planes).hessians
-    lever_m = lever_arm(features)
+    lever_m = float(np.sqrt(np.mean([f.centre @ f.centre for f in features])))
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     information = hessians.sum(axis=0)[:6, :6] / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(information)
-    weak = values < 1 / MAX_WEAK_SIGMA_M**2
+    weak = values < 1 / _MAX_WEAK_SIGMA_M**2
     if not weak.any():
         return
-    figures: dict[str, Figure] = {
-        "motions": tuple(dict.fromkeys(main_motion(vector) for vector in vectors[:, weak].T)),
-        "n_captures": len(features),
-        "spread_deg": normal_spread_deg(features),
-    }
-    raise not_enough(Finding("shortage.undetermined", "warning", figures=figures))
-
-
-def lever_arm(features: Sequence[CaptureFeatures]) -> float:
-    """Compute the rms distance of the boards from the camera, m: displacement by a rotation of 1 rad."""
-    return float(np.sqrt(np.mean([f.centre @ f.centre for f in features])))
-
-
-def normal_spread_deg(features: Sequence[CaptureFeatures]) -> float:
-    """Measure how far normals spread about their least varied axis, rms in deg."""
-    normals = np.array([f.normal for f in features])
-    values = np.linalg.eigvalsh(np.cov(normals.T, bias=True))
     # Unit vectors about one direction do not vary along it: the smaller of the two lateral spreads counts.
-    return float(np.degrees(np.sqrt(max(values[1], 0.0))))
+    spread = np.linalg.eigvalsh(np.cov(np.array([f.normal for f in features]).T, bias=True))[1]
+    finding = UNDETERMINED(
+        motions=tuple(dict.fromkeys(main_motion(vector) for vector in vectors[:, weak].T)),
+        n_captures=len(features),
+        spread_deg=float(np.degrees(np.sqrt(max(spread, 0.0)))),
+    )
+    raise NotEnoughDataError.of(finding)
 
 
 def main_motion(direction: Array) -> Motion:
@@ -75,7 +62,7 @@ def find_weakest(cov: Array, lever_m: float) -> WeakestMotion:
 
     Args:
         cov: (6, 6) of the tangent.
-        lever_m: the boards' `lever_arm`, by which rotations count as displacements.
+        lever_m: rms distance of the boards from the camera, by which rotations count as displacements.
     """
     scale = np.r_[np.ones(3), np.full(3, lever_m)]
     _, vectors = np.linalg.eigh(cov * np.outer(scale, scale))

@@ -26,6 +26,8 @@ from lce_rig.core.results import LidarBoard
 
 PLANE_FREEDOMS = 3
 """Two planes differ by an offset and two tilts, for any number of points."""
+EDGE_SHIFT_SIGMA_M = 0.015
+"""Prior standard deviation of the distance of ring ends beyond an edge: about a beam's width."""
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
 BLENDS = 1

@@ -6,15 +6,14 @@ in each capture: it causes no scatter, but moves the extrinsics.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.algorithm_1.moments import Problem
+from lce_rig.calibrate.algorithm_1.moments import Problem, Solutions
 from lce_rig.calibrate.covariance import symmetric_inverse
-from lce_rig.calibrate.features import CaptureFeatures, FeatureSettings, extract_features, see_lidar
+from lce_rig.calibrate.features import CaptureFeatures, extract_features, see_lidar
 from lce_rig.calibrate.tolerances import Sensitivity, Tolerances, Variant, sensitivities_of, vary
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -29,10 +28,8 @@ _CHUNK = 16
 def ring_sensitivities(
     observations: Sequence[Observation],
     board: Board,
-    settings: FeatureSettings,
     problem: Problem,
-    x: Array,
-    edge_ids: NDArray[np.int8],
+    solution: Solutions,
     information: Array,
 ) -> Array:
     """Differentiate the solution by the range offset of each ring, by one Newton step.
@@ -49,91 +46,85 @@ def ring_sensitivities(
     Args:
         observations: the F captures in `problem`.
         board: the board.
-        settings: of the feature extraction.
         problem: their moments.
-        x: (m,) solution [vec R; t; d; 1].
-        edge_ids: (n,) its association, which is held.
-        information: (6 + k, 6 + k) H with the prior.
+        solution: of all of them; its association is held.
+        information: (7, 7) H with the prior.
 
     Returns:
-        (6 + k, L): a column for each of the L rings seen, tangent (translation m, rotation rad, edge shift m)
+        (7, L): a column for each of the L rings seen, tangent (translation m, rotation rad, edge shift m)
         per m of range.
     """
     boards = [observation.lidar for observation in observations]
-    seen = [np.union1d(lidar.ring, lidar.edge_ring) for lidar in boards]
-    ring, column = np.unique(np.concatenate(seen), return_inverse=True)
+    rings = [np.union1d(lidar.ring, lidar.edge_ring) for lidar in boards]
+    ring, column = np.unique(np.concatenate(rings), return_inverse=True)
 
     def features_of(k: int) -> list[CaptureFeatures]:
-        shifted = shift_rings(boards[k], seen[k], STEP_M)
-        own = extract_features(observations[k], board, settings)
-        return [see_lidar(own, lidar, settings) for lidar in shifted]
+        features = extract_features(observations[k], board)
+        return [see_lidar(features, lidar) for lidar in shift_rings(boards[k], rings[k], STEP_M)]
 
     change = np.zeros((len(ring), len(information)))
-    np.add.at(change, column, _changes(features_of, board, problem, x, edge_ids) / STEP_M)
+    np.add.at(change, column, _changes(features_of, board, problem, solution) / STEP_M)
     return np.asarray(-symmetric_inverse(information) @ change.T)
 
 
 def profile_sensitivities(
     observations: Sequence[Observation],
     board: Board,
-    settings: FeatureSettings,
     problem: Problem,
-    x: Array,
-    edge_ids: NDArray[np.int8],
+    solution: Solutions,
     information: Array,
     known: Tolerances,
 ) -> tuple[Sensitivity, ...]:
     """Differentiate the solution by errors of the profile's lens and board, as (1) does by range offsets.
 
     Args:
-        observations, board, settings, problem, x, edge_ids, information: as of `ring_sensitivities`.
+        observations, board, problem, solution, information: as of `ring_sensitivities`.
         known: the profile's lens and its standard deviations.
     """
     variants = vary(observations, board, known)
-    n_captures, changes = len(observations), []
+    changes = []
     for assumed, group in groupby(variants, key=lambda variant: variant.board):
-        features_of = partial(_features_under, tuple(group), settings)
-        by_capture = _changes(features_of, assumed, problem, x, edge_ids)
-        changes.append(by_capture.reshape(n_captures, -1, by_capture.shape[1]).sum(axis=0))
+        same_board = tuple(group)
+
+        def features_of(k: int, same_board: tuple[Variant, ...] = same_board) -> list[CaptureFeatures]:
+            return [extract_features(variant.observations[k], variant.board) for variant in same_board]
+
+        by_capture = _changes(features_of, assumed, problem, solution)
+        changes.append(by_capture.reshape(len(observations), len(same_board), -1).sum(axis=0))
     moves = -np.concatenate(changes) @ symmetric_inverse(information)[:, :6]
     return sensitivities_of(variants, moves, known)
-
-
-def _features_under(variants: Sequence[Variant], settings: FeatureSettings, k: int) -> list[CaptureFeatures]:
-    """Extract the features of capture k under each error."""
-    return [extract_features(variant.observations[k], variant.board, settings) for variant in variants]
 
 
 def _changes(
     features_of: Callable[[int], list[CaptureFeatures]],
     board: Board,
     problem: Problem,
-    x: Array,
-    edge_ids: NDArray[np.int8],
+    solution: Solutions,
 ) -> Array:
-    """Compute by how much half gradients (n, 6 + k) differ from those of the captures as observed.
+    """Compute by how much half gradients (n, 7) differ from those of the captures as observed.
 
     Args:
         features_of: a capture's features, as they would be with each of some errors.
         board: that is assumed.
-        problem, x, edge_ids: as of `ring_sensitivities`.
+        problem, solution: as of `ring_sensitivities`.
 
     Returns:
         Of the n features, capture by capture.
     """
+    x, edge_ids = solution.x[0], solution.edge_ids[0]
     gradients = problem.quadratics(x, edge_ids).gradients
     starts = np.searchsorted(problem.edge_capture, np.arange(problem.n_captures + 1))
     own_ids = [edge_ids[first:last] for first, last in pairwise(starts)]
-    found = []
+    differences = []
     for start in range(0, problem.n_captures, _CHUNK):
         by_capture = {k: features_of(k) for k in range(start, min(start + _CHUNK, problem.n_captures))}
-        features = [each for own in by_capture.values() for each in own]
-        repeated = [k for k, own in by_capture.items() for _ in own]
+        features = [f for variants in by_capture.values() for f in variants]
+        repeated = [k for k, variants in by_capture.items() for _ in variants]
         keep = None if problem.keep is None else [problem.keep[k] for k in repeated]
         ids = np.concatenate([own_ids[k] for k in repeated])
         moved = Problem(features, board, problem.weights, keep).quadratics(x, ids).gradients
-        found.append(moved - gradients[repeated])
-    return np.concatenate(found)
+        differences.append(moved - gradients[repeated])
+    return np.concatenate(differences)
 
 
 def shift_rings(lidar: LidarBoard, rings: NDArray[np.int16], offset_m: float) -> list[LidarBoard]:

@@ -1,6 +1,7 @@
 """Boards as detected in images and scans, and the observations made of them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -204,3 +205,16 @@ class Observation:
     image: ImageBoard
     lidar: LidarBoard
     session: str = ""
+    others: tuple[LidarBoard, ...] = ()
+
+    @classmethod
+    def of(
+        cls, capture: str, image: ImageBoard, places: Sequence[LidarBoard], session: str = ""
+    ) -> "Observation":
+        """Pair a board in an image with the places of the scan where it may be, best first."""
+        return cls(capture, image, places[0], session, tuple(places[1:]))
+
+    @property
+    def places(self) -> tuple[LidarBoard, ...]:
+        """All places in the scan where the board may be, best first."""
+        return (self.lidar, *self.others)

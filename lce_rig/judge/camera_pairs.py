@@ -10,13 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.calibrate.covariance import symmetric_inverse
-from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.likelihood.image_terms import stack_images
 from lce_rig.calibrate.likelihood.levels import Levels
-from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.observations import group_placements, scan_key
 from lce_rig.calibrate.quadratics import Quadratics, without_prior
 from lce_rig.calibrate.relative_pose import mean_pose, relative_covariance, relative_pose
-from lce_rig.calibrate.shared_scans import scan_key
+from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation

@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.tolerances import Sensitivity, Source
 from lce_rig.core.calibration import Contribution
 from lce_rig.core.diagnostics import Diagnostics

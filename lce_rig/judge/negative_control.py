@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.calibrate.features import extract_features
-from lce_rig.calibrate.observability import lever_arm, main_motion
+from lce_rig.calibrate.observability import main_motion
 from lce_rig.calibrate.plane_and_ends import capture_costs, feature_sigmas
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
+from lce_rig.calibrate.result import lever_arm
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb, tangent_sizes
@@ -62,7 +63,7 @@ def run_control(
         n_sigmas: number of standard deviations by which it is moved otherwise.
     """
     features = [extract_features(seen, board) for seen in observations]
-    moves = _moves(cov, lever_arm(features), target, n_sigmas)
+    moves = _moves(cov, lever_arm(observations), target, n_sigmas)
     left_out = expansion.without_each()[expansion.placement]
     own = perturb(T_cam_lidar, left_out)
     sigmas = feature_sigmas(features, board, T_cam_lidar)

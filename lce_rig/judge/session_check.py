@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 
 from lce_rig.calibrate import Clocks
-from lce_rig.calibrate.metrics import capture_residual, summarise
-from lce_rig.calibrate.motion.board_motion import fit_motions
-from lce_rig.calibrate.motion.time_offsets import at_scan_time, deskew_points
-from lce_rig.calibrate.options import CaptureCandidates
-from lce_rig.calibrate.shared_scans import SharedScan, sample_scans
+from lce_rig.calibrate.motion.board_motion import compensate, fit_motions, sample_poses
+from lce_rig.calibrate.observations import SharedScan
+from lce_rig.calibrate.result import capture_residual, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, CaptureResidual, Metrics, SceneOpinion
 from lce_rig.core.findings import Finding
@@ -80,11 +78,11 @@ def bring_together(
         SharedScan((o.capture,), {**by_scan[o.lidar.points.tobytes()], channel: o.image}, o.lidar)
         for o in own
     ]
-    samples = sample_scans(scans, clocks, {name: results[name].noise_px for name in timed})
+    samples = sample_poses(scans, clocks, {name: results[name].noise_px for name in timed})
     offset_s = np.array([results[name].time_offset_s for name in samples.channels], dtype=np.float64)
     only = channel if len(samples.channels) > 1 else None
     motions = fit_motions(samples, offset_s, only)
-    swept = deskew_points(at_scan_time(own, motions, clocks.sweep_s), motions, calibration.T_cam_lidar)
+    swept = compensate(own, motions, calibration.T_cam_lidar, clocks.sweep_s)
     return {
         o.capture: Meeting(o, moved, _at_image_time(moved, o.image, calibration.T_cam_lidar))
         for o, moved in zip(own, swept, strict=True)
@@ -103,7 +101,7 @@ def _at_image_time(swept: Observation, image: ImageBoard, T_cam_lidar: Array) ->
     )
 
 
-def match_candidates(candidates: CaptureCandidates, board: Board, T_cam_lidar: Array) -> Observation:
+def match_candidates(candidates: Observation, board: Board, T_cam_lidar: Array) -> Observation:
     """Pair the candidates of one capture that are closest to each other under known extrinsics.
 
     Centres and normals decide, the angle weighted by the plate's half diagonal; rotations in the plane do not
@@ -120,17 +118,17 @@ def match_candidates(candidates: CaptureCandidates, board: Board, T_cam_lidar: A
     arm_m = np.hypot(board.width_m, board.height_m) / 2
 
     def misfit(pair: tuple[int, int]) -> float:
-        T_cam_board, lidar = poses[pair[0]], candidates.lidar[pair[1]]
+        T_cam_board, lidar = poses[pair[0]], candidates.places[pair[1]]
         normal = T_cam_lidar[:3, :3] @ lidar.plane[:3]
         centre = transform(T_cam_lidar, lidar.T_lidar_board[None, :3, 3])[0]
         turn_m = arm_m * np.linalg.norm(normal - T_cam_board[:3, 2])
         return float(np.hypot(turn_m, np.linalg.norm(centre - T_cam_board[:3, 3])))
 
     pose_index, lidar_index = min(
-        itertools.product(range(len(poses)), range(len(candidates.lidar))), key=misfit
+        itertools.product(range(len(poses)), range(len(candidates.places))), key=misfit
     )
     image = replace(candidates.image, T_cam_board=poses[pose_index])
-    return Observation(candidates.capture, image, candidates.lidar[lidar_index])
+    return Observation(candidates.capture, image, candidates.places[lidar_index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,9 +270,7 @@ def find_meetings(
             image, lidar = detections.of(pair, capture)
             if not isinstance(image, ImageBoard) or not isinstance(lidar, list):
                 continue
-            matched = match_candidates(
-                CaptureCandidates(capture, image, lidar), board, calibration.T_cam_lidar
-            )
+            matched = match_candidates(Observation.of(capture, image, lidar), board, calibration.T_cam_lidar)
             middle = calibration.T_cam_lidar @ matched.lidar.T_lidar_board[:, 3]
             if np.linalg.norm(middle[:3] - matched.image.T_cam_board[:3, 3]) < _ELSEWHERE_M:
                 observations[name].append(matched)

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.estimate import CalibrationEstimate
 from lce_rig.calibrate.local_quadratic import SCALE, expand
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
+from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.tolerances import Sensitivity
 from lce_rig.core.calibration import Contribution
 from lce_rig.core.camera import Intrinsics

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.calibrate.estimate import CalibrationEstimate
+from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion, SceneShare, WeakestMotion
 from lce_rig.core.findings import Finding, ranked

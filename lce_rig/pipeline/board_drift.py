@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lce_rig.calibrate.local_quadratic import SCALE, expand
-from lce_rig.calibrate.metrics import capture_residual, summarise
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
+from lce_rig.calibrate.result import capture_residual, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.findings import Finding

@@ -15,21 +15,20 @@ import numpy as np
 from lce_rig.calibrate import (
     CalibrateOptions,
     CalibrationEstimate,
-    CaptureCandidates,
     Clocks,
     EstimateSettings,
-    calibrate_channels,
+    estimate_extrinsics,
 )
-from lce_rig.calibrate.likelihood.calibrate_together import TogetherEstimate, calibrate_together
-from lce_rig.calibrate.metrics import error_to_reference
 from lce_rig.calibrate.observability import find_weakest
 from lce_rig.calibrate.relative_pose import relative_pose
+from lce_rig.calibrate.result import error_to_reference
+from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
-from lce_rig.core.results import ImageBoard
+from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.camera_pairs import CameraPair, camera_findings, relate
@@ -208,7 +207,7 @@ def _solve(
         NotEnoughDataError: no channel has enough captures with both boards, or a direction is undetermined.
     """
     camera, lidar, n_needed = pairs[0].camera, pairs[0].lidar, rig.quality.min_captures
-    candidates: dict[str, list[CaptureCandidates]] = {}
+    candidates: dict[str, list[Observation]] = {}
     refused: dict[str, Refusal] = {}
     shortages: list[Finding] = []
     for pair in pairs:
@@ -234,7 +233,7 @@ def _solve(
     tolerances = Tolerances.of(rig.cameras[camera], rig.board)
     settings = EstimateSettings.of(options, rig.lidars[lidar], tolerances)
     clocks = clocks_of(rig, camera, lidar)
-    estimate = calibrate_channels(candidates, rig.board.to_board(), settings, clocks, progress)
+    estimate = estimate_extrinsics(candidates, rig.board.to_board(), settings, clocks, progress)
     validation = _examine(rig, detections, pairs, estimate)
     return _Solved(tuple(pairs), settings, refused, estimate, validation)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, EstimateSettings, calibrate_channels
+from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, EstimateSettings, estimate_extrinsics
 from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors, estimate_lidar
 from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
@@ -64,7 +64,7 @@ def measure_lidar(
                 continue
             candidates, _ = candidates_of(detections, pair)
             clocks = clocks_of(session.rig, pair.camera, pair.lidar)
-            estimate = calibrate_channels({pair.channel: candidates}, board, options, clocks)
+            estimate = estimate_extrinsics({pair.channel: candidates}, board, options, clocks)
             _require_still(session, estimate)
             used.append([estimate.observations[capture] for capture in estimate.used])
             starts.append(estimate.T_cam_lidar)

@@ -1,18 +1,18 @@
 """Which captures show the board to both sensors, and in which the sensors agree on its place."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from lce_rig.calibrate import CaptureCandidates
-from lce_rig.calibrate.consensus import camera_poses, find_consensus
+from lce_rig.calibrate.consensus import Consensus, camera_poses, find_consensus
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, invert
-from lce_rig.core.results import LidarBoard
+from lce_rig.core.results import LidarBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.pipeline.findings import NO_AGREEMENT
 from lce_rig.rig import Rig
 
 
-def candidates_of(detections: Detections, pair: Pair) -> tuple[list[CaptureCandidates], dict[str, Refusal]]:
+def candidates_of(detections: Detections, pair: Pair) -> tuple[list[Observation], dict[str, Refusal]]:
     """List the captures in which both sensors detect the board; and by capture why the others do not."""
     candidates, refused = [], {}
     for name in detections.captures(pair):
@@ -22,7 +22,7 @@ def candidates_of(detections: Detections, pair: Pair) -> tuple[list[CaptureCandi
         elif isinstance(lidar, Refusal):
             refused[name] = lidar
         else:
-            candidates.append(CaptureCandidates(name, image, lidar, detections.session_of.get(name, "")))
+            candidates.append(Observation.of(name, image, lidar, detections.session_of.get(name, "")))
     return candidates, refused
 
 
@@ -41,12 +41,20 @@ def match_sensors(
     """
     chosen: dict[str, LidarBoard] = {}
     candidates, refused = candidates_of(detections, pair)
-    if len(candidates) >= 3:
-        consensus = find_consensus(candidates, rig.board.to_board())
-        nowhere = NO_AGREEMENT.refusal(n_captures=len(candidates))
-        refused |= consensus.refused if consensus else {item.capture: nowhere for item in candidates}
-        chosen = {each.capture: each.lidar for each in consensus.observations} if consensus else {}
+    consensus = _consensus(rig, candidates)
+    if consensus is not None:
+        refused |= consensus.refused
+        chosen = {observation.capture: observation.lidar for observation in consensus.observations}
+    elif len(candidates) >= 3:
+        refused |= {item.capture: NO_AGREEMENT.refusal(n_captures=len(candidates)) for item in candidates}
     return dict(sorted(refused.items())), chosen
+
+
+def _consensus(rig: Rig, candidates: Sequence[Observation]) -> Consensus | None:
+    try:
+        return find_consensus(candidates, rig.board.to_board())
+    except NotEnoughDataError:
+        return None
 
 
 #: So many captures must agree on extrinsics, and more than half of them, before others are looked at again.
@@ -62,7 +70,7 @@ def expected_poses(rig: Rig, detections: Detections) -> Mapping[str, Mapping[str
     expected: dict[str, dict[str, list[Array]]] = {}
     for pair in detections.pairs:
         candidates, _ = candidates_of(detections, pair)
-        consensus = find_consensus(candidates, rig.board.to_board()) if len(candidates) >= 3 else None
+        consensus = _consensus(rig, candidates)
         n_agreeing = len(consensus.observations) if consensus else 0
         if consensus is None or n_agreeing < max(_LEAST_AGREEING, len(candidates) / 2):
             continue

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.calibrate import CalibrationEstimate
-from lce_rig.calibrate.metrics import capture_residual, summarise
+from lce_rig.calibrate.result import capture_residual
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, Extrinsics, SceneShare
 from lce_rig.core.camera import Intrinsics
@@ -112,7 +112,6 @@ def fuse(by_boards: CalibrationEstimate, share: SceneShare, board: Board) -> Cal
         T_cam_lidar=T,
         cov=share.cov,
         residuals=residuals,
-        metrics=summarise(residuals),
     )
 
 

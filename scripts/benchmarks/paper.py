@@ -12,9 +12,9 @@ import numpy as np
 
 from benchmarks.paper_sets import LEVELS, LIDAR, PaperSet, paper_rig, paper_set
 from benchmarks.tables import compare, print_head, print_row, rms
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.calibrate import CalibrateOptions, EstimateSettings, fit_extrinsic
 from lce_rig.core.calibration import Method
-from lce_rig.core.results import ImageBoard
+from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
 
 # Of the paper's Algorithm 1 on one set, by level.
@@ -42,7 +42,7 @@ def bench_paper(n_seeds: int, folder: Path) -> None:
 def _errors(simulated: PaperSet, level: int, method: Method) -> tuple[float, float]:
     """Calibrate a set at one level of noise and return its error in deg and mm."""
     candidates = [
-        CaptureCandidates(f"{index:06d}", placement.image, placement.scans[level])
+        Observation.of(f"{index:06d}", placement.image, placement.scans[level])
         for index, placement in enumerate(simulated.placements)
         if isinstance(placement.image, ImageBoard) and isinstance(placement.scans[level], list)
     ]

@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,8 @@ import numpy as np
 import lce_rig as lce
 from benchmarks.recordings import SETS
 from benchmarks.tables import print_head, print_row
-from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
-from lce_rig.core.results import ImageBoard
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.finder import BoardFinder
 
 
@@ -55,10 +56,10 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
     pair = detections.pairs[0]
     both = ((name, *detections.of(pair, name)) for name in detections.captures(pair))
     candidates = [
-        CaptureCandidates(n, i, s) for n, i, s in both if isinstance(i, ImageBoard) and isinstance(s, list)
+        Observation.of(n, i, s) for n, i, s in both if isinstance(i, ImageBoard) and isinstance(s, list)
     ]
     thirty = (candidates * 2)[:30]
-    thirty = [CaptureCandidates(f"{k:06d}", c.image, c.lidar) for k, c in enumerate(thirty)]
+    thirty = [replace(c, capture=f"{k:06d}") for k, c in enumerate(thirty)]
     start = time.process_time()
     fit_extrinsic(thirty, board, EstimateSettings("paper", n_draws=100))
     yield "Algorithm 1, N = 30, I = 100, with certificates", f"{time.process_time() - start:.2f} s"

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.kept import kept_folder
-from lce_rig.calibrate import CaptureCandidates
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.planar_pose import solve_planar_pose
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import from_arrays, to_arrays
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import board_from_pose
@@ -44,7 +43,7 @@ class StillSession:
 
     T_cam_lidar: Array
     T_cam_board: dict[str, Array]
-    candidates: list[CaptureCandidates]
+    candidates: list[Observation]
 
 
 def still_session(
@@ -79,7 +78,7 @@ def still_session(
         image = draw_corners(rig, T_cam_board, sigma_px, rng)
         if isinstance(scan, list) and image is not None:
             boards = [board for board in scan if isinstance(board, LidarBoard)]
-            candidates.append(CaptureCandidates(name, image, boards))
+            candidates.append(Observation.of(name, image, boards))
     return StillSession(kept["truth"], poses, candidates)
 
 

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from benchmarks.profile_errors import with_profile_errors
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig.calibrate import CalibrateOptions, CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.calibrate import CalibrateOptions, EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.likelihood.along_rays import (
     N_FIELDS,
     N_OF_LASER,
@@ -29,10 +29,11 @@ from lce_rig.calibrate.likelihood.image_terms import stack_images
 from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.refine import to_extrinsic
 from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, Terms, assemble, linearise
-from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
+from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.calibration import Method
 from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, difference, invert
+from lce_rig.core.results import Observation
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions
@@ -237,10 +238,10 @@ def _at_truth(rig: Rig, session: StillSession) -> Terms:
     )
 
 
-def is_board(session: StillSession, item: CaptureCandidates) -> bool:
+def is_board(session: StillSession, item: Observation) -> bool:
     """Tell whether what was found in the scan lies where the board truly was."""
     T = invert(session.T_cam_lidar) @ session.T_cam_board[item.capture]
-    return float(np.linalg.norm(item.lidar[0].points.mean(axis=0) - T[:3, 3])) < _FOUND_M
+    return float(np.linalg.norm(item.lidar.points.mean(axis=0) - T[:3, 3])) < _FOUND_M
 
 
 def _fit_ends(edges: Sequence[EdgeRows]) -> dict[str, float]:

@@ -7,12 +7,11 @@ from itertools import islice
 
 import numpy as np
 
-from lce_rig.calibrate import CaptureCandidates
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, exp_so3, fit_plane, invert, pose, project_to_so3, transform
 from lce_rig.core.planar_pose import solve_planar_pose
-from lce_rig.core.results import ImageBoard, LidarBoard, LidarQuality
+from lce_rig.core.results import ImageBoard, LidarBoard, LidarQuality, Observation
 from lce_rig.detect.image.search import board_from_pose
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
@@ -49,7 +48,7 @@ def simulate(
     scenario: Scenario | None = None,
     T_cam_lidar: np.ndarray = T_FORWARD,
     board: Board = BOARD,
-) -> list[CaptureCandidates]:
+) -> list[Observation]:
     """Simulate n captures in which both sensors see the board."""
     made, source = _session(seed, scenario or Scenario(), T_cam_lidar.tobytes(), board)
     made += islice(source, max(0, n - len(made)))
@@ -59,14 +58,12 @@ def simulate(
 @lru_cache(maxsize=100)
 def _session(
     seed: int, scenario: Scenario, T_cam_lidar: bytes, board: Board
-) -> tuple[list[CaptureCandidates], Iterator[CaptureCandidates]]:
+) -> tuple[list[Observation], Iterator[Observation]]:
     """Keep what was simulated of a session, and what goes on with it: many tests ask for the same one."""
     return [], _captures(seed, scenario, np.frombuffer(T_cam_lidar).reshape(4, 4), board)
 
 
-def _captures(
-    seed: int, scenario: Scenario, T_cam_lidar: np.ndarray, board: Board
-) -> Iterator[CaptureCandidates]:
+def _captures(seed: int, scenario: Scenario, T_cam_lidar: np.ndarray, board: Board) -> Iterator[Observation]:
     rng = np.random.default_rng(seed)
     # A generator of their own: the captures of a seed are otherwise the same with and without biases.
     laser_rng = np.random.default_rng([seed, 1])
@@ -78,7 +75,7 @@ def _captures(
         lidar = scan_board(invert(T_cam_lidar) @ T_cam_board, rng, scenario, board, bias_m)
         image = photograph(T_cam_board, rng, scenario, board)
         if lidar is not None and image is not None:
-            yield CaptureCandidates(f"{n_seen:06d}", image, [lidar])
+            yield Observation(f"{n_seen:06d}", image, lidar)
             n_seen += 1
 
 
@@ -204,7 +201,7 @@ def measured_plate(
     )
 
 
-def with_decoy(item: CaptureCandidates, decoy: LidarBoard, *, is_first: bool) -> CaptureCandidates:
+def with_decoy(item: Observation, decoy: LidarBoard, *, is_first: bool) -> Observation:
     """Add a rival to the LiDAR's candidates."""
-    lidar = [decoy, *item.lidar] if is_first else [*item.lidar, decoy]
-    return replace(item, lidar=lidar)
+    places = (decoy, *item.places) if is_first else (*item.places, decoy)
+    return replace(item, lidar=places[0], others=places[1:])

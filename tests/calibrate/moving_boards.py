@@ -4,9 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate import CaptureCandidates
 from lce_rig.core.geometry import Array, fit_plane, invert, perturb
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, random_pose, scan_board
 
 STAMP_NS = 1_700_000_000_000_000_000
@@ -37,11 +36,11 @@ class Moving:
 
 def simulate_moving(
     n: int, seed: int, moving: Moving | None = None, scenario: Scenario | None = None
-) -> dict[str, list[CaptureCandidates]]:
+) -> dict[str, list[Observation]]:
     """Simulate n captures of a moving board, by channel."""
     moving, scenario = moving or Moving(), scenario or Scenario()
     rng = np.random.default_rng(seed)
-    found: dict[str, list[CaptureCandidates]] = {channel: [] for channel, _ in moving.offset_s}
+    found: dict[str, list[Observation]] = {channel: [] for channel, _ in moving.offset_s}
     while len(found["frames"]) < n:
         T_cam_board = random_pose(rng, scenario, BOARD)
         rates = np.r_[
@@ -62,7 +61,7 @@ def simulate_moving(
         name = f"{len(found['frames']):06d}"
         for channel, image in images.items():
             assert image is not None
-            found[channel].append(CaptureCandidates(name, image, [lidar]))
+            found[channel].append(Observation(name, image, lidar))
     return found
 
 

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import (
-    Algorithm1Parts,
     EstimateSettings,
     capture_residual,
     error_to_reference,
     fit_extrinsic,
 )
-from lce_rig.calibrate.features import FeatureSettings
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, exp_so3, pose
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
@@ -62,13 +60,8 @@ def test_exact_data_give_the_exact_extrinsic():
 
 
 def test_ring_ends_beyond_the_printed_edge_are_explained_by_the_shift():
-    captures = simulate(20, 0, Scenario(footprint_m=0.008))
-    free = fit_extrinsic(captures, BOARD, FAST)
-    off = fit_extrinsic(captures, BOARD, replace(FAST, parts=Algorithm1Parts(is_shift_free=False)))
-    shift, sigma = free.diagnostics.edge_shift_m, free.diagnostics.edge_shift_sigma_m
-    assert abs(shift - 0.008) < 4 * sigma + 3e-4
-    assert np.isnan(off.diagnostics.edge_shift_m)
-    assert free.held_out_m < off.held_out_m
+    figures = fit_extrinsic(simulate(20, 0, Scenario(footprint_m=0.008)), BOARD, FAST).diagnostics
+    assert abs(figures.edge_shift_m - 0.008) < 4 * figures.edge_shift_sigma_m + 3e-4
 
 
 def test_the_same_captures_in_any_order_give_the_same_bytes():
@@ -91,31 +84,6 @@ def test_the_result_is_as_good_with_the_lidar_turned(turn_deg):
     assert estimate.certificate.is_optimal
 
 
-@pytest.mark.parametrize(
-    "switch",
-    [
-        {"features": FeatureSettings(point_projection="normal")},
-        {"features": FeatureSettings(point_projection="none")},
-        {"features": FeatureSettings(half_step=False)},
-        {"use_uncertainty": False},
-        {"use_planes": False},
-        {"use_ends": False},
-        {"is_shift_free": False},
-        {"reject_outliers": False},
-        {"n_rounds": 1},
-    ],
-)
-def test_without_any_part_of_algorithm_1_the_result_changes_or_not_but_never_breaks(switch):
-    captures = simulate(12, 8)
-    estimate = fit_extrinsic(captures, BOARD, replace(FAST, parts=Algorithm1Parts(**switch)))
-    angle_deg, distance_m = error_to_reference(estimate.T_cam_lidar, T_FORWARD)
-    assert angle_deg < 0.6
-    assert distance_m < 0.02
-    unchanged = {"reject_outliers", "n_rounds"}
-    is_same = np.array_equal(estimate.T_cam_lidar, fit_extrinsic(captures, BOARD, FAST).T_cam_lidar)
-    assert is_same <= (set(switch) <= unchanged)
-
-
 @pytest.mark.parametrize("draws", [{"n_draws": 1}, {"n_draws": 1, "seed": 5}, {"n_draws": 10}])
 def test_draws_judge_the_result_and_do_not_change_it(draws):
     # Lost returns and wide steps near the corners: ring ends may be taken for either edge's.
@@ -130,11 +98,11 @@ def spoil(captures, numbers):
     """Move the board by 6 cm between the sensors in the captures of these numbers."""
     spoilt = list(captures)
     for k in numbers:
-        seen = captures[k].lidar[0]
+        seen = captures[k].lidar
         shift = np.array([0.06, 0.0, 0.0])
         plane = seen.plane - np.append(np.zeros(3), seen.plane[:3] @ shift)
         lidar = replace(seen, points=seen.points + shift, edge_points=seen.edge_points + shift, plane=plane)
-        spoilt[k] = replace(captures[k], lidar=[lidar])
+        spoilt[k] = replace(captures[k], lidar=lidar)
     return spoilt
 
 
@@ -159,8 +127,10 @@ def test_a_board_that_moved_between_the_sensors_is_refused_with_its_figures():
 
 
 def test_too_few_captures_are_refused_with_their_number():
-    with pytest.raises(NotEnoughDataError, match="2 captures"):
+    with pytest.raises(NotEnoughDataError) as caught:
         fit_extrinsic(simulate(2, 0), BOARD, FAST)
+    assert caught.value.finding.code == "shortage.few_captures"
+    assert caught.value.finding.figures["n_captures"] == 2
 
 
 def test_nearly_parallel_boards_are_refused_with_the_weak_direction_named():
@@ -174,11 +144,10 @@ def test_nearly_parallel_boards_are_refused_with_the_weak_direction_named():
     assert found.figure("spread_deg") < 5
 
 
-def test_three_well_tilted_boards_are_enough_but_judged_on_nothing():
+def test_three_well_tilted_boards_are_enough():
     captures = simulate(3, 12, Scenario(tilt_deg=(30.0, 45.0)))
     estimate = fit_extrinsic(captures, BOARD, FAST)
     assert len(estimate.used) == 3
-    assert np.isnan(estimate.held_out_m)
     assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 1.0
 
 
@@ -199,7 +168,3 @@ def test_progress_reaches_the_end():
     fit_extrinsic(simulate(6, 0), BOARD, FAST, lambda done, total: seen.append((done, total)))
     assert seen[-1] == (9, 9)
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
-
-
-def test_the_estimate_names_its_method():
-    assert fit_extrinsic(simulate(6, 0), BOARD, replace(FAST, method="paper")).method == "paper"

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.metrics import error_to_reference
+from lce_rig.calibrate.result import error_to_reference
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import exp_so3, invert, pose
+from lce_rig.core.results import Observation
 from tests.calibrate.boards import (
     BOARD,
     T_FORWARD,
@@ -42,7 +44,6 @@ def test_the_extrinsic_is_found_however_the_lidar_is_mounted(mounting, turn_deg)
     T = pose(T_FORWARD[:3, :3] @ R_turn.T, np.array([0.3, -0.2, 0.15]))
     captures = simulate(10, seed=3, T_cam_lidar=T)
     consensus = find_consensus(captures, BOARD)
-    assert consensus is not None
     assert len(consensus.observations) == 10
     angle_deg, distance_m = error_to_reference(consensus.T_cam_lidar, T)
     assert angle_deg < 2.0
@@ -53,7 +54,6 @@ def test_a_decoy_that_stands_still_and_comes_first_everywhere_is_not_taken():
     captures = simulate(12, seed=1)
     decoy = somewhere_else(99)
     consensus = find_consensus([with_decoy(item, decoy, is_first=True) for item in captures], BOARD)
-    assert consensus is not None
     assert len(consensus.observations) == 12
     assert all(observation.lidar is not decoy for observation in consensus.observations)
 
@@ -62,13 +62,13 @@ def test_three_rivals_at_every_capture_and_a_third_of_them_without_the_board_are
     captures = []
     for k, item in enumerate(simulate(15, seed=2)):
         rivals = [somewhere_else(1000 + 3 * k + j) for j in range(3)]
-        captures.append(replace(item, lidar=rivals if k % 3 == 0 else [*rivals, *item.lidar]))
+        places = rivals if k % 3 == 0 else [*rivals, item.lidar]
+        captures.append(Observation.of(item.capture, item.image, places))
     consensus = find_consensus(captures, BOARD)
-    assert consensus is not None
     assert error_to_reference(consensus.T_cam_lidar, T_FORWARD)[0] < 2.0
     right = [item for k, item in enumerate(captures) if k % 3]
     found = {observation.capture: observation.lidar for observation in consensus.observations}
-    assert all(found[item.capture] is item.lidar[-1] for item in right)
+    assert all(found[item.capture] is item.places[-1] for item in right)
     for capture, refusal in consensus.refused.items():
         assert int(capture) % 3 == 0
         assert (refusal.code, refusal.figures["n_candidates"]) == ("pair.elsewhere", 3)
@@ -88,7 +88,6 @@ def test_the_second_pose_is_taken_where_the_picture_chose_the_wrong_one():
         )
         swapped.append(replace(item, image=image))
     consensus = find_consensus(swapped + captures[4:], BOARD)
-    assert consensus is not None
     chosen = {observation.capture: observation.image.T_cam_board for observation in consensus.observations}
     for item in captures[:4]:
         np.testing.assert_array_equal(chosen[item.capture], item.image.T_cam_board)
@@ -96,13 +95,13 @@ def test_the_second_pose_is_taken_where_the_picture_chose_the_wrong_one():
 
 
 def test_captures_that_agree_with_nothing_have_no_consensus():
-    captures = [replace(item, lidar=[somewhere_else(k)]) for k, item in enumerate(simulate(4, seed=6))]
-    assert find_consensus(captures, BOARD) is None
+    captures = [replace(item, lidar=somewhere_else(k)) for k, item in enumerate(simulate(4, seed=6))]
+    with pytest.raises(NotEnoughDataError) as caught:
+        find_consensus(captures, BOARD)
+    assert caught.value.finding.code == "shortage.few_agree"
 
 
 def test_the_order_of_captures_does_not_matter():
     captures = simulate(8, seed=7)
     forward, backward = find_consensus(captures, BOARD), find_consensus(captures[::-1], BOARD)
-    assert forward is not None
-    assert backward is not None
     np.testing.assert_array_equal(forward.T_cam_lidar, backward.T_cam_lidar)

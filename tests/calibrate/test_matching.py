@@ -3,17 +3,19 @@
 from dataclasses import replace
 
 import numpy as np
+from lce_rig.show.overlays.session_check import match_candidates
 
 from lce_rig.core.geometry import perturb
+from lce_rig.core.results import Observation
 from lce_rig.judge.session_check import match_candidates
 from tests.calibrate.boards import BOARD, T_FORWARD, simulate
 
 
 def test_the_candidate_where_the_picture_puts_the_board_is_taken_wherever_it_is_listed():
     first, second = simulate(2, seed=0)
-    for order in ([first.lidar[0], second.lidar[0]], [second.lidar[0], first.lidar[0]]):
-        found = match_candidates(replace(first, lidar=order), BOARD, T_FORWARD)
-        assert found.lidar is first.lidar[0]
+    for places in ([first.lidar, second.lidar], [second.lidar, first.lidar]):
+        found = match_candidates(Observation.of("a", first.image, places), BOARD, T_FORWARD)
+        assert found.lidar is first.lidar
 
 
 def test_the_pose_that_the_scan_confirms_is_taken():

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.calibrate.metrics import capture_residual, error_to_reference, summarise
+from lce_rig.calibrate.result import capture_residual, error_to_reference, summarise
 from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
@@ -17,10 +17,7 @@ def test_the_error_to_a_reference_is_the_angle_and_the_distance():
 
 def test_noise_of_the_range_is_what_the_plane_residual_shows():
     captures = simulate(6, 0, Scenario(range_sigma_m=0.02, corner_sigma_px=0.0))
-    residuals = [
-        capture_residual(T_FORWARD, Observation(item.capture, item.image, item.lidar[0]), BOARD)
-        for item in captures
-    ]
+    residuals = [capture_residual(T_FORWARD, item, BOARD) for item in captures]
     rms_m = np.sqrt(np.mean([r.plane_rms_m**2 for r in residuals]))
     # Tilted boards see the noise of the range shortened by the cosine of incidence.
     assert 0.014 < rms_m < 0.0205
@@ -28,11 +25,11 @@ def test_noise_of_the_range_is_what_the_plane_residual_shows():
 
 def test_a_capture_without_ring_ends_does_not_spoil_the_mean():
     item = simulate(1, 0)[0]
-    whole = Observation("a", item.image, item.lidar[0])
+    whole = Observation("a", item.image, item.lidar)
     bare = replace(
         whole,
         lidar=replace(
-            item.lidar[0],
+            item.lidar,
             edge_points=np.zeros((0, 3)),
             edge_ring=np.zeros(0, dtype=np.int16),
             edge_side=np.zeros(0, dtype=np.int8),

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import Clocks, EstimateSettings, calibrate_channels, fit_extrinsic
+from lce_rig.calibrate import Clocks, EstimateSettings, estimate_extrinsics, fit_extrinsic
 from lce_rig.calibrate.motion.board_motion import deskew, fit_motions, sample_poses
+from lce_rig.calibrate.observations import SharedScan
 from lce_rig.core.geometry import Array, difference, invert
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board
 from tests.calibrate.moving_boards import Moving, simulate_moving, skew
@@ -22,15 +23,11 @@ def errors(T_cam_lidar: Array) -> Array:
 
 
 def samples_of(captures, noise_px):
-    rows = [
-        [(channel, captures[channel][k].image, clock_s(captures[channel][k])) for channel in captures]
-        for k in range(len(captures["frames"]))
+    scans = [
+        SharedScan((one.capture,), {channel: captures[channel][k].image for channel in captures}, one.lidar)
+        for k, one in enumerate(captures["frames"])
     ]
-    return sample_poses(rows, noise_px)
-
-
-def clock_s(capture) -> float:
-    return (capture.image.stamp_ns - capture.lidar[0].stamp_ns) * 1e-9
+    return sample_poses(scans, Clocks(), noise_px)
 
 
 def test_rates_of_motion_are_found_within_their_stated_uncertainty():
@@ -68,7 +65,7 @@ def test_points_of_a_moving_board_come_back_onto_one_plane():
 def followed():
     """Several sessions of moving boards whose events were followed: the captures and what comes of them."""
     sessions = [simulate_moving(20, seed, TRACKED) for seed in range(4)]
-    return [(captures, calibrate_channels(captures, BOARD, OPTIONS, Clocks())) for captures in sessions]
+    return [(captures, estimate_extrinsics(captures, BOARD, OPTIONS, Clocks())) for captures in sessions]
 
 
 def scores_of(results, moving):
@@ -89,7 +86,9 @@ def test_time_offsets_of_boards_that_were_followed_are_found_to_milliseconds(fol
 @pytest.mark.long
 def test_time_offsets_are_found_from_two_pictures_a_capture():
     moving = Moving()
-    results = [calibrate_channels(simulate_moving(20, s, moving), BOARD, OPTIONS, Clocks()) for s in range(2)]
+    results = [
+        estimate_extrinsics(simulate_moving(20, s, moving), BOARD, OPTIONS, Clocks()) for s in range(2)
+    ]
     # Four scores: the 99.9 % point of chi-squared over its freedoms is 4.6.
     assert np.mean(np.square(scores_of(results, moving))) < 4.6
 
@@ -121,7 +120,7 @@ def test_corner_noise_is_estimated_by_channel(followed):
 
 def test_a_channel_that_is_followed_is_compensated_alone():
     captures = {"events": simulate_moving(25, 1, TRACKED)["events"]}
-    result = calibrate_channels(captures, BOARD, OPTIONS, Clocks())
+    result = estimate_extrinsics(captures, BOARD, OPTIONS, Clocks())
     (events,) = result.channels
     assert abs(events.time_offset_s - 0.06) < 4 * events.time_offset_sigma_s
     assert events.depth_scatter_m < events.depth_scatter_still_m / 3
@@ -131,7 +130,7 @@ def test_a_channel_that_is_followed_is_compensated_alone():
 def test_the_expected_offset_of_the_profile_is_taken_off_first():
     captures = simulate_moving(25, 2, TRACKED)
     clocks = Clocks(channel_offset_s=dict(TRACKED.offset_s))
-    for channel in calibrate_channels(captures, BOARD, OPTIONS, clocks).channels:
+    for channel in estimate_extrinsics(captures, BOARD, OPTIONS, clocks).channels:
         assert abs(channel.time_offset_s) < 4 * channel.time_offset_sigma_s + 1e-3
 
 
@@ -139,7 +138,7 @@ def test_the_expected_offset_of_the_profile_is_taken_off_first():
 def test_pictures_without_stamps_are_timed_by_the_motion_between_channels():
     moving = Moving(has_stamps=False)
     captures = simulate_moving(25, 0, moving)
-    result = calibrate_channels(captures, BOARD, OPTIONS, Clocks())
+    result = estimate_extrinsics(captures, BOARD, OPTIONS, Clocks())
     assert np.all(
         errors(result.T_cam_lidar) < errors(fit_extrinsic(captures["frames"], BOARD, OPTIONS).T_cam_lidar)
     )
@@ -149,7 +148,7 @@ def test_pictures_without_stamps_are_timed_by_the_motion_between_channels():
 
 def test_boards_that_stand_still_are_not_moved_and_say_nothing_of_time():
     captures = simulate_moving(20, 4, Moving(speed_mps=0.0, turn_deg_s=0.0))
-    together = calibrate_channels(captures, BOARD, OPTIONS, Clocks())
+    together = estimate_extrinsics(captures, BOARD, OPTIONS, Clocks())
     assert np.all(errors(together.T_cam_lidar) < [0.06, 2.5])
     assert all(channel.time_offset_s is None for channel in together.channels)
 
@@ -157,7 +156,7 @@ def test_boards_that_stand_still_are_not_moved_and_say_nothing_of_time():
 def test_one_channel_that_is_not_followed_is_calibrated_as_before():
     captures = simulate_moving(12, 0)["frames"]
     plain = fit_extrinsic(captures, BOARD, OPTIONS)
-    result = calibrate_channels({"frames": captures}, BOARD, OPTIONS, Clocks())
+    result = estimate_extrinsics({"frames": captures}, BOARD, OPTIONS, Clocks())
     np.testing.assert_array_equal(result.T_cam_lidar, plain.T_cam_lidar)
     np.testing.assert_array_equal(result.cov, plain.cov)
     assert result.channels[0].time_offset_s is None
@@ -173,21 +172,23 @@ def test_pictures_that_read_the_board_upside_down_are_turned(followed):
         else item
         for k, item in enumerate(captures["events"])
     ]
-    turned = calibrate_channels({**captures, "events": flipped}, BOARD, OPTIONS, Clocks())
+    turned = estimate_extrinsics({**captures, "events": flipped}, BOARD, OPTIONS, Clocks())
     np.testing.assert_allclose(turned.T_cam_lidar, right.T_cam_lidar, atol=1e-6)
 
 
 def test_the_same_scan_in_two_captures_is_one_placement_seen_twice():
     captures = simulate_moving(15, 0)
     elsewhere = [replace(item, capture=f"1{item.capture[1:]}") for item in captures["events"]]
-    result = calibrate_channels({"frames": captures["frames"], "events": elsewhere}, BOARD, OPTIONS, Clocks())
+    result = estimate_extrinsics(
+        {"frames": captures["frames"], "events": elsewhere}, BOARD, OPTIONS, Clocks()
+    )
     assert len(result.used) == 15
     assert result.same_scan["000003"] == ("000003", "100003")
 
 
 def test_channels_that_put_the_camera_in_two_places_are_held_against_each_other(followed):
     apart = (0.03, 0.0, 0.0, 0.0, np.radians(1.0), 0.0)
-    moved = calibrate_channels(
+    moved = estimate_extrinsics(
         simulate_moving(20, 0, replace(TRACKED, apart=apart)), BOARD, OPTIONS, Clocks()
     )
 

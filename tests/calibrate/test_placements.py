@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.methods import METHODS
 from tests.calibrate.boards import BOARD, simulate
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["ml", "paper"])
 def test_the_same_placements_captured_again_claim_no_smaller_sigma(method):
     once = simulate(14, seed=4)
     again = [replace(item, capture=f"1{item.capture[1:]}") for item in once]

@@ -7,10 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CaptureCandidates, EstimateSettings, error_to_reference, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.pcd import decode_pcd
+from lce_rig.core.results import Observation
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.search import find_lidar_boards
 from lce_rig.io.folder.cloud import rings_from_elevation
@@ -27,7 +28,7 @@ def read_scan(path: Path) -> Scan:
     return Scan("lidar", None, points[kept], np.zeros(kept.sum(), dtype=np.float32), ring)
 
 
-def detect(folder: Path, rig: Rig) -> list[CaptureCandidates]:
+def detect(folder: Path, rig: Rig) -> list[Observation]:
     (camera,) = rig.cameras.values()
     board, intrinsics = rig.board.to_board(), camera.to_intrinsics()
     pictures, clouds = ({f.stem: f for f in (folder / name).iterdir()} for name in ("img", "pcd"))
@@ -39,7 +40,7 @@ def detect(folder: Path, rig: Rig) -> list[CaptureCandidates]:
         seen = find_image_board(image, board, intrinsics)
         places = find_lidar_boards(read_scan(clouds[cloud]), board)
         if not isinstance(seen, Refusal) and not isinstance(places, Refusal):
-            found.append(CaptureCandidates(picture, seen, places))
+            found.append(Observation.of(picture, seen, places))
     return found
 
 

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
-from lce_rig.calibrate.features import FeatureSettings, extract_features
+from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings
 from lce_rig.core.geometry import difference, fit_plane, perturb
-from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 NO_DRAWS = EstimateSettings("paper", n_draws=0)
@@ -20,7 +19,7 @@ RINGS = np.arange(16, dtype=np.int16)
 
 def longer(item, rings, offset_m):
     """Measure a capture's board again with the ranges of some rings lengthened, the plane fitted anew."""
-    (lidar,) = item.lidar
+    lidar = item.lidar
 
     def moved(points, ring):
         reach = np.linalg.norm(points, axis=1)
@@ -29,31 +28,25 @@ def longer(item, rings, offset_m):
     points = moved(lidar.points, lidar.ring)
     ends = moved(lidar.edge_points, lidar.edge_ring)
     plane, _ = fit_plane(points)
-    return CaptureCandidates(
-        item.capture, item.image, [replace(lidar, points=points, edge_points=ends, plane=plane)]
-    )
+    return replace(item, lidar=replace(lidar, points=points, edge_points=ends, plane=plane))
 
 
-def linearised(captures, settings):
+def linearised(captures):
     """Solve captures for good, and differentiate the solution by each ring's offset."""
-    observations = [Observation(item.capture, item.image, item.lidar[0]) for item in captures]
-    features = [extract_features(seen, BOARD, settings) for seen in observations]
-    problem = Problem(features, BOARD, Weights(3e4, 2e5, 1 / 0.015**2))
+    features = [extract_features(seen, BOARD) for seen in captures]
+    problem = Problem(features, BOARD, Weights(3e4, 2e5))
     solution = problem.solve(np.ones((1, len(features))), T_FORWARD, 5)
-    x, edge_ids = solution.x[0], solution.edge_ids[0]
-    information = problem.quadratics(x, edge_ids).information
-    columns = ring_sensitivities(observations, BOARD, settings, problem, x, edge_ids, information)
+    information = problem.quadratics(solution.x[0], solution.edge_ids[0]).information
+    columns = ring_sensitivities(captures, BOARD, problem, solution, information)
     return solution.T[0], solution.linear[0, 3], columns
 
 
 @pytest.mark.parametrize("rings", [[5], [11], list(range(16))])
-@pytest.mark.parametrize("projection", ["ray", "normal", "none"])
-def test_longer_ranges_move_the_solution_as_its_sensitivities_say(rings, projection):
-    settings = FeatureSettings(point_projection=projection)
+def test_longer_ranges_move_the_solution_as_its_sensitivities_say(rings):
     captures = simulate(15, 4)
-    T, shift_m, columns = linearised(captures, settings)
-    seen = np.unique(np.concatenate([item.lidar[0].ring for item in captures]))
-    T_moved, shift_moved_m, _ = linearised([longer(item, rings, 0.005) for item in captures], settings)
+    T, shift_m, columns = linearised(captures)
+    seen = np.unique(np.concatenate([item.lidar.ring for item in captures]))
+    T_moved, shift_moved_m, _ = linearised([longer(item, rings, 0.005) for item in captures])
     motion = np.append(difference(T_moved, T), shift_moved_m - shift_m)
     expected = 0.005 * columns[:, np.isin(seen, rings)].sum(axis=1)
     # Board at 2 m: metres and radians are comparable. fit_plane weighs points otherwise than ranges do.
@@ -62,9 +55,9 @@ def test_longer_ranges_move_the_solution_as_its_sensitivities_say(rings, project
 
 def test_the_plane_follows_a_ring_as_if_it_were_fitted_anew():
     for item in simulate(6, 2, Scenario(range_sigma_m=0.0)):
-        (lidar,) = item.lidar
+        lidar = item.lidar
         for ring, moved in zip(RINGS, shift_rings(lidar, RINGS, 0.005), strict=True):
-            (expected,) = longer(item, [ring], 0.005).lidar
+            expected = longer(item, [ring], 0.005).lidar
             np.testing.assert_allclose(moved.points, expected.points, atol=1e-12)
             np.testing.assert_allclose(moved.edge_points, expected.edge_points, atol=1e-12)
             np.testing.assert_allclose(moved.plane, expected.plane, atol=2e-3)

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.calibrate import CaptureCandidates
 from lce_rig.core.geometry import Array, exp_so3, invert, perturb, pose
+from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, random_pose, scan_board
 
 LEFT, RIGHT = "left", "right"
@@ -15,7 +15,7 @@ TRUTH = {LEFT: T_FORWARD, RIGHT: T_RIGHT_LEFT @ T_FORWARD}
 """T_cam_lidar (4, 4) by camera."""
 
 REAL = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.008, end_sigma_m=0.001)
-Session = dict[str, list[CaptureCandidates]]
+Session = dict[str, list[Observation]]
 
 
 def simulate_two(
@@ -48,7 +48,7 @@ def _captures(
     right_corner_sigma_px: float | None,
     nudge: Array | None,
     nudged_from: int,
-) -> Iterator[tuple[CaptureCandidates, CaptureCandidates]]:
+) -> Iterator[tuple[Observation, Observation]]:
     rng = np.random.default_rng([seed, 2])
     bias_m = scenario.laser_bias_sigma_m * np.random.default_rng([seed, 1]).standard_normal(16)
     bias_m += scenario.range_offset_m - bias_m.mean()
@@ -63,10 +63,10 @@ def _captures(
         right = photograph(T_right_left @ T_left_board, rng, of_right, BOARD)
         if lidar is not None and left is not None and right is not None:
             name = f"{n_seen:06d}"
-            yield CaptureCandidates(name, left, [lidar]), CaptureCandidates(name, right, [lidar])
+            yield Observation(name, left, lidar), Observation(name, right, lidar)
             n_seen += 1
 
 
-def only(captures: list[CaptureCandidates], kept: range) -> list[CaptureCandidates]:
+def only(captures: list[Observation], kept: range) -> list[Observation]:
     """Keep captures by their place."""
     return [captures[k] for k in kept]

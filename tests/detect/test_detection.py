@@ -21,9 +21,9 @@ def assert_same(a, b):
 def test_boards_of_both_sensors_come_back_as_they_were():
     item = simulate(1, seed=0)[0]
     assert_same(item.image, from_arrays(to_arrays(item.image)))
-    boards = from_arrays(to_arrays(list(item.lidar)))
+    boards = from_arrays(to_arrays([item.lidar]))
     assert len(boards) == 1
-    assert_same(item.lidar[0], boards[0])
+    assert_same(item.lidar, boards[0])
 
 
 def test_a_refusal_comes_back_as_it_was():

@@ -7,7 +7,6 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.core.geometry import difference, invert, perturb
-from lce_rig.core.results import Observation
 from lce_rig.judge.camera_pairs import camera_findings, pose_from_images, relate, shared_boards
 from lce_rig.rig.thresholds import CalibrationSettings, VerdictSettings
 from tests.calibrate.boards import BOARD
@@ -21,12 +20,7 @@ TURNED = np.array([0, 0, 0, 0, np.radians(0.5), 0])
 
 def observed(session):
     """Pair both cameras' boards as a calibration would, whose consensus is not what is tested."""
-    return list(
-        zip(
-            *([Observation(c.capture, c.image, c.lidar[0]) for c in session[name]] for name in (LEFT, RIGHT)),
-            strict=True,
-        )
-    )
+    return list(zip(session[LEFT], session[RIGHT], strict=True))
 
 
 def related(session):

@@ -8,7 +8,6 @@ import pytest
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.local_quadratic import SCALE, SHIFT, expand
 from lce_rig.core.geometry import difference, perturb
-from lce_rig.core.results import Observation
 from lce_rig.judge.negative_control import control_findings, run_control
 from lce_rig.judge.nuisances import estimate_nuisances, nuisance_findings
 from lce_rig.judge.split_consistency import contrast_halves, find_groups, split_findings
@@ -29,7 +28,7 @@ def calibrated(n=20, seed=1):
 
 
 def observed(n=15, seed=1, scenario=None):
-    return [Observation(item.capture, item.image, item.lidar[0]) for item in simulate(n, seed, scenario)]
+    return simulate(n, seed, scenario)
 
 
 def expanded(observations, T=T_NEAR, laser=0.008, offset=0.005, is_scale_free=False):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import Clocks
-from lce_rig.calibrate.metrics import capture_residual
+from lce_rig.calibrate.result import capture_residual
 from lce_rig.core.calibration import Calibration, Certificate, ChannelResult, Metrics
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import Observation

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.report import NO_CERTIFICATE
 from lce_rig.core.calibration import Certificate
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import perturb
@@ -57,7 +56,8 @@ def test_a_result_without_certificate_fails(estimate, verdict_of):
 
 
 def test_a_method_without_certificates_is_marginal_and_named(estimate, verdict_of):
-    verdict, reasons = verdict_of(replace(estimate, certificate=NO_CERTIFICATE, method="other"))
+    uncertified = Certificate(is_optimal=False, gap=float("inf"))
+    verdict, reasons = verdict_of(replace(estimate, certificate=uncertified, method="other"))
     assert verdict == "marginal"
     assert (reasons[0].code, reasons[0].figures) == ("verdict.no_certificate", {"method": "other"})
 
@@ -142,14 +142,15 @@ def test_a_plate_of_another_size_than_the_profiles_is_named(estimate, factor, ex
 
 
 def test_large_residuals_fail_and_name_their_limit(estimate, verdict_of):
-    bad = replace(estimate, metrics=replace(estimate.metrics, mpe_m=0.08))
+    bad = replace(estimate, residuals=tuple(replace(r, plane_mean_m=0.08) for r in estimate.residuals))
     verdict, reasons = verdict_of(bad)
     assert verdict == "fail"
-    assert reasons[0].figures == {"mean_m": 0.08, "limit_m": 0.03}
+    assert reasons[0].figures == pytest.approx({"mean_m": 0.08, "limit_m": 0.03})
 
 
 def test_the_worst_reason_comes_first(estimate, verdict_of):
-    doubtful = replace(estimate, certificate=Certificate(False, 1.0), held_out_m=1.0)
+    residuals = tuple(replace(r, held_out_m=1.0) for r in estimate.residuals)
+    doubtful = replace(estimate, certificate=Certificate(False, 1.0), residuals=residuals)
     verdict, reasons = verdict_of(doubtful)
     assert verdict == "fail"
     assert [reason.code for reason in reasons] == ["verdict.not_certified", "verdict.held_out"]

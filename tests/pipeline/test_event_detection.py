@@ -114,7 +114,7 @@ def test_stamps_of_either_clock_are_brought_to_the_rigs_time(tmp_path, stream):
 
 def test_the_stamp_is_the_median_firing_time_of_the_first_lidars_board(seen):
     rig = load_rig("rles")
-    lidar = replace(simulate(1, 0)[0].lidar[0], stamp_ns=SCAN_NS)
+    lidar = replace(simulate(1, 0)[0].lidar, stamp_ns=SCAN_NS)
     offset_ns = 31 * MS + np.arange(len(lidar.points))
     timed = replace(lidar, offset_ns=offset_ns)
     capture = seen.captures[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lce_rig as lce
-from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.observations import group_placements
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.core.results import Observation
@@ -78,7 +78,7 @@ def test_what_all_sessions_share_is_not_averaged_out(make):
 
 def test_placements_of_different_sessions_are_independent_wherever_the_board_stood():
     (item,) = simulate(1, 0)
-    board = Observation("a", item.image, item.lidar[0])
+    board = Observation("a", item.image, item.lidar)
     same = [replace(board, capture=name) for name in ("a", "b")]
     other = [replace(each, session="tuesday") for each in same]
     assert group_placements([*same, *other]).tolist() == [0, 0, 1, 1]

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.features import CaptureFeatures
 from lce_rig.calibrate.local_quadratic import SHIFT
-from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M
-from lce_rig.calibrate.plane_and_ends import describe_background, end_residuals, end_rows
+from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M, describe_background, end_residuals, end_rows
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array

@@ -13,6 +13,7 @@ matrix for each of the four edges, so that association only chooses which are su
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,26 +27,23 @@ from lce_rig.calibrate.algorithm_1.registration import (
     with_one,
 )
 from lce_rig.calibrate.features import CaptureFeatures
-from lce_rig.calibrate.plane_and_ends import residual_rows
+from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M, residual_rows
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, pose
 
+N_ROUNDS = 3
+"""Rounds of association and solution."""
+# Unknowns [vec R; t; d; 1].
+_SIZE = 14
 _EDGE_CHUNK = 4096
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Weights of (1), and of the prior on the edge shift.
-
-    Attributes:
-        plane, edge: w_plane, w_edge.
-        shift_prior: weight of d^2; None holds d at zero.
-    """
+class Weights(NamedTuple):
+    """Weights w_plane and w_edge of (1)."""
 
     plane: float
     edge: float
-    shift_prior: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +52,7 @@ class Solutions:
 
     Attributes:
         R: (B, 3, 3).
-        linear: (B, 3 + k): t, then the edge shift where it is free.
+        linear: (B, 4): t, then the edge shift.
         edge_ids: (B, n) edge of each ring end.
         certificates: of each.
     """
@@ -71,7 +69,7 @@ class Solutions:
 
     @property
     def x(self) -> Array:
-        """[vec R; t; d; 1] (B, m)."""
+        """[vec R; t; d; 1] (B, 14)."""
         return with_one(np.concatenate([vec_rotation(self.R), self.linear], axis=1))
 
 
@@ -94,39 +92,38 @@ class Problem:
     ) -> None:
         self.n_captures = len(features)
         self.keep = keep
-        self.n_shift = 0 if weights.shift_prior is None else 1
-        self.size = 13 + self.n_shift
-        self._upper = np.triu_indices(self.size)
+        self._upper = np.triu_indices(_SIZE)
         self._board = board
         masks = [np.ones(len(f.plane_points), dtype=bool) for f in features] if keep is None else keep
-        self.plane = np.stack([self._plane_moments(f, mask) for f, mask in zip(features, masks, strict=True)])
+        planes = []
+        for f, mask in zip(features, masks, strict=True):
+            rows = residual_rows(f.normal, f.centre, f.plane_points[mask], np.zeros((1, 1)))
+            planes.append((rows.T @ rows)[self._upper] / max(len(rows), 1))
+        self.plane = np.stack(planes)
         counts = [len(f.edge_points) for f in features]
         self.edge_capture = np.repeat(np.arange(len(features)), counts)
         self._edge_weight = 1.0 / np.maximum(np.array(counts), 1)[self.edge_capture]
         # Ring ends are sorted by capture: the first of each, and the captures that have any.
         self._first_end = np.flatnonzero(np.diff(self.edge_capture, prepend=-1))
-        edge_rows = np.concatenate([self._rows_of_edges(f) for f in features])
-        self._to_board = np.concatenate([_board_coordinates(f, self.size) for f in features])
+        shift = np.ones((1, 1, 1))
+        edge_rows = np.concatenate(
+            [
+                residual_rows(f.edge_normals[None], f.edge_anchors[None], f.edge_points[:, None], shift)
+                for f in features
+            ]
+        )
+        self._to_board = np.concatenate([_board_coordinates(f) for f in features])
         # In place: with hundreds of captures, this is the largest array of a calibration.
         self.edge = edge_rows[..., self._upper[0]]
         self.edge *= edge_rows[..., self._upper[1]]
         self.edge *= self._edge_weight[:, None, None]
         self.weights = weights
 
-    def _plane_moments(self, f: CaptureFeatures, mask: NDArray[np.bool_]) -> Array:
-        shift = np.zeros((1, self.n_shift))
-        rows = residual_rows(f.normal, f.centre, f.plane_points[mask], shift)
-        return np.asarray((rows.T @ rows)[self._upper] / max(len(rows), 1))
-
-    def _rows_of_edges(self, f: CaptureFeatures) -> Array:
-        shift = np.ones((1, 1, self.n_shift))
-        return residual_rows(f.edge_normals[None], f.edge_anchors[None], f.edge_points[:, None], shift)
-
     def associate(self, x: Array) -> NDArray[np.int8]:
         """Find the nearest of the board's edges to each ring end.
 
         Args:
-            x: (B, m).
+            x: (B, 14).
 
         Returns:
             (B, n), as `Board.nearest_edge`.
@@ -153,7 +150,7 @@ class Problem:
             weights: other weights than the problem's.
 
         Returns:
-            (B, m, m).
+            (B, 14, 14).
         """
         w = weights or self.weights
         # Most sets agree on most edges: sum those of the first set for all, then exchange what differs.
@@ -168,17 +165,16 @@ class Problem:
             first = np.flatnonzero(np.r_[True, np.diff(b) > 0])
             total[b[first]] += np.add.reduceat(change, first, axis=0)
         M = self._unpack(total)
-        if w.shift_prior is not None:
-            M[:, 12, 12] += w.shift_prior
+        M[:, 12, 12] += EDGE_SHIFT_SIGMA_M**-2
         return M
 
     def _unpack(self, upper: Array) -> Array:
-        M = np.empty((len(upper), self.size, self.size))
+        M = np.empty((len(upper), _SIZE, _SIZE))
         M[:, self._upper[0], self._upper[1]] = upper
         M[:, self._upper[1], self._upper[0]] = upper
         return M
 
-    def solve(self, selection: Array, T_start: Array, n_rounds: int) -> Solutions:
+    def solve(self, selection: Array, T_start: Array, n_rounds: int = N_ROUNDS) -> Solutions:
         """Solve each set of captures, re-associating the ring ends between rounds.
 
         Args:
@@ -187,8 +183,7 @@ class Problem:
             n_rounds: of association and solution.
         """
         R = np.repeat(T_start[None, :3, :3], len(selection), axis=0)
-        linear = np.zeros((len(selection), 3 + self.n_shift))
-        linear[:, :3] = T_start[:3, 3]
+        linear = np.tile(np.append(T_start[:3, 3], 0.0), (len(selection), 1))
         for _ in range(n_rounds):
             x = with_one(np.concatenate([vec_rotation(R), linear], axis=1))
             edge_ids = self.associate(x)
@@ -207,7 +202,7 @@ class Problem:
         """Expand each capture's cost in the tangent (translation m, rotation rad, edge shift m).
 
         Args:
-            x: (m,) solution [vec R; t; d; 1].
+            x: (14,) solution [vec R; t; d; 1].
             edge_ids: (n,) its association.
             placement: (F,) numbers of the board placements; each capture's own by default.
             weights: other weights than the problem's.
@@ -215,35 +210,30 @@ class Problem:
         w = weights or self.weights
         ends = self.edge[np.arange(len(edge_ids)), edge_ids]
         M = self._unpack(w.plane * self.plane + w.edge * self._by_capture(ends))
-        J = tangent_basis(x[:9].reshape(3, 3).T, self.n_shift)
-        prior = np.zeros((6 + self.n_shift, 6 + self.n_shift))
-        if w.shift_prior is not None:
-            prior[6, 6] = w.shift_prior
-        prior_gradient = prior[:, -1] * x[-2]
-        captures = np.arange(self.n_captures)
-        return Quadratics(
-            (M @ x) @ J, J.T @ M @ J, prior, prior_gradient, captures if placement is None else placement
-        )
+        J = tangent_basis(x[:9].reshape(3, 3).T, 1)
+        prior = np.zeros((7, 7))
+        prior[6, 6] = EDGE_SHIFT_SIGMA_M**-2
+        placement = np.arange(self.n_captures) if placement is None else placement
+        return Quadratics((M @ x) @ J, J.T @ M @ J, prior, prior[:, 6] * x[12], placement)
 
     def errors(self, x: Array) -> tuple[Array, Array]:
         """Compute each capture's rms plane and edge residual in m, (B, F) each.
 
         Args:
-            x: (B, m).
+            x: (B, 14).
         """
         products = x[:, self._upper[0]] * x[:, self._upper[1]]
         products[:, self._upper[0] != self._upper[1]] *= 2
         plane = np.maximum(products @ self.plane.T, 0)
-        shift_m = x[:, 12:-1].sum(axis=1, keepdims=True)
-        inside_m = self._board.inside_nearest_edge(self._on_board(x)) + shift_m
+        inside_m = self._board.inside_nearest_edge(self._on_board(x)) + x[:, 12, None]
         edge = self._by_capture((inside_m**2 * self._edge_weight).T).T
         return np.sqrt(plane), np.sqrt(edge)
 
 
-def _board_coordinates(f: CaptureFeatures, size: int) -> Array:
-    """Write the board coordinates x, y of ring ends as rows (M, 2, m) that multiply [vec R; t; d; 1]."""
+def _board_coordinates(f: CaptureFeatures) -> Array:
+    """Write the board coordinates x, y of ring ends as rows (M, 2, 14) that multiply [vec R; t; d; 1]."""
     R, t = f.T_board_cam[:2, :3], f.T_board_cam[:2, 3]
-    rows = np.zeros((len(f.edge_points), 2, size))
+    rows = np.zeros((len(f.edge_points), 2, _SIZE))
     rows[:, :, :9] = (f.edge_points[:, None, :, None] * R[None, :, None, :]).reshape(-1, 2, 9)
     rows[:, :, 9:12] = R
     rows[:, :, -1] = t

@@ -54,6 +54,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.features import turn_about_z
 from lce_rig.calibrate.plane_and_ends import (
     BLENDS,
     describe_background,
@@ -173,14 +174,6 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
         end_fields=_fields(ends, T_lidar_board[end_capture[sorted_ends]], board),
         end_background=np.concatenate([describe_background(board) for board in boards])[sorted_ends],
     )
-
-
-def turn_about_z(vectors: Array, angle_rad: Array) -> Array:
-    """Turn vectors (M, 3) about the z axis by angles (M,)."""
-    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
-    x = cosine * vectors[:, 0] - sine * vectors[:, 1]
-    y = sine * vectors[:, 0] + cosine * vectors[:, 1]
-    return np.stack([x, y, vectors[:, 2]], axis=1)
 
 
 def _fields(points: Array, T_lidar_board: Array, board: Board) -> Array:

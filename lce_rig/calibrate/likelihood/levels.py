@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lce_rig.calibrate.algorithm_1.background import BACKGROUND_SIGMAS_M
-from lce_rig.calibrate.known_lidar import KnownLidar
-from lce_rig.calibrate.options import EDGE_SHIFT_SIGMA_M, EstimateSettings
+from lce_rig.calibrate.options import EstimateSettings, KnownLidar
+from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.geometry import Array
 
 

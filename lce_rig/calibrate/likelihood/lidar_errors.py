@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.known_lidar import KnownLidar
 from lce_rig.calibrate.likelihood.along_rays import ERRORS_OF_LASER, N_LENS, N_OF_LASER
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
-from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.options import EstimateSettings, KnownLidar
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation

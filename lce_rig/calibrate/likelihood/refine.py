@@ -26,17 +26,14 @@ from lce_rig.calibrate.likelihood.levels import NO_LASER_M, Levels, PoseLevels, 
 from lce_rig.calibrate.likelihood.settle import JointProblem, Point
 from lce_rig.calibrate.likelihood.system import (
     PER_CAMERA,
-    Assembly,
     State,
     Terms,
     assemble,
-    linearise,
     of_the_lidar,
     scale_places,
 )
-from lce_rig.calibrate.placements import group_shared_placements
-from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
-from lce_rig.calibrate.tolerances import Variant
+from lce_rig.calibrate.observations import group_shared_placements
+from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation
@@ -128,7 +125,7 @@ def refine(
     seen = {o.capture: (o, T) for own, T in zip(cameras, T_cam_lidar, strict=True) for o in own}
     order = {name: k for k, name in enumerate(sorted(seen))}
     scans = stack_scans([interior(seen[name][0].lidar, board) for name in order], board)
-    images = tuple(_stack_images(own, order, board) for own in cameras)
+    images = tuple(stack_camera(own, order, board) for own in cameras)
     if pose_ratios is not None:
         images = tuple(p.with_larger_errors(r) for p, r in zip(images, pose_ratios, strict=True))
     state = State(
@@ -197,7 +194,8 @@ def _once(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array
     return 1 / fewest
 
 
-def _stack_images(observations: Sequence[Observation], order: dict[str, int], board: Board) -> StackedImages:
+def stack_camera(observations: Sequence[Observation], order: dict[str, int], board: Board) -> StackedImages:
+    """Stack one camera's images; `order` gives each capture's place by name."""
     capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
     return stack_images(capture, [o.image for o in observations], board)
 
@@ -267,71 +265,3 @@ def _covariance_parts(cost: Quadratics, priors: Priors, n_cameras: int) -> tuple
         claimed, of_profile = claimed.copy(), np.append(scale_places(n_cameras), bows)
         claimed[of_profile, of_profile] = 0.0
     return inverse @ cost.hessians.sum(axis=0) @ inverse, inverse @ claimed @ inverse
-
-
-def moves_under(
-    joint: JointEstimate, used: Sequence[Observation], variants: Sequence[Variant], board: Board
-) -> Array:
-    """Compute how far errors of the profile move one camera's extrinsics, to first order.
-
-    Args:
-        joint: of one camera.
-        used: the F observations, in the order of `variants`.
-        variants: V of what would have been observed.
-        board: as the profile says.
-
-    Returns:
-        (V, 6) tangents (translation m, rotation rad).
-    """
-    order = {name: k for k, name in enumerate(sorted(o.capture for o in used))}
-    here, changes = Assembly(joint.terms, joint.priors), []
-    for variant in variants:
-        images = (_stack_images(variant.observations, order, variant.board),)
-        lidars = {o.capture: o.lidar for o in variant.observations}
-        is_of_image = variant.board == board and all(o.lidar is lidars[o.capture] for o in used)
-        if is_of_image:
-            moved = here.with_images(images, joint.state)
-        else:
-            scans = stack_scans([interior(lidars[name], variant.board) for name in order], variant.board)
-            terms = linearise(scans, images, variant.board, joint.state, joint.trust)
-            moved = Assembly(terms, joint.priors)
-        gradients = moved.at(joint.levels).cost.gradients
-        changes.append((gradients - joint.cost.gradients).sum(axis=0))
-    moves = np.linalg.solve(joint.cost.information, np.transpose(changes))
-    return np.asarray(-(joint.to_extrinsics[0] @ moves).T)
-
-
-# Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
-_SURE = 2.0
-
-
-def inflate(
-    joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0, n_seen: int | None = None
-) -> tuple[Array, float]:
-    """Multiply a camera's covariance (6, 6) according to the spread over placements.
-
-    The spread of the optimum without each placement (`lce_rig.calibrate.quadratics`) is independent of the
-    noise model. If it significantly exceeds the model's covariance, there are errors that the model lacks.
-
-    Args:
-        joint: of F captures.
-        placement: (F,) number of each capture's placement.
-        camera: its number.
-        n_seen: number of placements that it saw; all if None.
-
-    Returns:
-        The covariance and the factor, 1 if model and spread agree.
-    """
-    cov = joint.cov[camera]
-    n = int(placement.max()) + 1 if n_seen is None else n_seen
-    ratio = float(np.trace(symmetric_inverse(cov) @ jackknife(joint, placement, camera))) / len(cov)
-    # A mean of 6 chi squares over n - 1 freedoms each.
-    chance = np.sqrt(2 / (len(cov) * max(n - 1, 1)))
-    factor = ratio if ratio > 1 + _SURE * chance else 1.0
-    return factor * cov, factor
-
-
-def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
-    """Compute the jackknife covariance (6, 6) of a camera's extrinsics over placements."""
-    cost = replace(joint.cost, placement=placement)
-    return jackknife_scatter(cost.moves() @ joint.to_extrinsics[camera].T)

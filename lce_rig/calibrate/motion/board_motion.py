@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.covariance import symmetric_inverse
+from lce_rig.calibrate.observations import Clocks, SharedScan
 from lce_rig.core.geometry import Array, difference, fit_plane, perturb, rotation_angle, skew
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import LidarBoard, Observation
 
 # Prior of a hand's typical rates: (speed m/s, turn rad/s) per axis, and its weight in captures.
 USUAL_HABITS = np.array([0.15, np.radians(10.0)])
@@ -105,50 +106,44 @@ class BoardMotions:
         return np.asarray(self.cov[:, :6, :6] + t * both + t**2 * self.cov[:, 6:, 6:])
 
 
-def sample_poses(
-    captures: Sequence[Sequence[tuple[str, ImageBoard, float]]], noise_px: Mapping[str, float]
-) -> PoseSamples:
-    """Collect the poses of captures.
+def sample_poses(scans: Sequence[SharedScan], clocks: Clocks, noise_px: Mapping[str, float]) -> PoseSamples:
+    """Collect the poses of the board in the images of scans.
 
     The images of one channel in one capture, reconstructed from one stream, share much of their error:
     together they count as one.
 
     Args:
-        captures: (channel, board, time in s of its image after the scan's timestamp) of each; the first
-            board's corners give the orientation of the others.
+        scans: with their images; the first image's corners give the orientation of the others.
+        clocks: of the sensors.
         noise_px: corner noise by channel, replacing each image's own.
     """
-    channels = tuple(sorted({channel for capture in captures for channel, *_ in capture}))
-    rows = [
-        [sample for channel, board, time_s in capture for sample in _samples_of(channel, board, time_s)]
-        for capture in captures
-    ]
+    channels = tuple(sorted({channel for scan in scans for channel in scan.images}))
+    floor = np.diag(POSE_FLOOR**2)
+    rows: list[list[tuple[Array, Array, float, int]]] = []
+    for scan in scans:
+        row = []
+        for channel, board in scan.images.items():
+            after_s = clocks.after_scan_s(channel, board, scan.lidar)
+            poses = [(board.T_cam_board, board.cov, after_s)]
+            if board.track_ns is not None and board.track_T_cam_board is not None:
+                assert board.stamp_ns is not None and board.track_cov is not None
+                times_s = after_s + (board.track_ns - board.stamp_ns) * 1e-9
+                poses += zip(board.track_T_cam_board, board.track_cov, times_s.tolist(), strict=True)
+            scale = (noise_px[channel] / max(board.sigma_px, 1e-6)) ** 2
+            for T_cam_board, cov, t in poses:
+                information = symmetric_inverse(len(poses) * (scale * cov + floor))
+                row.append((T_cam_board, information, t, channels.index(channel)))
+        rows.append(row)
     shape = len(rows), max(len(row) for row in rows)
     T = np.broadcast_to(np.eye(4), (*shape, 4, 4)).copy()
     information, time_s = np.zeros((*shape, 6, 6)), np.zeros(shape)
     channel_id = np.zeros(shape, dtype=np.intp)
-    floor = np.diag(POSE_FLOOR**2)
     for f, row in enumerate(rows):
-        for j, (channel, n_alike, sigma_px, T_cam_board, cov, t) in enumerate(row):
-            scale = (noise_px[channel] / max(sigma_px, 1e-6)) ** 2
-            T[f, j], time_s[f, j], channel_id[f, j] = T_cam_board, t, channels.index(channel)
-            information[f, j] = symmetric_inverse(n_alike * (scale * cov + floor))
+        for j, sample in enumerate(row):
+            T[f, j], information[f, j], time_s[f, j], channel_id[f, j] = sample
         turned = rotation_angle(T[f, 1:, :3, :3], T[f, 0, :3, :3]) > np.pi / 2
         T[f, 1:, :3, :3][turned] = T[f, 1:, :3, :3][turned] @ _HALF_TURN
     return PoseSamples(channels, T, information, time_s, channel_id)
-
-
-def _samples_of(
-    channel: str, board: ImageBoard, time_s: float
-) -> list[tuple[str, int, float, Array, Array, float]]:
-    main = (board.T_cam_board, board.cov, time_s)
-    if board.track_ns is None or board.track_T_cam_board is None or board.track_cov is None:
-        return [(channel, 1, board.sigma_px, *main)]
-    assert board.stamp_ns is not None
-    times_s = time_s + (board.track_ns - board.stamp_ns) * 1e-9
-    followed = zip(board.track_T_cam_board, board.track_cov, times_s.tolist(), strict=True)
-    n_alike = 1 + len(times_s)
-    return [(channel, n_alike, board.sigma_px, *each) for each in (main, *followed)]
 
 
 def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) -> BoardMotions:
@@ -271,6 +266,34 @@ def board_time_s(lidar: LidarBoard, sweep_s: float) -> float:
     return sweep_s / 2 if lidar.offset_ns is None else float(np.mean(lidar.offset_ns)) * 1e-9
 
 
+def compensate(
+    observations: Sequence[Observation], motions: BoardMotions, T_cam_lidar: Array, sweep_s: float
+) -> list[Observation]:
+    """Bring both sensors' boards to the LiDAR's time, and the points of each board to one time.
+
+    Args:
+        observations: of F captures.
+        motions: of the board in them.
+        T_cam_lidar: (4, 4), accurate to a few degrees; it only rotates the rates of motion.
+        sweep_s: of the LiDAR.
+    """
+    times_s = np.array([board_time_s(observation.lidar, sweep_s) for observation in observations])
+    moved = [
+        replace(o, image=replace(o.image, T_cam_board=T, cov=cov, T_cam_board_alternative=None))
+        for o, T, cov in zip(observations, motions.at(times_s), motions.cov_at(times_s), strict=True)
+    ]
+    return deskew_points(moved, motions, T_cam_lidar)
+
+
+def deskew_points(
+    observations: Sequence[Observation], motions: BoardMotions, T_cam_lidar: Array
+) -> list[Observation]:
+    """Motion-compensate the points of boards to one time, as `compensate`."""
+    R_cam_lidar = T_cam_lidar[:3, :3]
+    rates = np.concatenate([motions.rates[:, :3] @ R_cam_lidar, motions.rates[:, 3:] @ R_cam_lidar], axis=1)
+    return [replace(o, lidar=deskew(o.lidar, rate)) for o, rate in zip(observations, rates, strict=True)]
+
+
 def deskew(lidar: LidarBoard, rates_lidar: Array) -> LidarBoard:
     """Move a board's points to their positions at the points' mean firing time.
 
@@ -284,13 +307,11 @@ def deskew(lidar: LidarBoard, rates_lidar: Array) -> LidarBoard:
     arms = lidar.points - lidar.T_lidar_board[:3, 3]
     moved = -since_s[:, None] * (rates_lidar[:3] + np.cross(rates_lidar[3:], arms))
     # A ring end is one of the points, or within one step of a point.
-    nearest = np.argmin(_squared_distances(lidar.edge_points, lidar.points), axis=1)
+    ends, all_points = lidar.edge_points, lidar.points
+    squared = np.sum(ends**2, axis=1)[:, None] - 2 * ends @ all_points.T + np.sum(all_points**2, axis=1)
+    nearest = np.argmin(squared, axis=1)
     points = lidar.points + moved
     plane, rms_m = fit_plane(points)
     return replace(
         lidar, points=points, edge_points=lidar.edge_points + moved[nearest], plane=plane, sigma_m=rms_m
     )
-
-
-def _squared_distances(a: Array, b: Array) -> Array:
-    return np.asarray(np.sum(a**2, axis=1)[:, None] - 2 * a @ b.T + np.sum(b**2, axis=1))

@@ -16,16 +16,31 @@ from itertools import product
 
 import numpy as np
 
+from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.features import CaptureFeatures, extract_features, place_features
-from lce_rig.calibrate.motion.board_motion import BoardMotions, PoseSamples, board_time_s, deskew, fit_motions
-from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.motion.board_motion import (
+    BoardMotions,
+    PoseSamples,
+    board_time_s,
+    compensate,
+    deskew_points,
+    fit_motions,
+)
+from lce_rig.calibrate.observations import Clocks, SharedScan
 from lce_rig.calibrate.plane_and_ends import along_normals, differentiate
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import Observation
 
+MIN_MOVING = 6
+"""Fewer captures with images of several times do not determine time offsets."""
+# Ratio of mean squared rates to noise above which boards moved.
+_MOVED = 1.0
+# Time offsets a priori where a profile states no tolerance; and where timestamps are missing: such images may
+# be at any time around the scan they were saved with.
+_TOLERANCE_S, _NO_STAMPS_SIGMA_S = 0.05, 0.15
 _REACH_S, _GRID_S = 0.2, 0.04
 _STEP_S = 0.004
 _N_ITERATIONS = 6
@@ -52,78 +67,90 @@ class TimeOffsets:
     sensitivity: Array
 
 
-def at_scan_time(
-    observations: Sequence[Observation], motions: BoardMotions, sweep_s: float
-) -> list[Observation]:
-    """Replace the board's pose of every capture by that at the LiDAR's time.
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The boards of F scans, and how they moved between the scan and its images.
 
-    Args:
-        observations: of F captures.
-        motions: of the board in them.
-        sweep_s: of the LiDAR.
-    """
-    times_s = np.array([board_time_s(observation.lidar, sweep_s) for observation in observations])
-    return [
-        replace(o, image=replace(o.image, T_cam_board=T, cov=cov, T_cam_board_alternative=None))
-        for o, T, cov in zip(observations, motions.at(times_s), motions.cov_at(times_s), strict=True)
-    ]
-
-
-def deskew_points(
-    observations: Sequence[Observation], motions: BoardMotions, T_cam_lidar: Array
-) -> list[Observation]:
-    """Motion-compensate the points of boards to one time.
-
-    Args:
-        observations: of F captures.
-        motions: of the board in them.
+    Attributes:
+        scans: with their images.
+        samples: poses of the board in these.
         T_cam_lidar: (4, 4), accurate to a few degrees; it only rotates the rates of motion.
+        sweep_s: duration of a revolution of the LiDAR.
+        offsets: of the images' times; None where boards stood still.
     """
-    R_cam_lidar = T_cam_lidar[:3, :3]
-    rates = np.concatenate([motions.rates[:, :3] @ R_cam_lidar, motions.rates[:, 3:] @ R_cam_lidar], axis=1)
-    return [replace(o, lidar=deskew(o.lidar, rate)) for o, rate in zip(observations, rates, strict=True)]
+
+    scans: Sequence[SharedScan]
+    samples: PoseSamples
+    T_cam_lidar: Array
+    sweep_s: float
+    offsets: TimeOffsets | None = None
+
+    @property
+    def is_seen_by_each(self) -> bool:
+        """Whether boards stood still, or a channel alone shows their motion: channels can be compared."""
+        return self.offsets is None or bool(np.mean(self.samples.is_followed.any(axis=1)) > 0.5)
+
+    def observations(self, only: str | None = None) -> list[Observation]:
+        """Pair each scan with the board's pose at its time, from all channels or positioned by one alone."""
+        kept = [k for k, scan in enumerate(self.scans) if only is None or only in scan.images]
+        observations = [self.scans[k].observation(only) for k in kept]
+        if self.offsets is None:
+            return observations
+        motions = fit_motions(self.samples.select(kept), self.offsets.offset_s, only)
+        return compensate(observations, motions, self.T_cam_lidar, self.sweep_s)
+
+    def widened(self, cov: Array) -> Array:
+        """Add the effect of the time offsets' uncertainty to a covariance (6, 6) of the extrinsics."""
+        if self.offsets is None:
+            return cov
+        return np.asarray(cov + self.offsets.sensitivity @ self.offsets.cov @ self.offsets.sensitivity.T)
 
 
-def estimate_time_offsets(
-    samples: PoseSamples,
-    observations: Sequence[Observation],
-    board: Board,
-    options: EstimateSettings,
-    weights: Weights,
-    T_start: Array,
-    *,
-    prior_sigma_s: Array,
-    sweep_s: float,
-) -> TimeOffsets:
-    """Minimise (1).
+def estimate_motion(
+    scans: Sequence[SharedScan], samples: PoseSamples, board: Board, start: Algorithm1, clocks: Clocks
+) -> Motion:
+    """Minimise (1), if boards moved.
 
     Args:
-        samples: the poses of F captures by channel.
-        observations: the same captures with the LiDAR's boards and any channel's image.
+        scans: F of them with their images.
+        samples: poses of the board in these.
         board: its size.
-        options: switches of the features.
-        weights: of the cost's terms.
-        T_start: (4, 4) T_cam_lidar without compensation.
-        prior_sigma_s: (C,) prior standard deviation of each offset.
-        sweep_s: of the LiDAR.
+        start: extrinsics and weights without compensation.
+        clocks: of the sensors.
     """
-    offset_s = _search_grid(samples, observations, T_start, prior_sigma_s, sweep_s)
-    observations = deskew_points(observations, fit_motions(samples, offset_s), T_start)
+    still = Motion(scans, samples, start.T_cam_lidar, clocks.sweep_s)
+    moving = np.flatnonzero(samples.tells_motion).tolist()
+    if len(moving) < MIN_MOVING:
+        return still
+    samples, scans = samples.select(moving), [scans[k] for k in moving]
+    prior_sigma_s = np.zeros(len(samples.channels))
+    for c, channel in enumerate(samples.channels):
+        images = [(scan.images[channel], scan.lidar) for scan in still.scans if channel in scan.images]
+        is_stamped = all(image.stamp_ns is not None and lidar.stamp_ns is not None for image, lidar in images)
+        tolerance_s = clocks.tolerance_s.get(channel, _TOLERANCE_S)
+        prior_sigma_s[c] = tolerance_s if is_stamped else _NO_STAMPS_SIGMA_S
+    observations = [scan.observation() for scan in scans]
+    times_s = np.array([board_time_s(observation.lidar, clocks.sweep_s) for observation in observations])
+    offset_s = _search_grid(samples, observations, start.T_cam_lidar, prior_sigma_s, times_s)
+    swept = deskew_points(observations, fit_motions(samples, offset_s), start.T_cam_lidar)
     cost = _Cost(
         samples,
-        [extract_features(observation, board, options.parts.features) for observation in observations],
-        np.array([board_time_s(observation.lidar, sweep_s) for observation in observations]),
+        [extract_features(observation, board) for observation in swept],
+        times_s,
         board,
-        weights,
+        start.problem.weights,
         precision=np.diag(prior_sigma_s**-2.0),
     )
-    offset_s, slopes = _descend(cost, offset_s, T_start)
-    inverse = symmetric_inverse(slopes.hessian + cost.precision)
+    offset_s, gradients, hessian, T_rates = cost.minimise(offset_s, start.T_cam_lidar)
+    inverse = symmetric_inverse(hessian + cost.precision)
     few = len(observations) / max(len(observations) - len(offset_s) - 6, 1)
-    cov = inverse @ (few * slopes.gradients.T @ slopes.gradients + cost.precision) @ inverse
+    cov = inverse @ (few * gradients.T @ gradients + cost.precision) @ inverse
     # Uninformative captures scatter little: the variance must not be below that from the curvature of (1).
     widen = np.sqrt(np.maximum(np.diag(inverse) / np.diag(cov), 1.0))
-    return TimeOffsets(samples.channels, offset_s, np.asarray(widen[:, None] * cov * widen), slopes.T_rates)
+    if fit_motions(samples, offset_s).significance <= _MOVED:
+        return still
+    offsets = TimeOffsets(samples.channels, offset_s, np.asarray(widen[:, None] * cov * widen), T_rates)
+    return replace(still, offsets=offsets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +175,50 @@ class _Cost:
         cost = self.weights.plane * plane[0] ** 2 + self.weights.edge * edge[0] ** 2
         return _Evaluation(cost, motions, solution.T[0], float(offset_s @ self.precision @ offset_s))
 
+    def minimise(self, offset_s: Array, T_start: Array) -> tuple[Array, Array, Array, Array]:
+        """Minimise (1) by Newton steps, shortened if the cost rises.
+
+        Returns:
+            The offsets (C,), and derivatives of half of (1) without its prior near them: gradients (F, C) of
+            each capture, the Hessian (C, C) of all, the rates (6, C) of the extrinsics' tangent.
+        """
+        here = self.at(offset_s, T_start)
+        for _ in range(_N_ITERATIONS):
+            unit = float(np.median(here.cost)) / _FREEDOMS
+            gradients, hessian, T_rates = self._differentiate(offset_s, here, unit)
+            gradient = gradients.sum(axis=0) + self.precision @ offset_s
+            step = symmetric_inverse(hessian + self.precision) @ gradient
+            step *= min(1.0, _GRID_S / max(float(np.max(np.abs(step))), 1e-9))
+            if np.max(np.abs(step)) < _CONVERGED_S:
+                break
+            there = self.at(offset_s - step, here.T)
+            while there.total(unit) > here.total(unit) and np.max(np.abs(step)) > _CONVERGED_S:
+                step /= 3
+                there = self.at(offset_s - step, here.T)
+            if there.total(unit) > here.total(unit):
+                break
+            offset_s, here = offset_s - step, there
+        return offset_s, gradients, hessian, T_rates
+
+    def _differentiate(self, offset_s: Array, here: "_Evaluation", unit: float) -> tuple[Array, Array, Array]:
+        """Differentiate numerically at offsets (C,); costs of captures count in units of `unit`."""
+        n = len(offset_s)
+        steps = _STEP_S * np.eye(n)
+        middle = here.by_capture(unit)
+        ahead, behind = ([self.at(offset_s + sign * step, here.T) for step in steps] for sign in (1, -1))
+        up, down = ([e.by_capture(unit) for e in side] for side in (ahead, behind))
+        g = np.stack([(a - b) / (2 * _STEP_S) for a, b in zip(up, down, strict=True)], axis=1)
+        H = np.zeros((n, n))
+        for i in range(n):
+            H[i, i] = float(np.sum(up[i] + down[i] - 2 * middle)) / _STEP_S**2
+            for j in range(i):
+                corner = self.at(offset_s + steps[i] + steps[j], here.T).by_capture(unit)
+                H[i, j] = H[j, i] = float(np.sum(corner - up[i] - up[j] + middle)) / _STEP_S**2
+        rates = [difference(a.T, b.T) / (2 * _STEP_S) for a, b in zip(ahead, behind, strict=True)]
+        # Far from the minimum the curvature may be negative.
+        values, vectors = np.linalg.eigh(H)
+        return g, np.asarray((vectors * np.abs(values)) @ vectors.T), np.stack(rates, axis=1)
+
 
 @dataclass(frozen=True, eq=False)
 class _Evaluation:
@@ -170,69 +241,11 @@ def _rho(squared: Array) -> Array:
     return np.asarray(_ROBUST * np.log1p(squared / _ROBUST))
 
 
-@dataclass(frozen=True, eq=False)
-class _Slopes:
-    """Derivatives of half of (1), without its prior, by the offsets.
-
-    Attributes:
-        gradients: (F, C) of each capture.
-        hessian: (C, C) of all.
-        T_rates: (6, C) of the extrinsics' tangent.
-    """
-
-    gradients: Array
-    hessian: Array
-    T_rates: Array
-
-
-def _descend(cost: _Cost, offset_s: Array, T_start: Array) -> tuple[Array, _Slopes]:
-    """Minimise (1) by Newton steps, shortened if the cost rises: the offsets (C,), slopes near them."""
-    here = cost.at(offset_s, T_start)
-    for _ in range(_N_ITERATIONS):
-        unit = float(np.median(here.cost)) / _FREEDOMS
-        slopes = _differentiate(cost, offset_s, here, unit)
-        gradient = slopes.gradients.sum(axis=0) + cost.precision @ offset_s
-        step = symmetric_inverse(slopes.hessian + cost.precision) @ gradient
-        step *= min(1.0, _GRID_S / max(float(np.max(np.abs(step))), 1e-9))
-        if np.max(np.abs(step)) < _CONVERGED_S:
-            break
-        there = cost.at(offset_s - step, here.T)
-        while there.total(unit) > here.total(unit) and np.max(np.abs(step)) > _CONVERGED_S:
-            step /= 3
-            there = cost.at(offset_s - step, here.T)
-        if there.total(unit) > here.total(unit):
-            break
-        offset_s, here = offset_s - step, there
-    return offset_s, slopes
-
-
-def _differentiate(cost: _Cost, offset_s: Array, here: _Evaluation, unit: float) -> _Slopes:
-    """Differentiate numerically at offsets (C,); costs of captures count in units of `unit`."""
-    n = len(offset_s)
-    steps = _STEP_S * np.eye(n)
-    middle = here.by_capture(unit)
-    ahead, behind = ([cost.at(offset_s + sign * step, here.T) for step in steps] for sign in (1, -1))
-    up, down = ([e.by_capture(unit) for e in side] for side in (ahead, behind))
-    g = np.stack([(a - b) / (2 * _STEP_S) for a, b in zip(up, down, strict=True)], axis=1)
-    H = np.zeros((n, n))
-    for i in range(n):
-        H[i, i] = float(np.sum(up[i] + down[i] - 2 * middle)) / _STEP_S**2
-        for j in range(i):
-            corner = cost.at(offset_s + steps[i] + steps[j], here.T).by_capture(unit)
-            H[i, j] = H[j, i] = float(np.sum(corner - up[i] - up[j] + middle)) / _STEP_S**2
-    rates = [difference(a.T, b.T) / (2 * _STEP_S) for a, b in zip(ahead, behind, strict=True)]
-    # Far from the minimum the curvature may be negative.
-    values, vectors = np.linalg.eigh(H)
-    return _Slopes(g, np.asarray((vectors * np.abs(values)) @ vectors.T), np.stack(rates, axis=1))
-
-
 def _search_grid(
-    samples: PoseSamples, observations: Sequence[Observation], T: Array, prior_sigma_s: Array, sweep_s: float
+    samples: PoseSamples, observations: Sequence[Observation], T: Array, prior_sigma_s: Array, times_s: Array
 ) -> Array:
     """Find the offsets (C,) with the boards' middles closest to the camera's planes, on a coarse grid."""
-    lidars = [observation.lidar for observation in observations]
-    times_s = np.array([board_time_s(lidar, sweep_s) for lidar in lidars])
-    middles = np.array([lidar.points.mean(axis=0) for lidar in lidars])
+    middles = np.array([observation.lidar.points.mean(axis=0) for observation in observations])
     ticks = np.arange(-_REACH_S, _REACH_S + _GRID_S / 2, _GRID_S)
     best, best_cost = np.zeros(len(samples.channels)), np.inf
     for ticks_s in product(ticks, repeat=len(samples.channels)):

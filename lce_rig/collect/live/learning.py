@@ -7,12 +7,13 @@ from types import TracebackType
 
 import numpy as np
 
-from lce_rig.calibrate import CaptureCandidates, EstimateSettings, fit_extrinsic
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.guidance import Planner
 from lce_rig.collect.live.guide import Guide, Learned, make_guides
 from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.results import Observation
 from lce_rig.rig import Rig
 
 _NICE = 10
@@ -26,7 +27,7 @@ class Learning:
         self._guides = guides
         self._min_captures = rig.quality.min_captures
         self._worker = Worker("calibrate captures", _Teacher, rig, nice=_NICE)
-        self._candidates: dict[int, list[CaptureCandidates]] = {k: [] for k in range(len(guides))}
+        self._candidates: dict[int, list[Observation]] = {k: [] for k in range(len(guides))}
         self._due: deque[int] = deque()
         self._taught: deque[tuple[Guide, Planner | None]] = deque()
         self._unlearned: set[int] = set()
@@ -55,7 +56,7 @@ class Learning:
             for k, guide in enumerate(self._guides):
                 if guide.sees(detection):
                     image, scans = detection.images[guide.key], detection.lidars[guide.lidar]
-                    self._candidates[k].append(CaptureCandidates(name, image, scans))
+                    self._candidates[k].append(Observation.of(name, image, scans))
                     if len(self._candidates[k]) >= self._min_captures and k not in self._due:
                         self._due.append(k)
             self._changed.notify()
@@ -116,7 +117,7 @@ class _Teacher:
         self._board = rig.board.to_board()
         self._guides = make_guides(rig)
 
-    def learn(self, k: int, candidates: Sequence[CaptureCandidates]) -> Planner | None:
+    def learn(self, k: int, candidates: Sequence[Observation]) -> Planner | None:
         """Calibrate what one guide's sensors have shown; None where more captures are needed."""
         try:
             estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings("paper", n_draws=0))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.features import AS_MEASURED, extract_features
+from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.plane_and_ends import plane_residuals
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration
@@ -48,7 +48,7 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
     T = calibration.T_cam_lidar
     corners = board.corners()
     plane_m = [
-        plane_residuals(extract_features(o, board, AS_MEASURED), T, o.lidar.points) for o in observations
+        plane_residuals(extract_features(o, board, half_step=False), T, o.lidar.points) for o in observations
     ]
     points = np.concatenate([o.lidar.points for o in observations])
     residuals_px = []

@@ -7,7 +7,6 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, capture_residual, fit_extrinsic
 from lce_rig.core.geometry import difference
-from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 OPTIONS = EstimateSettings("paper", n_draws=0)
@@ -16,14 +15,14 @@ NAMES = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m
 
 def sooner(capture, by_m, echo, behind_m):
     """Move ring ends of one capture inwards by (M,), and tell what is behind them."""
-    lidar = capture.lidar[0]
+    lidar = capture.lidar
     axis = lidar.T_lidar_board[:3, :2]
     local = (lidar.edge_points - lidar.T_lidar_board[:3, 3]) @ axis
     beyond = np.abs(local) - [BOARD.width_m / 2, BOARD.height_m / 2]
     nearest = np.argmax(beyond, axis=1)
     outwards = np.sign(np.take_along_axis(local, nearest[:, None], axis=1)) * axis.T[nearest]
     ends = lidar.edge_points - by_m[:, None] * outwards
-    return replace(capture, lidar=[replace(lidar, edge_points=ends, edge_echo=echo, edge_behind_m=behind_m)])
+    return replace(capture, lidar=replace(lidar, edge_points=ends, edge_echo=echo, edge_behind_m=behind_m))
 
 
 def held(capture, is_behind, echo=0.0):
@@ -34,16 +33,14 @@ def held(capture, is_behind, echo=0.0):
 
 def lit(capture, rng):
     """Put walls of any brightness far behind the board: it ends 15 mm times their share sooner."""
-    side = capture.lidar[0].edge_side
+    side = capture.lidar.edge_side
     share = np.where(side > 0, 0.8, 0.2) * rng.uniform()
     return sooner(capture, 0.015 * share, share, np.full(len(side), 3.0))
 
 
 def unaware(capture):
-    nothing = np.zeros(len(capture.lidar[0].edge_side))
-    return replace(
-        capture, lidar=[replace(capture.lidar[0], edge_echo=nothing, edge_behind_m=nothing + np.inf)]
-    )
+    nothing = np.zeros(len(capture.lidar.edge_side))
+    return replace(capture, lidar=replace(capture.lidar, edge_echo=nothing, edge_behind_m=nothing + np.inf))
 
 
 def error_m(captures):
@@ -54,12 +51,12 @@ def error_m(captures):
 
 def test_what_the_board_ends_sooner_before_a_person_is_found_and_made_good():
     plain = simulate(20, 3)
-    captures = [held(c, (c.lidar[0].edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
+    captures = [held(c, (c.lidar.edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
     found = fit_extrinsic(captures, BOARD, OPTIONS)
     assert found.diagnostics.edge_shift_blended_m == pytest.approx(-0.008, abs=0.003)
     for residual in found.residuals:
         (capture,) = (c for c in captures if c.capture == residual.capture)
-        observation = Observation(capture.capture, capture.image, capture.lidar[0])
+        observation = capture
         assert residual.edge_mean_m == capture_residual(found.T_cam_lidar, observation, BOARD).edge_mean_m
     corrected, as_measured = error_m(captures), error_m([unaware(c) for c in captures])
     assert corrected < 0.002
@@ -76,7 +73,7 @@ def test_what_walls_behind_the_board_take_from_its_edges_is_found_and_made_good(
 
 def test_the_echo_of_a_person_counts_by_itself():
     rng = np.random.default_rng(1)
-    captures = [held(c, c.lidar[0].edge_side > 0, rng.uniform()) for c in simulate(20, 7)]
+    captures = [held(c, c.lidar.edge_side > 0, rng.uniform()) for c in simulate(20, 7)]
     found = fit_extrinsic(captures, BOARD, OPTIONS).diagnostics
     middle_m = found.edge_shift_blended_m + 0.5 * found.edge_shift_blended_echo_m
     assert middle_m == pytest.approx(-0.018, abs=0.004)
@@ -90,7 +87,7 @@ def test_edges_that_no_background_moves_are_left_as_they_are():
     for seed in range(12):
         rng, captures = np.random.default_rng(seed), []
         for capture in simulate(15, 40 + seed, scenario):
-            n = len(capture.lidar[0].edge_side)
+            n = len(capture.lidar.edge_side)
             captures.append(sooner(capture, np.zeros(n), rng.uniform(0, 0.6, n), rng.uniform(0.1, 3.0, n)))
         found = fit_extrinsic(captures, BOARD, OPTIONS).diagnostics
         n_moved += any(getattr(found, name) for name in NAMES)
@@ -100,7 +97,7 @@ def test_edges_that_no_background_moves_are_left_as_they_are():
 
 def test_weights_are_those_of_moved_ring_ends():
     plain = simulate(20, 3)
-    captures = [held(c, (c.lidar[0].edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
+    captures = [held(c, (c.lidar.edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
     moved, clean = (fit_extrinsic(c, BOARD, OPTIONS).diagnostics for c in (captures, plain))
     for weight in ("plane_weight", "edge_weight"):
         assert getattr(moved, weight) == pytest.approx(getattr(clean, weight), rel=0.5)
@@ -111,6 +108,6 @@ def test_a_person_behind_few_boards_is_too_little_to_tell():
     rng = np.random.default_rng(2)
     for n_held in (1, 2, 3):
         boards = enumerate(simulate(6, 9))
-        captures = [held(c, (c.lidar[0].edge_side > 0) & (k < n_held), rng.uniform()) for k, c in boards]
+        captures = [held(c, (c.lidar.edge_side > 0) & (k < n_held), rng.uniform()) for k, c in boards]
         found = fit_extrinsic(captures, BOARD, OPTIONS).diagnostics
         assert [getattr(found, name) for name in NAMES] == [0.0, 0.0, 0.0]

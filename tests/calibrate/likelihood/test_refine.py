@@ -7,10 +7,11 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.likelihood.along_rays import SHIFTS, turn_about_z
+from lce_rig.calibrate.features import turn_about_z
+from lce_rig.calibrate.likelihood.along_rays import SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.refine import inflate, refine
-from lce_rig.calibrate.placements import group_placements
+from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.tolerances import Tolerances, vary
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, photograph, simulate
@@ -73,14 +74,14 @@ def test_an_offset_common_to_all_ranges_is_found_though_it_is_four_times_what_th
 
 def raised(capture, metres_per_rad):
     """Displace a LiDAR's points as a driver does that knows nothing of the lasers' heights."""
-    lidar = capture.lidar[0]
+    lidar = capture.lidar
 
     def move(points):
         elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
         return points - metres_per_rad * elevation[:, None] * [0, 0, 1]
 
     return replace(
-        capture, lidar=[replace(lidar, points=move(lidar.points), edge_points=move(lidar.edge_points))]
+        capture, lidar=replace(lidar, points=move(lidar.points), edge_points=move(lidar.edge_points))
     )
 
 

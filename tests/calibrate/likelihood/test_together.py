@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.likelihood.calibrate_together import calibrate_together
-from lce_rig.calibrate.placements import group_placements, group_shared_placements
+from lce_rig.calibrate.observations import group_placements, group_shared_placements
 from lce_rig.calibrate.relative_pose import relative_pose
+from lce_rig.calibrate.together import calibrate_together
 from lce_rig.core.geometry import difference
-from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, simulate
 from tests.calibrate.test_tolerances import KNOWN
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, only, simulate_two
@@ -139,8 +138,7 @@ def test_captures_whose_scan_the_cameras_use_differently_are_left_out(runs):
 
 def test_placements_are_those_of_any_camera():
     """The second camera sees captures 1 and 2 in one place, the first does not see 2 at all."""
-    captures = simulate(4, 0)
-    observations = [Observation(c.capture, c.image, c.lidar[0]) for c in captures]
+    observations = simulate(4, 0)
     order = {o.capture: k for k, o in enumerate(observations)}
     first = [observations[k] for k in (0, 1, 3)]
     second = [replace(observations[1], capture=observations[k].capture) for k in (1, 2)]

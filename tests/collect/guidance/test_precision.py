@@ -1,6 +1,7 @@
 """The predicted covariance against the calibration's own matrices and against its errors over many seeds."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ from lce_rig.calibrate import EstimateSettings
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.algorithm_1.registration import vec_rotation
 from lce_rig.calibrate.covariance import symmetric_inverse
-from lce_rig.calibrate.features import FeatureSettings, extract_features
-from lce_rig.calibrate.methods import calibrate_observations
+from lce_rig.calibrate.estimate import estimate_observations
+from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.collect.guidance import combine, sigmas, weigh_placements
 from lce_rig.collect.guidance.evidence import combine_with_each
@@ -44,7 +45,7 @@ def linearised(poses):
     errors = replace(SURROGATE, plane_m=0.004, edge_m=0.005)
     observations = observe(poses, 6, Scenario(range_sigma_m=0.0, corner_sigma_px=1e-6))
     features = [extract_features(each, BOARD) for each in observations]
-    weights = Weights(3 / errors.plane_m**2, 14 / errors.edge_m**2, 1 / errors.edge_shift_m**2)
+    weights = Weights(3 / errors.plane_m**2, 14 / errors.edge_m**2)
     problem = Problem(features, BOARD, weights)
     x = np.concatenate([vec_rotation(T_FORWARD[:3, :3]), T_FORWARD[:3, 3], [0.0, 1.0]])
     edge_ids = problem.associate(x[None])[0]
@@ -65,8 +66,8 @@ def test_information_is_that_of_the_calibration(poses, linearised):
 def test_lasers_pull_as_in_the_calibration(poses, linearised):
     errors, observations, problem, x, edge_ids = linearised
     information = problem.quadratics(x, edge_ids).information
-    settings = FeatureSettings()
-    sensitivities = ring_sensitivities(observations, BOARD, settings, problem, x, edge_ids, information)
+    solution = SimpleNamespace(x=x[None], edge_ids=edge_ids[None])
+    sensitivities = ring_sensitivities(observations, BOARD, problem, solution, information)
     rings = np.unique(np.concatenate([each.lidar.ring for each in observations]))
     predicted = -symmetric_inverse(information) @ weigh_placements(model(errors), poses, T_FORWARD).drift.sum(
         axis=0
@@ -79,9 +80,7 @@ def test_lasers_pull_as_in_the_calibration(poses, linearised):
 def test_predicted_scatter_is_that_of_many_sessions(poses):
     scenario = Scenario(range_sigma_m=0.01, corner_sigma_px=0.1)
     options = EstimateSettings(n_draws=0)
-    runs = [
-        calibrate_observations(observe(poses, seed, scenario), BOARD, options) for seed in range(100, 125)
-    ]
+    runs = [estimate_observations(observe(poses, seed, scenario), BOARD, options) for seed in range(100, 125)]
     errors = np.array([difference(run.T_cam_lidar, T_FORWARD) for run in runs])
     figures = [run.diagnostics for run in runs]
     learned = SURROGATE

@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.estimate import CalibrationEstimate
-from lce_rig.calibrate.likelihood.calibrate_jointly import add_figures, describe, expand_joint
+from lce_rig.calibrate.findings import TWO_PLACES
 from lce_rig.calibrate.likelihood.levels import PoseLevels, what_is_known
-from lce_rig.calibrate.likelihood.refine import inflate, refine
+from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
+from lce_rig.calibrate.likelihood.refine import refine
+from lce_rig.calibrate.observations import group_shared_placements, scan_key
 from lce_rig.calibrate.options import EstimateSettings
-from lce_rig.calibrate.placements import group_shared_placements
-from lce_rig.calibrate.shared_scans import scan_key
+from lce_rig.calibrate.result import CalibrationEstimate, Start, report
+from lce_rig.calibrate.uncertainty import add_figures, expand_joint, inflate
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import Observation
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +57,16 @@ def calibrate_together(
     names = tuple(sorted(alone))
     conflicts = _conflicts(alone)
     starts = [_without(alone[name], conflicts) for name in names]
-    used = [[start.observations[capture] for capture in start.used] for start in starts]
-    labelled = _label_scans(used)
-    priors, usual = what_is_known(options[names[0]])
-    priors = replace(priors, scale=tuple(_scale_of(options[name]) for name in names))
+    # Observations of the same scan share a name, in any capture.
+    scans: dict[bytes, str] = {}
+    labelled = []
+    for start in starts:
+        for observation in start.observations:
+            scans.setdefault(scan_key(observation), f"{len(scans):06d}")
+        labelled.append([replace(o, capture=scans[scan_key(o)]) for o in start.observations])
+    known = [what_is_known(options[name]) for name in names]
+    usual = known[0][1]
+    priors = replace(known[0][0], scale=tuple(float(np.ravel(each.scale)[0]) for each, _ in known))
     T_start = [start.T_cam_lidar for start in starts]
     joint = refine(labelled, board, T_start, priors, usual, pose_ratios=_pose_ratios(starts))
     order = {name: k for k, name in enumerate(sorted({o.capture for own in labelled for o in own}))}
@@ -68,73 +74,57 @@ def calibrate_together(
     J = joint.to_extrinsics.reshape(-1, joint.to_extrinsics.shape[2])
     scales, estimates = [], {}
     for k, (name, start) in enumerate(zip(names, starts, strict=True)):
+        own = alone[name]
         n_seen = len(np.unique(placement[[order[o.capture] for o in labelled[k]]]))
         cov, inflation = inflate(joint, placement, k, n_seen)
         scales.append(np.full(6, np.sqrt(inflation)))
         figures = add_figures(start.diagnostics, joint, k, inflation)
-        estimate = describe(joint, k, cov, start, used[k], board, options[name], figures)
         estimates[name] = replace(
-            estimate,
-            method=start.method,
-            sensitivities=start.sensitivities,
+            report(start, joint.T_cam_lidar[k], cov, board, figures),
+            method=own.method,
+            lidar=lidar_of(joint),
+            sensitivities=own.sensitivities,
             cost=expand_joint(joint, k, placement),
             estimated_with=tuple(other for other in names if other != name),
-            same_scan=start.same_scan,
+            same_scan=own.same_scan,
         )
     scale = np.concatenate(scales)
     cov = scale[:, None] * (J @ (joint.cov_scatter + joint.cov_constants) @ J.T) * scale
     return TogetherEstimate(names, estimates, cov)
 
 
-def _scale_of(options: EstimateSettings) -> float:
-    scale = what_is_known(options)[0].scale
-    assert isinstance(scale, float)
-    return scale
-
-
-def _without(start: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> CalibrationEstimate:
+def _without(alone: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> Start:
     """Remove captures, and figures that apply to the camera alone."""
-    singles = [start.captures_of([name]) for name in start.used]
-    kept = [k for k, names in enumerate(singles) if not names & conflicts.keys()]
-    mine = {name: why for name, why in conflicts.items() if name in set().union(*singles)}
-    return replace(
-        start,
-        used=tuple(start.used[k] for k in kept),
-        residuals=tuple(start.residuals[k] for k in kept),
-        refused={**start.refused, **mine},
-        diagnostics=replace(start.diagnostics, algorithm_1_offset_deg=np.nan, algorithm_1_offset_m=np.nan),
+    singles = {name: alone.captures_of([name]) for name in alone.used}
+    kept = [residual for residual in alone.residuals if not singles[residual.capture] & conflicts.keys()]
+    mine = {name: why for name, why in conflicts.items() if name in set().union(*singles.values())}
+    return Start(
+        alone.T_cam_lidar,
+        alone.certificate,
+        [alone.observations[residual.capture] for residual in kept],
+        {**alone.refused, **mine},
+        np.array([residual.held_out_m for residual in kept]),
+        replace(alone.diagnostics, algorithm_1_offset_deg=np.nan, algorithm_1_offset_m=np.nan),
     )
 
 
 def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
     """Find captures in which cameras use different surfaces of the scan."""
-    seen: dict[str, tuple[str, bytes]] = {}
-    found = {}
+    surfaces: dict[str, tuple[str, bytes]] = {}
+    conflicts = {}
     for camera, estimate in sorted(alone.items()):
         for observation in estimate.observations.values():
             key = scan_key(observation)
             for capture in sorted(estimate.captures_of([observation.capture])):
-                other, held = seen.setdefault(capture, (camera, key))
+                other, held = surfaces.setdefault(capture, (camera, key))
                 if held != key:
-                    figures = {"first": other, "second": camera}
-                    found[capture] = Refusal("pair.two_places", figures=figures)
-    return found
+                    conflicts[capture] = TWO_PLACES.refusal(first=other, second=camera)
+    return conflicts
 
 
-def _label_scans(used: Sequence[Sequence[Observation]]) -> list[list[Observation]]:
-    """Rename observations so that those of the same scan share a name, in any capture."""
-    names: dict[bytes, str] = {}
-    labelled = []
-    for own in used:
-        for observation in own:
-            names.setdefault(scan_key(observation), f"{len(names):06d}")
-        labelled.append([replace(o, capture=names[scan_key(o)]) for o in own])
-    return labelled
-
-
-def _pose_ratios(starts: Sequence[CalibrationEstimate]) -> list[PoseLevels]:
+def _pose_ratios(starts: Sequence[Start]) -> list[PoseLevels]:
     """Compare cameras' pose errors, as each alone estimates them, with their geometric mean."""
-    each = [start.diagnostics for start in starts]
-    logs = np.log([[d.noise_tilt_deg, d.noise_spin_deg, d.noise_depth_m, d.noise_across_m] for d in each])
+    figures = [start.diagnostics for start in starts]
+    logs = np.log([[d.noise_tilt_deg, d.noise_spin_deg, d.noise_depth_m, d.noise_across_m] for d in figures])
     ratios = np.exp(logs - logs.mean(axis=0))
-    return [PoseLevels(*own) for own in ratios.tolist()]
+    return [PoseLevels(*of_camera) for of_camera in ratios.tolist()]

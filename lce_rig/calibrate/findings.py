@@ -1,0 +1,65 @@
+"""Findings of the calibration: captures that disagree, and captures that are too few."""
+
+from lce_rig.core.findings import Finding, Kind
+from lce_rig.core.phrasing import motion_words
+
+
+def _undetermined(finding: Finding) -> str:
+    """{motions} undetermined by {n_captures} captures: boards nearly parallel, spread {spread_deg}."""
+    motions, n_captures = finding.figures["motions"], finding.figures["n_captures"]
+    assert isinstance(motions, tuple)
+    names = " and ".join(motion_words(str(motion)) for motion in motions)
+    return (
+        f"{names} cannot be determined from {n_captures} captures: their boards are nearly parallel "
+        f"(normals spread by {finding.figure('spread_deg'):.1f} deg)"
+    )
+
+
+def _elsewhere(finding: Finding) -> str:
+    """Best of {n_candidates} candidates: {distance_m}, {rotation_deg} from where the image has the board."""
+    n, distance_m = finding.figures["n_candidates"], finding.figure("distance_m")
+    which = "the only candidate" if n == 1 else f"the best of {n} candidates"
+    apart = f"{distance_m:.1f} m" if distance_m >= 1 else f"{100 * distance_m:.0f} cm"
+    return (
+        f"{which} in the scan is {apart}, {finding.figure('rotation_deg'):.0f} deg from where the image has "
+        "the board"
+    )
+
+
+FEW_CAPTURES = Kind(
+    "shortage.few_captures",
+    "{n_captures} captures show the board in both sensors (minimum {n_needed})",
+    "add captures: ten or more, with the board at different places and tilts",
+    severity="warning",
+)
+FEW_AGREE = Kind(
+    "shortage.few_agree",
+    "only {n_agreeing} of {n_captures} captures agree with one set of extrinsics (minimum {n_needed})",
+    "check the board's size, the intrinsics and the pairing of images with scans; add captures",
+    severity="warning",
+)
+UNDETERMINED = Kind(
+    "shortage.undetermined",
+    _undetermined,
+    "add captures with the board tilted by 20 deg or more, left and right as well as up and down",
+    severity="warning",
+)
+ELSEWHERE = Kind(
+    "pair.elsewhere",
+    _elsewhere,
+    "come closer or tilt the board more, so that both sensors see its tilt well",
+    actions={
+        "hold_still": "hold the board still, and 20 cm or more clear of walls, pillars and other things"
+    },
+)
+TWO_PLACES = Kind(
+    "pair.two_places",
+    "{first} and {second} give different board positions in the scan",
+    "remove other things of the board's size, or cover them",
+)
+OUTLIER = Kind(
+    "calibrate.outlier",
+    "outlier: plane {plane_m:mm}, edges {edges_m:mm} rms from the other captures' prediction "
+    "(median {plane_median_m:mm}, {edges_median_m:mm})",
+    "hold the board still while capturing, with nothing in front of it or close behind its rim",
+)

@@ -1,0 +1,167 @@
+"""Observations of the board: images of all channels that share one scan, and placements of the board."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.findings import TWO_PLACES
+from lce_rig.core.findings import Refusal
+from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+
+SAME_PLACE_M = 0.03
+SAME_TURN_RAD = np.radians(3.0)
+"""Captures whose boards lie nearer show one placement; captures of one placement are not independent."""
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """The profile's settings of time.
+
+    Attributes:
+        sweep_s: duration of a revolution.
+        lidar_offset_s: offset from the LiDAR's timestamps to the rig's time.
+        channel_offset_s: the same for each channel.
+        tolerance_s: remaining tolerance of each channel's timestamps.
+    """
+
+    sweep_s: float = 0.1
+    lidar_offset_s: float = 0.0
+    channel_offset_s: Mapping[str, float] = field(default_factory=dict)
+    tolerance_s: Mapping[str, float] = field(default_factory=dict)
+
+    def after_scan_s(self, channel: str, image: ImageBoard, lidar: LidarBoard) -> float:
+        """Compute how long after a scan's first firing an image was taken; 0 if timestamps are missing."""
+        if image.stamp_ns is None or lidar.stamp_ns is None:
+            return 0.0
+        apart_s = (image.stamp_ns - lidar.stamp_ns) * 1e-9
+        return apart_s + self.channel_offset_s.get(channel, 0.0) - self.lidar_offset_s
+
+
+@dataclass(frozen=True, eq=False)
+class SharedScan:
+    """One scan of the board and its images.
+
+    Attributes:
+        captures: names of those that hold it, sorted; its images may lie in several, with copies of it.
+        images: the board by channel, at least one.
+        lidar: the board in the scan.
+        session: where captures are of several.
+    """
+
+    captures: tuple[str, ...]
+    images: Mapping[str, ImageBoard]
+    lidar: LidarBoard
+    session: str = ""
+
+    @property
+    def capture(self) -> str:
+        """The capture that stands for all of them."""
+        return self.captures[0]
+
+    def observation(self, channel: str | None = None) -> Observation:
+        """Pair the scan with a channel's image, by default the first's."""
+        image = self.images[channel or next(iter(self.images))]
+        return Observation(self.capture, image, self.lidar, self.session)
+
+
+def join_scans(
+    agreed: Mapping[str, Sequence[Observation]], candidates: Mapping[str, Sequence[Observation]]
+) -> tuple[list[SharedScan], dict[str, Refusal]]:
+    """Group the channels' observations by scan, in any captures.
+
+    Recordings often hold the images of each channel in a folder of its own, with copies of the same scans.
+
+    Args:
+        agreed: observations of each channel that agree, the most trusted channel first.
+        candidates: of each channel, with all places that each scan offers.
+
+    Returns:
+        The scans by name, and refusals of images that match another surface of the scan than those of the
+        channel before.
+    """
+    scan_of = {(channel, o.capture): scan_key(o) for channel, items in candidates.items() for o in items}
+    groups: dict[bytes, dict[str, Observation]] = {}
+    refused: dict[str, Refusal] = {}
+    for channel, observations in agreed.items():
+        for observation in observations:
+            group = groups.setdefault(scan_of[channel, observation.capture], {})
+            first = next(iter(group.values()), observation)
+            if scan_key(first) != scan_key(observation):
+                refused[observation.capture] = TWO_PLACES.refusal(first=next(iter(group)), second=channel)
+            elif channel not in group:
+                group[channel] = observation
+    scans = []
+    for group in groups.values():
+        captures = tuple(sorted({o.capture for o in group.values()}))
+        first = next(iter(group.values()))
+        images = {channel: o.image for channel, o in group.items()}
+        scans.append(SharedScan(captures, images, first.lidar, first.session))
+    return sorted(scans, key=lambda scan: scan.capture), refused
+
+
+def scan_key(observation: Observation) -> bytes:
+    """Identify the board of a scan by its points."""
+    return observation.lidar.points.tobytes()
+
+
+def pooled_noise_px(images: Sequence[ImageBoard]) -> float:
+    """Estimate a channel's corner noise per coordinate from the residuals of all its boards."""
+    return float(np.sqrt(np.mean([image.sigma_px**2 for image in images])))
+
+
+def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
+    """Number the board placements of captures; captures that stood in the same place share a number.
+
+    A capture joins the first placement of its session whose first capture has its centre and normal nearby.
+
+    Args:
+        observations: with the camera's pose of the board.
+
+    Returns:
+        (F,) numbers from 0.
+    """
+    T = np.array([observation.image.T_cam_board for observation in observations]).reshape(-1, 4, 4)
+    session = np.array([observation.session for observation in observations])
+    numbers = np.zeros(len(observations), dtype=np.intp)
+    firsts: list[int] = []
+    for k, own in enumerate(T):
+        apart = np.linalg.norm(T[firsts] - own, axis=1)
+        is_same = (apart[:, 3] < SAME_PLACE_M) & (apart[:, 2] < SAME_TURN_RAD)
+        is_same &= session[firsts] == session[k]
+        if is_same.any():
+            numbers[k] = np.argmax(is_same)
+        else:
+            numbers[k] = len(firsts)
+            firsts.append(k)
+    return numbers
+
+
+def group_shared_placements(
+    cameras: Sequence[Sequence[Observation]], order: Mapping[str, int]
+) -> NDArray[np.intp]:
+    """Number the board placements of captures that several cameras share.
+
+    Captures in the same place for one camera are one placement, for any other cameras.
+
+    Args:
+        cameras: observations of each.
+        order: place of each capture by name, 0 to F - 1.
+
+    Returns:
+        (F,) numbers from 0.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n_captures, links = len(order), []
+    for k, own in enumerate(cameras):
+        # Each placement of a camera is a node beside those of the captures.
+        placement = group_placements(own) + n_captures * (k + 1)
+        links += [(order[o.capture], number) for o, number in zip(own, placement, strict=True)]
+    n_nodes = n_captures * (len(cameras) + 1)
+    graph = coo_array((np.ones(len(links)), np.array(links).T), shape=(n_nodes, n_nodes))
+    _, component = connected_components(graph, directed=False)
+    _, first, inverse = np.unique(component[:n_captures], return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[inverse], dtype=np.intp)

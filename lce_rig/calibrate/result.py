@@ -1,0 +1,214 @@
+"""What a calibration gives: extrinsics with uncertainty, certificate and residuals."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.observations import group_placements
+from lce_rig.calibrate.options import KnownLidar
+from lce_rig.calibrate.plane_and_ends import ends_on_board, plane_residuals
+from lce_rig.calibrate.quadratics import Quadratics
+from lce_rig.calibrate.tolerances import Sensitivity
+from lce_rig.core.board import Board
+from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Metrics
+from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.findings import Refusal
+from lce_rig.core.geometry import Array, rotation_angle, sigma_sizes
+from lce_rig.core.results import Observation
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A solution of the captures that agree, from which an estimate begins.
+
+    Attributes:
+        T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
+        certificate: of Algorithm 1's final cost over all captures used.
+        observations: the F captures used, as measured, sorted by name.
+        refused: why each other capture is not used.
+        held_out_m: (F,) error of each capture where it was not fitted.
+        diagnostics: further figures.
+    """
+
+    T_cam_lidar: Array
+    certificate: Certificate
+    observations: Sequence[Observation]
+    refused: Mapping[str, Refusal]
+    held_out_m: Array
+    diagnostics: Diagnostics
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationEstimate:
+    """Extrinsics with their uncertainty, certificate and residuals.
+
+    Attributes:
+        T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
+        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: from the noise of the captures
+            and from the sensors' errors that are common to all of them. Errors of the profile's lens
+            and board are not in it, but in `sensitivities`.
+        certificate: of Algorithm 1's final cost over all captures used, from whose solution other methods
+            start.
+        refused: why each other capture is not used.
+        observations: capture -> the boards that were paired, as measured, for each capture used, sorted; one
+            stands for all that hold the same scan.
+        fitted: the same as used in the method's cost: Algorithm 1 moves ring ends by the background's shift.
+        residuals: one per capture used, in the order of `observations`.
+        diagnostics: further figures.
+        method: that found it, as `CalibrateOptions.method`.
+        sensitivities: how far errors of the profile's lens and board move the result; empty without
+            `EstimateSettings.tolerances`.
+        cost: the method's own cost about its result, capture by capture, in the extrinsics (and those of
+            cameras estimated with it) alone, boards' poses eliminated; None if the method has none.
+        lidar: constant errors of the LiDAR that were estimated with it; None if the method knows none.
+        estimated_with: cameras whose extrinsics were estimated together with this one.
+        same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
+        channels: the result of each channel of the camera alone; empty if they were not separated.
+        channel_difference: (6,) tangent between the extrinsics of two channels; None with one channel.
+        channel_difference_cov: (6, 6) of it.
+    """
+
+    T_cam_lidar: Array
+    cov: Array
+    certificate: Certificate
+    refused: Mapping[str, Refusal]
+    observations: Mapping[str, Observation]
+    fitted: Mapping[str, Observation]
+    residuals: tuple[CaptureResidual, ...]
+    diagnostics: Diagnostics
+    method: str = "paper"
+    sensitivities: tuple[Sensitivity, ...] = ()
+    cost: Quadratics | None = None
+    lidar: KnownLidar | None = None
+    estimated_with: tuple[str, ...] = ()
+    same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    channels: tuple[ChannelResult, ...] = ()
+    channel_difference: Array | None = None
+    channel_difference_cov: Array | None = None
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """Names of the captures used, sorted."""
+        return tuple(self.observations)
+
+    @property
+    def metrics(self) -> Metrics:
+        """Errors over all captures used, of the boards as measured."""
+        return summarise(self.residuals)
+
+    @property
+    def held_out_m(self) -> float:
+        """Mean over captures of `CaptureResidual.held_out_m`."""
+        return float(np.mean([residual.held_out_m for residual in self.residuals]))
+
+    @property
+    def lever_m(self) -> float:
+        """Rms distance of the boards from the camera."""
+        return lever_arm(list(self.observations.values()))
+
+    def captures_of(self, names: Iterable[str]) -> set[str]:
+        """Name every capture that holds the scan of one of the captures named."""
+        return {capture for name in names for capture in self.same_scan.get(name, (name,))}
+
+
+def report(
+    start: Start, T_cam_lidar: Array, cov: Array, board: Board, diagnostics: Diagnostics
+) -> CalibrationEstimate:
+    """Measure the residuals of extrinsics and assemble the estimate.
+
+    Args:
+        start: the captures, and where the estimate began.
+        T_cam_lidar: (4, 4).
+        cov: (6, 6) of it, tangent (translation m, rotation rad).
+        board: the board.
+        diagnostics: the method's own figures.
+    """
+    residuals = tuple(
+        capture_residual(T_cam_lidar, observation, board, float(error))
+        for observation, error in zip(start.observations, start.held_out_m, strict=True)
+    )
+    observations = {observation.capture: observation for observation in start.observations}
+    figures = replace(
+        diagnostics,
+        # The paper's code counts every ring end twice, which halves its mean.
+        paper_mee_m=summarise(residuals).mee_m / 2,
+        held_out_m=float(np.mean(start.held_out_m)),
+        n_placements=float(group_placements(start.observations).max() + 1),
+    )
+    refused = dict(sorted(start.refused.items()))
+    return CalibrationEstimate(
+        T_cam_lidar, cov, start.certificate, refused, observations, observations, residuals, figures
+    )
+
+
+def with_parts(figures: Diagnostics, scatter: Array, systematic: Array) -> Diagnostics:
+    """Add the sizes of both parts of a covariance, each (6 + k, 6 + k)."""
+    (scatter_deg, scatter_m), (systematic_deg, systematic_m) = map(sigma_sizes, (scatter, systematic))
+    return replace(
+        figures,
+        sigma_scatter_rotation_deg=scatter_deg,
+        sigma_scatter_translation_m=scatter_m,
+        sigma_systematic_rotation_deg=systematic_deg,
+        sigma_systematic_translation_m=systematic_m,
+    )
+
+
+def lever_arm(observations: Sequence[Observation]) -> float:
+    """Compute the rms distance of the boards from the camera, m: displacement by a rotation of 1 rad."""
+    centres = [observation.image.T_cam_board[:3, 3] for observation in observations]
+    return float(np.sqrt(np.mean([centre @ centre for centre in centres])))
+
+
+def capture_residual(
+    T_cam_lidar: Array, observation: Observation, board: Board, held_out_m: float = float("nan")
+) -> CaptureResidual:
+    """Measure the residuals of one capture under given extrinsics.
+
+    Points are taken as the LiDAR measured them; ring ends are moved along their rays onto the board's plane
+    and compared with the profile's size, without half step or shift.
+
+    Args:
+        T_cam_lidar: (4, 4).
+        observation: the boards of both sensors.
+        board: its size.
+        held_out_m: passed through.
+    """
+    features = extract_features(observation, board, half_step=False)
+    plane = np.abs(plane_residuals(features, T_cam_lidar, observation.lidar.points))
+    edge = board.outline_distance(ends_on_board(features, T_cam_lidar))
+    return CaptureResidual(
+        capture=observation.capture,
+        plane_mean_m=_mean(plane),
+        plane_rms_m=_rms(plane),
+        edge_mean_m=_mean(edge),
+        edge_rms_m=_rms(edge),
+        held_out_m=held_out_m,
+        reprojection_px=observation.image.reprojection_px,
+    )
+
+
+def summarise(residuals: Sequence[CaptureResidual]) -> Metrics:
+    """Average per-capture residuals: MPE, MEE (mean distances) and the rms corner residual."""
+    # A scan may show the board without any usable end of a ring.
+    edges = np.array([r.edge_mean_m for r in residuals])
+    return Metrics(
+        mpe_m=_mean(np.array([r.plane_mean_m for r in residuals])),
+        mee_m=_mean(edges[np.isfinite(edges)]),
+        reprojection_px=_rms(np.array([r.reprojection_px for r in residuals])),
+    )
+
+
+def error_to_reference(T_cam_lidar: Array, T_reference: Array) -> tuple[float, float]:
+    """Compute the paper's EGT: angle in deg and distance in m between extrinsics and a reference (4, 4)."""
+    angle = rotation_angle(T_cam_lidar[:3, :3], T_reference[:3, :3])
+    return float(np.degrees(angle)), float(np.linalg.norm(T_cam_lidar[:3, 3] - T_reference[:3, 3]))
+
+
+def _mean(values: Array) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(_mean(values**2)))

@@ -1,0 +1,197 @@
+"""Uncertainty of a solution: covariance, its check by leaving placements out, and errors of the profile."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
+from lce_rig.calibrate.covariance import symmetric_inverse, systematic_covariances
+from lce_rig.calibrate.likelihood.along_rays import N_SHIFTS, SHIFTS, interior, stack_scans
+from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
+from lce_rig.calibrate.likelihood.refine import JointEstimate, stack_camera
+from lce_rig.calibrate.likelihood.system import PER_CAMERA, Assembly, linearise
+from lce_rig.calibrate.observations import group_placements
+from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
+from lce_rig.calibrate.result import CalibrationEstimate, Start, error_to_reference, report, with_parts
+from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities
+from lce_rig.calibrate.tolerances import Variant, sensitivities_of, vary
+from lce_rig.core.board import Board
+from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import Observation
+
+# Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
+_SURE = 2.0
+
+
+def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> CalibrationEstimate:
+    """Report Algorithm 1's solution: covariance from the scatter of captures, and from the LiDAR's errors.
+
+    Args:
+        start: the solution.
+        board: its specification.
+        settings: priors and tolerances.
+    """
+    captures = start.fitted, board, start.problem, start.solution, start.cost.information
+    scatter = start.cost.jackknife_covariance()
+    systematic = np.zeros_like(scatter)
+    laser_m, offset_m = settings.laser_bias_sigma_m, settings.range_offset_sigma_m
+    if laser_m or offset_m:
+        lasers, offset = systematic_covariances(ring_sensitivities(*captures), laser_m, offset_m)
+        systematic = lasers + offset
+    cov = scatter + systematic
+    figures = replace(start.diagnostics, edge_shift_sigma_m=float(np.sqrt(cov[6, 6])))
+    figures = with_parts(figures, scatter, systematic)
+    known = settings.tolerances
+    return replace(
+        report(start, start.T_cam_lidar, cov[:6, :6], board, figures),
+        fitted={observation.capture: observation for observation in start.fitted},
+        sensitivities=() if known is None else profile_sensitivities(*captures, known),
+    )
+
+
+def by_likelihood(
+    start: Start, joint: JointEstimate, board: Board, settings: EstimateSettings
+) -> CalibrationEstimate:
+    """Report the joint estimate of one camera.
+
+    Certificate, outliers and held-out residuals are those of Algorithm 1, from whose solution it starts.
+
+    Args:
+        start: Algorithm 1's solution.
+        joint: of the captures that it used.
+        board: its specification.
+        settings: tolerances.
+    """
+    placement = group_placements(start.observations)
+    cov, inflation = inflate(joint, placement)
+    offset_deg, offset_m = error_to_reference(joint.T_cam_lidar[0], start.T_cam_lidar)
+    figures = replace(
+        add_figures(start.diagnostics, joint, 0, inflation),
+        algorithm_1_offset_deg=offset_deg,
+        algorithm_1_offset_m=offset_m,
+    )
+    estimate = report(start, joint.T_cam_lidar[0], cov, board, figures)
+    estimate = replace(estimate, method="ml", lidar=lidar_of(joint), cost=expand_joint(joint, 0, placement))
+    if settings.tolerances is None:
+        return estimate
+    variants = vary(start.observations, board, settings.tolerances)
+    moves = moves_under(joint, start.observations, variants, board)
+    return replace(estimate, sensitivities=sensitivities_of(variants, moves, settings.tolerances))
+
+
+def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Quadratics:
+    """Expand the cost about a joint estimate, in the extrinsics alone, the camera's own first.
+
+    Constant errors are held fixed.
+
+    Args:
+        joint: of F captures.
+        camera: its number.
+        placement: (F,) number of each capture's placement.
+    """
+    n_cameras = len(joint.T_cam_lidar)
+    order = [camera, *(c for c in range(n_cameras) if c != camera)]
+    mine = np.concatenate([np.arange(6) + PER_CAMERA * c for c in order])
+    # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
+    prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
+    return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)), placement=placement)
+
+
+def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:
+    """Replace the start's constant errors, noise levels and covariance parts by those of a joint estimate."""
+    levels, J = joint.levels, joint.to_extrinsics[camera]
+    shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
+    figures = replace(
+        start,
+        covariance_inflation=inflation,
+        edge_shift_m=shifts["d_0"],
+        edge_shift_sigma_m=float(joint.constants_sigma[-N_SHIFTS]),
+        edge_shift_echo_m=shifts["d_1"],
+        edge_shift_blended_m=shifts["d_2"],
+        edge_shift_blended_echo_m=shifts["d_3"],
+        range_offset_m=float(np.mean(joint.lasers[0])),
+        laser_spread_m=float(np.std(joint.lasers[0])),
+        lens_lateral_m=float(joint.fields[0]),
+        lens_vertical_m_per_rad=float(joint.fields[1]),
+        bow_width_m=float(joint.fields[-2]),
+        bow_height_m=float(joint.fields[-1]),
+        camera_scale=1.0 - float(joint.scale[camera]),
+        noise_range_m=levels.range_m,
+        noise_ring_m=levels.ring_m,
+        noise_ring_end_mrad=1e3 * levels.edge_rad,
+        ring_ends_lost=levels.lost_share,
+        noise_edge_shift_m=levels.own_shift_m,
+        noise_tilt_deg=float(np.degrees(levels.tilt_rad)),
+        noise_spin_deg=float(np.degrees(levels.spin_rad)),
+        noise_depth_m=levels.depth_m,
+        noise_across_m=levels.across_m,
+    )
+    return with_parts(figures, J @ joint.cov_scatter @ J.T, J @ joint.cov_constants @ J.T)
+
+
+def moves_under(
+    joint: JointEstimate, used: Sequence[Observation], variants: Sequence[Variant], board: Board
+) -> Array:
+    """Compute how far errors of the profile move one camera's extrinsics, to first order.
+
+    Args:
+        joint: of one camera.
+        used: the F observations, in the order of `variants`.
+        variants: V of what would have been observed.
+        board: as the profile says.
+
+    Returns:
+        (V, 6) tangents (translation m, rotation rad).
+    """
+    order = {name: k for k, name in enumerate(sorted(o.capture for o in used))}
+    here, changes = Assembly(joint.terms, joint.priors), []
+    for variant in variants:
+        images = (stack_camera(variant.observations, order, variant.board),)
+        lidars = {o.capture: o.lidar for o in variant.observations}
+        is_of_image = variant.board == board and all(o.lidar is lidars[o.capture] for o in used)
+        if is_of_image:
+            moved = here.with_images(images, joint.state)
+        else:
+            scans = stack_scans([interior(lidars[name], variant.board) for name in order], variant.board)
+            terms = linearise(scans, images, variant.board, joint.state, joint.trust)
+            moved = Assembly(terms, joint.priors)
+        gradients = moved.at(joint.levels).cost.gradients
+        changes.append((gradients - joint.cost.gradients).sum(axis=0))
+    moves = np.linalg.solve(joint.cost.information, np.transpose(changes))
+    return np.asarray(-(joint.to_extrinsics[0] @ moves).T)
+
+
+def inflate(
+    joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0, n_seen: int | None = None
+) -> tuple[Array, float]:
+    """Multiply a camera's covariance (6, 6) according to the spread over placements.
+
+    The spread of the optimum without each placement (`lce_rig.calibrate.quadratics`) is independent of the
+    noise model. If it significantly exceeds the model's covariance, there are errors that the model lacks.
+
+    Args:
+        joint: of F captures.
+        placement: (F,) number of each capture's placement.
+        camera: its number.
+        n_seen: number of placements that it saw; all if None.
+
+    Returns:
+        The covariance and the factor, 1 if model and spread agree.
+    """
+    cov = joint.cov[camera]
+    n = int(placement.max()) + 1 if n_seen is None else n_seen
+    ratio = float(np.trace(symmetric_inverse(cov) @ jackknife(joint, placement, camera))) / len(cov)
+    # A mean of 6 chi squares over n - 1 freedoms each.
+    chance = np.sqrt(2 / (len(cov) * max(n - 1, 1)))
+    factor = ratio if ratio > 1 + _SURE * chance else 1.0
+    return factor * cov, factor
+
+
+def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
+    """Compute the jackknife covariance (6, 6) of a camera's extrinsics over placements."""
+    cost = replace(joint.cost, placement=placement)
+    return jackknife_scatter(cost.moves() @ joint.to_extrinsics[camera].T)
