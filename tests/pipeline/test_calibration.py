@@ -24,7 +24,7 @@ def systematic_sigma_m(*lines: str) -> float:
 def found() -> Detections:
     captures = simulate(10, 3)
     images = {item.capture: item.image for item in captures}
-    return Detections({("cam", "frames"): images}, {"lidar": {c.capture: list(c.lidar) for c in captures}})
+    return Detections({("cam", "frames"): images}, {"lidar": {c.capture: list(c.places) for c in captures}})
 
 
 def test_the_lidars_range_errors_come_from_the_profile() -> None:

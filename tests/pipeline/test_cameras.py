@@ -35,7 +35,7 @@ def detections(session, **kept):
         }
         for name, captures in session.items()
     }
-    return Detections(images, {"lidar": {c.capture: list(c.lidar) for c in next(iter(session.values()))}})
+    return Detections(images, {"lidar": {c.capture: list(c.places) for c in next(iter(session.values()))}})
 
 
 def calibrated(seen, options, rig=RIG):

@@ -22,7 +22,7 @@ def seen(moved_m):
         T = item.image.T_cam_board
         move = np.r_[moved_m * rng.standard_normal() * T[:3, 2], np.zeros(3)]
         images[item.capture] = replace(item.image, T_cam_board=perturb(T, move))
-    return Detections({("cam", "frames"): images}, {"lidar": {i.capture: list(i.lidar) for i in captures}})
+    return Detections({("cam", "frames"): images}, {"lidar": {i.capture: list(i.places) for i in captures}})
 
 
 def test_boards_that_moved_between_image_and_scan_are_refused_with_an_action(tmp_path):

@@ -39,7 +39,7 @@ def make(tmp_path):
 def seen(n, seed, T_cam_lidar=T_FORWARD):
     captures = simulate(n, seed, T_cam_lidar=T_cam_lidar)
     images = {item.capture: item.image for item in captures}
-    return Detections({("cam", "frames"): images}, {"lidar": {i.capture: list(i.lidar) for i in captures}})
+    return Detections({("cam", "frames"): images}, {"lidar": {i.capture: list(i.places) for i in captures}})
 
 
 @pytest.mark.long

@@ -10,13 +10,14 @@ from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.features import turn_about_z
 from lce_rig.calibrate.likelihood.along_rays import SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
-from lce_rig.calibrate.likelihood.refine import inflate, refine
+from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.tolerances import Tolerances, vary
+from lce_rig.calibrate.uncertainty import inflate
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, photograph, simulate
 
-ML = EstimateSettings(method="ml", n_draws=3, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+ML = EstimateSettings(method="ml", laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
 REAL = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.008, end_sigma_m=0.001)
 
 

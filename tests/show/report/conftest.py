@@ -30,7 +30,7 @@ def one() -> Calibration:
     """One camera."""
     captures = simulate(12, 3)
     images = {item.capture: item.image for item in captures}
-    scans = {item.capture: list(item.lidar) for item in captures}
+    scans = {item.capture: list(item.places) for item in captures}
     seen = Detections({("cam", "frames"): images}, {"lidar": scans})
     (calibration,), _ = calibrate_detections(RLFS, seen, CalibrateOptions(n_draws=0))
     return calibration
@@ -41,7 +41,7 @@ def two() -> list[Calibration]:
     """Two cameras that saw the same boards, estimated together."""
     session = simulate_two(12, 0)
     images = {(name, "frames"): {c.capture: c.image for c in own} for name, own in session.items()}
-    seen = Detections(images, {"lidar": {c.capture: list(c.lidar) for c in next(iter(session.values()))}})
+    seen = Detections(images, {"lidar": {c.capture: list(c.places) for c in next(iter(session.values()))}})
     calibrations, _ = calibrate_detections(TWO, seen, CalibrateOptions("ml", n_draws=0))
     return calibrations
 
