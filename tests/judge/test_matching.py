@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from lce_rig.show.overlays.session_check import match_candidates
 
 from lce_rig.core.geometry import perturb
 from lce_rig.core.results import Observation
