@@ -87,13 +87,6 @@ def test_every_sample_is_passed_on_and_pictures_follow_the_events_they_are_made_
             assert last_ns >= sample.stamp_ns - 1_000_000
 
 
-def test_pictures_carry_stamps_of_the_events_own_clock() -> None:
-    rig = rig_with(offset_s=-10.0)
-    ahead = [replace(e, t_ns=e.t_ns + 10_000 * MS) for e in EVENTS]
-    found = pictures(merge_by_time([ahead, map(scan, MIDDLES_MS)], rig), rig)
-    assert [i.stamp_ns for i in found] == [T0_NS + (10_000 + t) * MS for t in MIDDLES_MS]
-
-
 def test_scans_before_the_first_event_get_no_picture_and_are_counted() -> None:
     rig, tally = rig_with(), Losses()
     scans = [scan(t) for t in range(-2950, 500, 100)]

@@ -4,18 +4,15 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
-from lce_rig.collect.offline.slow_motion import _Neighbours, find_moving_moments
+from lce_rig.collect.offline.slow_motion import find_moving_moments
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
 from lce_rig.rig import Rig, load_rig
-from lce_rig.timing.scan_pairing import Frame
 
-from .event_sightings import T0_NS, S, event_stream, watch
+from .event_sightings import event_stream, watch
 
 PLENTY = event_stream([(-1.3, 6.0, 6.0)])
 SOME = event_stream([(-1.3, 6.0, 2.0)])
@@ -30,10 +27,6 @@ def choose(detections: Iterable[BoardDetection], rig: Rig) -> tuple[list[Capture
     tally = Losses()
     moments = find_moving_moments(detections, rig, Placements(0.15, 10.0), tally)
     return list(moments), tally.by_code()
-
-
-def times_s(moments: list[CaptureMoment]) -> list[float]:
-    return [round((m.detection.frame.time_ns - T0_NS) / S, 2) for m in moments]
 
 
 def places_m(moments: list[CaptureMoment]) -> list[float]:
@@ -90,12 +83,6 @@ def test_the_slowest_part_of_a_way_is_preferred_to_a_fast_one_through_the_same_p
     assert all(np.diff(sorted(places_m(moments))) >= 0.15)
 
 
-def test_moments_with_all_their_events_are_preferred_to_those_before_the_stream_began(rig: Rig) -> None:
-    late = event_stream([(-0.4, 6.0, 4.0)])
-    moments, _ = choose(watch(rig, lambda t: (0.05 * t, 0.0), 1.6, late), rig)
-    assert times_s(moments)[0] >= 0.85
-
-
 def test_moments_before_the_stream_or_after_it_are_counted(rig: Rig) -> None:
     stream = event_stream([(1.0, 2.0, 4.0)])
     _, refused = choose(watch(rig, lambda t: (0.05 * t, 0.0), 6.0, stream), rig)
@@ -107,26 +94,10 @@ def test_a_board_that_the_lidar_does_not_see_is_no_moment(rig: Rig) -> None:
     assert choose(watch(rig, lambda t: (0.1 * t, 0.0), 1.0, SOME, has_lidar=False), rig) == ([], {})
 
 
-def test_a_board_seen_in_single_frames_only_has_no_speed_and_is_no_moment(rig: Rig) -> None:
-    detections = watch(
-        rig, lambda t: (0.1 * t, 0.0), 2.0, SOME, is_seen=lambda t: round(10 * t - 0.5) % 4 == 0
-    )
-    assert choose(detections, rig) == ([], {})
-
-
 def test_a_board_that_comes_back_is_not_taken_twice(rig: Rig) -> None:
     moments, _ = choose(watch(rig, lambda t: (0.1 * abs(t - 3.0), 0.0), 6.0, SOME), rig)
     places = sorted(places_m(moments))
     assert 2 <= len(places) <= 3 and np.diff(places).min() >= 0.15
-
-
-def test_the_moments_are_the_same_however_often_they_are_sought(rig: Rig) -> None:
-    detections = watch(rig, lambda t: (0.1 * t - 0.2, 0.05 * np.sin(4 * t)), 4.0, SOME)
-    first, again = (times_s(choose(detections, rig)[0]) for _ in range(2))
-    assert first == again and first
-    # Whoever stops early has had the first of them.
-    moments = find_moving_moments(detections, rig, Placements(0.15, 10.0), Losses())
-    assert times_s([next(moments)]) == first[:1]
 
 
 def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig: Rig) -> None:
@@ -142,20 +113,3 @@ def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig:
         told = [BoardDetection(s.frame, {}, {}, {("davis", "events"): unseen}) for s in detections]
         moments, refused = choose(told, rig)
         assert moments == [] and list(refused) == [code]
-
-
-@given(steps=st.lists(st.integers(1, 400), min_size=1, max_size=40), set_back=st.integers(0, 40))
-def test_every_detection_is_judged_once_with_all_that_lie_within_half_a_window(
-    steps: list[int], set_back: int
-) -> None:
-    times_ms = np.cumsum(steps)
-    times_ms[set_back:] -= 100_000
-    detections = [BoardDetection(Frame(int(t) * 10**6, (), ()), {}, {}) for t in times_ms]
-    neighbours = _Neighbours(0.5)
-    found = [each for detection in detections for each in neighbours.take(detection)]
-    found.extend(neighbours.finish())
-    assert [detection for detection, _ in found] == detections
-    for k, (detection, around) in enumerate(found):
-        same_clock = detections[:set_back] if k < set_back else detections[set_back:]
-        near = [s for s in same_clock if abs(s.frame.time_ns - detection.frame.time_ns) <= 250_000_000]
-        assert around == near

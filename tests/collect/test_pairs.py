@@ -118,14 +118,6 @@ def test_pictures_of_another_size_are_said(tmp_path, folder, rig):
     assert (found.code, found.severity, found.subject) == ("image.size_other", "error", "cam.frames")
 
 
-def test_progress_tells_of_every_pair(tmp_path, folder, rig):
-    told = []
-    with Session.create(tmp_path / "s", rig) as session:
-        collect(session, [open_recording(folder, rig)], progress=lambda *step: told.append(step))
-    assert [(done, total) for done, total, _ in told] == [(k + 1, N_PAIRS) for k in range(N_PAIRS)]
-    assert "00000.png" in told[0][2] and told[0][2].endswith(" 000000")
-
-
 COLLECTOR = """
 import sys
 from lce_rig.collect import collect

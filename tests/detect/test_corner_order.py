@@ -61,22 +61,6 @@ def test_corners_in_the_right_order_stay_as_they_are():
     assert align_corner_order(found, seen(OBLONG, looking((0.2, 0.1, 0.6))), OBLONG) is found
 
 
-def test_the_track_turns_with_its_board():
-    found = seen(OBLONG, looking(), 0.1)
-    followed = replace(
-        found,
-        stamp_ns=0,
-        track_ns=np.array([50]),
-        track_T_cam_board=found.T_cam_board[None],
-        track_cov=found.cov[None],
-    )
-    turned = counted_from_elsewhere(followed, OBLONG, 2)
-    turned = replace(turned, track_T_cam_board=turned.T_cam_board[None], track_cov=turned.cov[None])
-    aligned = align_corner_order(turned, found, OBLONG)
-    np.testing.assert_allclose(aligned.track_T_cam_board[0], found.T_cam_board, atol=1e-6)
-    np.testing.assert_allclose(aligned.track_cov[0], found.cov, rtol=1e-4, atol=1e-12)
-
-
 def test_of_two_poses_the_nearer_one_is_taken_with_the_covariance_it_has():
     truth = looking((0.3, -0.25, 0.4), (0.0, 0.0, 3.5))
     found = seen(OBLONG, truth, 0.2)

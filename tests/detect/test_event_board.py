@@ -1,7 +1,5 @@
 """The board in raw events: followed where it truly is, and where it is not seen, the cause is named."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from moving_board import (
@@ -108,13 +106,6 @@ def test_events_are_counted_on_the_board_only(stream, detection):
     assert quality.events_px > 3
 
 
-def test_the_track_ends_with_the_stream(stream):
-    cut = stream.between(0, STAMP + 70 * MS)
-    board = find(cut).board
-    assert board.track_ns[-1] == cut.t_ns[-1]
-    assert len(board.track_ns) == 4
-
-
 def test_a_stream_that_ends_before_the_stamp_is_told_by_how_much(stream):
     detection = find(stream, stamp_ns=3_000 * MS)
     assert isinstance(detection.picture, Refusal)
@@ -164,15 +155,6 @@ def test_hot_pixels_are_named_with_their_share_and_do_not_hide_a_moving_board(st
     assert isinstance(find(join(stream, hot)).board, ImageBoard)
 
 
-def test_the_event_map_does_not_show_the_board_though_it_moves(stream):
-    detection = find(stream, method="map")
-    assert isinstance(detection.picture, Image)
-    assert isinstance(detection.board, Refusal)
-    # Nothing happened where the picture is grey; edges are brighter or darker than that.
-    values = detection.picture.pixels
-    assert np.median(values) == 128 and values.min() < 40 and values.max() > 215
-
-
 @pytest.mark.parametrize(
     ("limit", "code", "figure"),
     [
@@ -190,19 +172,6 @@ def test_limits_of_the_profile_refuse_with_their_figures(detection, limit, code,
         board = gate_event_board(detection.board, limits)
     assert isinstance(board, Refusal)
     assert (board.code, board.figures[figure]) == (code, *limit.values())
-
-
-def test_speeds_that_could_be_noise_are_not_held_against_a_board(detection):
-    for figures, code in (
-        ({"speed_mps": 0.6, "speed_sigma_mps": 0.1}, ""),
-        ({"speed_mps": 0.6, "speed_sigma_mps": 0.02}, "image.too_fast"),
-        ({"turn_deg_s": 90.0, "turn_sigma_deg_s": 20.0}, ""),
-        ({"turn_deg_s": 90.0, "turn_sigma_deg_s": 5.0}, "image.turning"),
-    ):
-        board = gate_event_board(
-            replace(detection.board, events=replace(detection.board.events, **figures)), LIMITS
-        )
-        assert (board.code if isinstance(board, Refusal) else "") == code
 
 
 def test_pictures_made_by_others_are_judged_without_figures_of_events(detection):

@@ -8,7 +8,7 @@ import pytest
 from moving_board import COLS, ROWS, Motion, board_events, cut, events_of, inner_corners_px
 
 from lce_rig.core.data import Image
-from lce_rig.core.errors import SourceError, UsageError
+from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Refusal
 from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
 
@@ -50,10 +50,6 @@ def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream, kind):
     assert np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2)) < 0.5
 
 
-def test_the_event_map_shows_the_board_far_less_often(stream):
-    assert np.isfinite(errors_px(stream, "map", WindowOptions())).mean() < 0.5
-
-
 def test_the_picture_lasts_while_the_board_stands_still():
     events = board_events(PAUSE, DURATION_S)
     stamps = [1_200 * MS, 1_500 * MS]
@@ -67,12 +63,6 @@ def test_batches_may_be_cut_anywhere(stream):
     )
     for one, other in zip(whole, parts, strict=True):
         np.testing.assert_array_equal(one.pixels, other.pixels)
-
-
-def test_other_stamps_do_not_change_a_picture(stream):
-    alone = next(Reconstructor().reconstruct([stream], [STAMPS[5]]))
-    among = list(Reconstructor().reconstruct([stream], STAMPS[:6]))[5]
-    np.testing.assert_array_equal(alone.pixels, among.pixels)
 
 
 def test_a_picture_shows_nothing_that_happened_after_its_stamp(stream):
@@ -96,13 +86,6 @@ def test_every_stamp_gets_an_answer_and_warm_up_is_refused_with_its_figures(stre
     assert {answer.channel for answer in answers[2:]} == {"events"}
 
 
-def test_pictures_at_a_steady_rate_cover_the_stream(stream):
-    answers = list(Reconstructor().reconstruct(cut(stream, 5), every_ns=100 * MS))
-    assert len(answers) == int((stream.t_ns[-1] - stream.t_ns[0]) // (100 * MS))
-    is_picture = [isinstance(answer, Image) for answer in answers]
-    assert is_picture == sorted(is_picture)  # refused during warm-up, never afterwards
-
-
 def test_clocks_that_do_not_overlap_are_refused_saying_by_how_much(stream):
     answers = list(Reconstructor().reconstruct([stream], [-2_500 * MS, STAMPS[0], 9_000 * MS]))
     assert answers[0].code == "read.before_events"
@@ -110,13 +93,6 @@ def test_clocks_that_do_not_overlap_are_refused_saying_by_how_much(stream):
     assert isinstance(answers[1], Image)
     assert answers[2].code == "read.after_events"
     assert answers[2].figure("gap_s") == pytest.approx(7.4, abs=0.1)
-
-
-def test_a_stream_cut_off_at_the_stamp_gives_the_same_picture(stream):
-    stamp = STAMPS[4]
-    whole = next(Reconstructor().reconstruct([stream], [stamp]))
-    excerpt = next(Reconstructor().reconstruct([stream.between(0, stamp)], [stamp]))
-    np.testing.assert_array_equal(whole.pixels, excerpt.pixels)
 
 
 def test_a_stream_without_events_refuses_every_stamp():
@@ -138,12 +114,6 @@ def test_events_that_go_back_in_time_are_an_error(stream):
         list(Reconstructor().reconstruct([stream, stream], [9_000 * MS]))
 
 
-def test_stamps_must_be_given_once_and_in_order(stream):
-    for wrong in ({}, {"stamps_ns": [1], "every_ns": 1}, {"stamps_ns": [2, 1]}, {"every_ns": 0}):
-        with pytest.raises(UsageError):
-            list(Reconstructor().reconstruct([stream], **wrong))
-
-
 @pytest.mark.parametrize("kind", ["auto", "time"])
 def test_an_hour_of_silence_costs_no_hour_of_steps(stream, kind):
     first, rest = stream.between(0, 800 * MS), stream.between(800 * MS, 10_000 * MS)
@@ -153,14 +123,6 @@ def test_an_hour_of_silence_costs_no_hour_of_steps(stream, kind):
     answers = list(reconstructor.reconstruct([first, later], [hour_ns + 1_500 * MS]))
     assert isinstance(answers[0], Image)
     assert reconstructor.n_steps < 100
-
-
-def test_a_reconstructor_starts_afresh_with_each_stream(stream):
-    reconstructor = Reconstructor()
-    first = list(reconstructor.reconstruct([stream], STAMPS[:2]))
-    second = list(reconstructor.reconstruct([stream], STAMPS[:2]))
-    for one, other in zip(first, second, strict=True):
-        np.testing.assert_array_equal(one.pixels, other.pixels)
 
 
 def test_steps_of_the_callers_own_windows_give_float_pictures_and_grey_ones(stream):

@@ -37,16 +37,6 @@ def test_windows_of_constant_count_hold_that_many_events(n_events):
     assert len(events.between(0, end)) == n_events
 
 
-def test_a_count_that_equal_stamps_overrun_is_not_cut_between_them():
-    events = events_of([0, 10, 10, 10, 20], [0] * 5, [0] * 5, [1] * 5)
-    rule = window_rule(WindowOptions("count", n_events=2), 64, 64, 1.0)
-    assert len(events.between(0, rule.end(events, 0))) == 4
-
-
-def test_the_count_follows_the_sensors_size_where_none_is_given():
-    assert window_rule(WindowOptions("count"), 260, 346, 1.0).n_events == pytest.approx(31_500, abs=50)
-
-
 @pytest.mark.parametrize(("rate_hz", "expected_ms"), [(1e3, 60), (3e4, 48), (1e6, 20)])
 def test_automatic_windows_follow_the_event_rate_between_20_and_60_ms(rate_hz, expected_ms):
     events = steady(rate_hz, 0.2)
@@ -59,12 +49,6 @@ def test_a_small_active_part_gets_proportionally_smaller_windows():
     assert small == pytest.approx(1 / 16, rel=0.05)
     full = window_rule(WindowOptions(), 256, 256, 1.0).n_events
     assert window_rule(WindowOptions(), 256, 256, small).n_events == pytest.approx(full / 4, rel=0.05)
-
-
-def test_the_active_share_does_not_depend_on_the_number_of_events():
-    shares = [active_share(steady(rate, 0.1)) for rate in (3e4, 3e5)]
-    assert shares[0] == pytest.approx(shares[1], rel=0.02)
-    assert active_share(steady(1e3, 0.0)) == 1.0
 
 
 @pytest.mark.parametrize("bad", [{"duration_s": 0.0}, {"duration_s": -1.0}, {"n_events": 0}])

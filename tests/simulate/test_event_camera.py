@@ -129,13 +129,6 @@ def test_events_come_in_order_of_whole_microseconds_across_packets() -> None:
     assert max(int(packet.x.max()) for packet in packets) == 63
 
 
-def test_packets_hold_what_one_recording_would() -> None:
-    (whole,) = record(QUIET, ripples())
-    parts = record(QUIET, ripples(), n_packets=5)
-    assert np.array_equal(np.concatenate([part.t_ns for part in parts]), whole.t_ns)
-    assert np.array_equal(np.concatenate([part.x for part in parts]), whole.x)
-
-
 def test_no_pixel_fires_within_its_refractory_period() -> None:
     fast = ripples(1)
     noise = EventNoise(refractory_s=0.004, noise_hz=20.0, threshold_on=0.1, threshold_off=0.1)
@@ -146,15 +139,6 @@ def test_no_pixel_fires_within_its_refractory_period() -> None:
     assert intervals_ns(events).min() >= 4_000_000 - 1000
     free = record(replace(noise, refractory_s=0.0), lambda t_s: fast(4 * t_s))[0]
     assert np.mean(intervals_ns(free) < 4_000_000) > 0.1
-
-
-def test_a_pixel_blind_for_a_while_compares_against_what_it_sees_when_released() -> None:
-    # ln rises by 10 a second; threshold 0.25 after 25 ms, blind for 15 ms: an event every 40 ms.
-    noise = replace(QUIET, threshold_on=0.25, dark_radiance=0.0, refractory_s=0.015)
-    (events,) = record(noise, lambda t_s: 0.01 * np.exp(10 * np.float32(t_s)) * flat(1.0)(0), duration_s=0.4)
-    expected_ns = 1_000_000 * (25 + 40 * np.arange(10))
-    one = events.select(pixel_of(events) == 77)
-    assert np.allclose(one.t_ns - START_NS, expected_ns, atol=20_000)
 
 
 def test_slow_pixels_lag_behind_and_dark_ones_more() -> None:
@@ -172,15 +156,6 @@ def test_slow_pixels_lag_behind_and_dark_ones_more() -> None:
     assert np.allclose(delay_s, expected, atol=1e-3)
 
 
-def test_leaks_are_on_events_at_their_rate_and_not_in_step() -> None:
-    noise = replace(QUIET, leak_hz=2.0)
-    (events,) = record(noise, flat(0.3), duration_s=2.0, step_s=0.01)
-    assert events.polarity.all()
-    assert len(events) / 2.0 / np.prod(SHAPE) == pytest.approx(2.0, rel=0.03)
-    per_tenth = np.histogram(events.t_ns, 20)[0]
-    assert per_tenth.min() > 0.8 * per_tenth.max()
-
-
 def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark() -> None:
     noise = replace(QUIET, noise_hz=10.0)
     halves = np.where(np.arange(SHAPE[1]) < 32, 0.0, 1.0).astype(np.float32) * np.ones(SHAPE, np.float32)
@@ -188,20 +163,6 @@ def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark() -> None:
     rate_hz = [np.sum((events.x < 32) == dark) / (2.0 * np.prod(SHAPE) / 2) for dark in (True, False)]
     assert rate_hz == pytest.approx([20.0, 10.0], rel=0.05)
     assert events.polarity.mean() == pytest.approx(0.5, abs=0.02)
-
-
-def test_hot_pixels_are_the_sensors_own_and_fire_on_events() -> None:
-    noise = replace(QUIET, hot_share=0.004, hot_hz=(50.0, 200.0))
-    pixels = draw_pixels(LENS, noise, np.random.default_rng(9))
-    hot = np.flatnonzero(pixels.hot_hz)
-    assert len(hot) == 12
-    for seed in (0, 1):
-        (events,) = record(noise, flat(0.3), duration_s=2.0, step_s=0.05, pixels=pixels, seed=seed)
-        assert set(np.unique(pixel_of(events))) == set(hot)
-        assert events.polarity.mean() > 0.9
-        assert counts(events, True).sum() + counts(events, False).sum() == pytest.approx(
-            2.0 * pixels.hot_hz.sum(), rel=0.15
-        )
 
 
 def test_thresholds_spread_from_pixel_to_pixel_and_from_event_to_event() -> None:
@@ -225,15 +186,3 @@ def test_stamps_carry_the_offset_of_the_cameras_clock() -> None:
     plain, shifted = (record(QUIET, ripples(), offset_ns=offset)[0] for offset in (0, -15_000_000))
     assert np.array_equal(shifted.t_ns, plain.t_ns - 15_000_000)
     assert np.array_equal(shifted.x, plain.x)
-
-
-def test_the_same_seed_gives_the_same_bytes() -> None:
-    one, same, other = (record(EventNoise(noise_hz=5.0), ripples(), seed=s)[0] for s in (4, 4, 5))
-    for column in ("t_ns", "x", "y", "polarity"):
-        assert getattr(one, column).tobytes() == getattr(same, column).tobytes()
-    assert one.t_ns.tobytes() != other.t_ns.tobytes()
-
-
-def test_a_camera_that_sees_nothing_change_is_silent_without_noise() -> None:
-    (events,) = record(QUIET, flat(0.5))
-    assert len(events) == 0 and events.t_ns.dtype == np.int64 and events.host_ns is None

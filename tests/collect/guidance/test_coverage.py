@@ -41,19 +41,3 @@ def test_each_bar_fills_by_its_own_movement(reachable, bar, changes):
     assert getattr(coverage(reachable, *changes), bar) == pytest.approx(1.0, abs=0.15)
     others = replace(coverage(reachable, *changes), **{bar: 0.0})
     assert max(vars(others).values()) < 0.6
-
-
-def test_each_leaning_fills_a_quarter_of_the_tilt(reachable):
-    assert coverage(reachable, {}, {"tilt_deg": 20.0}).tilt == 0.25
-    assert coverage(reachable, {"turn_deg": -20.0}, {"tilt_deg": 20.0}).tilt == 0.5
-
-
-def test_bars_never_empty_again(reachable):
-    rng = np.random.default_rng(0)
-    order = rng.permutation(len(reachable))[:12]
-    last = np.zeros(5)
-    for n in range(1, 12):
-        bars = np.array(list(vars(measure_coverage(VIEW, reachable[order[:n]], reachable)).values()))
-        assert np.all(bars >= last)
-        last = bars
-    assert np.all((last > 0.3) & (last <= 1))

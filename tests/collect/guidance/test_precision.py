@@ -14,7 +14,6 @@ from lce_rig.calibrate.estimate import estimate_observations
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.collect.guidance import combine, sigmas, weigh_placements
-from lce_rig.collect.guidance.evidence import combine_with_each
 from lce_rig.collect.guidance.sensor_noise import ErrorModel
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Observation
@@ -99,30 +98,10 @@ def test_a_placement_more_makes_it_better_and_a_second_of_the_same_kind_less_so(
     assert np.all(before - after > after - again)
 
 
-def test_without_captures_nothing_is_known():
-    rotation, translation = sigmas(predict_covariance(model(), np.zeros((0, 4, 4)), T_FORWARD))
-    assert rotation > 0.5
-    assert translation > 1.0
-
-
-def test_one_more_of_many_is_as_if_it_were_held(poses):
-    evidence = weigh_placements(model(), poses, T_FORWARD)
-    held = evidence.of(np.arange(5))
-    each = combine_with_each(held, evidence.of(np.array([9, 11])), ErrorModel())
-    one = combine(evidence.of(np.array([0, 1, 2, 3, 4, 11])), ErrorModel())
-    np.testing.assert_allclose(each.cov[1], one.cov, rtol=1e-9)
-
-
 def test_a_range_offset_adds_its_own_size_along_the_sight(poses):
     errors = replace(ErrorModel(), range_offset_m=0.005)
     precision = combine(weigh_placements(model(errors), poses, T_FORWARD), errors)
     assert np.sqrt(precision.offset[2, 2]) == pytest.approx(0.005, rel=0.25)
-
-
-def test_few_captures_claim_more_than_they_err(poses):
-    precision = combine(weigh_placements(model(), poses, T_FORWARD), ErrorModel())
-    assert np.all(np.diag(precision.claimed(14)) > np.diag(precision.cov))
-    np.testing.assert_allclose(precision.claimed(10_000), precision.cov, rtol=2e-3)
 
 
 def test_worse_residuals_than_expected_are_learned():

@@ -6,7 +6,7 @@ import pytest
 from lce_rig.collect.guidance import Person
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, Learned, make_guides
 from lce_rig.core.geometry import Array
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import Rig
 from tests.collect.live.follow import NEW_DEG, NEW_M, follow_guide
 from tests.collect.live.replay import rig
 
@@ -173,14 +173,6 @@ def test_a_person_who_goes_on_is_sent_to_new_places_until_there_are_as_many_capt
     walk = follow_guide(rig(), 20)
     assert len(walk.captured) == 20
     assert len(walk.proposed) >= 20 and is_new(walk.nearest())
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["rlfs", "rles"])
-def test_forty_placements_are_as_new_as_twenty(name: str) -> None:
-    for seed in range(2):
-        walk = follow_guide(load_rig(name), 40, seed)
-        assert len(walk.captured) == 40 and is_new(walk.nearest())
 
 
 def test_half_a_room_and_a_careless_person_will_do() -> None:
