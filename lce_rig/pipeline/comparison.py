@@ -17,9 +17,8 @@ from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, ONLY_ONE, OTHER_BOARD, OUTDATED
 from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
 from lce_rig.session import Session
-from lce_rig.session.identity import DifferingKey, differing_keys
+from lce_rig.session.identity import differing_keys
 from lce_rig.session.session import CAPTURES
-from lce_rig.words import describe, recommend
 
 # Inputs of the extrinsics besides the captures; another lens is another camera.
 _SAME_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
@@ -111,28 +110,54 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
         if (where / RESULT).exists() or name not in (None, CURRENT):
             saved = _read(session, where)
             results[label] = list(saved.pairs)
-            captures[label] = frozenset(sha for path, sha in saved.inputs_sha256.items() if _is_capture(path))
+            # Inputs are those of one session or of several; its captures are among them.
+            captures[label] = frozenset(
+                sha for path, sha in saved.inputs_sha256.items() if CAPTURES in path.split("/")
+            )
         else:
-            results[label], own_troubles = _calibrate(label, session)
-            captures[label] = _manifests(session)
+            try:
+                result = calibrate(session)
+            except NotEnoughDataError as error:
+                raise NotEnoughDataError(f"{label}: {error.what}", error.hint) from None
+            results[label] = list(result.pairs)
             calibrated.append(label)
-            troubles += own_troubles
+            troubles += [
+                NOT_CALIBRATED(
+                    label,
+                    sensors=shortage.subject,
+                    cause=shortage.code,
+                    what=shortage.text,
+                    hint=shortage.advice,
+                )
+                for shortage in result.shortages
+            ]
+            hashes = set()
+            for capture in session.captures:
+                with suppress(SessionError):
+                    hashes.add(capture.manifest_sha256)
+            captures[label] = frozenset(hashes)
         progress(done, len(sessions))
     _require_apart(captures)
-    rig = next(iter(sessions.values())).rig.name
+    first_name, first = next(iter(sessions.items()))
+    other_boards = [
+        OTHER_BOARD(label, first=first_name)
+        for label, session in sessions.items()
+        if session.rig.board != first.rig.board
+    ]
     comparisons, lonely = compare_sensors(results)
     _require_some(comparisons, results, "sessions")
-    findings = (*_other_boards(sessions), *troubles, *lonely, *_failures(results))
-    return Repeat(rig, comparisons, tuple(calibrated), findings)
+    findings = (*other_boards, *troubles, *lonely, *_failures(results))
+    return Repeat(first.rig.name, comparisons, tuple(calibrated), findings)
 
 
 def _require_some(
     comparisons: Sequence[Repeatability], results: dict[str, list[Calibration]], what: str
 ) -> None:
     if not comparisons:
+        sensors = {name: ", ".join(f"{c.camera} and {c.lidar}" for c in own) for name, own in results.items()}
         raise SessionError(
             f"no camera and LiDAR are calibrated in two of the {what}",
-            "\n".join(_calibrated_sensors(name, own) for name, own in results.items()),
+            "\n".join(f"{name}: {own or 'its result holds no sensors'}" for name, own in sensors.items()),
         )
 
 
@@ -168,18 +193,17 @@ def require_one_rig(sessions: Mapping[str, Session]) -> None:
                 f"{first_name} belongs to rig {first.rig.name!r}, {name} to rig {session.rig.name!r}",
                 "Give sessions of one rig.",
             )
-        keys = [key for key in differing_keys(first.rig, session.rig) if _is_of_sensors(key)]
+        # Differences between profiles that move extrinsics.
+        keys = [
+            key
+            for key in differing_keys(first.rig, session.rig)
+            if key.path[0] in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(key.path[1:])
+        ]
         if keys:
             raise SessionError(
                 f"{first_name} and {name} were made with different sensors: {'; '.join(map(str, keys[:4]))}",
                 "Put the same intrinsics into both (rig.yaml of the session) and calibrate again.",
             )
-
-
-def _is_of_sensors(difference: DifferingKey) -> bool:
-    """Return whether a difference between profiles moves extrinsics."""
-    block, *keys = difference.path
-    return block in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(keys)
 
 
 def require_independent(sessions: Mapping[str, Session]) -> None:
@@ -201,19 +225,6 @@ def require_independent(sessions: Mapping[str, Session]) -> None:
             )
 
 
-def _is_capture(path: str) -> bool:
-    """Return whether an input of a result, of one session or of several, is a capture."""
-    return CAPTURES in path.split("/")
-
-
-def _manifests(session: Session) -> frozenset[str]:
-    found = set()
-    for capture in session.captures:
-        with suppress(SessionError):
-            found.add(capture.manifest_sha256)
-    return frozenset(found)
-
-
 def _require_apart(captures: Mapping[str, frozenset[str]]) -> None:
     """Refuse results made from the same captures, as that of several sessions contains each of them."""
     for one, other in combinations(captures, 2):
@@ -224,42 +235,6 @@ def _require_apart(captures: Mapping[str, frozenset[str]]) -> None:
                 "A result of several sessions contains the captures of each. Compare results of one session "
                 "each (without --name), or of sessions that it does not contain.",
             )
-
-
-def _other_boards(sessions: dict[str, Session]) -> list[Finding]:
-    (first_name, first), *others = sessions.items()
-    return [
-        OTHER_BOARD(name, first=first_name)
-        for name, session in others
-        if session.rig.board != first.rig.board
-    ]
-
-
-def _calibrate(name: str, session: Session) -> tuple[list[Calibration], list[Finding]]:
-    """Calibrate a session, and report sensors that could not be calibrated.
-
-    Raises:
-        NotEnoughDataError: no sensors could be calibrated; the session is named.
-    """
-    try:
-        result = calibrate(session)
-    except NotEnoughDataError as error:
-        raise NotEnoughDataError(f"{name}: {error.what}", error.hint) from None
-    return list(result.pairs), [
-        NOT_CALIBRATED(
-            name,
-            sensors=shortage.subject,
-            cause=shortage.code,
-            what=describe(shortage),
-            hint=recommend(shortage),
-        )
-        for shortage in result.shortages
-    ]
-
-
-def _calibrated_sensors(name: str, calibrations: Sequence[Calibration]) -> str:
-    sensors = ", ".join(f"{c.camera} and {c.lidar}" for c in calibrations)
-    return f"{name}: {sensors or 'its result holds no sensors'}"
 
 
 def _read(session: Session, folder: Path) -> ResultFile:

@@ -9,12 +9,10 @@ estimate of all captures they are common unknowns, and their part of the covaria
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
 
 from lce_rig.calibrate import CalibrateOptions
-from lce_rig.core.calibration import Calibration, SceneOpinion
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
-from lce_rig.core.findings import Finding
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.repeatability import Repeatability
@@ -29,11 +27,9 @@ from lce_rig.pipeline.sharpening import by_boards, sharpen
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys
-from lce_rig.words import describe, recommend
 
 # Captures of all sessions are estimated with one of these; targets and limits are those of the first session.
 _SHARED = frozenset({"board", "cameras", "lidars"})
-_D = TypeVar("_D")
 
 
 def calibrate(
@@ -96,18 +92,14 @@ def calibrate(
         progress=progress,
     )
     agreements = {(each.camera, each.lidar): (each.finding,) for each in comparisons}
-    told = [replace(c, findings=(*c.findings, *agreements.get((c.camera, c.lidar), ()))) for c in pairs]
-    heard = [with_opinion(c, _hear(named, found, by_boards(c))) for c in told]
+    heard = []
+    for c in pairs:
+        # The scene of the first session that holds captures of these sensors.
+        name = next(name for name in named if Pair.of(c) in found[name].pairs)
+        opinion = hear_scene(named[name], found[name], by_boards(c))
+        agreement = agreements.get((c.camera, c.lidar), ())
+        heard.append(with_opinion(replace(c, findings=(*c.findings, *agreement)), opinion))
     return Result(session[0], tuple(heard), tuple(shortages), named)
-
-
-def _hear(
-    sessions: Mapping[str, Session], found: Mapping[str, Detections], calibration: Calibration
-) -> SceneOpinion:
-    """Ask the scene of the first session that holds captures of the calibrated sensors."""
-    seen = {name for name, own in found.items() if Pair.of(calibration) in own.pairs}
-    first = next(name for name in sessions if name in seen)
-    return hear_scene(sessions[first], found[first], calibration)
 
 
 def require_unit(sessions: Sequence[Session]) -> dict[str, Session]:
@@ -145,15 +137,11 @@ def join_detections(found: Mapping[str, Detections]) -> Detections:
     session_of: dict[str, str] = {}
     for name, own in found.items():
         for key, by_image in own.images.items():
-            images.setdefault(key, {}).update(_renamed(name, by_image))
+            images.setdefault(key, {}).update({f"{name}/{k}": image for k, image in by_image.items()})
         for lidar, by_scan in own.lidars.items():
-            lidars.setdefault(lidar, {}).update(_renamed(name, by_scan))
-            session_of |= dict.fromkeys(_renamed(name, by_scan), name)
+            lidars.setdefault(lidar, {}).update({f"{name}/{k}": scan for k, scan in by_scan.items()})
+            session_of |= {f"{name}/{k}": name for k in by_scan}
     return Detections(images, lidars, session_of)
-
-
-def _renamed(session: str, detections: Mapping[str, _D]) -> dict[str, _D]:
-    return {f"{session}/{capture}": detection for capture, detection in detections.items()}
 
 
 def _require_unmoved(
@@ -181,25 +169,23 @@ def _require_unmoved(
                 f"{error.hint}\nOr leave {name} out.".strip(),
             ) from None
     comparisons, _ = compare_sensors(alone)
-    for each in comparisons:
-        if not each.agrees:
-            raise ResultRefusedError(describe(_moved(each)), recommend(_moved(each)))
+    for comparison in comparisons:
+        if comparison.agrees:
+            continue
+        # The sensors moved between the odd one and another, or between the two that differ most.
+        odd = comparison.odd_one
+        pairs = [each for each in comparison.differences if odd in (None, each.first, each.second)]
+        worst = min(pairs, key=lambda pair: (pair.p, -pair.distance))
+        moved = MOVED(
+            action="" if odd is None else "odd_one",
+            camera=comparison.camera,
+            lidar=comparison.lidar,
+            first=worst.first,
+            second=worst.second,
+            rotation_deg=worst.rotation_deg,
+            translation_m=worst.translation_m,
+            p=comparison.p,
+            odd_one=odd,
+        )
+        raise ResultRefusedError(moved.text, moved.advice)
     return comparisons
-
-
-def _moved(comparison: Repeatability) -> Finding:
-    """State between which sessions the sensors moved: the odd one, or the two that differ most."""
-    odd = comparison.odd_one
-    pairs = [each for each in comparison.differences if odd in (None, each.first, each.second)]
-    worst = min(pairs, key=lambda pair: (pair.p, -pair.distance))
-    return MOVED(
-        action="" if odd is None else "odd_one",
-        camera=comparison.camera,
-        lidar=comparison.lidar,
-        first=worst.first,
-        second=worst.second,
-        rotation_deg=worst.rotation_deg,
-        translation_m=worst.translation_m,
-        p=comparison.p,
-        odd_one=odd,
-    )
