@@ -40,8 +40,7 @@ from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE
 from lce_rig.pipeline.matching import candidates_of
 from lce_rig.pipeline.result_files import Result
-from lce_rig.pipeline.sharpening import Sharpen, by_boards, fuse, sharpen
-from lce_rig.pipeline.witness import hear_scene
+from lce_rig.pipeline.witness import Sharpen, by_boards, fuse, hear_scene, sharpen
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 

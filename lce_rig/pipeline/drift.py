@@ -16,14 +16,15 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.devices.reading import LiveSource
-from lce_rig.pipeline.board_drift import BoardDrift, board_finding, watch_boards
+from lce_rig.judge.board_drift import BoardDrift, watch_boards
+from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
 from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, own_offset_ns
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import evenly
-from lce_rig.scene.drift import AxisDrift, Drift, State, overall, watch
+from lce_rig.scene.drift import Drift, State, overall, watch
 from lce_rig.scene.findings import (
     CHANGED_WITH_BOARD,
     CLOCKS_APART,
@@ -40,7 +41,6 @@ from lce_rig.session import Session
 from lce_rig.show.overlays.drift_picture import draw_drift
 from lce_rig.show.overlays.overlay_files import write_picture
 from lce_rig.timing.rig_time import event_channel, rig_time_ns
-from lce_rig.words import as_json
 
 _MIN_MOVING = 3
 _MAX_BOARDS = 20
@@ -68,7 +68,11 @@ class PairDrift:
         scene = {axis.axis: axis.state for axis in self.drift.axes}
         if self.board is None:
             return scene
-        return {axis.axis: _either(scene[axis.axis], axis.state) for axis in self.board.axes}
+        order: tuple[State, ...] = ("changed", "unchanged", "unknown")
+        return {
+            axis.axis: next(state for state in order if state in (scene[axis.axis], axis.state))
+            for axis in self.board.axes
+        }
 
     @property
     def state(self) -> State:
@@ -97,8 +101,7 @@ class PairDrift:
         """The verdict first, then the scene's opinion on each axis and what is missing, then the board's."""
         if self.board is None:
             return self.drift.findings
-        told = tuple(board_finding(axis) for axis in self.board.axes if axis.state != "unchanged")
-        return (self.summary, *self.drift.findings, *told)
+        return (self.summary, *self.drift.findings, *self.board.findings)
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
@@ -110,32 +113,13 @@ class PairDrift:
             "scene_state": self.drift.state,
             "n_captures": self.drift.n_captures,
             "n_edges": self.drift.n_edges,
-            "axes": [_axis(axis) for axis in self.drift.axes],
+            "axes": [axis.document() for axis in self.drift.axes],
             "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
             "T_cam_lidar_best": self.drift.T_best.tolist(),
             "covariance_best": None if self.drift.cov_best is None else self.drift.cov_best.tolist(),
-            "board": None if self.board is None else _board(self.board),
-            "findings": [as_json(finding) for finding in self.findings],
+            "board": None if self.board is None else self.board.document(),
+            "findings": [finding.as_json() for finding in self.findings],
         }
-
-
-def _either(first: State, second: State) -> State:
-    return next(state for state in ("changed", "unchanged", "unknown") if state in (first, second))
-
-
-def _board(board: BoardDrift) -> dict[str, Any]:
-    return {
-        "n_boards": board.n_boards,
-        "n_placements": board.n_placements,
-        "mpe_m": board.metrics.mpe_m,
-        "mee_m": board.metrics.mee_m,
-        "axes": [_axis(axis) for axis in board.axes],
-    }
-
-
-def _axis(axis: AxisDrift) -> dict[str, Any]:
-    finite = {name: value if np.isfinite(value) else None for name, value in axis.figures.items()}
-    return {"axis": axis.axis, "state": axis.state, **finite, "instead": list(axis.instead)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,10 +277,16 @@ class _Judge:
             judged = replace(judged, findings=(*judged.findings, EVENTS_OF_STANDING_RIG(c.camera)))
         if len(moving) >= _MIN_MOVING and judged.curves:
             judged = _with_clocks(judged, moving, lens, c.camera)
-        return PairDrift(c, judged, self._boards(c, boards), _example(kept, whole))
+        example = None
+        if whole:
+            # The picture is of the capture with most edges.
+            view = max(whole, key=lambda each: len(each.edges))
+            image = next(seen.image for seen in kept if seen.name == view.capture)
+            example = view.capture, image if isinstance(image, Image) else _picture_of(image), view
+        return PairDrift(c, judged, self._boards(c, boards), example)
 
     def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
-        """Ask the boards, of at most 20 captures."""
+        """Compare the extrinsics with the boards of at most 20 captures."""
         images: dict[str, ImageBoard] = {}
         scans: dict[str, list[LidarBoard]] = {}
         for seen, board in evenly(boards, _MAX_BOARDS):
@@ -306,7 +296,8 @@ class _Judge:
         if not images:
             return None
         channel = boards[0][0].image.channel if isinstance(boards[0][0].image, Image) else ""
-        return watch_boards(self._rig, c, channel, images, scans)
+        clocks = clocks_of(self._rig, c.camera, c.lidar)
+        return watch_boards(self._rig, c, channel, images, scans, clocks)
 
     def _motion(self, seen: Seen) -> RigMotion | None:
         """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""
@@ -317,15 +308,6 @@ class _Judge:
             motion = estimate_motion(seen.previous, seen.scan)
             self._motions[key] = None if motion is None or motion.is_still else motion
         return self._motions[key]
-
-
-def _example(kept: Sequence[Seen], views: Sequence[SceneView]) -> tuple[str, Image, SceneView] | None:
-    """Choose the capture with most edges for the picture."""
-    if not views:
-        return None
-    view = max(views, key=lambda each: len(each.edges))
-    image = next(seen.image for seen in kept if seen.name == view.capture)
-    return view.capture, _picture_of(image) if isinstance(image, Events) else image, view
 
 
 def _picture_of(events: Events) -> Image:

@@ -1,6 +1,6 @@
 """Captures of a scene: from sessions, recordings of all kinds and attached sensors, in bounded memory."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,12 +23,11 @@ from lce_rig.pipeline.detect_session import Progress
 from lce_rig.rig import Rig
 from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.views import MAX_CAPTURES
-from lce_rig.session import Capture, Session
+from lce_rig.session import Session
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_clock import RigClock
 from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns, stream_of
 from lce_rig.timing.scan_pairing import Frame, pair_by_time
-from lce_rig.words import describe
 
 _LIVE_WAIT_S = 0.2
 #: Of events this long about the time at which the LiDAR looks where the camera does.
@@ -105,31 +104,30 @@ class SceneCaptures:
 
     def take_session(self, session: Session, progress: Progress) -> None:
         """Read the captures of a session; what is damaged is skipped."""
+        cameras, lidars = {c.camera for c in self._pairs}, {c.lidar for c in self._pairs}
         captures = evenly(session.captures, MAX_CAPTURES * len(self._pairs))
         for done, capture in enumerate(captures, start=1):
-            with suppress(SessionError):
-                self._take_capture(capture)
             progress(done, len(captures))
-
-    def _take_capture(self, capture: Capture) -> None:
-        cameras, lidars = {c.camera for c in self._pairs}, {c.lidar for c in self._pairs}
-        images: list[Image] = []
-        scans: list[Scan] = []
-        events: list[Events] = []
-        # A damaged file costs its own sensor only.
-        for key in capture.image_keys:
-            if key[0] in cameras:
+            images: list[Image] = []
+            scans: list[Scan] = []
+            cuts: list[EventCut] = []
+            keys: Sequence[tuple[str, str]] = ()
+            # A damaged file costs its own sensor only, a damaged manifest the capture.
+            with suppress(SessionError):
+                keys = [key for key in capture.image_keys if key[0] in cameras]
+            for key in keys:
                 with suppress(SessionError):
                     images.append(capture.image(*key))
-        for lidar in capture.lidars:
-            if lidar in lidars:
+            for lidar in lidars:
                 with suppress(SessionError):
                     scans.append(capture.scan(lidar))
-        for camera in capture.event_cameras:
-            if camera in cameras:
+            for camera in cameras:
                 with suppress(SessionError):
-                    events.append(capture.events(camera))
-        self._take(capture.name, images, scans, [_whole(each, self._rig) for each in events if len(each)])
+                    if camera in capture.event_cameras and len(events := capture.events(camera)):
+                        offset_ns = rig_offset_ns(stream_of(events, self._rig), self._rig)
+                        first_ns, last_ns = int(events.t_ns[0]), int(events.t_ns[-1])
+                        cuts.append(EventCut(events, first_ns, last_ns + 1, offset_ns, 0))
+            self._take(capture.name, images, scans, cuts)
 
     def take_recordings(self, paths: Sequence[Path], progress: Progress) -> None:
         """Read recordings: pairs of images and point clouds, or streams, whose scans are paired by time.
@@ -167,12 +165,20 @@ class SceneCaptures:
     def _take_stream(self, recording: ContinuousRecording, progress: Progress) -> None:
         require_sensors(recording)
         losses = Losses()
-        samples = _counted(recording.samples(), recording.n_samples, progress)
-        for frame in pair_by_time(samples, self._rig, losses, are_events_enough=True):
+
+        def counted() -> Iterator[Sample]:
+            done = 0
+            for sample in recording.samples():
+                yield sample
+                if not isinstance(sample, Events):
+                    done += 1
+                    progress(done, recording.n_samples)
+
+        for frame in pair_by_time(counted(), self._rig, losses, are_events_enough=True):
             self.take_frame(frame)
         if not any(self.kept) and losses.counts():
             (why, n), *_ = losses.counts()
-            raise SourceError(f"{recording.path}: {n} scans cannot be used: {describe(why)}")
+            raise SourceError(f"{recording.path}: {n} scans cannot be used: {why.text}")
 
     def take_live(self, sources: Sequence[LiveSource], is_over: Callable[[int], bool]) -> None:
         """Read attached sensors until it is over.
@@ -255,18 +261,3 @@ def own_offset_ns(c: Calibration, channel: str) -> int:
     """Return what the calibration adds to a channel's timestamps beyond the profile's expected offset."""
     found = [each.time_offset_s for each in c.channel_results if each.channel == channel]
     return round(1e9 * found[0]) if found and found[0] is not None else 0
-
-
-def _whole(events: Events, rig: Rig) -> EventCut:
-    """Give all events of a capture as a cut."""
-    offset_ns = rig_offset_ns(stream_of(events, rig), rig)
-    return EventCut(events, int(events.t_ns[0]), int(events.t_ns[-1]) + 1, offset_ns, 0)
-
-
-def _counted(samples: Iterable[Sample], n_samples: int, progress: Progress) -> Iterator[Sample]:
-    done = 0
-    for sample in samples:
-        yield sample
-        if not isinstance(sample, Events):
-            done += 1
-            progress(done, n_samples)

@@ -23,8 +23,7 @@ from lce_rig.pipeline.comparison import compare_sensors, require_independent, re
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.findings import MOVED
 from lce_rig.pipeline.result_files import Result
-from lce_rig.pipeline.sharpening import by_boards, sharpen
-from lce_rig.pipeline.witness import hear_scene
+from lce_rig.pipeline.witness import by_boards, hear_scene, sharpen
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys
 

@@ -1,27 +1,47 @@
-"""Ask the scene for its opinion on extrinsics that a board gave: its edges are no part of the evidence."""
+"""Edges of the scene beside the boards: an independent opinion on extrinsics, or part of one estimate."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.core.calibration import AxisOpinion, Calibration, Extrinsics, OpinionState, SceneOpinion
+from lce_rig.calibrate import CalibrationEstimate
+from lce_rig.calibrate.result import capture_residual
+from lce_rig.core.board import Board
+from lce_rig.core.calibration import (
+    AxisOpinion,
+    Calibration,
+    Extrinsics,
+    OpinionState,
+    SceneOpinion,
+    SceneShare,
+)
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SessionError
+from lce_rig.core.geometry import Array, difference
 from lce_rig.detect.detection import Detections
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import evenly
-from lce_rig.scene.drift import AxisDrift, State, watch
-from lce_rig.scene.views import build_view, without_board, without_movers
+from lce_rig.scene.drift import State, watch
+from lce_rig.scene.estimate import estimate
+from lce_rig.scene.views import MAX_CAPTURES, build_view, without_board, without_movers
 from lce_rig.session import Session
 
-MAX_CAPTURES = 6
+OPINION_CAPTURES = 6
 """More captures of one place add time, mainly for decoding images, and no information."""
 _STATES: dict[State, OpinionState] = {
     "unchanged": "agrees",
     "changed": "contradicts",
     "unknown": "unknown",
 }
+
+
+_KNOWN_SHARE = 0.02  # of the boards' variance that the scene must remove in a direction to have a say in it
+_CHANCE = 0.01  # of a scene that agrees with the boards to be refused
+
+Sharpen = Callable[[Extrinsics], SceneShare]
+"""Asks the scene about extrinsics that boards gave."""
 
 
 def hear_scene(session: Session, detections: Detections, calibration: Calibration) -> SceneOpinion:
@@ -34,7 +54,7 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
         detections: of this session: its captures, and where the board is.
         calibration: the extrinsics and their covariance.
     """
-    views = scene_views(session, detections, calibration, MAX_CAPTURES)
+    views = scene_views(session, detections, calibration, OPINION_CAPTURES)
     return opinion_of(views, session.rig.cameras[calibration.camera].to_intrinsics(), calibration)
 
 
@@ -68,10 +88,113 @@ def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibr
     drift = watch(without_movers(views), lens, c.T_cam_lidar, c.cov, is_joint=False)
     if not drift.curves:
         return SceneOpinion(drift.n_captures, drift.n_edges)
-    return SceneOpinion(drift.n_captures, drift.n_edges, tuple(map(_of_axis, drift.axes)))
+    axes = tuple(
+        AxisOpinion(
+            axis.axis,
+            _STATES[axis.state],
+            axis.unit,
+            float(axis.change),
+            float(axis.sigma),
+            float(axis.smallest) if np.isfinite(axis.smallest) else None,
+        )
+        for axis in drift.axes
+    )
+    return SceneOpinion(drift.n_captures, drift.n_edges, axes)
 
 
-def _of_axis(drift: AxisDrift) -> AxisOpinion:
-    smallest = float(drift.smallest) if np.isfinite(drift.smallest) else None
-    change, sigma = float(drift.change), float(drift.sigma)
-    return AxisOpinion(drift.axis, _STATES[drift.state], drift.unit, change, sigma, smallest)
+def sharpen(sessions: Sequence[Session], found: Sequence[Detections], by_boards: Extrinsics) -> SceneShare:
+    """Add what the edges of the scene tell to extrinsics that boards gave.
+
+    Args:
+        sessions: of the captures; damaged ones are skipped.
+        found: detections of each: edges at the board and its holder are left out.
+        by_boards: the extrinsics by the boards alone.
+    """
+    lens = sessions[0].rig.cameras[by_boards.camera].to_intrinsics()
+    n_most = MAX_CAPTURES // len(sessions)
+    views = [
+        view
+        for session, detections in zip(sessions, found, strict=True)
+        for view in without_movers(scene_views(session, detections, by_boards, n_most))
+    ]
+    return share_of(views, lens, by_boards)
+
+
+def share_of(views: Sequence[SceneView], lens: Intrinsics, by_boards: Extrinsics) -> SceneShare:
+    """Estimate extrinsics from boards and scene, and test whether the two agree.
+
+    Errors of the profile's lens and board (C) move all extrinsics found with it: the scene does not reduce
+    them. With P = C + Q the covariance of the boards' extrinsics, Q is the prior, Q' the covariance of both
+    that results, and C + Q' is what is claimed. The scene may not share all of C: with G = 1 - Q' Q^-1 the
+    change d = G (scene - boards) has at most the covariance D = Q - Q' + G C G^T. d^T D^-1 d, over the
+    directions in which the scene knows anything, is chi-squared.
+
+    Args:
+        views: of the scene, without the board and without what moves before a standing rig.
+        lens: of the camera.
+        by_boards: the extrinsics by the boards alone.
+    """
+    from scipy.stats import chi2
+
+    T_boards, cov_boards = by_boards.T_cam_lidar, by_boards.cov
+    own = cov_boards - by_boards.cov_shared
+    found = estimate(views, lens, T_boards, (T_boards, own))
+    change = difference(found.T_cam_lidar, T_boards)
+    root = np.asarray(np.linalg.cholesky(own), dtype=np.float64)
+    gain = np.eye(6) - np.linalg.solve(own, found.cov).T
+    expected = own - found.cov + gain @ by_boards.cov_shared @ gain.T
+    removed, directions = np.linalg.eigh(_whitened(own - found.cov, root))
+    is_known = removed > _KNOWN_SHARE
+    seen = directions[:, is_known].T
+    along = seen @ np.linalg.solve(root, change)
+    n_known = int(np.count_nonzero(is_known))
+    surprise = float(along @ np.linalg.solve(seen @ _whitened(expected, root) @ seen.T, along))
+    is_surprising = n_known > 0 and surprise > chi2.ppf(1 - _CHANCE, n_known)
+    return SceneShare(
+        state="contradicts" if is_surprising else "used" if n_known else "unknown",
+        n_captures=len(views),
+        n_edges=sum(len(view.edges) for view in views),
+        T_cam_lidar=found.T_cam_lidar,
+        cov=found.cov + by_boards.cov_shared,
+        T_cam_lidar_boards=T_boards,
+        cov_boards=cov_boards,
+        change=change,
+        change_sigma=np.sqrt(np.maximum(np.diag(expected), 0.0)),
+        surprise=surprise,
+        n_directions=n_known,
+    )
+
+
+def _whitened(cov: Array, root: Array) -> Array:
+    """Express a covariance (6, 6) in units of L L^T, with L = `root`."""
+    scaled = np.linalg.solve(root, np.linalg.solve(root, cov).T)
+    return np.asarray(0.5 * (scaled + scaled.T), dtype=np.float64)
+
+
+def fuse(by_boards: CalibrationEstimate, share: SceneShare, board: Board) -> CalibrationEstimate:
+    """Replace the extrinsics by those of boards and scene; residuals are those of the boards under them.
+
+    Args:
+        by_boards: the boards' own.
+        share: of the scene.
+        board: its size.
+    """
+    T, observations = share.T_cam_lidar, by_boards.observations
+    residuals = tuple(
+        capture_residual(T, observations[each.capture], board, each.held_out_m)
+        for each in by_boards.residuals
+    )
+    return replace(
+        by_boards,
+        T_cam_lidar=T,
+        cov=share.cov,
+        residuals=residuals,
+    )
+
+
+def by_boards(calibration: Calibration) -> Calibration:
+    """Give the extrinsics of the boards alone, of which the scene is independent."""
+    share = calibration.scene_share
+    if share is None:
+        return calibration
+    return replace(calibration, T_cam_lidar=share.T_cam_lidar_boards, cov=share.cov_boards)

@@ -82,6 +82,11 @@ class AxisDrift:
         """The figures by their names with the unit, as findings hold them."""
         return {f"{name}_{self.unit}": getattr(self, name) for name in ("change", "sigma", "smallest")}
 
+    def document(self) -> dict[str, Any]:
+        """List everything as plain types for JSON; figures that are not finite are null."""
+        finite = {name: value if np.isfinite(value) else None for name, value in self.figures.items()}
+        return {"axis": self.axis, "state": self.state, **finite, "instead": list(self.instead)}
+
 
 def overall(states: Iterable[State]) -> State:
     """Judge all axes: changed if any is; unchanged only if none is unknown."""
@@ -149,7 +154,9 @@ def watch(
         alignment = Alignment(views, intrinsics, T_cam_lidar)
         n_edges = len(alignment)
         missing = _sides_without_edges(alignment)
-    if n_edges < _MIN_EDGES * max(len(views), 1) ** 0.5 or _n_parts(alignment) < _MIN_PARTS:
+    # The parts of the image that carry edges.
+    n_parts = int(np.count_nonzero(alignment.weight_of_parts)) if n_edges else 0
+    if n_edges < _MIN_EDGES * max(len(views), 1) ** 0.5 or n_parts < _MIN_PARTS:
         few = FEW_EDGES(n_edges=n_edges, n_captures=len(views))
         axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, few.code) for axis in AXES)
         return Drift(axes, (few, *missing), T_cam_lidar, T_cam_lidar, None, {}, len(views), n_edges)
@@ -161,13 +168,21 @@ def watch(
     if is_joint:
         best = estimate(views, intrinsics, T_best, is_far=any(axis.state != "unchanged" for axis in axes))
         T_best, cov_best = best.T_cam_lidar, best.cov
-    findings = (_summary(axes, len(views)), *map(_of_axis, axes), *_open_axes(cov_best), *missing)
+    changed, unknown = (
+        tuple(axis.axis for axis in axes if axis.state == state) for state in ("changed", "unknown")
+    )
+    kind = CHANGED if changed else UNKNOWN if unknown else UNCHANGED
+    findings = [kind(n_captures=len(views), changed=changed, unknown=unknown)]
+    for axis in axes:
+        if axis.state == "changed":
+            findings.append(AXIS_CHANGED(axis.axis, instead=axis.instead, **axis.figures))
+        else:
+            findings.append(KINDS[axis.reason or AXIS_UNCHANGED.code](axis.axis, **axis.figures))
+    if cov_best is not None and np.any(is_open := np.sqrt(np.diag(cov_best)) > LARGEST):
+        findings.append(BEST_UNCERTAIN(axes=tuple(np.array(AXES)[is_open].tolist())))
     by_axis = dict(zip(AXES, curves, strict=True))
-    return Drift(axes, findings, T_cam_lidar, T_best, cov_best, by_axis, len(views), n_edges)
-
-
-def _n_parts(alignment: Alignment) -> int:
-    return int(np.count_nonzero(alignment.weight_of_parts))
+    every = (*findings, *missing)
+    return Drift(axes, every, T_cam_lidar, T_best, cov_best, by_axis, len(views), n_edges)
 
 
 def _decide(
@@ -218,29 +233,6 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     state: State = "changed" if is_changed else "unknown" if reason else "unchanged"
     figures = (unit * peak, unit * sigma, unit * smallest)
     return AxisDrift(AXES[axis], state, *figures, "" if is_changed else reason)
-
-
-def _summary(axes: tuple[AxisDrift, ...], n_captures: int) -> Finding:
-    changed = tuple(axis.axis for axis in axes if axis.state == "changed")
-    unknown = tuple(axis.axis for axis in axes if axis.state == "unknown")
-    kind = CHANGED if changed else UNKNOWN if unknown else UNCHANGED
-    return kind(n_captures=n_captures, changed=changed, unknown=unknown)
-
-
-def _of_axis(axis: AxisDrift) -> Finding:
-    if axis.state == "changed":
-        return AXIS_CHANGED(axis.axis, instead=axis.instead, **axis.figures)
-    kind = AXIS_UNCHANGED if axis.state == "unchanged" else KINDS[axis.reason]
-    return kind(axis.axis, **axis.figures)
-
-
-def _open_axes(cov_best: Array | None) -> list[Finding]:
-    """Name the axes in which the best extrinsics are uncertain."""
-    if cov_best is None:
-        return []
-    is_open = np.sqrt(np.diag(cov_best)) > LARGEST
-    axes = tuple(axis for axis, each in zip(AXES, is_open, strict=True) if each)
-    return [BEST_UNCERTAIN(axes=axes)] if axes else []
 
 
 def _sides_without_edges(alignment: Alignment) -> list[Finding]:

@@ -17,8 +17,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, perturb, sigma_sizes, tangent_sizes
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import calibrate_detections
-from lce_rig.pipeline.sharpening import share_of
-from lce_rig.pipeline.witness import scene_views
+from lce_rig.pipeline.witness import scene_views, share_of
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import without_movers

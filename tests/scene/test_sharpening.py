@@ -8,8 +8,7 @@ import numpy as np
 import lce_rig as lce
 from lce_rig.core.calibration import Calibration, ResultFile, SceneShare, read_result
 from lce_rig.core.geometry import Array, difference, invert, perturb, transform
-from lce_rig.pipeline.sharpening import share_of
-from lce_rig.pipeline.witness import scene_views
+from lce_rig.pipeline.witness import scene_views, share_of
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import without_movers
 from lce_rig.session import Session

@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from lce_rig.calibrate import Clocks
 from lce_rig.calibrate.local_quadratic import SCALE, expand
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import capture_residual, summarise
@@ -15,7 +17,6 @@ from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.session_check import find_meetings
-from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State
@@ -44,6 +45,25 @@ class BoardDrift:
     n_boards: int
     n_placements: int
 
+    def document(self) -> dict[str, Any]:
+        """List everything as plain types for JSON."""
+        return {
+            "n_boards": self.n_boards,
+            "n_placements": self.n_placements,
+            "mpe_m": self.metrics.mpe_m,
+            "mee_m": self.metrics.mee_m,
+            "axes": [axis.document() for axis in self.axes],
+        }
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Axes that the boards find changed, or cannot tell."""
+        return tuple(
+            (BOARD_CHANGED if axis.state == "changed" else BOARD_UNSURE)(axis.axis, **axis.figures)
+            for axis in self.axes
+            if axis.state != "unchanged"
+        )
+
 
 def watch_boards(
     rig: Rig,
@@ -51,6 +71,7 @@ def watch_boards(
     channel: str,
     images: Mapping[str, ImageBoard],
     scans: Mapping[str, list[LidarBoard]],
+    clocks: Clocks,
 ) -> BoardDrift | None:
     """Compare deployed extrinsics with boards.
 
@@ -59,6 +80,7 @@ def watch_boards(
         calibration: the deployed extrinsics.
         channel: of the images.
         images, scans: the board in them, by capture.
+        clocks: the profile's settings of the two sensors' times.
 
     Returns:
         None where both sensors see the board at about the same place in fewer than three placements.
@@ -67,7 +89,6 @@ def watch_boards(
     if channel not in calibration.channels:
         deployed = replace(calibration, channels=(*calibration.channels, channel))
     detections = Detections({(calibration.camera, channel): dict(images)}, {calibration.lidar: dict(scans)})
-    clocks = clocks_of(rig, calibration.camera, calibration.lidar)
     board = rig.board.to_board()
     meetings = find_meetings(rig, detections, channel, deployed, clocks)
     met = [meeting.at_scan_time for meeting in meetings.values()]
@@ -127,9 +148,3 @@ def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:
         state = "unknown"
     reason = "" if state != "unknown" else "scene.board_unsure"
     return AxisDrift(AXES[axis], state, unit * change, unit * sigma, unit * smallest, reason)
-
-
-def board_finding(axis: AxisDrift) -> Finding:
-    """Tell an axis that the boards find changed, or cannot tell."""
-    kind = BOARD_CHANGED if axis.state == "changed" else BOARD_UNSURE
-    return kind(axis.axis, **axis.figures)
