@@ -349,7 +349,7 @@ def calibrate(
 def _earlier_result_named(folder: Path) -> Iterator[None]:
     """Say that the files are those of an earlier run if this one ends without a result."""
     from lce_rig.core.errors import LceRigError
-    from lce_rig.fleet.deploy.changes import RESULT
+    from lce_rig.pipeline.result_files import RESULT
 
     try:
         yield

@@ -9,9 +9,8 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
 
 if TYPE_CHECKING:
-    from lce_rig.fleet.deploy.changes import SensorChange
-    from lce_rig.fleet.deploy.deployment import Deployed, Plan
-    from lce_rig.fleet.deploy.releases import ReleaseRecord, Standing
+    from lce_rig.fleet.deploy.deployment import Deployed, Plan, SensorChange, Standing
+    from lce_rig.fleet.deploy.releases import ReleaseRecord
     from lce_rig.rig import Rig
     from lce_rig.rig.target_settings import TargetSettings
 

@@ -8,6 +8,7 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 from lce_rig.core.errors import SourceError
+from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import copy_over
 
 
@@ -75,6 +76,14 @@ class Storage:
             return bytes(self.fs.cat_file(self.path))
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
             return None
+
+    def write(self, content: bytes) -> None:
+        """Write it as a file, in one step."""
+        if self.local is None:
+            self.fs.pipe_file(self.path, content)
+            return
+        self.local.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.local, content)
 
     def names(self) -> list[str]:
         """List what it holds as a folder, by name; nothing if there is no such folder."""

@@ -25,7 +25,7 @@ OutputFormat = Literal[
     "ply",
     "ply_captures",
 ]
-# None of these makes ssh run a program on this computer.
+# Options that make ssh run a program on this computer are not among them.
 SshOption = Literal[
     "AddressFamily",
     "CertificateFile",
@@ -45,12 +45,15 @@ SshOption = Literal[
     "User",
     "UserKnownHostsFile",
 ]
-# [user@]host:path, as scp writes it. Nothing that a shell or an option could take for something else.
-_REMOTE = re.compile(
-    r"((?:[A-Za-z0-9_][A-Za-z0-9_.-]*@)?(?:[A-Za-z0-9][A-Za-z0-9_.-]*|\[[0-9A-Fa-f:.%a-z]+\])):(.*)",
-    re.DOTALL,
-)
+# [user@]host:path, as scp writes it, without characters of shells and options.
+_HOST = r"(?:[A-Za-z0-9_][A-Za-z0-9_.-]*@)?(?:[A-Za-z0-9][A-Za-z0-9_.-]*|\[[0-9A-Fa-f:.%a-z]+\])"
+_REMOTE = re.compile(rf"({_HOST}):(.*)", re.DOTALL)
 _REMOTE_PATH = re.compile(r"(?:~/)?[A-Za-z0-9_./][A-Za-z0-9_./+@=-]*")
+# ssh pastes some options into commands: a jump into its own, others into those of the user's ssh_config.
+_SSH_VALUE = re.compile(r"[A-Za-z0-9_.~/:@+=,][A-Za-z0-9_.~/:@+=,-]*")
+_JUMPS = re.compile(rf"{_HOST}(?::[0-9]+)?(?:,{_HOST}(?::[0-9]+)?)*")
+ROBOT_FIELD = "{robot}"
+"""Stands for the robot's name in `to`."""
 
 
 class TargetSettings(Settings):
@@ -58,10 +61,11 @@ class TargetSettings(Settings):
 
     Attributes:
         to: a folder on this computer, or `user@host:path` by OpenSSH; robot software reads `to`/current/.
+            {robot} in it stands for the robot's name.
         robot: the robot there; results of another one are refused.
         formats: export formats; None for the profile's `exports`, else the usual ones.
         files: further files of the result's folder, as patterns such as `report.html`.
-        run: a command to run there afterwards, by sh.
+        run: a command to run there afterwards, by sh; $1 is the robot's name.
         run_timeout_s: time that it may take.
         ssh: options of ssh_config for the connection, such as Port and IdentityFile.
         keep: so many releases are kept, the current one included.
@@ -78,22 +82,31 @@ class TargetSettings(Settings):
 
     @model_validator(mode="after")
     def _place_is_clear(self) -> "TargetSettings":
-        remote = _REMOTE.fullmatch(self.to)
+        to = self.to.replace(ROBOT_FIELD, "robot")
+        remote = _REMOTE.fullmatch(to)
         if remote is not None and not _REMOTE_PATH.fullmatch(remote[2]):
             what = f"{remote[2]!r}: a path there has letters, digits and _ . / + @ = - only"
             raise problem(what, "to")
-        if (
-            remote is None
-            and "@" in (named := self.to.partition(":")[0])
-            and ":" in self.to
-            and "/" not in named
-        ):
+        if remote is None and "@" in (named := to.partition(":")[0]) and ":" in to and "/" not in named:
             raise problem(f"{self.to!r}: neither a folder nor user@host:path; ./NAME is a folder", "to")
         if not self.to or self.to.startswith("-") or "\0" in self.to:
             raise problem("no folder and no user@host:path", "to")
         if remote is None and self.ssh:
             raise problem("belongs to a target user@host:path", "ssh")
+        for name, value in self.ssh.items():
+            if not (_JUMPS if name == "ProxyJump" else _SSH_VALUE).fullmatch(str(value)):
+                allowed = "names of hosts" if name == "ProxyJump" else "letters, digits and _.~/:@+=,-"
+                raise problem(f"{value!r}: only {allowed} are allowed", f"ssh.{name}")
         return self
+
+    def for_robot(self, robot: str) -> "TargetSettings":
+        """Put a robot's name in place of {robot}; results of other robots are refused there.
+
+        Raises:
+            ValueError: no robot can have this name.
+        """
+        values = {"to": self.to.replace(ROBOT_FIELD, robot), "robot": self.robot or robot}
+        return TargetSettings.model_validate(self.model_dump() | values)
 
     @property
     def host(self) -> str | None:
@@ -109,6 +122,6 @@ class TargetSettings(Settings):
 
     def located(self, folder: Path) -> "TargetSettings":
         """Make paths on this computer absolute; relative ones start at the file's folder."""
-        if self.host is not None:
+        if _REMOTE.fullmatch(self.to.replace(ROBOT_FIELD, "robot")):
             return self
         return self.model_copy(update={"to": str((folder / Path(self.to).expanduser()).absolute())})

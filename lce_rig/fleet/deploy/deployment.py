@@ -1,12 +1,12 @@
-"""Deploy a result to a target, ask what is there, and go back.
+"""Deploy a result to a target, ask for its state, and restore an earlier release.
 
-`plan` says what would change and what speaks against it, `deploy` does it, `standing` asks, `rollback` makes
-an earlier release current again. Each opens its own connections; nothing is kept between calls.
+`plan` lists changes and objections, `deploy` makes the changes, `standing` asks for the state, `rollback`
+makes an earlier release current again. Each opens its own connections; nothing is kept between calls.
 """
 
+import difflib
 import getpass
 import json
-import secrets
 import shutil
 import socket
 from collections.abc import Mapping
@@ -15,46 +15,72 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from lce_rig.core.calibration import MADE_BY, ResultFile, read_result
 from lce_rig.core.errors import CommandError, LceRigError, ResultRefusedError, SessionError, TargetError
 from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.export import export_formats
-from lce_rig.fleet.deploy.changes import RESULT, SensorChange, sensor_changes, text_changes
-from lce_rig.fleet.deploy.place import LostError, Place, open_place
+from lce_rig.fleet.deploy.place import (
+    CHANGED,
+    COMMIT,
+    DISCARD,
+    RECORD,
+    RUN,
+    SAYS,
+    STAGE,
+    LostError,
+    OddFilesError,
+    Place,
+)
 from lce_rig.fleet.deploy.releases import (
     ReleaseRecord,
-    Standing,
     TargetState,
     content_of,
     differences,
     read_state,
     set_sha256,
-    succeed,
-    to_state,
 )
-from lce_rig.fleet.deploy.shell import CHANGED, COMMIT, PREPARE, RECORD, RUN, SAYS
 from lce_rig.fleet.findings import DEPLOY_FAILED, DEPLOY_OLDER, DEPLOY_OTHER_ROBOT, DEPLOY_OTHER_SERIAL
+from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
 from lce_rig.session.replacing import copy_over
 
+# Files whose lines are compared; others only differ or not.
+_TEXTS = (".json", ".yaml", ".yml", ".urdf", ".xml", ".txt", ".py", ".cfg", ".ini")
 _OTHER = "Another deployment came first: look at `--status`, then run the same command again."
+
+
+class SensorChange(NamedTuple):
+    """The change of the extrinsics of a camera and a LiDAR.
+
+    Attributes:
+        camera, lidar: the sensors.
+        moved: deg and m between both sets; None if only one of them has these extrinsics.
+        is_new: whether the new set has them.
+    """
+
+    camera: str
+    lidar: str
+    moved: tuple[float, float] | None
+    is_new: bool = False
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a deployment would change.
+    """The changes of a deployment.
 
     Attributes:
         record: of the release that would be made.
         state: of the target now.
         changed: files that differ from the current release's: "changed", "missing", "added".
         changed_there: current files that are not as they were deployed.
-        sensors: how far the extrinsics differ.
+        sensors: changes of the extrinsics.
         text: the lines that differ, as `diff -u` gives them; new and removed files by name.
-        objections: what speaks against it; a deployment is refused unless it is forced.
+        objections: a deployment is refused for them unless it is forced.
     """
 
     record: ReleaseRecord
@@ -73,7 +99,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Deployed:
-    """What a deployment or a rollback did.
+    """The outcome of a deployment or a rollback.
 
     Attributes:
         release: that is current now.
@@ -90,8 +116,15 @@ class Deployed:
     changed_there: Mapping[str, str] = field(default_factory=dict)
 
 
+class Standing(NamedTuple):
+    """A target's state, and the current files that are not as they were deployed, with how they differ."""
+
+    state: TargetState
+    changed: Mapping[str, str]
+
+
 def plan(result: Path, rig: Rig, target: TargetSettings, *, session: Session | None = None) -> Plan:
-    """Compare a result with what is at a target; nothing is changed there.
+    """Compare a result with the state of a target; nothing is changed there.
 
     Args:
         result: folder with its result.json.
@@ -103,10 +136,8 @@ def plan(result: Path, rig: Rig, target: TargetSettings, *, session: Session | N
         SessionError: there is no result.
         TargetError: the target cannot be reached or read.
     """
-    place = open_place(target)
-    state = read_state(place)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
-        return _plan(result, rig, target, session, place, state, Path(folder))
+        return _plan(result, rig, target, session, Place(target), Path(folder))
 
 
 def deploy(
@@ -120,7 +151,7 @@ def deploy(
 ) -> Deployed:
     """Write the files of a result to a target, all at once, and run its command.
 
-    If these very files are in place, only a command that has not succeeded yet runs. Whatever interrupts it,
+    If these very files are in place, only a command that has not succeeded yet runs. After any interruption
     the target holds the earlier set or the new one.
 
     Args:
@@ -128,7 +159,7 @@ def deploy(
         rig: the profile of the session.
         target: where to.
         session: with images and scans, for formats that show them.
-        reason: why it is deployed against objections; it is written down there.
+        reason: for deploying it against objections; it is written down there.
         place: another way to the target's folder than the target's own.
 
     Raises:
@@ -137,32 +168,40 @@ def deploy(
         TargetError: the target cannot be reached or written, or another deployment came first.
         CommandError: the command failed; the new files are in place.
     """
-    place = place or open_place(target)
-    state = to_state(place, succeed(place, place.run(PREPARE)))
+    place = place or Place(target)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
-        planned = _plan(result, rig, target, session, place, state, Path(folder))
+        planned = _plan(result, rig, target, session, place, Path(folder))
         if planned.objections and not reason:
-            raise _refused(target, planned)
-        record = planned.record
-        if planned.is_in_place:
-            assert state.current is not None
-            output = _run(place, target, state.current.name) if state.is_pending else None
-            return Deployed(state.current, state.current.replaces, False, output)
+            causes = "; ".join(finding.text for finding in planned.objections)
+            advice = dict.fromkeys(finding.advice for finding in planned.objections)
+            hint = "\n".join([*advice, "To deploy it nevertheless: --force --reason TEXT"])
+            raise ResultRefusedError(f"not deployed to {target.to}: {causes}", hint)
+        record, current = planned.record, planned.state.current
+        if planned.is_in_place and current is not None:
+            output = _run(place, target, current.name) if planned.state.is_pending else None
+            return Deployed(current, current.replaces, False, output)
         if planned.objections:
-            forced = sorted({each.code for each in planned.objections})
+            forced = sorted({finding.code for finding in planned.objections})
             record = record.model_copy(update={"reason": reason, "forced": forced})
-        _write(place, target, record, Path(folder))
+        try:
+            _write(place, record, Path(folder))
+            _commit(place, target, record, record.replaces, "deploy")
+        except TargetError:
+            # Free the space; after a lost connection, the next deployment does.
+            with suppress(TargetError):
+                place.must_run(DISCARD, record.name)
+            raise
     output = _run(place, target, record.name)
     return Deployed(record, record.replaces, True, output, planned.changed_there)
 
 
 def standing(target: TargetSettings) -> Standing:
-    """Ask what is at a target, and whether its current files are as they were deployed.
+    """Ask for the state of a target, and whether its current files are as they were deployed.
 
     Raises:
         TargetError: it cannot be reached or read.
     """
-    place = open_place(target)
+    place = Place(target)
     state = read_state(place)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
         return Standing(state, _changed_there(place, state, Path(folder) / "deployed"))
@@ -180,8 +219,8 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
         TargetError: there is none, its files are not as they were deployed, or the target cannot be reached.
         CommandError: the command failed; the earlier files are in place.
     """
-    place = open_place(target)
-    state = to_state(place, succeed(place, place.run(PREPARE)))
+    place = Place(target)
+    state = read_state(place)
     if state.current is None:
         raise TargetError(f"{place.label}: nothing has been deployed", "Deploy a result first.")
     wanted = state.current.replaces if name is None else name
@@ -195,39 +234,41 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
         place.get(f"releases/{release.name}", Path(folder) / "release")
         wrong = differences(content_of(Path(folder) / "release"), release.files)
     if wrong:
-        told = ", ".join(f"{file} {how}" for file, how in wrong.items())
         raise TargetError(
-            f"{place.label}: release {release.name} is not as it was deployed: {told}",
+            f"{place.label}: release {release.name} is not as it was deployed: {_listed(wrong)}",
             "Name another release, or deploy its session again.",
         )
     replaces = state.current.name
     if release.name != replaces:
-        _commit(place, target, release, "", replaces, _line("rollback", release, replaces, reason))
+        _commit(place, target, release, replaces, "rollback", reason)
     return Deployed(release, replaces, release.name != replaces, _run(place, target, release.name))
 
 
 def _plan(
-    result: Path,
-    rig: Rig,
-    target: TargetSettings,
-    session: Session | None,
-    place: Place,
-    state: TargetState,
-    folder: Path,
+    result: Path, rig: Rig, target: TargetSettings, session: Session | None, place: Place, folder: Path
 ) -> Plan:
     """Write the new files to folder/new, fetch the current ones to folder/deployed, and compare."""
+    state = read_state(place)
     new, deployed = folder / "new", folder / "deployed"
     saved = _stage(result, rig, target, session, new)
     changed_there = _changed_there(place, state, deployed)
     files = content_of(new)
-    changed = differences(files, {} if state.current is None else state.current.files)
+    before, after = _extrinsics(deployed), _extrinsics(new)
+    sensors = [
+        SensorChange(
+            *key,
+            tangent_sizes(difference(after[key], before[key])) if key in before and key in after else None,
+            key in after,
+        )
+        for key in dict.fromkeys([*after, *before])
+    ]
     return Plan(
         _record(saved, files, state),
         state,
-        changed,
+        differences(files, {} if state.current is None else state.current.files),
         changed_there,
-        tuple(sensor_changes(deployed, new)),
-        tuple(text_changes(deployed, new, differences(files, content_of(deployed)))),
+        tuple(sensors),
+        tuple(_text_changes(deployed, new, differences(files, content_of(deployed)))),
         tuple(_objections(saved, target, state.current)),
     )
 
@@ -235,33 +276,32 @@ def _plan(
 def _stage(
     result: Path, rig: Rig, target: TargetSettings, session: Session | None, folder: Path
 ) -> ResultFile:
-    """Write the files of the set: result.json, the exports, and what else the target names."""
+    """Write the files of the set: result.json, the exports, and further files of the target."""
     saved = read_result(result / RESULT)
     folder.mkdir()
-    # Whether a failed result may be deployed is decided on with everything else that speaks against it.
+    # A failed result is one of the objections, which are decided on together.
     export_formats(saved.pairs, rig, folder, formats=target.formats, is_forced=True, session=session)
     shutil.copyfile(result / RESULT, folder / RESULT)
     for pattern in target.files:
-        found = sorted(path for path in _matching(result, pattern) if not (folder / path.name).exists())
-        if not found and not any(folder.glob(pattern)):
+        matching: list[Path] = []
+        with suppress(ValueError, NotImplementedError):
+            # Of the folder itself, and no links, which may lead out of it.
+            matching = [
+                path for path in result.glob(pattern) if path.parent == result and not path.is_symlink()
+            ]
+        added = sorted(path for path in matching if not (folder / path.name).exists())
+        if not added and not any(folder.glob(pattern)):
             raise SessionError(
                 f"{result} has no file {pattern}", "Correct `files` of the target, or write the file first."
             )
-        for path in found:
+        for path in added:
             copy_over(path, folder / path.name)
     return saved
 
 
-def _matching(result: Path, pattern: str) -> list[Path]:
-    with suppress(ValueError, NotImplementedError):
-        # Of the folder itself, and nothing that a link leads to.
-        return [path for path in result.glob(pattern) if path.parent == result and not path.is_symlink()]
-    return []
-
-
 def _record(saved: ResultFile, files: Mapping[str, str], state: TargetState) -> ReleaseRecord:
     time = datetime.now(timezone.utc).replace(microsecond=0)
-    # In order of time, even if this computer's clock is behind that of who deployed before.
+    # In order of time, even if this computer's clock is behind that of an earlier deployment.
     newest = max((each.name[:16] for each in state.releases), default="")
     if f"{time:%Y%m%dT%H%M%SZ}" <= newest:
         time = datetime.strptime(newest, "%Y%m%dT%H%M%SZ").replace(tzinfo=timezone.utc) + timedelta(seconds=1)
@@ -287,104 +327,115 @@ def _user() -> str:
     return ""
 
 
+def _listed(wrong: Mapping[str, str]) -> str:
+    return ", ".join(f"{file} {how}" for file, how in wrong.items())
+
+
 def _objections(saved: ResultFile, target: TargetSettings, current: ReleaseRecord | None) -> list[Finding]:
-    """Find what speaks against a deployment."""
+    """List the objections to a deployment."""
     origin = saved.provenance
-    found = [DEPLOY_FAILED(f"{c.camera} and {c.lidar}") for c in saved.pairs if c.verdict == "fail"]
+    objections = [DEPLOY_FAILED(f"{c.camera} and {c.lidar}") for c in saved.pairs if c.verdict == "fail"]
     robots = {robot for robot in (target.robot, None if current is None else current.robot) if robot}
     for robot in sorted(robots - {origin.robot}) if origin.robot else ():
-        found.append(DEPLOY_OTHER_ROBOT(robot=origin.robot, there=robot))
+        objections.append(DEPLOY_OTHER_ROBOT(robot=origin.robot, there=robot))
     if current is None:
-        return found
+        return objections
     for sensor, serial in sorted(origin.serials.items()):
         there = current.serials.get(sensor, serial)
         if there != serial:
-            found.append(DEPLOY_OTHER_SERIAL(sensor, serial=serial, there=there))
+            objections.append(DEPLOY_OTHER_SERIAL(sensor, serial=serial, there=there))
     if origin.date and current.date and origin.date < current.date:
-        found.append(DEPLOY_OLDER(date=origin.date, there=current.date))
-    return found
-
-
-def _refused(target: TargetSettings, planned: Plan) -> ResultRefusedError:
-    told = "; ".join(each.text for each in planned.objections)
-    advice = [text for each in planned.objections if (text := each.advice)]
-    hint = "\n".join([*dict.fromkeys(advice), "To deploy it nevertheless: --force --reason TEXT"])
-    return ResultRefusedError(f"not deployed to {target.to}: {told}", hint)
+        objections.append(DEPLOY_OLDER(date=origin.date, there=current.date))
+    return objections
 
 
 def _changed_there(place: Place, state: TargetState, folder: Path) -> dict[str, str]:
-    """Fetch the current files, and find those that are not as they were deployed."""
-    if state.current is None:
-        folder.mkdir()
-        return {}
-    place.get(f"releases/{state.current.name}", folder)
-    return differences(content_of(folder), state.current.files)
+    """Fetch the current files, and list those that are not as they were deployed."""
+    if state.current is not None:
+        try:
+            place.get(f"releases/{state.current.name}", folder)
+            return differences(content_of(folder), state.current.files)
+        except OddFilesError as error:
+            folder.mkdir()
+            return dict.fromkeys(error.names, "no plain file")
+    folder.mkdir()
+    return {}
 
 
-def _write(place: Place, target: TargetSettings, record: ReleaseRecord, folder: Path) -> None:
-    """Copy the new files, read them back, and make them current."""
-    number = secrets.token_hex(4)
-    (folder / "new" / RECORD).write_text(record.line(), encoding="utf-8")
-    place.put(folder / "new", f".new-{number}")
+def _extrinsics(folder: Path) -> dict[tuple[str, str], Array]:
+    with suppress(LceRigError):
+        return {(c.camera, c.lidar): c.T_cam_lidar for c in read_result(folder / RESULT).pairs}
+    return {}
+
+
+def _text_changes(earlier: Path, new: Path, changed: Mapping[str, str]) -> list[str]:
+    """List the lines in which texts differ, as `diff -u` does; new, removed and other files by name."""
+    lines: list[str] = []
+    for name, how in changed.items():
+        if how == "changed" and name.endswith(_TEXTS):
+            with suppress(OSError, ValueError):
+                before, after = ((folder / name).read_text("utf-8").splitlines() for folder in (earlier, new))
+                lines += difflib.unified_diff(before, after, f"deployed/{name}", f"new/{name}", lineterm="")
+                continue
+        lines.append(f"{name}: {'new' if how == 'added' else 'removed' if how == 'missing' else how}")
+    return lines
+
+
+def _write(place: Place, record: ReleaseRecord, folder: Path) -> None:
+    """Copy the new files into a release and read them back."""
+    name = f"releases/{record.name}"
+    place.must_run(STAGE, record.name, content=record.line().encode())
+    place.put(folder / "new", name)
     try:
-        place.get(f".new-{number}", folder / "back")
+        place.get(name, folder / "back")
         wrong = differences(content_of(folder / "back"), record.files)
     except LostError:
         raise
     except TargetError as error:
         raise TargetError(f"{place.label}: new files cannot be read back: {error.what}", _OTHER) from error
-    if wrong or (folder / "back" / RECORD).read_bytes() != (folder / "new" / RECORD).read_bytes():
-        told = ", ".join(f"{file} {how}" for file, how in wrong.items()) or RECORD
-        raise TargetError(f"{place.label}: files read back differently: {told}", "Check the disk there.")
-    _commit(place, target, record, number, record.replaces, _line("deploy", record, record.replaces))
+    if wrong or (folder / "back" / RECORD).read_bytes() != record.line().encode():
+        raise TargetError(
+            f"{place.label}: files read back differently: {_listed(wrong) or RECORD}", "Check the disk there."
+        )
 
 
 def _commit(
-    place: Place, target: TargetSettings, record: ReleaseRecord, number: str, expected: str, line: str
+    place: Place, target: TargetSettings, release: ReleaseRecord, expected: str, action: str, reason: str = ""
 ) -> None:
     """Make a release current.
 
     Raises:
         TargetError: another one has become current since, or the target cannot be written or reached.
     """
+    entry = {
+        "time": f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
+        "action": action,
+        "release": release.name,
+        "replaces": expected,
+        "by": _user(),
+        "robot": release.robot,
+        "session_sha256": release.session_sha256,
+        "reason": reason or release.reason,
+        "forced": release.forced if action == "deploy" else [],
+    }
     pending = "1" if target.run else ""
     try:
-        ran = place.run(COMMIT, number, record.name, expected, str(target.keep), pending, line)
-    except LostError as error:
-        if not _is_current(place, record, error):
+        ran = place.run(COMMIT, release.name, expected, str(target.keep), pending, json.dumps(entry))
+    except LostError as lost:
+        # Ask once more after a lost connection whether the last step was taken.
+        try:
+            current = read_state(place).current
+        except LceRigError:
+            raise TargetError(
+                f"{lost.what}; whether {release.name} is in place is not known",
+                "Run `lce-rig deploy --status`, or the same command again.",
+            ) from lost
+        if current is None or current.name != release.name:
             raise
         return
     if ran.code == CHANGED:
         raise TargetError(f"{place.label}: {ran.err.strip()}, not {expected or 'nothing'}", _OTHER)
-    succeed(place, ran)
-
-
-def _is_current(place: Place, record: ReleaseRecord, lost: LostError) -> bool:
-    """Ask once more after a lost connection whether the last step was taken."""
-    try:
-        current = read_state(place).current
-    except LceRigError:
-        raise TargetError(
-            f"{lost.what}; whether {record.name} is in place is not known",
-            "Run `lce-rig deploy --status`, or the same command again.",
-        ) from lost
-    return current is not None and current.name == record.name
-
-
-def _line(action: str, record: ReleaseRecord, replaces: str, reason: str = "") -> str:
-    """Write a line of deployments.log."""
-    entry = {
-        "time": f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
-        "action": action,
-        "release": record.name,
-        "replaces": replaces,
-        "by": _user(),
-        "robot": record.robot,
-        "session_sha256": record.session_sha256,
-        "reason": reason or record.reason,
-        "forced": record.forced if action == "deploy" else [],
-    }
-    return json.dumps(entry)
+    place.check(ran)
 
 
 def _run(place: Place, target: TargetSettings, release: str) -> str | None:
@@ -396,8 +447,10 @@ def _run(place: Place, target: TargetSettings, release: str) -> str | None:
     if target.run is None:
         return None
     again = "`--rollback` restores the earlier files; the same command again runs only what failed."
+    arguments = (release, f"{target.run_timeout_s:g}", target.run, target.robot or "")
     try:
-        ran = place.run(RUN, release, target.run, timeout_s=target.run_timeout_s)
+        # The target ends the command at its time limit, if it has the program `timeout`.
+        ran = place.run(RUN, *arguments, timeout_s=target.run_timeout_s + 5)
     except TargetError as error:
         what = f"{release} is in place, but its command has no outcome: {error.what}"
         raise CommandError(what, f"{error.hint}\n{again}".strip()) from error

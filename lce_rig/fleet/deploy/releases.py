@@ -1,51 +1,39 @@
-"""What lies at a target: releases, each a set of files with a record of where it comes from."""
+"""Releases at a target, each a set of files with a record of their origin."""
 
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from lce_rig.core.documents import parse_json
 from lce_rig.core.errors import TargetError
-from lce_rig.core.limits import read_file
-from lce_rig.fleet.deploy.place import Place, Ran, last_line
-from lce_rig.fleet.deploy.shell import LOCKED, NO_LINK, NO_RELEASE, RECORD, SAYS, STATE, USED
-
-_NAME = r"^[0-9]{8}T[0-9]{6}Z-[0-9a-f]{8}$"
-_HINTS = {
-    LOCKED: "Wait for the other deployment to end.",
-    NO_LINK: "Move what is in its place away.",
-    NO_RELEASE: "`--status` lists the releases.",
-}
+from lce_rig.fleet.deploy.place import RECORD, SAYS, STATE, USED, Place
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
-
-
-class ReleaseRecord(_Record):
+class ReleaseRecord(BaseModel):
     """The file .deployed.json of a release.
 
     Attributes:
         format_version: of this schema.
-        name: of the release: when it was deployed, UTC, and the begin of `set_sha256`.
-        time: when it was deployed, by the clock of the computer that did.
-        by: who did, user@computer.
+        name: of the release: time of deployment, UTC, and the begin of `set_sha256`.
+        time: of deployment, by the clock of the computer that deployed it.
+        by: user@computer that deployed it.
         made_by: the program that wrote the files.
         replaces: the release that was current before; "" for the first.
-        reason: why it was forced; "" where it was not.
-        forced: codes of what spoke against it.
+        reason: of a forced deployment; "" if it was not forced.
+        forced: codes of the objections.
         files: SHA-256 of each file by its path.
         robot, serials, date, session_sha256: as of the result's provenance.
         verdicts: by camera and LiDAR.
     """
 
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
+
     format_version: int = 1
-    name: Annotated[str, Field(pattern=_NAME)]
+    name: Annotated[str, Field(pattern=r"^[0-9]{8}T[0-9]{6}Z-[0-9a-f]{8}$")]
     time: str
     by: str = ""
     made_by: str = ""
@@ -71,10 +59,10 @@ class ReleaseRecord(_Record):
 
 @dataclass(frozen=True)
 class TargetState:
-    """What lies at a target.
+    """The state of a target.
 
     Attributes:
-        current: what robot software reads; None before the first deployment.
+        current: read by robot software; None before the first deployment.
         releases: all that are kept, the newest first.
         pending: the release whose command has not succeeded yet; "" where none is pending.
     """
@@ -85,7 +73,7 @@ class TargetState:
 
     def named(self, name: str) -> ReleaseRecord | None:
         """Find a release."""
-        return next((each for each in self.releases if each.name == name), None)
+        return next((release for release in self.releases if release.name == name), None)
 
     @property
     def is_pending(self) -> bool:
@@ -93,27 +81,46 @@ class TargetState:
         return self.current is not None and self.pending == self.current.name
 
 
-@dataclass(frozen=True)
-class Standing:
-    """A target's state, and whether its current files are those that were deployed.
+def read_state(place: Place) -> TargetState:
+    """Ask for the state of a target; nothing is changed there.
 
-    Attributes:
-        state: of the target.
-        changed: current files that are not as they were deployed, by what is wrong: "changed", "missing",
-            "added".
+    Raises:
+        TargetError: it cannot be reached, or `current` or `releases` are not those of lce-rig.
     """
-
-    state: TargetState
-    changed: Mapping[str, str] = field(default_factory=dict)
+    current, pending, releases = "", "", []
+    for line in place.must_run(STATE).splitlines():
+        kind, _, rest = line.removeprefix(SAYS).partition(" ") if line.startswith(SAYS) else ("", "", "")
+        if kind == "current":
+            current = rest
+        elif kind == "pending":
+            pending = rest.strip()
+        elif kind == "release":
+            name, _, text = rest.partition(" ")
+            try:
+                record = ReleaseRecord.model_validate_json(text)
+            except ValidationError:
+                continue
+            if record.name == name:
+                releases.append(record)
+    releases.sort(key=lambda release: release.name, reverse=True)
+    state = TargetState(None, tuple(releases), pending)
+    if not current:
+        return state
+    if state.named(current) is None:
+        raise TargetError(
+            f"{place.label}: the record of the current release {current} is damaged",
+            f"Remove the link {place.path}/current there to begin anew.",
+        )
+    return TargetState(state.named(current), state.releases, pending)
 
 
 def content_of(folder: Path) -> dict[str, str]:
-    """Fingerprint the files of a set by their path; the record and marks of a release are not part of it.
+    """Fingerprint the files of a set by their path; the record and mark of a release are not part of it.
 
     Raises:
-        TargetError: a file cannot be read, or is a link or no plain file.
+        TargetError: a file cannot be read, or is a link.
     """
-    found = {}
+    content = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if name in (RECORD, USED) or (path.is_dir() and not path.is_symlink()):
@@ -121,10 +128,10 @@ def content_of(folder: Path) -> dict[str, str]:
         if path.is_symlink():
             raise TargetError(f"{path} is a link, not a file of the set", "Deploy plain files only.")
         try:
-            found[name] = hashlib.sha256(read_file(path)).hexdigest()
-        except (OSError, ValueError) as error:
-            raise TargetError(f"{path} cannot be read: {error}") from error
-    return found
+            content[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise TargetError(f"{path} cannot be read: {error.strerror or error}") from error
+    return content
 
 
 def set_sha256(files: Mapping[str, str]) -> str:
@@ -134,66 +141,9 @@ def set_sha256(files: Mapping[str, str]) -> str:
 
 
 def differences(files: Mapping[str, str], expected: Mapping[str, str]) -> dict[str, str]:
-    """Say which files of a set are not as expected."""
+    """Compare the files of a set with those expected: "changed", "missing" or "added" by path."""
     names = sorted(name for name in files.keys() | expected.keys() if files.get(name) != expected.get(name))
     return {
         name: "missing" if name not in files else "added" if name not in expected else "changed"
         for name in names
     }
-
-
-def read_state(place: Place) -> TargetState:
-    """Ask what lies at a target; nothing is changed there.
-
-    Raises:
-        TargetError: it cannot be reached, or its current release is not one that lce-rig made.
-    """
-    return to_state(place, succeed(place, place.run(STATE)))
-
-
-def succeed(place: Place, ran: Ran) -> Ran:
-    """Pass on what a script did.
-
-    Raises:
-        TargetError: it failed.
-    """
-    if ran.code:
-        what = last_line(ran.err)
-        raise TargetError(
-            f"{place.label}: {what}", _HINTS.get(ran.code, "Check space and permissions there.")
-        )
-    return ran
-
-
-def to_state(place: Place, ran: Ran) -> TargetState:
-    """Understand what a script printed; see `read_state`."""
-    current, pending, releases = "", "", []
-    for line in ran.out.splitlines():
-        kind, _, rest = line.removeprefix(SAYS).partition(" ") if line.startswith(SAYS) else ("", "", "")
-        if kind == "current":
-            current = rest
-        elif kind == "pending":
-            pending = rest
-        elif kind == "release":
-            name, _, record = rest.partition(" ")
-            found = _parse(record)
-            if found is not None and found.name == name:
-                releases.append(found)
-    releases.sort(key=lambda each: each.name, reverse=True)
-    state = TargetState(None, tuple(releases), pending)
-    if not current:
-        return state
-    named = state.named(current)
-    if named is None:
-        raise TargetError(
-            f"{place.label}: current is {current}, which lce-rig has not deployed or is damaged",
-            f"Look at {place.path}/current there, and remove this link to begin anew.",
-        )
-    return TargetState(named, state.releases, pending)
-
-
-def _parse(text: str) -> ReleaseRecord | None:
-    try:
-        return ReleaseRecord.model_validate(parse_json(text.encode()))
-    except (ValueError, ValidationError):
-        return None

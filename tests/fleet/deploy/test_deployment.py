@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.errors import CommandError, ResultRefusedError, SessionError, TargetError
-from lce_rig.fleet.deploy import deployment, shell
+from lce_rig.fleet.deploy import deployment
 from lce_rig.fleet.deploy.deployment import deploy, plan, rollback, standing
-from lce_rig.fleet.deploy.place import LocalPlace, Ran
+from lce_rig.fleet.deploy.place import CHANGED, COMMIT, RECORD, Place
 from lce_rig.fleet.deploy.releases import content_of, set_sha256
 from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
@@ -181,7 +181,7 @@ def test_releases_are_in_order_even_if_the_clock_was_set_back(
     first = deploy(result("a"), rig, local).release
     later = "20990101T000000Z" + first.name[16:]
     (robot / "releases" / first.name).rename(robot / "releases" / later)
-    record = robot / "releases" / later / shell.RECORD
+    record = robot / "releases" / later / RECORD
     record.write_text(record.read_text().replace(first.name, later))
     (robot / "current").unlink()
     (robot / "current").symlink_to(f"releases/{later}")
@@ -189,11 +189,11 @@ def test_releases_are_in_order_even_if_the_clock_was_set_back(
     assert second.name[:16] == "20990101T000001Z" and standing(local).state.releases[0] == second
 
 
-class Meanwhile(LocalPlace):
+class Meanwhile(Place):
     """A place at which something happens once new files have been copied."""
 
-    def __init__(self, path: str, happens: Callable[[Path], object]) -> None:
-        super().__init__(path)
+    def __init__(self, target: TargetSettings, happens: Callable[[Path], object]) -> None:
+        super().__init__(target)
         self._happens = happens
 
     def put(self, folder: Path, name: str) -> None:
@@ -208,7 +208,7 @@ def test_of_two_deployments_at_once_one_is_refused(
     folder, other = result("b", 0.15), result("c", 0.2)
 
     with pytest.raises(TargetError):
-        deploy(folder, rig, local, place=Meanwhile(str(robot), lambda _: deploy(other, rig, local)))
+        deploy(folder, rig, local, place=Meanwhile(local, lambda _: deploy(other, rig, local)))
     assert (robot / "current" / "result.json").read_bytes() == (other / "result.json").read_bytes()
     assert sorted(entry.name for entry in robot.glob(".*")) == [".lock"]
 
@@ -222,7 +222,7 @@ def test_files_that_the_disk_does_not_give_back_are_not_made_current(
         (draft / "rles.urdf").write_text("")
 
     with pytest.raises(TargetError, match=r"read back differently: rles\.urdf changed"):
-        deploy(result("b", 0.15), rig, local, place=Meanwhile(str(robot), damage))
+        deploy(result("b", 0.15), rig, local, place=Meanwhile(local, damage))
     assert standing(local).state.current == first
     deploy(result("c", 0.2), rig, local)
     assert sorted(entry.name for entry in robot.glob(".*")) == [".lock"]
@@ -242,71 +242,123 @@ def test_a_full_disk_leaves_the_earlier_set_and_the_next_deployment_clears_it(
         with pytest.raises(TargetError, match="No space left"):
             deploy(large, rig, with_settings(local, files=["large.bin"]))
         assert standing(local).state.current == first.release and not standing(local).changed
-        assert list(robot.glob(".new-*")), "nothing was left that could be cleared"
         deploy(result("c", 0.2), rig, local)
-        assert not list(robot.glob(".new-*"))
+        assert len(list((robot / "releases").iterdir())) == 2
     finally:
         subprocess.run(["umount", str(robot)], check=True)
 
 
-def test_what_is_in_the_links_place_is_not_touched(
+LOST = "releases/20260101T000000Z-00000000"
+
+
+def tree(folder: Path) -> dict[str, object]:
+    """List everything below a folder, with contents and targets of links."""
+    return {
+        str(path): str(path.readlink())
+        if path.is_symlink()
+        else path.read_bytes()
+        if path.is_file()
+        else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        "mkdir -p robot/current && echo mine >robot/current/mine.yaml",
+        "mkdir -p robot/theirs && ln -s theirs robot/current",
+        "mkdir -p robot elsewhere && ln -s ../elsewhere robot/releases",
+        "mkdir -p robot && echo mine >robot/releases",
+        "mkdir -p robot/releases/v1 robot/releases/v2 && ln -s releases/v2 robot/current",
+        "mkdir -p robot/releases/v1 && echo mine >robot/releases/v1/mine.yaml",
+        f"mkdir -p robot/{LOST} && ln -s {LOST} robot/current",
+        "mkdir -p robot && ln -s /dev/zero robot/.pending",
+        "mkdir -p robot && mkfifo robot/deployments.log",
+    ],
+)
+def test_a_folder_that_lce_rig_has_not_made_is_refused_untouched(
+    result: Result, rig: Rig, local: TargetSettings, tmp_path: Path, way: str
+) -> None:
+    folder = result("a")
+    subprocess.run(["sh", "-c", way], cwd=tmp_path, check=True)
+    before = tree(tmp_path)
+    for call in (lambda: deploy(folder, rig, local), lambda: standing(local), lambda: rollback(local)):
+        with pytest.raises(TargetError):
+            call()
+    assert tree(tmp_path) == before
+
+
+def test_only_own_releases_are_removed_and_only_after_the_switch(
     result: Result, rig: Rig, local: TargetSettings, robot: Path
 ) -> None:
-    (robot / "current").mkdir(parents=True)
-    (robot / "current" / "mine.yaml").write_text("mine")
-    with pytest.raises(TargetError, match="is no link"):
-        deploy(result("a"), rig, local)
-    assert (robot / "current" / "mine.yaml").read_text() == "mine"
+    few = with_settings(local, keep=2)
+    first = deploy(result("a"), rig, few).release
+    others = ["golden", "20260101T000000Z-00000000", "20260101T000000Z-0000000", "notes.txt"]
+    for name in others:
+        (robot / "releases" / name).mkdir()
+        (robot / "releases" / name / "mine.yaml").write_text("mine")
+    # As an interrupted deployment leaves it: named and recorded, and never current.
+    lost = robot / "releases" / "20260101T000000Z-11111111"
+    shutil.copytree(robot / "releases" / first.name, lost, ignore=shutil.ignore_patterns(".used"))
+    before = tree(robot)
+    with pytest.raises(ResultRefusedError):
+        deploy(result("failed", 0.13, verdict="fail"), rig, few)
+    assert tree(robot) == before
+    assert [release.name for release in standing(few).state.releases] == [first.name]
+    names = [deploy(result(f"{k}", 0.2 + 0.01 * k), rig, few).release.name for k in range(3)]
+    assert sorted(path.name for path in (robot / "releases").iterdir()) == sorted([*others, *names[1:]])
 
 
-def test_a_release_that_never_was_current_is_removed(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
+def test_a_release_with_a_link_to_an_endless_device_is_named_and_replaced(
+    result: Result, rig: Rig, target: TargetSettings, robot: Path
 ) -> None:
-    deploy(result("a"), rig, local)
-    # As a computer leaves it that is switched off between the two last steps.
-    lost = robot / "releases" / "20260101T000000Z-00000000"
-    lost.mkdir()
-    (lost / "rles.urdf").write_text("")
-    assert len(standing(local).state.releases) == 1
-    deploy(result("b", 0.15), rig, local)
-    assert not lost.exists()
+    deploy(result("a"), rig, target)
+    (robot / "current" / "extrinsics.yaml").unlink()
+    (robot / "current" / "extrinsics.yaml").symlink_to("/dev/zero")
+    assert standing(target).changed == {"extrinsics.yaml": "no plain file"}
+    assert deploy(result("b", 0.15), rig, target).is_new and not standing(target).changed
+    with pytest.raises(TargetError):
+        rollback(target)
 
 
-def run_without_flock(robot: Path, tools: Path, *arguments: str) -> Ran:
-    """Run the last step as a system without flock would."""
-    if not tools.exists():
-        tools.mkdir()
-        for name in ("sh", "cat", "ln", "ls", "mkdir", "mv", "rm", "sleep", "sync"):
-            found = subprocess.run(["which", name], capture_output=True, text=True, check=True).stdout.strip()
-            (tools / name).symlink_to(found)
-    words = ["sh", "-c", shell.COMMIT, "sh", str(robot), *arguments]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env={"PATH": str(tools)})
-    return Ran(done.returncode, done.stdout, done.stderr)
+@pytest.mark.long
+def test_the_output_and_the_time_of_a_command_are_bounded(
+    result: Result, rig: Rig, target: TargetSettings
+) -> None:
+    endless = with_settings(target, run="yes", run_timeout_s=2)
+    with pytest.raises(CommandError) as caught:
+        deploy(result("a"), rig, endless)
+    assert len(str(caught.value)) < 10_000
+    assert standing(endless).state.is_pending
 
 
-def test_where_flock_is_missing_a_folder_is_the_lock_and_a_dead_holders_is_taken_over(
+def test_the_command_gets_the_robot_as_an_argument(result: Result, rig: Rig, local: TargetSettings) -> None:
+    named = with_settings(local, robot="kestrel", run='echo "for $1"')
+    assert deploy(result("a"), rig, named).output == "for kestrel\n"
+
+
+def test_without_flock_the_current_release_still_decides(
     result: Result, rig: Rig, local: TargetSettings, robot: Path, tmp_path: Path
 ) -> None:
     names = [deploy(result(f"{k}", 0.1 + 0.01 * k), rig, local).release.name for k in range(2)]
-    again = ("", names[0], names[1], "10", "", "{}")
     tools = tmp_path / "tools"
-    assert run_without_flock(robot, tools, *again).code == 0
-    assert run_without_flock(robot, tools, *again).code == shell.CHANGED
-    (robot / ".lock.d").mkdir()
-    (robot / ".lock.d" / "owner").write_text("another-boot 1\n")
-    back = ("", names[1], names[0], "10", "", "{}")
-    assert run_without_flock(robot, tools, *back).code == 0
-    assert not (robot / ".lock.d").exists()
+    tools.mkdir()
+    for name in ("sh", "ln", "mv", "readlink", "rm", "sync"):
+        (tools / name).symlink_to(shutil.which(name) or name)
+    again = ["sh", "-c", COMMIT, "sh", str(robot), names[0], names[1], "10", "", "{}"]
+    codes = [subprocess.run(again, env={"PATH": str(tools)}, check=False).returncode for _ in range(2)]
+    assert codes == [0, CHANGED] and (robot / "current").readlink() == Path("releases", names[0])
 
 
-TOOLS = ("cat", "flock", "ln", "ls", "mkdir", "mv", "rm", "sync")
+TOOLS = ("cat", "flock", "head", "ln", "mkdir", "mv", "readlink", "rm", "sync")
 
 
-class Failing(LocalPlace):
+class Failing(Place):
     """A place where the shell is killed before it starts its n-th program; flushing is left out."""
 
-    def __init__(self, path: str, tools: Path, n: int) -> None:
-        super().__init__(path)
+    def __init__(self, target: TargetSettings, tools: Path, n: int) -> None:
+        super().__init__(target)
         self._tools = tools
         shutil.rmtree(tools, ignore_errors=True)
         tools.mkdir()
@@ -329,14 +381,14 @@ def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(
 ) -> None:
     settings = with_settings(local, keep=2, formats=["urdf"])
     folders = [result("a"), result("b", 0.15)]
-    sound = Failing(str(robot), tmp_path / "sound", 0)
+    sound = Failing(settings, tmp_path / "sound", 0)
     for folder in (*folders, folders[0]):
         deploy(folder, rig, settings, place=sound)
     sets = {set_sha256(standing(settings).state.releases[k].files) for k in (0, 1)}
     n_new = n_old = 0
     for n in range(1, 100):
         before = content_of(robot / "current")
-        place = Failing(str(robot), tmp_path / "tools", n)
+        place = Failing(settings, tmp_path / "tools", n)
         with contextlib.suppress(TargetError):
             deploy(folders[1], rig, settings, place=place)
         found = content_of(robot / "current")
@@ -347,16 +399,17 @@ def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(
             break
         deploy(folders[0], rig, settings, place=sound)
         assert content_of(robot / "current") == before
-        assert {entry.name for entry in robot.glob(".*")} <= {".lock"}, f"step {n}"
-        assert len(list((robot / "releases").iterdir())) <= 3
+        assert {entry.name for entry in robot.glob(".*")} <= {".lock", ".current.new"}, f"step {n}"
     assert n > 15 and n_new > 2 and n_old > 2
+    deploy(result("c", 0.2), rig, settings, place=sound)
+    assert len(list((robot / "releases").glob(f"*/{RECORD}"))) == 2
 
 
 def test_a_set_is_known_by_what_sha256sum_prints(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("1")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "c.txt").write_text("2")
-    (tmp_path / shell.RECORD).write_text("{}")
+    (tmp_path / RECORD).write_text("{}")
     lines = subprocess.run(["sha256sum", "a.txt", "b/c.txt"], capture_output=True, check=True, cwd=tmp_path)
     printed = subprocess.run(["sha256sum"], input=lines.stdout, capture_output=True, check=True).stdout
     assert set_sha256(content_of(tmp_path)) == printed.decode().split()[0]

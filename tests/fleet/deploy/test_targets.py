@@ -6,7 +6,7 @@ import pytest
 
 from lce_rig.core.errors import ProfileError, TargetError, UsageError
 from lce_rig.fleet.deploy.deployment import standing
-from lce_rig.fleet.deploy.place import SshPlace
+from lce_rig.fleet.deploy.place import Place
 from lce_rig.fleet.deploy.targets import find_target, read_targets
 from lce_rig.rig import load_rig
 from lce_rig.rig.target_settings import TargetSettings
@@ -61,17 +61,26 @@ def test_places_are_read_as_scp_reads_them(to: str, host: str | None, path: str)
         "to: 'kestrel:$(reboot)'",
         "to: /opt\n    ssh: {Port: 22}",
         "to: 'kestrel:c'\n    ssh: {ProxyCommand: touch}",
+        "to: 'kestrel:c'\n    ssh: {LocalCommand: touch}",
+        "to: 'kestrel:c'\n    ssh: {KnownHostsCommand: touch}",
+        "to: 'kestrel:c'\n    ssh: {PKCS11Provider: /tmp/a.so}",
+        "to: 'kestrel:c'\n    ssh: {Match: exec touch}",
+        "to: 'kestrel:c'\n    ssh: {ProxyJump: '-oProxyCommand=touch'}",
+        "to: 'kestrel:c'\n    ssh: {ProxyJump: 'a,$(touch x)'}",
+        "to: 'kestrel:c'\n    ssh: {User: '$(touch x)'}",
+        "to: 'kestrel:c'\n    ssh: {Port: '22 -oProxyCommand=touch'}",
+        "to: '{robot}@kestrel:$(touch)'",
         "to: /opt\n    keep: 1",
     ],
 )
 def test_what_a_shell_or_ssh_could_take_for_something_else_is_refused(tmp_path: Path, text: str) -> None:
     path = write(tmp_path / "deploy.yaml", f"targets:\n  kestrel:\n    {text}\n")
-    with pytest.raises(ProfileError, match=r"deploy\.yaml:[34]: targets\.kestrel"):
+    with pytest.raises(ProfileError, match=r"deploy\.yaml:[34]:"):
         read_targets(path)
 
 
 def test_arguments_reach_the_script_as_they_are(tmp_path: Path) -> None:
-    words = SshPlace(TargetSettings(to="kestrel:c", ssh={"Port": 2222})).command("echo $2", "it's; $(reboot)")
+    words = Place(TargetSettings(to="kestrel:c", ssh={"Port": 2222})).command("echo $2", "it's; $(reboot)")
     assert words[0] == "ssh" and "Port=2222" in words and "BatchMode=yes" in words
     assert words[-2] == "kestrel" and words[-1] == """sh -c 'echo $2' sh c 'it'"'"'s; $(reboot)'"""
 
@@ -81,3 +90,20 @@ def test_a_computer_that_is_not_there_is_an_error_in_words() -> None:
     with pytest.raises(TargetError) as caught:
         standing(TargetSettings(to="robot@127.0.0.1:c", ssh={"Port": 1}))
     assert "no connection" in caught.value.what and caught.value.exit_code == 8
+
+
+def test_a_jump_over_hosts_is_allowed() -> None:
+    jump = "ann@gate:2222,[fe80::1]"
+    assert TargetSettings(to="kestrel:c", ssh={"ProxyJump": jump}).ssh == {"ProxyJump": jump}
+
+
+def test_the_name_of_a_robot_is_put_into_the_place_only(tmp_path: Path) -> None:
+    text = "targets: {nav: {to: 'robot@{robot}.local:calib', run: 'echo {robot}'}}"
+    (target,) = read_targets(write(tmp_path / "deploy.yaml", text)).values()
+    own = target.for_robot("r17")
+    assert (own.host, own.robot, own.run) == ("robot@r17.local", "r17", "echo {robot}")
+    for name in ("a}]}\n  b", "-oProxyCommand=touch", "$(touch x)", "a b", "../r1", ""):
+        with pytest.raises(ValueError):
+            target.for_robot(name)
+    with pytest.raises(UsageError):
+        find_target("nav", tmp_path / "deploy.yaml", None, None)

@@ -1,4 +1,4 @@
-"""Results of many robots put onto them: canaries first, stopped by the first doubt, rolled back together."""
+"""Results of many robots put onto them, one after the other, and rolled back together."""
 
 import json
 import sys
@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 
+import lce_rig.collect.findings
+import lce_rig.judge.findings  # noqa: F401  kinds of the findings in stored results
 from lce_rig.cli.main import run
 from lce_rig.core.calibration import Provenance
 from lce_rig.core.errors import ProfileError, UsageError
-from lce_rig.fleet.deployment import FleetDeployment, Rollout, newest_results, read_rollout
 from lce_rig.fleet.registry import Registry, write_rows
+from lce_rig.fleet.rollout import FleetDeployment, Rollout, newest_results, read_rollout
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import Row
+from lce_rig.fleet.table import Row, as_table
 from lce_rig.rig import dump_rig, load_rig
 from tests.export.conftest import calibration, some_pose
 from tests.saved_results import result_file
@@ -51,9 +53,9 @@ def add(registry: Registry) -> Add:
 
 @pytest.fixture
 def targets(tmp_path: Path) -> Path:
-    """Each robot's files lie in a folder of its name; r4's command fails where there is a file `broken`."""
+    """Each robot's files lie in a folder of its name; its command fails where there is a file `broken`."""
     file = tmp_path / "deploy.yaml"
-    run = f"! test -e {tmp_path}/robots/{{robot}}/broken"
+    run = f"! test -e {tmp_path}/robots/$1/broken"
     file.write_text(
         f'targets: {{nav: {{to: "robots/{{robot}}/calib", run: "{run}", formats: [extrinsics]}}}}'
     )
@@ -69,10 +71,8 @@ def whole(add: Add) -> None:
         add(robot)
 
 
-def deploy(
-    registry: Registry, targets: Path, canaries: tuple[str, ...] = ROBOTS[:2], check: str = ""
-) -> Rollout:
-    return FleetDeployment(registry, "nav", targets, check).run(newest_results(registry), canaries, jobs=2)
+def deploy(registry: Registry, targets: Path, check: str = "") -> Rollout:
+    return FleetDeployment(registry, "nav", targets, check).run(newest_results(registry))
 
 
 def held(targets: Path, robot: str) -> bytes | None:
@@ -94,7 +94,6 @@ def test_every_robot_gets_its_own_newest_result(registry: Registry, targets: Pat
         assert content["provenance"]["robot"] == robot
         assert content["pairs"][0]["T_cam_lidar"][0][3] == (0.2 if robot == "r2" else 0.1)
     assert read_rollout(registry, "nav") == rollout
-    assert [s.is_canary for s in rollout.robots.values()] == [True, True, False, False, False]
 
 
 @pytest.mark.usefixtures("whole")
@@ -107,44 +106,60 @@ def test_a_robot_whose_newest_session_failed_is_left_out(registry: Registry, tar
 
 
 @pytest.mark.usefixtures("whole")
-@pytest.mark.parametrize(("robot", "reached"), [("r2", 2), ("r4", 5)])
-def test_a_command_that_fails_stops_everything(
-    registry: Registry, targets: Path, robot: str, reached: int
-) -> None:
-    (targets.parent / "robots" / robot / "broken").touch()
+def test_the_first_failure_stops_and_the_same_call_goes_on(registry: Registry, targets: Path) -> None:
+    robots = targets.parent / "robots"
+    (robots / "r2" / "broken").touch()
     rollout = deploy(registry, targets)
-    assert rollout.stopped_by == robot and rollout.robots[robot].state == "command_failed"
-    assert 2 <= len(rollout.robots) <= reached and rollout.robots[robot].release
-    # Mended, the same call goes on; canaries that hold the result are not written again.
-    before = (targets.parent / "robots" / "r1" / "calib" / "deployments.log").read_bytes()
-    (targets.parent / "robots" / robot / "broken").unlink()
+    assert states(rollout) == {"r1": "in_place", "r2": "failed"} and rollout.stopped_by == "r2"
+    assert rollout.robots["r2"].release and held(targets, "r3") is None
+    before = (robots / "r1" / "calib" / "deployments.log").read_bytes()
+    (robots / "r2" / "broken").unlink()
     assert states(deploy(registry, targets)) == dict.fromkeys(ROBOTS, "in_place")
-    assert (targets.parent / "robots" / "r1" / "calib" / "deployments.log").read_bytes() == before
+    assert (robots / "r1" / "calib" / "deployments.log").read_bytes() == before
 
 
 @pytest.mark.usefixtures("whole")
-def test_a_check_that_contradicts_a_canary_stops_before_the_others(registry: Registry, targets: Path) -> None:
-    script = "import sys; sys.exit(7 * (sys.argv[1] == 'r2'))"
-    rollout = deploy(registry, targets, check=f'{sys.executable} -c "{script}" {{robot}} {{result}} {{to}}')
-    assert states(rollout) == {"r1": "in_place", "r2": "contradicted"} and rollout.stopped_by == "r2"
-    assert held(targets, "r3") is None
-    unsure = f"{sys.executable} -c 'import sys; sys.exit(6)'"
-    assert states(deploy(registry, targets, check=unsure)) == dict.fromkeys(ROBOTS, "in_place")
-
-
-@pytest.mark.usefixtures("whole")
-def test_a_robot_that_refuses_is_passed_over_but_not_as_a_canary(
-    registry: Registry, targets: Path, add: Add
-) -> None:
+def test_a_robot_that_refuses_its_result_stops_it(registry: Registry, targets: Path, add: Add) -> None:
+    # The files at r3 come from later captures than its newest result in this registry.
+    add("r3", "2026-03-01T10:00:00Z")
     deploy(registry, targets)
-    # r4's files come from later captures than its newest result in this registry.
-    add("r4", "2026-03-01T10:00:00Z")
-    deploy(registry, targets)
-    registry.set_aside("r4/2026-03-01-0f")
+    registry.set_aside("r3/2026-03-01-0f")
     registry.consolidate()
+    assert deploy(registry, targets).stopped_by == "r3"
+
+
+@pytest.mark.usefixtures("whole")
+@pytest.mark.parametrize(("code", "state"), [(0, "in_place"), (6, "in_place"), (7, "failed"), (1, "failed")])
+def test_a_check_gets_names_as_arguments_and_decides(
+    registry: Registry, targets: Path, tmp_path: Path, code: int, state: str
+) -> None:
+    script = (
+        f"import sys, pathlib; pathlib.Path({str(tmp_path / 'words')!r}).write_text(' '.join(sys.argv[1:]))"
+    )
+    check = f'{sys.executable} -c "{script}; sys.exit({code})" {{robot}} {{to}}'
+    assert deploy(registry, targets, check).robots["r1"].state == state
+    robot = "r5" if state == "in_place" else "r1"
+    assert (tmp_path / "words").read_text() == f"{robot} {tmp_path}/robots/{robot}/calib"
+
+
+@pytest.mark.usefixtures("whole")
+def test_the_output_of_a_check_is_bounded(registry: Registry, targets: Path) -> None:
+    check = f"{sys.executable} -c 'import sys; sys.stdout.write(chr(120) * 50_000_000); sys.exit(7)'"
+    assert len(deploy(registry, targets, check).robots["r1"].detail) < 3000
+
+
+@pytest.mark.usefixtures("whole")
+@pytest.mark.parametrize("name", ["a}]}, x: {to: /tmp", "$(touch x)", "../r1", "r 9", "-oProxyCommand=x"])
+def test_a_name_in_the_registry_becomes_no_yaml_no_path_and_no_command(
+    registry: Registry, targets: Path, name: str
+) -> None:
+    row = Row(name, date="2026-01-05T10:00:00Z", folder=f"{name}/a", camera="c", lidar="l", verdict="pass")
+    registry.write_table(as_table([row]))
+    before = sorted(targets.parent.rglob("*"))
     rollout = deploy(registry, targets)
-    assert rollout.robots["r4"].state == "refused" and not rollout.stopped_by
-    assert deploy(registry, targets, ("r4",)).stopped_by == "r4"
+    assert [state.state for state in rollout.robots.values()] in (["left_out"], ["failed"])
+    made = set(targets.parent.rglob("*")) - set(before)
+    assert {path.name for path in made} == {".deployments", "nav.json"}
 
 
 @pytest.mark.usefixtures("whole")
@@ -177,15 +192,6 @@ def test_what_was_deployed_by_others_since_is_not_rolled_back(
 
 
 @pytest.mark.usefixtures("whole")
-def test_an_unknown_canary_or_target_is_refused(registry: Registry, targets: Path) -> None:
-    with pytest.raises(UsageError, match="r9"):
-        deploy(registry, targets, ("r9",))
-    with pytest.raises(UsageError, match="base"):
-        FleetDeployment(registry, "base", targets).run(newest_results(registry), ("r1",))
-    assert read_rollout(registry, "base").robots == {} and held(targets, "r1") is None
-
-
-@pytest.mark.usefixtures("whole")
 def test_the_verb_plans_deploys_shows_and_rolls_back(
     targets: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -195,37 +201,32 @@ def test_the_verb_plans_deploys_shows_and_rolls_back(
         code = run(["fleet", "deploy", *place, "--target", "nav", *options])
         return code, capsys.readouterr().out
 
-    code, planned = call("--dry-run", "--canary", "2")
-    assert code == 0 and planned.count("canary") == 2 and held(targets, "r1") is None
+    code, planned = call("--dry-run")
+    assert code == 0 and all(robot in planned for robot in ROBOTS) and held(targets, "r1") is None
     (targets.parent / "robots" / "r2" / "broken").touch()
-    assert call("--canary", "2")[0] == 7
+    assert call()[0] == 7
     assert held(targets, "r2") is not None and held(targets, "r3") is None
     (targets.parent / "robots" / "r2" / "broken").unlink()
-    code, said = call("--canary", "r2,r5", "--json")
-    found = {name: each["state"] for name, each in json.loads(said)["robots"].items()}
-    assert code == 0 and found == dict.fromkeys(ROBOTS, "in_place")
+    code, said = call("--json", "--where", "robot <> 'r5'")
+    in_place = {name: each["state"] for name, each in json.loads(said)["robots"].items()}
+    assert code == 0 and in_place == dict.fromkeys(ROBOTS[:-1], "in_place")
     code, shown = call("--status")
-    assert code == 0 and all(robot in shown for robot in ROBOTS)
+    assert code == 0 and all(robot in shown for robot in ROBOTS[:-1])
     assert call("--rollback", "--reason", "test")[0] == 0
     assert call("--status", "--rollback")[0] == 2
 
 
 @pytest.mark.parametrize(
-    "check", ["see 'this", "see {robots}", "see {robot", "see {0}", "see {robot.wheels}"]
+    ("target", "check", "text", "error"),
+    [
+        ("nav", "see 'this", None, UsageError),
+        ("../nav", "", None, UsageError),
+        ("base", "", None, UsageError),
+        ("nav", "", "targets: {nav: {too: x}}", ProfileError),
+    ],
 )
-def test_a_check_that_cannot_be_filled_in_is_refused_before_anything_is_deployed(registry, targets, check):
-    with pytest.raises(UsageError, match="--check"):
-        FleetDeployment(registry, "nav", targets, check)
-
-
-def test_a_name_of_a_target_does_not_lead_out_of_the_registry(registry, targets):
-    with pytest.raises(UsageError):
-        FleetDeployment(registry, "../nav", targets)
-
-
-@pytest.mark.usefixtures("whole")
-def test_a_mistake_in_the_targets_is_an_error_and_not_a_refusal(registry, targets):
-    targets.write_text("targets: {nav: {too: x}}")
-    with pytest.raises(ProfileError):
-        FleetDeployment(registry, "nav", targets).run(newest_results(registry), ["r1"])
-    assert read_rollout(registry, "nav").robots == {}
+def test_a_mistake_is_an_error_before_anything_is_deployed(registry, targets, target, check, text, error):
+    if text is not None:
+        targets.write_text(text)
+    with pytest.raises(error):
+        FleetDeployment(registry, target, targets, check)
