@@ -12,8 +12,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
 from lce_rig.judge.findings import cause_words
 from lce_rig.judge.reach import point_uncertainties
-from lce_rig.show.overlays.canvas import BLUE, INK, ORANGE
-from lce_rig.show.report.drawing import drawing, new_axes
+from lce_rig.show.report.drawing import BLUE, INK, ORANGE, drawing, new_axes
 
 _DISTANCES_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0)
 # Causes of less than this, in percent, are in the table only.
