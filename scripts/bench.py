@@ -43,7 +43,6 @@ PARTS: dict[str, tuple[str, Part]] = {
         "boards and scene in one estimate: simulated rooms, recordings",
         lambda bench, a: bench(a.seeds or 100, min(a.splits, 10), a.only),
     ),
-    "outputs": ("every output read by other programs", lambda bench, _: bench()),
     "lidars": (
         "other LiDARs, simulated: boards found, errors, time of a search",
         lambda bench, a: bench(a.captures or 20, a.output, a.only),

@@ -1,15 +1,11 @@
 """`lce-rig export`: write a result for other programs, and into a robot's own URDF."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import session_argument, split_names
-
-if TYPE_CHECKING:
-    from lce_rig.export.robot_tree import JointChange
 
 
 def _list_formats(context: click.Context, _param: click.Parameter, is_asked: bool) -> None:
@@ -17,8 +13,8 @@ def _list_formats(context: click.Context, _param: click.Parameter, is_asked: boo
     if is_asked and not context.resilient_parsing:
         from lce_rig.export import EXPORTS
 
-        for name, each in EXPORTS.items():
-            show.say(f"{name + (' *' if each.is_usual else ''):<16} {each.about}")
+        for name, form in EXPORTS.items():
+            show.say(f"{name + (' *' if form.is_usual else ''):<16} {form.about}")
         show.note("* unless others are named with --formats or as `exports` in the profile")
         context.exit()
 
@@ -97,7 +93,7 @@ def export(
     pairs = lce.read_result(opened.path.joinpath(*result_parts(name), RESULT)).pairs
     if output is not None:
         from lce_rig.export import export_formats
-        from lce_rig.export.robot_tree import read_robot
+        from lce_rig.export.robot_files import read_robot
 
         robot = None if tree is None else read_robot(tree)
         output.mkdir(parents=True, exist_ok=True)
@@ -110,18 +106,15 @@ def export(
             (show.note if finding.severity == "note" else show.warn)(finding.sentence)
         return
     from lce_rig.export import require_usable
-    from lce_rig.export.robot_urdf import write_into_urdf
+    from lce_rig.export.robot_files import write_into_urdf
 
     assert into is not None
     require_usable(pairs, is_forced=force)
-    update = write_into_urdf(into, pairs, opened.rig, datetime.now())
-    for change in update.changes:
-        show.say(f"{change.joint.parent} to {change.joint.child}: {_told(change)}")
-    show.say(f"{into}: nothing to change" if update.backup is None else f"earlier text: {update.backup}")
-
-
-def _told(change: "JointChange") -> str:
-    if change.moved is None:
-        return "added"
-    angle_deg, distance_m = change.moved
-    return f"moved by {angle_deg:.2f} deg, {1000 * distance_m:.1f} mm"
+    backup, changes = write_into_urdf(into, pairs, opened.rig, datetime.now())
+    for change in changes:
+        done = "added"
+        if change.moved is not None:
+            angle_deg, distance_m = change.moved
+            done = f"moved by {angle_deg:.2f} deg, {1000 * distance_m:.1f} mm"
+        show.say(f"{change.joint.parent} to {change.joint.child}: {done}")
+    show.say(f"{into}: nothing to change" if backup is None else f"earlier text: {backup}")

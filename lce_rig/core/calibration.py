@@ -23,7 +23,7 @@ from pydantic import (
     ValidationError,
     WrapSerializer,
 )
-from pydantic_core import PydanticSerializationError, core_schema
+from pydantic_core import core_schema
 from typing_extensions import NotRequired, TypedDict
 
 import lce_rig
@@ -52,13 +52,11 @@ def _kept_as(record: Any, read: Callable[[Any], Any], write: Callable[[Any], Any
 
 def _array(record: Any, read: Callable[[Any], Array] = np.array) -> GetPydanticSchema:
     """Keep an array as lists of numbers with all their digits."""
-
-    def write(array: Array) -> Any:
-        if not np.isfinite(array).all():
-            raise ValueError("not finite")
-        return (array.astype(np.float64) + 0.0).tolist()
-
-    return _kept_as(record, lambda rows: np.asarray(read(rows), dtype=np.float64), write)
+    return _kept_as(
+        record,
+        lambda rows: np.asarray(read(rows), dtype=np.float64),
+        lambda array: (array.astype(np.float64) + 0.0).tolist(),
+    )
 
 
 def _number(lowest: float, otherwise: float) -> GetPydanticSchema:
@@ -615,13 +613,15 @@ class ResultFile:
         Raises:
             ResultRefusedError: a pose or covariance is not finite.
         """
-        try:
-            document: dict[str, Any] = _file().dump_python(self, mode="json", by_alias=True)
-        except PydanticSerializationError as error:
-            raise ResultRefusedError(
-                "a pose or covariance of the result is not finite",
-                "Add captures: they leave a direction undetermined.",
-            ) from error
+        for pair in self.pairs:
+            evidence = (pair, *pair.channel_results, *pair.other_cameras, pair.scene_share)
+            values = [value for record in evidence if record for value in vars(record).values()]
+            if not all(np.isfinite(value).all() for value in values if isinstance(value, np.ndarray)):
+                raise ResultRefusedError(
+                    f"a pose or covariance of {pair.camera} and {pair.lidar} is not finite",
+                    "Add captures: they leave a direction undetermined.",
+                )
+        document: dict[str, Any] = _file().dump_python(self, mode="json", by_alias=True)
         document["inputs_sha256"] = dict(sorted(document["inputs_sha256"].items()))
         if self.provenance == Provenance():
             del document["provenance"]

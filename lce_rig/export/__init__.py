@@ -1,24 +1,22 @@
-"""Write results as files for other programs; each is read back and checked."""
+"""Write results as files for other programs."""
 
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, reading
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import difference, tangent_sizes
 from lce_rig.export.findings import MOUNT_UNUSED
-from lce_rig.export.frames import require_known
 from lce_rig.export.job import ExportJob
-from lce_rig.export.robot_tree import RobotTree
+from lce_rig.export.robot_tree import RobotTree, require_known
 from lce_rig.rig import Rig
-
-if TYPE_CHECKING:
-    from lce_rig.session import Session
+from lce_rig.session import Session
 
 Exporter = Callable[[ExportJob], list[Path]]
 
@@ -56,7 +54,7 @@ EXPORTS: dict[str, Format] = {
         "static_transforms.txt: static_transform_publisher lines, ROS 1 and 2",
     ),
     "ros2_launch": Format(
-        "lce_rig.export.ros2_launch:export_ros2_launch", "RIG.launch.py: a ROS 2 launch file"
+        "lce_rig.export.static_tf:export_ros2_launch", "RIG.launch.py: a ROS 2 launch file"
     ),
     "tf_static_bag": Format(
         "lce_rig.export.ros_bag:export_tf_static_bag", "tf_static/: a ROS 2 bag with latched /tf_static"
@@ -74,11 +72,9 @@ EXPORTS: dict[str, Format] = {
         "lce_rig.export.koide3:export_koide3", "calib_CAMERA.json: direct_visual_lidar_calibration"
     ),
     "opencv": Format("lce_rig.export.opencv:export_opencv", "opencv_CAMERA.yaml: for cv::FileStorage"),
-    "isaac": Format(
-        "lce_rig.export.isaac:export_isaac", "isaac_calibration.urdf: Isaac ROS; needs base_link"
-    ),
+    "isaac": Format("lce_rig.export.urdf:export_isaac", "isaac_calibration.urdf: Isaac ROS; needs base_link"),
     "mcap": Format(
-        "lce_rig.export.session_bag:export_mcap",
+        "lce_rig.export.ros_bag:export_mcap",
         "RIG_session/: the session for Foxglove and RViz, with projected clouds",
     ),
     "ply": Format(
@@ -104,7 +100,7 @@ def load_exporter(name: str) -> Exporter:
 
 def usual_formats(rig: Rig) -> tuple[str, ...]:
     """List the formats that are written unless others are named: the profile's `exports`, else the usual."""
-    return tuple(rig.exports) or tuple(name for name, each in EXPORTS.items() if each.is_usual)
+    return tuple(rig.exports) or tuple(name for name, form in EXPORTS.items() if form.is_usual)
 
 
 def export(
@@ -114,10 +110,10 @@ def export(
     *,
     formats: Iterable[str] | None = None,
     is_forced: bool = False,
-    session: "Session | None" = None,
+    session: Session | None = None,
     robot: RobotTree | None = None,
 ) -> list[Path]:
-    """Write formats into a folder, each read back and checked; see `export_formats`, which also says more."""
+    """Write formats into a folder as `export_formats` does, and return the files alone."""
     files, _ = export_formats(
         calibrations, rig, folder, formats=formats, is_forced=is_forced, session=session, robot=robot
     )
@@ -131,10 +127,10 @@ def export_formats(
     *,
     formats: Iterable[str] | None = None,
     is_forced: bool = False,
-    session: "Session | None" = None,
+    session: Session | None = None,
     robot: RobotTree | None = None,
 ) -> tuple[list[Path], list[Finding]]:
-    """Write formats into a folder, each read back and checked by probe points.
+    """Write formats into a folder.
 
     Exports of an earlier run are removed first, even if this one is refused, so that they are not mistaken
     for this result.
@@ -155,12 +151,15 @@ def export_formats(
     Raises:
         LceRigError: a calibration names sensors that the rig does not have.
         SessionError: the sensors do not fit into the robot's tree.
-        ResultRefusedError: a verdict is "fail"; nothing is written.
-        LceRigError: a file reads back differently; it and all others are removed again.
+        ResultRefusedError: a verdict is "fail", or a pose is not finite; nothing is written.
     """
     folder = Path(folder)
     for calibration in calibrations:
         require_known(calibration, rig)
+        if not (np.isfinite(calibration.T_cam_lidar).all() and np.isfinite(calibration.cov).all()):
+            raise ResultRefusedError(
+                f"the pose of {calibration.camera} and {calibration.lidar} is not finite"
+            )
     exporters = [load_exporter(name) for name in (usual_formats(rig) if formats is None else formats)]
     remove_exports(folder)
     require_usable(calibrations, is_forced=is_forced)

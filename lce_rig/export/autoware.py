@@ -8,22 +8,18 @@ References:
     https://github.com/ros-drivers/velodyne (velodyne_description: from the base to the centre)
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, pose
-from lce_rig.export.files import header, number, quoted, reads_back
+from lce_rig.export.files import number, quoted
 from lce_rig.export.findings import NO_FRAME
-from lce_rig.export.frames import T_BODY_OPTICAL, FrameTree
 from lce_rig.export.job import ExportJob
-from lce_rig.export.probes import check_pose
-from lce_rig.export.robot_tree import RobotJoint, RobotTree
-from lce_rig.export.rotations import rotation_from_rpy, rpy
-from lce_rig.session.durable import write_atomically
+from lce_rig.export.robot_tree import FrameTree, RobotTree
+from lce_rig.export.rotations import rpy
 
 KIT, BASE = "sensor_kit_base_link", "base_link"
 KIT_FILE, BASE_FILE = "sensor_kit_calibration.yaml", "sensors_calibration.yaml"
@@ -32,8 +28,7 @@ _KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 _CENTRE_M = {"VLP-16": 0.0377, "VLP16": 0.0377}
 
 
-@dataclass(frozen=True, eq=False)
-class _Entry:
+class _Entry(NamedTuple):
     """A sensor of the kit.
 
     Attributes:
@@ -48,39 +43,35 @@ class _Entry:
 
 
 def export_autoware(job: ExportJob) -> list[Path]:
-    """Write the sensors' poses in the kit, and the kit's on the vehicle where that is known; read both back.
+    """Write the sensors' poses in the kit, and the kit's on the vehicle where that is known.
 
     Without a frame `sensor_kit_base_link` in the robot's tree, the kit is where the first sensor's entry is.
-
-    Raises:
-        LceRigError: a file reads back differently.
     """
     paths = []
     for index, tree in enumerate(job.trees):
-        robot = _as_robot(tree)
+        robot = RobotTree.of_joints("the tree", tree.joints)
         entries = _entries(tree, robot, job)
-        T_root_kit = _kit(tree, robot, entries)
-        poses = {e.key: _in(T_root_kit, robot, tree, e) for e in entries}
+        if KIT in tree.frames:
+            T_root_kit = robot.find_pose(tree.root, KIT)
+        else:
+            first = min(entries, key=lambda entry: len(robot.chain(entry.frame)))
+            T_root_kit = robot.find_pose(tree.root, first.frame) @ invert(first.T_key_frame)
+        T_kit_root = invert(T_root_kit)
+        poses = {
+            entry.key: T_kit_root @ robot.find_pose(tree.root, entry.frame) @ invert(entry.T_key_frame)
+            for entry in entries
+        }
         suffix = f"-{tree.root.replace('/', '_')}" if index else ""
-        path = job.folder / KIT_FILE.replace(".yaml", f"{suffix}.yaml")
-        write_atomically(path, _text("Autoware sensor kit calibration", KIT, poses, entries, job))
-        _check(path, tree, entries, job)
-        paths.append(path)
+        lines = _content("Autoware sensor kit calibration", KIT, poses, entries, job)
+        paths.append(job.write(KIT_FILE.replace(".yaml", f"{suffix}.yaml"), lines))
         if tree.root == BASE or BASE in tree.frames:
             T_base_kit = invert(robot.find_pose(tree.root, BASE)) @ T_root_kit
-            path = job.folder / BASE_FILE
-            write_atomically(path, _text("Autoware sensors calibration", BASE, {KIT: T_base_kit}, (), job))
-            _check_base(path, T_base_kit)
-            paths.append(path)
+            lines = _content("Autoware sensors calibration", BASE, {KIT: T_base_kit}, (), job)
+            paths.append(job.write(BASE_FILE, lines))
         else:
             figures = {"format": "autoware", "file": BASE_FILE, "frame": BASE, "root": tree.root}
             job.findings.append(NO_FRAME(tree.root, severity="note", **figures))
     return paths
-
-
-def _as_robot(tree: FrameTree) -> RobotTree:
-    joints = [(joint.child, RobotJoint(joint.parent, joint.T_parent_child)) for joint in tree.joints]
-    return RobotTree.of_joints("the tree", joints)
 
 
 def _entries(tree: FrameTree, robot: RobotTree, job: ExportJob) -> list[_Entry]:
@@ -120,22 +111,10 @@ def _housing(frame: str, model: str) -> _Entry:
     return _Entry(f"{frame}_base_link", frame, pose(np.eye(3), np.array([0.0, 0.0, height_m])))
 
 
-def _kit(tree: FrameTree, robot: RobotTree, entries: list[_Entry]) -> Array:
-    if KIT in tree.frames:
-        return robot.find_pose(tree.root, KIT)
-    first = min(entries, key=lambda entry: len(robot.chain(entry.frame)))
-    return robot.find_pose(tree.root, first.frame) @ invert(first.T_key_frame)
-
-
-def _in(T_root_kit: Array, robot: RobotTree, tree: FrameTree, entry: _Entry) -> Array:
-    T_root_key = robot.find_pose(tree.root, entry.frame) @ invert(entry.T_key_frame)
-    return np.asarray(invert(T_root_kit) @ T_root_key)
-
-
-def _text(
-    what: str, root: str, poses: Mapping[str, Array], entries: "list[_Entry] | tuple[()]", job: ExportJob
-) -> str:
-    lines = [f"# {line}" for line in header(what, job.rig, job.chosen)]
+def _content(
+    content: str, root: str, poses: Mapping[str, Array], entries: Sequence[_Entry], job: ExportJob
+) -> list[str]:
+    lines = [f"# {line}" for line in job.head(content, *job.chosen)]
     for entry in entries:
         lines.append(f"# {entry.key}: {_described(entry)}")
     lines.append(f"{root}:")
@@ -143,7 +122,7 @@ def _text(
         values = (*T[:3, 3], *rpy(T[:3, :3]))
         lines.append(f"  {quoted(frame)}:")
         lines += [f"    {key}: {number(value)}" for key, value in zip(_KEYS, values, strict=True)]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _described(entry: _Entry) -> str:
@@ -153,40 +132,3 @@ def _described(entry: _Entry) -> str:
     if np.allclose(entry.T_key_frame, np.eye(4)):
         return f"{entry.frame} of the profile"
     return f"{entry.frame} lies at ({x:.4f}, {y:.4f}, {z:.4f}) m in it, as its description must say"
-
-
-@reads_back
-def _check(path: Path, tree: FrameTree, entries: list[_Entry], job: ExportJob) -> None:
-    frames = {entry.frame: read_block(path, KIT)[entry.key] @ entry.T_key_frame for entry in entries}
-    optical = {}
-    for joint in tree.joints:
-        if joint.parent in frames:
-            optical[joint.child] = joint.T_parent_child
-    for calibration in job.chosen:
-        camera, lidar = job.rig.cameras[calibration.camera], job.rig.lidars[calibration.lidar].frame
-        if (calibration.camera, calibration.lidar) in tree.pairs:
-            T_body_optical = optical.get(camera.optical_frame, T_BODY_OPTICAL)
-            T_cam_lidar = invert(frames[camera.frame] @ T_body_optical) @ frames[lidar]
-            check_pose(path, f"{lidar} to {camera.frame}", T_cam_lidar, calibration, job.rig)
-
-
-@reads_back
-def _check_base(path: Path, T_base_kit: Array) -> None:
-    if not np.allclose(read_block(path, BASE)[KIT], T_base_kit, rtol=0, atol=1e-9):
-        raise LceRigError(f"{path}: reads back differently")
-
-
-@reads_back
-def read_block(path: Path, root: str) -> dict[str, Array]:
-    """Read the poses (4, 4) of the frames below one from a file of Autoware's.
-
-    Raises:
-        LceRigError: it has no such frame, or is damaged.
-    """
-    import yaml
-
-    poses = {}
-    for frame, block in yaml.safe_load(path.read_text(encoding="utf-8"))[root].items():
-        x, y, z, *angles = (float(block[key]) for key in _KEYS)
-        poses[frame] = pose(rotation_from_rpy(np.array(angles)), np.array([x, y, z]))
-    return poses

@@ -7,41 +7,32 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.errors import LceRigError, ProfileError
+from lce_rig.core.errors import ProfileError
 from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
-from lce_rig.export.files import header, numbers, quoted, reads_back
+from lce_rig.export.files import numbers, quoted
 from lce_rig.export.job import ExportJob
-from lce_rig.export.probes import check_projection
 from lce_rig.session.durable import write_atomically
 
 
 def export_camera_info(job: ExportJob) -> list[Path]:
-    """Write a file for each calibrated camera and check it by reading it back.
-
-    Raises:
-        LceRigError: a file projects differently from the rig's camera.
-    """
-    rig = job.rig
+    """Write a file for each calibrated camera."""
     paths = []
-    for name, calibration in {each.camera: each for each in job.chosen}.items():
+    for name, calibration in {c.camera: c for c in job.chosen}.items():
         path = job.folder / f"camera_info_{name}.yaml"
-        intrinsics = rig.cameras[name].to_intrinsics()
-        lines = header("camera_info", rig, [calibration], of_one_camera=True)
-        write_atomically(path, camera_info_text(name, intrinsics, lines))
-        read = read_camera_info(path)
-        check_projection(path, "the camera model", calibration.T_cam_lidar, read, calibration, rig)
+        head = job.head("camera_info", calibration, of_one_camera=True)
+        write_atomically(path, camera_info_text(name, job.rig.cameras[name].to_intrinsics(), head))
         paths.append(path)
     return paths
 
 
 def ros_distortion(intrinsics: Intrinsics) -> tuple[str, tuple[float, ...]]:
     """Return the name of the ROS distortion model and its coefficients (4, 5 or 8)."""
-    given = intrinsics.distortion
+    coefficients = intrinsics.distortion
     if intrinsics.model == "equidistant":
-        return "equidistant", given
+        return "equidistant", coefficients
     # plumb_bob has five coefficients, k3 last; rational_polynomial eight.
-    model, count = ("plumb_bob", 5) if len(given) <= 5 else ("rational_polynomial", 8)
-    return model, (*given, *(0.0,) * (count - len(given)))
+    model, count = ("plumb_bob", 5) if len(coefficients) <= 5 else ("rational_polynomial", 8)
+    return model, (*coefficients, *(0.0,) * (count - len(coefficients)))
 
 
 def camera_info_text(name: str, intrinsics: Intrinsics, head: Sequence[str]) -> str:
@@ -67,22 +58,6 @@ def _matrix(key: str, matrix: Any) -> list[str]:
     return [f"{key}:", f"  rows: {n_rows}", f"  cols: {n_cols}", f"  data: {numbers(matrix.ravel())}"]
 
 
-@reads_back
-def read_camera_info(path: Path) -> Intrinsics:
-    """Read a camera model from a camera_info file.
-
-    Raises:
-        LceRigError: a model or shape that ROS does not support.
-    """
-    import yaml
-
-    data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    K, P = np.array(data["camera_matrix"]["data"]), np.array(data["projection_matrix"]["data"])
-    if not np.array_equal(P.reshape(3, 4), np.hstack([K.reshape(3, 3), np.zeros((3, 1))])):
-        raise LceRigError(f"{path}: projection_matrix does not belong to camera_matrix")
-    return _intrinsics(data)
-
-
 def load_camera_info(path: Path) -> Intrinsics:
     """Read a camera_info file of any maker; its projection_matrix, of a rectified image, is not used.
 
@@ -93,7 +68,10 @@ def load_camera_info(path: Path) -> Intrinsics:
 
     try:
         data = yaml.safe_load(read_file(path, MAX_DOCUMENT_BYTES))
-        return _intrinsics(data)
+        coefficients = tuple(float(value) for value in data["distortion_coefficients"]["data"])
+        size = int(data["image_width"]), int(data["image_height"])
+        K = np.array(data["camera_matrix"]["data"], dtype=np.float64)
+        return Intrinsics.from_ros(str(data["distortion_model"]), K, coefficients, size)
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read: {error.strerror}") from None
     except KeyError as error:
@@ -102,10 +80,3 @@ def load_camera_info(path: Path) -> Intrinsics:
         raise ProfileError(f"{path}: not a camera_info file of ROS: a block of it has no keys") from None
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise ProfileError(f"{path}: not a usable camera_info file: {' '.join(str(error).split())}") from None
-
-
-def _intrinsics(data: Any) -> Intrinsics:
-    coefficients = tuple(float(value) for value in data["distortion_coefficients"]["data"])
-    size = int(data["image_width"]), int(data["image_height"])
-    K = np.array(data["camera_matrix"]["data"], dtype=np.float64)
-    return Intrinsics.from_ros(str(data["distortion_model"]), K, coefficients, size)

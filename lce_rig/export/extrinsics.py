@@ -1,39 +1,24 @@
 """extrinsics.yaml: the pose and its inverse, each with its meaning, an example point and its uncertainty."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lce_rig.core.calibration import MADE_BY, Calibration
-from lce_rig.core.errors import LceRigError
-from lce_rig.core.geometry import Array, invert, pose, transform
-from lce_rig.export.files import header, number, numbers, quoted, reads_back, rows, texts
+from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.export.files import number, numbers, quoted, rows, texts
 from lce_rig.export.job import ExportJob
-from lce_rig.export.probes import TOLERANCE, check_pose
-from lce_rig.export.rotations import quaternion_wxyz, rotation_from_quaternion
+from lce_rig.export.rotations import quaternion_wxyz
 from lce_rig.rig import Rig
-from lce_rig.session.durable import write_atomically
-
-FILE_NAME = "extrinsics.yaml"
 
 
 def export_extrinsics(job: ExportJob) -> list[Path]:
-    """Write extrinsics.yaml and check it by reading it back.
-
-    Raises:
-        LceRigError: the file reads back differently.
-    """
-    rig, calibrations = job.rig, job.calibrations
-    lines = [f"# {line}" for line in header("extrinsics", rig, calibrations)]
-    lines += ["format_version: 1", f"rig: {quoted(rig.name)}", f"made_by: {quoted(MADE_BY)}", "pairs:"]
-    for calibration in calibrations:
-        lines += _pair(calibration, rig)
-    path = job.folder / FILE_NAME
-    write_atomically(path, "\n".join(lines) + "\n")
-    _check(path, calibrations, rig)
-    return [path]
+    """Write extrinsics.yaml."""
+    lines = [f"# {line}" for line in job.head("extrinsics", *job.calibrations)]
+    lines += ["format_version: 1", f"rig: {quoted(job.rig.name)}", f"made_by: {quoted(MADE_BY)}", "pairs:"]
+    for calibration in job.calibrations:
+        lines += _pair(calibration, job.rig)
+    return [job.write("extrinsics.yaml", lines)]
 
 
 def _pair(calibration: Calibration, rig: Rig) -> list[str]:
@@ -104,34 +89,4 @@ def _judgement(calibration: Calibration) -> list[str]:
         f"    {what}: {'true' if calibration.certificate.is_optimal else 'false'}",
         f"    n_captures: {calibration.n_captures}",
         f"    captures_used: {texts(calibration.captures_used)}",
-    ]
-
-
-@reads_back
-def _check(path: Path, calibrations: Sequence[Calibration], rig: Rig) -> None:
-    import yaml
-
-    pairs = yaml.safe_load(path.read_text(encoding="utf-8"))["pairs"]
-    if len(pairs) != len(calibrations):
-        raise LceRigError(f"{path}: {len(pairs)} pairs read back, {len(calibrations)} written")
-    for pair, calibration in zip(pairs, calibrations, strict=True):
-        for way, T in _poses(pair["T_cam_lidar"]):
-            check_pose(path, f"T_cam_lidar.{way}", T, calibration, rig)
-        for way, T in _poses(pair["T_lidar_cam"]):
-            check_pose(path, f"T_lidar_cam.{way}", invert(T), calibration, rig)
-        worked = pair["T_cam_lidar"]["worked_point"]
-        point_camera = transform(calibration.T_cam_lidar, np.array([worked["p_lidar_m"]]))
-        if not np.abs(point_camera - worked["p_cam_m"]).max() <= TOLERANCE:
-            raise LceRigError(f"{path}: the example point of T_cam_lidar is wrong")
-
-
-def _poses(block: Mapping[str, Any]) -> list[tuple[str, Array]]:
-    """List the pose in each representation of the block."""
-    t = np.array(block["translation_m"], dtype=np.float64)
-    wxyz = np.array(block["quaternion_wxyz"], dtype=np.float64)
-    x, y, z, w = block["quaternion_xyzw"]
-    return [
-        ("matrix", np.array(block["matrix"], dtype=np.float64)),
-        ("quaternion_wxyz", pose(rotation_from_quaternion(wxyz), t)),
-        ("quaternion_xyzw", pose(rotation_from_quaternion(np.array([w, x, y, z])), t)),
     ]

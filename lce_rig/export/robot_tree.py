@@ -1,39 +1,81 @@
-"""A robot's own tree of frames, and what has to change in it for calibrations to hold.
+"""A robot's own tree of frames, and the changes in it that make calibrations hold.
 
 The tree comes from the profile's `mount`, from the robot's URDF, or from the static transforms of a
 recording. Without any of them the sensors make a tree of their own. All outputs with frames are made from
 `build_trees`.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, SessionError
 from lce_rig.core.geometry import Array, difference, invert, tangent_sizes
-from lce_rig.export.frames import T_BODY_OPTICAL, FrameTree, Joint, check_tree, choose_channels
-from lce_rig.export.probes import check_pose
+from lce_rig.export.rotations import T_BODY_OPTICAL
 from lce_rig.rig import Rig
 
+_VERDICTS = ("pass", "marginal", "fail")
 
-@dataclass(frozen=True, eq=False)
-class RobotJoint:
-    """A joint of a robot.
+
+class Joint(NamedTuple):
+    """A joint between two frames.
 
     Attributes:
-        parent: the frame above.
-        T_parent_child: (4, 4), where a joint that moves stands at zero.
+        parent, child: the frames.
+        T_parent_child: (4, 4), the child's pose in the parent's frame; of a joint that moves, at zero.
         is_fixed: whether it never moves.
-        name: of the joint; "" where joints have none.
+        name: in the robot's URDF; "" where joints have none.
+        is_optical: whether it is the rotation from a camera's body to its optical frame.
+        is_given: whether the robot's own tree has it like this already.
     """
 
     parent: str
+    child: str
     T_parent_child: Array
     is_fixed: bool = True
     name: str = ""
+    is_optical: bool = False
+    is_given: bool = False
+
+
+class FrameTree(NamedTuple):
+    """Frames under one root; joints with parents first."""
+
+    root: str
+    joints: tuple[Joint, ...]
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """All frames, the root first."""
+        return (self.root, *(joint.child for joint in self.joints))
+
+
+class JointChange(NamedTuple):
+    """A joint that is new, or that has another pose.
+
+    Attributes:
+        joint: as it is to be.
+        before: T_parent_child (4, 4) of the robot's own; None for a new joint.
+    """
+
+    joint: Joint
+    before: Array | None
+
+    @property
+    def is_real(self) -> bool:
+        """Whether it is more than rounding."""
+        return self.before is None or not np.allclose(self.joint.T_parent_child, self.before, atol=1e-9)
+
+    @property
+    def moved(self) -> tuple[float, float] | None:
+        """The size of the change (deg, m); None for a new joint."""
+        if self.before is None:
+            return None
+        return tangent_sizes(difference(self.joint.T_parent_child, self.before))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,37 +90,48 @@ class RobotTree:
 
     source: str
     frames: frozenset[str]
-    above: Mapping[str, RobotJoint]
+    above: Mapping[str, Joint]
 
     @classmethod
     def of_joints(
         cls,
         source: str,
-        joints: Iterable[tuple[str, RobotJoint]],
+        joints: Sequence[Joint],
         links: Iterable[str] | None = None,
         *,
         has_one_root: bool = True,
     ) -> "RobotTree":
-        """Build the tree of (child, joint) pairs.
+        """Build the tree of joints, and check that it is one.
 
         Args:
             source: for messages.
-            joints: each frame with the joint above it.
+            joints: in any order.
             links: the frames, where the source lists them.
-            has_one_root: as for `check_tree`.
+            has_one_root: whether it has to be one tree; else several, as static transforms make where others
+                change while the robot drives.
 
         Raises:
-            SessionError: it is not a tree.
+            SessionError: no frame, a name twice, an unknown frame, two parents, several roots, or a loop.
         """
-        joints = list(joints)
-        named = dict.fromkeys(frame for child, joint in joints for frame in (joint.parent, child))
-        frames = list(named if links is None else links)
-        try:
-            pairs = [(joint.parent, child) for child, joint in joints]
-            check_tree(frames, pairs, has_one_root=has_one_root)
-        except LceRigError as error:
-            raise SessionError(f"{source}: not a tree of frames: {error.what}") from error
-        return cls(source, frozenset(frames), dict(joints))
+        named = dict.fromkeys(frame for joint in joints for frame in (joint.parent, joint.child))
+        counts = Counter(list(named) if links is None else links)
+        above: dict[str, Joint] = {}
+        faults = ["no links"] if not counts else []
+        faults += [f"link {link} is defined twice" for link, count in counts.items() if count > 1]
+        faults += [f"a joint names link {link}, which is not defined" for link in named if link not in counts]
+        for joint in joints:
+            if joint.child in above:
+                parents = f"{above[joint.child].parent} and {joint.parent}"
+                faults.append(f"link {joint.child} has two parents, {parents}")
+            above[joint.child] = joint
+        roots = [link for link in counts if link not in above]
+        if has_one_root and len(roots) > 1:
+            faults.append(f"several roots: {', '.join(roots)}")
+        if not faults:
+            faults = _loops(roots, above)
+        if faults:
+            raise SessionError(f"{source}: not a tree of frames: {faults[0]}")
+        return cls(source, frozenset(counts), above)
 
     def chain(self, frame: str) -> list[str]:
         """List a frame and those above it, up to the root."""
@@ -100,16 +153,16 @@ class RobotTree:
         Raises:
             SessionError: nothing connects them, or a joint between them moves.
         """
-        chain_a, chain_b = self.chain(frame_a), self.chain(frame_b)
-        common = next((frame for frame in chain_a if frame in chain_b), None)
+        above_b = set(self.chain(frame_b))
+        common = next((frame for frame in self.chain(frame_a) if frame in above_b), None)
         if common is None:
             raise SessionError(f"{self.source}: nothing connects {frame_a} and {frame_b}")
-        return invert(self._from(common, chain_a)) @ self._from(common, chain_b)
+        return invert(self._from(common, frame_a)) @ self._from(common, frame_b)
 
-    def _from(self, ancestor: str, chain: Sequence[str]) -> Array:
-        """Compute the pose of a chain's first frame in one above it."""
+    def _from(self, ancestor: str, frame: str) -> Array:
+        """Compute the pose of a frame in one above it."""
         T = np.eye(4)
-        for frame in chain[: chain.index(ancestor)]:
+        while frame != ancestor:
             joint = self.above[frame]
             if not joint.is_fixed:
                 raise SessionError(
@@ -117,75 +170,66 @@ class RobotTree:
                     "Extrinsics hold between sensors that are fixed to each other.",
                 )
             T = joint.T_parent_child @ T
+            frame = joint.parent
         return T
 
     def with_joint(self, joint: Joint) -> "RobotTree":
         """Set the pose of a frame in its parent, or add the frame."""
         old = self.above.get(joint.child)
-        new = RobotJoint(joint.parent, joint.T_parent_child, name=old.name if old else "")
+        new = Joint(joint.parent, joint.child, joint.T_parent_child, name=old.name if old else "")
         frames = self.frames | {joint.parent, joint.child}
         return replace(self, frames=frames, above={**self.above, joint.child: new})
 
 
-@dataclass(frozen=True, eq=False)
-class JointChange:
-    """A joint that is new, or that has another pose.
-
-    Attributes:
-        joint: as it is to be.
-        before: T_parent_child (4, 4) of the robot's own; None for a new joint.
-    """
-
-    joint: Joint
-    before: Array | None
-
-    @property
-    def is_real(self) -> bool:
-        """Whether it is more than rounding."""
-        return self.before is None or not np.allclose(self.joint.T_parent_child, self.before, atol=1e-9)
-
-    @property
-    def moved(self) -> tuple[float, float] | None:
-        """By how much, (deg, m); None for a new joint."""
-        if self.before is None:
-            return None
-        return tangent_sizes(difference(self.joint.T_parent_child, self.before))
+def _loops(roots: Iterable[str], above: Mapping[str, Joint]) -> list[str]:
+    """Name the loop above the first frame that leads to no root."""
+    rooted = set(roots)
+    for frame in above:
+        way: dict[str, None] = {}
+        while frame not in rooted:
+            if frame in way:
+                return [f"a loop: {' < '.join([*way, frame])}"]
+            way[frame] = None
+            frame = above[frame].parent
+        rooted.update(way)
+    return []
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A robot's tree in which calibrated sensors lie as the calibrations say.
-
-    Attributes:
-        tree: of the robot.
-        changes: in it, parents first.
-        groups: frames of sensors that calibrations connect, the one that stays first.
-        pairs: (camera, LiDAR) of the calibrations that joints express; others close a loop.
-    """
-
-    tree: RobotTree
-    changes: tuple[JointChange, ...]
-    groups: tuple[tuple[str, ...], ...]
-    pairs: frozenset[tuple[str, str]]
-
-
-def read_robot(path: Path) -> RobotTree:
-    """Read a robot's tree from its URDF, or from the static transforms of a recording.
+def choose_channels(calibrations: Sequence[Calibration], rig: Rig) -> list[Calibration]:
+    """Keep one calibration of each camera and LiDAR: by verdict, then by the smaller sigma.
 
     Raises:
-        SessionError: the file cannot be read, or its frames are not a tree.
-        SourceError: the recording cannot be read or has no static transforms; or a package is missing.
+        LceRigError: a calibration names a sensor or channel that the rig does not have.
     """
-    if path.suffix.lower() in (".urdf", ".xml", ".xacro"):
-        from lce_rig.export.robot_urdf import read_robot_urdf
+    best: dict[tuple[str, str], Calibration] = {}
+    ranks: dict[tuple[str, str], tuple[int, float, float]] = {}
+    for calibration in calibrations:
+        require_known(calibration, rig)
+        pair = calibration.camera, calibration.lidar
+        sigmas = calibration.sigma_rotation_deg, calibration.sigma_translation_m
+        rank = _VERDICTS.index(calibration.verdict), *sigmas
+        if pair not in best or rank < ranks[pair]:
+            best[pair], ranks[pair] = calibration, rank
+    return list(best.values())
 
-        return read_robot_urdf(path)
-    from lce_rig.export.robot_bag import read_robot_bag
 
-    return read_robot_bag(path)
+def require_known(calibration: Calibration, rig: Rig) -> None:
+    """Check that a calibration names sensors of the rig.
+
+    Raises:
+        LceRigError: a sensor or channel that the rig does not have.
+    """
+    camera = rig.cameras.get(calibration.camera)
+    is_known = camera is not None and set(calibration.channels) <= set(camera.channels)
+    if not is_known or calibration.lidar not in rig.lidars:
+        pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
+        what = f"the result is for {pair}, which rig {rig.name} does not have"
+        raise LceRigError(what, "Use the profile that the session was made with.")
 
 
-def fit_tree(robot: RobotTree | None, calibrations: Sequence[Calibration], rig: Rig) -> Fit:
+def fit_tree(
+    robot: RobotTree | None, calibrations: Sequence[Calibration], rig: Rig
+) -> tuple[RobotTree, list[JointChange], list[tuple[str, ...]]]:
     """Change the joints of a robot's tree so that calibrated sensors lie as the calibrations say.
 
     Of the sensors that calibrations connect, the one nearest to the root stays. Each other one that the
@@ -198,6 +242,10 @@ def fit_tree(robot: RobotTree | None, calibrations: Sequence[Calibration], rig: 
         calibrations: of the rig's sensors; one each of a camera and LiDAR is used.
         rig: the profile, which names the frames.
 
+    Returns:
+        The robot's tree with the changes, the changes, parents first, and the frames of sensors that
+        calibrations connect, the one that stays first.
+
     Raises:
         SessionError: the robot has none of a calibration's frames, or a joint between two of them moves, or
             a frame would get two parents.
@@ -207,7 +255,6 @@ def fit_tree(robot: RobotTree | None, calibrations: Sequence[Calibration], rig: 
     bodies = {name: lidar.frame for name, lidar in rig.lidars.items()}
     bodies |= {name: camera.frame for name, camera in rig.cameras.items()}
     groups: list[tuple[str, ...]] = []
-    pairs: set[tuple[str, str]] = set()
     for names in _connected(chosen, bodies):
         frames = [bodies[name] for name in names]
         if robot is None and not tree.frames.intersection(frames):
@@ -219,12 +266,11 @@ def fit_tree(robot: RobotTree | None, calibrations: Sequence[Calibration], rig: 
                 lidar = rig.lidars[calibration.lidar].frame
                 camera = rig.cameras[calibration.camera].frame
                 if anchor in (lidar, camera) and not {lidar, camera} <= set(placed):
-                    tree, found = _placed(tree, calibration, rig, anchor)
-                    changes += found
+                    tree, placing = _placed(tree, calibration, rig, anchor)
+                    changes += placing
                     placed.append(camera if anchor == lidar else lidar)
-                    pairs.add((calibration.camera, calibration.lidar))
         groups.append(tuple(placed))
-    return Fit(tree, tuple(changes), tuple(groups), frozenset(pairs))
+    return tree, changes, groups
 
 
 def build_trees(
@@ -239,47 +285,21 @@ def build_trees(
         LceRigError: a calibration names a sensor that the rig does not have.
         SessionError: they do not fit into the robot's tree, see `fit_tree`.
     """
-    fit = fit_tree(robot, calibrations, rig)
+    tree, changes, groups = fit_tree(robot, calibrations, rig)
     optical = {camera.frame: camera.optical_frame for camera in rig.cameras.values()}
-    cameras = {name: camera.frame for name, camera in rig.cameras.items()}
-    changed = {change.joint.child for change in fit.changes if change.is_real}
+    changed = {change.joint.child for change in changes if change.is_real}
     joints: dict[str, dict[str, Joint]] = {}
-    for group in fit.groups:
+    for group in groups:
         for frame in (*group, *(optical[body] for body in group if body in optical)):
-            *below, root = fit.tree.fixed_chain(frame)
+            *below, root = tree.fixed_chain(frame)
             for child in reversed(below):
-                joint = fit.tree.above[child]
+                joint = tree.above[child]
                 is_optical = optical.get(joint.parent) == child and np.allclose(
                     joint.T_parent_child, T_BODY_OPTICAL, atol=1e-9
                 )
-                made = Joint(joint.parent, child, joint.T_parent_child, is_optical, child not in changed)
-                joints.setdefault(root, {}).setdefault(child, made)
-    return [
-        FrameTree(root, tuple(own.values()), frozenset(p for p in fit.pairs if cameras[p[0]] in {root, *own}))
-        for root, own in joints.items()
-    ]
-
-
-def check_frames(
-    path: Path,
-    what: str,
-    tree: RobotTree,
-    trees: Sequence[FrameTree],
-    calibrations: Sequence[Calibration],
-    rig: Rig,
-) -> None:
-    """Check by the probe points that a tree read back from a file says what the calibrations say.
-
-    Raises:
-        LceRigError: a point lands more than 1e-6 m or px elsewhere.
-    """
-    expressed = frozenset[tuple[str, str]]().union(*(each.pairs for each in trees))
-    for calibration in calibrations:
-        if (calibration.camera, calibration.lidar) in expressed:
-            optical = rig.cameras[calibration.camera].optical_frame
-            lidar = rig.lidars[calibration.lidar].frame
-            T_cam_lidar = tree.find_pose(optical, lidar)
-            check_pose(path, f"{what}the chain {lidar} to {optical}", T_cam_lidar, calibration, rig)
+                joint = joint._replace(is_optical=is_optical, is_given=child not in changed)
+                joints.setdefault(root, {}).setdefault(child, joint)
+    return [FrameTree(root, tuple(below.values())) for root, below in joints.items()]
 
 
 def _mounted(robot: RobotTree | None, rig: Rig) -> tuple[RobotTree, list[JointChange]]:
@@ -319,13 +339,13 @@ def _connected(chosen: Sequence[Calibration], bodies: Mapping[str, str]) -> list
 
 def _anchor(tree: RobotTree, frames: Sequence[str]) -> str:
     """Choose the frame that stays: of those that the robot has, the one nearest to its root."""
-    known = [frame for frame in frames if frame in tree.frames]
-    if not known:
+    present = [frame for frame in frames if frame in tree.frames]
+    if not present:
         raise SessionError(
             f"{tree.source} has none of the sensors' frames: {', '.join(frames)}",
             "Name the robot's frames in the profile (`frame` of each sensor), or set `mount` there.",
         )
-    return min(known, key=lambda frame: len(tree.chain(frame)))
+    return min(present, key=lambda frame: len(tree.chain(frame)))
 
 
 def _placed(
@@ -336,12 +356,12 @@ def _placed(
     optical = _optical(tree, camera.frame, camera.optical_frame)
     T_lidar_body = invert(calibration.T_cam_lidar) @ invert(optical.T_parent_child)
     if anchor == lidar:
-        found = _place(tree, lidar, camera.frame, T_lidar_body)
+        joint = _place(tree, lidar, camera.frame, T_lidar_body)
     else:
-        found = _place(tree, camera.frame, lidar, invert(T_lidar_body))
-    above = tree.above.get(found.child)
-    changes = [JointChange(found, None if above is None else above.T_parent_child)]
-    tree = tree.with_joint(found)
+        joint = _place(tree, camera.frame, lidar, invert(T_lidar_body))
+    above = tree.above.get(joint.child)
+    changes = [JointChange(joint, None if above is None else above.T_parent_child)]
+    tree = tree.with_joint(joint)
     if camera.optical_frame not in tree.frames:
         changes.append(JointChange(optical, None))
         tree = tree.with_joint(optical)

@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from lce_rig.core.geometry import Array
-from lce_rig.export.urdf import read_urdf
+from lce_rig.export.robot_files import read_robot_urdf
 
 _COLOURS = ("#e5484d", "#2b9a3e", "#2f6fdb")
 _CAMERA_FRAMES = ("camera_link", "camera_optical_frame")
@@ -16,7 +16,7 @@ _LENGTH_M = 0.1
 
 def draw_frames(urdf: Path) -> Any:
     """Draw both frames of the camera of rig rlfs, each with the LiDAR's, from behind and above."""
-    frames = read_urdf(urdf)
+    frames = read_robot_urdf(urdf)
     figure = plt.figure(figsize=(9.6, 4.4))
     for column, name in enumerate(_CAMERA_FRAMES):
         axes: Any = figure.add_subplot(1, 2, 1 + column, projection="3d")

@@ -6,10 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lce_rig.collect.findings import CALIBRATE_KNOWN_PLACEMENT
 from lce_rig.core.calibration import Calibration, Certificate, Metrics
 from lce_rig.core.diagnostics import Diagnostics
-from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, exp_so3, pose
+from lce_rig.detect.findings import LIDAR_TOO_FEW_RINGS
+from lce_rig.judge.findings import ROTATION_UNCERTAIN, WIDENED
 from lce_rig.rig import Rig, load_rig
 
 Make = Callable[..., Calibration]
@@ -61,18 +64,13 @@ def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration
         "n_detected": 3,
         "captures_used": ("000000", "000002"),
         "captures_refused": {
-            "000003": Refusal(
-                "calibrate.known_placement", figures={"capture": "000002", "instruction": "näher – ¼ m"}
-            ),
-            "000001": Refusal(
-                "lidar.too_few_rings",
-                figures={"n_rings": 2, "min_rings": 4, "distance_m": 1.6, "closer_m": 0.8},
-            ),
+            "000003": CALIBRATE_KNOWN_PLACEMENT.refusal(capture="000002", instruction="näher – ¼ m"),
+            "000001": LIDAR_TOO_FEW_RINGS.refusal(n_rings=2, min_rings=4, distance_m=1.6, closer_m=0.8),
         },
         "verdict": "pass",
         "findings": (
-            Finding("verdict.widened", "note", figures={"ratio": 1.5, "spread": "halves"}),
-            Finding("verdict.rotation_uncertain", "warning", figures=_UNCERTAIN, action="measure_ranges"),
+            WIDENED(ratio=1.5, spread="halves"),
+            ROTATION_UNCERTAIN(severity="warning", action="measure_ranges", **_UNCERTAIN),
         ),
         "diagnostics": Diagnostics(n_placements=4.0, fit_plane_rms_m=1 / 300),
     }
@@ -81,7 +79,7 @@ def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration
 
 def reason(text: str) -> Finding:
     """A reason of a verdict that only its words tell from others."""
-    return Finding("verdict.text", figures={"text": text, "advice": ""})
+    return Finding("verdict.text", figures={"text": text}, stored=(text, ""))
 
 
 def some_pose(

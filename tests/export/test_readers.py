@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.outputs import MODELS, READERS, Case, off_px, outputs_case, session_image
 
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, perturb
@@ -15,6 +14,7 @@ from lce_rig.export.coloured_cloud import coloured
 from lce_rig.export.job import ExportJob
 from lce_rig.rig import load_rig
 from lce_rig.rig.profile import OutputFormat
+from tests.export.readers import MODELS, READERS, Case, off_px, outputs_case, session_image
 
 
 @pytest.fixture(scope="module", params=MODELS)

@@ -1,7 +1,9 @@
 """Calibrations in a robot's own tree of frames: its parents, comments and order stay."""
 
+import time
 from collections.abc import Callable
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +15,8 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.export import export
-from lce_rig.export.robot_tree import fit_tree
-from lce_rig.export.robot_urdf import read_robot_urdf, write_into_urdf
-from lce_rig.export.urdf import read_urdf
+from lce_rig.export.robot_files import read_robot_urdf, write_into_urdf
+from lce_rig.export.robot_tree import build_trees, fit_tree
 from lce_rig.rig import Rig
 from lce_rig.rig.mount import Mount
 
@@ -55,11 +56,11 @@ def test_a_camera_is_moved_below_its_own_parent_or_added_below_the_lidar(
     text = HEAD + BASE + MAST + (CAMERA.format(kind="fixed") if has_camera else "")
     text += (OPTICAL if has_camera and has_optical else "") + "</robot>\n<!-- end -->\n"
     path.write_text(text)
-    update = write_into_urdf(path, [calibration], rles, NOW)
+    backup, _ = write_into_urdf(path, [calibration], rles, NOW)
     np.testing.assert_allclose(found(path, rles), calibration.T_cam_lidar, atol=1e-9)
-    assert update.backup == tmp_path / "cart.urdf.2026-05-04T101500.bak"
-    assert update.backup.read_text() == text
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["cart.urdf", update.backup.name]
+    assert backup == tmp_path / "cart.urdf.2026-05-04T101500.bak"
+    assert backup.read_text() == text
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cart.urdf", backup.name]
     tree = read_robot_urdf(path)
     assert tree.above["davis_link"].parent == ("base_link" if has_camera else "velodyne")
     if has_optical and has_camera:
@@ -68,7 +69,7 @@ def test_a_camera_is_moved_below_its_own_parent_or_added_below_the_lidar(
     lines = iter(path.read_text().splitlines())
     kept = [line for line in text.splitlines() if "bracket" not in line and line != "</robot>"]
     assert all(line in lines for line in kept)
-    assert write_into_urdf(path, [calibration], rles, NOW).backup is None
+    assert write_into_urdf(path, [calibration], rles, NOW) == (None, [])
 
 
 def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(
@@ -77,8 +78,7 @@ def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(
     path, calibration = tmp_path / "cart.urdf", make()
     mast = MAST.replace('"base_link"', '"davis_link"')
     path.write_text(HEAD + BASE + CAMERA.format(kind="fixed") + mast + OPTICAL + "</robot>\n")
-    update = write_into_urdf(path, [calibration], rles, NOW)
-    (change,) = update.changes
+    _, (change,) = write_into_urdf(path, [calibration], rles, NOW)
     assert change.joint.child == "velodyne" and change.before is not None and change.moved is not None
     turn = Rotation.from_matrix(change.joint.T_parent_child[:3, :3] @ change.before[:3, :3].T)
     shift = change.joint.T_parent_child[:3, 3] - change.before[:3, 3]
@@ -90,25 +90,56 @@ def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(
 @pytest.mark.parametrize(
     ("text", "what"),
     [
+        *(
+            (HEAD + BASE + MAST.replace("0.9", bad) + "</robot>", "joint mast")
+            for bad in ("nan", "1e999", "")
+        ),
+        ((HEAD.replace("?>", ' encoding="utf-16"?>') + BASE + MAST + "</robot>").encode("utf-16"), "UTF-8"),
         (HEAD + BASE + MAST + CAMERA.format(kind="revolute") + "</robot>", "moves"),
         (HEAD + '<link name="base_link"/></robot>', "none of the sensors' frames"),
         (HEAD + BASE + MAST + MAST.replace("mast", "other") + "</robot>", "two parents"),
         (HEAD + BASE + MAST + OPTICAL.replace("davis_link", "base_link") + "</robot>", "is not below"),
         (HEAD + "<xacro:include/>" + BASE + MAST + "</robot>", "xacro"),
-        (HEAD + BASE, "not a URDF"),
-        ("", "not a URDF"),
+        (HEAD + BASE, ""),
+        ("", ""),
     ],
 )
 def test_what_does_not_fit_is_refused_and_stays_as_it_was(
-    rles: Rig, make: Make, tmp_path: Path, text: str, what: str
+    rles: Rig, make: Make, tmp_path: Path, text: str | bytes, what: str
 ) -> None:
     path = tmp_path / "cart.urdf"
-    path.write_text(text)
+    before = text.encode() if isinstance(text, str) else text
+    path.write_bytes(before)
     with pytest.raises(SessionError) as error:
         write_into_urdf(path, [make()], rles, NOW)
     assert what in error.value.what and str(path) in error.value.what
-    assert path.read_text() == text
+    assert path.read_bytes() == before
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_link_stays_a_link_and_its_target_gets_the_joints(rles: Rig, make: Make, tmp_path: Path) -> None:
+    target, link = tmp_path / "package" / "cart.urdf", tmp_path / "cart.urdf"
+    target.parent.mkdir()
+    target.write_text(HEAD + BASE + MAST + "</robot>\n")
+    link.symlink_to(target)
+    backup, _ = write_into_urdf(link, [make()], rles, NOW)
+    assert link.is_symlink() and link.resolve() == target and not target.is_symlink()
+    np.testing.assert_allclose(found(target, rles), make().T_cam_lidar, atol=1e-9)
+    assert backup is not None and backup.parent == target.parent
+
+
+def test_a_chain_of_2000_links_takes_less_than_a_second(rles: Rig, make: Make, tmp_path: Path) -> None:
+    links = [f"link_{k}" for k in range(2000)] + ["velodyne"]
+    text = "".join(f'<link name="{link}"/>\n' for link in links)
+    for parent, child in pairwise(links):
+        ends = f'<parent link="{parent}"/><child link="{child}"/>'
+        text += f'<joint name="to_{child}" type="fixed">{ends}</joint>\n'
+    path = tmp_path / "cart.urdf"
+    path.write_text(HEAD + text + "</robot>\n")
+    begun_s = time.process_time()
+    write_into_urdf(path, [make()], rles, NOW)
+    build_trees([make()], rles, read_robot_urdf(path))
+    assert time.process_time() - begun_s < 1.0
 
 
 def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(
@@ -120,19 +151,19 @@ def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(
     calibrations = [make(T, camera=c, lidar=lidar) for T, (c, lidar) in zip(poses, pairs, strict=True)]
     path = tmp_path / "cart.urdf"
     path.write_text(HEAD + BASE + MAST + CAMERA.format(kind="fixed") + "</robot>")
-    fit = fit_tree(read_robot_urdf(path), calibrations, three_sensor_rig)
-    assert [change.before is None for change in fit.changes].count(False) == 1
+    tree, changes, _ = fit_tree(read_robot_urdf(path), calibrations, three_sensor_rig)
+    assert [change.before is None for change in changes].count(False) == 1
     for calibration, T in zip(calibrations, poses, strict=True):
         optical = three_sensor_rig.cameras[calibration.camera].optical_frame
         lidar = three_sensor_rig.lidars[calibration.lidar].frame
-        np.testing.assert_allclose(fit.tree.find_pose(optical, lidar), T, atol=1e-12)
+        np.testing.assert_allclose(tree.find_pose(optical, lidar), T, atol=1e-12)
 
 
 def test_with_a_mount_all_outputs_hang_from_the_robots_frame(rles: Rig, make: Make, tmp_path: Path) -> None:
     mount = Mount(parent="base_link", of="davis_link", xyz_m=(0.1, 0.2, 0.3), rpy_deg=(10.0, 20.0, 30.0))
     rig = rles.model_copy(update={"mount": mount})
     export([make()], rig, tmp_path)
-    read = read_urdf(tmp_path / f"{rig.name}.urdf")
+    read = read_robot_urdf(tmp_path / f"{rig.name}.urdf")
     assert read.chain("velodyne")[-1] == "base_link"
     np.testing.assert_allclose(read.find_pose("base_link", "davis_link"), mount.to_matrix())
     np.testing.assert_allclose(read.find_pose("davis_optical_frame", "velodyne"), make().T_cam_lidar)

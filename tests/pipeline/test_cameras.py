@@ -14,7 +14,7 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, invert
 from lce_rig.detect.detection import Detections
 from lce_rig.export import export
-from lce_rig.export.urdf import read_urdf
+from lce_rig.export.robot_files import read_robot_urdf
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import load_rig
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
@@ -206,7 +206,7 @@ def test_the_result_file_holds_it_and_gives_it_back(together, by_paper, tmp_path
 
 def test_exports_put_both_cameras_where_they_are(together, tmp_path):
     export(list(together.values()), RIG, tmp_path, is_forced=False)
-    read = read_urdf(tmp_path / "two_cameras.urdf")
+    read = read_robot_urdf(tmp_path / "two_cameras.urdf")
     T = read.find_pose("right_optical_frame", "left_optical_frame")
     assert np.allclose(T, together[RIGHT].other_cameras[0].T_cam_other, atol=1e-9)
     assert read.frames >= {"velodyne", "left_link", "right_link"}

@@ -9,7 +9,7 @@ import yaml
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
-from lce_rig.export.camera_info import read_camera_info
+from lce_rig.export.camera_info import load_camera_info
 from lce_rig.judge.intrinsics_check import judge_lens
 from lce_rig.lens.models import MODELS
 from lce_rig.pipeline.intrinsics import measure_intrinsics
@@ -131,7 +131,7 @@ def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     block = yaml.safe_load((session.path / "intrinsics" / "davis.yaml").read_text())["intrinsics"]
     assert block["fx_px"] == lens.fx_px
     assert tuple(block["distortion"]) == lens.distortion
-    info = read_camera_info(session.path / "intrinsics" / "camera_info_davis.yaml")
+    info = load_camera_info(session.path / "intrinsics" / "camera_info_davis.yaml")
     assert (info.matrix == lens.matrix).all()
     document = json.loads(files[0].read_text())["cameras"][0]
     assert document["intrinsics"]["cy_px"] == lens.cy_px

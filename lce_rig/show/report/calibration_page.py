@@ -10,8 +10,7 @@ from markupsafe import Markup
 from lce_rig.core.calibration import Calibration, CaptureResidual
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
-from lce_rig.export.frames import T_BODY_OPTICAL
-from lce_rig.export.rotations import rpy
+from lce_rig.export.rotations import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words, weakest_words
 from lce_rig.rig import Rig
 from lce_rig.show.report.board_drawings import draw_from_above, draw_in_image, draw_ranges_and_angles

@@ -82,7 +82,7 @@ def test_the_pose_is_that_of_the_camera_s_body_in_the_lidar_s_frame(one, one_pag
 
 def test_a_failed_result_is_explained(one):
     reasons = (
-        Finding("verdict.text", "error", figures={"text": "the <board> moved", "advice": "hold it `still`"}),
+        Finding("verdict.text", "error", stored=("the <board> moved", "hold it `still`")),
         Finding("verdict.not_certified", "warning", figures={"gap": 0.1}),
     )
     text = page(RLFS, replace(one, verdict="fail", findings=reasons))

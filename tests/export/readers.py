@@ -7,7 +7,6 @@ conventions of the format, through its own parser and OpenCV's projection. Tests
 import json
 import shlex
 import sys
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +18,11 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from benchmarks.tables import print_head, print_row
 from lce_rig.core.calibration import Calibration, Certificate, Metrics
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.geometry import Array, exp_so3, pose, transform
+from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.export import EXPORTS, export_formats
 from lce_rig.export.lens import fit_coefficients
-from lce_rig.export.probes import probe_points
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.mount import Mount
 from lce_rig.session import Session
@@ -310,6 +307,18 @@ def _ply(case: Case) -> Array:
     return wanted + (named - nearest % 256)
 
 
+def probe_points(calibration: Calibration, rig: Rig) -> Array:
+    """List points (N, 3) m, frame LiDAR, that cover the camera's image at 1 to 10 m."""
+    intrinsics = rig.cameras[calibration.camera].to_intrinsics()
+    u = np.linspace(0.05, 0.95, 5) * (intrinsics.width_px - 1)
+    v = np.linspace(0.05, 0.95, 5) * (intrinsics.height_px - 1)
+    rays = intrinsics.unproject(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+    # A lens model may end before the image's corners.
+    rays = rays[np.isfinite(rays).all(axis=1)]
+    points_camera = (rays[:, None, :] * np.array([1.0, 3.0, 10.0])[:, None]).reshape(-1, 3)
+    return transform(invert(calibration.T_cam_lidar), points_camera)
+
+
 READERS: dict[tuple[str, str], Callable[[Case], Array]] = {
     ("extrinsics", "PyYAML, scipy"): _extrinsics,
     ("urdf", "yourdfpy"): _urdf,
@@ -407,18 +416,3 @@ def off_px(case: Case, name: str, reader: Callable[[Case], Array]) -> float:
     intrinsics = fit_coefficients(given, FITTED[name]).intrinsics if name in FITTED else given
     wanted, is_seen = intrinsics.project(transform(case.calibration.T_cam_lidar, case.points_lidar))
     return float(np.abs(reader(case) - wanted)[is_seen].max())
-
-
-def bench_outputs() -> None:
-    """Tabulate the largest difference of every reader over kinds of lens, and what fitted models miss."""
-    with tempfile.TemporaryDirectory() as folder:
-        cases = [outputs_case("rlfs", Path(folder) / model, model=model) for model in MODELS]
-        print_head("format", "reader", *(f"{model} (px)" for model in MODELS.values()))
-        for (name, program), reader in READERS.items():
-            print_row(f"`{name}`", program, *(f"{off_px(case, name, reader):.1g}" for case in cases))
-    print_head("coefficients", *(f"{model}: rms, most (px)" for model in MODELS.values()))
-    for n_coefficients in sorted(set(FITTED.values())):
-        given = [case.rig.cameras[case.camera].to_intrinsics() for case in cases]
-        fits = [fit_coefficients(each, n_coefficients) for each in given]
-        told = (f"{fit.rms_px:.2g}, {fit.max_px:.2g}" if fit.max_px else "as given" for fit in fits)
-        print_row(n_coefficients, *told)
