@@ -2,9 +2,8 @@
 
 import sys
 from collections import Counter
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -13,7 +12,7 @@ from lce_rig.cli.options import FiniteRange, json_option, rig_option
 
 if TYPE_CHECKING:
     from lce_rig.core.findings import Severity
-    from lce_rig.doctor import Check
+    from lce_rig.doctor.examination import Check
 
 _MARKS = {"note": "[green]ok[/]", "warning": "[yellow]warn[/]", "error": "[bold red]FAIL[/]"}
 _EXIT_ERROR = 5
@@ -52,8 +51,8 @@ def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
     Exits with 5 if a check reports FAIL, else with 0.
     """
     from lce_rig.core.findings import worst
+    from lce_rig.doctor.examination import sensors
     from lce_rig.doctor.examine import DoctorOptions, examine
-    from lce_rig.doctor.sensor_sources import sensors
     from lce_rig.rig import load_rig
 
     rig = load_rig(rig_name)
@@ -61,27 +60,27 @@ def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
     checks = examine(rig, DoctorOptions(duration, folder))
     severity = worst(found for check in checks for found in check.findings)
     if as_json:
-        show.print_json(_document(rig.name, severity, checks))
+        # Figures that were not measured are null.
+        lines = [
+            {
+                "subject": check.subject,
+                "name": check.name,
+                "severity": check.severity,
+                "findings": [finding.as_json() for finding in check.findings],
+            }
+            for check in checks
+        ]
+        show.print_json({"format_version": 2, "rig": rig.name, "severity": severity, "checks": lines})
     else:
         _print_screen(checks)
-        show.say(_summary(checks))
+        n = Counter(check.severity for check in checks)
+        if n["error"]:
+            show.say(f"{n['error']} FAIL, {n['warning']} warn, {n['note']} ok: follow the lines after ->")
+        elif n["warning"]:
+            show.say(f"{n['warning']} warn, {n['note']} ok: fit to collect, with the limits above")
+        else:
+            show.say(f"all {n['note']} ok: fit to collect")
     return _EXIT_ERROR if severity == "error" else 0
-
-
-def _document(rig: str, severity: str, checks: "list[Check]") -> dict[str, Any]:
-    """Return every line with its findings, with null for figures that were not measured."""
-    from lce_rig.words import as_json
-
-    lines = [
-        {
-            "subject": check.subject,
-            "name": check.name,
-            "severity": check.severity,
-            "findings": [as_json(found) for found in check.findings],
-        }
-        for check in checks
-    ]
-    return {"format_version": 2, "rig": rig, "severity": severity, "checks": lines}
 
 
 def _print_screen(checks: "list[Check]") -> None:
@@ -90,11 +89,17 @@ def _print_screen(checks: "list[Check]") -> None:
 
     console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
     room = console.height - _N_OTHER_LINES
-    lines = [_Line.of(check) for check in checks]
+    lines = [_line(check) for check in checks]
     for subject in dict.fromkeys(line.subject for line in lines):
         if not sys.stdout.isatty() or len(console.render_lines(_screen(lines))) <= room:
             break
-        lines = _together(lines, subject)
+        fine = [line for line in lines if line.subject == subject and line.severity == "note"]
+        if len(fine) > 1:
+            # One line for those that are ok, before those that are not.
+            at = next(index for index, line in enumerate(lines) if line.subject == subject)
+            lines = [line for line in lines if line not in fine]
+            names = ", ".join(line.name for line in fine)
+            lines.insert(at, fine[0]._replace(name="", text=names, actions=()))
     with console.capture() as capture:
         console.print(_screen(lines))
     # Rich fills wrapped lines up with blanks.
@@ -102,8 +107,7 @@ def _print_screen(checks: "list[Check]") -> None:
         click.echo(line.rstrip())
 
 
-@dataclass(frozen=True)
-class _Line:
+class _Line(NamedTuple):
     """A check in words: its findings in one line, and a line for each action."""
 
     subject: str
@@ -112,29 +116,13 @@ class _Line:
     text: str
     actions: tuple[str, ...]
 
-    @staticmethod
-    def of(check: "Check") -> "_Line":
-        from lce_rig.words import as_line, describe, recommend
 
-        actions = [action for found in check.findings for action in recommend(found).splitlines()]
-        return _Line(
-            check.subject,
-            check.name,
-            check.severity,
-            "; ".join(describe(found) for found in check.findings),
-            tuple(dict.fromkeys(as_line(action) for action in actions)),
-        )
+def _line(check: "Check") -> _Line:
+    from lce_rig.core.phrasing import as_line
 
-
-def _together(lines: list[_Line], subject: str) -> list[_Line]:
-    """Put a subject's lines that are ok into one, before those that are not."""
-    fine = [line for line in lines if line.subject == subject and line.severity == "note"]
-    if len(fine) < 2:
-        return lines
-    names = ", ".join(line.name for line in fine)
-    at = next(index for index, line in enumerate(lines) if line.subject == subject)
-    rest = [line for line in lines if line not in fine]
-    return [*rest[:at], replace(fine[0], name="", text=names, actions=()), *rest[at:]]
+    text = "; ".join(finding.text for finding in check.findings)
+    actions = [as_line(action) for finding in check.findings for action in finding.advice.splitlines()]
+    return _Line(check.subject, check.name, check.severity, text, tuple(dict.fromkeys(actions)))
 
 
 def _screen(lines: list[_Line]) -> Any:
@@ -160,12 +148,3 @@ def _screen(lines: list[_Line]) -> Any:
         ]
         last = line.subject
     return Group(*rows)
-
-
-def _summary(checks: "list[Check]") -> str:
-    n = Counter(check.severity for check in checks)
-    if n["error"]:
-        return f"{n['error']} FAIL, {n['warning']} warn, {n['note']} ok: follow the lines after ->"
-    if n["warning"]:
-        return f"{n['warning']} warn, {n['note']} ok: fit to collect, with the limits above"
-    return f"all {n['note']} ok: fit to collect"

@@ -1,72 +1,66 @@
 """Is this computer, with these sensors, fit to collect? Every check in a table, and how they are made."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
+from lce_rig.core import velodyne
 from lce_rig.core.data import Image, join_events
 from lce_rig.core.errors import LceRigError, SourceError, refusal_of
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.detect.events.search import find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.devices.velodyne_web import WebReport
-from lce_rig.doctor import Check
-from lce_rig.doctor.clocks import (
-    check_clock,
-    check_edges,
-    check_frames_of_pulses,
-    check_offsets,
-    check_pulses_sent,
-    check_sync,
-)
-from lce_rig.doctor.computer import COMPUTER_CHECKS
-from lce_rig.doctor.devices import (
-    check_board,
-    check_device,
-    check_events,
-    check_image,
-    check_pulse,
-    check_settings,
-    check_stream,
-    read_web,
-)
-from lce_rig.doctor.observing import ObservedSensor, SensorReport, observe
-from lce_rig.doctor.sensor_sources import driver_of, sensors, source_of
+from lce_rig.devices.velodyne_web import VelodyneWeb, WebReport
+from lce_rig.doctor import clocks, computer, findings, streams
+from lce_rig.doctor.examination import Check, Examination, driver_of, sensors, source_of
+from lce_rig.doctor.observing import ObservedSensor, observe
 from lce_rig.rig import Rig
 from lce_rig.rig.sync_settings import BOARD
 
-SensorCheck = Callable[[SensorReport, str], Check | None]
+_WEB_TIMEOUT_S = 1.0
 
-LIDAR_CHECKS: tuple[SensorCheck, ...] = (check_device, check_settings, check_stream, check_pulse, check_board)
-CAMERA_CHECKS: tuple[SensorCheck, ...] = (
-    check_device,
-    check_stream,
-    check_clock,
-    check_frames_of_pulses,
-    check_edges,
-    check_image,
-    check_events,
-    check_board,
-)
-SYNC_CHECKS: tuple[SensorCheck, ...] = (
-    check_device,
-    lambda exam, _sensor: check_pulses_sent(exam),
-    check_clock,
-)
-RIG_CHECKS: tuple[Callable[[SensorReport], Check | None], ...] = (check_offsets, check_sync)
+COMPUTER_CHECKS: dict[str, Callable[[Examination], Iterable[Finding]]] = {
+    "python": computer.check_python,
+    "packages": computer.check_packages,
+    "libraries": computer.check_libraries,
+    "disk": computer.check_disk,
+    "buffer": computer.check_socket_buffer,
+    "udev rules": computer.check_udev_rules,
+    "clock": computer.check_clock,
+}
+SENSOR_CHECKS: dict[str, dict[str, Callable[[Examination, str], Iterable[Finding]]]] = {
+    "lidar": {
+        "device": streams.check_device,
+        "settings": streams.check_settings,
+        "stream": streams.check_stream,
+        "PPS": clocks.check_pps,
+        "board": streams.check_board,
+    },
+    "camera": {
+        "device": streams.check_device,
+        "stream": streams.check_stream,
+        "clock": clocks.check_clock,
+        "pulses": clocks.check_frames_of_pulses,
+        "edges": clocks.check_edges,
+        "picture": streams.check_image,
+        "events": streams.check_events,
+        "board": streams.check_board,
+    },
+    "sync": {
+        "device": streams.check_device,
+        "pulses": clocks.check_pulses_sent,
+        "clock": clocks.check_clock,
+    },
+    "rig": {"clocks": clocks.check_offsets, "sync": clocks.check_sync},
+}
+"""Every check by its line's name; a line without findings is left out."""
 
 
-@dataclass(frozen=True)
-class DoctorOptions:
-    """How to examine.
-
-    Attributes:
-        duration_s: how long the sensors are watched.
-        folder: where sessions are to be written.
-        web_port: of a VLP-16's web server.
-    """
+class DoctorOptions(NamedTuple):
+    """How to examine: for how long, where sessions are to be written, port of a VLP-16's web server."""
 
     duration_s: float = 5.0
     folder: Path = Path()
@@ -86,34 +80,34 @@ def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
         A line for each thing looked at: the computer's, each sensor's, the rig's.
     """
     options = options or DoctorOptions()
-    computer: list[Check] = []
+    exam, checks = Examination(rig, options.folder), list[Check]()
+
+    def look_at_computer() -> None:
+        for name, check in COMPUTER_CHECKS.items():
+            checks.append(Check("computer", name, tuple(check(exam))))
+
     with ThreadPoolExecutor(thread_name_prefix="web") as pool:
-        asked = {
-            name: pool.submit(read_web, rig, name, options.web_port)
-            for name in rig.lidars
-            if driver_of(rig, name) == "vlp16"
-        }
-        seen = observe(
-            {sensor: partial(source_of, rig, sensor) for sensor in sensors(rig)},
-            options.duration_s,
-            [lambda: computer.extend(_applying(COMPUTER_CHECKS, rig, options.folder))],
-        )
-        web: dict[str, WebReport | SourceError] = {name: answer.result() for name, answer in asked.items()}
-    exam = SensorReport(rig, seen, web, look_for_boards(rig, seen))
-    checks = list(computer)
-    for names, table in (
-        (list(rig.lidars), LIDAR_CHECKS),
-        (list(rig.cameras), CAMERA_CHECKS),
-        ([BOARD] if rig.sync is not None else [], SYNC_CHECKS),
-    ):
-        for name in names:
-            checks += _applying(table, exam, name)
-    return checks + _applying(RIG_CHECKS, exam)
+        names = [name for name in rig.lidars if driver_of(rig, name) == "vlp16"]
+        asked = {name: pool.submit(_read_web, rig, name, options.web_port) for name in names}
+        sources = {sensor: partial(source_of, rig, sensor) for sensor in sensors(rig)}
+        seen = observe(sources, options.duration_s, [look_at_computer])
+        web = {name: answer.result() for name, answer in asked.items()}
+    exam = replace(exam, seen=seen, web=web, boards=look_for_boards(rig, seen))
+    subjects = [*((name, "lidar") for name in rig.lidars), *((name, "camera") for name in rig.cameras)]
+    subjects += [(BOARD, "sync")] if rig.sync is not None else []
+    for subject, kind in (*subjects, ("rig", "rig")):
+        for name, look in SENSOR_CHECKS[kind].items():
+            checks.append(Check(subject, name, tuple(look(exam, subject))))
+    return [check for check in checks if check.findings]
 
 
-def _applying(table: tuple[Callable[..., Check | None], ...], *arguments: object) -> list[Check]:
-    """Make the checks of a table, and keep those that apply."""
-    return [line for line in (check(*arguments) for check in table) if line is not None]
+def _read_web(rig: Rig, lidar: str, port: int) -> WebReport | SourceError:
+    """Ask the web page of a VLP-16; why it says nothing where it does not."""
+    address = rig.lidars[lidar].driver.address or velodyne.FACTORY_ADDRESS
+    try:
+        return VelodyneWeb(address, port, _WEB_TIMEOUT_S).read()
+    except SourceError as error:
+        return error
 
 
 def look_for_boards(rig: Rig, seen: Mapping[str, ObservedSensor]) -> dict[tuple[str, str], Finding]:
@@ -135,8 +129,12 @@ def _sight_in_scan(rig: Rig, seen: ObservedSensor) -> Finding:
     if isinstance(found, Refusal):
         return found
     best = found[0].quality
-    figures = {"distance_m": best.distance_m, "n_rings": best.n_rings, "n_points": best.n_points}
-    return Finding("board.in_scan", "note", figures={**figures, "n_candidates": len(found)})
+    return findings.BOARD_IN_SCAN(
+        distance_m=best.distance_m,
+        n_rings=best.n_rings,
+        n_points=best.n_points,
+        n_candidates=len(found),
+    )
 
 
 def _sight_in_image(rig: Rig, image: Image) -> Finding:
@@ -147,7 +145,8 @@ def _sight_in_image(rig: Rig, image: Image) -> Finding:
     if isinstance(found, Refusal):
         return found
     names, figures = ("distance_m", "n_corners", "corner_rms_px", "sharpness"), found.figures()
-    return Finding("board.in_image", "note", figures={name: figures[name] for name in names})
+    shown: dict[str, Any] = {name: figures[name] for name in names}
+    return findings.BOARD_IN_IMAGE(**shown)
 
 
 def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
@@ -170,4 +169,4 @@ def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
         found = refusal_of("image", error)
     if isinstance(found, Refusal):
         return found
-    return Finding("board.in_events", "note", figures={"distance_m": found.distance_m})
+    return findings.BOARD_IN_EVENTS(distance_m=found.distance_m)

@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, LiveSample, Pulse, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Finding
 from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import LiveSource
 from lce_rig.devices.sync_board import SyncBoard
-from lce_rig.devices.velodyne_web import WebReport
-from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 
 # A sync board that its port's opening resets takes some seconds to speak; the wait ends then.
@@ -75,7 +72,13 @@ class ObservedSensor:
         if isinstance(sample, Pulse):
             self.pulses.append(sample)
         elif isinstance(sample, Events):
-            self._take_events(sample)
+            if not len(sample):
+                return
+            self._note("events", int(sample.t_ns[-1]), sample.host_ns)
+            self.n_events += len(sample)
+            self.events.append(sample)
+            while self.events[0].t_ns[-1] < sample.t_ns[-1] - _EVENTS_KEPT_NS:
+                self.events.popleft()
         elif isinstance(sample, Image):
             self._note("frames", sample.stamp_ns, sample.host_ns)
             self.frames.append(replace(sample, pixels=_NO_PIXELS))
@@ -83,15 +86,6 @@ class ObservedSensor:
         else:
             self._note("scans", sample.stamp_ns, sample.host_ns)
             self.scan = sample
-
-    def _take_events(self, events: Events) -> None:
-        if not len(events):
-            return
-        self._note("events", int(events.t_ns[-1]), events.host_ns)
-        self.n_events += len(events)
-        self.events.append(events)
-        while self.events[0].t_ns[-1] < events.t_ns[-1] - _EVENTS_KEPT_NS:
-            self.events.popleft()
 
     def _note(self, stream: str, stamp_ns: int | None, host_ns: int | None) -> None:
         if stamp_ns is not None and host_ns is not None:
@@ -121,7 +115,13 @@ def observe(
     try:
         for work in meanwhile:
             work()
-        while _goes_on(list(watches.values()), time.monotonic() - start_s, duration_s):
+        while (now_s := time.monotonic()) < start_s + duration_s + PATIENCE_S:
+            open_s = [now_s - watch.opened_s for watch in watches.values() if watch.opened_s is not None]
+            is_any_opening = any(watch.opened_s is None and not watch.is_over for watch in watches.values())
+            has_watched = not is_any_opening and all(each_s >= duration_s / 2 for each_s in open_s)
+            is_due = now_s >= start_s + duration_s and has_watched
+            if is_due or all(watch.is_over for watch in watches.values()):
+                break
             time.sleep(_POLL_S)
     except BaseException:  # Ctrl-C too: what a source has started must not outlive the program.
         for watch in watches.values():
@@ -133,15 +133,6 @@ def observe(
         watch.stop.set()
     limit_s = max(duration_s, time.monotonic() - start_s) + PATIENCE_S
     return {sensor: watch.result(start_s + limit_s - time.monotonic()) for sensor, watch in watches.items()}
-
-
-def _goes_on(watches: list["_Watch"], elapsed_s: float, duration_s: float) -> bool:
-    if all(watch.is_over for watch in watches) or elapsed_s > duration_s + PATIENCE_S:
-        return False
-    if elapsed_s < duration_s or any(watch.opened_s is None and not watch.is_over for watch in watches):
-        return True
-    now_s = time.monotonic()
-    return any(now_s - watch.opened_s < duration_s / 2 for watch in watches if watch.opened_s is not None)
 
 
 class _Watch:
@@ -181,37 +172,16 @@ class _Watch:
                             self._seen.take(sample)
                 except SourceError as error:
                     self._seen.failure = error
-                self._close(source, self.opened_s)
+                # Nothing of one that never sent anything.
+                if self._seen.failure is None or self._seen.stamps or self._seen.pulses:
+                    self._seen.status = source.status()
+                    self._seen.watched_s = time.monotonic() - self.opened_s
+                    self._seen.ended_ns = time.time_ns()
+                    if isinstance(source, SyncBoard):
+                        self._seen.host_clock, self._seen.utc_clock = source.host_clock, source.utc_clock
         except SourceError as error:
             self._seen.failure = self._seen.failure or error
         except Exception as error:  # A bug in one driver must not hide what is known of the others.
             self._seen.failure = SourceError(f"its driver failed: {error!r}", "This is a bug: report it.")
         finally:
             self.is_over = True
-
-    def _close(self, source: LiveSource, opened_s: float) -> None:
-        """Note what the source has to say while it is open still; nothing of one that never sent anything."""
-        if self._seen.failure is not None and not self._seen.stamps and not self._seen.pulses:
-            return
-        self._seen.status = source.status()
-        self._seen.watched_s, self._seen.ended_ns = time.monotonic() - opened_s, time.time_ns()
-        if isinstance(source, SyncBoard):
-            self._seen.host_clock, self._seen.utc_clock = source.host_clock, source.utc_clock
-
-
-@dataclass(frozen=True, eq=False)
-class SensorReport:
-    """What is known of a rig's sensors.
-
-    Attributes:
-        rig: the profile.
-        seen: what was observed, by the sensor's name.
-        web: what the web page of each VLP-16 says, or why it says nothing, by name.
-        boards: the board as each sensor shows it, by (sensor, channel), a LiDAR's channel is "": a note with
-            its figures, or why it is not there.
-    """
-
-    rig: Rig
-    seen: Mapping[str, ObservedSensor]
-    web: Mapping[str, WebReport | SourceError]
-    boards: Mapping[tuple[str, str], Finding]

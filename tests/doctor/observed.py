@@ -1,6 +1,6 @@
 """Sensors as they might have been observed, written down by hand: what the checks of them look at."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -8,8 +8,8 @@ import numpy as np
 from lce_rig.core.data import Image, Pulse, Scan
 from lce_rig.core.findings import Figure, Finding
 from lce_rig.devices.protocol import ClockState, SourceStatus
-from lce_rig.doctor import Check
-from lce_rig.doctor.observing import ObservedSensor, SensorReport
+from lce_rig.doctor.examination import Check, Examination
+from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 
@@ -48,8 +48,14 @@ def make_rig(**changes: Any) -> Rig:
 
 def examination(
     *seen: ObservedSensor, rig: Rig | None = None, web: Mapping[str, Any] | None = None
-) -> SensorReport:
-    return SensorReport(rig or make_rig(), {each.sensor: each for each in seen}, web or {}, {})
+) -> Examination:
+    return Examination(rig or make_rig(), seen={each.sensor: each for each in seen}, web=web or {})
+
+
+def look(check: Callable[..., Iterable[Finding]], *arguments: Any) -> Check | None:
+    """Make the line of a check; None where it finds nothing."""
+    line = Check(arguments[1] if len(arguments) > 1 else "line", "check", tuple(check(*arguments)))
+    return line if line.findings else None
 
 
 def codes(line: Check | None) -> list[str]:

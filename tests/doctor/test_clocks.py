@@ -19,7 +19,7 @@ from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.rig_clock import RigClock
 
-from .observed import LOCKED, START_NS, S, camera, codes, examination, lidar, make_rig, sync_board
+from .observed import LOCKED, START_NS, S, camera, codes, examination, lidar, look, make_rig, sync_board
 
 
 def with_utc(board: ObservedSensor) -> ObservedSensor:
@@ -56,7 +56,7 @@ def test_the_drift_and_offset_of_every_stream_are_measured_against_the_computer(
         (START_NS + round((1 + 30e-6) * (stamp_ns - START_NS)) - 7_000_000, host_ns)
         for stamp_ns, host_ns in drifting.stamps["frames"]
     ]
-    line = check_offsets(examination(lidar(clock=LOCKED), drifting, sync_board(), rig=v4l2_rig()))
+    line = look(check_offsets, examination(lidar(clock=LOCKED), drifting, sync_board(), rig=v4l2_rig()))
     assert line is not None and line.severity == "note"
     by_sensor = {found.subject: found for found in line.findings}
     assert by_sensor["lidar"].figure("offset_ms") == pytest.approx(0.3)
@@ -69,7 +69,7 @@ def test_first_scans_that_were_stamped_by_arrival_do_not_count() -> None:
     seen = lidar(clock=LOCKED)
     late = [(stamp_ns + S, host_ns) for stamp_ns, host_ns in seen.stamps["scans"][:3]]
     seen.stamps["scans"] = late + seen.stamps["scans"][3:]
-    line = check_offsets(examination(seen))
+    line = look(check_offsets, examination(seen))
     assert line is not None and abs(line.findings[0].figure("drift_ppm")) < 1
 
 
@@ -79,24 +79,24 @@ def test_a_clock_that_is_being_set_is_told() -> None:
         (START_NS + round(1.01 * (stamp_ns - START_NS)), host_ns)
         for stamp_ns, host_ns in stepped.stamps["frames"]
     ]
-    line = check_offsets(examination(stepped, rig=v4l2_rig()))
+    line = look(check_offsets, examination(stepped, rig=v4l2_rig()))
     assert line is not None and line.severity == "warning" and "clock.drifts" in codes(line)
 
 
 def test_scans_and_pictures_stamped_by_arrival_say_nothing_of_a_clock() -> None:
-    assert check_offsets(examination(lidar(), camera())) is None
+    assert look(check_offsets, examination(lidar(), camera())) is None
 
 
 def test_a_davis_is_fitted_to_the_edges_it_saw() -> None:
     exam = examination(davis(), sync_board(4.0, drift=0.0), rig=davis_rig())
-    line = check_edges(exam, "cam")
+    line = look(check_edges, exam, "cam")
     assert line is not None and line.severity == "note"
     assert line.figures["drift_ppm"] == pytest.approx(-25, abs=1)
     assert line.findings[0].figure("rms_us") < 2
 
 
 def test_a_davis_that_sees_no_edges_is_red_and_says_what_to_wire() -> None:
-    line = check_edges(examination(davis(n=0), sync_board(4.0), rig=davis_rig()), "cam")
+    line = look(check_edges, examination(davis(n=0), sync_board(4.0), rig=davis_rig()), "cam")
     assert line is not None and line.severity == "error"
     assert codes(line) == ["edges.not_fitted", "edges.none_seen"]
     assert (line.figures["n_edges"], line.figures["n_pulses"]) == (0, 20)
@@ -104,7 +104,7 @@ def test_a_davis_that_sees_no_edges_is_red_and_says_what_to_wire() -> None:
 
 def test_boards_may_move_where_every_clock_is_tied() -> None:
     exam = examination(lidar(clock=LOCKED), camera(), with_utc(sync_board()))
-    line = check_sync(exam)
+    line = look(check_sync, exam)
     assert line is not None and (line.severity, codes(line)) == ("note", ["sync.boards_may_move"])
     model = tie(exam).common.models.get("cam")
     assert isinstance(model, ClockModel)
@@ -112,7 +112,7 @@ def test_boards_may_move_where_every_clock_is_tied() -> None:
 
 
 def test_a_clock_that_is_not_tied_is_named_with_the_way_out() -> None:
-    line = check_sync(examination(lidar(clock=LOCKED), camera(), rig=make_rig(sync=None)))
+    line = look(check_sync, examination(lidar(clock=LOCKED), camera(), rig=make_rig(sync=None)))
     assert line is not None and line.severity == "warning"
     verdict, reason = line.findings
     assert (verdict.code, verdict.action) == ("sync.boards_must_stand", "add_board")
@@ -125,20 +125,20 @@ def test_still_boards_are_no_fault_where_the_profile_promises_nothing() -> None:
         lidars={"lidar": {}},
         cameras={"cam": {**make_rig().model_dump()["cameras"]["cam"], "channels": {"frames": {}}}},
     )
-    line = check_sync(examination(lidar(), camera(), rig=rig))
+    line = look(check_sync, examination(lidar(), camera(), rig=rig))
     assert line is not None and line.severity == "note" and codes(line)[0] == "sync.boards_must_stand"
 
 
 def test_absent_sensors_are_left_out_of_the_verdict() -> None:
     absent = ObservedSensor("cam", failure=SourceError("it is not there"))
-    assert check_sync(examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
+    assert look(check_sync, examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
 
 
 def test_how_old_pictures_are_and_how_long_the_board_takes_to_answer_is_said() -> None:
     seen = Finding("clock.davis", "note", figures={"delay_ms": 12.4})
     own = Finding("clock.board", "note", figures={"round_trip_ms": 0.24})
     exam = examination(camera(clock=ClockState(seen)), sync_board(clock=ClockState(own)))
-    of_camera, of_board = check_clock(exam, "cam"), check_clock(exam, "sync")
+    of_camera, of_board = look(check_clock, exam, "cam"), look(check_clock, exam, "sync")
     assert of_camera is not None and of_board is not None
     assert of_camera.figures["delay_ms"] == 12.4 and of_board.figures["round_trip_ms"] == 0.24
 
@@ -146,7 +146,7 @@ def test_how_old_pictures_are_and_how_long_the_board_takes_to_answer_is_said() -
 def test_doubts_of_a_driver_about_its_clock_stand_in_its_line() -> None:
     problem = Finding("clock.missing", "warning", figures={"clock": "tsc"})
     arrival = ClockState(Finding("clock.arrival", "note"))
-    line = check_clock(examination(camera(clock=arrival, problems=(problem,))), "cam")
+    line = look(check_clock, examination(camera(clock=arrival, problems=(problem,))), "cam")
     assert line is not None and line.severity == "warning"
     assert codes(line) == ["clock.arrival", "clock.missing"]
 

@@ -8,26 +8,27 @@ from pathlib import Path
 import pytest
 
 from lce_rig.doctor import computer
+from lce_rig.doctor.examination import Examination
 from lce_rig.rig import load_rig
 
-from .observed import codes, make_rig
+from .observed import codes, look, make_rig
 
 
 def test_python_and_the_packages_of_these_tests_are_in_order() -> None:
-    line = computer.check_python(make_rig(), Path())
+    line = look(computer.check_python, Examination(make_rig()))
     assert line.severity == "note" and line.figures["n_bits"] == 64
-    assert computer.check_packages(make_rig(), Path()).severity == "note"
+    assert look(computer.check_packages, Examination(make_rig())).severity == "note"
 
 
 def test_a_missing_package_is_named_with_the_line_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(computer, "_PACKAGES", {"no_such_module": "no-such-package"})
-    line = computer.check_packages(make_rig(), Path())
+    line = look(computer.check_packages, Examination(make_rig()))
     assert line.severity == "error" and codes(line) == ["computer.packages_missing"]
     assert line.figures["packages"] == ("no-such-package",)
 
 
 def test_a_rig_with_a_davis_needs_its_library() -> None:
-    line = computer.check_packages(load_rig("rles"), Path())
+    line = look(computer.check_packages, Examination(load_rig("rles")))
     is_there = find_spec("dv_processing") is not None
     assert codes(line) == ["computer.packages" if is_there else "computer.dv_processing_missing"]
     assert not is_there or line.figures["dv_processing"]
@@ -35,13 +36,13 @@ def test_a_rig_with_a_davis_needs_its_library() -> None:
 
 def test_a_missing_system_library_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(computer, "_OPEN3D_LIBRARIES", {"libnosuch.so.7": "libnosuch7"})
-    line = computer.check_libraries(make_rig(), Path())
+    line = look(computer.check_libraries, Examination(make_rig()))
     assert line.severity == "warning"
     assert (line.figures["libraries"], line.figures["packages"]) == (("libnosuch.so.7",), ("libnosuch7",))
 
 
 def test_the_disk_of_a_folder_that_is_not_there_yet_is_measured_and_left_clean(tmp_path: Path) -> None:
-    line = computer.check_disk(make_rig(), tmp_path / "not" / "yet")
+    line = look(computer.check_disk, Examination(make_rig(), tmp_path / "not" / "yet"))
     disk = line.findings[0]
     assert disk.figure("write_mbps") > 0 and disk.figure("free_mb") > 0
     assert disk.figures["folder"] == str(tmp_path)
@@ -49,12 +50,12 @@ def test_the_disk_of_a_folder_that_is_not_there_yet_is_measured_and_left_clean(t
 
 
 def test_a_folder_that_cannot_be_written_is_red() -> None:
-    line = computer.check_disk(make_rig(), Path("/proc"))
+    line = look(computer.check_disk, Examination(make_rig(), Path("/proc")))
     assert line.severity == "error" and codes(line) == ["computer.disk_not_writable"]
 
 
 def test_the_receive_buffer_is_what_the_kernel_grants() -> None:
-    line = computer.check_socket_buffer(make_rig(), Path())
+    line = look(computer.check_socket_buffer, Examination(make_rig()))
     assert line is not None
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
         port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
@@ -68,7 +69,7 @@ def test_the_receive_buffer_is_what_the_kernel_grants() -> None:
 
 def test_a_rig_without_a_vlp16_needs_no_buffer() -> None:
     rig = make_rig(lidars={"lidar": {"model": "another"}})
-    assert computer.check_socket_buffer(rig, Path()) is None
+    assert look(computer.check_socket_buffer, Examination(rig)) is None
 
 
 @pytest.fixture
@@ -81,27 +82,27 @@ def udev(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_davis_wants_udev_rules_and_the_shipped_ones_do(udev: Path) -> None:
     rig = load_rig("rles")
-    line = computer.check_udev_rules(rig, Path())
+    line = look(computer.check_udev_rules, Examination(rig))
     assert line is not None and codes(line) == ["computer.udev_rules_missing"]
     assert line.severity == "warning" and line.figures["devices"] == ("DAVIS",)
     shutil.copy(str(line.figures["rules"]), udev)
-    line = computer.check_udev_rules(rig, Path())
+    line = look(computer.check_udev_rules, Examination(rig))
     assert line is not None and codes(line) == ["computer.udev_rules"]
 
 
 def test_the_shipped_rules_hold_for_a_sync_board_too(udev: Path) -> None:
     rig = make_rig(sync={"device": "/dev/ttyACM0"})
-    line = computer.check_udev_rules(rig, Path())
+    line = look(computer.check_udev_rules, Examination(rig))
     assert line is not None and line.figures["devices"] == ("sync board",)
     shutil.copy(str(line.figures["rules"]), udev)
-    assert codes(computer.check_udev_rules(rig, Path())) == ["computer.udev_rules"]
+    assert codes(look(computer.check_udev_rules, Examination(rig))) == ["computer.udev_rules"]
 
 
 def test_a_rig_without_such_devices_needs_no_udev_rules(udev: Path) -> None:
-    assert computer.check_udev_rules(load_rig("rlfs"), Path()) is None
+    assert look(computer.check_udev_rules, Examination(load_rig("rlfs"))) is None
 
 
 def test_the_clock_is_judged_by_the_kernel() -> None:
-    line = computer.check_clock(make_rig(), Path())
+    line = look(computer.check_clock, Examination(make_rig()))
     code = "computer.clock" if line.severity == "note" else "computer.clock_not_synchronised"
     assert codes(line) == [code] and (line.severity == "note") == ("max_error_ms" in line.figures)

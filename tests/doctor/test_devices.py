@@ -5,27 +5,27 @@ import pytest
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices.velodyne_web import WebReport
-from lce_rig.doctor.devices import check_device, check_stream, wanted_rate_hz
+from lce_rig.doctor.examination import driver_of, sensors, source_of
 from lce_rig.doctor.observing import ObservedSensor
-from lce_rig.doctor.sensor_sources import driver_of, sensors, source_of
+from lce_rig.doctor.streams import check_device, check_stream, wanted_rate_hz
 from lce_rig.rig import Rig, load_rig
 
-from .observed import S, camera, codes, examination, lidar, make_rig
+from .observed import S, camera, codes, examination, lidar, look, make_rig
 
 
 def test_what_does_not_open_is_red_with_what_to_check() -> None:
     seen = ObservedSensor(
         "cam", failure=SourceError("camera 'cam': /dev/video0 is busy", "fuser -v names it.")
     )
-    line = check_device(examination(seen), "cam")
+    line = look(check_device, examination(seen), "cam")
     assert line.severity == "error" and codes(line) == ["sensor.failed"]
     assert "/dev/video0" in str(line.figures["what"]) and "fuser" in str(line.figures["hint"])
-    assert check_stream(examination(seen), "cam") is None
+    assert look(check_stream, examination(seen), "cam") is None
 
 
 def test_a_lidar_is_named_with_what_its_web_page_says() -> None:
     web = {"lidar": WebReport(model="VLP-16", serial="AG43510116", firmware="3.0.41.1", temperature_c=41.2)}
-    line = check_device(examination(lidar(device="VLP-16 at 127.0.0.1"), web=web), "lidar")
+    line = look(check_device, examination(lidar(device="VLP-16 at 127.0.0.1"), web=web), "lidar")
     assert codes(line) == ["sensor.answers"] and line.severity == "note"
     told = ("device", "firmware", "serial", "temperature_c")
     assert [line.figures[name] for name in told] == ["VLP-16 at 127.0.0.1", "3.0.41.1", "AG43510116", 41.2]
@@ -41,7 +41,7 @@ def test_complaints_of_a_driver_stand_in_the_line_they_belong_to() -> None:
         ),
     }
     exam = examination(camera(**status))
-    device, stream = check_device(exam, "cam"), check_stream(exam, "cam")
+    device, stream = look(check_device, exam, "cam"), look(check_stream, exam, "cam")
     assert stream is not None
     assert device.severity == stream.severity == "warning"
     assert codes(device)[1:] == ["device.row_padding"]
@@ -54,7 +54,7 @@ def test_complaints_of_a_driver_stand_in_the_line_they_belong_to() -> None:
     [(10.0, "note", "stream.rate"), (20.0, "warning", "stream.rate_off"), (10.3, "note", "stream.rate")],
 )
 def test_the_rotors_rate_is_compared_with_the_profile(rate_hz: float, severity: str, code: str) -> None:
-    line = check_stream(examination(lidar(rate_hz, n_packets=3770)), "lidar")
+    line = look(check_stream, examination(lidar(rate_hz, n_packets=3770)), "lidar")
     assert line is not None
     assert line.severity == severity and codes(line) == [code, "stream.complete"]
     assert line.figures["rate_hz"] == pytest.approx(rate_hz, rel=1e-3)
@@ -63,13 +63,13 @@ def test_the_rotors_rate_is_compared_with_the_profile(rate_hz: float, severity: 
 
 
 def test_scans_that_arrive_late_do_not_make_the_rotor_slow() -> None:
-    line = check_stream(examination(lidar(8.0, rates_hz={"scans": 10.01})), "lidar")
+    line = look(check_stream, examination(lidar(8.0, rates_hz={"scans": 10.01})), "lidar")
     assert line is not None and line.severity == "note" and line.figures["rate_hz"] == 10.01
 
 
 @pytest.mark.parametrize(("n_lost", "severity"), [(0, "note"), (1, "warning"), (40, "error")])
 def test_losses_are_counted_and_judged_by_their_share(n_lost: int, severity: str) -> None:
-    line = check_stream(examination(lidar(n_lost=n_lost, n_packets=3770)), "lidar")
+    line = look(check_stream, examination(lidar(n_lost=n_lost, n_packets=3770)), "lidar")
     assert line is not None and line.severity == severity
     assert ("stream.losses" in codes(line)) == (n_lost > 0)
 
@@ -77,7 +77,7 @@ def test_losses_are_counted_and_judged_by_their_share(n_lost: int, severity: str
 def test_a_stream_that_stopped_before_the_end_is_red() -> None:
     seen = camera(duration_s=2.0)
     seen.ended_ns += 3 * S
-    line = check_stream(examination(seen), "cam")
+    line = look(check_stream, examination(seen), "cam")
     assert (
         line is not None
         and line.severity == "error"
@@ -86,7 +86,7 @@ def test_a_stream_that_stopped_before_the_end_is_red() -> None:
 
 
 def test_a_triggered_camera_without_pictures_is_red() -> None:
-    line = check_stream(examination(camera(duration_s=0.0)), "cam")
+    line = look(check_stream, examination(camera(duration_s=0.0)), "cam")
     assert line is not None and line.severity == "error" and codes(line)[0] == "stream.none"
 
 

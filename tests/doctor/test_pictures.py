@@ -6,10 +6,10 @@ import pytest
 
 from lce_rig.core.data import Events, Image
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.doctor.devices import check_board, check_events, check_image
-from lce_rig.doctor.observing import SensorReport
+from lce_rig.doctor.examination import Examination
+from lce_rig.doctor.streams import check_board, check_events, check_image
 
-from .observed import START_NS, S, camera, codes, examination, make_rig
+from .observed import START_NS, S, camera, codes, examination, look, make_rig
 
 SHAPE = (260, 346)
 
@@ -22,7 +22,7 @@ def chequered() -> np.ndarray:
 def judged(pixels: np.ndarray):
     seen = camera(duration_s=0.5)
     seen.images["frames"] = Image("cam", "frames", START_NS, pixels)
-    line = check_image(examination(seen), "cam")
+    line = look(check_image, examination(seen), "cam")
     assert line is not None
     return line
 
@@ -61,13 +61,13 @@ def events(seed: int, n: int) -> Events:
 def test_events_of_a_busy_scene_are_green_and_a_flickering_lamp_is_named() -> None:
     busy = camera(duration_s=0.5)
     busy.take(events(1, 900_000))
-    line = check_events(examination(busy), "cam")
+    line = look(check_events, examination(busy), "cam")
     assert line is not None and line.severity == "note"
     lamp = camera(duration_s=0.5)
     steady = events(1, 900_000)
     is_bright = (steady.t_ns // 5_000_000) % 2 == 0
     lamp.take(Events("cam", steady.t_ns, steady.x, steady.y, is_bright, SHAPE[1], SHAPE[0], steady.host_ns))
-    line = check_events(examination(lamp), "cam")
+    line = look(check_events, examination(lamp), "cam")
     assert (
         line is not None and line.severity == "warning" and line.figures["frequency_hz"] == pytest.approx(100)
     )
@@ -79,7 +79,7 @@ def test_the_board_is_green_where_any_channel_sees_it() -> None:
 
     def line(*sights: Finding):
         boards = {("cam", f"channel{n}"): sight for n, sight in enumerate(sights)}
-        return check_board(SensorReport(make_rig(), {}, {}, boards), "cam")
+        return look(check_board, Examination(make_rig(), boards=boards), "cam")
 
     assert line() is None
     both, none = line(unseen, seen), line(unseen)

@@ -8,7 +8,7 @@ import pytest
 from lce_rig.doctor.clocks import check_frames_of_pulses, check_pulses_sent
 from lce_rig.rig import Rig
 
-from .observed import camera, codes, examination, make_rig, sync_board
+from .observed import camera, codes, examination, look, make_rig, sync_board
 
 
 def with_sync(**sync: Any) -> Rig:
@@ -20,7 +20,7 @@ def with_trigger(**trigger: float) -> Rig:
 
 
 def test_as_many_frames_as_pulses_are_green_with_their_delay() -> None:
-    line = check_frames_of_pulses(examination(camera(), sync_board()), "cam")
+    line = look(check_frames_of_pulses, examination(camera(), sync_board()), "cam")
     assert line is not None and line.severity == "note"
     counts, delay = line.findings
     assert abs(counts.figure("n_frames") - counts.figure("n_pulses")) <= 1
@@ -30,50 +30,54 @@ def test_as_many_frames_as_pulses_are_green_with_their_delay() -> None:
 
 
 def test_a_camera_that_runs_freely_is_red() -> None:
-    line = check_frames_of_pulses(examination(camera(rate_hz=30.0), sync_board()), "cam")
+    line = look(check_frames_of_pulses, examination(camera(rate_hz=30.0), sync_board()), "cam")
     assert line is not None and line.severity == "error"
     assert {"pulses.not_matched", "pulses.missed"} & set(codes(line))
 
 
 def test_frames_that_come_too_late_for_their_pulses_are_not_matched() -> None:
-    line = check_frames_of_pulses(
-        examination(camera(delay_s=0.045), sync_board(), rig=with_trigger(max_delay_s=0.03)), "cam"
+    line = look(
+        check_frames_of_pulses,
+        examination(camera(delay_s=0.045), sync_board(), rig=with_trigger(max_delay_s=0.03)),
+        "cam",
     )
     assert line is not None and line.severity == "error" and "pulses.not_matched" in codes(line)
 
 
 def test_where_two_pulses_could_have_made_a_frame_they_are_counted() -> None:
     exam = examination(camera(), sync_board(), rig=with_trigger(max_delay_s=0.1))
-    line = check_frames_of_pulses(exam, "cam")
+    line = look(check_frames_of_pulses, exam, "cam")
     assert line is not None and line.severity == "note" and "pulses.counted_only" in codes(line)
     free = examination(camera(rate_hz=30.0), sync_board(), rig=with_trigger(max_delay_s=0.1))
-    line = check_frames_of_pulses(free, "cam")
+    line = look(check_frames_of_pulses, free, "cam")
     assert line is not None and line.severity == "error" and "pulses.unequal" in codes(line)
 
 
 def test_lost_frames_count_by_their_numbers() -> None:
     seen = camera()
     seen.frames = [frame for frame in seen.frames if frame.count is not None and frame.count % 10]
-    line = check_frames_of_pulses(examination(seen, sync_board()), "cam")
+    line = look(check_frames_of_pulses, examination(seen, sync_board()), "cam")
     assert line is not None and line.severity == "note"
 
 
 def test_the_boards_lines_are_held_against_the_profile() -> None:
-    line = check_pulses_sent(examination(sync_board()))
+    line = look(check_pulses_sent, examination(sync_board()))
     assert line is not None and line.severity == "note"
     assert codes(line) == ["pulses.line_none", "pulses.line", "pulses.lost"]
     assert line.findings[1].figure("rate_hz") == pytest.approx(20.0, rel=1e-3)
-    slow = check_pulses_sent(examination(sync_board(rate_hz=10.0)))
+    slow = look(check_pulses_sent, examination(sync_board(rate_hz=10.0)))
     assert slow is not None and slow.severity == "warning" and "pulses.line_off" in codes(slow)
-    dead = check_pulses_sent(examination(replace(sync_board(), pulses=[])))
+    dead = look(check_pulses_sent, examination(replace(sync_board(), pulses=[])))
     assert dead is not None and dead.severity == "error"
 
 
 def test_a_pulse_per_second_that_is_none_is_told() -> None:
-    line = check_pulses_sent(examination(sync_board(rate_hz=2.0, line="pps"), rig=with_sync(triggers={})))
+    line = look(
+        check_pulses_sent, examination(sync_board(rate_hz=2.0, line="pps"), rig=with_sync(triggers={}))
+    )
     assert line is not None and line.severity == "warning"
     assert (line.figures["line"], line.findings[0].code) == ("pps", "pulses.line_off")
 
 
 def test_without_a_board_there_is_no_line() -> None:
-    assert check_frames_of_pulses(examination(camera(), rig=make_rig(sync=None)), "cam") is None
+    assert look(check_frames_of_pulses, examination(camera(), rig=make_rig(sync=None)), "cam") is None

@@ -8,10 +8,11 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices.protocol import ClockState
 from lce_rig.devices.velodyne_web import WebReport
-from lce_rig.doctor.devices import check_pulse, check_settings
+from lce_rig.doctor.clocks import check_pps
+from lce_rig.doctor.streams import check_settings
 from lce_rig.rig import Rig
 
-from .observed import LOCKED, UNLOCKED, codes, examination, lidar, make_rig
+from .observed import LOCKED, UNLOCKED, codes, examination, lidar, look, make_rig
 
 
 def with_timestamps(**timestamps: Any) -> Rig:
@@ -19,7 +20,7 @@ def with_timestamps(**timestamps: Any) -> Rig:
 
 
 def test_a_locked_sensor_is_green_with_the_time_it_was_told() -> None:
-    line = check_pulse(examination(lidar(clock=LOCKED)), "lidar")
+    line = look(check_pps, examination(lidar(clock=LOCKED)), "lidar")
     assert line is not None and line.severity == "note"
     assert codes(line) == ["clock.pulse", "clock.lidar_utc"]
     assert (line.figures["pps"], line.figures["nmea_past_hour_s"]) == ("locked", 754)
@@ -37,14 +38,14 @@ def test_a_sensor_without_pulses_is_judged_by_what_the_profile_promises(
     timestamps: dict[str, str], severity: str
 ) -> None:
     seen = lidar(clock=UNLOCKED, problems=(UNLOCKED.finding,))
-    line = check_pulse(examination(seen, rig=with_timestamps(**timestamps)), "lidar")
+    line = look(check_pps, examination(seen, rig=with_timestamps(**timestamps)), "lidar")
     assert line is not None and line.severity == severity
     assert codes(line)[:2] == ["clock.pulse", "clock.pps_not_locked"]
 
 
 def test_without_position_packets_the_web_page_tells_of_the_pulse() -> None:
     seen = lidar(clock=ClockState(Finding("clock.no_position_packets", "warning")))
-    line = check_pulse(examination(seen, web={"lidar": WebReport(pps="locked")}), "lidar")
+    line = look(check_pps, examination(seen, web={"lidar": WebReport(pps="locked")}), "lidar")
     assert line is not None and line.findings[0].figures["pps"] == "locked"
     assert "clock.no_position_packets" in codes(line)
 
@@ -58,7 +59,7 @@ def test_settings_that_differ_from_the_profile_are_named_once() -> None:
         fov_deg=(10, 350),
         data_port=2369,
     )
-    line = check_settings(examination(lidar(), web={"lidar": report}), "lidar")
+    line = look(check_settings, examination(lidar(), web={"lidar": report}), "lidar")
     assert line is not None and line.severity == "warning"
     # The pulse has a line of its own.
     wrong = ["settings.rotor_rate", "settings.fov_cut", "settings.data_port"]
@@ -67,5 +68,5 @@ def test_settings_that_differ_from_the_profile_are_named_once() -> None:
 
 def test_a_web_page_that_does_not_answer_is_no_fault_of_the_packets() -> None:
     web = {"lidar": SourceError("http://192.168.1.201 does not answer", "Check the network.")}
-    line = check_settings(examination(lidar(), web=web), "lidar")
+    line = look(check_settings, examination(lidar(), web=web), "lidar")
     assert line is not None and line.severity == "warning" and codes(line) == ["settings.unknown"]

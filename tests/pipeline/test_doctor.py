@@ -8,11 +8,10 @@ import pytest
 from wire.vlp16_packets import Vlp16Clock
 
 from lce_rig.core.findings import worst
-from lce_rig.doctor import Check
+from lce_rig.doctor.examination import Check
 from lce_rig.doctor.examine import DoctorOptions, examine, look_for_boards
 from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
-from lce_rig.words import recommend
 from tests.detect.moving_board import CENTRE_PX, HEIGHT_PX, WIDTH_PX, Motion, board_events
 from tests.doctor.attached import Attached, attach, picture_of, scan_of
 from tests.doctor.observed import codes, make_rig
@@ -151,7 +150,7 @@ def test_a_picture_without_a_board_says_what_to_show(tmp_path: Path) -> None:
             if ("cam", "board") in lines:
                 break
     (missing,) = lines["cam", "board"].findings
-    assert (missing.severity, missing.family) == ("warning", "image") and recommend(missing)
+    assert (missing.severity, missing.family) == ("warning", "image") and missing.advice
 
 
 def test_a_camera_of_events_alone_sees_the_board_while_it_moves() -> None:
