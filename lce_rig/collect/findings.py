@@ -89,3 +89,10 @@ CALIBRATE_LITTLE_GAIN = Kind(
     "this placement improves the result by {gain:1percent}, another by {best_gain:percent}",
     "{instruction}",
 )
+CLOCK_SIMULATED = Kind("clock.simulated", "simulated", severity="note")
+STREAM_SIMULATED_SLOWLY = Kind(
+    "stream.simulated_slowly",
+    "simulated about {factor} times slower than real time",
+    "expect low rates: this computer is too busy or too slow, no sensor is at fault",
+    severity="warning",
+)
