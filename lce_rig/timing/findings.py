@@ -1,6 +1,6 @@
 """Kinds of findings on the sensors' clocks: images and pulses, edges, synchronisation."""
 
-from lce_rig.core.findings import Kind
+from lce_rig.core.findings import Finding, Kind
 
 NOTHING_YET = Kind("pulses.nothing_yet", "no images and pulses yet")
 IMAGES_NOT_NUMBERED = Kind(
@@ -77,3 +77,13 @@ TOO_UNCERTAIN = Kind(
     severity="warning",
     actions={"named": ""},
 )
+
+
+def _no_image(finding: Finding) -> str:
+    """No image at the time of the scan; the nearest was {nearest_s} away."""
+    nearest_s = finding.figures.get("nearest_s")
+    nearest = f" (nearest: {nearest_s:.3f} s away)" if isinstance(nearest_s, float) else ""
+    return f"no image at the time of the scan{nearest}"
+
+
+READ_NO_IMAGE_AT_SCAN = Kind("read.no_image_at_scan", _no_image)

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from lce_rig.core.data import Events, Image, Sample, Scan
-from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer, EventCut
+from lce_rig.timing.findings import READ_NO_IMAGE_AT_SCAN
 from lce_rig.timing.rig_time import rig_time_ns
 
 PATIENCE_NS = 1_000_000_000
@@ -155,7 +155,7 @@ class _Pairing:
         is_best = nearest_ns is not None and nearest_ns < (self._nearest_ns or 2**62)
         nearest_s = None if nearest_ns is None else nearest_ns * 1e-9
         self._nearest_ns = nearest_ns if is_best else self._nearest_ns
-        self._losses.add(Refusal("read.no_image_at_scan", figures={"nearest_s": nearest_s}), is_best=is_best)
+        self._losses.add(READ_NO_IMAGE_AT_SCAN.refusal(nearest_s=nearest_s), is_best=is_best)
 
 
 def middle_of_sweep_ns(scan: Scan, rig: Rig) -> int | None:
