@@ -131,8 +131,16 @@ def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> Relat
     T_second, cov_second = _poses(seconds)
     T, J = relative_pose(T_second, T_first)
     information = symmetric_inverse(relative_covariance(J, cov_second, cov_first))
-    middle = T[int(np.argmin(np.median(_distances(T, information), axis=1)))]
-    mean, weight = mean_pose(T, information, middle, _student_weights)
+    # Start at the pose with the least median of squared distances (F, F) to all.
+    apart = difference(T[None].repeat(len(T), axis=0), T[:, None].repeat(len(T), axis=1))
+    distances = np.einsum("mki,kij,mkj->mk", apart, information, apart)
+    middle = T[int(np.argmin(np.median(distances, axis=1)))]
+
+    def student_weights(chi2: Array) -> Array:
+        """Weight poses by their squared distances (F,) from the mean, in units of the typical value."""
+        return np.asarray((_STUDENT + 6) / (_STUDENT + chi2 / max(float(np.median(chi2)) / 6, 1.0)))
+
+    mean, weight = mean_pose(T, information, middle, student_weights)
     apart = difference(T, mean)
     chi2 = float(np.einsum("ki,kij,kj->", apart, information, apart))
     hessians = weight[:, None, None] * information
@@ -154,17 +162,6 @@ def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
     every = np.arange(len(images), dtype=np.intp)
     stacked = stack_images(every, images)
     return stacked.T_cam_board, stacked.total_cov(Levels().pose)
-
-
-def _student_weights(chi2: Array) -> Array:
-    """Weight poses by their squared distances (F,) from the mean, in units of the typical value."""
-    return np.asarray((_STUDENT + 6) / (_STUDENT + chi2 / max(float(np.median(chi2)) / 6, 1.0)))
-
-
-def _distances(T: Array, information: Array) -> Array:
-    """Compute squared distances (F, F) of all poses from each."""
-    apart = difference(T[None].repeat(len(T), axis=0), T[:, None].repeat(len(T), axis=1))
-    return np.asarray(np.einsum("mki,kij,mkj->mk", apart, information, apart))
 
 
 def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_first: Array) -> float:

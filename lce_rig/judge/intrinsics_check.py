@@ -155,6 +155,8 @@ def compare_with_given(
         intrinsics: the intrinsics to check, at the same resolution.
         board: the board.
     """
+    from scipy.special import fdtrc
+
     given_px = distances_under(intrinsics, fitted.views, board)
     corners_px = fitted.corners_px.reshape(-1, 2)
     difference = compare_lenses(intrinsics, fitted.intrinsics, corners_px, fitted.cov, fitted.model)
@@ -169,8 +171,16 @@ def compare_with_given(
     with suppress(ValueError):
         found, cov = lens_errors(intrinsics, fitted.intrinsics, corners_px, fitted.cov, fitted.model)
         errors, errors_cov = tuple(found.tolist()), tuple(map(tuple, cov.tolist()))
+    n_captures, chance = len({view.capture for view in fitted.views}), None
+    with suppress(ValueError):
+        # All parameters at once by the F distribution, as the deviations come from few captures.
+        change = fitted.model.vector(intrinsics) - fitted.model.vector(fitted.intrinsics)
+        scale = 1.0 / fitted.sigma
+        correlation = fitted.cov * np.outer(scale, scale)
+        chi2 = float(change * scale @ np.linalg.solve(correlation, change * scale))
+        chance = float(fdtrc(len(change), n_captures - 1, chi2 / len(change)))
     check = IntrinsicsCheck(
-        n_captures=len({view.capture for view in fitted.views}),
+        n_captures=n_captures,
         rms_px=float(np.sqrt(np.mean(given_px**2))),
         possible_px=fitted.held_out_rms_px,
         displacement_px=difference.rms_px,
@@ -180,28 +190,13 @@ def compare_with_given(
         turn_sigma_deg=float(np.degrees(np.sqrt(along @ difference.cov_turn @ along))),
         focal_ratio=float(np.sqrt(fitted.intrinsics.fx_px * fitted.intrinsics.fy_px) / given_focal),
         focal_sigma=float(np.sqrt(by_focal @ fitted.cov @ by_focal)),
-        chance=_chance(fitted, intrinsics),
+        chance=chance,
         covered=certainty.covered,
         image_sigma_px=certainty.image_sigma_px,
         errors=errors,
         errors_cov=errors_cov,
     )
     return check, difference
-
-
-def _chance(fitted: IntrinsicsEstimate, intrinsics: Intrinsics) -> float | None:
-    """Compare all parameters at once by the F distribution, as the deviations come from few captures."""
-    from scipy.special import fdtrc
-
-    try:
-        change = fitted.model.vector(intrinsics) - fitted.model.vector(fitted.intrinsics)
-    except ValueError:
-        return None
-    n_captures = len({view.capture for view in fitted.views})
-    scale = 1.0 / fitted.sigma
-    correlation = fitted.cov * np.outer(scale, scale)
-    chi2 = float(change * scale @ np.linalg.solve(correlation, change * scale))
-    return float(fdtrc(len(change), n_captures - 1, chi2 / len(change)))
 
 
 def describe(check: IntrinsicsCheck) -> str:

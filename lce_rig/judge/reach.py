@@ -32,7 +32,8 @@ def point_uncertainties(
     Returns:
         One for each distance, with the worst of the four corners.
     """
-    rays = lens.unproject(np.concatenate([[_middle(lens)], outermost_pixels(lens)]))
+    middle = [(lens.width_px - 1) / 2, (lens.height_px - 1) / 2]
+    rays = lens.unproject(np.concatenate([[middle], outermost_pixels(lens)]))
     found = []
     for distance_m in distances_m:
         sigmas = [_sigmas(distance_m * ray, T_cam_lidar[:3, 3], cov, lens) for ray in rays]
@@ -41,14 +42,10 @@ def point_uncertainties(
     return tuple(found)
 
 
-def _middle(lens: Intrinsics) -> Array:
-    return np.array([(lens.width_px - 1) / 2, (lens.height_px - 1) / 2])
-
-
 def outermost_pixels(lens: Intrinsics) -> Array:
     """Find the image's corners (4, 2), or where the lens ends on the way to them from the middle."""
-    middle = _middle(lens)
     w, h = lens.width_px - 1.0, lens.height_px - 1.0
+    middle = np.array([w / 2, h / 2])
     corners = []
     for corner in np.array([[0, 0], [w, 0], [0, h], [w, h]]):
         on_the_way = corner + _INWARDS[:, None] * (middle - corner)

@@ -150,13 +150,26 @@ def compare_calibrations(
     deviations = difference(T, mean)
     pairs = list(combinations(range(len(names)), 2))
     factor = 1.0 if are_independent else 2.0
-    differences = tuple(_difference(names, T, factor * cov, i, j) for i, j in pairs)
+    differences = []
+    for i, j in pairs:
+        x = difference(T[i], T[j])
+        distance = float(np.sqrt(x @ np.linalg.solve(factor * (cov[i] + cov[j]), x)))
+        angle_deg = float(np.degrees(np.linalg.norm(log_so3(T[i, :3, :3] @ T[j, :3, :3].T))))
+        shift_m, p = float(np.linalg.norm(x[:3])), _tail(distance**2, 6)
+        differences.append(PairDifference(names[i], names[j], angle_deg, shift_m, distance, p))
     if are_independent:
         chi2, dof = _spread(T, cov), 6 * (len(names) - 1)
         p = _tail(chi2, dof)
     else:
         chi2, dof = max(pair.distance for pair in differences) ** 2, 6
         p = min(1.0, len(pairs) * _tail(chi2, dof))
+    blamed = []
+    if are_independent and p < _CHANCE and len(names) > 2:
+        # Sessions without which the others agree.
+        for k, name in enumerate(names):
+            rest = np.arange(len(names)) != k
+            if _tail(_spread(T[rest], cov[rest]), 6 * (len(names) - 2)) >= _CHANCE:
+                blamed.append(name)
     first = calibrations[names[0]]
     scatter_deg = _rms([c.diagnostics.sigma_scatter_rotation_deg for c in calibrations.values()])
     scatter_m = _rms([c.diagnostics.sigma_scatter_translation_m for c in calibrations.values()])
@@ -176,8 +189,8 @@ def compare_calibrations(
         chi2=chi2,
         dof=dof,
         p=p,
-        differences=differences,
-        odd_one=_odd_one(names, T, cov) if are_independent and p < _CHANCE else None,
+        differences=tuple(differences),
+        odd_one=blamed[0] if len(blamed) == 1 else None,
         are_independent=are_independent,
     )
 
@@ -187,26 +200,6 @@ def _spread(T: Array, cov: Array) -> float:
     weights = np.asarray(np.linalg.inv(cov))
     deviations = difference(T, mean_pose(T, weights)[0])
     return float(np.einsum("ki,kij,kj->", deviations, weights, deviations))
-
-
-def _difference(names: Sequence[str], T: Array, cov: Array, i: int, j: int) -> PairDifference:
-    tangent = difference(T[i], T[j])
-    chi2 = float(tangent @ np.linalg.solve(cov[i] + cov[j], tangent))
-    angle_deg = float(np.degrees(np.linalg.norm(log_so3(T[i, :3, :3] @ T[j, :3, :3].T))))
-    distance_m = float(np.linalg.norm(tangent[:3]))
-    return PairDifference(names[i], names[j], angle_deg, distance_m, float(np.sqrt(chi2)), _tail(chi2, 6))
-
-
-def _odd_one(names: Sequence[str], T: Array, cov: Array) -> str | None:
-    """Name the calibration without which the others agree, if there is exactly one."""
-    if len(names) < 3:
-        return None
-    blamed = []
-    for index, name in enumerate(names):
-        rest = np.arange(len(names)) != index
-        if _tail(_spread(T[rest], cov[rest]), 6 * (len(names) - 2)) >= _CHANCE:
-            blamed.append(name)
-    return blamed[0] if len(blamed) == 1 else None
 
 
 def _rms(values: Sequence[float]) -> float | None:

@@ -95,7 +95,13 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
     by_lot, _ = _chi2(expansion, (order < n_placements // 2) @ expansion.groups)
     unit = max(float(np.median(by_lot)) / _MEDIAN_CHI2, 1e-12)
     x, y, z = centres.T
-    found = [_changed_on_the_way(expansion, unit)]
+    # The capture from which on the results differ most, corrected for the number of captures tried.
+    n = len(expansion.gradients)
+    cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
+    chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
+    best = int(np.argmax(chi2))
+    chance = min(len(cuts) * _tail(chi2[best] / unit), 1.0)
+    found = [_contrast("before", "after", apart[best], chance, int(cuts[best]))]
     for first, second, key in (
         ("near", "far", np.linalg.norm(centres, axis=1)),
         ("left", "right", x / z),
@@ -193,16 +199,6 @@ def _share_out(g: Array, H: Array, starts: NDArray[np.bool_]) -> tuple[Array, ND
     x = np.where(found[..., None], x_first[each, best][:, None], x_second[each, best][:, None])
     left = g + np.einsum("kij,bkj->bki", H, x)
     return np.sqrt(np.maximum(gains[each, best], 0.0)), found, left
-
-
-def _changed_on_the_way(expansion: Quadratics, unit: float) -> Contrast:
-    """Find the capture from which on the results differ most, corrected for the number of captures tried."""
-    n = len(expansion.gradients)
-    cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
-    chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
-    best = int(np.argmax(chi2))
-    chance = min(len(cuts) * _tail(chi2[best] / unit), 1.0)
-    return _contrast("before", "after", apart[best], chance, int(cuts[best]))
 
 
 def _tail(chi2: float) -> float:

@@ -31,8 +31,6 @@ from lce_rig.judge.split_consistency import Contrast, contrast_halves, find_grou
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import LidarSettings, Rig, VerdictSettings
 
-# Check the reported uncertainty with bootstrap samples, leave-one-out results and random halves.
-
 _N_DRAWS = 300
 
 
@@ -57,24 +55,13 @@ class Spread:
             Largest ratio of the three to the reported standard deviation, in rotation or translation, and the
             name of its method.
         """
-        ways = {
-            "bootstrap": self.bootstrap,
-            "left_out": self.left_out,
-            "halves": self.halves,
-        }
+        ways = {"bootstrap": self.bootstrap, "left_out": self.left_out, "halves": self.halves}
         ratios = {
-            words: float(
-                np.sqrt(
-                    max(
-                        np.trace(spread[part, part]) / np.trace(cov[part, part])
-                        for part in (slice(0, 3), slice(3, 6))
-                    )
-                )
-            )
-            for words, spread in ways.items()
+            name: max(np.trace(spread[k, k]) / np.trace(cov[k, k]) for k in (slice(0, 3), slice(3, 6)))
+            for name, spread in ways.items()
         }
-        words = max(ratios, key=lambda name: ratios[name])
-        return ratios[words], words
+        widest = max(ratios, key=lambda name: ratios[name])
+        return float(np.sqrt(ratios[widest])), widest
 
 
 def resample(expansion: Quadratics, seed: int = 0) -> Spread:
@@ -184,8 +171,12 @@ def validate(
         lens: of the camera.
         views: its boards in the captures used.
     """
-    board = rig.board.to_board()
-    intrinsics = check_intrinsics(_thinned(views), lens, board) if views else None
+    board, known = rig.board.to_board(), estimate.sensitivities
+    # More views do not improve the check of the intrinsics.
+    thinned = views[:: max(1, -(-len(views) // _MAX_VIEWS))]
+    intrinsics = check_intrinsics(thinned, lens, board) if views else None
+    widened_by, remark, control, nuisances = 1.0, None, None, None
+    contrasts: tuple[Contrast, ...] = ()
     observations = [estimate.fitted[name] for name in estimate.used]
     expansion = expand(
         observations,
@@ -194,28 +185,40 @@ def validate(
         laser_bias_sigma_m=lidar.laser_bias_sigma_m,
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
-    if len(expansion.groups) < _MIN_PLACEMENTS:
-        return _reported(estimate, rig, intrinsics=intrinsics)
-    settled = expansion.hold(SCALE).settled()
-    # Compare a covariance with the scatter of its own method, as another cost scatters differently.
-    widened_by, remark = widening(estimate.cov, resample(estimate.cost or settled), rig.verdict)
-    cov, moved = widened_by**2 * estimate.cov, (rig.calibration, rig.verdict.control_sigmas)
-    if estimate.method == "ml":
-        with_constants = _with_prior_of_scale(expansion, estimate.sensitivities)
-        control = run_control_with_constants(with_constants, cov, estimate.lever_m, *moved)
-    else:
-        control = run_control(observations, board, estimate.T_cam_lidar, cov, settled, *moved)
-    rings = np.unique(np.concatenate([observation.lidar.ring for observation in observations]))
-    centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
-    return _reported(
-        estimate,
-        rig,
-        widened_by,
-        remark,
-        (*contrast_halves(settled, centres), *find_groups(settled)),
-        control,
-        estimate_nuisances(expansion, rings),
-        intrinsics,
+    if len(expansion.groups) >= _MIN_PLACEMENTS:
+        settled = expansion.hold(SCALE).settled()
+        # Compare a covariance with the scatter of its own method, as another cost scatters differently.
+        widened_by, remark = widening(estimate.cov, resample(estimate.cost or settled), rig.verdict)
+        cov, moved = widened_by**2 * estimate.cov, (rig.calibration, rig.verdict.control_sigmas)
+        if estimate.method == "ml":
+            with_constants = _with_prior_of_scale(expansion, known)
+            control = run_control_with_constants(with_constants, cov, estimate.lever_m, *moved)
+        else:
+            control = run_control(observations, board, estimate.T_cam_lidar, cov, settled, *moved)
+        rings = np.unique(np.concatenate([observation.lidar.ring for observation in observations]))
+        centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
+        contrasts = (*contrast_halves(settled, centres), *find_groups(settled))
+        nuisances = estimate_nuisances(expansion, rings)
+    contradictions = [
+        *lens_contradiction(intrinsics, known, rig.calibration.target_sigma_deg),
+        *scale_contradiction(nuisances, known),
+        *split_contradictions(contrasts, rig.calibration, rig.verdict),
+        *channels_contradiction(estimate, rig.calibration),
+    ]
+    cov_shared = profile_covariance(known)
+    cov_agreed = widened_by**2 * estimate.cov + cov_shared
+    return Validation(
+        cov=cov_agreed + sum(each.cov for each in contradictions),
+        cov_agreed=cov_agreed,
+        cov_shared=cov_shared,
+        contributions=list_contributions(estimate.diagnostics, widened_by, known, contradictions),
+        known_better=known_better(intrinsics, nuisances, known),
+        widened_by=widened_by,
+        remark=remark,
+        contrasts=contrasts,
+        control=control,
+        nuisances=nuisances,
+        intrinsics=intrinsics,
     )
 
 
@@ -227,46 +230,3 @@ def _with_prior_of_scale(expansion: Quadratics, sensitivities: Sequence[Sensitiv
     prior = expansion.prior.copy()
     prior[SCALE, SCALE] = 1 / sum(sigma**2 for sigma in sigmas)
     return replace(expansion, prior=prior)
-
-
-def _reported(
-    estimate: CalibrationEstimate,
-    rig: Rig,
-    widened_by: float = 1.0,
-    remark: Finding | None = None,
-    contrasts: tuple[Contrast, ...] = (),
-    control: NegativeControl | None = None,
-    nuisances: Nuisances | None = None,
-    intrinsics: IntrinsicsCheck | None = None,
-) -> Validation:
-    """Sum up the covariance to report."""
-    known = estimate.sensitivities
-    contradictions = [
-        *lens_contradiction(intrinsics, known, rig.calibration.target_sigma_deg),
-        *scale_contradiction(nuisances, known),
-        *split_contradictions(contrasts, rig.calibration, rig.verdict),
-        *channels_contradiction(estimate, rig.calibration),
-    ]
-    cov_shared = profile_covariance(known)
-    cov_agreed = widened_by**2 * estimate.cov + cov_shared
-    cov = cov_agreed + sum(each.cov for each in contradictions)
-    causes = list_contributions(estimate.diagnostics, widened_by, known, contradictions)
-    better = known_better(intrinsics, nuisances, known)
-    return Validation(
-        cov,
-        cov_agreed,
-        cov_shared,
-        causes,
-        better,
-        widened_by,
-        remark,
-        contrasts,
-        control,
-        nuisances,
-        intrinsics,
-    )
-
-
-def _thinned(views: Sequence[BoardView]) -> list[BoardView]:
-    every = -(-len(views) // _MAX_VIEWS)
-    return list(views[::every])
