@@ -7,10 +7,14 @@ LCE_RIG_DATA names.
 """
 
 import argparse
+import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+# The stand-ins of devices: tests/wire.
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
 Part = Callable[[Any, argparse.Namespace], None]
 PARTS: dict[str, tuple[str, Part]] = {

@@ -13,6 +13,10 @@ import argparse
 import json
 import sys
 from importlib import import_module
+from pathlib import Path
+
+# The stand-ins of devices: tests/wire.
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
 TARGETS = {
     "kills": ("fuzzing.kills:fuzz_kills", 200, "a live collection, killed"),

@@ -12,8 +12,8 @@ from typing import Any
 from lce_rig.rig import Rig, dump_rig, load_rig
 from wire.reel import Reel
 
-_SCRIPTS = Path(__file__).parents[1]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{_SCRIPTS}:{_SCRIPTS.parent}", "OMP_NUM_THREADS": "1"}
+_TESTS = Path(__file__).parents[1]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{_TESTS}:{_TESTS.parent}", "OMP_NUM_THREADS": "1"}
 """For processes of these senders and of lce-rig."""
 
 
