@@ -20,7 +20,7 @@ from lce_rig.core.geometry import pose
 from lce_rig.export.robot_tree import Joint, JointChange, RobotTree, fit_tree
 from lce_rig.export.urdf import joint_lines, origin
 from lce_rig.io.ros.bag_file import BagFile, list_topics
-from lce_rig.io.ros.rosbag import deserialize
+from lce_rig.io.ros.messages import deserialize
 from lce_rig.rig import Rig
 from lce_rig.session.durable import write_atomically
 

@@ -23,7 +23,7 @@ from lce_rig.export.job import ExportJob
 from lce_rig.export.robot_tree import Joint
 from lce_rig.export.rotations import quaternion_wxyz
 from lce_rig.io.ros.bag_recorder import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan
-from lce_rig.io.ros.message_fields import typestore
+from lce_rig.io.ros.messages import typestore
 from lce_rig.show.overlays.overlay import draw_projection, range_limits
 
 _TF_TYPE, _TF_STATIC = "tf2_msgs/msg/TFMessage", "/tf_static"

@@ -6,19 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.core import limits
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream, join_events
 from lce_rig.core.errors import SourceError
-from lce_rig.core.losses import Losses
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.io.events.word_codec import EVT3, WordDecoder
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import open_bag_writer
-from lce_rig.io.ros.event_messages import BagEvents, PacketDecoder, parse_packet
+from lce_rig.io.ros.event_messages import PacketDecoder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.rig_time import rig_time_ns
 from tests.io.events import encoders
-from tests.io.events.bags import write_packet_bag
+from tests.io.events.bags import parsed, write_packet_bag
 from tests.io.events.encoders import listed
 from tests.notes import has_note
 
@@ -124,13 +122,13 @@ def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_pat
 
 
 def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path: Path, rig: Rig) -> None:
-    from lce_rig.io.ros.bag_recorder import add_event_topic, encode_image, encode_scan
-    from lce_rig.io.ros.message_fields import typestore
+    from lce_rig.io.ros.bag_recorder import encode_image, encode_scan
+    from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, typestore
 
     def write(path: Path, has_pictures: bool) -> Path:
         with open_bag_writer(path) as writer:
-            add_event_topic(writer, "/davis/events", is_ros1=True)
             store = typestore(True)
+            writer.add_connection("/davis/events", EVENT_ARRAY_TYPE, typestore=store)
             cloud = writer.add_connection("/velodyne_points", "sensor_msgs/msg/PointCloud2", typestore=store)
             writer.write(cloud, T0_NS, encode_scan(sweep(0), rig.lidars["lidar"], True, 0))
             if has_pictures:
@@ -262,25 +260,12 @@ def test_real_drivers_bags_open_with_a_profile_that_fits(
     assert recording.streams[Stream("davis", "events", "events")] is not None
 
 
-def test_a_packet_that_holds_more_events_than_any_camera_sends_is_left_out(tmp_path: Path) -> None:
-    words = np.array([0x8000, 0x6001, 0x0005, 0x2007], "<u2").tobytes()
-    sizes = 1, limits.MAX_PACKET_BYTES // 8 + 1, 1
-    messages = [
-        ("/davis/events", T0_NS + k, encoders.packet(words * n, "evt3", is_ros1=True))
-        for k, n in enumerate(sizes)
-    ]
-    losses = Losses()
-    events = list(BagEvents(write_packet_bag(tmp_path / "a.bag", messages), None).stretches(losses))
-    assert sum(map(len, events)) == 2
-    assert losses.by_code() == {"recording.broken_packets": 1}
-
-
 def test_a_packet_whose_words_hold_many_events_each_is_decoded_in_pieces() -> None:
     rng = np.random.default_rng(0)
     words = np.tile(np.array([0x8000, 0x6001, 0x0005, 0x3000, 0x4FFF, 0x4FFF, 0x50FF], "<u2"), 40_000)
     words[1::7] = 0x6000 | np.sort(rng.integers(0, 4096, 40_000))
     decoder = PacketDecoder()
-    packet = parse_packet(encoders.packet(words.tobytes(), "evt3", is_ros1=True), "ros1")
+    packet = parsed(encoders.packet(words.tobytes(), "evt3", is_ros1=True), True)
     pieces = [*decoder.decode(packet), *decoder.finish()]
     whole = WordDecoder(EVT3).decode(words.astype(np.uint16))
     assert len(pieces) > 2 and max(map(len, pieces)) < len(whole) / 2

@@ -1,4 +1,13 @@
-"""A bag written as samples arrive, on the topics of the rig's profile."""
+"""A bag written as samples arrive, on the topics of the rig's profile.
+
+Messages have the fields and conventions that other programs expect.
+
+References:
+    https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/Image.html
+    https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointCloud2.html
+    https://github.com/ros-drivers/velodyne (the layout of its point clouds)
+    https://github.com/uzh-rpg/rpg_dvs_ros/tree/master/dvs_msgs/msg
+"""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -11,24 +20,19 @@ import numpy as np
 
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.io.ros.event_array import encode_event_array
-from lce_rig.io.ros.message_fields import typestore
+from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, encode_event_array, typestore
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.timing.rig_time import event_channel
 
-# Writing events into ROS bags as dvs_msgs/EventArray.
-#
-# References:
-#     https://github.com/uzh-rpg/rpg_dvs_ros/tree/master/dvs_msgs/msg
-
-MESSAGE_TYPE = "dvs_msgs/msg/EventArray"
-# The drivers' own rate.
+IMAGE_TYPE = "sensor_msgs/msg/Image"
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
+# The event drivers' own rate.
 _MESSAGE_NS = 33_000_000
-_HEADER = "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"
-_EVENT = {
-    True: "uint16 x\nuint16 y\ntime ts\nbool polarity\n",
-    False: "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity\n",
-}
+_NS_PER_S = 10**9
+_UINT16, _FLOAT32 = 4, 7
+# velodyne_pointcloud's: times are seconds after the header's timestamp, which float32 holds to 4 ns.
+_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2")])
+_TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
 
 
 def open_bag_writer(path: Path) -> Any:
@@ -41,16 +45,6 @@ def open_bag_writer(path: Path) -> Any:
     from rosbags.rosbag2 import Writer as Ros2Writer
 
     return Ros2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-
-
-def add_event_topic(writer: Any, topic: str, is_ros1: bool) -> Any:
-    """Announce a topic of events in a bag that may hold others as well."""
-    from rosbags.typesys import get_types_from_msg
-
-    store = typestore(is_ros1)
-    store.register(get_types_from_msg(_EVENT[is_ros1], "dvs_msgs/msg/Event"))
-    store.register(get_types_from_msg(_HEADER, MESSAGE_TYPE))
-    return writer.add_connection(topic, MESSAGE_TYPE, typestore=store)
 
 
 def event_messages(
@@ -75,22 +69,6 @@ def event_messages(
                 received_ns = events.host_ns + int(part.t_ns[0]) - first_ns
             yield received_ns, encode_event_array(part, frame_id, encoding, number)
             number += 1
-
-
-# Images and scans as ROS messages, with the fields and conventions that other programs expect.
-#
-# References:
-#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/Image.html
-#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointCloud2.html
-#     https://github.com/ros-drivers/velodyne (the layout of its point clouds)
-
-IMAGE_TYPE = "sensor_msgs/msg/Image"
-CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
-_NS_PER_S = 10**9
-_UINT16, _FLOAT32 = 4, 7
-# velodyne_pointcloud's: times are seconds after the header's timestamp, which float32 holds to 4 ns.
-_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2")])
-_TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
 
 
 def encode_image(image: Image, frame_id: str, is_ros1: bool, number: int) -> memoryview:
@@ -125,7 +103,13 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool, number: int)
         is_ros1: whether for ROS 1.
         number: of the message in its topic; ROS 1 headers carry it.
     """
-    stamp_ns = _cloud_stamp_ns(scan, settings)
+    # The LiDAR's driver would have timestamped the first firing, or the last one.
+    stamp_ns = scan.stamp_ns or 0
+    if scan.stamp_ns is not None and settings.timestamps.reference != "first_firing":
+        if scan.offset_ns is not None and len(scan.offset_ns):
+            stamp_ns += int(scan.offset_ns.max())
+        else:
+            stamp_ns += round(_NS_PER_S / settings.rate_hz)
     points = np.empty(len(scan.points), _POINT if scan.offset_ns is None else _TIMED_POINT)
     for axis, name in enumerate("xyz"):
         points[name] = scan.points[:, axis]
@@ -149,15 +133,6 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool, number: int)
         is_dense=True,
     )
     return _serialize(message, CLOUD_TYPE, is_ros1)
-
-
-def _cloud_stamp_ns(scan: Scan, settings: LidarSettings) -> int:
-    """Say what the LiDAR's driver would have timestamped: the first firing, or the last one."""
-    if scan.stamp_ns is None or settings.timestamps.reference == "first_firing":
-        return scan.stamp_ns or 0
-    if scan.offset_ns is None or not len(scan.offset_ns):
-        return scan.stamp_ns + round(_NS_PER_S / settings.rate_hz)
-    return scan.stamp_ns + int(scan.offset_ns.max())
 
 
 def _header(stamp_ns: int, frame_id: str, is_ros1: bool, number: int) -> Any:
@@ -217,20 +192,26 @@ class BagRecorder:
             ValueError: it has no timestamp at all.
         """
         if isinstance(sample, Events):
-            self._write_events(sample)
+            channel = event_channel(self._rig, sample.sensor) or "events"
+            topic, frame = self._camera_topic(sample.sensor, channel)
+            first = self._numbers[topic]
+            for arrival_ns, packet in event_messages(sample, frame, self._is_ros1, first):
+                self._write(topic, EVENT_ARRAY_TYPE, arrival_ns, packet)
             return
         received_ns = sample.stamp_ns if sample.host_ns is None else sample.host_ns
         if received_ns is None:
             raise ValueError(f"a sample of {sample.sensor} carries no time")
         if isinstance(sample, Image):
             topic, frame = self._camera_topic(sample.sensor, sample.channel)
-            data = encode_image(sample, frame, self._is_ros1, self._numbers[topic])
-            self._write(topic, IMAGE_TYPE, received_ns, data)
+            image = encode_image(sample, frame, self._is_ros1, self._numbers[topic])
+            self._write(topic, IMAGE_TYPE, received_ns, image)
         else:
-            topic = self._lidar_topic(sample)
+            if sample.sensor not in self._rig.lidars:
+                raise SourceError(f"rig {self._rig.name!r} has no lidar {sample.sensor!r}")
             settings = self._rig.lidars[sample.sensor]
-            data = encode_scan(sample, settings, self._is_ros1, self._numbers[topic])
-            self._write(topic, CLOUD_TYPE, received_ns, data)
+            topic = settings.topic or f"/{sample.sensor}/points"
+            cloud = encode_scan(sample, settings, self._is_ros1, self._numbers[topic])
+            self._write(topic, CLOUD_TYPE, received_ns, cloud)
 
     def close(self) -> None:
         """Write the index; does nothing the second time, or after a failure.
@@ -254,42 +235,23 @@ class BagRecorder:
         with suppress(SourceError):
             self.close()
 
-    def _write_events(self, events: Events) -> None:
-        channel = event_channel(self._rig, events.sensor) or "events"
-        topic, frame = self._camera_topic(events.sensor, channel)
-        for received_ns, data in event_messages(events, frame, self._is_ros1, self._numbers[topic]):
-            self._write(topic, MESSAGE_TYPE, received_ns, data)
-
     def _write(self, topic: str, msgtype: str, received_ns: int, data: bytes | memoryview) -> None:
-        connection = self._connection(topic, msgtype)
+        if topic not in self._connections:
+            store = typestore(self._is_ros1)
+            self._connections[topic] = msgtype, self._writer.add_connection(topic, msgtype, typestore=store)
+        before, connection = self._connections[topic]
+        if before != msgtype:
+            hint = "Give each a topic in the profile."
+            raise SourceError(f"topic {topic} would carry both {before} and {msgtype}", hint)
         with self._disk():
             self._writer.write(connection, received_ns, data)
         self._numbers[topic] += 1
-
-    def _connection(self, topic: str, msgtype: str) -> Any:
-        if topic not in self._connections:
-            if msgtype == MESSAGE_TYPE:
-                connection = add_event_topic(self._writer, topic, self._is_ros1)
-            else:
-                connection = self._writer.add_connection(topic, msgtype, typestore=typestore(self._is_ros1))
-            self._connections[topic] = msgtype, connection
-        known, connection = self._connections[topic]
-        if known != msgtype:
-            raise SourceError(
-                f"topic {topic} would carry both {known} and {msgtype}", "Give each a topic in the profile."
-            )
-        return connection
 
     def _camera_topic(self, camera: str, channel: str) -> tuple[str, str]:
         settings = self._rig.cameras.get(camera)
         if settings is None or channel not in settings.channels:
             raise SourceError(f"rig {self._rig.name!r} has no camera channel {camera}.{channel}")
         return settings.channels[channel].topic or f"/{camera}/{channel}", settings.optical_frame
-
-    def _lidar_topic(self, scan: Scan) -> str:
-        if scan.sensor not in self._rig.lidars:
-            raise SourceError(f"rig {self._rig.name!r} has no lidar {scan.sensor!r}")
-        return self._rig.lidars[scan.sensor].topic or f"/{scan.sensor}/points"
 
     @contextmanager
     def _disk(self) -> Iterator[None]:

@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lce_rig.core import limits
 from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
@@ -17,172 +15,20 @@ from lce_rig.io import findings
 from lce_rig.io.events.event_recording import CameraEvents, EventRecording
 from lce_rig.io.events.stream import NoEventsError, worded
 from lce_rig.io.folder.cloud import to_scan
-from lce_rig.io.folder.image_file import decode_image, to_8_bit
 from lce_rig.io.merging import merge_by_time
 from lce_rig.io.overlap import check_overlap
 from lce_rig.io.protocol import SourceOptions, Span
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import BagEvents
-from lce_rig.io.ros.message_fields import MessageReader, read_header, typestore
-from lce_rig.io.ros.topics import CLOUD_TYPES, PACKET_TYPES, Target, choose_topics
+from lce_rig.io.ros.messages import (
+    decode_pointcloud2,
+    decode_ros_image,
+    deserialize,
+    header_stamp_ns,
+)
+from lce_rig.io.ros.topics import PACKET_TYPES, Target, choose_topics
 from lce_rig.io.velodyne.stream import OFFSETS_NOTE, Vlp16Stream
 from lce_rig.rig import CameraSettings, LidarSettings, Rig
-
-# sensor_msgs/Image and CompressedImage as grey or BGR images.
-#
-# References:
-#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/image__encodings_8h_source.html
-
-# Encoding: bytes of one channel, channels, name of OpenCV's conversion to BGR ("" where none is needed).
-_ENCODINGS = {
-    "mono8": (1, 1, ""),
-    "8uc1": (1, 1, ""),
-    "mono16": (2, 1, ""),
-    "16uc1": (2, 1, ""),
-    "bgr8": (1, 3, ""),
-    "8uc3": (1, 3, ""),
-    "bgr16": (2, 3, ""),
-    "rgb8": (1, 3, "COLOR_RGB2BGR"),
-    "rgb16": (2, 3, "COLOR_RGB2BGR"),
-    "bgra8": (1, 4, "COLOR_BGRA2BGR"),
-    "8uc4": (1, 4, "COLOR_BGRA2BGR"),
-    "rgba8": (1, 4, "COLOR_RGBA2BGR"),
-    "yuv422": (1, 2, "COLOR_YUV2BGR_UYVY"),
-    "uyvy": (1, 2, "COLOR_YUV2BGR_UYVY"),
-    "yuv422_yuy2": (1, 2, "COLOR_YUV2BGR_YUY2"),
-    "yuyv": (1, 2, "COLOR_YUV2BGR_YUY2"),
-    **{f"bayer_{m}8": (1, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
-    **{f"bayer_{m}16": (2, 1, f"COLOR_Bayer{m.upper()}2BGR") for m in ("rggb", "bggr", "gbrg", "grbg")},
-}
-
-
-def decode_ros_image(message: Any) -> NDArray[np.uint8]:
-    """Decode sensor_msgs/Image.
-
-    Returns:
-        (H, W) grey or (H, W, 3) BGR.
-
-    Raises:
-        ValueError: an unknown encoding, or sizes that contradict each other.
-    """
-    encoding = str(message.encoding).lower()
-    if encoding not in _ENCODINGS:
-        raise ValueError(f"its encoding {message.encoding!r} is not known; known are {', '.join(_ENCODINGS)}")
-    n_bytes, n_channels, conversion = _ENCODINGS[encoding]
-    width, height = int(message.width), int(message.height)
-    if width * height > limits.MAX_PIXELS:
-        raise ValueError(f"it declares {width}x{height} pixels (limit {limits.MAX_PIXELS})")
-    n_row = width * n_channels * n_bytes
-    step = int(message.step) or n_row
-    data = np.ascontiguousarray(message.data, dtype=np.uint8)
-    if width * height == 0 or step < n_row or len(data) < (height - 1) * step + n_row:
-        raise ValueError(
-            f"{len(data)} bytes are not a {width}x{height} image in {encoding} with rows of {step} bytes"
-        )
-    kind = np.dtype(f"{'>' if message.is_bigendian else '<'}u{n_bytes}")
-    rows = np.ndarray((height, width, n_channels), kind, data.data, 0, (step, n_channels * n_bytes, n_bytes))
-    pixels = rows[:, :, 0] if n_channels == 1 else rows
-    return _convert(to_8_bit(pixels.astype(kind.newbyteorder("="))), conversion)
-
-
-def decode_ros_compressed_image(message: Any) -> NDArray[np.uint8]:
-    """Decode sensor_msgs/CompressedImage.
-
-    Returns:
-        (H, W) grey or (H, W, 3) BGR.
-
-    Raises:
-        ValueError: it is damaged, or no image.
-    """
-    form = str(message.format).lower()
-    if "compresseddepth" in form:
-        raise ValueError("it is a depth image")
-    pixels = decode_image(bytes(message.data))
-    mosaic = form.split(";")[0].strip()
-    # A camera's raw mosaic may have been compressed as if it were grey.
-    if mosaic.startswith("bayer_") and mosaic in _ENCODINGS and pixels.ndim == 2:
-        return _convert(pixels, _ENCODINGS[mosaic][2])
-    return pixels
-
-
-def _convert(pixels: NDArray[np.uint8], conversion: str) -> NDArray[np.uint8]:
-    if not conversion:
-        return pixels
-    import cv2
-
-    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)), dtype=np.uint8)
-
-
-# sensor_msgs/PointCloud2 of any layout as a structured array.
-#
-# References:
-#     https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointCloud2.html
-
-_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-
-
-def check_field_count(data: bytes, encoding: str) -> None:
-    """Make sure that a message does not declare more fields than points have, before it is deserialised.
-
-    Args:
-        data: sensor_msgs/PointCloud2 as it lies in the bag.
-        encoding: "ros1" or "cdr".
-
-    Raises:
-        ValueError: it does, or it is damaged.
-    """
-    reader = MessageReader(data, encoding)
-    read_header(reader)  # Height and width stand behind the header as they do in messages of events.
-    n_fields = reader.number("I")
-    if n_fields > limits.MAX_FIELDS:
-        raise ValueError(f"it declares {n_fields} fields per point (limit {limits.MAX_FIELDS})")
-
-
-def decode_pointcloud2(message: Any) -> NDArray[Any]:
-    """View a message's points by their names, row by row.
-
-    Field offsets, gaps between fields, gaps behind rows and byte order are as the message says.
-
-    Args:
-        message: sensor_msgs/PointCloud2 of ROS 1 or 2.
-
-    Returns:
-        Structured (height * width,); fields with a count of c > 1 have shape (c,).
-
-    Raises:
-        ValueError: what in the message contradicts itself.
-    """
-    order = ">" if message.is_bigendian else "<"
-    names: list[str] = []
-    formats: list[Any] = []
-    offsets: list[int] = []
-    for entry in message.fields:
-        if entry.datatype not in _KINDS:
-            raise ValueError(f"field {entry.name!r} has the unknown datatype {entry.datatype}")
-        kind, count = np.dtype(order + _KINDS[entry.datatype]), max(int(entry.count), 1)
-        if entry.offset + kind.itemsize * count > message.point_step:
-            raise ValueError(f"field {entry.name!r} does not fit into point_step {message.point_step}")
-        if entry.name and entry.name not in names:
-            names.append(entry.name)
-            formats.append(kind if count == 1 else (kind, (count,)))
-            offsets.append(int(entry.offset))
-    width, height, step = int(message.width), int(message.height), int(message.point_step)
-    if width * height > limits.MAX_POINTS:
-        raise ValueError(f"it declares {width * height} points (limit {limits.MAX_POINTS})")
-    # Some drivers leave row_step at zero in point clouds of one row.
-    row_step = int(message.row_step) or width * step
-    if row_step < width * step:
-        raise ValueError(f"row_step {row_step} is less than {width} points of {step} bytes")
-    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
-    if width * height == 0:
-        return np.empty(0, dtype=dtype)
-    data = np.ascontiguousarray(message.data, dtype=np.uint8)
-    n_needed = (height - 1) * row_step + width * step
-    if len(data) < n_needed:
-        raise ValueError(f"it holds {len(data)} of {n_needed} bytes of points")
-    rows: NDArray[Any] = np.ndarray((height, width), dtype, data.data, 0, (row_step, step))
-    return rows.reshape(-1)
-
 
 # A timestamp this much earlier than the one before is a clock that was set, not a message that came late.
 CLOCK_JUMP_NS = 1_000_000_000
@@ -221,7 +67,7 @@ class TopicDecoder:
             if message.msgtype in PACKET_TYPES:
                 self._take_packets(content)
                 return self._oldest()
-            stamp_ns = _header_stamp_ns(content)
+            stamp_ns = header_stamp_ns(content)
             if stamp_ns == 0:
                 self.notes.add("headers have no timestamps; the time of receipt is used")
                 stamp_ns = message.log_ns
@@ -275,8 +121,7 @@ class TopicDecoder:
         sensor, channel = self._target.sensor, self._target.channel
         if isinstance(self._settings, CameraSettings):
             assert channel is not None  # as every topic of a camera has
-            is_compressed = message.msgtype.endswith("CompressedImage")
-            pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
+            pixels = decode_ros_image(content)
             if self._settings.channels[channel].timestamps.reference == "start":
                 self.notes.add(
                     "messages have no exposure time; timestamps of its start are used as its middle"
@@ -426,7 +271,7 @@ class BagRecording:
             for message in islice(self._bag.messages(self._targets.keys()), _N_PROBED):
                 if message.topic not in found:
                     with suppress(ValueError):
-                        stamp_ns = _header_stamp_ns(deserialize(message)) or message.log_ns
+                        stamp_ns = header_stamp_ns(deserialize(message)) or message.log_ns
                         found[message.topic] = stamp_ns, message.log_ns
                 if len(found) == len(self._targets):
                     break
@@ -437,22 +282,3 @@ class BagRecording:
     def _summarise(self, decoders: dict[str, TopicDecoder]) -> None:
         for topic, decoder in decoders.items():
             self.notes += [f"{topic}: {line}" for line in decoder.account()]
-
-
-def _header_stamp_ns(content: Any) -> int:
-    return int(content.header.stamp.sec * 10**9 + content.header.stamp.nanosec)
-
-
-def deserialize(message: RawMessage) -> Any:
-    """Deserialise by ROS's own definitions; those in a bag may be missing, or beyond what rosbags parses."""
-    is_ros1 = message.encoding == "ros1"
-    if message.msgtype in CLOUD_TYPES:
-        check_field_count(message.data, message.encoding)
-    store = typestore(is_ros1)
-    msgtype = message.msgtype.replace("/", "/msg/")
-    try:
-        if is_ros1:
-            return store.deserialize_ros1(message.data, msgtype)
-        return store.deserialize_cdr(message.data, msgtype)
-    except Exception as error:  # A damaged message fails in any way: struct, assert, unicode, index.
-        raise ValueError(f"a message is damaged: {str(error) or type(error).__name__}") from None

@@ -1,4 +1,4 @@
-"""What a bag holds of cameras and LiDARs: what a rig's profile has to say of them."""
+"""The cameras and LiDARs in a bag, as far as a rig's profile needs them."""
 
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SourceError
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
-from lce_rig.io.ros.event_messages import EVENT_TYPES
-from lce_rig.io.ros.message_fields import MessageReader, read_header
-from lce_rig.io.ros.rosbag import (
+from lce_rig.io.ros.event_messages import EVENT_TYPES, read_event_head
+from lce_rig.io.ros.messages import (
     decode_pointcloud2,
-    decode_ros_compressed_image,
     decode_ros_image,
     deserialize,
 )
@@ -34,12 +32,12 @@ class SensorTopic:
         topic: its name.
         kind: "scans", "frames" or "events".
         n_messages: how many there are.
-        rate_hz: by when the recorder received the first and the last; None for a single one.
+        rate_hz: by the times of receipt of the first and the last; None for a single one.
         frame: of the first message's header, "" without.
         size_px: (width, height) of images and event arrays; None where they do not say.
         n_rings: number of rings of a scan; None where points have none.
         intrinsics: by the camera_info topic in the same namespace; None where there is no usable one.
-        note: why there is no usable one, "" where there is one or no topic.
+        note: the reason for which the one there is unusable; "" otherwise.
         cloud: the first point cloud of a topic of scans; None where it has packets.
     """
 
@@ -66,105 +64,86 @@ class SensorTopic:
 def survey_bag(path: Path) -> list[SensorTopic]:
     """List the topics of a bag with images, events and point clouds, in the order of their names.
 
-    Depth images and images that are another topic's compressed ones are left out.
+    Depth images and images that are another topic's compressed ones are left out, and packets where there are
+    point clouds.
 
     Raises:
         SourceError: it cannot be read, or holds no such topic.
     """
     bag = BagFile(path)
-    kinds = {topic: _kind(msgtype) for topic, (msgtype, n) in bag.topics.items() if n > 0}
-    wanted = {topic for topic, kind in kinds.items() if kind is not None}
+    types = {topic: kind for topic, (kind, n) in bag.topics.items() if n > 0}
+    read = CLOUD_TYPES | PACKET_TYPES | IMAGE_TYPES | EVENT_TYPES
+    wanted = {topic for topic, kind in types.items() if kind in read}
     wanted = {topic for topic in wanted if topic.removesuffix("/compressed") not in wanted - {topic}}
-    if any(bag.topics[topic][0] in CLOUD_TYPES for topic in wanted):
-        wanted = {topic for topic in wanted if bag.topics[topic][0] not in PACKET_TYPES}
-    infos = {topic for topic, (msgtype, n) in bag.topics.items() if msgtype == _INFO and n > 0}
-    first = _first_messages(bag, wanted | infos)
-    found = []
-    for topic in sorted(wanted & first.keys()):
-        kind = kinds[topic]
-        assert kind is not None
-        n = bag.topics[topic][1]
-        probed = _probe(
-            SensorTopic(topic, kind, n, _rate_hz(bag, topic, n, first[topic].log_ns)), first[topic]
-        )
-        if probed is not None:
-            found.append(probed if kind == "scans" else _with_lens(probed, first, infos))
-    if not found:
-        raise SourceError(f"{path}: no images, events or point clouds", list_topics(bag.topics))
-    return found
-
-
-def _kind(msgtype: str) -> Literal["scans", "frames", "events"] | None:
-    if msgtype in CLOUD_TYPES | PACKET_TYPES:
-        return "scans"
-    if msgtype in IMAGE_TYPES:
-        return "frames"
-    return "events" if msgtype in EVENT_TYPES else None
-
-
-def _first_messages(bag: BagFile, topics: set[str]) -> dict[str, RawMessage]:
+    if any(types[topic] in CLOUD_TYPES for topic in wanted):
+        wanted = {topic for topic in wanted if types[topic] not in PACKET_TYPES}
+    infos = {topic for topic, kind in types.items() if kind == _INFO}
     first: dict[str, RawMessage] = {}
     try:
-        for message in islice(bag.messages(topics), _N_PROBED):
+        for message in islice(bag.messages(wanted | infos), _N_PROBED):
             first.setdefault(message.topic, message)
-            if len(first) == len(topics):
+            if len(first) == len(wanted | infos):
                 break
     except SourceError:
         if not first:
             raise
-    return first
+    sensors = []
+    for topic in sorted(wanted & first.keys()):
+        message, n = first[topic], bag.topics[topic][1]
+        try:
+            sensor = _probe(message, n)
+        except (SourceError, ValueError):
+            continue  # No image or scan that can be used.
+        last_ns = bag.end_ns(topic)
+        if n > 1 and last_ns is not None and last_ns > message.log_ns:
+            sensor = replace(sensor, rate_hz=(n - 1) / ((last_ns - message.log_ns) * 1e-9))
+        if sensor.kind != "scans":
+            beside = (info for info in sorted(infos & first.keys()) if _is_beside(info, sensor))
+            info = next(beside, None)
+            sensor = sensor if info is None else _with_lens(sensor, first[info])
+        sensors.append(sensor)
+    if not sensors:
+        raise SourceError(f"{path}: no images, events or point clouds", list_topics(bag.topics))
+    return sensors
 
 
-def _rate_hz(bag: BagFile, topic: str, n_messages: int, first_ns: int) -> float | None:
-    last_ns = bag.end_ns(topic)
-    if last_ns is None or last_ns <= first_ns or n_messages < 2:
-        return None
-    return (n_messages - 1) / ((last_ns - first_ns) * 1e-9)
+def _probe(message: RawMessage, n: int) -> SensorTopic:
+    """Describe a topic with n messages by its first one.
 
-
-def _probe(found: SensorTopic, message: RawMessage) -> SensorTopic | None:
-    """Look into a topic's first message; None where it is no image or scan that can be used."""
-    try:
-        if found.kind == "events":
-            header = read_header(MessageReader(message.data, message.encoding))
-            size = (header.width_px, header.height_px) if header.width_px > 0 else None
-            return replace(found, frame=header.frame_id.lstrip("/"), size_px=size)
-        content: Any = deserialize(message)
-        found = replace(found, frame=str(content.header.frame_id).lstrip("/"))
-        if found.kind == "frames":
-            is_compressed = message.msgtype.endswith("CompressedImage")
-            pixels = decode_ros_compressed_image(content) if is_compressed else decode_ros_image(content)
-            return replace(found, size_px=(pixels.shape[1], pixels.shape[0]))
-        if message.msgtype in PACKET_TYPES:
-            return found
-        cloud = decode_pointcloud2(content)
-        return replace(found, n_rings=_count_rings(cloud, int(content.height)), cloud=cloud)
-    except (SourceError, ValueError):
-        return None
-
-
-def _count_rings(cloud: NDArray[Any], height: int) -> int | None:
-    for name in ("ring", "channel"):
+    Raises:
+        SourceError, ValueError: that is damaged, or no image or scan.
+    """
+    if message.msgtype in EVENT_TYPES:
+        head = read_event_head(message)
+        size_px = (head.width_px, head.height_px) if head.width_px > 0 else None
+        return SensorTopic(message.topic, "events", n, frame=head.frame_id.lstrip("/"), size_px=size_px)
+    content: Any = deserialize(message)
+    frame = str(content.header.frame_id).lstrip("/")
+    if message.msgtype in IMAGE_TYPES:
+        height_px, width_px = decode_ros_image(content).shape[:2]
+        return SensorTopic(message.topic, "frames", n, frame=frame, size_px=(width_px, height_px))
+    if message.msgtype in PACKET_TYPES:
+        return SensorTopic(message.topic, "scans", n, frame=frame)
+    cloud = decode_pointcloud2(content)
+    n_rings = int(content.height) if content.height > 1 else None
+    for name in ("channel", "ring"):
         if name in (cloud.dtype.names or ()) and len(cloud):
-            return len(np.unique(cloud[name]))
-    return height if height > 1 else None
+            n_rings = len(np.unique(cloud[name]))
+    return SensorTopic(message.topic, "scans", n, frame=frame, n_rings=n_rings, cloud=cloud)
 
 
-def _with_lens(found: SensorTopic, first: dict[str, RawMessage], infos: set[str]) -> SensorTopic:
-    """Add what the camera_info topic of an image's namespace says."""
-    topic = next((t for t in sorted(infos & first.keys()) if _namespace_of(t) == found.namespace), None)
-    if topic is None:
-        return found
+def _is_beside(info: str, sensor: SensorTopic) -> bool:
+    return "/".join([part for part in info.split("/") if part][:-1]) == sensor.namespace
+
+
+def _with_lens(sensor: SensorTopic, message: RawMessage) -> SensorTopic:
+    """Add the intrinsics of the camera_info topic of an image's namespace."""
     try:
-        info: Any = deserialize(first[topic])
+        info: Any = deserialize(message)
         # ROS 1 has capital letters.
         K, D = (info.k, info.d) if hasattr(info, "k") else (info.K, info.D)
         size = int(info.width), int(info.height)
         lens = Intrinsics.from_ros(str(info.distortion_model), np.asarray(K), tuple(D), size)
-        return replace(found, intrinsics=lens)
+        return replace(sensor, intrinsics=lens)
     except ValueError as error:
-        return replace(found, note=f"{topic}: {error}")
-
-
-def _namespace_of(topic: str) -> str:
-    return "/".join([part for part in topic.split("/") if part][:-1])
+        return replace(sensor, note=f"{message.topic}: {error}")

@@ -4,21 +4,21 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lce_rig.core.data import Events
-from lce_rig.io.ros.bag_recorder import add_event_topic, event_messages, open_bag_writer
+from lce_rig.io.ros.bag_file import RawMessage
+from lce_rig.io.ros.bag_recorder import event_messages, open_bag_writer
+from lce_rig.io.ros.event_messages import EventPacket, parse_packet
+from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, typestore
 
-_PACKET = (
-    "std_msgs/Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\n"
-    "string encoding\nbool is_bigendian\nuint8[] events\n"
-)
+
+def parsed(data: bytes, is_ros1: bool) -> EventPacket:
+    """Parse an EventPacket's bytes."""
+    encoding = "ros1" if is_ros1 else "cdr"
+    return parse_packet(RawMessage("/events", "event_camera_msgs/EventPacket", encoding, 0, data))
 
 
 def write_packet_bag(path: Path, messages: Sequence[tuple[str, int, bytes]]) -> Path:
     """Write (topic, time of receipt, message) as EventPackets; ROS 1 where the path ends in .bag."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_HUMBLE)
-    name = "event_camera_msgs/msg/EventPacket"
-    store.register(get_types_from_msg(_PACKET, name))
+    store, name = typestore(path.suffix == ".bag"), "event_camera_msgs/msg/EventPacket"
     with open_bag_writer(path) as writer:
         topics = sorted({topic for topic, _, _ in messages})
         connections = {topic: writer.add_connection(topic, name, typestore=store) for topic in topics}
@@ -31,7 +31,8 @@ def write_event_bag(path: Path, stretches: Iterable[Events]) -> None:
     """Write events as EventArrays: a ROS 1 bag where the path ends in .bag, else a ROS 2 folder."""
     is_ros1 = path.suffix == ".bag"
     with open_bag_writer(path) as writer:
-        connection = add_event_topic(writer, "/dvs/events", is_ros1)
+        store = typestore(is_ros1)
+        connection = writer.add_connection("/dvs/events", EVENT_ARRAY_TYPE, typestore=store)
         number = 0
         for stretch in stretches:
             for received_ns, message in event_messages(stretch, "event_camera", is_ros1, number):

@@ -6,7 +6,8 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.io.events import EventRecording, open_events
-from lce_rig.io.ros.bag_recorder import add_event_topic, event_messages
+from lce_rig.io.ros.bag_recorder import event_messages
+from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, typestore
 from tests.io.events import encoders
 from tests.io.events.bags import write_event_bag, write_packet_bag
 from tests.io.events.encoders import Event, listed, random_events
@@ -43,7 +44,7 @@ def test_sqlite_bags_are_read_as_a_folder_and_as_a_file(tmp_path: Path) -> None:
 
     events = random_events(2000, 11, start_us=1_700_000_000_000_000)
     with Writer(tmp_path / "ros2", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        connection = add_event_topic(writer, "/dvs/events", is_ros1=False)
+        connection = writer.add_connection("/dvs/events", EVENT_ARRAY_TYPE, typestore=typestore(False))
         for received_ns, message in event_messages(events, "cam", is_ros1=False):
             writer.write(connection, received_ns, message)
     (file,) = (tmp_path / "ros2").glob("*.db3")

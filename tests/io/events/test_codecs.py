@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 
 from lce_rig.core.data import EventColumns, Events, join_events
 from lce_rig.io.events.word_codec import EVT3, LIBCAER_CMP, Evt2Decoder, WordDecoder
-from lce_rig.io.ros.event_array import decode_event_array, encode_event_array
-from lce_rig.io.ros.event_messages import PacketDecoder, parse_packet
+from lce_rig.io.ros.event_messages import PacketDecoder
+from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, decode_event_array, encode_event_array, typestore
 from tests.io.events import encoders
+from tests.io.events.bags import parsed
 from tests.io.events.encoders import Event, listed, random_events
 
 WORDS = {"evt2": (encoders.evt2, "<u4"), "evt3": (encoders.evt3, "<u2")}
@@ -125,7 +126,7 @@ def test_packets_of_every_encoding_come_back(encoding: str, is_ros1: bool, seed:
     for half in (truth[: n // 2], truth[n // 2 :]):
         payload = payloads[encoding](half)
         data = encoders.packet(payload, encoding, is_ros1=is_ros1, base_ns=start_us * 1000, stamp_ns=77)
-        parts += list(decoder.decode(parse_packet(data, "ros1" if is_ros1 else "cdr")))
+        parts += list(decoder.decode(parsed(data, is_ros1)))
     parts += list(decoder.finish())
     assert columns_listed(join_events(parts)) == truth
     assert parts[0].host_ns == 77
@@ -135,14 +136,14 @@ def test_stamps_that_wrap_inside_a_libcaer_packet_go_on() -> None:
     start_us = (1 << 31) - 30
     truth = [(start_us + 20 * i, i, i, True) for i in range(5)]
     data = encoders.packet(encoders.libcaer(truth, 0), "libcaer", is_ros1=False)
-    (columns,) = PacketDecoder().decode(parse_packet(data, "cdr"))
+    (columns,) = PacketDecoder().decode(parsed(data, False))
     assert columns_listed(columns) == truth
 
 
 def test_packets_of_triggers_hold_no_events() -> None:
     edges = [(10, 0, 3, True), (20, 0, 3, False)]
     data = encoders.packet(encoders.mono(edges, 0), "trigger", is_ros1=True, base_ns=0)
-    assert list(PacketDecoder().decode(parse_packet(data, "ros1"))) == []
+    assert list(PacketDecoder().decode(parsed(data, True))) == []
 
 
 @pytest.mark.parametrize("encoding", ["ros1", "cdr"])
@@ -157,27 +158,21 @@ def test_event_arrays_come_back(encoding: str, n: int, seed: int, frame_id: str)
 
 @pytest.mark.parametrize("is_ros1", [True, False])
 def test_event_arrays_are_what_ros_itself_reads(is_ros1: bool) -> None:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    from lce_rig.io.ros import bag_recorder as bag_writer
-
-    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg(bag_writer._EVENT[is_ros1], "dvs_msgs/msg/Event"))
-    store.register(get_types_from_msg(bag_writer._HEADER, bag_writer.MESSAGE_TYPE))
+    store = typestore(is_ros1)
     events = random_events(20, 4, start_us=1_700_000_000_000_000)
     data = encode_event_array(events, "cam", "ros1" if is_ros1 else "cdr", number=5)
     read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-    message = read(data, bag_writer.MESSAGE_TYPE)
+    message = read(data, EVENT_ARRAY_TYPE)
     found = [(e.ts.sec * 10**6 + e.ts.nanosec // 1000, e.x, e.y, e.polarity) for e in message.events]
     assert found == listed(events)
     write = store.serialize_ros1 if is_ros1 else store.serialize_cdr
-    assert bytes(write(message, bag_writer.MESSAGE_TYPE)) == data
+    assert bytes(write(message, EVENT_ARRAY_TYPE)) == data
 
 
 @given(data=st.binary(max_size=200), is_ros1=st.booleans())
 def test_rubbish_is_refused_in_words_and_nothing_else(data: bytes, is_ros1: bool) -> None:
-    for decode in (parse_packet, decode_event_array):
+    for decode in (parsed, lambda data, is_ros1: decode_event_array(data, "ros1" if is_ros1 else "cdr")):
         try:
-            decode(data, "ros1" if is_ros1 else "cdr")
+            decode(data, is_ros1)
         except ValueError as error:
             assert str(error)

@@ -46,7 +46,7 @@ def test_a_real_drivers_compressed_packets_are_read_as_word_by_word(folder: Path
     path = folder / "davis346_apriltag_libcaer_cmp.mcap"
     found = []
     for message in BagFile(path).messages({"/event_camera/events"}):
-        packet = parse_packet(message.data, message.encoding)
+        packet = parse_packet(message)
         found += compressed_word_by_word(packet.payload.tobytes(), packet.time_base_ns // 1000)
     truth = np.array(found)
     t_ns, x, y, polarity = columns(path)
@@ -64,7 +64,7 @@ def test_evt3_is_read_as_word_by_word(folder: Path, name: str, n: int, duration_
     path = folder / name
     if path.suffix == ".bag":
         messages = BagFile(path).messages({"/event_camera/events"})
-        data = b"".join(parse_packet(m.data, m.encoding).payload.tobytes() for m in messages)
+        data = b"".join(parse_packet(m).payload.tobytes() for m in messages)
     else:
         data = path.read_bytes()
         while data.startswith(b"%"):
