@@ -14,7 +14,7 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder, ImageSearch
 from lce_rig.detect.image.search import NOT_SEEN_AT_ONCE
 from lce_rig.rig import Rig
-from lce_rig.rig.nominal import NominalExtrinsic
+from lce_rig.rig.poses import NominalExtrinsic
 from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]

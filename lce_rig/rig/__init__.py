@@ -3,9 +3,8 @@
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.editing import derive_text, edit_text, set_value
 from lce_rig.rig.loading import dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
-from lce_rig.rig.nominal import NominalExtrinsic
+from lce_rig.rig.poses import NominalExtrinsic
 from lce_rig.rig.profile import Rig
-from lce_rig.rig.reconstruction import ReconstructionSettings
 from lce_rig.rig.sensors import (
     CameraSettings,
     ChannelSettings,
@@ -14,6 +13,7 @@ from lce_rig.rig.sensors import (
     IntrinsicsSettings,
     LidarIntrinsicsSettings,
     LidarSettings,
+    ReconstructionSettings,
     TimestampSettings,
 )
 from lce_rig.rig.sync_settings import SyncSettings, TriggerSettings

@@ -1,6 +1,5 @@
 """The text of a new profile from its parts: sensors, lenses, board; nothing of another rig."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -8,9 +7,8 @@ from typing import Literal
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import TYPICAL, VLP_16, find_data_sheet
-from lce_rig.rig.document import read_document
-from lce_rig.rig.editing import is_plain
-from lce_rig.rig.loading import rig_from_document
+from lce_rig.rig.editing import as_text
+from lce_rig.rig.loading import read_document, rig_from_document
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def draft_profile(
     lines = [
         f"# {name}: written by `lce-rig rigs new`; `lce-rig rigs show FILE` shows every setting.",
         "format_version: 1",
-        f"name: {_text(name)}",
+        f"name: {as_text(name)}",
         "",
         "board:                            # measure it; do not rely on the CAD model",
         f"  inner_corners: [{board.cols}, {board.rows}]           "
@@ -110,12 +108,12 @@ def draft_profile(
         lines += _camera(camera)
     text = "\n".join(lines) + "\n"
     # Nobody has seen the text yet: errors name keys, not its lines.
-    rig_from_document(replace(read_document(text, source), lines={}))
+    rig_from_document(replace(read_document(text, source), root=None))
     return text
 
 
 def _lidar(lidar: LidarDraft) -> list[str]:
-    model = f"    model: {_text(lidar.model)}"
+    model = f"    model: {as_text(lidar.model)}"
     return [
         f"  {lidar.name}:",
         f"{model:<34}# {lidar.sees}" if lidar.sees else model,
@@ -175,7 +173,3 @@ def _camera(camera: CameraDraft) -> list[str]:
             "          sync: none",
         ]
     return lines
-
-
-def _text(value: str) -> str:
-    return value if is_plain(value) else json.dumps(value, ensure_ascii=False)

@@ -1,4 +1,8 @@
-"""Edits of a profile's text that keep comments and layout."""
+"""Edits of a profile's text that keep comments and layout.
+
+PyYAML's marks tell where a key's text begins and ends. ruamel.yaml would keep comments, too, but it ties each
+comment to the key above it: a key added to or removed from a block takes the next block's comments along.
+"""
 
 import json
 from collections.abc import Sequence
@@ -6,8 +10,7 @@ from collections.abc import Sequence
 import yaml
 
 from lce_rig.core.errors import UsageError
-from lce_rig.rig.document import BAD_SCALARS, read_document
-from lce_rig.rig.loading import rig_from_document
+from lce_rig.rig.loading import BAD_SCALARS, read_document, rig_from_document
 
 
 def derive_text(
@@ -36,10 +39,8 @@ def derive_text(
         UsageError: a value that is not YAML, or a path into something that has no keys.
     """
     head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are from {origin}.\n"
-    # What the other profile says of itself above its first key does not hold for this one.
-    text = text[_begin(text) :]
-    # A name such as 346 is a text only in quotes.
-    text = head + set_value(text, "name", name if is_plain(name) else json.dumps(name))
+    # The comments above the first key are about the other profile.
+    text = head + set_value(text[_compose(text).start_mark.index :], "name", as_text(name))
     if "description" not in [key for key, _ in settings]:
         text = remove_key(text, "description", must_exist=False)
     return edit_text(text, settings, removed, source)
@@ -66,19 +67,34 @@ def set_value(text: str, path: str, value: str) -> str:
     Raises:
         UsageError: a value that is not YAML on one line, or a path into something that has no keys.
     """
-    wanted = _parsed(path, value)
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    if root is None:
-        raise UsageError(f"--set {path}: no block for this key")
     keys = path.split(".")
-    node, depth = _descend(root, keys)
+    try:
+        wanted = _load(value)
+    except UsageError:
+        raise UsageError(f"--set {path}: {value!r} is not a YAML value") from None
+    if "\n" in value or not value.strip() or not all(keys):
+        raise UsageError(f"--set {path}={value}: expected KEY=VALUE, such as board.square_m=0.08")
+    node, depth = _descend(_compose(text), keys)
     if depth == len(keys):
         new = text[: node.start_mark.index] + value + text[_end(node) :]
-    elif isinstance(node, yaml.MappingNode):
-        new = _insert(text, node, keys[depth:], value)
-    else:
+    elif not isinstance(node, yaml.MappingNode):
         raise UsageError(f"--set {path}: {'.'.join(keys[:depth])} has no key {keys[depth]}")
-    if _value_at(new, keys) != wanted:
+    else:
+        entry = value
+        for key in reversed(keys[depth + 1 :]):
+            entry = f"{{{key}: {entry}}}"
+        entry = f"{keys[depth]}: {entry}"
+        if node.flow_style:
+            at = node.end_mark.index - 1
+            new = f"{text[:at]}{', ' if node.value else ''}{entry}{text[at:]}"
+        else:
+            at = text.find("\n", _end(node))
+            at = len(text) if at < 0 else at
+            new = f"{text[:at]}\n{' ' * node.start_mark.column}{entry}{text[at:]}"
+    data = _load(new)
+    for key in keys:
+        data = data[int(key)] if isinstance(data, list) else data.get(key) if isinstance(data, dict) else None
+    if data != wanted:
         raise UsageError(f"--set {path}: {value!r} is not allowed there", "quote a text that holds : or #")
     return new
 
@@ -92,91 +108,65 @@ def remove_key(text: str, path: str, *, must_exist: bool = True) -> str:
         must_exist: whether a key that is missing is an error.
 
     Raises:
-        UsageError: there is no such key, or it cannot be removed.
+        UsageError: there is no such key, or it stands in a block in braces.
     """
-    keys = path.split(".")
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    node, depth = (root, 0) if root is None else _descend(root, keys[:-1])
-    entry = None
-    if depth == len(keys) - 1 and isinstance(node, yaml.MappingNode):
-        entry = next(((key, value) for key, value in node.value if key.value == keys[-1]), None)
-    if entry is None or not isinstance(node, yaml.MappingNode):
+    *parents, last = path.split(".")
+    node, depth = _descend(_compose(text), parents)
+    pairs = node.value if depth == len(parents) and isinstance(node, yaml.MappingNode) else []
+    pair = next(((key, value) for key, value in pairs if key.value == last), None)
+    if pair is None:
         if must_exist:
             raise UsageError(f"--unset {path}: the profile has no such key")
         return text
-    key, value = entry
-    if node.flow_style:
-        raise UsageError(f"--unset {path}: remove it with --set {'.'.join(keys[:-1])}=VALUE")
+    key, value = pair
+    if isinstance(node, yaml.MappingNode) and node.flow_style:
+        raise UsageError(f"--unset {path}: remove it with --set {'.'.join(parents)}=VALUE")
     begin = text.rfind("\n", 0, key.start_mark.index) + 1
-    indent = key.start_mark.column
     while begin > 0:
         above = text.rfind("\n", 0, begin - 1) + 1
         line = text[above : begin - 1]
-        if not (line.lstrip().startswith("#") and len(line) - len(line.lstrip()) == indent):
+        if not (line.lstrip().startswith("#") and len(line) - len(line.lstrip()) == key.start_mark.column):
             break
         begin = above
     end = text.find("\n", _end(value))
-    new = text[:begin] + ("" if end < 0 else text[end + 1 :])
-    if _value_at(new, keys) is not _ABSENT:
-        raise UsageError(f"--unset {path}: it cannot be removed there")
-    return new
+    return text[:begin] + ("" if end < 0 else text[end + 1 :])
 
 
-def _begin(text: str) -> int:
-    """Find where the first key stands, behind the comments above it."""
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    return 0 if root is None else int(root.start_mark.index)
-
-
-_ABSENT = object()
-
-
-def _value_at(text: str, keys: Sequence[str]) -> object:
-    """Read the value of a key; `_ABSENT` if there is none, or the text is not YAML."""
+def as_text(value: str) -> str:
+    """Write a text as YAML: in quotes if it would be read as something else, as the name 346."""
     try:
-        data = yaml.safe_load(text)
-        for key in keys:
-            data = data[int(key)] if isinstance(data, list) else data[key]
-    except (yaml.YAMLError, RecursionError, *BAD_SCALARS):
-        return _ABSENT
-    return data
+        is_plain = _load(value) == value
+    except UsageError:
+        is_plain = False
+    return value if is_plain else json.dumps(value, ensure_ascii=False)
 
 
-def is_plain(name: str) -> bool:
-    """Return whether a text is read as that text without quotes."""
+def _load(text: str) -> object:
     try:
-        return bool(yaml.safe_load(name) == name)
-    except (yaml.YAMLError, RecursionError, *BAD_SCALARS):
-        return False
-
-
-def _parsed(path: str, value: str) -> object:
-    try:
-        parsed: object = yaml.safe_load(value)
+        return yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, *BAD_SCALARS) as error:
-        raise UsageError(f"--set {path}: {value!r} is not a YAML value") from error
-    if "\n" in value or not value.strip() or not all(path.split(".")):
-        raise UsageError(f"--set {path}={value}: expected KEY=VALUE, such as board.square_m=0.08")
-    return parsed
+        raise UsageError(f"this is not YAML: {text[:60]!r}") from error
+
+
+def _compose(text: str) -> yaml.Node:
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    if root is None:
+        raise UsageError("the profile is empty")
+    return root
 
 
 def _descend(node: yaml.Node, keys: Sequence[str]) -> tuple[yaml.Node, int]:
     """Follow keys as far as they lead; return the node and how many keys were followed."""
     for depth, key in enumerate(keys):
-        below = _child(node, key)
+        below = None
+        if isinstance(node, yaml.MappingNode):
+            below = next((value for name, value in node.value if name.value == key), None)
+        elif isinstance(node, yaml.SequenceNode) and key.isdigit() and int(key) < len(node.value):
+            below = node.value[int(key)]
         if below is None:
             return node, depth
         node = below
     return node, len(keys)
-
-
-def _child(node: yaml.Node, key: str) -> yaml.Node | None:
-    if isinstance(node, yaml.MappingNode):
-        return next((value for name, value in node.value if name.value == key), None)
-    if isinstance(node, yaml.SequenceNode) and key.isdigit() and int(key) < len(node.value):
-        child: yaml.Node = node.value[int(key)]
-        return child
-    return None
 
 
 def _end(node: yaml.Node) -> int:
@@ -186,16 +176,3 @@ def _end(node: yaml.Node) -> int:
         return _end(last[1] if isinstance(last, tuple) else last)
     end: int = node.end_mark.index
     return end
-
-
-def _insert(text: str, block: yaml.MappingNode, keys: Sequence[str], value: str) -> str:
-    for key in reversed(keys[1:]):
-        value = f"{{{key}: {value}}}"
-    entry = f"{keys[0]}: {value}"
-    if block.flow_style:
-        at = block.end_mark.index - 1
-        return f"{text[:at]}{', ' if block.value else ''}{entry}{text[at:]}"
-    at = text.find("\n", _end(block))
-    at = len(text) if at < 0 else at
-    indent = " " * block.start_mark.column
-    return f"{text[:at]}\n{indent}{entry}{text[at:]}"

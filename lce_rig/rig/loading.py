@@ -1,6 +1,7 @@
-"""Read and write profiles as YAML, by name or by path."""
+"""Read and write profiles as YAML, by name or by path; errors name file, line and key."""
 
 import difflib
+import reprlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,148 +13,28 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from lce_rig.core.errors import ProfileError, reading
-from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
-from lce_rig.rig.document import Document, KeyPath, read_document
 from lce_rig.rig.profile import Rig
 from lce_rig.rig.settings import PATTERNS
 
-# Validation errors with file, line, key and the nearest valid key.
-
+KeyPath = tuple[str | int, ...]
+BAD_SCALARS = (ValueError, ArithmeticError, LookupError, AttributeError, TypeError)
+"""Errors of PyYAML for a scalar that contradicts its tag: `!!bool x`, `!!int ""`, `!!timestamp x`."""
+# A profile has a page or two. Parsing 100 kB of YAML takes a second.
+_MAX_BYTES = 1 << 18
 # The search for the nearest key takes 1 ms per problem.
 _MOST_SHOWN = 100
-
-
-@dataclass(frozen=True)
-class _InvalidKey:
-    path: KeyPath
-    what: str
-    # The valid key nearest to an unknown one; it need not be reported as missing as well.
-    meant: KeyPath | None = None
-
-
-def explain(error: ValidationError, document: Document) -> ProfileError:
-    """Build the error for the user, with each problem once, in the order of the file's lines."""
-    details = error.errors()
-    problems = {
-        problem.path: problem for problem in reversed([_problem(detail) for detail in details[:_MOST_SHOWN]])
-    }
-    meant = {problem.meant for problem in problems.values()}
-    lines = [
-        (document.line(path), f"{'.'.join(map(str, path))}: {problem.what}" if path else problem.what)
-        for path, problem in problems.items()
-        if path not in meant
-    ]
-    places = {line: f"{document.source}:{line}" if document.lines else document.source for line, _ in lines}
-    sentences = [f"{places[line]}: {text}" for line, text in sorted(lines)]
-    if len(sentences) == 1:
-        return ProfileError(sentences[0])
-    n_more = max(len(details) - _MOST_SHOWN, 0)
-    what = f"{document.source}: {len(sentences) + n_more} problems"
-    return ProfileError(what, "\n".join([*sentences, *([f"and {n_more} more"] if n_more else [])]))
-
-
-def _problem(detail: ErrorDetails) -> _InvalidKey:
-    path = tuple(part for part in detail["loc"] if part != "[key]")
-    kind, given, context = detail["type"], detail["input"], detail.get("ctx", {})
-    if kind == "extra_forbidden":
-        return _unknown_key(path)
-    if kind == "missing" and isinstance(path[-1], int):
-        return _InvalidKey(path[:-1], f"{_shown(given)} has too few values")
-    if kind == "missing":
-        return _InvalidKey(path, "is missing")
-    if kind == "profile":
-        return _InvalidKey((*path, *_parts(context["key"])), context["what"])
-    if kind == "string_pattern_mismatch":
-        return _InvalidKey(path, f"{_shown(given)}: {PATTERNS[context['pattern']]}")
-    if "controls" in path[:-2]:
-        # The last part names the member of the union that validation tried.
-        return _InvalidKey(path[:-1], "must be a text, a number, true or false")
-    what = detail["msg"].replace("Input should", "must").replace("Tuple should", "must")
-    what = (
-        what.replace("a valid i", "an i")
-        .replace("a valid ", "a ")
-        .replace("List should", "must")
-        .replace("a tuple", "a list")
-        .replace("a dictionary", "a block of keys")
-        .replace(" after validation", "")
-    )
-    return _InvalidKey(path, f"{what}; {_shown(given)} given")
-
-
-def _parts(key: str) -> KeyPath:
-    return tuple(int(part) if part.isdigit() else part for part in key.split(".") if part)
-
-
-def _shown(value: Any) -> str:
-    text = "nothing" if value is None else repr(value)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
-def _unknown_key(path: KeyPath) -> _InvalidKey:
-    key = str(path[-1])
-    valid = valid_keys(path[:-1])
-    # A missing unit is the most likely error: for difflib, fx is as close to fy_px as to fx_px.
-    nearest = [name for name in valid if name.startswith(f"{key}_")]
-    elsewhere = [block for block, name in all_keys() if name == key]
-    if elsewhere and not nearest:
-        return _InvalidKey(path, f"unknown key here; move it to {elsewhere[0] or 'the top level'}")
-    nearest = nearest or difflib.get_close_matches(key, valid, n=1)
-    if nearest:
-        return _InvalidKey(path, f"unknown key; the nearest is {nearest[0]}", (*path[:-1], nearest[0]))
-    return _InvalidKey(path, f"unknown key; choose one of: {', '.join(valid)}")
-
-
-def valid_keys(path: KeyPath) -> list[str]:
-    """List the keys that a block may have.
-
-    Args:
-        path: the block's path; () for the whole profile.
-    """
-    model: type[BaseModel] | None = Rig
-    parts = list(path)
-    while parts and model is not None:
-        key = str(parts.pop(0))
-        annotation = model.model_fields[key].annotation if key in model.model_fields else None
-        model = _model_within(annotation)
-        # Names of sensors and list indices lie between a block and its settings.
-        if parts and not _is_block(annotation):
-            parts.pop(0)
-    return list(model.model_fields) if model is not None else []
-
-
-def _is_model(annotation: Any) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def _is_block(annotation: Any) -> bool:
-    """Return whether an annotation is one settings block, optional or not, not a dict or list of them."""
-    return _is_model(annotation) or any(_is_model(argument) for argument in _members(annotation))
-
-
-def _members(annotation: Any) -> tuple[Any, ...]:
-    return get_args(annotation) if isinstance(annotation, UnionType) else ()
-
-
-def _model_within(annotation: Any) -> type[BaseModel] | None:
-    """Find the settings class in an annotation such as dict[Name, CameraSettings]."""
-    if _is_model(annotation):
-        found: type[BaseModel] = annotation
-        return found
-    inner = (_model_within(argument) for argument in get_args(annotation))
-    return next((model for model in inner if model is not None), None)
-
-
-def all_keys(model: type[BaseModel] = Rig, block: str = "") -> Iterator[tuple[str, str]]:
-    """List every key of the schema as (block, key), names of sensors and list indices shown as *."""
-    for key, field in model.model_fields.items():
-        yield block, key
-        inner = _model_within(field.annotation)
-        if inner is not None:
-            name = "" if _is_block(field.annotation) else ".*"
-            yield from all_keys(inner, f"{block}.{key}{name}".removeprefix("."))
-
-
 _SUFFIXES = (".yaml", ".yml")
+# The words of pydantic's messages, and those of ours.
+_REWORDED = (
+    ("Input should", "must"),
+    ("Tuple should", "must"),
+    ("List should", "must"),
+    ("a valid i", "an i"),
+    ("a valid ", "a "),
+    ("a tuple", "a list"),
+    ("a dictionary", "a block of keys"),
+    (" after validation", ""),
+)
 
 
 def profile_folder() -> Path:
@@ -209,9 +90,12 @@ def read_profile(path: Path) -> str:
     Raises:
         ProfileError: it cannot be read, is not text, or is too large.
     """
-    with reading(path, ProfileError):
+    with reading(path, ProfileError), path.open("rb") as file:
+        content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise ProfileError(f"{path}: is too large to be a rig profile")
         try:
-            return read_file(path, MAX_DOCUMENT_BYTES).decode()
+            return content.decode()
         except UnicodeDecodeError as error:
             raise ProfileError(f"{path}: is not UTF-8 text (byte {error.start})") from error
 
@@ -229,14 +113,6 @@ def parse_rig(text: str, source: str = "profile") -> Rig:
     return rig_from_document(read_document(text, source))
 
 
-def rig_from_document(document: Document) -> Rig:
-    """Validate a document; raise a ProfileError that lists every problem with its line."""
-    try:
-        return Rig.model_validate(document.data)
-    except ValidationError as error:
-        raise explain(error, document) from error
-
-
 def dump_rig(rig: Rig) -> str:
     """Write a rig as YAML, without comments; `parse_rig` returns an equal rig."""
     data = rig.model_dump(mode="json", exclude_none=True)
@@ -251,3 +127,187 @@ class _Dumper(yaml.SafeDumper):
     ) -> yaml.SequenceNode:
         is_flat = all(not isinstance(item, dict) for item in sequence)
         return super().represent_sequence(tag, sequence, flow_style=is_flat)
+
+
+class _BadValueError(yaml.MarkedYAMLError):
+    """YAML that no profile has."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuse keys given twice, and name the line of a scalar that contradicts its tag."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        data: dict[Any, Any] = {}
+        for key, value in node.value:
+            # As written: YAML 1.1 reads the keys `on` and `no` as truth values.
+            if key.value in data:
+                raise _BadValueError(problem=f"{key.value} is given twice", problem_mark=key.start_mark)
+            data[key.value] = self.construct_object(value, deep=True)
+        return data
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        try:
+            return super().construct_object(node, deep)
+        except BAD_SCALARS as error:
+            problem = f"{node.value!r} cannot be read: {error}"
+            raise _BadValueError(problem=problem, problem_mark=node.start_mark) from error
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """Parsed YAML.
+
+    Attributes:
+        source: file the text came from.
+        data: the plain data.
+        root: the nodes, which know their lines; None if errors are to name keys only.
+    """
+
+    source: str
+    data: Any
+    root: yaml.Node | None
+
+    def line(self, path: KeyPath) -> int:
+        """Find the line (from 1) of a key, or of the nearest block around it that exists."""
+        node, line = self.root, 1
+        for part in path:
+            if isinstance(node, yaml.MappingNode):
+                pairs = {key.value: (key, value) for key, value in node.value}
+                key, node = pairs.get(part, (None, None))
+            else:
+                items = node.value if isinstance(node, yaml.SequenceNode) else []
+                key = node = items[part] if isinstance(part, int) and part < len(items) else None
+            if key is None:
+                break
+            line = key.start_mark.line + 1
+        return line
+
+
+def read_document(text: str, source: str) -> Document:
+    """Parse YAML text by the safe loader.
+
+    Raises:
+        ProfileError: not YAML, not a mapping, or a key given twice; with file and line.
+    """
+    try:
+        loader = _Loader(text)
+        root = loader.get_single_node()
+        if root is None:
+            raise ProfileError(
+                f"{source}: is empty", "Start from a shipped one: `lce-rig rigs new NAME --from rlfs`"
+            )
+        data: Any = loader.construct_document(root)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"{source}:{mark.line + 1}" if mark else source
+        kind = "" if isinstance(error, _BadValueError) else "not YAML: "
+        raise ProfileError(f"{where}: {kind}{error.problem or error.context}") from error
+    except yaml.YAMLError as error:
+        raise ProfileError(f"{source}: not YAML: {str(error).splitlines()[0]}") from error
+    except RecursionError as error:
+        raise ProfileError(f"{source}: is too deeply nested to be a rig profile") from error
+    if not isinstance(data, dict):
+        raise ProfileError(f"{source}: is not a rig profile: expected a mapping of keys")
+    return Document(source, data, root)
+
+
+def rig_from_document(document: Document) -> Rig:
+    """Validate a document; raise a ProfileError that lists every problem with its line."""
+    try:
+        return Rig.model_validate(document.data)
+    except ValidationError as error:
+        raise explain(error, document) from error
+
+
+def explain(error: ValidationError, document: Document) -> ProfileError:
+    """Build the error for the user, with each problem once, in the order of the file's lines."""
+    details = error.errors()
+    problems: dict[KeyPath, tuple[str, KeyPath | None]] = {}
+    for detail in details[:_MOST_SHOWN]:
+        path, what, meant = _problem(detail)
+        problems.setdefault(path, (what, meant))
+    # A misspelt key is not reported as missing as well.
+    all_meant = {meant for _, meant in problems.values()}
+    lines = sorted(
+        (document.line(path), f"{'.'.join(map(str, path))}: {what}" if path else what)
+        for path, (what, _) in problems.items()
+        if path not in all_meant
+    )
+    source = document.source
+    sentences = [f"{source}{f':{line}' if document.root else ''}: {text}" for line, text in lines]
+    if len(sentences) == 1:
+        return ProfileError(sentences[0])
+    n_more = max(len(details) - _MOST_SHOWN, 0)
+    hint = "\n".join([*sentences, *([f"and {n_more} more"] if n_more else [])])
+    return ProfileError(f"{source}: {len(sentences) + n_more} problems", hint)
+
+
+def _problem(detail: ErrorDetails) -> tuple[KeyPath, str, KeyPath | None]:
+    """Give a problem's key, its words, and the valid key that an unknown one probably stands for."""
+    path = tuple(part for part in detail["loc"] if part != "[key]")
+    kind, context = detail["type"], detail.get("ctx", {})
+    # Bounded: repr() would write nested aliases out.
+    value = "nothing" if detail["input"] is None else reprlib.repr(detail["input"])
+    if kind == "extra_forbidden":
+        return path, *_unknown_key(path)
+    if kind == "missing" and isinstance(path[-1], int):
+        return path[:-1], f"{value} has too few values", None
+    if kind == "missing":
+        return path, "is missing", None
+    if kind == "profile":
+        parts = (int(part) if part.isdigit() else part for part in context["key"].split(".") if part)
+        return (*path, *parts), context["what"], None
+    if kind == "string_pattern_mismatch":
+        return path, f"{value}: {PATTERNS[context['pattern']]}", None
+    if "controls" in path[:-2]:
+        # The last part names the member of the union that validation tried.
+        return path[:-1], "must be a text, a number, true or false", None
+    what = detail["msg"]
+    for old, new in _REWORDED:
+        what = what.replace(old, new)
+    return path, f"{what}; {value} given", None
+
+
+def _unknown_key(path: KeyPath) -> tuple[str, KeyPath | None]:
+    key = str(path[-1])
+    valid = valid_keys(path[:-1])
+    # A missing unit is the most likely error: for difflib, fx is as close to fy_px as to fx_px.
+    nearest = [name for name in valid if name.startswith(f"{key}_")]
+    elsewhere = [block for block, name in all_keys() if name == key]
+    if elsewhere and not nearest:
+        return f"unknown key here; move it to {elsewhere[0] or 'the top level'}", None
+    nearest = nearest or difflib.get_close_matches(key, valid, n=1)
+    if nearest:
+        return f"unknown key; the nearest is {nearest[0]}", (*path[:-1], nearest[0])
+    return f"unknown key; choose one of: {', '.join(valid)}", None
+
+
+def valid_keys(path: KeyPath) -> list[str]:
+    """List the keys that a block may have.
+
+    Args:
+        path: the block's path; () for the whole profile.
+    """
+
+    def is_here(block: str) -> bool:
+        parts = block.split(".") if block else []
+        return len(parts) == len(path) and all(a in ("*", str(b)) for a, b in zip(parts, path, strict=True))
+
+    return [key for block, key in all_keys() if is_here(block)]
+
+
+def all_keys(model: type[BaseModel] = Rig, block: str = "") -> Iterator[tuple[str, str]]:
+    """List every key of the schema as (block, key), names of sensors and list indices shown as *."""
+    for key, field in model.model_fields.items():
+        yield block, key
+        for inner, name in _models_within(field.annotation):
+            yield from all_keys(inner, f"{block}.{key}{name}".removeprefix("."))
+
+
+def _models_within(annotation: Any, name: str = "") -> Iterator[tuple[type[BaseModel], str]]:
+    """List the settings classes in an annotation such as dict[Name, CameraSettings], with ".*" if named."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation, name
+        return
+    for argument in get_args(annotation):
+        yield from _models_within(argument, name if isinstance(annotation, UnionType) else ".*")

@@ -10,8 +10,7 @@ from lce_rig.core import velodyne
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
-from lce_rig.rig.mount import Mount
-from lce_rig.rig.nominal import NominalExtrinsic
+from lce_rig.rig.poses import Mount, NominalExtrinsic
 from lce_rig.rig.sensors import (
     CAMERA_DRIVERS,
     LIDAR_DRIVERS,

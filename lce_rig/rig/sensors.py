@@ -8,8 +8,7 @@ from pydantic import Field, model_validator
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import TYPICAL, VLP_16, DataSheet, find_data_sheet
-from lce_rig.core.limits import MAX_PIXELS
-from lce_rig.rig.reconstruction import ReconstructionSettings
+from lce_rig.core.limits import MAX_EVENTS, MAX_PIXELS
 from lce_rig.rig.settings import (
     Figure,
     FrameName,
@@ -230,6 +229,37 @@ class IntrinsicsSettings(Settings):
             what = f"{len(self.distortion)} coefficients given, {self.model} has {wanted}"
             raise problem(what, "distortion")
         return self
+
+
+class ReconstructionSettings(Settings):
+    """Settings of image reconstruction from a channel's events.
+
+    Attributes:
+        method: a recurrent network, or the event map: sums of polarities, for comparison.
+        model: ONNX file of another network than the shipped one; absolute in a loaded profile.
+        window_s: windows of this duration; if neither is given, the rate of events decides.
+        window_events: windows of this number of events.
+    """
+
+    method: Literal["network", "map"] = "network"
+    model: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
+    window_s: Annotated[float, Field(ge=0.001, le=10)] | None = None
+    window_events: Annotated[int, Field(ge=1, le=MAX_EVENTS)] | None = None
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> "ReconstructionSettings":
+        if self.window_s is not None and self.window_events is not None:
+            raise problem("window_s and window_events exclude each other", "window_events")
+        if self.model is not None and self.method == "map":
+            raise problem("the event map needs no network", "model")
+        return self
+
+    def located(self, folder: Path) -> "ReconstructionSettings":
+        """Make the model's path absolute; a relative one starts at the profile's folder."""
+        if self.model is None:
+            return self
+        path = (folder / Path(self.model).expanduser()).resolve()
+        return self.model_copy(update={"model": str(path)})
 
 
 class ChannelSettings(Settings):

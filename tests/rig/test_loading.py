@@ -98,37 +98,35 @@ def test_an_unreadable_file_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "place"),
     [
-        (b"", "is empty"),
-        (b"# only a comment\n", "is empty"),
-        (b"\xff\xfe\x00", "is not UTF-8"),
-        (b"\x00", "not YAML"),
-        (b"- 1\n- 2\n", "expected a mapping of keys, found a list"),
-        (b"PNG", "expected a mapping of keys, found a text"),
-        (b"name: [1, 2", "mine.yaml:1: not YAML"),
-        (b"name: a\nboard:\n  x: 1\n  x: 2\n", "mine.yaml:4: board.x is given twice, first on line 3"),
-        (
-            b"name: !!python/object/apply:os.system [ls]\n",
-            "os.system is not allowed",
-        ),
-        (b"a: &a [*a, *a]\n", "too deeply nested"),
-        (b"[" * 5000, "nested"),
-        (b"name: 2026-13-45\n", "mine.yaml:1: '2026-13-45' cannot be read"),
+        (b"", ""),
+        (b"# only a comment\n", ""),
+        (b"\xff\xfe\x00", ""),
+        (b"\x00", ""),
+        (b"- 1\n- 2\n", ""),
+        (b"PNG", ""),
+        (b"name: [1, 2", ":1"),
+        (b"name: a\nboard:\n  x: 1\n  x: 2\n", ":4"),
+        (b"name: !!python/object/apply:os.system [ls]\n", ":1"),
+        (b"a: &a [*a, *a]\n", ":1"),
+        (b"[" * 5000, ""),
+        (b"name: 2026-13-45\n", ":1"),
+        (b"a: 1\n" * 200_000, ""),
     ],
 )
-def test_what_is_no_profile_is_refused_with_its_place(tmp_path: Path, content: bytes, says: str) -> None:
+def test_what_is_no_profile_is_refused_with_its_place(tmp_path: Path, content: bytes, place: str) -> None:
     path = tmp_path / "mine.yaml"
     path.write_bytes(content)
     with pytest.raises(ProfileError) as caught:
         load_rig(path)
-    assert says in str(caught.value)
+    assert f"{path}{place}: " in str(caught.value)
 
 
 def test_nested_aliases_do_not_exhaust_the_memory() -> None:
     levels = "".join(f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 10)}]\n" for i in range(1, 12))
-    with pytest.raises(ProfileError, match="too large"):
-        parse_rig(f"l0: &l0 [1]\n{levels}")
+    with pytest.raises(ProfileError):
+        parse_rig(f"l0: &l0 [1]\n{levels}name: *l11\n")
 
 
 @settings(max_examples=30)
@@ -144,27 +142,19 @@ def test_any_damage_is_a_profile_error_or_harmless(start: int, length: int, inse
 
 
 @pytest.mark.parametrize(
-    ("value", "cause"),
-    [
-        ("!!bool x", "cannot be read"),
-        ('!!int ""', "cannot be read"),
-        ("!!timestamp x", "cannot be read"),
-        ("0x" + "f" * 5000, "too large a number"),
-        ('"\\ud800"', "half a character"),
-        ("1.0e+308", "less than or equal to"),
-        ("&a [*a]", "deeply nested"),
-    ],
+    "value",
+    ["!!bool x", '!!int ""', "!!timestamp x", "0x" + "f" * 5000, '"\\ud800"', "1.0e+308", "&a [*a]"],
 )
-def test_a_scalar_that_is_no_figure_is_named_with_its_line(value: str, cause: str) -> None:
-    text = re.sub(r"cy_px: [\d.]+", lambda _: f"cy_px: {value}", find_profile("rlfs").read_text(), count=1)
-    with pytest.raises(ProfileError, match=rf"mine\.yaml.*{cause}"):
+def test_a_scalar_that_is_no_figure_is_named_with_its_line(value: str) -> None:
+    text = re.sub(r"cy_px: [\d.]+", lambda _: f"cy_px: {value}", RLFS, count=1)
+    line = text[: text.index("cy_px: ")].count("\n") + 1
+    with pytest.raises(ProfileError) as caught:
         parse_rig(text, "mine.yaml")
+    assert f"mine.yaml:{line}: " in str(caught.value)
 
 
-def test_what_is_far_too_long_for_a_profile_is_not_parsed() -> None:
-    with pytest.raises(ProfileError, match="too large to be a rig profile"):
-        parse_rig("a: 1\n" * 200_000)
+def test_many_problems_are_counted_and_the_first_shown() -> None:
     many = "".join(f"k{k}: 1\n" for k in range(3000))
-    with pytest.raises(ProfileError, match="problems") as caught:
+    with pytest.raises(ProfileError, match="300. problems") as caught:
         parse_rig(many)
-    assert "more" in caught.value.hint
+    assert caught.value.hint.count("\n") <= 100

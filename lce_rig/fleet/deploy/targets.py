@@ -7,8 +7,7 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from lce_rig.core.errors import UsageError
 from lce_rig.rig import Rig
-from lce_rig.rig.document import read_document
-from lce_rig.rig.loading import explain, read_profile
+from lce_rig.rig.loading import explain, read_document, read_profile
 from lce_rig.rig.settings import RobotName, Settings
 from lce_rig.rig.target_settings import ROBOT_FIELD, TargetSettings
 

@@ -1,4 +1,4 @@
-"""Nominal poses of a profile: the CAD model's values, as a check of the result."""
+"""Poses of a profile: of the rig on its robot, and of its sensors by the CAD model."""
 
 from typing import Literal
 
@@ -6,10 +6,33 @@ import numpy as np
 from pydantic import model_validator
 
 from lce_rig.core.geometry import Array, pose, project_to_so3
-from lce_rig.rig.settings import Figure, Name, Positive, Row, Settings, problem
+from lce_rig.rig.settings import Figure, FrameName, Name, Positive, Row, Settings, problem
 
 # CAD models and papers round to three digits, which changes a unit quaternion's norm by up to about 1e-3.
 _ROUNDING = 5e-3
+
+
+class Mount(Settings):
+    """The pose of one sensor on the robot, which makes the sensors part of the robot's tree of frames.
+
+    Attributes:
+        parent: a frame of the robot, such as base_link.
+        of: the frame of the LiDAR, or of a camera's body, whose pose is given.
+        xyz_m: its origin in the parent's frame.
+        rpy_deg: (roll, pitch, yaw) about the parent's fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
+    """
+
+    parent: FrameName
+    of: FrameName
+    xyz_m: Row
+    rpy_deg: Row = (0.0, 0.0, 0.0)
+
+    def to_matrix(self) -> Array:
+        """Build T_parent_of (4, 4)."""
+        from scipy.spatial.transform import Rotation
+
+        R = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_matrix()
+        return pose(R, np.array(self.xyz_m))
 
 
 class NominalExtrinsic(Settings):
