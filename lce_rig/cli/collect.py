@@ -113,7 +113,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     is_flag=False,
     flag_value="127.0.0.1:8765",
     metavar="[HOST:PORT]",
-    help="Live: serve a page for a phone [default address: 127.0.0.1:8765]. Other addresses require a token.",
+    help="Live: serve a page for a phone [default address: 127.0.0.1:8765]. Its link has a token.",
 )
 @click.option(
     "--record",

@@ -225,7 +225,7 @@ def write_debug_images(
     from lce_rig.show.overlays.debug_image import draw_debug
     from lce_rig.show.overlays.overlay_files import write_picture
 
-    base = folder or session.own(DEBUG)
+    base = folder or session.path / DEBUG
     jobs = [(pair, name) for pair in detections.pairs for name in detections.captures(pair)]
     matches = {pair: match_sensors(session.rig, detections, pair) for pair in detections.pairs}
     for done, (pair, name) in enumerate(jobs, start=1):
@@ -251,10 +251,8 @@ def write_debug_images(
             mismatch=mismatch if mismatch is not None and mismatch.stage == "pair" else None,
             events=None if view is None else view.events,
         )
-        own = base if len(detections.pairs) == 1 else base / pair.folder_name
-        if folder is None:
-            session.own(*own.relative_to(session.path).parts)
-        write_picture(own / f"{name}.png", picture)
+        place = base if len(detections.pairs) == 1 else base / pair.folder_name
+        write_picture(place / f"{name}.png", picture)
         progress(done, len(jobs))
     return base
 

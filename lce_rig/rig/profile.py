@@ -10,11 +10,20 @@ from lce_rig.core import velodyne
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
+from lce_rig.rig.findings import (
+    DRIFTING_CLOCK,
+    OTHER_DRIVER,
+    SHARED,
+    SWAPPED_SIDES,
+    UNKNOWN_DRIVER,
+    UNKNOWN_MODEL,
+)
 from lce_rig.rig.poses import Mount, NominalExtrinsic
 from lce_rig.rig.sensors import (
     CAMERA_DRIVERS,
     LIDAR_DRIVERS,
     CameraSettings,
+    ChannelSettings,
     LidarSettings,
 )
 from lce_rig.rig.settings import FrameName, Name, RigName, RobotName, Settings, Text, problem
@@ -130,10 +139,6 @@ class Rig(Settings):
                 what = f"a second entry for {entry.camera} and {entry.lidar}"
                 raise problem(what, f"nominal_extrinsics.{index}")
             seen.add((entry.camera, entry.lidar))
-        return self
-
-    @model_validator(mode="after")
-    def _triggered_cameras_are_known(self) -> "Rig":
         for name in self.sync.triggers if self.sync else ():
             if name not in self.cameras:
                 what = f"no camera is called {name}; there is {', '.join(self.cameras)}"
@@ -155,51 +160,42 @@ class Rig(Settings):
 
     def warnings(self) -> tuple[Finding, ...]:
         """List valid but probably unintended settings; the subject is the key."""
-        (cols, rows), width_m, height_m = self.board.inner_corners, self.board.width_m, self.board.height_m
-        found = []
-        if (cols - rows) * (width_m - height_m) < 0:
-            figures = {"n_cols": cols, "n_rows": rows, "width_m": width_m, "height_m": height_m}
-            found.append(Finding("profile.swapped_sides", "warning", "board", figures))
-        timestamps = [(f"lidars.{name}", lidar.timestamps) for name, lidar in self.lidars.items()]
-        for camera, settings in self.cameras.items():
-            timestamps += [
-                (f"cameras.{camera}.channels.{n}", c.timestamps) for n, c in settings.channels.items()
-            ]
-        found += [
-            Finding("profile.drifting_clock", "warning", f"{key}.timestamps")
-            for key, settings in timestamps
-            if settings.clock == "device" and settings.sync == "none"
-        ]
-        return (*found, *self._shared(), *self._unknown())
+        return tuple(self._warnings())
 
-    def _unknown(self) -> Iterator[Finding]:
-        """List drivers that do not exist, and models for which nothing but recordings works."""
+    def _warnings(self) -> Iterator[Finding]:
+        (cols, rows), width_m, height_m = self.board.inner_corners, self.board.width_m, self.board.height_m
+        if (cols - rows) * (width_m - height_m) < 0:
+            yield SWAPPED_SIDES("board", n_cols=cols, n_rows=rows, width_m=width_m, height_m=height_m)
+        # Streams have timestamps and a topic of their own, cameras a device.
+        streams: dict[str, LidarSettings | ChannelSettings] = {
+            f"lidars.{name}": lidar for name, lidar in self.lidars.items()
+        }
+        for name, camera in self.cameras.items():
+            streams |= {f"cameras.{name}.channels.{n}": channel for n, channel in camera.channels.items()}
+        for key, stream in streams.items():
+            if stream.timestamps.clock == "device" and stream.timestamps.sync == "none":
+                yield DRIFTING_CLOCK(f"{key}.timestamps")
+        # A copied block leaves settings that two sensors cannot share.
+        unshared = [(f"{key}.topic", "topic", stream.topic) for key, stream in streams.items()]
+        unshared += [
+            (f"cameras.{n}.driver.device", "device", c.driver.device) for n, c in self.cameras.items()
+        ]
+        first: dict[tuple[str, str], str] = {}
+        for key, kind, value in unshared:
+            if value is not None and first.setdefault((kind, value), key) != key:
+                yield SHARED(key, value=value, other=first[kind, value])
         for name, lidar in self.lidars.items():
             if lidar.data_sheet() is None:
-                yield Finding(
-                    "profile.unknown_model", "warning", f"lidars.{name}.model", {"value": lidar.model}
-                )
+                yield UNKNOWN_MODEL(f"lidars.{name}.model", value=lidar.model)
             if lidar.driver.type == "vlp16" and velodyne.product_of(lidar.model) is None:
-                figures = {"value": lidar.driver.type, "model": lidar.model}
-                yield Finding("profile.other_driver", "warning", f"lidars.{name}.driver.type", figures)
-            yield from _unknown_driver(f"lidars.{name}.driver.type", lidar.driver.type, LIDAR_DRIVERS)
-        for name, camera in self.cameras.items():
-            yield from _unknown_driver(f"cameras.{name}.driver.type", camera.driver.type, CAMERA_DRIVERS)
-
-    def _shared(self) -> Iterator[Finding]:
-        """List settings that two sensors cannot share, usually left from a copied block."""
-        owned = [(f"lidars.{n}.topic", "topic", lidar.topic) for n, lidar in self.lidars.items()]
-        for name, camera in self.cameras.items():
-            owned += [
-                (f"cameras.{name}.channels.{n}.topic", "topic", c.topic) for n, c in camera.channels.items()
-            ]
-            owned.append(
-                (f"cameras.{name}.driver.device", "device", camera.driver.device if camera.driver else None)
-            )
-        first: dict[tuple[str, str], str] = {}
-        for key, kind, value in owned:
-            if value is not None and first.setdefault((kind, value), key) != key:
-                yield Finding("profile.shared", "warning", key, {"value": value, "other": first[kind, value]})
+                yield OTHER_DRIVER(f"lidars.{name}.driver.type", value="vlp16", model=lidar.model)
+        drivers = [(f"lidars.{n}", lidar.driver.type, LIDAR_DRIVERS) for n, lidar in self.lidars.items()]
+        drivers += [
+            (f"cameras.{n}", camera.driver.type, CAMERA_DRIVERS) for n, camera in self.cameras.items()
+        ]
+        for key, value, names in drivers:
+            if value is not None and value not in names:
+                yield UNKNOWN_DRIVER(f"{key}.driver.type", value=value, known=", ".join(names))
 
     def nominal(self, camera: str, lidar: str) -> NominalExtrinsic | None:
         """Find the CAD pose of a pair of sensors; None if the profile has none."""
@@ -207,8 +203,3 @@ class Rig(Settings):
             entry for entry in self.nominal_extrinsics if (entry.camera, entry.lidar) == (camera, lidar)
         )
         return next(matches, None)
-
-
-def _unknown_driver(key: str, value: str | None, known: tuple[str, ...]) -> Iterator[Finding]:
-    if value is not None and value not in known:
-        yield Finding("profile.unknown_driver", "warning", key, {"value": value, "known": ", ".join(known)})

@@ -1,33 +1,31 @@
 """One capture of a session: a folder of plain files and a manifest with their checksums."""
 
 import hashlib
-import os
+import json
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lce_rig.core.data import Events, Image, Scan
-from lce_rig.core.documents import read_json
-from lce_rig.core.errors import LceRigError, SessionError, reason_of
+from lce_rig.core.errors import SessionError, reading
 from lce_rig.core.event_file import decode_events
 from lce_rig.core.image_codec import decode_pixels
-from lce_rig.core.limits import MAX_DOCUMENT_BYTES, MAX_FILE_BYTES, MAX_TIME_NS, describe, read_file
 from lce_rig.core.pcd import decode_pcd
+from lce_rig.rig import Rig
 from lce_rig.rig.settings import Name
-from lce_rig.session.capture_files import EVENTS_VERSION, MANIFEST, check_events, stamps_of
+from lce_rig.session.capture_files import EVENTS_VERSION, MANIFEST
 
-# The schema of a capture's manifest. Reading is strict, as a session may come from another source.
-
-_Stamp = Annotated[int, Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)] | None
-_Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+SERIALS = "serials"
+"""The key of `meta` with the serial numbers of the sensors."""
+SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
+_Stamp = Annotated[int, Field(ge=-(1 << 62), le=1 << 62)] | None
 
 
 class _Record(BaseModel):
@@ -36,9 +34,10 @@ class _Record(BaseModel):
 
 
 class _FileEntry(_Record):
-    file: Annotated[str, Field(max_length=255)]
-    bytes: Annotated[int, Field(ge=0, le=MAX_FILE_BYTES)]
-    sha256: _Sha256
+    # No manifest names a file outside its folder.
+    file: Annotated[str, Field(pattern=f"^{SAFE_NAME.pattern}$")]
+    bytes: int
+    sha256: str
     host_ns: _Stamp
 
 
@@ -70,6 +69,7 @@ class EventsEntry(_FileEntry):
 
 
 Entry = ImageEntry | ScanEntry | EventsEntry
+_SOME_ENTRY = TypeVar("_SOME_ENTRY", bound=Entry)
 
 
 class Manifest(_Record):
@@ -77,7 +77,7 @@ class Manifest(_Record):
 
     format_version: Annotated[int, Field(ge=1)]
     content_sha256: str
-    files: Annotated[list[Annotated[Entry, Field(discriminator="kind")]], Field(max_length=1000)]
+    files: list[Annotated[Entry, Field(discriminator="kind")]]
     meta: dict[str, Any]
 
     @property
@@ -97,40 +97,13 @@ class Manifest(_Record):
 
     @model_validator(mode="after")
     def _sensors_are_named_once(self) -> "Manifest":
-        names = list(self._sensors())
+        names = [f"image of {entry.camera}.{entry.channel}" for entry in self.images]
+        names += [f"scan of {entry.lidar}" for entry in self.scans]
+        names += [f"events of {entry.camera}" for entry in self.events]
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"{name} is named twice")
         return self
-
-    def _sensors(self) -> Iterator[str]:
-        yield from (f"image of {entry.camera}.{entry.channel}" for entry in self.images)
-        yield from (f"scan of {entry.lidar}" for entry in self.scans)
-        yield from (f"events of {entry.camera}" for entry in self.events)
-
-
-def parse_manifest(document: Any) -> Manifest:
-    """Validate a manifest.
-
-    Raises:
-        ValueError: the first thing found wrong, with its key.
-    """
-    try:
-        return Manifest.model_validate(document)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        given = "" if first["type"] in ("missing", "value_error") else f"; {describe(first['input'])} given"
-        what = first["msg"].removeprefix("Value error, ").replace("Input should", "must")
-        raise ValueError(f"{describe(key)[1:-1] + ': ' if key else ''}{what}{given}") from None
-
-
-SERIALS = "serials"
-"""The key of `meta` with the serial numbers of the sensors."""
-SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
-_SOME_ENTRY = TypeVar("_SOME_ENTRY", bound=Entry)
-# Maximum time of a firing after the scan's first.
-_MAX_OFFSET_NS = 3600 * 10**9
 
 
 @dataclass(frozen=True)
@@ -194,7 +167,7 @@ class Capture:
             SessionError: there is none.
         """
         with self._reading(MANIFEST):
-            return hashlib.sha256(read_file(self.path / MANIFEST, MAX_DOCUMENT_BYTES)).hexdigest()
+            return hashlib.sha256((self.path / MANIFEST).read_bytes()).hexdigest()
 
     @property
     def image_keys(self) -> list[tuple[str, str]]:
@@ -225,11 +198,10 @@ class Capture:
 
         entries = [e for e in self._manifest.images if (e.camera, e.channel) == (camera, channel)]
         entry: ImageEntry = self._only(entries, f"nothing from {camera}.{channel}")
+        data = self._read(entry)
         with self._reading(entry.file):
-            pixels = decode_pixels(self._read(entry), cv2.IMREAD_UNCHANGED)
-        if pixels.dtype != np.uint8 or not (pixels.ndim == 2 or pixels.shape[2:] == (3,)):
-            raise self._damaged(f"{entry.file} is {pixels.dtype} {pixels.shape}, not 8-bit grey or BGR")
-        return Image(camera, channel, entry.stamp_ns, pixels, entry.host_ns)
+            pixels = decode_pixels(data, cv2.IMREAD_UNCHANGED)
+            return Image(camera, channel, entry.stamp_ns, pixels, entry.host_ns)
 
     def scan(self, lidar: str) -> Scan:
         """Read a scan exactly as it was captured.
@@ -239,16 +211,16 @@ class Capture:
         """
         entries = [e for e in self._manifest.scans if e.lidar == lidar]
         entry: ScanEntry = self._only(entries, f"nothing from {lidar}")
+        data = self._read(entry)
         with self._reading(entry.file):
-            cloud = decode_pcd(self._read(entry))
-            has_time = "time" in (cloud.dtype.names or ())
+            cloud = decode_pcd(data)
             return Scan(
                 lidar,
                 entry.stamp_ns,
-                np.stack([_lengths(cloud, axis) for axis in "xyz"], axis=1),
-                _lengths(cloud, "intensity"),
-                _whole(cloud, "ring", 0, np.iinfo(np.int16).max).astype(np.int16),
-                _whole(cloud, "time", -_MAX_OFFSET_NS, _MAX_OFFSET_NS) if has_time else None,
+                np.stack([cloud[axis] for axis in "xyz"], axis=1).astype(np.float32),
+                cloud["intensity"].astype(np.float32),
+                cloud["ring"].astype(np.int16),
+                cloud["time"].astype(np.int64) if "time" in (cloud.dtype.names or ()) else None,
                 entry.host_ns,
             )
 
@@ -260,12 +232,9 @@ class Capture:
         """
         entries = [e for e in self._manifest.events if e.camera == camera]
         entry: EventsEntry = self._only(entries, f"no events from {camera}")
+        data = self._read(entry)
         with self._reading(entry.file):
-            events = decode_events(self._read(entry), camera)
-            check_events(events)
-        if stamps_of(events) != {"first_ns": entry.first_ns, "last_ns": entry.last_ns}:
-            raise self._damaged(f"{entry.file} holds other timestamps than {MANIFEST} says")
-        return events
+            return decode_events(data, camera)
 
     def check(self) -> None:
         """Read every file once.
@@ -279,27 +248,15 @@ class Capture:
     @cached_property
     def _manifest(self) -> Manifest:
         with self._reading(MANIFEST):
-            document = read_json(self.path / MANIFEST)
-            version = document.get("format_version") if isinstance(document, dict) else None
+            document = json.loads((self.path / MANIFEST).read_bytes())
+            version = document.get("format_version")
             if isinstance(version, int) and version > EVENTS_VERSION:
                 raise SessionError(f"capture {self.name} was written by a newer lce-rig", "Update lce-rig.")
-            manifest = parse_manifest(document)
-        for entry in manifest.files:
-            self._require_here(entry.file)
-        return manifest
-
-    def _require_here(self, name: str) -> None:
-        # The manifest is untrusted input: it must not make us read or show files elsewhere.
-        # Unlike Path.resolve, realpath accepts circular links; it raises on a NUL.
-        is_here = SAFE_NAME.fullmatch(name) is not None and (
-            Path(os.path.realpath(self.path / name)).parent == Path(os.path.realpath(self.path))
-        )
-        if not is_here:
-            raise SessionError(
-                f"capture {self.name}: {MANIFEST} names the file {name!r} outside the capture's folder",
-                f"Files outside {self.path} are not read. Remove this capture if you did not make it "
-                "yourself.",
-            )
+            try:
+                return Manifest.model_validate(document)
+            except ValidationError as error:
+                first = error.errors(include_url=False)[0]
+                raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
     def _only(self, entries: Sequence[_SOME_ENTRY], lacking: str) -> _SOME_ENTRY:
         """Return the entry of a sensor, at most one."""
@@ -311,47 +268,83 @@ class Capture:
 
     def _read(self, entry: Entry) -> bytes:
         with self._reading(entry.file):
-            data = read_file(self.path / entry.file)
-        if len(data) != entry.bytes:
-            raise self._damaged(f"{entry.file} has {len(data)} of {entry.bytes} bytes")
-        if hashlib.sha256(data).hexdigest() != entry.sha256:
-            raise self._damaged(f"{entry.file} has changed since it was captured (checksum)")
+            data = (self.path / entry.file).read_bytes()
+            if len(data) != entry.bytes:
+                raise ValueError(f"it has {len(data)} of {entry.bytes} bytes")
+            if hashlib.sha256(data).hexdigest() != entry.sha256:
+                raise ValueError("it has changed since it was captured (checksum)")
         return data
 
-    @contextmanager
-    def _reading(self, name: str) -> Iterator[None]:
-        """Report what is wrong with a file of the capture as damage."""
-        try:
-            yield
-        except LceRigError:
-            raise
-        except Exception as error:  # of a library, about a damaged file
-            raise self._damaged(f"{name}: {reason_of(error)}") from None
-
-    def _damaged(self, what: str) -> SessionError:
+    def _reading(self, name: str) -> AbstractContextManager[None]:
         hint = f"Remove {self.path} and collect again; the other captures are not affected."
-        return SessionError(f"capture {self.name} is damaged: {what}", hint)
+        return reading(f"capture {self.name} is damaged: {name}", SessionError, hint)
 
 
-def _lengths(cloud: NDArray[Any], name: str) -> NDArray[np.float32]:
-    """Take a field of finite values from a scan's point cloud; raise a ValueError if one is not."""
-    values = _field(cloud, name, "f")
-    if not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
-        raise ValueError(f"its field {name} is not finite everywhere")
-    return values.astype(np.float32)
+def check_samples(rig: Rig, images: Sequence[Image], scans: Sequence[Scan], events: Sequence[Events]) -> None:
+    """Check that samples can be one capture of a rig.
+
+    Raises:
+        SessionError: there are none, two of one sensor, one of a sensor that the rig lacks, or events of
+            another resolution than the camera's.
+    """
+    keys = [(i.sensor, i.channel) for i in images]
+    keys += [(s.sensor, "") for s in scans] + [(e.sensor, "raw events") for e in events]
+    if len(set(keys)) < len(keys) or not keys:
+        raise SessionError(
+            "a capture holds at most one image per camera channel, one scan per lidar and one stretch of "
+            "events a camera at most, and not nothing"
+        )
+    cameras = [e.sensor for e in events]
+    _require_sensors(rig, [(i.sensor, i.channel) for i in images], [s.sensor for s in scans], cameras)
+    for stretch in events:
+        size, wanted = (stretch.width_px, stretch.height_px), rig.cameras[stretch.sensor].resolution_px
+        if size != wanted:
+            raise SessionError(
+                f"events of {stretch.sensor} are {size[0]}x{size[1]} px; "
+                f"rig {rig.name!r} gives it {wanted[0]}x{wanted[1]}",
+                "Use this camera's recording, or correct resolution_px in the profile.",
+            )
 
 
-def _whole(cloud: NDArray[Any], name: str, lowest: int, highest: int) -> NDArray[np.int64]:
-    """Take a field of whole numbers from a scan's point cloud; raise a ValueError if one is not."""
-    values = _field(cloud, name, "iu")
-    if len(values) and (int(values.min()) < lowest or int(values.max()) > highest):
-        raise ValueError(f"its field {name} runs from {values.min()} to {values.max()} (limit {highest})")
-    return values.astype(np.int64)
+def check_capture(rig: Rig, capture: Capture) -> None:
+    """Check that a capture that was read names sensors of its rig only.
+
+    Raises:
+        SessionError: it names another sensor, or its manifest is damaged.
+    """
+    images, lidars, event_cameras = capture.image_keys, capture.lidars, capture.event_cameras
+    try:
+        _require_sensors(rig, images, lidars, event_cameras)
+    except SessionError as error:
+        raise SessionError(
+            f"capture {capture.name} belongs to another rig: {error.what}",
+            f"Remove {capture.path} and collect again; the other captures are not affected.",
+        ) from None
 
 
-def _field(cloud: NDArray[Any], name: str, kinds: str) -> NDArray[Any]:
-    if name not in (cloud.dtype.names or ()):
-        raise ValueError(f"it has no field {name}; it has {', '.join(cloud.dtype.names or ())}")
-    if cloud[name].ndim != 1 or cloud[name].dtype.kind not in kinds:
-        raise ValueError(f"its field {name} is of type {cloud.dtype[name]}")
-    return cloud[name]
+def _require_sensors(
+    rig: Rig, images: Sequence[tuple[str, str]], lidars: Sequence[str], event_cameras: Sequence[str]
+) -> None:
+    for name, channel in images:
+        if name not in rig.cameras or channel not in rig.cameras[name].channels:
+            raise SessionError(f"rig {rig.name!r} has no camera channel {name}.{channel}")
+    for name in lidars:
+        if name not in rig.lidars:
+            raise SessionError(f"rig {rig.name!r} has no lidar {name!r}")
+    for name in event_cameras:
+        event_channel(rig, name)
+
+
+def event_channel(rig: Rig, camera: str) -> str:
+    """Name the channel that a camera's events belong to, its first of kind events.
+
+    Raises:
+        SessionError: the rig has no such camera, or the camera no such channel.
+    """
+    channel = rig.cameras[camera].first_channel("events") if camera in rig.cameras else None
+    if channel is not None:
+        return channel
+    raise SessionError(
+        f"rig {rig.name!r} has no camera {camera!r} with events",
+        f"Add a channel with `kind: events` to the profile, under cameras.{camera}.channels.",
+    )

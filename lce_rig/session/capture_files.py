@@ -79,51 +79,7 @@ def write_capture(
     flush_folder(folder)
 
 
-def stamps_of(events: Events) -> dict[str, int | None]:
-    """Read the first and last timestamp of events as in a manifest, null if there are none."""
-    if not len(events):
-        return {"first_ns": None, "last_ns": None}
-    return {"first_ns": int(events.t_ns[0]), "last_ns": int(events.t_ns[-1])}
-
-
-def check_events(events: Events) -> None:
-    """Check that events are ordered by time and within the sensor's resolution.
-
-    Raises:
-        ValueError: they are not; the message says which.
-    """
-    if np.any(np.diff(events.t_ns) < 0):
-        raise ValueError(f"events of {events.sensor} are not in order of time")
-    if np.any(events.x >= events.width_px) or np.any(events.y >= events.height_px):
-        size = f"{events.width_px}x{events.height_px}"
-        raise ValueError(f"events of {events.sensor} lie outside its {size} pixels")
-
-
 def _store_image(folder: Path, image: Image) -> dict[str, Any]:
-    entry = {"kind": "image", "camera": image.sensor, "channel": image.channel}
-    stored = _store(folder, f"{image.sensor}.{image.channel}.png", _encode_png(image))
-    return {**entry, **stored, "stamp_ns": image.stamp_ns, "host_ns": image.host_ns}
-
-
-def _store_scan(folder: Path, scan: Scan) -> dict[str, Any]:
-    stored = _store(folder, f"{scan.sensor}.pcd", _encode_scan(scan))
-    stamps = {"stamp_ns": scan.stamp_ns, "host_ns": scan.host_ns}
-    return {"kind": "scan", "lidar": scan.sensor, **stored, **stamps}
-
-
-def _store_events(folder: Path, channel: str, stretch: Events) -> dict[str, Any]:
-    check_events(stretch)
-    entry = {"kind": "events", "camera": stretch.sensor, "channel": channel}
-    stored = _store(folder, f"{stretch.sensor}.events.npz", encode_events(stretch))
-    return {**entry, **stored, **stamps_of(stretch), "host_ns": stretch.host_ns}
-
-
-def _store(folder: Path, name: str, data: bytes) -> dict[str, Any]:
-    write_new_file(folder / name, data)
-    return {"file": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-
-
-def _encode_png(image: Image) -> bytes:
     import cv2
 
     pixels = image.pixels
@@ -135,7 +91,32 @@ def _encode_png(image: Image) -> bytes:
     is_done, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not is_done:
         raise ValueError(f"an image of {image.sensor} could not be encoded as PNG")
-    return bytes(data)
+    entry = {"kind": "image", "camera": image.sensor, "channel": image.channel}
+    stored = _store(folder, f"{image.sensor}.{image.channel}.png", bytes(data))
+    return {**entry, **stored, "stamp_ns": image.stamp_ns, "host_ns": image.host_ns}
+
+
+def _store_scan(folder: Path, scan: Scan) -> dict[str, Any]:
+    stored = _store(folder, f"{scan.sensor}.pcd", _encode_scan(scan))
+    stamps = {"stamp_ns": scan.stamp_ns, "host_ns": scan.host_ns}
+    return {"kind": "scan", "lidar": scan.sensor, **stored, **stamps}
+
+
+def _store_events(folder: Path, channel: str, stretch: Events) -> dict[str, Any]:
+    if np.any(np.diff(stretch.t_ns) < 0):
+        raise ValueError(f"events of {stretch.sensor} are not in order of time")
+    if np.any(stretch.x >= stretch.width_px) or np.any(stretch.y >= stretch.height_px):
+        size = f"{stretch.width_px}x{stretch.height_px}"
+        raise ValueError(f"events of {stretch.sensor} lie outside its {size} pixels")
+    first_ns, last_ns = (int(stretch.t_ns[0]), int(stretch.t_ns[-1])) if len(stretch) else (None, None)
+    entry = {"kind": "events", "camera": stretch.sensor, "channel": channel}
+    stored = _store(folder, f"{stretch.sensor}.events.npz", encode_events(stretch))
+    return {**entry, **stored, "first_ns": first_ns, "last_ns": last_ns, "host_ns": stretch.host_ns}
+
+
+def _store(folder: Path, name: str, data: bytes) -> dict[str, Any]:
+    write_new_file(folder / name, data)
+    return {"file": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
 def _encode_scan(scan: Scan) -> bytes:

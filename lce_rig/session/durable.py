@@ -1,29 +1,10 @@
 """Files that survive a power failure, and the lock against a second writer."""
 
-import errno
 import fcntl
 import os
 from pathlib import Path
 
 from lce_rig.core.errors import SessionError
-
-# A link in a file's place must not lead out of the session.
-_WRITE_OWN = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
-
-
-def own_path(root: Path, path: Path) -> Path:
-    """Return a path that, with links followed, stays in a folder.
-
-    Raises:
-        OSError: it leads elsewhere. A session from another source must not make us overwrite files.
-    """
-    try:
-        is_own = path.resolve().is_relative_to(root.resolve())
-    except RuntimeError:  # a loop of links, until Python 3.13
-        is_own = False
-    if not is_own:
-        raise OSError(errno.ELOOP, "it is a link that leads out of the session", str(path))
-    return path
 
 
 def write_new_file(path: Path, data: bytes) -> None:
@@ -87,7 +68,7 @@ def append_line(path: Path, line: str) -> None:
     Raises:
         OSError: a full disk, no permission.
     """
-    descriptor = os.open(path, _WRITE_OWN, 0o644)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
         size = os.lseek(descriptor, 0, os.SEEK_END)
         is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
@@ -116,7 +97,7 @@ class WriterLock:
 
     def __init__(self, path: Path) -> None:
         self._descriptor = -1
-        self._descriptor = os.open(path, _WRITE_OWN, 0o644)
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

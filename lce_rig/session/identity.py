@@ -2,16 +2,13 @@
 
 import json
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import yaml
+from typing import Any, NamedTuple
 
 from lce_rig import __version__
 from lce_rig.core.documents import read_json
 from lce_rig.core.errors import SessionError, reading
-from lce_rig.rig import Rig, dump_rig
+from lce_rig.rig import Rig
 
 FORMAT_VERSION = 1
 _MAY_DIFFER = re.compile(
@@ -60,8 +57,7 @@ def read_marker(path: Path) -> dict[str, Any]:
     return marker
 
 
-@dataclass(frozen=True)
-class DifferingKey:
+class DifferingKey(NamedTuple):
     """A key in which two profiles differ.
 
     Attributes:
@@ -83,15 +79,14 @@ def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
     The description, the nominal extrinsics, targets of `deploy` and the addresses of attached sensors may
     differ, as no capture depends on them. The robot and serial numbers may be absent in either.
     """
-    a, b = (_flatten(yaml.safe_load(dump_rig(rig))) for rig in (theirs, ours))
-    paths = sorted(path for path in a.keys() | b.keys() if a.get(path) != b.get(path))
-    found = [DifferingKey(path, a.get(path, _ABSENT), b.get(path, _ABSENT)) for path in paths]
-    return [key for key in found if not _may_differ(key)]
-
-
-def _may_differ(key: DifferingKey) -> bool:
-    name = ".".join(key.path)
-    return bool(_MAY_DIFFER(name)) or (bool(_IS_IDENTITY(name)) and _ABSENT in (key.theirs, key.ours))
+    a, b = (_flatten(rig.model_dump(mode="json", exclude_none=True)) for rig in (theirs, ours))
+    keys = []
+    for path in sorted(a.keys() | b.keys()):
+        name, values = ".".join(path), (a.get(path, _ABSENT), b.get(path, _ABSENT))
+        may_differ = _MAY_DIFFER(name) or (_IS_IDENTITY(name) and _ABSENT in values)
+        if values[0] != values[1] and not may_differ:
+            keys.append(DifferingKey(path, *values))
+    return keys
 
 
 def keep_identity(earlier: Rig, rig: Rig) -> Rig:

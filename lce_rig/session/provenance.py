@@ -10,7 +10,6 @@ from typing import Any
 
 from lce_rig.core.calibration import Provenance
 from lce_rig.core.errors import SessionError
-from lce_rig.core.limits import read_file
 from lce_rig.rig import Rig
 from lce_rig.session.capture import Capture
 from lce_rig.session.session import CAPTURED, Session
@@ -117,8 +116,8 @@ def _profile(rig: Rig) -> dict[str, Any]:
 
 
 def _file_sha256(path: Path) -> str:
-    with suppress(OSError, ValueError):
-        return hashlib.sha256(read_file(path)).hexdigest()
+    with suppress(OSError):
+        return hashlib.sha256(path.read_bytes()).hexdigest()
     return "unreadable"
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from lce_rig.session.durable import flush_folder, own_path
+from lce_rig.session.durable import flush_folder
 
 DRAFT, ASIDE = ".new-", ".old-"
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -49,7 +49,10 @@ def replacing(
         check_folder(folder)
         draft = root / f"{DRAFT}{folder.name}-{secrets.token_hex(4)}"
         with _locked(root):
-            _remove_drafts(root, folder.name)
+            for other in root.glob(f"{DRAFT}{folder.name}-*"):
+                # Of a killed process; those of living ones are locked.
+                with suppress(OSError), _locked(other, waits=False):
+                    shutil.rmtree(other, ignore_errors=True)
             draft.mkdir()
             lock.enter_context(_locked(draft))
         try:
@@ -58,7 +61,8 @@ def replacing(
                 _put_back(root)
                 check_folder(folder)
                 finish(folder, draft)
-                _flush(draft)
+                for path, _, _ in os.walk(draft):
+                    flush_folder(Path(path))
                 folder.parent.mkdir(exist_ok=True)
                 _change_places(draft, folder, root, can_exchange=can_exchange)
         finally:
@@ -139,25 +143,11 @@ def _exchange(a: Path, b: Path) -> bool:
 def _put_back(root: Path) -> None:
     """Move each folder that was put aside back if its place is free, else remove it."""
     for aside in root.glob(f"{ASIDE}*"):
-        parts = aside.name.removeprefix(ASIDE).split("+")
-        # In a session from another source, names must not move folders out of it.
-        if aside.is_symlink() or not aside.is_dir() or not {"", ".", ".."}.isdisjoint(parts):
-            continue
-        folder = root.joinpath(*parts)
-        own_path(root, folder)
-        if not folder.parent.is_dir():
-            continue
+        folder = root.joinpath(*aside.name.removeprefix(ASIDE).split("+"))
         if folder.exists():
             shutil.rmtree(aside, ignore_errors=True)
         else:
             aside.rename(folder)
-
-
-def _remove_drafts(root: Path, name: str) -> None:
-    """Remove drafts of killed processes; those of living ones are locked."""
-    for draft in root.glob(f"{DRAFT}{name}-*"):
-        with suppress(OSError), _locked(draft, waits=False):
-            shutil.rmtree(draft, ignore_errors=True)
 
 
 @contextmanager
@@ -167,7 +157,6 @@ def _locked(folder: Path, *, waits: bool = True) -> Iterator[None]:
     Raises:
         BlockingIOError: another process holds it, and this one does not wait.
     """
-    # Links are followed: the session's own folder may be one. What a link leads to is locked, nothing else.
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         try:
@@ -178,8 +167,3 @@ def _locked(folder: Path, *, waits: bool = True) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-def _flush(folder: Path) -> None:
-    for path, _, _ in os.walk(folder):
-        flush_folder(Path(path))

@@ -20,14 +20,12 @@ from numpy.typing import NDArray
 
 from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
-from lce_rig.core.documents import parse_json
 from lce_rig.core.errors import LceRigError, SessionError, reading
-from lce_rig.core.limits import MAX_DOCUMENT_BYTES, MAX_FILE_BYTES, open_regular
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import cache
-from lce_rig.session.capture import SAFE_NAME, Capture
+from lce_rig.session.capture import Capture, check_samples, event_channel
 from lce_rig.session.capture_files import content_hash, write_capture
-from lce_rig.session.durable import WriterLock, append_line, flush_folder, own_path, replace_file
+from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file
 from lce_rig.session.identity import (
     MARKER,
     check_marker,
@@ -36,44 +34,13 @@ from lce_rig.session.identity import (
     marker_of,
     read_marker,
 )
-from lce_rig.session.membership import check_samples, event_channel
 from lce_rig.session.replacing import recover, replacing
-
-# A session's journal, one event per line.
-
-
-def read_entries(path: Path) -> list[dict[str, Any]]:
-    """List the entries of a journal; skip invalid lines, such as one torn by a crash.
-
-    Args:
-        path: its file; a missing file has no entries.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is not a regular file.
-    """
-    entries: list[dict[str, Any]] = []
-    if not path.exists():
-        return entries
-    with open_regular(path) as file:
-        n_left = MAX_FILE_BYTES
-        while n_left > 0 and (line := file.readline(min(n_left, MAX_DOCUMENT_BYTES))):
-            n_left -= len(line)
-            try:
-                entry = parse_json(line)
-            except ValueError:
-                continue
-            if isinstance(entry, dict):
-                entries.append(entry)
-    return entries
-
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
 CAPTURES, REJECTED, DETECTIONS, DRAFT_PREFIX = "captures", "rejected", "detections", ".new-"
 CAPTURED = "captured"
 """The journal's event of a capture."""
 CALIBRATION, RESULTS, INTRINSICS, DEBUG = "calibration", "results", "intrinsics", "debug"
-_WRITTEN = (JOURNAL, LOCK, CAPTURES, REJECTED, DETECTIONS, CALIBRATION, RESULTS, INTRINSICS, DEBUG)
 
 
 class Session:
@@ -134,7 +101,6 @@ class Session:
         """
         path = Path(path)
         check_marker(path)
-        _check_links(path)
         with suppress(OSError):  # without permission to write, nothing was put aside
             recover(path)
         try:
@@ -143,17 +109,19 @@ class Session:
             raise SessionError(
                 f"{path / PROFILE}: the session's profile cannot be used: {error.what}", error.hint
             ) from error
-        _check_rig(path, rig)
+        named = read_marker(path).get("rig")
+        if named != rig.name:
+            raise SessionError(
+                f"{path}: {MARKER} is of rig {named!r}, {PROFILE} of rig {rig.name!r}",
+                "Restore the profile that the session was made with.",
+            )
         if not writable:
             return cls(path, rig, None)
         try:
             lock = _take_lock(path)
             (path / CAPTURES).mkdir(exist_ok=True)
             for draft in sorted((path / CAPTURES).glob(f"{DRAFT_PREFIX}*")):
-                if draft.is_symlink():
-                    draft.unlink()
-                else:
-                    shutil.rmtree(draft)
+                shutil.rmtree(draft)
         except OSError as error:
             raise _not_writable(path, error) from error
         return cls(path, rig, lock)
@@ -264,7 +232,7 @@ class Session:
     def _move(self, name: str, source: str, target: str, event: str, **fields: str) -> None:
         """Move a capture's folder in one step: it is in one of the two places at any time."""
         self._require_lock()
-        old, new = self.own(source, name), self.own(target, name)
+        old, new = self.path / source / name, self.path / target / name
         if new.exists():
             raise SessionError(f"{new} blocks capture {name}", f"Move {new} out of the session.")
         # First, so that nothing moves where the disk is full.
@@ -312,7 +280,7 @@ class Session:
         contents = self._contents()
         captures = self.captures
         name = self.next_name
-        folder = self.own(CAPTURES, name)
+        folder = self.path / CAPTURES / name
         draft = folder.with_name(DRAFT_PREFIX + name)
         try:
             draft.mkdir()
@@ -357,8 +325,13 @@ class Session:
             SessionError: the journal cannot be read.
         """
         path = self.path / JOURNAL
+        entries = []
         with reading(path, SessionError):
-            return read_entries(path)
+            for line in path.read_bytes().splitlines() if path.exists() else ():
+                with suppress(ValueError):
+                    entry = json.loads(line)
+                    entries += [entry] if isinstance(entry, dict) else []
+        return entries
 
     def store_cached(self, key: str, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> bool:
         """Store arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
@@ -373,22 +346,7 @@ class Session:
         return cache.load(self._cache_path(key))
 
     def _cache_path(self, key: str) -> Path:
-        parts = key.split("/")
-        if not all(SAFE_NAME.fullmatch(part) for part in parts):
-            raise ValueError(f"{key!r} is not a cache key")
-        return self.own(DETECTIONS, *parts[:-1], parts[-1] + ".npz")
-
-    def own(self, *parts: str) -> Path:
-        """Return the path of a file or folder of the session that is to be written.
-
-        Raises:
-            SessionError: a link there leads out of the session.
-        """
-        path = self.path.joinpath(*parts)
-        try:
-            return own_path(self.path, path)
-        except OSError as error:
-            raise _not_writable(path, error) from None
+        return self.path / DETECTIONS / f"{key}.npz"
 
     @contextmanager
     def replacing(
@@ -403,10 +361,9 @@ class Session:
             finish: see `lce_rig.session.replacing`.
 
         Raises:
-            SessionError: the disk is full or read-only, or a link leads out of the session; the earlier
-                folder is untouched.
+            SessionError: the disk is full or read-only; the earlier folder is untouched.
         """
-        folder = self.own(*parts)
+        folder = self.path.joinpath(*parts)
         try:
             with replacing(self.path, folder, finish) as draft:
                 yield draft
@@ -425,36 +382,34 @@ class Session:
         return self._names_by_content
 
 
+def discard_if_empty(path: Path) -> bool:
+    """Remove a session's folder if it holds nothing but the files of its creation.
+
+    Args:
+        path: the folder, without a writer.
+
+    Returns:
+        Whether it was removed. A folder with a capture or any other file is left unchanged.
+    """
+    with suppress(OSError):
+        if {entry.name for entry in path.iterdir()} - {MARKER, PROFILE, JOURNAL, LOCK, CAPTURES}:
+            return False
+        if (path / CAPTURES).is_dir():
+            (path / CAPTURES).rmdir()  # fails where there is a capture
+        # The marker last, so that an interrupted removal leaves a session.
+        for name in (LOCK, JOURNAL, PROFILE, MARKER):
+            (path / name).unlink(missing_ok=True)
+        path.rmdir()
+        return True
+    return False
+
+
 def _captures_in(folder: Path) -> list[Capture]:
     with reading(folder, SessionError):
         names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
     numbered = [name for name in names if re.fullmatch(r"[0-9]{6,}", name)]
     # By number: 1000000 follows 999999.
     return [Capture(folder / name) for name in sorted(numbered, key=lambda name: (len(name), name))]
-
-
-def _check_rig(path: Path, rig: Rig) -> None:
-    """Refuse a session whose marker and profile name different rigs."""
-    named = read_marker(path).get("rig")
-    if named != rig.name:
-        raise SessionError(
-            f"{path}: {MARKER} is of rig {named!r}, {PROFILE} of rig {rig.name!r}",
-            "Restore the profile that the session was made with.",
-        )
-
-
-def _check_links(path: Path) -> None:
-    """Refuse a session with links that lead out of the folders written here.
-
-    Raises:
-        SessionError: it names the link.
-    """
-    for name in _WRITTEN:
-        if (path / name).is_symlink():
-            try:
-                own_path(path, path / name)
-            except OSError as error:
-                raise _not_writable(path / name, error) from None
 
 
 def _take_lock(path: Path) -> WriterLock:
@@ -471,8 +426,6 @@ def _not_writable(path: Path, error: OSError, n_safe: int | None = None) -> Sess
     safe = "" if not n_safe else f" The {n_safe} captures before it are safe."
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         hint = "Move away what is in its place, or choose another folder."
-    elif error.errno == errno.ELOOP:
-        hint = "Put a folder or file of its own there: nothing outside the session is written or removed."
     elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         hint = "Choose a folder that you may write to, or see to its permissions."
     else:

@@ -19,7 +19,7 @@ from lce_rig.export.robot_files import read_robot, read_robot_bag
 from lce_rig.export.robot_tree import build_trees, fit_tree
 from lce_rig.export.rotations import R_BODY_OPTICAL
 from lce_rig.rig import Rig
-from lce_rig.rig.mount import Mount
+from lce_rig.rig.poses import Mount
 
 Make = Callable[..., Calibration]
 Transform = tuple[str, str, Array]

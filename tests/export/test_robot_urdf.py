@@ -18,7 +18,7 @@ from lce_rig.export import export
 from lce_rig.export.robot_files import read_robot_urdf, write_into_urdf
 from lce_rig.export.robot_tree import build_trees, fit_tree
 from lce_rig.rig import Rig
-from lce_rig.rig.mount import Mount
+from lce_rig.rig.poses import Mount
 
 Make = Callable[..., Calibration]
 NOW = datetime(2026, 5, 4, 10, 15)

@@ -143,7 +143,7 @@ def test_any_damage_is_a_profile_error_or_harmless(start: int, length: int, inse
 
 @pytest.mark.parametrize(
     "value",
-    ["!!bool x", '!!int ""', "!!timestamp x", "0x" + "f" * 5000, '"\\ud800"', "1.0e+308", "&a [*a]"],
+    ["!!bool x", '!!int ""', "!!timestamp x", '"\\ud800"', "1.0e+308", "&a [*a]"],
 )
 def test_a_scalar_that_is_no_figure_is_named_with_its_line(value: str) -> None:
     text = re.sub(r"cy_px: [\d.]+", lambda _: f"cy_px: {value}", RLFS, count=1)
@@ -155,6 +155,6 @@ def test_a_scalar_that_is_no_figure_is_named_with_its_line(value: str) -> None:
 
 def test_many_problems_are_counted_and_the_first_shown() -> None:
     many = "".join(f"k{k}: 1\n" for k in range(3000))
-    with pytest.raises(ProfileError, match="300. problems") as caught:
+    with pytest.raises(ProfileError, match=r"300. problems") as caught:
         parse_rig(many)
     assert caught.value.hint.count("\n") <= 100

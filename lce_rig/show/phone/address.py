@@ -33,19 +33,22 @@ def parse_address(text: str) -> tuple[str, int]:
         UsageError: it is none of these.
     """
     text = text.strip()
+    refusal = UsageError(f"{text!r} is no address for a page", _HINT)
+    host, port = text, ""
     if text.startswith("["):
         host, closing, rest = text[1:].partition("]")
-        if not closing or (rest and not rest.startswith(":")) or not _is_ipv6(host):
-            raise UsageError(f"{text!r} is no address for a page", _HINT)
-        return host, _port(rest[1:], text)
-    if _is_ipv6(text):
-        return text, DEFAULT_PORT
-    host, separator, port = text.partition(":")
-    if not separator and _is_number(text):
-        host, port = "", text
-    if ":" in port or "/" in host or any(character.isspace() for character in text):
-        raise UsageError(f"{text!r} is no address for a page", _HINT)
-    return host or LOOPBACK, _port(port, text)
+        if not closing or not _is_ipv6(host) or (rest and not rest.startswith(":")):
+            raise refusal
+        port = rest[1:]
+    elif not _is_ipv6(text):
+        host, separator, port = text.partition(":")
+        if not separator and text.isdecimal():
+            host, port = "", text
+        if "/" in host or any(character.isspace() for character in text):
+            raise refusal
+    if port and not (port.isascii() and port.isdigit() and int(port[:6]) <= 65535):
+        raise refusal
+    return host or LOOPBACK, int(port or DEFAULT_PORT)
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -54,6 +57,7 @@ def listen(host: str, port: int) -> socket.socket:
     Raises:
         UsageError: the port is in use or not permitted, or the host is not this computer.
     """
+    address = f"{_bracketed(host)}:{port}"
     try:
         family, _, _, _, where = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -61,50 +65,45 @@ def listen(host: str, port: int) -> socket.socket:
         is_dual = family == socket.AF_INET6 and host == "::" and socket.has_dualstack_ipv6()
         return socket.create_server(where[:2], family=family, dualstack_ipv6=is_dual)
     except (OSError, UnicodeError) as error:
-        raise _explained(host, port, error) from None
+        number, why, hint = getattr(error, "errno", None), str(error), _HINT
+        if number == errno.EADDRINUSE:
+            other = f"{_bracketed(host)}:{min(port + 1, 65535)}"
+            why = "the port is in use"
+            hint = (
+                f"Another collection may be running: `ss -ltnp sport = :{port}` names it. "
+                f"Or choose another port: --preview {other}."
+            )
+        elif number in (errno.EACCES, errno.EPERM):
+            why = "not permitted"
+            hint = f"Ports below 1024 need root: --preview {_bracketed(host)}:{DEFAULT_PORT}."
+        elif number == errno.EADDRNOTAVAIL or isinstance(error, (socket.gaierror, UnicodeError)):
+            why = "not an address of this computer"
+            hint = "`hostname -I` lists this computer's addresses; 0.0.0.0 stands for all of them."
+        raise UsageError(f"the page cannot be served at {address}: {why}", hint) from None
 
 
-def is_loopback(opened: socket.socket) -> bool:
-    """Return whether only programs on this computer reach a socket."""
-    return ipaddress.ip_address(_bound_to(opened)).is_loopback
-
-
-def links(opened: socket.socket, token: str | None) -> tuple[str, ...]:
+def links(opened: socket.socket, token: str) -> tuple[str, ...]:
     """Build the links under which a page can be opened, the likeliest first.
 
     Where the socket listens on all addresses, there is one for each IPv4 address of this computer: which of
     its networks a phone is in cannot be known.
-
-    Args:
-        opened: the listening socket.
-        token: part of the link; None where none is needed.
     """
-    host, port = _bound_to(opened), opened.getsockname()[1]
+    # A link-local address may carry its interface: fe80::1%eth0.
+    host, port = str(opened.getsockname()[0]).partition("%")[0], opened.getsockname()[1]
     hosts = [host]
     if ipaddress.ip_address(host).is_unspecified:
-        hosts = _own_addresses() or [f"{socket.gethostname()}.local"]
-    query = f"?token={token}" if token else ""
-    return tuple(f"http://{bracketed(each)}:{port}/{query}" for each in hosts)
+        hosts = _network_addresses() or [f"{socket.gethostname()}.local"]
+    return tuple(f"http://{_bracketed(host)}:{port}/?token={token}" for host in hosts)
 
 
-def bracketed(host: str) -> str:
-    """Write a host as it stands in a link: IPv6 addresses in brackets."""
-    return f"[{host}]" if ":" in host else host
-
-
-def _bound_to(opened: socket.socket) -> str:
-    # A link-local address may carry its interface: fe80::1%eth0.
-    return str(opened.getsockname()[0]).partition("%")[0]
-
-
-def _own_addresses() -> list[str]:
+def _network_addresses() -> list[str]:
     """List the IPv4 addresses of this computer's networks, that of the default route first."""
-    found = []
+    addresses = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             # Chooses a route without sending anything (TEST-NET-1, RFC 5737).
             probe.connect(("192.0.2.1", 9))
-            found.append(str(probe.getsockname()[0]))
+            addresses.append(str(probe.getsockname()[0]))
         except OSError:
             pass  # no default route, as with a computer that is the access point itself
         for _, name in socket.if_nameindex():
@@ -113,20 +112,12 @@ def _own_addresses() -> list[str]:
                 answer = fcntl.ioctl(probe.fileno(), _SIOCGIFADDR, request)
             except OSError:
                 continue  # an interface without an IPv4 address
-            found.append(socket.inet_ntoa(answer[20:24]))
-    return [each for each in dict.fromkeys(found) if not ipaddress.ip_address(each).is_loopback]
+            addresses.append(socket.inet_ntoa(answer[20:24]))
+    return [each for each in dict.fromkeys(addresses) if not ipaddress.ip_address(each).is_loopback]
 
 
-def _port(text: str, whole: str) -> int:
-    if not text:
-        return DEFAULT_PORT
-    if not _is_number(text) or int(text) > 65535:
-        raise UsageError(f"{whole!r} is no address for a page: {text!r} is no port", _HINT)
-    return int(text)
-
-
-def _is_number(text: str) -> bool:
-    return text.isascii() and text.isdigit() and len(text) <= 5
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
 
 
 def _is_ipv6(text: str) -> bool:
@@ -135,22 +126,3 @@ def _is_ipv6(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _explained(host: str, port: int, error: OSError | UnicodeError) -> UsageError:
-    """Say why a page cannot be served at an address, and what to do about it."""
-    where = f"{bracketed(host)}:{port}"
-    number = getattr(error, "errno", None)
-    if number == errno.EADDRINUSE:
-        return UsageError(
-            f"the page cannot be served at {where}: the port is in use",
-            f"Another collection may be running: `ss -ltnp sport = :{port}` names it. "
-            f"Or choose another port: --preview {bracketed(host)}:{min(port + 1, 65535)}.",
-        )
-    if number in (errno.EACCES, errno.EPERM):
-        hint = f"Ports below 1024 need root: --preview {bracketed(host)}:{DEFAULT_PORT}."
-        return UsageError(f"the page cannot be served at {where}: not permitted", hint)
-    if number == errno.EADDRNOTAVAIL or isinstance(error, (socket.gaierror, UnicodeError)):
-        hint = "`hostname -I` lists this computer's addresses; 0.0.0.0 stands for all of them."
-        return UsageError(f"the page cannot be served at {where}: not an address of this computer", hint)
-    return UsageError(f"the page cannot be served at {where}: {error}", _HINT)

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Iterator
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -60,6 +61,10 @@ def preview() -> Iterator[Preview]:
     """A page for this computer alone, on any free port."""
     with Preview(port=0) as opened:
         yield opened
+
+
+def port_of(preview: Preview) -> int:
+    return urlsplit(preview.urls[0]).port or 0
 
 
 @pytest.fixture(scope="session")

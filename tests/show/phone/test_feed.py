@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.live.state import Drawing
-from lce_rig.show.phone import Preview
-from lce_rig.show.phone import preview as page_module
-from lce_rig.show.phone.preview import MAX_UNDER_WAY
+from lce_rig.show.phone import Preview, pages
+from lce_rig.show.phone.pages import MAX_UNDER_WAY
 from lce_rig.show.phone.state_message import MAX_WIDTH_PX, encode_picture
 
-from .conftest import PRESENT_PX, picture, state
+from .conftest import PRESENT_PX, picture, port_of, state
 from .watcher import Watcher
 
 LAST = 10_000
@@ -145,14 +144,15 @@ def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pag
 
 
 def test_a_page_that_vanished_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_module, "HEARTBEAT_S", 0.2)
-    monkeypatch.setattr(page_module, "MAX_VIEWERS", 1)
+    monkeypatch.setattr(pages, "HEARTBEAT_S", 0.2)
+    monkeypatch.setattr(pages, "MAX_VIEWERS", 1)
     with Preview(port=0) as preview, Watcher(preview.urls[0]) as watcher:
         preview.publish(state())
-        host, port = preview.urls[0].removeprefix("http://").rstrip("/").split(":")
-        with socket.create_connection((host, int(port))) as silent:
+        port, query = port_of(preview), preview.urls[0].partition("?")[2]
+        with socket.create_connection(("127.0.0.1", port)) as silent:
             silent.sendall(
-                f"GET /live HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                f"GET /live?{query} HTTP/1.1\r\nHost: localhost:{port}\r\n"
+                "Upgrade: websocket\r\nConnection: Upgrade\r\n"
                 "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
             )
             assert silent.recv(12) == b"HTTP/1.1 101"
@@ -201,7 +201,7 @@ def test_what_no_page_sends_ends_its_connection_only(preview: Preview, text: str
 
 
 def test_noise_on_the_port_is_survived_in_silence(preview: Preview, caplog: pytest.LogCaptureFixture) -> None:
-    port = int(preview.urls[0].rstrip("/").rpartition(":")[2])
+    port = port_of(preview)
     random = np.random.default_rng(1)
     said = [random.bytes(300) for _ in range(20)]
     said += [
@@ -259,13 +259,15 @@ def test_closing_does_not_wait_for_pages_that_are_stuck() -> None:
 
 def test_closing_does_not_wait_for_pages_whose_line_is_full() -> None:
     preview = Preview(port=0)
-    port = int(preview.start().rstrip("/").rpartition(":")[2])
+    query = preview.start().partition("?")[2]
+    port = port_of(preview)
     noise = np.random.default_rng(1).integers(0, 255, (3000, 960, 3), np.uint8)
     with socket.socket() as full:
         full.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
         full.connect(("127.0.0.1", port))
         full.sendall(
-            f"GET /live HTTP/1.1\r\nHost: localhost:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"GET /live?{query} HTTP/1.1\r\nHost: localhost:{port}\r\n"
+            "Upgrade: websocket\r\nConnection: Upgrade\r\n"
             "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
         )
         for n in (1, 2):

@@ -5,13 +5,14 @@ import pytest
 from lce_rig.show.phone import Preview
 
 from .browser import Browser
+from .conftest import port_of
 from .screen import OPEN, has_text, shown
 
 
 def test_it_says_that_the_line_is_lost_and_finds_back(browser: Browser) -> None:
-    first = Preview(port=0)
+    first = Preview(port=0, token="one-token")
     page = browser.open(first.start())
-    port = int(first.urls[0].rstrip("/").rpartition(":")[2])
+    port = port_of(first)
     shown(first, page, has_text("count", "7"))
     is_lost = "document.getElementById('banner').textContent.startsWith('Connection to the rig lost')"
     assert not page.evaluate(is_lost)
@@ -22,7 +23,7 @@ def test_it_says_that_the_line_is_lost_and_finds_back(browser: Browser) -> None:
         page.evaluate("getComputedStyle(document.getElementById('banner')).backgroundColor")
         == "rgb(211, 18, 31)"
     )
-    with Preview(port=port) as second:
+    with Preview(port=port, token="one-token") as second:
         page.wait_until(OPEN)
         shown(second, page, has_text("count", "8"), n_captures=8)
         assert not page.evaluate(is_lost)
@@ -65,7 +66,7 @@ def test_an_old_link_is_said_to_be_old(browser: Browser) -> None:
     first = Preview(port=0, token="first-token")
     page = browser.open(first.start())
     shown(first, page, has_text("count", "7"))
-    port = int(first.urls[0].partition("/?")[0].rpartition(":")[2])
+    port = port_of(first)
     first.close()
     with Preview(port=port, token="second-token"):
         page.wait_until(

@@ -13,10 +13,11 @@ class Watcher:
 
     def __init__(self, url: str) -> None:
         self.url, _, query = url.partition("?")
-        self.token = query.removeprefix("token=")
         self._loop = asyncio.new_event_loop()
         self._http = self._run(_client())
         self.socket: Any = None
+        if query:
+            self.get(f"?{query}")  # the link leaves a cookie
 
     def get(
         self, path: str = "", headers: Mapping[str, str] | None = None

@@ -1,0 +1,41 @@
+"""Findings of valid but probably unintended settings of a profile; the subject is the key."""
+
+from lce_rig.core.findings import Kind
+
+SWAPPED_SIDES = Kind(
+    "profile.swapped_sides",
+    "{subject}: {n_cols}x{n_rows} inner corners run along the shorter side of the plate "
+    "{width_m:g} x {height_m:g} m",
+    "check whether to swap width_m and height_m, or the inner_corners",
+    severity="warning",
+)
+DRIFTING_CLOCK = Kind(
+    "profile.drifting_clock",
+    "{subject}: the sensor's own clock without sync drifts away from the others",
+    severity="warning",
+)
+UNKNOWN_MODEL = Kind(
+    "profile.unknown_model",
+    "{subject}: the beams of {value} are not known: recordings can be calibrated, live guidance and "
+    "simulation need elevations_deg and columns",
+    "enter them and your LiDAR's noise (docs/rig-profiles.md: LiDAR models), or make a new profile with "
+    "`lce-rig rigs new --lidar other --from RECORDING`",
+    severity="warning",
+)
+OTHER_DRIVER = Kind(
+    "profile.other_driver",
+    "{subject}: {value} reads Velodynes, and the model is {model}",
+    "remove the driver block, or correct the model",
+    severity="warning",
+)
+UNKNOWN_DRIVER = Kind(
+    "profile.unknown_driver",
+    "{subject}: there is no driver {value}",
+    "choose one of: {known}",
+    severity="warning",
+)
+SHARED = Kind(
+    "profile.shared",
+    "{subject}: {value} equals {other}, but two sensors cannot share it",
+    severity="warning",
+)

@@ -1,0 +1,308 @@
+"""The web application behind the page: its files, the token, and the connection that feeds each open page."""
+
+import asyncio
+import hmac
+import json
+import re
+import socket
+import time
+from collections import deque
+from contextlib import suppress
+from importlib import resources
+
+from aiohttp import WSMsgType, web
+from aiohttp.typedefs import Handler
+
+from lce_rig.collect.live.state import LiveState, TakeBack
+from lce_rig.show.phone.state_message import Encoder, Pixels, beat, to_json
+
+# A person who taps faster than the collection listens wants one thing.
+_MOST_ASKED = 8
+# Waking the other thread would cost the collection a system call, and the interpreter's lock with it.
+_LOOK_S = 0.03
+#: Between two updates.
+PERIOD_S = 0.1
+#: Without news the page gets a message this often, and so knows that it is still connected.
+BEAT_S = 1.0
+#: Updates under way to a page. Two hide the time of their way; more would only grow old in buffers.
+MAX_UNDER_WAY = 2
+MAX_MESSAGE_BYTES = 256
+#: A page that shows no update for so long sleeps; it connects again when it wakes.
+ANSWER_S = 5.0
+#: A page that does not answer a ping for so long is gone: a phone out of range says no goodbye.
+HEARTBEAT_S = 10.0
+#: Pages open at once.
+MAX_VIEWERS = 8
+#: Connections open at once: the process needs its descriptors for captures and sensors.
+MAX_CONNECTIONS = 48
+#: A connection that does not feed a page is closed after this time: loading the page takes less.
+CONNECTION_S = 10.0
+_SET_UP_S, _GOODBYE_S = 1.0, 0.5
+_COOKIE = "lce_rig_preview"
+_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+# The page loads nothing from elsewhere, and may not be framed.
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+
+
+class Feed:
+    """Hold one state, the newest; a slow reader misses those between. Requests go the other way."""
+
+    def __init__(self) -> None:
+        self._newest: tuple[int, float, LiveState] | None = None
+        self._asked: deque[TakeBack] = deque(maxlen=_MOST_ASKED)
+
+    def publish(self, state: LiveState) -> None:
+        """Put a state in; from one thread at a time. It is a single assignment, so it never blocks."""
+        number = 1 if self._newest is None else self._newest[0] + 1
+        self._newest = (number, time.monotonic(), state)
+
+    def ask(self, asked: TakeBack) -> None:
+        """Put a request of a page in, for the thread that collects; the oldest make way."""
+        self._asked.append(asked)
+
+    def asked(self) -> TakeBack | None:
+        """Take the oldest request; None where nothing is asked for."""
+        return self._asked.popleft() if self._asked else None
+
+    def newest(self) -> tuple[int, LiveState] | None:
+        """Give the newest state and its running number, from 1; None before one has come."""
+        newest = self._newest
+        return None if newest is None else (newest[0], newest[2])
+
+    def age_s(self) -> float | None:
+        """Compute how long ago the newest state came."""
+        newest = self._newest
+        return None if newest is None else time.monotonic() - newest[1]
+
+    async def wait_beyond(self, number: int, timeout_s: float) -> bool:
+        """Wait for a state newer than `number`; False where none came in time."""
+        end_s = time.monotonic() + timeout_s
+        while self._newest is None or self._newest[0] <= number:
+            if time.monotonic() > end_s:
+                return False
+            await asyncio.sleep(_LOOK_S)
+        return True
+
+
+class Viewer:
+    """Feeds one open page with the newest state as fast as it can follow, and no faster.
+
+    The page answers each update with its number once it is on the screen, and images are sent to pages that
+    are looked at. It may ask for the capture that it shows as the last to be taken back. Nothing else is read
+    from it.
+    """
+
+    def __init__(self, line: web.WebSocketResponse, feed: Feed, encoder: Encoder) -> None:
+        self._line = line
+        self._feed = feed
+        self._encoder = encoder
+        self._n_sent = 0
+        self._n_shown = 0
+        self._is_looked_at = True
+        self._state = 0
+        self._delivered = 0
+        self._pixels: Pixels | None = None
+        self._has_room = asyncio.Event()
+        self._has_room.set()
+
+    async def serve(self) -> None:
+        """Feed the page until it goes away."""
+        tasks = {asyncio.create_task(self._read()), asyncio.create_task(self._write())}
+        try:
+            ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in ended:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def close(self) -> None:
+        """Let the page have the last state, for a moment, and close the connection."""
+        for _ in range(10):
+            newest = self._feed.newest()
+            if newest is None or newest[0] <= self._delivered:
+                break
+            await asyncio.sleep(_GOODBYE_S / 10)
+        # Closing waits until the page has taken what was sent, and a stuck one never does.
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._line.close(code=1001, message=b"closed"), _GOODBYE_S)
+
+    async def _read(self) -> None:
+        async for received in self._line:
+            if received.type is not WSMsgType.TEXT or not self._take(received.data):
+                await self._line.close(code=1008, message=b"only answers and requests are read")
+                return
+
+    async def _write(self) -> None:
+        with suppress(ConnectionError, asyncio.TimeoutError):  # the page went away, or sleeps
+            while True:
+                await asyncio.wait_for(self._has_room.wait(), ANSWER_S)
+                if not await self._feed.wait_beyond(self._state, BEAT_S):
+                    await self._line.send_str(beat(self._feed.age_s()))
+                    continue
+                began_s = time.monotonic()
+                newest = self._feed.newest()
+                assert newest is not None
+                self._state, state = newest
+                await self._send(state)
+                self._delivered = newest[0]
+                await asyncio.sleep(max(0.0, began_s + PERIOD_S - time.monotonic()))
+
+    async def _send(self, state: LiveState) -> None:
+        jpeg = None
+        if state.drawing is not None and self._is_looked_at and state.drawing.pixels is not self._pixels:
+            self._pixels = state.drawing.pixels
+            jpeg = await self._encoder.encode(state.drawing.pixels)
+        self._n_sent += 1
+        if self._n_sent - self._n_shown >= MAX_UNDER_WAY:
+            self._has_room.clear()
+        await self._line.send_str(to_json(state, self._n_sent, has_picture=jpeg is not None))
+        if jpeg is not None:
+            await self._line.send_bytes(jpeg)
+
+    def _take(self, text: str) -> bool:
+        """Take {"shown": update, "visible": bool} or {"take_back": name}; False where it is neither."""
+        try:
+            answer = json.loads(text)
+            name = answer.get("take_back")
+            shown, is_looked_at = (0, True) if name is not None else (answer["shown"], answer["visible"])
+        except (ValueError, AttributeError, KeyError, RecursionError):
+            return False
+        if name is not None:
+            if not isinstance(name, str) or not re.fullmatch(r"[0-9]{6,20}", name):
+                return False
+            self._feed.ask(TakeBack(name))
+            return True
+        if type(shown) is not int or type(is_looked_at) is not bool:
+            return False
+        if not self._n_shown <= shown <= self._n_sent:
+            return False
+        self._n_shown = shown
+        if is_looked_at and not self._is_looked_at:
+            # What was sent meanwhile had no image.
+            self._pixels, self._state = None, 0
+        self._is_looked_at = is_looked_at
+        if self._n_sent - self._n_shown < MAX_UNDER_WAY:
+            self._has_room.set()
+        return True
+
+
+class _Refused(asyncio.Protocol):
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        transport.abort()
+
+
+class Pages:
+    """Answers requests that bring the token, in the link or in the cookie that the link leaves.
+
+    The cookie is sent by pages of this site only (SameSite), so that no other site shows or watches the page.
+
+    Attributes:
+        encoder: compresses the images.
+    """
+
+    def __init__(self, token: str, feed: Feed) -> None:
+        self.encoder = Encoder()
+        self._token = token
+        self._feed = feed
+        self._viewers: dict[web.RequestHandler, Viewer] = {}
+        folder = resources.files("lce_rig.show.phone") / "page"
+        self._files = {entry.name: entry.read_bytes() for entry in folder.iterdir()}
+
+    def application(self) -> web.Application:
+        """Build the application."""
+        app = web.Application(middlewares=[self._guard], client_max_size=1024)
+        app.on_response_prepare.append(_add_headers)
+        app.router.add_get("/live", self._live, allow_head=False)
+        app.router.add_get("/", self._file)
+        app.router.add_get("/{name}", self._file)
+        return app
+
+    async def listen(self, runner: web.AppRunner, opened: socket.socket) -> asyncio.Server:
+        """Accept connections, within limits, for the application of a runner that is set up."""
+        server, loop = runner.server, asyncio.get_running_loop()
+        assert server is not None
+        accepted: dict[web.RequestHandler, float] = {}
+
+        def accept() -> asyncio.Protocol:
+            now_s = loop.time()
+            for other, since_s in list(accepted.items()):
+                # It has no transport before it is set up, and after it is closed.
+                if other.transport is None and now_s - since_s > _SET_UP_S:
+                    del accepted[other]
+            if len(accepted) >= MAX_CONNECTIONS:
+                return _Refused()
+            handler = server()
+            accepted[handler] = now_s
+            loop.call_later(CONNECTION_S, self._cut, handler)
+            return handler
+
+        return await loop.create_server(accept, sock=opened)
+
+    async def close(self) -> None:
+        """Let the pages have the last state, and close them."""
+        closing = (viewer.close() for viewer in self._viewers.values())
+        await asyncio.gather(*closing, return_exceptions=True)
+        self.encoder.close()
+
+    def _cut(self, handler: web.RequestHandler) -> None:
+        if handler not in self._viewers and handler.transport is not None:
+            handler.transport.abort()
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        given = (request.query.get("token", ""), request.cookies.get(self._cookie(request), ""))
+        # In constant time, so that a wrong token does not tell how much of it is right.
+        if not any(
+            hmac.compare_digest(text.encode(errors="replace"), self._token.encode()) for text in given
+        ):
+            text = "This page needs the whole link that lce-rig shows, with its token.\n"
+            answer = web.Response(status=403, text=text)
+            # Without the connection, strangers ask no faster than they are accepted.
+            answer.force_close()
+            return answer
+        return await handler(request)
+
+    async def _file(self, request: web.Request) -> web.Response:
+        name = request.match_info.get("name", "index.html")
+        if name not in self._files:
+            raise web.HTTPNotFound
+        kind = _TYPES[name.rpartition(".")[2]]
+        response = web.Response(body=self._files[name], content_type=kind, charset="utf-8")
+        if "token" in request.query:
+            # Lax: a link opened from another program or site must work at the first click.
+            response.set_cookie(self._cookie(request), self._token, httponly=True, samesite="Lax", path="/")
+        return response
+
+    async def _live(self, request: web.Request) -> web.StreamResponse:
+        if len(self._viewers) >= MAX_VIEWERS:
+            return web.Response(status=503, text=f"{MAX_VIEWERS} pages are open already.\n")
+        line = web.WebSocketResponse(
+            heartbeat=HEARTBEAT_S, max_msg_size=MAX_MESSAGE_BYTES, timeout=_GOODBYE_S
+        )
+        await line.prepare(request)
+        viewer = self._viewers[request.protocol] = Viewer(line, self._feed, self.encoder)
+        try:
+            await viewer.serve()
+        finally:
+            del self._viewers[request.protocol]
+        return line
+
+    @staticmethod
+    def _cookie(request: web.Request) -> str:
+        # Cookies are shared between the ports of a host.
+        address = request.transport.get_extra_info("sockname") if request.transport else ("", 0)
+        return f"{_COOKIE}_{address[1]}"
+
+
+async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(_HEADERS)
