@@ -189,7 +189,9 @@ class Rig(Settings):
                 yield UNKNOWN_MODEL(f"lidars.{name}.model", value=lidar.model)
             if lidar.driver.type == "vlp16" and velodyne.product_of(lidar.model) is None:
                 yield OTHER_DRIVER(f"lidars.{name}.driver.type", value="vlp16", model=lidar.model)
-        drivers = [(f"lidars.{n}", lidar.driver.type, LIDAR_DRIVERS) for n, lidar in self.lidars.items()]
+        drivers: list[tuple[str, str | None, tuple[str, ...]]] = [
+            (f"lidars.{n}", lidar.driver.type, LIDAR_DRIVERS) for n, lidar in self.lidars.items()
+        ]
         drivers += [
             (f"cameras.{n}", camera.driver.type, CAMERA_DRIVERS) for n, camera in self.cameras.items()
         ]
