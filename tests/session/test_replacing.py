@@ -1,4 +1,4 @@
-"""Folders of results change whole, whoever dies meanwhile, and no link leads out of a session."""
+"""Folders of results change whole, even if a process is killed meanwhile."""
 
 import os
 import signal
