@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import click
 import numpy as np
@@ -22,7 +22,6 @@ from lce_rig.core.calibration import (
     AxisOpinion,
     Calibration,
     Method,
-    OtherCamera,
     SceneOpinion,
 )
 from lce_rig.core.errors import NotEnoughDataError
@@ -30,61 +29,48 @@ from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
 from lce_rig.judge.findings import weakest_words
-from lce_rig.words import not_enough, sentence
-
-# The uncertainty in the report: by axis, and for points at several distances.
 
 _AXES = ("x right", "y down", "z forward")
-
-
-def uncertainty_lines(calibration: Calibration) -> list[str]:
-    """State extrinsics's standard deviations and its least certain motion, in lines of 80 columns."""
-    c = calibration
-    sigmas = np.sqrt(np.diag(c.cov))
-    return [
-        f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
-        f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
-        f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
-        *_boards_alone(c),
-        *([f"  weakest: {weakest_words(c.weakest)}"] if c.weakest else []),
-        *_at_distances(c),
-    ]
-
-
-def _boards_alone(c: Calibration) -> list[str]:
-    if c.scene_share is None or c.scene_share.state != "used":
-        return []
-    sigma_deg, sigma_m = sigma_sizes(c.scene_share.cov_boards)
-    return [f"               of the boards alone {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm"]
-
-
-def _by_axis(values: Array, digits: str) -> str:
-    return ", ".join(f"{axis} {value:{digits}}" for axis, value in zip(_AXES, values, strict=True))
-
-
-def _at_distances(c: Calibration) -> list[str]:
-    if not c.uncertainty:
-        return []
-    columns = [f"{each.distance_m:g} m away" for each in c.uncertainty]
-    centre = [f"{each.centre_px:.1f} px, {100 * each.centre_m:.1f} cm" for each in c.uncertainty]
-    corner = [f"{each.corner_px:.1f} px, {100 * each.corner_m:.1f} cm" for each in c.uncertainty]
-    return [
-        f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
-        for title, cells in (("a point", columns), ("  in centre", centre), ("  in corner", corner))
-    ]
-
-
 _OPINIONS = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
+_UNITS = {"deg": "deg", "m": "mm"}
+
+
+def uncertainty_lines(c: Calibration) -> list[str]:
+    """State extrinsics's standard deviations, by axis and for points at several distances."""
+
+    def by_axis(values: Array, digits: str) -> str:
+        return ", ".join(f"{axis} {value:{digits}}" for axis, value in zip(_AXES, values, strict=True))
+
+    sigmas = np.sqrt(np.diag(c.cov))
+    lines = [
+        f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
+        f"               about {by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
+        f"               along {by_axis(1000 * sigmas[:3], '.1f')} mm",
+    ]
+    if c.scene_share is not None and c.scene_share.state == "used":
+        sigma_deg, sigma_m = sigma_sizes(c.scene_share.cov_boards)
+        lines.append(f"               of the boards alone {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm")
+    if c.weakest:
+        lines.append(f"  weakest: {weakest_words(c.weakest)}")
+    if c.uncertainty:
+        rows = {
+            "a point": [f"{each.distance_m:g} m away" for each in c.uncertainty],
+            "  in centre": [f"{e.centre_px:.1f} px, {100 * e.centre_m:.1f} cm" for e in c.uncertainty],
+            "  in corner": [f"{e.corner_px:.1f} px, {100 * e.corner_m:.1f} cm" for e in c.uncertainty],
+        }
+        for title, cells in rows.items():
+            lines.append(f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip())
+    return lines
 
 
 def scene_texts(opinion: SceneOpinion) -> list[str]:
     """State the scene's opinion: what contradicts, which changes it would see, and what it cannot tell."""
     if not opinion.n_captures:
         return ["cannot tell: no capture has a frame and a scan"]
-    seen = f"{show.counted(opinion.n_captures, 'capture')}, {opinion.n_edges} edges"
+    edges = f"{show.counted(opinion.n_captures, 'capture')}, {opinion.n_edges} edges"
     if not opinion.axes:
-        return [f"cannot tell: too few edges ({seen})"]
-    texts = [f"{_OPINIONS[opinion.state]} ({seen})"]
+        return [f"cannot tell: too few edges ({edges})"]
+    texts = [f"{_OPINIONS[opinion.state]} ({edges})"]
     texts += [
         f"{motion_words(axis.axis)}: {_value(axis, axis.change, '+')} +- {_value(axis, axis.sigma)} "
         f"{_UNITS[axis.unit]}"
@@ -100,25 +86,20 @@ def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> list[st
     """Name axes as rotations about and translations along x, y and z."""
     parts = []
     for unit, kind in (("deg", "about"), ("m", "along")):
-        own = [axis for axis in axes if axis.unit == unit]
         names = [
-            f"{each.axis[-1]} {_value(each, each.smallest)}" if with_size else each.axis[-1] for each in own
+            f"{each.axis[-1]} {_value(each, each.smallest)}" if with_size else each.axis[-1]
+            for each in axes
+            if each.unit == unit
         ]
-        if own:
+        if names:
             parts.append(f"{kind} {', '.join(names)}{' ' + _UNITS[unit] if with_size else ''}")
     return parts
-
-
-_UNITS = {"deg": "deg", "m": "mm"}
 
 
 def _value(axis: AxisOpinion, value: float | None, sign: str = "") -> str:
     if value is None:
         return "?"
     return f"{value:{sign}.2f}" if axis.unit == "deg" else f"{1000 * value:{sign}.0f}"
-
-
-# The report of several cameras: their relative poses, and which of them has no result.
 
 
 def together_lines(calibration: Calibration) -> list[str]:
@@ -135,63 +116,33 @@ def together_lines(calibration: Calibration) -> list[str]:
 
 def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) -> list[str]:
     """State the poses of cameras earlier in the result relative to this one, each pair of cameras once."""
-    c = calibration
-    others = {other.camera: other for other in c.other_cameras}
+    camera = calibration.camera
+    others = {other.camera: other for other in calibration.other_cameras}
     lines: list[str] = []
-    for earlier in calibrations[: calibrations.index(c)]:
-        if earlier.lidar == c.lidar and earlier.camera in others:
-            lines += _camera_lines(c.camera, others[earlier.camera])
-        elif earlier.lidar == c.lidar:
+    for earlier in calibrations[: calibrations.index(calibration)]:
+        name = earlier.camera
+        if earlier.lidar != calibration.lidar:
+            continue
+        if name not in others:
+            lines.append(f"[bold]{name} and {camera}[/]: not compared, as no still board was seen by both")
+            continue
+        other = others[name]
+        lines += [
+            f"[bold]{name} and {camera}[/], from {other.n_captures} captures of both",
+            f"  T_{camera}_{name} (p_{camera} = R p_{name} + t)",
+            *show.matrix_lines(other.T_cam_other, "    "),
+        ]
+        if other.cov is not None:
+            sigma_deg, sigma_m = sigma_sizes(other.cov)
+            lines.append(f"  uncertainty  {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)")
+        if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
+            separately = ", each camera estimated separately" if other.cov is not None else ""
             lines.append(
-                f"[bold]{earlier.camera} and {c.camera}[/]: not compared, as no still board was seen by both"
+                f"  images       differ by {other.apart_rotation_deg:.3f} deg, "
+                f"{1000 * other.apart_translation_m:.1f} mm{separately}"
             )
+        lines.append(f"  boards       {1000 * other.board_rms_m:.1f} mm apart")
     return lines
-
-
-def lacking_extrinsics(
-    wanted: Sequence[str], seen: Collection[str], calibrations: Sequence[Calibration]
-) -> NotEnoughDataError | None:
-    """Name the cameras without extrinsics; None if all have them.
-
-    Args:
-        wanted: cameras that should have extrinsics.
-        seen: cameras of which the session holds captures.
-        calibrations: the results, at least one.
-    """
-    calibrated = {calibration.camera for calibration in calibrations}
-    missing = [camera for camera in wanted if camera not in calibrated]
-    if not missing:
-        return None
-    causes = [f"No capture holds an image of {name} and a scan." for name in missing if name not in seen]
-    others = " ".join(f"--camera {name}" for name in wanted if name in calibrated)
-    return NotEnoughDataError(
-        f"no extrinsics of camera {', '.join(missing)}",
-        "\n".join([*causes, f"Collect more captures, or omit the camera: {others}"]),
-    )
-
-
-def _camera_lines(camera: str, other: OtherCamera) -> list[str]:
-    name = other.camera
-    lines = [
-        f"[bold]{name} and {camera}[/], from {other.n_captures} captures of both",
-        f"  T_{camera}_{name} (p_{camera} = R p_{name} + t)",
-        *("    " + "  ".join(f"{value: .6f}" for value in row) for row in other.T_cam_other[:3]),
-    ]
-    if other.cov is not None:
-        sigma_deg, sigma_m = sigma_sizes(other.cov)
-        lines.append(f"  uncertainty  {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)")
-    if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
-        separately = ", each camera estimated separately" if other.cov is not None else ""
-        lines.append(
-            f"  images       differ by {other.apart_rotation_deg:.3f} deg, "
-            f"{1000 * other.apart_translation_m:.1f} mm{separately}"
-        )
-    lines.append(f"  boards       {1000 * other.board_rms_m:.1f} mm apart")
-    return lines
-
-
-if TYPE_CHECKING:
-    from lce_rig.pipeline.result_files import WrittenResult
 
 
 @click.command()
@@ -315,7 +266,7 @@ def calibrate(
                 progress=progress,
             )
         for shortage in result.shortages:
-            show.warn(str(not_enough(shortage)))
+            show.warn(str(NotEnoughDataError.of(shortage)))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} has no T_cam_lidar for these sensors")
         written = result.write(name=name, force=force, report=not no_report)
@@ -339,10 +290,20 @@ def calibrate(
         show.note(f"report: {written.report}")
     for finding in written.findings:
         if finding.severity != "note":
-            show.warn(sentence(finding))
-    _tell_earlier(written)
-    seen = {pair.camera for own in detections for pair in own.pairs}
-    _exit(result.pairs, wanted, seen, are_printed=not as_json)
+            show.warn(finding.sentence)
+    if written.previous is not None:
+        if len(written.files) == 1 and written.has_usable_previous:
+            show.warn(f"this result is not exported; the last usable result is in {written.previous}")
+        elif not written.is_same:
+            show.note(f"the earlier result is in {written.previous}")
+        if written.only_previous:
+            show.note(f"not calibrated in this run: {', '.join(written.only_previous)}")
+    lacking = _lacking(wanted, {pair.camera for each in detections for pair in each.pairs}, result.pairs)
+    if lacking is not None and any(c.verdict == "fail" for c in result.pairs):
+        show.warn(str(lacking))
+    exit_by_verdict(result.pairs, are_printed=not as_json)
+    if lacking is not None:
+        raise lacking
 
 
 @contextmanager
@@ -360,29 +321,26 @@ def _earlier_result_named(folder: Path) -> Iterator[None]:
         raise
 
 
-def _tell_earlier(written: "WrittenResult") -> None:
-    """Say where the earlier run's files are, and which are usable."""
-    has_exports = len(written.files) > 1
-    if written.previous is None:
-        return
-    if not has_exports and written.has_usable_previous:
-        show.warn(f"this result is not exported; the last usable result is in {written.previous}")
-    elif not written.is_same:
-        show.note(f"the earlier result is in {written.previous}")
-    if written.only_previous:
-        show.note(f"not calibrated in this run: {', '.join(written.only_previous)}")
+def _lacking(
+    wanted: Sequence[str], cameras: Collection[str], calibrations: Sequence[Calibration]
+) -> NotEnoughDataError | None:
+    """Name the wanted cameras without extrinsics; None if all have them.
 
-
-def _exit(
-    calibrations: Sequence[Calibration], wanted: Sequence[str], seen: Collection[str], *, are_printed: bool
-) -> None:
-    """Exit with 7 if a result has failed, else with 6 if a camera has no result."""
-    lacking = lacking_extrinsics(wanted, seen, calibrations)
-    if lacking is not None and any(c.verdict == "fail" for c in calibrations):
-        show.warn(str(lacking))
-    exit_by_verdict(calibrations, are_printed=are_printed)
-    if lacking is not None:
-        raise lacking
+    Args:
+        wanted: cameras that should have extrinsics.
+        cameras: of which the session holds captures.
+        calibrations: the results, at least one.
+    """
+    calibrated = {calibration.camera for calibration in calibrations}
+    missing = [camera for camera in wanted if camera not in calibrated]
+    if not missing:
+        return None
+    causes = [f"No capture holds an image of {name} and a scan." for name in missing if name not in cameras]
+    others = " ".join(f"--camera {name}" for name in wanted if name in calibrated)
+    return NotEnoughDataError(
+        f"no extrinsics of camera {', '.join(missing)}",
+        "\n".join([*causes, f"Collect more captures, or omit the camera: {others}"]),
+    )
 
 
 def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = False) -> None:
@@ -396,52 +354,47 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = 
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed:
         pairs = ", ".join(str(Pair.of(c)) for c in failed)
-        causes = "\n".join(sentence(finding) for c in failed for finding in c.findings)
+        causes = "\n".join(finding.sentence for c in failed for finding in c.findings)
         raise ResultRefusedError(f"failed: {pairs}; do not use this result", "" if are_printed else causes)
 
 
-def _held_out(held_out_m: float) -> str:
-    return f"held out {1000 * held_out_m:.1f} mm, " if math.isfinite(held_out_m) else ""
-
-
-def _lines(calibration: Calibration) -> list[str]:
-    c = calibration
-    colour = show.COLOURS[c.verdict]
-    metrics = c.metrics
+def _lines(c: Calibration) -> list[str]:
+    colour, metrics = show.COLOURS[c.verdict], c.metrics
+    held_out = f"held out {1000 * c.held_out_m:.1f} mm, " if math.isfinite(c.held_out_m) else ""
+    certificate = f"none (method {c.method} has no certificate)"
+    if math.isfinite(c.certificate.gap):
+        certificate = "global minimum" if c.certificate.is_optimal else "[red]not proven[/]"
+        certificate += " of Algorithm 1, where the estimate starts" if c.is_start_certified else ""
+        certificate += f", gap {c.certificate.gap:.0e}"
     lines = [
         f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]",
         "  T_cam_lidar (p_cam = R p_lidar + t)",
-        *("    " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
+        *show.matrix_lines(c.T_cam_lidar, "    "),
         *uncertainty_lines(c),
         f"  captures     {len(c.captures_used)} used of {c.n_captures}, "
         f"board found by both sensors in {c.n_detected}",
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
-        f"{_held_out(c.held_out_m)}corners {metrics.reprojection_px:.2f} px",
-        f"  certificate  {_certificate(c)}",
+        f"{held_out}corners {metrics.reprojection_px:.2f} px",
+        f"  certificate  {certificate}",
+        *_titled("channels", _channel_texts(c)),
+        *together_lines(c),
     ]
-    lines += [*_channel_lines(c), *together_lines(c)]
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
         lines.append(
             f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
         )
-    for k, text in enumerate([] if c.scene is None else scene_texts(c.scene)):
-        lines.append(f"  {'scene' if k == 0 else '':<13}{text}")
+    lines += _titled("scene", [] if c.scene is None else scene_texts(c.scene))
     for name, why in c.captures_refused.items():
-        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
-    lines += [f"  [{colour}]{show.escape(sentence(finding))}[/]" for finding in c.findings]
-    return lines
+        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]")
+    return lines + [f"  [{colour}]{show.escape(finding.sentence)}[/]" for finding in c.findings]
 
 
-def _certificate(calibration: Calibration) -> str:
-    is_optimal, gap = calibration.certificate.is_optimal, calibration.certificate.gap
-    if not math.isfinite(gap):
-        return f"none (method {calibration.method} has no certificate)"
-    of_start = " of Algorithm 1, where the estimate starts" if calibration.is_start_certified else ""
-    return f"{'global minimum' if is_optimal else '[red]not proven[/]'}{of_start}, gap {gap:.0e}"
+def _titled(title: str, texts: Sequence[str]) -> list[str]:
+    return [f"  {'' if k else title:<13}{text}" for k, text in enumerate(texts)]
 
 
-def _channel_lines(calibration: Calibration) -> list[str]:
-    """Say what each channel contributes if there are several, or if boards moved."""
+def _channel_texts(calibration: Calibration) -> list[str]:
+    """State what each channel contributes if there are several, or if boards moved."""
     results = calibration.channel_results
     if len(results) == 1 and results[0].time_offset_s is None:
         return []
@@ -462,4 +415,4 @@ def _channel_lines(calibration: Calibration) -> list[str]:
             f"channels differ by {figures.channels_rotation_deg:.2f} deg, "
             f"{1000 * figures.channels_translation_m:.1f} mm"
         )
-    return [f"  {'channels' if k == 0 else '':<13}{text}" for k, text in enumerate(texts)]
+    return texts

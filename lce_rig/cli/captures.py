@@ -68,30 +68,34 @@ def _require_there(session: "Session", rejecting: list[str], restoring: list[str
     from lce_rig.core.errors import UsageError
 
     names = [*rejecting, *restoring]
-    there = {capture.name for capture in session.captures}
-    aside = {capture.name for capture in session.rejected}
+    kept = {capture.name for capture in session.captures}
+    rejected = {capture.name for capture in session.rejected}
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"capture {name} is given twice")
-    for name, known, other, state in (
-        *((name, there, aside, "rejected already") for name in rejecting),
-        *((name, aside, there, "not rejected") for name in restoring),
-    ):
-        if name in other and name in known:
+        if name in kept and name in rejected:
             raise UsageError(
                 f"{session.path}: capture {name} is in captures/ and in rejected/",
                 "Move one of the two out of the session.",
             )
-        if name in other:
-            raise UsageError(f"{session.path}: capture {name} is {state}")
-        if name not in known:
+        if name not in kept | rejected:
             raise UsageError(
                 f"{session.path} has no capture {name}", f"List them with: lce-rig captures {session.path}"
             )
+        if name not in (kept if name in rejecting else rejected):
+            state = "rejected already" if name in rejecting else "not rejected"
+            raise UsageError(f"{session.path}: capture {name} is {state}")
 
 
 def _records(session: "Session", stored: Sequence["StoredResult"]) -> list[dict[str, Any]]:
-    used = _used(stored)
+    from lce_rig.pipeline.result_files import CURRENT
+
+    # The cameras whose current result used each capture.
+    used: dict[str, list[str]] = {}
+    for result in stored:
+        for calibration in result.file.pairs if result.name == CURRENT and result.file else ():
+            for name in calibration.captures_used:
+                used.setdefault(name, []).append(calibration.camera)
     states = [(each, "kept") for each in session.captures] + [(each, "rejected") for each in session.rejected]
     states.sort(key=lambda item: int(item[0].name))
     return [_record(capture, state, used.get(capture.name, [])) for capture, state in states]
@@ -109,18 +113,6 @@ def _record(capture: "Capture", state: str, used_by: list[str]) -> dict[str, Any
         return {**record, "streams": [], "source": "", "damage": error.what}
     label = source.get("label", "") if isinstance(source, dict) else ""
     return {**record, "streams": streams, "source": str(label), "damage": None}
-
-
-def _used(stored: Sequence["StoredResult"]) -> dict[str, list[str]]:
-    """Name the cameras whose current result used each capture."""
-    from lce_rig.pipeline.result_files import CURRENT
-
-    used: dict[str, list[str]] = {}
-    for result in stored:
-        for calibration in result.file.pairs if result.name == CURRENT and result.file else ():
-            for name in calibration.captures_used:
-                used.setdefault(name, []).append(calibration.camera)
-    return used
 
 
 def _table(records: list[dict[str, Any]]) -> Any:

@@ -15,7 +15,6 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.lidar.search import plane_limit_m
 from lce_rig.rig import Rig
-from lce_rig.words import describe, recommend, refusal_as_json
 
 
 @click.command()
@@ -45,13 +44,21 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
             folder = write_debug_images(opened, detections, event_image=event_image, progress=progress)
         show.note(f"debug images: {folder}")
     refusals = {pair: refusals_of(opened.rig, detections, pair) for pair in detections.pairs}
+    records = {
+        pair: {
+            name: _record(*detections.of(pair, name), refused.get(name)) for name in detections.captures(pair)
+        }
+        for pair, refused in refusals.items()
+    }
     if as_json:
-        show.print_json(
-            {"format_version": 1, "rig": opened.rig.name, "pairs": _document(detections, refusals)}
-        )
+        pairs = [
+            {"camera": pair.camera, "channel": pair.channel, "lidar": pair.lidar, "captures": captures}
+            for pair, captures in records.items()
+        ]
+        show.print_json({"format_version": 1, "rig": opened.rig.name, "pairs": pairs})
     else:
         for pair, refused in refusals.items():
-            show.print_table(_table(detections, pair, refused))
+            show.print_table(_table(detections, pair, records[pair]))
             _summarise(opened.rig, detections, pair, refused)
     if all(len(refused) == len(detections.captures(pair)) for pair, refused in refusals.items()):
         raise NotEnoughDataError(
@@ -61,37 +68,22 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
         )
 
 
-def _document(detections: Detections, refusals: Mapping[Pair, Mapping[str, Refusal]]) -> list[dict[str, Any]]:
-    return [
-        {
-            "camera": pair.camera,
-            "channel": pair.channel,
-            "lidar": pair.lidar,
-            "captures": {
-                name: _record(*detections.of(pair, name), refused.get(name))
-                for name in detections.captures(pair)
-            },
-        }
-        for pair, refused in refusals.items()
-    ]
-
-
 def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | None) -> dict[str, Any]:
-    best = lidar[0] if isinstance(lidar, list) else lidar
+    """Describe a capture for programs; figures that were not measured are null."""
+
+    def figures(detected: ImageBoard | LidarBoard | Refusal) -> dict[str, float | None] | None:
+        if isinstance(detected, Refusal):
+            return None
+        values = detected.figures().items()
+        return {key: float(value) if math.isfinite(value) else None for key, value in values}
+
     return {
         "is_usable": refusal is None,
-        "refusal": None if refusal is None else refusal_as_json(refusal),
-        "image": _figures(image),
-        "lidar": _figures(best),
+        "refusal": None if refusal is None else refusal.as_json(),
+        "image": figures(image),
+        "lidar": figures(lidar[0] if isinstance(lidar, list) else lidar),
         "n_surfaces": len(lidar) if isinstance(lidar, list) else 0,
     }
-
-
-def _figures(found: ImageBoard | LidarBoard | Refusal) -> dict[str, float | None] | None:
-    """Return a detection's quality record, with null for figures that were not measured."""
-    if isinstance(found, Refusal):
-        return None
-    return {key: float(value) if math.isfinite(value) else None for key, value in found.figures().items()}
 
 
 # Heading and unit, sensor, figure, scale to the unit, digits.
@@ -118,27 +110,18 @@ _LIDAR: tuple[Column, ...] = (
 _SIDE_SIGMA_MAX_M = 0.05
 
 
-def _table(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> Any:
-    table = show.plain_table(str(pair))
-    columns = _columns(detections, pair)
-    table.add_column("capture", no_wrap=True)
-    for title, *_ in columns:
-        table.add_column(title, justify="right")
-    table.add_column("")
-    for name in detections.captures(pair):
-        refusal = refused.get(name)
-        record = _record(*detections.of(pair, name), refusal)
+def _table(detections: Detections, pair: Pair, records: Mapping[str, dict[str, Any]]) -> Any:
+    """List the captures, in columns that fit a terminal of 80 characters."""
+    images = [detections.of(pair, name)[0] for name in records]
+    # Images from events have their own figures.
+    is_from_events = any(not isinstance(image, Refusal) and image.events is not None for image in images)
+    columns = (*_IMAGE, *(_EVENTS if is_from_events else _POINTS), *_LIDAR)
+    table = show.plain_table(str(pair), "capture", *(f">{title}" for title, *_ in columns), "")
+    for name, record in records.items():
         cells = [_cell(record[sensor], key, scale, digits) for _, sensor, key, scale, digits in columns]
-        state = "[green]ok[/]" if refusal is None else f"[red]{refusal.stage}[/]"
+        state = "[green]ok[/]" if record["is_usable"] else f"[red]{record['refusal']['stage']}[/]"
         table.add_row(name, *cells, state)
     return table
-
-
-def _columns(detections: Detections, pair: Pair) -> tuple[Column, ...]:
-    """Choose columns that fit a terminal of 80 characters; images from events have their own figures."""
-    images = [detections.of(pair, name)[0] for name in detections.captures(pair)]
-    is_from_events = any(not isinstance(image, Refusal) and image.events is not None for image in images)
-    return (*_IMAGE, *(_EVENTS if is_from_events else _POINTS), *_LIDAR)
 
 
 def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, digits: int) -> str:
@@ -169,7 +152,7 @@ def _summarise(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[st
     )
     names: dict[str, list[str]] = {}
     for name, refusal in sorted(refused.items()):
-        text = f"{refusal.stage}: {describe(refusal)}\n    -> {recommend(refusal)}"
+        text = f"{refusal.stage}: {refusal.text}\n    -> {refusal.advice}"
         names.setdefault(text, []).append(name)
     for text, own in names.items():
         show.say(f"  {', '.join(own)}: {text}")

@@ -7,8 +7,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, require_sensors, robot_option
-from lce_rig.words import sentence
+from lce_rig.cli.options import FiniteRange, require_sensors, rig_option, robot_option, session_argument
 
 
 def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
@@ -22,11 +21,9 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 
 
 @click.command()
-@click.option(
-    "--rig", "rig_name", required=True, metavar="NAME|FILE", help="Set the rig profile: a name or a file."
-)
+@rig_option
 @robot_option
-@click.argument("session", type=click.Path(path_type=Path), default="session")
+@session_argument
 @click.option(
     "--from",
     "paths",
@@ -154,23 +151,26 @@ def collect(
     """
     from lce_rig.rig import load_rig
 
+    rig = load_rig(rig_name).of_robot(robot)
     if not paths:
-        _refuse_options(_OF_RECORDINGS, "applies to recordings only", "Add --from, or omit this option.")
-        from lce_rig.cli.collect_live import LiveArguments, run_live
+        _refuse_options(
+            (*_OF_RECORDINGS, "target"), "applies to recordings only", "Add --from, or omit this option."
+        )
+        from lce_rig.cli.collect_live import run_live
 
-        run_live(load_rig(rig_name).of_robot(robot), session, LiveArguments(**live))
+        run_live(rig, session, **live)
         return
-    from lce_rig.cli.simulate import require_kind
-
     _refuse_options(tuple(live), "applies to live collection only", "Omit --from or this option.")
+    from lce_rig.cli.collect_live import show_next
+    from lce_rig.cli.simulate import require_kind
     from lce_rig.collect import CollectOptions
+    from lce_rig.collect.live.guide import predict
     from lce_rig.core.errors import NotEnoughDataError
     from lce_rig.io import open_recordings
     from lce_rig.io.protocol import PairedRecording, SourceOptions
     from lce_rig.pipeline.collect_recordings import fill_session
     from lce_rig.session import Session
 
-    rig = load_rig(rig_name).of_robot(robot)
     require_kind(session, None)
     sensors = zip(
         _one_for_each(paths, "--camera", cameras, rig.cameras),
@@ -178,8 +178,8 @@ def collect(
         _one_for_each(paths, "--lidar", lidars, rig.lidars),
         strict=True,
     )
-    options = [SourceOptions(*names, pair, pair_tolerance, topics) for names in sensors]
-    recordings = open_recordings(paths, rig, options)
+    sources = [SourceOptions(*names, pair, pair_tolerance, topics) for names in sensors]
+    recordings = open_recordings(paths, rig, sources)
     wanted = CollectOptions(max_captures=max_captures, target=target)
     with show.progress_bar("collecting") as progress:
         report = fill_session(rig, recordings, session, wanted, progress)
@@ -188,26 +188,14 @@ def collect(
         show.warn("--topic is ignored for a folder of images and point clouds")
     _tell(report, session, n_captures)
     if n_captures == 0:
-        raise NotEnoughDataError(
-            f"{session}: no capture from {', '.join(map(str, paths))}",
-            _remedy(report),
-        )
-    from lce_rig.cli.collect_live import show_next
-    from lce_rig.collect.live.guide import predict
-
+        hint = "Hold the board still for 1 s in view of both sensors, and check that their clocks agree."
+        if report.has_events:
+            hint = "Move the board slowly, about 10 cm/s, in view of both sensors; the causes are above."
+        raise NotEnoughDataError(f"{session}: no capture from {', '.join(map(str, paths))}", hint)
     show_next(session, rig, predict(Session.open(session)), n_captures)
 
 
-_OF_RECORDINGS = (
-    "pair",
-    "pair_tolerance",
-    "topics",
-    "cameras",
-    "channels",
-    "lidars",
-    "max_captures",
-    "target",
-)
+_OF_RECORDINGS = ("pair", "pair_tolerance", "topics", "cameras", "channels", "lidars", "max_captures")
 
 
 def _one_for_each(
@@ -247,13 +235,6 @@ def _refuse_options(names: tuple[str, ...], what: str, hint: str) -> None:
             raise UsageError(f"{param.opts[-1]} {what}", hint)
 
 
-def _remedy(report: Any) -> str:
-    """Say what to do if nothing could be captured."""
-    if report.has_events:
-        return "Move the board slowly, about 10 cm/s, in view of both sensors; the causes are above."
-    return "Hold the board still for 1 s in view of both sensors, and check that their clocks agree."
-
-
 def _tell(report: Any, session: Path, n_captures: int) -> None:
     """Report captures, duplicates and refusals.
 
@@ -262,16 +243,16 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
     """
     for text in report.notes:
         show.note(text)
-    for found in report.sizes.values():
-        tell = show.warn if found[0].severity == "error" else show.note
-        tell(f"{found[0].subject}: {show.counted(len(found), 'image')} of {sentence(found[0])}")
+    for first, *others in report.sizes.values():
+        tell = show.warn if first.severity == "error" else show.note
+        tell(f"{first.subject}: {show.counted(1 + len(others), 'image')} of {first.sentence}")
     for label, capture in report.duplicates.items():
         show.note(f"{label}: duplicate of {capture}, skipped")
     for label, refusal in report.refused.items():
-        show.warn(f"{label}: {sentence(refusal)}")
+        show.warn(f"{label}: {refusal.sentence}")
     counts = report.counts.counts()
     if counts:
-        show.note("not captured:\n" + "\n".join(f"  {n} x {sentence(why)}" for why, n in counts))
+        show.note("not captured:\n" + "\n".join(f"  {n} x {why.sentence}" for why, n in counts))
     if report.n_missing:
         show.warn(f"{report.n_missing} captures short of the target")
     new = f"{len(report.captured)} new" + (

@@ -5,7 +5,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,11 +14,10 @@ from lce_rig.cli import show
 from lce_rig.cli.simulate import TRUTH, require_kind, write_truth
 from lce_rig.core.errors import LceRigError
 from lce_rig.show.screen.keys import Controls, controls
-from lce_rig.words import sentence
 
 if TYPE_CHECKING:
     from lce_rig.collect.live.simulated import SimulatedRig
-    from lce_rig.collect.live.state import LiveReport, LiveState, TakeBack
+    from lce_rig.collect.live.state import Key, LiveReport, LiveState, TakeBack
     from lce_rig.core.findings import Finding
     from lce_rig.devices.reading import LiveSource
     from lce_rig.rig import Rig
@@ -39,55 +37,50 @@ _ENDINGS = {
 }
 
 
-@dataclass(frozen=True)
-class LiveArguments:
-    """The options of live collection, as given.
-
-    Attributes:
-        frames, timeout, keep_going, hold, plain, silent, preview, record, simulated, seed: see --help.
-    """
-
-    frames: int | None
-    timeout: float | None
-    keep_going: bool
-    hold: float | None
-    plain: bool
-    silent: bool
-    preview: str | None
-    record: Path | None
-    simulated: bool
-    seed: int | None
-
-
-def run_live(rig: "Rig", path: Path, given: LiveArguments) -> None:
-    """Collect live into a session and report the outcome."""
+def run_live(
+    rig: "Rig",
+    path: Path,
+    *,
+    frames: int | None,
+    timeout: float | None,
+    keep_going: bool,
+    hold: float | None,
+    plain: bool,
+    silent: bool,
+    preview: str | None,
+    record: Path | None,
+    simulated: bool,
+    seed: int | None,
+) -> None:
+    """Collect live into a session and report the outcome; the options are those of --help."""
     from lce_rig.collect.live.collection import collect_live
     from lce_rig.collect.live.state import HOLD_S, LiveOptions
     from lce_rig.core.errors import UsageError
     from lce_rig.show.screen.live_view import open_view
 
-    if given.seed is not None and not given.simulated:
+    if seed is not None and not simulated:
         raise UsageError("--seed applies to --simulated only", "Add --simulated, or omit --seed.")
-    require_kind(path, (given.seed or 0) if given.simulated else None)
-    hold_s = HOLD_S if given.hold is None else given.hold
+    require_kind(path, (seed or 0) if simulated else None)
     with ExitStack() as stack:
         # The page first: an address that cannot be served fails before anything is created or started.
-        listeners, links, page_asked = _open_preview(stack, given)
+        page = None if preview is None else _open_page(stack, preview)
         session = stack.enter_context(_session(path, rig))
         n_before = len(session.captures)
-        sources, simulated = _open_rig(stack, rig, path, given)
-        listeners += [simulated.watch] if simulated else []
+        sources, person = _open_rig(stack, rig, path, (seed or 0) if simulated else None)
         asked = stack.enter_context(controls())
-        idle_s = _idle_s(given, asked)
-        options = LiveOptions(given.frames, given.timeout, hold_s, goes_on=given.keep_going, idle_s=idle_s)
+        idle_s = SIMULATED_IDLE_S if simulated else None if asked.is_interactive else UNATTENDED_IDLE_S
+        hold_s = HOLD_S if hold is None else hold
+        options = LiveOptions(frames, timeout, hold_s, goes_on=keep_going, idle_s=idle_s)
         with open_view(
-            is_plain=given.plain,
+            is_plain=plain,
             has_keys=asked.is_interactive,
-            links=links,
-            is_silent=given.silent,
+            links=() if page is None else page.urls,
+            is_silent=silent,
             wants_code=lambda: asked.wants_code,
         ) as view:
-            listeners.append(_until_gone(view.show))
+            listeners = [_until_gone(view.show)]
+            listeners += [] if page is None else [page.publish]
+            listeners += [] if person is None else [person.watch]
             is_begun = threading.Event()
 
             def tell(state: "LiveState") -> None:
@@ -95,24 +88,20 @@ def run_live(rig: "Rig", path: Path, given: LiveArguments) -> None:
                 for listener in listeners:
                     listener(state)
 
+            def ask() -> "Key | TakeBack | None":
+                return asked() or (None if page is None else page.asked())
+
             try:
-                report = collect_live(
-                    session, sources, options, tell, lambda: asked() or page_asked(), given.record
-                )
+                report = collect_live(session, sources, options, tell, ask, record)
             finally:
                 n_captures = len(session.captures)
                 if n_captures or is_begun.is_set():
                     saved = f"{path}: {show.counted(n_captures, 'capture')} ({n_captures - n_before} new)"
                     stack.callback(show.note, saved)
-    _tell(report, n_captures, asked, simulated, given)
+    if report.n_recorded is not None:
+        show.note(f"{record}: {report.n_recorded} samples recorded")
+    _tell(report, n_captures, asked, person, frames)
     show_next(path, rig, report.predicted, n_captures)
-
-
-def _idle_s(given: LiveArguments, asked: Controls) -> float | None:
-    """Return the time without a capture that ends an unattended run; None if the run is attended."""
-    if given.simulated:
-        return SIMULATED_IDLE_S
-    return None if asked.is_interactive else UNATTENDED_IDLE_S
 
 
 def _until_gone(show_state: "Callable[[LiveState], None]") -> "Callable[[LiveState], None]":
@@ -145,47 +134,41 @@ def _session(path: Path, rig: "Rig") -> "Iterator[Session]":
 
 
 def _open_rig(
-    stack: ExitStack, rig: "Rig", path: Path, given: LiveArguments
+    stack: ExitStack, rig: "Rig", path: Path, seed: int | None
 ) -> "tuple[list[LiveSource], SimulatedRig | None]":
-    """Open the attached or simulated sources; write the truth of simulated ones into the session."""
-    if not given.simulated:
+    """Open the attached sources, or with a seed simulated ones, whose truth goes into the session."""
+    if seed is None:
         from lce_rig.devices.opening import open_live
 
         return open_live(rig), None
     from lce_rig.collect.live.simulated import SimulatedRig
     from lce_rig.simulate import SimulationOptions, rig_truth
 
-    seed = given.seed or 0
     show.note("starting the simulated rig ...")
     simulated = stack.enter_context(SimulatedRig(rig, seed))
     write_truth(path / TRUTH, rig_truth(rig, seed, SimulationOptions.for_rig(rig.name)))
     return simulated.sources, simulated
 
 
-def _open_preview(
-    stack: ExitStack, given: LiveArguments
-) -> "tuple[list[Callable[[LiveState], None]], tuple[str, ...], Callable[[], TakeBack | None]]":
-    """Serve the preview page if requested; return its listeners, links and what its viewers ask for."""
-    if given.preview is None:
-        return [], (), lambda: None
+def _open_page(stack: ExitStack, address: str) -> "Preview":
+    """Serve the preview page and print its link."""
     from lce_rig.show.phone import Preview, parse_address
     from lce_rig.show.screen.live_view import qr_lines
 
-    host, port = parse_address(given.preview)
-    preview = Preview(host, port)
-    stack.callback(_tell_troubles, preview)
-    stack.enter_context(preview)
-    for url in preview.urls:
+    page = Preview(*parse_address(address))
+
+    def tell_troubles() -> None:
+        for text in page.notes():
+            show.note(text)
+
+    stack.callback(tell_troubles)
+    stack.enter_context(page)
+    for url in page.urls:
         show.note(f"preview: {url}")
     if sys.stderr.isatty():
-        for line in qr_lines(preview.urls[0]):
+        for line in qr_lines(page.urls[0]):
             click.secho(line, fg="bright_white", bg="black", err=True)
-    return [preview.publish], preview.urls, preview.asked
-
-
-def _tell_troubles(preview: "Preview") -> None:
-    for text in preview.notes():
-        show.note(text)
+    return page
 
 
 def _tell(
@@ -193,7 +176,7 @@ def _tell(
     n_captures: int,
     asked: Controls,
     simulated: "SimulatedRig | None",
-    given: LiveArguments,
+    n_wanted: int | None,
 ) -> None:
     """Report the outcome.
 
@@ -206,60 +189,49 @@ def _tell(
 
     for text in report.notes:
         show.note(text)
-    if report.n_recorded is not None:
-        show.note(f"{given.record}: {report.n_recorded} samples recorded")
     lost = {name: n for name, n in report.n_lost.items() if n}
     if lost:
         show.note("dropped: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
     slow = None if simulated is None else simulated.pace.problem()
     if slow is not None:
-        show.warn(sentence(slow))
-    show.note(f"ended: {_ending(report, n_captures, given)}")
+        show.warn(slow.sentence)
+    ending = _ENDINGS[report.ending]
+    if report.ending == "enough":
+        ending += " (--keep-going or --frames N collect more)"
+    elif report.ending == "exhausted" and n_wanted is not None:
+        ending += f"; {n_captures} of {n_wanted} captures"
+    show.note(f"ended: {ending}")
     if report.error is not None:
         raise report.error
     if asked.signal == signal.SIGINT:
         raise click.exceptions.Exit(130)
+    remedy = "Give the simulated person more time with a longer --timeout."
+    if report.lost:
+        remedy = "\n".join(
+            f"{name} is lost: {error.what}. {error.hint}" for name, error in report.lost.items()
+        )
+    elif simulated is None:
+        remedy = "Hold the board in view of all sensors at once; run `lce-rig doctor` to find the fault."
+    elif slow is not None:
+        remedy = "This computer is too busy or too slow. End other programs, or use `lce-rig simulate`."
+    elif report.ending == "exhausted":
+        remedy = "Run the same command again to continue."
     if n_captures == 0:
-        raise NotEnoughDataError("nothing was captured", _remedy(report, simulated))
+        raise NotEnoughDataError("nothing was captured", remedy)
     if report.recording_error is not None:
         raise report.recording_error
     if report.ending == "exhausted" and not report.is_enough:
-        raise NotEnoughDataError(
-            f"{show.counted(n_captures, 'capture')} are not enough: the target is not predicted to be met",
-            _remedy(report, simulated),
-        )
+        few = f"{show.counted(n_captures, 'capture')} are not enough: the target is not predicted to be met"
+        raise NotEnoughDataError(few, remedy)
 
 
 def show_next(path: Path, rig: "Rig", predicted: "Sequence[Finding]", n_captures: int) -> None:
     """Print the predicted standard deviations and the next command."""
     for found in predicted:
-        show.note(sentence(found))
+        show.note(found.sentence)
     if n_captures < rig.quality.min_captures:
         show.note(f"{show.counted(n_captures, 'capture')} (minimum {rig.quality.min_captures}): collect more")
     elif predicted and not all(found.figures["is_enough"] for found in predicted):
         show.note("the target is not predicted to be met: collect more, or see what these captures give")
     if n_captures >= rig.quality.min_captures:
         show.note(f"next: lce-rig calibrate {path}")
-
-
-def _ending(report: "LiveReport", n_captures: int, given: LiveArguments) -> str:
-    """Say why the collection ended, and how to continue if it ended at the target."""
-    ending = _ENDINGS[report.ending]
-    if report.ending == "enough":
-        return f"{ending} (--keep-going or --frames N collect more)"
-    if report.ending == "exhausted" and given.frames is not None:
-        return f"{ending}; {n_captures} of {given.frames} captures"
-    return ending
-
-
-def _remedy(report: "LiveReport", simulated: "SimulatedRig | None") -> str:
-    """Say what to do if too little was captured."""
-    if report.lost:
-        return "\n".join(f"{name} is lost: {error.what}. {error.hint}" for name, error in report.lost.items())
-    if simulated is None:
-        return "Hold the board in view of all sensors at once; run `lce-rig doctor` to find the fault."
-    if simulated.pace.problem():
-        return "This computer is too busy or too slow. End other programs, or use `lce-rig simulate`."
-    if report.ending == "exhausted":
-        return "Run the same command again to continue."
-    return "Give the simulated person more time with a longer --timeout."

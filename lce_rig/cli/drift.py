@@ -60,9 +60,9 @@ def drift(
     """
     from lce_rig.core.calibration import read_result
     from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
+    from lce_rig.core.phrasing import as_line
     from lce_rig.pipeline.drift import drift as watch_drift
     from lce_rig.rig import load_rig
-    from lce_rig.words import as_line, describe, recommend
 
     is_live = rig_name is not None and not recordings
     if seconds is not None and not is_live:
@@ -95,7 +95,7 @@ def drift(
         if concerned:
             first = concerned[0].summary
             names = " and ".join(f"{pair.calibration.camera}, {pair.calibration.lidar}" for pair in concerned)
-            raise error(f"{names}: {describe(first)}", as_line(recommend(first)))
+            raise error(f"{names}: {first.text}", as_line(first.advice))
 
 
 # What was seen is judged after Ctrl-C; a second one ends that too.
@@ -133,44 +133,35 @@ def _table(pair: "PairDrift") -> Any:
     from lce_rig.scene.findings import STATES
 
     opinions = [("scene", pair.drift.axes if pair.drift.curves else None)]
-    if pair.board is not None:
-        opinions.append(("board", pair.board.axes))
+    opinions += [] if pair.board is None else [("board", pair.board.axes)]
     title = f"{pair.calibration.camera}, {pair.calibration.lidar} (camera: x right, y down, z forward)"
-    table = show.plain_table(title, "axis of\nthe camera", "")
-    for name, _ in opinions:
-        # With two opinions, all fits into 80 columns.
-        for title in (f"{name}:\nbest fit at", "would\nhave seen"):
-            table.add_column(title, justify="right")
+    # With two opinions, all fits into 80 columns.
+    headings = [
+        heading for name, _ in opinions for heading in (f">{name}:\nbest fit at", ">would\nhave seen")
+    ]
+    table = show.plain_table(title, "axis of\nthe camera", "", *headings)
     for index, axis in enumerate(pair.drift.axes):
-        figures = [
-            figure
-            for _, axes in opinions
-            for figure in (("-", "-") if axes is None else _figures(axes[index]))
-        ]
+        name = f"about {axis.axis[-1]}, deg" if axis.is_rotation else f"along {axis.axis[-1]}, mm"
         state = pair.states[axis.axis]
-        table.add_row(_axis(axis), f"[{_COLOURS[state]}]{STATES[state]}[/]", *figures)
+        figures = [text for _, axes in opinions for text in _figures(axes[index] if axes else None)]
+        table.add_row(name, f"[{_COLOURS[state]}]{STATES[state]}[/]", *figures)
     return table
 
 
-def _axis(axis: "AxisDrift") -> str:
-    name = axis.axis[-1]
-    return f"about {name}, deg" if axis.is_rotation else f"along {name}, mm"
-
-
-def _figures(axis: "AxisDrift") -> tuple[str, str]:
-    scale, digits = (1.0, 2) if axis.is_rotation else (1000.0, 0)
-    if not math.isfinite(axis.sigma) or axis.reason in _WITHOUT_FIT:
+def _figures(axis: "AxisDrift | None") -> tuple[str, str]:
+    if axis is None or not math.isfinite(axis.sigma) or axis.reason in _WITHOUT_FIT:
         return "-", "-"
+    scale, digits = (1.0, 2) if axis.is_rotation else (1000.0, 0)
     best = f"{scale * axis.change:+.{digits}f} +- {scale * axis.sigma:.{digits}f}"
     return best, f"{scale * axis.smallest:.{digits}f}" if math.isfinite(axis.smallest) else "-"
 
 
 def _summary(pair: "PairDrift") -> list[str]:
-    from lce_rig.words import as_line, describe
+    from lce_rig.core.phrasing import as_line
 
-    seen = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
+    line = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
     if pair.board is not None:
-        seen += (
+        line += (
             f"; {show.counted(pair.board.n_boards, 'board')} at {pair.board.n_placements} places, residuals: "
             f"planes {1000 * pair.board.metrics.mpe_m:.1f} mm, edges {1000 * pair.board.metrics.mee_m:.1f} mm"
         )
@@ -178,5 +169,7 @@ def _summary(pair: "PairDrift") -> list[str]:
     untold = {"scene.axis_unchanged", "scene.board_unsure"}
     if pair.board is not None:
         untold |= {"scene.unchanged", "scene.changed", "scene.unknown"}
-    told = [finding for finding in pair.findings if finding.code not in untold]
-    return [seen, *(show.escape(as_line(describe(finding))) for finding in told)]
+    return [
+        line,
+        *(show.escape(as_line(finding.text)) for finding in pair.findings if finding.code not in untold),
+    ]

@@ -7,7 +7,6 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import cameras_option, require_sensors, session_argument, split_names
-from lce_rig.words import describe, sentence
 
 if TYPE_CHECKING:
     from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
@@ -89,7 +88,7 @@ def intrinsics(
         for one in measured:
             if one.judgement.code != "intrinsics.better":
                 how = "new intrinsics forced" if one.camera in replaced else "intrinsics kept"
-                show.note(f"{one.camera}: {how}: {describe(one.judgement)}")
+                show.note(f"{one.camera}: {how}: {one.judgement.text}")
     if troubles:
         raise join_shortages(troubles)
 
@@ -97,27 +96,20 @@ def intrinsics(
 def _head(measured: "MeasuredIntrinsics") -> list[str]:
     estimate = measured.estimate
     n = len({view.capture for view in estimate.views})
+    (along_width, along_height, aspect), sigma = estimate.shape, estimate.shape_sigma
     lines = [
         f"[bold]{measured.camera}[/] ({', '.join(measured.channels)}): {estimate.model.name} from "
         f"{len(estimate.views)} images of {n} captures",
         f"  corners   {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on held-out captures",
         f"  covered   {100 * measured.certainty.is_covered.mean():.0f} % of the image",
-        f"  board     {_board(measured)}",
+        # The board's deviation from its nominal shape, estimated with the intrinsics.
+        f"  board     bow {1000 * along_width:+.1f}, {1000 * along_height:+.1f} mm (width, height), pattern "
+        f"{100 * aspect:+.2f} +- {100 * sigma[2]:.2f} % too wide, "
+        f"corner error {1000 * estimate.print_rms_m:.2f} mm",
     ]
     if measured.choice is not None:
         lines.append(f"  model     {show.escape(measured.choice.reason)}")
     return lines
-
-
-def _board(measured: "MeasuredIntrinsics") -> str:
-    """State the board's deviation from its nominal shape, estimated with the intrinsics."""
-    estimate = measured.estimate
-    (along_width, along_height, aspect), sigma = estimate.shape, estimate.shape_sigma
-    return (
-        f"bow {1000 * along_width:+.1f}, {1000 * along_height:+.1f} mm (width, height), pattern "
-        f"{100 * aspect:+.2f} +- {100 * sigma[2]:.2f} % too wide, "
-        f"corner error {1000 * estimate.print_rms_m:.2f} mm"
-    )
 
 
 def _table(measured: "MeasuredIntrinsics") -> Any:
@@ -130,9 +122,7 @@ def _table(measured: "MeasuredIntrinsics") -> Any:
         old = None if measured.check is None else estimate.model.vector(given)
     except ValueError:
         old = None
-    table = show.plain_table("")
-    for title in ("", "measured", "sigma", "profile", "difference"):
-        table.add_column(title, justify="left" if not title else "right")
+    table = show.plain_table("", "", ">measured", ">sigma", ">profile", ">difference")
     for index, name in enumerate(estimate.model.parameters):
         digits = 2 if name.endswith("_px") else 5
         sigma = float(estimate.sigma[index])
@@ -156,9 +146,9 @@ def _findings(measured: "MeasuredIntrinsics") -> list[str]:
         lines.append(f"  {figures_of(measured.check)}")
     if measured.misfit is not None:
         colour = "red" if measured.misfit.severity == "error" else "yellow"
-        lines.append(f"  [{colour}]{show.escape(describe(measured.misfit))}[/]")
-    lines.append(f"  {show.escape(sentence(measured.judgement))}")
+        lines.append(f"  [{colour}]{show.escape(measured.misfit.text)}[/]")
+    lines.append(f"  {show.escape(measured.judgement.sentence)}")
     lines += [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
     for name, why in measured.refused.items():
-        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {sentence(why)}')}[/]")
+        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]")
     return lines

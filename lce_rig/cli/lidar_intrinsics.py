@@ -41,61 +41,57 @@ def lidar_intrinsics(
     opened = [Session.open(path) for path in sessions]
     with show.progress_bar("detecting") as progress:
         errors = measure_lidar(opened, lidar, progress=progress)
-    print_errors(errors, as_json=as_json)
+    document = _document(errors)
+    show.print_json(document) if as_json else _print(document)
     if save_profile is not None:
         save_lidar(opened[0], lidar, errors, save_profile)
         show.note(f"written: {save_profile}")
 
 
-def print_errors(errors: "LidarErrors", *, as_json: bool) -> None:
-    """Print a LiDAR's errors as a table or as JSON."""
-    if as_json:
-        show.print_json(_document(errors))
-        return
-    known, mm = errors.found, 1e3
+def _print(document: dict[str, Any]) -> None:
+    mm, n_captures = 1e3, document["n_captures"]
+    lateral, vertical = (
+        f"{mm * document[f'lens_{value}']:+.1f} +- {mm * document[f'lens_{sigma}']:.1f} mm"
+        for value, sigma in (
+            ("lateral_m", "lateral_sigma_m"),
+            ("vertical_m_per_rad", "vertical_sigma_m_per_rad"),
+        )
+    )
     show.print_lines(
         [
-            f"{show.counted(sum(errors.n_captures), 'capture')} of "
-            f"{show.counted(len(errors.n_captures), 'session')}",
-            f"  lens  {mm * known.lens[0]:+.1f} +- {mm * known.lens_sigma[0]:.1f} mm beside the axis, "
-            f"{mm * known.lens[1]:+.1f} +- {mm * known.lens_sigma[1]:.1f} mm per rad of elevation",
+            f"{show.counted(sum(n_captures), 'capture')} of {show.counted(len(n_captures), 'session')}",
+            f"  lens  {lateral} beside the axis, {vertical} per rad of elevation",
         ]
     )
-    show.print_table(_table(errors))
-
-
-def _table(errors: "LidarErrors") -> Any:
-    table = show.plain_table("")
-    for title in ("laser", "range mm", "sigma", "azimuth deg", "sigma", "elevation deg", "sigma", "returns"):
-        table.add_column(title, justify="right")
-    for row in _document(errors)["lasers"]:
-        cells = [f"{row['ring']}", f"{1e3 * row['range_m']:+.1f}", f"{1e3 * row['range_sigma_m']:.1f}"]
+    angles = (">azimuth deg", ">sigma", ">elevation deg", ">sigma")
+    table = show.plain_table("", ">laser", ">range mm", ">sigma", *angles, ">returns")
+    for row in document["lasers"]:
+        cells = [f"{row['ring']}", f"{mm * row['range_m']:+.1f}", f"{mm * row['range_sigma_m']:.1f}"]
         for angle in ("azimuth", "elevation"):
             cells += [f"{row[f'{angle}_deg']:+.3f}", f"{row[f'{angle}_sigma_deg']:.3f}"]
         table.add_row(*cells, f"{row['n_points']}")
-    return table
+    show.print_table(table)
 
 
 def _document(errors: "LidarErrors") -> dict[str, Any]:
-    """Build what --json prints."""
     import numpy as np
 
-    known = errors.found
-    values, sigmas = known.lasers.copy(), known.lasers_sigma.copy()
+    found = errors.found
+    values, sigmas = found.lasers.copy(), found.lasers_sigma.copy()
     values[1:], sigmas[1:] = np.degrees(values[1:]), np.degrees(sigmas[1:])
-    names = ("range_m", "azimuth_deg", "elevation_deg")
-    deviations = ("range_sigma_m", "azimuth_sigma_deg", "elevation_sigma_deg")
     lasers = []
-    for k, ring in enumerate(known.rings.tolist()):
+    for k, ring in enumerate(found.rings.tolist()):
         row: dict[str, Any] = {"ring": ring, "n_points": int(errors.n_points[k])}
-        row |= {name: float(values[i, k]) for i, name in enumerate(names)}
-        row |= {name: float(sigmas[i, k]) for i, name in enumerate(deviations)}
+        row |= zip(("range_m", "azimuth_deg", "elevation_deg"), values[:, k].tolist(), strict=True)
+        row |= zip(
+            ("range_sigma_m", "azimuth_sigma_deg", "elevation_sigma_deg"), sigmas[:, k].tolist(), strict=True
+        )
         lasers.append(row)
     return {
         "n_captures": list(errors.n_captures),
-        "lens_lateral_m": float(known.lens[0]),
-        "lens_lateral_sigma_m": float(known.lens_sigma[0]),
-        "lens_vertical_m_per_rad": float(known.lens[1]),
-        "lens_vertical_sigma_m_per_rad": float(known.lens_sigma[1]),
+        "lens_lateral_m": float(found.lens[0]),
+        "lens_lateral_sigma_m": float(found.lens_sigma[0]),
+        "lens_vertical_m_per_rad": float(found.lens[1]),
+        "lens_vertical_sigma_m_per_rad": float(found.lens_sigma[1]),
         "lasers": lasers,
     }

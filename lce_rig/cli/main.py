@@ -100,25 +100,11 @@ def cli(debug: bool) -> None:
     """
 
 
-def _report(error: LceRigError) -> int:
-    from lce_rig.cli import show
-
-    click.secho(show.wrapped(f"error: {error.what}", sys.stderr), fg="red", err=True)
-    for line in error.hint.splitlines():
-        show.note(f"  {line}")
-    return error.exit_code
-
-
 def _comes_of_interrupt(error: BaseException | None) -> bool:
     """Return whether Ctrl-C caused an error, as when it stops the import of a compiled module (open3d)."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__
     return error is not None
-
-
-def _interrupted() -> int:
-    click.echo(INTERRUPTED, err=True)
-    return EXIT_INTERRUPTED
 
 
 def run(arguments: list[str]) -> int:
@@ -131,35 +117,37 @@ def run(arguments: list[str]) -> int:
     try:
         result: Any = cli.main(args=arguments, prog_name="lce-rig", standalone_mode=False)
         return result if isinstance(result, int) else 0
-    except LceRigError as error:
-        if _comes_of_interrupt(error):
-            return _interrupted()
-        if show_traceback:
-            traceback.print_exc()
-        return _report(error)
     except click.ClickException as error:
         error.show()
         return error.exit_code
-    except (click.Abort, KeyboardInterrupt):
-        return _interrupted()
     except BrokenPipeError:
         # The reader of our output has gone (`lce-rig check | head`).
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
-    except ModuleNotFoundError as error:
-        if show_traceback or (error.name or "").startswith("lce_rig"):
-            traceback.print_exc()
-        click.secho(f"error: the package '{error.name}' is missing", fg="red", err=True)
-        click.echo(f"  pip install {error.name}", err=True)
-        return 5
-    except OSError as error:
-        if show_traceback:
-            traceback.print_exc()
-        click.secho(f"error: {error}", fg="red", err=True)
-        return LceRigError.exit_code
-    except Exception as error:
-        if _comes_of_interrupt(error):
-            return _interrupted()
-        traceback.print_exc()
+    except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, click.Abort) or _comes_of_interrupt(error):
+            click.echo(INTERRUPTED, err=True)
+            return EXIT_INTERRUPTED
+        return _report(error, show_traceback=show_traceback)
+
+
+def _report(error: BaseException, *, show_traceback: bool) -> int:
+    """Print an error and its hint; return the exit code."""
+    from lce_rig.cli import show
+
+    what, hint, code = str(error), "", LceRigError.exit_code
+    if isinstance(error, LceRigError):
+        what, hint, code = error.what, error.hint, error.exit_code
+    elif isinstance(error, ModuleNotFoundError):
+        what, hint, code = f"the package '{error.name}' is missing", f"pip install {error.name}", 5
+        show_traceback |= (error.name or "").startswith("lce_rig")
+    elif not isinstance(error, OSError):
+        traceback.print_exception(error)
         click.secho("this is a bug in lce-rig: report it with these lines", fg="red", err=True)
         return EXIT_BUG
+    if show_traceback:
+        traceback.print_exception(error)
+    click.secho(show.wrapped(f"error: {what}", sys.stderr), fg="red", err=True)
+    for line in hint.splitlines():
+        show.note(f"  {line}")
+    return code

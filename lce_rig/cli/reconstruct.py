@@ -8,7 +8,6 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import EVENT_IMAGES, FiniteRange
-from lce_rig.words import describe
 
 if TYPE_CHECKING:
     from lce_rig.core.data import Events
@@ -90,6 +89,7 @@ def reconstruct(
     E2VID's text. Skips the first images, until the network has settled, and prints how many.
     """
     from lce_rig.core.errors import SourceError, UsageError
+    from lce_rig.detect.events.flicker import measure_flicker
     from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
     from lce_rig.io.events import open_events
 
@@ -103,7 +103,12 @@ def reconstruct(
     options = ReconstructionOptions(method=event_image, windows=windows, is_filtered=not no_filter)
     reconstructor = Reconstructor(model, options)
     events = open_events(recording, topic=topic)
-    _warn_of_flicker(recording, events)
+    flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
+    if flicker.is_storm:
+        show.warn(
+            f"{recording.name}: most events come from light that flickers at {flicker.frequency_hz:.0f} Hz. "
+            "Record in daylight or under lamps that do not flicker."
+        )
     stamps_ns = _stamps(recording, events, start, duration, every)
     files, refused = _write(output, reconstructor, events, stamps_ns)
     for text in events.notes:
@@ -116,17 +121,6 @@ def reconstruct(
         )
     show.note(f"{len(files)} images in {output}, timestamps in {output / STAMPS}")
     _animate(files, every, gif, video)
-
-
-def _warn_of_flicker(recording: Path, events: "EventRecording") -> None:
-    from lce_rig.detect.events.flicker import measure_flicker
-
-    flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
-    if flicker.is_storm:
-        show.warn(
-            f"{recording.name}: most events come from light that flickers at {flicker.frequency_hz:.0f} Hz. "
-            "Record in daylight or under lamps that do not flicker."
-        )
 
 
 def _stamps(
@@ -170,7 +164,7 @@ def _write(
     with show.progress_bar("reconstructing") as progress:
         for done, picture in enumerate(pictures, start=1):
             if isinstance(picture, Refusal):
-                refused.append(describe(picture))
+                refused.append(picture.text)
             else:
                 files.append(write_picture(output / f"{len(files):06d}.png", picture.pixels))
                 lines.append(f"{files[-1].name},{picture.stamp_ns}")

@@ -7,11 +7,10 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option
-from lce_rig.words import as_line, describe, recommend, sentence
+from lce_rig.core.phrasing import as_line
 
 if TYPE_CHECKING:
     from lce_rig.judge.repeatability import Repeatability
-    from lce_rig.pipeline.comparison import Repeat
 
 
 @click.command()
@@ -52,9 +51,17 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
         show.note(f"{name} has no result: calibrated for this comparison, not written")
     for finding in compared.findings:
         if finding.severity != "error":
-            show.warn(sentence(finding))
+            show.warn(finding.sentence)
     if as_json:
-        show.print_json(_document(compared))
+        show.print_json(
+            {
+                "format_version": 2,
+                "rig": compared.rig,
+                "calibrated": list(compared.calibrated),
+                "findings": [finding.as_json() for finding in compared.findings],
+                "pairs": [_pair(comparison) for comparison in compared.comparisons],
+            }
+        )
     else:
         for comparison in compared.comparisons:
             show.print_table(_deviations(comparison))
@@ -62,7 +69,7 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
             show.print_lines(_summary(comparison))
     if compared.failed:
         raise ResultRefusedError(
-            "; ".join(describe(finding) for finding in compared.failed), recommend(compared.failed[0])
+            "; ".join(finding.text for finding in compared.failed), compared.failed[0].advice
         )
     refused = [comparison for comparison in compared.comparisons if not comparison.agrees]
     if refused:
@@ -74,10 +81,8 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
 def _deviations(comparison: "Repeatability") -> Any:
     import numpy as np
 
-    table = show.plain_table(f"{_sensors(comparison)}: difference from the mean")
-    table.add_column("session")
-    for title in ("x mm", "y mm", "z mm", "about x deg", "about y deg", "about z deg"):
-        table.add_column(title, justify="right")
+    headings = (">x mm", ">y mm", ">z mm", ">about x deg", ">about y deg", ">about z deg")
+    table = show.plain_table(f"{_sensors(comparison)}: difference from the mean", "session", *headings)
     for name, tangent in zip(comparison.names, comparison.deviations, strict=True):
         cells = [f"{1000 * value:+.1f}" for value in tangent[:3]]
         cells += [f"{value:+.3f}" for value in np.degrees(tangent[3:])]
@@ -86,9 +91,8 @@ def _deviations(comparison: "Repeatability") -> Any:
 
 
 def _differences(comparison: "Repeatability") -> Any:
-    table = show.plain_table("pairs of sessions")
-    for title in ("first", "second", "deg", "mm", "distance", "chance"):
-        table.add_column(title, justify="left" if title in ("first", "second") else "right")
+    headings = ("first", "second", ">deg", ">mm", ">distance", ">chance")
+    table = show.plain_table("pairs of sessions", *headings)
     for pair in comparison.differences:
         figures = (f"{pair.rotation_deg:.3f}", f"{1000 * pair.translation_m:.1f}", f"{pair.distance:.1f}")
         table.add_row(show.escape(pair.first), show.escape(pair.second), *figures, f"{pair.p:.2g}")
@@ -97,55 +101,34 @@ def _differences(comparison: "Repeatability") -> Any:
 
 def _summary(comparison: "Repeatability") -> list[str]:
     c = comparison
+    scatter = ""
+    if c.scatter_rotation_deg is not None and c.scatter_translation_m is not None:
+        scatter = f", of which independent {c.scatter_rotation_deg:.3f} deg, "
+        scatter += f"{1000 * c.scatter_translation_m:.1f} mm"
     lines = [
         "mean T_cam_lidar (p_cam = R p_lidar + t)",
-        *("  " + "  ".join(f"{value: .6f}" for value in row) for row in c.T_cam_lidar[:3]),
+        *show.matrix_lines(c.T_cam_lidar, "  "),
         f"spread   {c.spread_rotation_deg:.3f} deg, {1000 * c.spread_translation_m:.1f} mm "
         "(1 sigma of one session)",
-        f"reported {c.reported_rotation_deg:.3f} deg, {1000 * c.reported_translation_m:.1f} mm{_scatter(c)}",
+        f"reported {c.reported_rotation_deg:.3f} deg, {1000 * c.reported_translation_m:.1f} mm{scatter}",
         f"chi2     {c.chi2:.1f} with {c.dof} degrees of freedom, chance {c.p:.2g}"
         + ("" if c.are_independent else " (at least: the results share captures)"),
     ]
     colour = "green" if c.agrees else "red"
-    return [*lines, f"[{colour}]{show.escape(as_line(sentence(c.finding)))}[/]"]
-
-
-def _scatter(comparison: "Repeatability") -> str:
-    """State the part of the reported uncertainty that is independent between sessions."""
-    if comparison.scatter_rotation_deg is None or comparison.scatter_translation_m is None:
-        return ""
-    return (
-        f", of which independent {comparison.scatter_rotation_deg:.3f} deg, "
-        f"{1000 * comparison.scatter_translation_m:.1f} mm"
-    )
+    return [*lines, f"[{colour}]{show.escape(as_line(c.finding.sentence))}[/]"]
 
 
 def _sensors(comparison: "Repeatability") -> str:
     return f"{comparison.camera} and {comparison.lidar}"
 
 
-def _document(compared: "Repeat") -> dict[str, Any]:
-    from lce_rig.words import as_json
-
-    return {
-        "format_version": 2,
-        "rig": compared.rig,
-        "calibrated": list(compared.calibrated),
-        "findings": [as_json(finding) for finding in compared.findings],
-        "pairs": [_pair(comparison) for comparison in compared.comparisons],
-    }
-
-
-def _pair(comparison: "Repeatability") -> dict[str, Any]:
-    from lce_rig.words import as_json
-
-    c = comparison
+def _pair(c: "Repeatability") -> dict[str, Any]:
     return {
         "camera": c.camera,
         "lidar": c.lidar,
         "sessions": list(c.names),
         "agrees": c.agrees,
-        "finding": as_json(c.finding),
+        "finding": c.finding.as_json(),
         "T_cam_lidar": c.T_cam_lidar.tolist(),
         "deviations": c.deviations.tolist(),
         "spread_rotation_deg": c.spread_rotation_deg,

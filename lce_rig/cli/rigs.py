@@ -1,12 +1,13 @@
 """`lce-rig rigs`: list, show, check and derive rig profiles."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from lce_rig.cli import show as screen
+from lce_rig.cli import show
 
 if TYPE_CHECKING:
     from lce_rig.rig import Rig
@@ -24,39 +25,32 @@ def rigs(ctx: click.Context) -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def list_profiles(as_json: bool) -> None:
     """List the shipped profiles."""
-
     from lce_rig.rig import load_rig, shipped_profiles
 
     profiles = [load_rig(name) for name in shipped_profiles()]
+    summaries: list[dict[str, Any]] = [
+        {
+            "name": rig.name,
+            "description": rig.description,
+            "lidars": list(rig.lidars),
+            "cameras": {name: list(camera.channels) for name, camera in rig.cameras.items()},
+        }
+        for rig in profiles
+    ]
     if as_json:
-        screen.print_json({"rigs": [_summary(rig) for rig in profiles]})
+        show.print_json({"rigs": summaries})
         return
-    table = screen.plain_table("", "rig", "LiDARs", "cameras (channels)", "board", "description")
-    for rig in profiles:
-        summary = _summary(rig)
-        cameras = ", ".join(
-            f"{name} ({', '.join(channels)})" for name, channels in summary["cameras"].items()
-        )
-        table.add_row(rig.name, ", ".join(summary["lidars"]), cameras, _board(rig), rig.description)
-    screen.print_table(table)
-    screen.note(
+    table = show.plain_table("", "rig", "LiDARs", "cameras (channels)", "board", "description")
+    for rig, summary in zip(profiles, summaries, strict=True):
+        cameras = (f"{name} ({', '.join(channels)})" for name, channels in summary["cameras"].items())
+        cols, rows = rig.board.inner_corners
+        board = f"{cols}x{rows} corners, {1e3 * rig.board.square_m:g} mm"
+        table.add_row(rig.name, ", ".join(rig.lidars), ", ".join(cameras), board, rig.description)
+    show.print_table(table)
+    show.note(
         "for your own rig: lce-rig rigs new NAME --from rlfs, "
         "then pass --rig NAME.yaml to doctor and collect; sessions keep it"
     )
-
-
-def _summary(rig: "Rig") -> dict[str, Any]:
-    return {
-        "name": rig.name,
-        "description": rig.description,
-        "lidars": list(rig.lidars),
-        "cameras": {name: list(camera.channels) for name, camera in rig.cameras.items()},
-    }
-
-
-def _board(rig: "Rig") -> str:
-    cols, rows = rig.board.inner_corners
-    return f"{cols}x{rows} corners, {1e3 * rig.board.square_m:g} mm"
 
 
 @rigs.command("show")
@@ -69,44 +63,44 @@ def show_profile(rig_name: str, as_json: bool, as_yaml: bool) -> None:
 
     rig = load_rig(rig_name)
     if as_json:
-        screen.print_json(rig.model_dump(mode="json"))
+        show.print_json(rig.model_dump(mode="json"))
     elif as_yaml:
         click.echo(dump_rig(rig), nl=False)
     else:
         for table in (*_sensor_tables(rig), _reconstruction_table(rig), _board_table(rig), _limit_table(rig)):
             if table.row_count:
-                screen.print_table(table)
+                show.print_table(table)
         _print_warnings(rig)
 
 
 def _sensor_tables(rig: "Rig") -> tuple[Any, Any]:
     """List the sensors, then where their data come from; side by side they are wider than a terminal."""
-    sensors = screen.plain_table(f"{rig.name}: {rig.description}", "sensor", "model", "frame", "optics")
-    sources = screen.plain_table("", "sensor", "topic", "timestamps")
+
+    def stamps(settings: Any) -> str:
+        return f"{settings.reference}, clock {settings.clock}, sync {settings.sync}"
+
+    sensors = show.plain_table(f"{rig.name}: {rig.description}", "sensor", "model", "frame", "optics")
+    sources = show.plain_table("", "sensor", "topic", "timestamps")
     for name, lidar in rig.lidars.items():
         sensors.add_row(name, lidar.model, lidar.frame, f"{lidar.min_range_m:g}-{lidar.max_range_m:g} m")
-        sources.add_row(name, lidar.topic or "-", _stamps(lidar.timestamps))
+        sources.add_row(name, lidar.topic or "-", stamps(lidar.timestamps))
     for name, camera in rig.cameras.items():
         given, (width, height) = camera.intrinsics, camera.resolution_px
         optics = f"{width}x{height}, f {given.fx_px:.1f} {given.fy_px:.1f} px, {given.model}"
         sensors.add_row(name, camera.model, camera.optical_frame, optics)
         for channel, settings in camera.channels.items():
-            sources.add_row(f"{name}/{channel}", settings.topic or "-", _stamps(settings.timestamps))
+            sources.add_row(f"{name}/{channel}", settings.topic or "-", stamps(settings.timestamps))
     for column in (*sensors.columns, *sources.columns):
         # A truncated topic or frame is unusable.
         column.overflow = "fold"
     return sensors, sources
 
 
-def _stamps(settings: Any) -> str:
-    return f"{settings.reference}, clock {settings.clock}, sync {settings.sync}"
-
-
 def _reconstruction_table(rig: "Rig") -> Any:
     """List how images are reconstructed from events."""
     from lce_rig.rig import ReconstructionSettings
 
-    table = screen.plain_table("", "images from events", "method", "network", "windows")
+    table = show.plain_table("", "images from events", "method", "network", "windows")
     for name, camera in rig.cameras.items():
         for channel, stream in camera.channels.items():
             if stream.kind == "events":
@@ -125,7 +119,7 @@ def _board_table(rig: "Rig") -> Any:
 
     board = rig.board
     (cols, rows), (x, y) = board.inner_corners, board.pattern_offset_m
-    table = screen.plain_table("", "board", "")
+    table = show.plain_table("", "board", "")
     table.add_row("inner corners", f"{cols} x {rows}")
     table.add_row("square", f"{1e3 * board.square_m:g} mm")
     table.add_row("plate", f"{board.width_m:g} x {board.height_m:g} m")
@@ -139,7 +133,7 @@ def _board_table(rig: "Rig") -> Any:
 
 
 def _limit_table(rig: "Rig") -> Any:
-    table = screen.plain_table("", "threshold", "value", "default", "meaning")
+    table = show.plain_table("", "threshold", "value", "default", "meaning")
     for block in ("quality", "calibration", "verdict"):
         settings = getattr(rig, block)
         meanings = _attributes(type(settings))
@@ -169,7 +163,6 @@ def _attributes(documented: type) -> dict[str, str]:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def check_profile(file: str, as_json: bool) -> None:
     """Check the profile FILE and list every problem with its line. Exits with 3 if there is one."""
-    from lce_rig import words
     from lce_rig.core.errors import ProfileError
     from lce_rig.pipeline.detect_session import check_networks
     from lce_rig.rig import find_profile, load_rig
@@ -180,16 +173,16 @@ def check_profile(file: str, as_json: bool) -> None:
     except ProfileError as error:
         if as_json:
             problems = error.hint.splitlines() if error.hint else [error.what]
-            screen.print_json({"is_valid": False, "problems": problems, "warnings": [], "findings": []})
+            show.print_json({"is_valid": False, "problems": problems, "warnings": [], "findings": []})
         raise
     if as_json:
         found = rig.warnings()
-        screen.print_json(
+        show.print_json(
             {
                 "is_valid": True,
                 "problems": [],
-                "warnings": [words.sentence(warning) for warning in found],
-                "findings": [words.as_json(warning) for warning in found],
+                "warnings": [warning.sentence for warning in found],
+                "findings": [warning.as_json() for warning in found],
             }
         )
         return
@@ -198,10 +191,9 @@ def check_profile(file: str, as_json: bool) -> None:
 
 
 def _print_warnings(rig: "Rig") -> None:
-    from lce_rig import words
 
     for warning in rig.warnings():
-        screen.warn(words.sentence(warning))
+        show.warn(warning.sentence)
 
 
 @rigs.command("new")
@@ -260,19 +252,22 @@ def new_profile(
       lce-rig rigs new truck --from drive.bag --lidar OS1-64 --board 8x6,0.07,0.767x0.626
       lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset nominal_extrinsics
     """
-    from lce_rig.rig import (
-        derive_text,
-        edit_text,
-        find_profile,
-        load_rig,
-        read_profile,
-        shipped_profiles,
-    )
+    from lce_rig.core.errors import UsageError
+    from lce_rig.rig import derive_text, edit_text, find_profile, load_rig, read_profile, shipped_profiles
 
-    values = [_setting(text) for text in settings]
+    stem = name.removesuffix(".yaml").removesuffix(".yml")
+    if stem != name:
+        raise UsageError(
+            f"{name} is a file, not the name of a rig", f"Write: lce-rig rigs new {stem} -o {name}"
+        )
+    values = []
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        if not (key and equals and value):
+            raise UsageError(f"--set {setting}: KEY=VALUE is expected, such as board.square_m=0.08")
+        values.append((key.strip(), value.strip()))
     path = Path(output or f"{name}.yaml")
     target = f"{name if output == '-' else path} (not written)"
-    _require_name(name)
     has_sensors = bool(lidar or cameras or intrinsics)
     bag = None if origin is None or not _is_bag(Path(origin)) else Path(origin)
     if bag is not None or (origin is None and has_sensors):
@@ -281,26 +276,17 @@ def new_profile(
     else:
         origin = origin or "rlfs"
         parent = load_rig(origin)
-        values = [*_sensor_settings(parent, lidar, cameras, intrinsics), *_board_settings(board), *values]
+        values = [*_sensor_settings(parent, lidar, cameras, intrinsics, board), *values]
         original = read_profile(find_profile(origin))
         text = derive_text(original, name, values, target, parent.name, removed)
     if output == "-":
         click.echo(text, nl=False)
         return
     _write_new(path, text)
-    screen.note(f"wrote {path}; compare it with your rig, then: lce-rig rigs check {path}")
+    show.note(f"wrote {path}; compare it with your rig, then: lce-rig rigs check {path}")
     if name in shipped_profiles():
-        screen.warn(f"--rig {name} is the shipped profile: use --rig {path}")
+        show.warn(f"--rig {name} is the shipped profile: use --rig {path}")
     _print_warnings(load_rig(path))
-
-
-def _setting(text: str) -> tuple[str, str]:
-    from lce_rig.core.errors import UsageError
-
-    key, equals, value = text.partition("=")
-    if not (key and equals and value):
-        raise UsageError(f"--set {text}: KEY=VALUE is expected, such as board.square_m=0.08")
-    return key.strip(), value.strip()
 
 
 def _is_bag(path: Path) -> bool:
@@ -350,28 +336,17 @@ def _from_sensors(
         source=target,
     )
     for line in found:
-        screen.note(line)
+        show.note(line)
     return text
 
 
-def _require_name(name: str) -> None:
-    """Refuse a file where a rig's name is wanted."""
-    from lce_rig.core.errors import UsageError
-
-    stem = name.removesuffix(".yaml").removesuffix(".yml")
-    if stem != name:
-        raise UsageError(
-            f"{name} is a file, not the name of a rig", f"Write: lce-rig rigs new {stem} -o {name}"
-        )
-
-
 def _sensor_settings(
-    parent: "Rig", lidar: str | None, cameras: tuple[str, ...], intrinsics: tuple[str, ...]
+    parent: "Rig", lidar: str | None, cameras: Sequence[str], intrinsics: Sequence[str], board: str | None
 ) -> list[tuple[str, str]]:
-    """Give what --lidar and --intrinsics change in the profile that is derived from."""
+    """Give the keys that --lidar, --intrinsics and --board change in the profile that is derived from."""
     from lce_rig.cli.options import require_sensors
     from lce_rig.core.errors import UsageError
-    from lce_rig.pipeline.new_profile import parse_intrinsics
+    from lce_rig.pipeline.new_profile import parse_board, parse_intrinsics
 
     require_sensors("camera", cameras, parent.cameras)
     names = cameras or tuple(parent.cameras)[: len(intrinsics)]
@@ -379,28 +354,20 @@ def _sensor_settings(
         raise UsageError(
             f"{len(intrinsics)} --intrinsics for {len(names)} cameras", "Give one for each --camera."
         )
-    found = [] if lidar is None else [(f"lidars.{next(iter(parent.lidars))}.model", json.dumps(lidar))]
+    values = [] if lidar is None else [(f"lidars.{next(iter(parent.lidars))}.model", json.dumps(lidar))]
     for name, text in zip(names, intrinsics, strict=True):
         lens, block = parse_intrinsics(text), f"cameras.{name}.intrinsics"
-        found += [(f"cameras.{name}.resolution_px", f"[{lens.width_px}, {lens.height_px}]")]
-        found += [(f"{block}.model", lens.model), (f"{block}.distortion", f"{list(lens.distortion)}")]
-        found += [(f"{block}.{key}", f"{getattr(lens, key)}") for key in ("fx_px", "fy_px", "cx_px", "cy_px")]
-    return found
-
-
-def _board_settings(text: str | None) -> list[tuple[str, str]]:
-    from lce_rig.pipeline.new_profile import parse_board
-
-    if text is None:
-        return []
-    board = parse_board(text)
-    return [
-        ("board.inner_corners", f"[{board.cols}, {board.rows}]"),
-        ("board.square_m", f"{board.square_m}"),
-        ("board.width_m", f"{board.width_m}"),
-        ("board.height_m", f"{board.height_m}"),
-        ("board.pattern_offset_m", f"{list(board.pattern_offset_m)}"),
-    ]
+        values += [(f"cameras.{name}.resolution_px", f"[{lens.width_px}, {lens.height_px}]")]
+        values += [(f"{block}.model", lens.model), (f"{block}.distortion", f"{list(lens.distortion)}")]
+        values += [
+            (f"{block}.{key}", f"{getattr(lens, key)}") for key in ("fx_px", "fy_px", "cx_px", "cy_px")
+        ]
+    if board is not None:
+        plate = parse_board(board)
+        values += [("board.inner_corners", f"[{plate.cols}, {plate.rows}]")]
+        values += [(f"board.{key}", f"{getattr(plate, key)}") for key in ("square_m", "width_m", "height_m")]
+        values += [("board.pattern_offset_m", f"{list(plate.pattern_offset_m)}")]
+    return values
 
 
 def _write_new(path: Path, text: str) -> None:

@@ -57,19 +57,25 @@ def print_json(document: Any) -> None:
 
 
 def plain_table(title: str, *headings: str) -> Any:
-    """Start a rich table without rules, so that it can be copied into a message."""
+    """Start a rich table without rules, so that it can be copied into a message; ">" aligns to the right."""
     from rich.table import Table
 
-    narrow = (0, 1, 0, 0)
-    return Table(
-        *headings,
+    table = Table(
         title=title or None,
         title_justify="left",
         pad_edge=False,
         box=None,
         header_style="bold",
-        padding=narrow,
+        padding=(0, 1, 0, 0),
     )
+    for heading in headings:
+        table.add_column(heading.removeprefix(">"), justify="right" if heading.startswith(">") else "left")
+    return table
+
+
+def matrix_lines(T: Any, indent: str) -> list[str]:
+    """Write the upper three rows of a pose."""
+    return [indent + "  ".join(f"{value: .6f}" for value in row) for row in T[:3]]
 
 
 def print_table(table: Any) -> None:

@@ -7,7 +7,6 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, json_option, session_argument
-from lce_rig.words import describe
 
 
 @click.command()
@@ -73,16 +72,14 @@ def verify(
             f"the captures of {session} contradict the extrinsics of "
             + " and that of ".join(str(checked.pair) for checked in contradicted),
             "\n".join(
-                f"{checked.pair}: {describe(doubt)}" for checked in contradicted for doubt in checked.findings
+                f"{checked.pair}: {doubt.text}" for checked in contradicted for doubt in checked.findings
             ),
         )
 
 
 def _table(checked: Any) -> Any:
-    table = show.plain_table(str(checked.pair))
-    for title in ("capture", "planes mm", "rms", "edges mm", "rms", "corners px"):
-        table.add_column(title, justify="left" if title == "capture" else "right")
-    table.add_column("")
+    headings = ("capture", ">planes mm", ">rms", ">edges mm", ">rms", ">corners px", "")
+    table = show.plain_table(str(checked.pair), *headings)
     for r in checked.residuals:
         lengths = (r.plane_mean_m, r.plane_rms_m, r.edge_mean_m, r.edge_rms_m)
         state = "" if r.capture in checked.calibration.captures_used else "[dim]not used[/]"
@@ -103,7 +100,7 @@ def _summary(checked: Any) -> list[str]:
         )
     lines.append(f"scene: {'; '.join(scene_texts(checked.scene))}")
     lines.append(f"verdict of the calibration: {checked.calibration.verdict}")
-    lines.append(f"these captures: {'; '.join(map(describe, checked.findings)) or 'agree'}")
+    lines.append(f"these captures: {'; '.join(finding.text for finding in checked.findings) or 'agree'}")
     if checked.contact_sheets:
         first, *others = checked.contact_sheets
         last = f" to {others[-1].name}" if others else ""

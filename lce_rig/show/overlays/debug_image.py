@@ -18,7 +18,6 @@ from lce_rig.show.overlays import canvas
 from lce_rig.show.overlays.canvas import BLACK, BLUE, FAINT, INK, MAGENTA, ORANGE, WHITE, Colour, Picture
 from lce_rig.show.overlays.event_picture import draw_event_key, draw_events
 from lce_rig.show.overlays.overlay import draw_image_board, range_limits
-from lce_rig.words import describe, recommend
 
 _PANE_PX = 800
 _PANORAMA_PX = 190
@@ -324,9 +323,9 @@ def _refusal(heading: str, refusal: Refusal) -> Picture:
     canvas.draw_text(pane, heading, 14, 28, _TEXT_PX + 2, ORANGE)
     width_px = _PANE_PX - 120
     canvas.draw_text(pane, "seen", 14, 58, _TEXT_PX, FAINT)
-    below = canvas.draw_paragraph(pane, describe(refusal), 90, 58, width_px, _TEXT_PX)
+    below = canvas.draw_paragraph(pane, refusal.text, 90, 58, width_px, _TEXT_PX)
     canvas.draw_text(pane, "do", 14, below + 8, _TEXT_PX, FAINT)
-    canvas.draw_paragraph(pane, recommend(refusal), 90, below + 8, width_px, _TEXT_PX, WHITE)
+    canvas.draw_paragraph(pane, refusal.advice, 90, below + 8, width_px, _TEXT_PX, WHITE)
     return pane
 
 
