@@ -90,23 +90,19 @@ def _draw(
     session: Session,
     check: SessionCheck,
     view: ImageWithEvents,
-    seen: object,
+    detected: object,
     limits_m: tuple[float, float],
 ) -> Overlay:
     """Draw one capture with the board of both sensors."""
-    rig, name, calibration, meeting = (
-        session.rig,
-        capture.name,
-        check.calibration,
-        check.meetings.get(capture.name),
-    )
+    rig, name, calibration = session.rig, capture.name, check.calibration
+    meeting = check.meetings.get(name)
     r = next((each for each in check.residuals if each.capture == name), None)
     warning = ""
     if calibration.captures_used and name not in calibration.captures_used:
         # Extrinsics of another session were fitted to none of these captures.
         refusal = calibration.captures_refused.get(name)
         warning = "not used" if refusal is None else f"refused, {refusal.stage}: {refusal.sentence}"
-    image_board = seen if isinstance(seen, ImageBoard) else None
+    image_board = detected if isinstance(detected, ImageBoard) else None
     picture = draw_overlay(
         view.image,
         scan if meeting is None else _without(scan, meeting.measured.lidar),

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
@@ -78,14 +77,27 @@ def draw_overlay(
         ends = _to_picture(lidar_board.edge_points, T_cam_lidar, intrinsics, factor)[0]
         canvas.draw_diamonds(picture, ends, ORANGE, 4.2 * unit)
     width_px, has_lidar, has_image = picture.shape[1], lidar_board is not None, image_board is not None
-    legend = _legend(width_px, limits_m, residuals, has_lidar, has_image)
-    parts = [_title_strip(title, width_px), picture, legend]
+    strip = canvas.panel(width_px, _title_px(width_px))
+    text_px = 13 * unit
+    canvas.draw_text(strip, title, text_px, 1.8 * text_px, text_px, INK)
+    parts = [strip, picture, _legend(width_px, limits_m, residuals, has_lidar, has_image)]
     if warning:
-        parts.append(_warning_strip(warning, width_px))
+        text_px, left = 11 * unit, 16 * unit
+        lines = canvas.wrapped(warning, width_px - 2 * left, text_px)
+        strip = canvas.panel(width_px, round((1.9 * len(lines) + 0.8) * text_px))
+        canvas.draw_paragraph(strip, warning, left, 1.4 * text_px, width_px - 2 * left, text_px, ORANGE)
+        parts.append(strip)
     if events is not None:
-        ends = np.zeros((0, 3)) if lidar_board is None else lidar_board.edge_points
-        ends = _to_picture(ends, T_cam_lidar, intrinsics, factor)[0]
-        parts.append(_event_picture(image, events, ends, image_board, board, intrinsics))
+        # The LiDAR's ring ends too, as a board's border makes events.
+        below, factor = draw_events(image, events)
+        if image_board is not None:
+            _draw_outline(below, factor, image_board, board, intrinsics)
+        if lidar_board is not None:
+            ends = _to_picture(lidar_board.edge_points, T_cam_lidar, intrinsics, factor)[0]
+            canvas.draw_diamonds(below, ends, ORANGE, 4.2 * unit)
+        strip = canvas.panel(width_px, round(28 * unit))
+        draw_event_key(strip, events, 13 * unit, 20 * unit, 11 * unit)
+        parts += [strip, below]
     return np.vstack(parts)
 
 
@@ -100,30 +112,16 @@ def draw_projection(
     return picture
 
 
-def _event_picture(
-    image: Image,
-    events: Events,
-    ends: Array,
-    image_board: ImageBoard | None,
-    board: Board,
-    intrinsics: Intrinsics,
-) -> Picture:
-    """Draw recent events with the LiDAR's ring ends (M, 2) px, as a board's border makes events."""
-    picture, factor = draw_events(image, events)
-    unit = picture.shape[1] / 1000
-    if image_board is not None:
-        _draw_outline(picture, factor, image_board, board, intrinsics)
-    canvas.draw_diamonds(picture, ends, ORANGE, 4.2 * unit)
-    strip = canvas.panel(picture.shape[1], round(28 * unit))
-    draw_event_key(strip, events, 13 * unit, 20 * unit, 11 * unit)
-    return np.vstack([strip, picture])
-
-
 def camera_part(overlay: Picture, image: Image) -> Picture:
     """Cut the camera's image out of the output of `draw_overlay`, without title and legend."""
     width_px = overlay.shape[1]
-    top = _title_strip("", width_px).shape[0]
+    top = _title_px(width_px)
     return overlay[top : top + image.pixels.shape[0] * width_px // image.pixels.shape[1]]
+
+
+def _title_px(width_px: int) -> int:
+    """Height of the strip above an image."""
+    return round(2.6 * 13 * width_px / 1000)
 
 
 def range_limits(scans: Sequence[Scan]) -> tuple[float, float]:
@@ -159,17 +157,15 @@ def _to_picture(
     """Project points (N, 3) to pixels (M, 2) of the enlarged image, with the ranges (M,) of those in it."""
     points_camera = transform(T_cam_lidar, points_lidar)
     pixels, _ = intrinsics.project(points_camera)
-    is_seen = intrinsics.is_inside(pixels, -0.5) & _is_before_fold(points_camera, intrinsics)
+    # Near the radius where the distortion folds, pixels hardly move.
+    rho, z = np.hypot(points_camera[:, 0], points_camera[:, 1]), points_camera[:, 2]
+    limit = _FOLD_MARGIN * intrinsics.max_radius
+    is_clear = (
+        np.arctan2(rho, z) < limit if intrinsics.model == "equidistant" else (z > 0) & (rho < limit * z)
+    )
+    is_seen = intrinsics.is_inside(pixels, -0.5) & is_clear
     ranges_m = np.linalg.norm(points_lidar, axis=1)
     return (pixels[is_seen] + 0.5) * factor - 0.5, ranges_m[is_seen]
-
-
-def _is_before_fold(points_camera: Array, intrinsics: Intrinsics) -> NDArray[np.bool_]:
-    """Return which points are clear of the radius where the distortion folds; near it pixels hardly move."""
-    rho, z = np.hypot(points_camera[:, 0], points_camera[:, 1]), points_camera[:, 2]
-    if intrinsics.model == "equidistant":
-        return np.asarray(np.arctan2(rho, z) < _FOLD_MARGIN * intrinsics.max_radius)
-    return np.asarray((z > 0) & (rho < _FOLD_MARGIN * intrinsics.max_radius * z))
 
 
 def _draw_scan(
@@ -188,22 +184,6 @@ def _draw_scan(
     canvas.draw_discs(picture, pixels[order], canvas.turbo(ranges_m[order], *limits_m), radius_px)
 
 
-def _title_strip(title: str, width_px: int) -> Picture:
-    text_px = 13 * width_px / 1000
-    strip = canvas.panel(width_px, round(2.6 * text_px))
-    canvas.draw_text(strip, title, text_px, 1.8 * text_px, text_px, INK)
-    return strip
-
-
-def _warning_strip(warning: str, width_px: int) -> Picture:
-    text_px, left = 11 * width_px / 1000, 16 * width_px / 1000
-    lines = canvas.wrapped(warning, width_px - 2 * left, text_px)
-    strip = canvas.panel(width_px, round((1.9 * len(lines) + 0.8) * text_px))
-    for k, line in enumerate(lines):
-        canvas.draw_text(strip, line, left, (1.4 + 1.9 * k) * text_px, text_px, ORANGE)
-    return strip
-
-
 def _legend(
     width_px: int,
     limits_m: tuple[float, float],
@@ -215,7 +195,9 @@ def _legend(
     unit = width_px / 1000
     text_px = 11 * unit
     line_px = 2.1 * text_px
-    entries = [f"{name}  {_figure(value)}" for name, value in residuals.items()]
+    entries = [
+        f"{name}  {value if isinstance(value, str) else f'{value:.3g}'}" for name, value in residuals.items()
+    ]
     n_columns = 2 if len(entries) > 4 else 1
     n_lines = max(4, -(-len(entries) // n_columns))
     legend = canvas.panel(width_px, round((n_lines + 0.9) * line_px))
@@ -236,10 +218,6 @@ def _legend(
         legend, np.array([[605, 8], [605, 1e3 * legend.shape[0] / width_px - 8]]) * unit, FAINT, 1, None
     )
     return legend
-
-
-def _figure(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.3g}"
 
 
 def draw_mark(legend: Picture, kind: str, u: float, v: float, unit: float) -> None:

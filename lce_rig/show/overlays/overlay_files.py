@@ -3,8 +3,8 @@
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,8 +26,7 @@ _TEXT_PX, _LINE_PX = 11, 22
 _COLOURS = {"pass": GREEN, "marginal": ORANGE, "fail": RED}
 
 
-@dataclass(frozen=True, eq=False)
-class Overlay:
+class Overlay(NamedTuple):
     """One capture's image.
 
     Attributes:
@@ -45,8 +44,7 @@ class Overlay:
     warning: str = ""
 
 
-@dataclass(frozen=True)
-class SheetHead:
+class SheetHead(NamedTuple):
     """What stands above the images of a contact sheet.
 
     Attributes:
@@ -153,10 +151,10 @@ def write_overlays(
     files: list[Path] = []
     tiles: list[Overlay] = []
     for overlay in overlays:
-        files.append(write_picture(folder / f"{_file_name(overlay.name)}.png", overlay.picture))
+        files.append(write_picture(folder / f"{overlay.name}.png", overlay.picture))
         part = overlay.part
         small = canvas.fitted(part, _TILE_PX, round(part.shape[0] * _TILE_PX / part.shape[1]))
-        tiles.append(replace(overlay, picture=small, part=small))
+        tiles.append(overlay._replace(picture=small, part=small))
     sheets = contact_sheets(tiles, head) if tiles else []
     stem, suffix = CONTACT_SHEET.split(".")
     names = (
@@ -182,8 +180,3 @@ def write_picture(path: Path, picture: Picture) -> Path:
         raise SessionError(f"{path}: an image of shape {picture.shape} cannot be written as PNG")
     write_atomically(path, np.asarray(data).tobytes())
     return path
-
-
-def _file_name(name: str) -> str:
-    """Keep letters, digits, dot, dash and underscore of a name, so that it stays in its folder."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).lstrip(".") or "picture"
