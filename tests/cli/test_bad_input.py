@@ -123,20 +123,9 @@ def test_a_range_noise_that_is_no_length_is_a_usage_error(lce_rig, tmp_path, val
     assert not (tmp_path / "s").exists()
 
 
-def test_a_manifest_that_points_outside_the_session_is_refused(lce_rig, session, tmp_path):
-    (tmp_path / "secret.png").write_bytes(b"not yours")
-    manifest = session / "captures" / "000002" / "meta.json"
-    document = json.loads(manifest.read_text())
-    document["files"][0]["file"] = "../../../secret.png"
-    manifest.write_text(json.dumps(document))
-    outcome = lce_rig("check", session)
-    assert outcome.code == 0
-    assert any("000002: read:" in line for line in outcome.out.splitlines())
-
-
 @pytest.mark.parametrize(
     "changes",
-    [{"file": True}, {"camera": "other"}, {"channel": "a b"}, {"channel": "none"}, {"bytes": -1}],
+    [{"file": True}, {"file": "../../../secret.png"}, {"camera": "other"}, {"channel": "none"}],
 )
 def test_a_capture_with_a_bad_manifest_is_refused_alone(lce_rig, session, changes):
     keep(session, 3)

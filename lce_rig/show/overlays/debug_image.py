@@ -101,7 +101,12 @@ def draw_debug(
     right = np.vstack([_panorama(points, candidates, chosen, colour, limits_m, _PANE_PX), views])
     strip = canvas.panel(2 * _PANE_PX, 34)
     canvas.draw_text(strip, title, 14, 23, 13, INK)
-    reports = [_image_report(image_result), _lidar_report(lidar_result, chosen, mismatch, limits)]
+    if isinstance(image_result, Refusal):
+        report = _refusal("camera: refused", image_result)
+    else:
+        notes = ["pose ambiguous from the image alone"] if image_result.is_ambiguous else []
+        report = _figures("camera: board found", image_result.figures(), _IMAGE_FIGURES, notes)
+    reports = [report, _lidar_report(lidar_result, chosen, mismatch, limits)]
     above = np.hstack([left, right])
     if image is None or events is None:
         return np.vstack([strip, above, np.hstack(reports)])
@@ -118,21 +123,24 @@ def _camera_pane(
         canvas.draw_text(pane, "no image", _PANE_PX / 2, height_px / 2, 16, FAINT, align=0.5)
         return pane
     picture, factor = canvas.enlarged(image.pixels)
+    unit = picture.shape[1] / 1000
     if isinstance(result, ImageBoard):
         draw_image_board(picture, factor, result, board, intrinsics)
-        _draw_axes(picture, factor, result, board)
+        # The first corner, its row (x) and its column (-y), so that a flipped order is visible.
+        grid = ((result.corners_px + 0.5) * factor - 0.5).reshape(board.rows, board.cols, 2)
+        canvas.draw_line(picture, grid[0], ORANGE, max(2, round(3 * unit)))
+        canvas.draw_line(picture, grid[:, 0], BLUE, max(2, round(3 * unit)))
+        canvas.draw_discs(picture, grid[0, :1], MAGENTA, 6 * unit, WHITE)
+        left, baseline = grid[0, -1] + 8 * unit
+        canvas.draw_text(picture, "x", float(left), float(baseline), 16 * unit, ORANGE)
     else:
-        _draw_found_corners(picture, factor, image, board)
+        # The corners detected in a refused image, of the whole pattern or a part of it.
+        whole = find_grid(image.grey, board, is_thorough=False)
+        grid_px = seen_grid(image.grey) if whole is None else whole.grid_px
+        if grid_px is not None:
+            pixels = (grid_px.reshape(-1, 2) + 0.5) * factor - 0.5
+            canvas.draw_discs(picture, pixels, ORANGE, max(1.5, 2.5 * unit), BLACK)
     return canvas.fitted(picture, _PANE_PX, height_px, BLACK)
-
-
-def _draw_found_corners(picture: Picture, factor: int, image: Image, board: Board) -> None:
-    """Mark the corners found in a refused image, of the whole pattern or a part of it."""
-    whole = find_grid(image.grey, board, is_thorough=False)
-    grid_px = seen_grid(image.grey) if whole is None else whole.grid_px
-    if grid_px is not None:
-        pixels = (grid_px.reshape(-1, 2) + 0.5) * factor - 0.5
-        canvas.draw_discs(picture, pixels, ORANGE, max(1.5, picture.shape[1] / 400), BLACK)
 
 
 def _event_pane(
@@ -160,17 +168,6 @@ def _event_pane(
     if isinstance(result, ImageBoard) and result.track_ns is not None:
         canvas.draw_text(pane, "grey: tracked from, and to", _PANE_PX - 8, 16, 10, FAINT, 1.0)
     return pane
-
-
-def _draw_axes(picture: Picture, factor: int, found: ImageBoard, board: Board) -> None:
-    """Mark the first corner, its row (x) and its column (-y), so that a flipped order is visible."""
-    grid = ((found.corners_px + 0.5) * factor - 0.5).reshape(board.rows, board.cols, 2)
-    unit = picture.shape[1] / 1000
-    canvas.draw_line(picture, grid[0], ORANGE, max(2, round(3 * unit)))
-    canvas.draw_line(picture, grid[:, 0], BLUE, max(2, round(3 * unit)))
-    canvas.draw_discs(picture, grid[0, :1], MAGENTA, 6 * unit, WHITE)
-    left, baseline = grid[0, -1] + 8 * unit
-    canvas.draw_text(picture, "x", float(left), float(baseline), 16 * unit, ORANGE)
 
 
 def _panorama(
@@ -293,13 +290,6 @@ def _draw_number(pane: Picture, index: int, colour: Colour, at: tuple[float, flo
 def _label(pane: Picture, text: str) -> None:
     pane[:24, : round(canvas.text_width_px(text, 10)) + 16] = BLACK
     canvas.draw_text(pane, text, 8, 16, 10, INK)
-
-
-def _image_report(result: ImageBoard | Refusal) -> Picture:
-    if isinstance(result, Refusal):
-        return _refusal("camera: refused", result)
-    notes = ["pose ambiguous from the image alone"] if result.is_ambiguous else []
-    return _figures("camera: board found", result.figures(), _IMAGE_FIGURES, notes)
 
 
 def _lidar_report(
