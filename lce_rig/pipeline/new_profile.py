@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +19,7 @@ from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.folder.cloud_file import DECODERS, read_cloud
 from lce_rig.io.ros.survey import SensorTopic, survey_bag
 from lce_rig.rig import LidarSettings
-from lce_rig.rig.draft import CameraDraft, ChannelDraft, LidarDraft, draft_profile
+from lce_rig.rig.draft import CameraDraft, LidarDraft, draft_profile
 
 _UNKNOWN_MODEL = "other"
 # A ring that sees one distance only has no height: 0.1 mrad against 15 mm.
@@ -93,8 +92,12 @@ def new_profile(
         lens = intrinsics[index] if intrinsics else _lens(camera, group)
         frame = next((t.frame for t in group if t.frame and t.frame not in used), None)
         used.add(frame)
-        channels = tuple(ChannelDraft("events" if t.kind == "events" else "frames", t.topic) for t in group)
-        drafts.append(CameraDraft(camera, lens, frame, channels or (ChannelDraft(),)))
+        draft = CameraDraft(camera, lens, frame)
+        if group:
+            draft = draft._replace(
+                channels=[("events" if t.kind == "events" else "frames", t.topic) for t in group]
+            )
+        drafts.append(draft)
     found = [_line(topic) for topic in topics] + [f"{each.name}: {each.sees}" for each in lidars if clouds]
     return draft_profile(name, lidars, drafts, board, source), found
 
@@ -199,7 +202,7 @@ def _with_beams(lidar: LidarDraft, cloud: NDArray[Any], where: str) -> LidarDraf
     scan = to_scan(cloud, lidar.name, LidarSettings.model_validate({"model": lidar.model}), where).scan
     elevations_deg, columns = measure_beams(scan)
     sees = f"{len(elevations_deg)} rings, {columns or 'unknown'} columns in the recording"
-    return replace(lidar, elevations_deg=elevations_deg, columns=columns, sees=sees)
+    return lidar._replace(elevations_deg=elevations_deg, columns=columns, sees=sees)
 
 
 def _by_camera(topics: Sequence[SensorTopic]) -> list[list[SensorTopic]]:

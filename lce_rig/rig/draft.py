@@ -1,8 +1,8 @@
 """The text of a new profile from its parts: sensors, lenses, board; nothing of another rig."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import replace
+from typing import Literal, NamedTuple
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
@@ -11,8 +11,7 @@ from lce_rig.rig.editing import as_text
 from lce_rig.rig.loading import read_document, rig_from_document
 
 
-@dataclass(frozen=True)
-class LidarDraft:
+class LidarDraft(NamedTuple):
     """A LiDAR of the new profile.
 
     Attributes:
@@ -36,34 +35,20 @@ class LidarDraft:
     columns: int | None = None
 
 
-@dataclass(frozen=True)
-class ChannelDraft:
-    """A stream of a camera of the new profile.
-
-    Attributes:
-        kind: "frames" or "events".
-        topic: in bags.
-    """
-
-    kind: Literal["frames", "events"] = "frames"
-    topic: str | None = None
-
-
-@dataclass(frozen=True)
-class CameraDraft:
+class CameraDraft(NamedTuple):
     """A camera of the new profile.
 
     Attributes:
         name: in the profile.
         intrinsics: of its images.
         optical_frame: None for the usual one.
-        channels: at least one.
+        channels: at least one: kind, "frames" or "events", and topic in bags.
     """
 
     name: str
     intrinsics: Intrinsics
     optical_frame: str | None = None
-    channels: Sequence[ChannelDraft] = field(default_factory=lambda: (ChannelDraft(),))
+    channels: Sequence[tuple[Literal["frames", "events"], str | None]] = (("frames", None),)
 
 
 def draft_profile(
@@ -162,11 +147,11 @@ def _camera(camera: CameraDraft) -> list[str]:
         f"      distortion: [{', '.join(f'{value:.10g}' for value in lens.distortion)}]",
         "    channels:",
     ]
-    for channel in camera.channels:
+    for kind, topic in camera.channels:
         lines += [
-            f"      {channel.kind}:",
-            f"        kind: {channel.kind}",
-            *([f"        topic: {channel.topic}"] if channel.topic else []),
+            f"      {kind}:",
+            f"        kind: {kind}",
+            *([f"        topic: {topic}"] if topic else []),
             "        timestamps:",
             "          clock: host",
             "          reference: mid_exposure # or start",

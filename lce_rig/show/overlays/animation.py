@@ -1,6 +1,7 @@
 """Write GIF and video files."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,17 @@ from lce_rig.show.overlays.canvas import Picture
 
 # Codecs of OpenCV's own builds, by the file's suffix.
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG", ".mkv": "mp4v"}
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise SourceError(
+            f"{path}: cannot be written: {error.strerror or error}", "Choose another folder."
+        ) from error
 
 
 def write_gif(path: Path, pictures: Iterable[Picture], period_s: float) -> None:
@@ -29,18 +41,11 @@ def write_gif(path: Path, pictures: Iterable[Picture], period_s: float) -> None:
     except ImportError as error:
         raise SourceError("GIFs require pillow, which is not installed", "Run: pip install pillow") from error
 
-    def frames() -> Iterator[PillowImage.Image]:
-        for picture in pictures:
-            yield PillowImage.fromarray(picture if picture.ndim == 2 else picture[..., ::-1])
-
-    rest = frames()
-    first = next(rest)
+    frames = (PillowImage.fromarray(each if each.ndim == 2 else each[..., ::-1]) for each in pictures)
     duration_ms = max(20, 10 * round(100 * period_s))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        first.save(path, "GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
-    except OSError as error:
-        raise _not_written(path, error) from error
+    first = next(frames)
+    with _writing(path):
+        first.save(path, "GIF", save_all=True, append_images=frames, duration=duration_ms, loop=0)
 
 
 def write_video(path: Path, pictures: Iterable[Picture], period_s: float) -> None:
@@ -48,7 +53,7 @@ def write_video(path: Path, pictures: Iterable[Picture], period_s: float) -> Non
 
     Args:
         path: the file; its suffix, .mp4, .avi or .mkv, gives the format.
-        pictures: grey (H, W) or BGR (H, W, 3), all of one size; taken one at a time.
+        pictures: grey (H, W) or BGR (H, W, 3), all of one size, at least one; taken one at a time.
         period_s: time between images.
 
     Raises:
@@ -59,30 +64,19 @@ def write_video(path: Path, pictures: Iterable[Picture], period_s: float) -> Non
         raise SourceError(
             f"{path}: unknown video format", f"Choose one of: {', '.join(_CODECS)}, or write a GIF."
         )
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with _writing(path):
         path.touch()
-    except OSError as error:
-        raise _not_written(path, error) from error
-    writer = None
+    writer = cv2.VideoWriter()
     for picture in pictures:
-        bgr = np.ascontiguousarray(
-            cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture
-        )
-        if writer is None:
+        bgr = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture
+        if not writer.isOpened():
             size = (bgr.shape[1], bgr.shape[0])
-            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 1 / period_s, size)
-            if not writer.isOpened():
+            if not writer.open(str(path), cv2.VideoWriter.fourcc(*codec), 1 / period_s, size):
                 break
-        writer.write(bgr)
-    if writer is not None:
-        writer.release()
+        writer.write(np.ascontiguousarray(bgr))
+    writer.release()
     if path.stat().st_size == 0:
         path.unlink()
         raise SourceError(
             f"{path}: this OpenCV cannot write videos (codec {codec})", "Write a GIF, or try another suffix."
         )
-
-
-def _not_written(path: Path, error: OSError) -> SourceError:
-    return SourceError(f"{path}: cannot be written: {error.strerror or error}", "Choose another folder.")

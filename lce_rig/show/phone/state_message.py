@@ -5,13 +5,12 @@ import json
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.collect.live.state import Drawing, LiveState
+from lce_rig.collect.live.state import LiveState
 from lce_rig.core.geometry import Array
 
 Pixels = NDArray[np.uint8]
@@ -31,6 +30,18 @@ def to_json(state: LiveState, update: int, *, has_picture: bool) -> str:
         update: a number that the page answers with once it has shown the state.
         has_picture: whether a JPEG of the drawing follows.
     """
+    drawing = None
+    if state.drawing is not None:
+        height, width = state.drawing.pixels.shape[:2]
+        drawing = {
+            "camera": state.drawing.camera,
+            "width_px": width,
+            "height_px": height,
+            "present_px": _outline(state.drawing.present_px),
+            "wanted_px": _outline(state.drawing.wanted_px),
+            "is_there": bool(state.drawing.is_there),
+            "has_picture": has_picture,
+        }
     document = {
         "update": update,
         "rig": state.rig,
@@ -45,7 +56,7 @@ def to_json(state: LiveState, update: int, *, has_picture: bool) -> str:
         "last_capture": state.last_capture,
         "goes_on": state.goes_on,
         "streams": [asdict(stream) | {"rate_hz": _number(stream.rate_hz)} for stream in state.streams],
-        "drawing": None if state.drawing is None else _drawing(state.drawing, has_picture),
+        "drawing": drawing,
         "coverage": None if state.coverage is None else asdict(state.coverage),
         "sigma_deg": _number(state.sigma_deg),
         "sigma_mm": _number(state.sigma_mm),
@@ -65,7 +76,15 @@ def beat(age_s: float | None) -> str:
 
 def encode_picture(pixels: Pixels) -> bytes:
     """Compress an image, (H, W) or (H, W, 3) BGR, at most `MAX_WIDTH_PX` wide."""
-    _, jpeg = cv2.imencode(".jpg", _shrunk(pixels), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    height, width = pixels.shape[:2]
+    shrinkage = width / MAX_WIDTH_PX
+    if shrinkage > 1:
+        # Means over areas are fast for whole factors only, and below two there is little to be averaged.
+        kind = cv2.INTER_LINEAR if shrinkage < 2 else cv2.INTER_AREA
+        shrinkage = shrinkage if shrinkage < 2 else math.ceil(shrinkage)
+        size = (round(width / shrinkage), max(1, round(height / shrinkage)))
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=kind), np.uint8)
+    _, jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return bytes(jpeg)
 
 
@@ -94,31 +113,6 @@ class Encoder:
     def close(self) -> None:
         """End the thread."""
         self._thread.shutdown()
-
-
-def _shrunk(pixels: Pixels) -> Pixels:
-    height, width = pixels.shape[:2]
-    shrinkage = width / MAX_WIDTH_PX
-    if shrinkage <= 1:
-        return pixels
-    # Means over areas are fast for whole factors only, and below two there is little to be averaged.
-    kind = cv2.INTER_LINEAR if shrinkage < 2 else cv2.INTER_AREA
-    shrinkage = shrinkage if shrinkage < 2 else math.ceil(shrinkage)
-    size = (round(width / shrinkage), max(1, round(height / shrinkage)))
-    return np.asarray(cv2.resize(pixels, size, interpolation=kind), np.uint8)
-
-
-def _drawing(drawing: Drawing, has_picture: bool) -> dict[str, Any]:
-    height, width = drawing.pixels.shape[:2]
-    return {
-        "camera": drawing.camera,
-        "width_px": width,
-        "height_px": height,
-        "present_px": _outline(drawing.present_px),
-        "wanted_px": _outline(drawing.wanted_px),
-        "is_there": bool(drawing.is_there),
-        "has_picture": has_picture,
-    }
 
 
 def _outline(points_px: Array | None) -> list[list[float] | None] | None:
