@@ -1,38 +1,22 @@
-"""The report of a calibration: its verdict, what it means for a point, and the evidence, on one page."""
+"""The report of a calibration: its verdict, its effect on a point, and the evidence, on one page."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
-from lce_rig.core.calibration import Calibration, CaptureResidual
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
+from lce_rig.core.phrasing import as_line
 from lce_rig.export.rotations import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words, weakest_words
 from lce_rig.rig import Rig
-from lce_rig.show.report.board_drawings import draw_from_above, draw_in_image, draw_ranges_and_angles
+from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.drawing import style
-from lce_rig.show.report.evidence import gather
+from lce_rig.show.report.evidence import Evidence, gather
 from lce_rig.show.report.page import as_markup, render
-from lce_rig.show.report.residual_drawings import (
-    draw_by_capture,
-    draw_by_place,
-    draw_by_range,
-    draw_by_ring,
-    draw_corners,
-)
-from lce_rig.show.report.statement import next_steps, statement
-from lce_rig.show.report.uncertainty_drawings import (
-    draw_by_distance,
-    draw_causes,
-    draw_ellipsoid,
-    principal_axes,
-)
-from lce_rig.show.report.worked_point import WorkedPoint, work_point
-from lce_rig.words import describe, recommend, sentence
 
 Overlays = Callable[[Calibration, str], Sequence[str]]
 """Gives the paths of a capture's overlays, from the folder of the page."""
@@ -41,62 +25,8 @@ Row = Sequence[object]
 _STEP = 1e-6
 _AXES = {"x": "x right", "y": "y down", "z": "z forward"}
 _LENS_CODES = ("verdict.intrinsics", "verdict.known_better", "verdict.scale")
-
-
-@dataclass(frozen=True)
-class CaptureView:
-    """One capture of a report.
-
-    Attributes:
-        name: of the capture.
-        anchor: of its figures and overlays in the page.
-        figures: residuals by name, with units.
-        overlays: paths of its images.
-    """
-
-    name: str
-    anchor: str
-    figures: tuple[tuple[str, str], ...]
-    overlays: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class PairView:
-    """What the page shows of one camera and one LiDAR.
-
-    Attributes:
-        calibration: of the sensors.
-        anchor: of its part of the page.
-        statement: the paragraph to sign; steps: what to do next.
-        findings: severity, what was found, what to do.
-        body_frames: of the LiDAR and of the camera.
-        pose, uncertainty, axes, causes, clocks, scene, cameras, refused: rows of tables.
-        weakest: the least determined motion.
-        worked: the worked point.
-        captures: those used.
-        lens: sentences about the profile's intrinsics.
-        drawings: by name.
-    """
-
-    calibration: Calibration
-    anchor: str
-    statement: str
-    steps: Sequence[str]
-    findings: Sequence[tuple[str, str, str]]
-    body_frames: tuple[str, str]
-    pose: Sequence[Row]
-    uncertainty: Sequence[Row]
-    axes: Sequence[Row]
-    weakest: str
-    causes: Sequence[Row]
-    worked: WorkedPoint | None
-    captures: Sequence[CaptureView]
-    clocks: Sequence[Row]
-    lens: Sequence[str]
-    scene: Sequence[Row]
-    cameras: Sequence[Row]
-    refused: Sequence[Row]
-    drawings: Mapping[str, Markup]
+# The statement names the expected error at this distance.
+_USUAL_M = 10.0
 
 
 def calibration_page(
@@ -113,39 +43,64 @@ def calibration_page(
     pairs = []
     for k, c in enumerate(calibrations):
         with style(f"pair-{k}"):
-            pairs.append(_pair_view(rig, c, f"pair-{k}", overlays))
+            pairs.append(_pair(rig, c, f"pair-{k}", overlays))
     return render("calibration.html", rig=rig.name, pairs=pairs, facts=facts)
 
 
-def _pair_view(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> PairView:
+def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str, Any]:
+    """List the content of one camera and one LiDAR's part of the page, by the template's names."""
     board, lens = rig.board.to_board(), rig.cameras[c.camera].to_intrinsics()
     evidence = gather(c, board, lens)
-    captures = [
-        CaptureView(r.capture, f"{anchor}-capture-{k}", _figures(r), tuple(overlays(c, r.capture)))
-        for k, r in enumerate(c.residuals)
-    ]
-    links = {each.name: f"#{each.anchor}" for each in captures}
-    drawings = _uncertainty_drawings(c, lens)
+    captures = []
+    for k, residual in enumerate(c.residuals):
+        figures = [
+            ("planes", 1000 * residual.plane_mean_m, "mm"),
+            ("edges", 1000 * residual.edge_mean_m, "mm"),
+        ]
+        figures += [
+            ("held out", 1000 * residual.held_out_m, "mm"),
+            ("corners", residual.reprojection_px, "px"),
+        ]
+        captures.append(
+            {
+                "name": residual.capture,
+                "anchor": f"{anchor}-capture-{k}",
+                "figures": [
+                    (name, f"{value:.{1 if unit == 'mm' else 2}f} {unit}" if math.isfinite(value) else "")
+                    for name, value, unit in figures
+                ],
+                "overlays": overlays(c, residual.capture),
+            }
+        )
+    links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}
+    drawn = {
+        "rotation": drawings.draw_ellipsoid(
+            np.degrees(np.degrees(c.cov[3:, 3:])), "deg", "Uncertainty of the rotation"
+        ),
+        "translation": drawings.draw_ellipsoid(1e6 * c.cov[:3, :3], "mm", "Uncertainty of the translation"),
+        "by_distance": drawings.draw_by_distance(c, lens),
+    }
+    if c.contributions:
+        drawn["causes"] = drawings.draw_causes(c)
     if evidence is not None:
-        drawings |= {
-            "in_image": draw_in_image(evidence, board, lens, links),
-            "from_above": draw_from_above(c, evidence, board, lens, links),
-            "ranges": draw_ranges_and_angles(evidence, links),
-            "by_capture": draw_by_capture(c, links),
-            "by_ring": draw_by_ring(evidence),
-            "by_range": draw_by_range(evidence, links),
-            "by_place": draw_by_place(evidence, lens),
-            "corners": draw_corners(evidence, lens),
+        drawn |= {
+            "in_image": drawings.draw_in_image(evidence, board, lens, links),
+            "from_above": drawings.draw_from_above(c, evidence, board, lens, links),
+            "ranges": drawings.draw_ranges_and_angles(evidence, links),
+            "by_capture": drawings.draw_by_capture(c, links),
+            "by_ring": drawings.draw_by_ring(evidence),
+            "by_range": drawings.draw_by_range(evidence, links),
+            "by_place": drawings.draw_by_place(evidence, lens),
+            "corners": drawings.draw_corners(evidence, lens),
         }
-    return PairView(
-        calibration=c,
-        anchor=anchor,
-        statement=statement(c),
-        steps=next_steps(c),
-        findings=[(f.severity, describe(f), recommend(f)) for f in c.findings],
-        body_frames=(rig.lidars[c.lidar].frame, rig.cameras[c.camera].frame),
-        pose=_pose_rows(c),
-        uncertainty=[
+    return {
+        "calibration": c,
+        "anchor": anchor,
+        "statement": _statement(c),
+        "steps": _next_steps(c),
+        "body_frames": (rig.lidars[c.lidar].frame, rig.cameras[c.camera].frame),
+        "pose": _pose_rows(c),
+        "uncertainty": [
             (
                 f"{p.distance_m:g} m",
                 f"{p.centre_px:.1f} px, {100 * p.centre_m:.1f} cm",
@@ -153,46 +108,69 @@ def _pair_view(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> Pai
             )
             for p in c.uncertainty
         ],
-        axes=[*_axis_rows(c.cov[3:, 3:], "deg", "about"), *_axis_rows(c.cov[:3, :3], "mm", "along")],
-        weakest="" if c.weakest is None else weakest_words(c.weakest),
-        causes=[
+        "axes": [*_axis_rows(c.cov[3:, 3:], "deg", "about"), *_axis_rows(c.cov[:3, :3], "mm", "along")],
+        "weakest": "" if c.weakest is None else weakest_words(c.weakest),
+        "causes": [
             (
-                cause_words(each.source),
-                f"{each.sigma_rotation_deg:.3f}",
-                f"{1000 * each.sigma_translation_m:.1f}",
+                cause_words(cause.source),
+                f"{cause.sigma_rotation_deg:.3f}",
+                f"{1000 * cause.sigma_translation_m:.1f}",
             )
-            for each in c.contributions
+            for cause in c.contributions
         ],
-        worked=None if evidence is None else work_point(c, lens, evidence),
-        captures=captures,
-        clocks=_clock_rows(c),
-        lens=[sentence(f) for f in c.findings if f.code in _LENS_CODES],
-        scene=_scene_rows(c),
-        cameras=_camera_rows(c),
-        refused=[(name, why.stage, as_markup(sentence(why))) for name, why in c.captures_refused.items()],
-        drawings=drawings,
-    )
-
-
-def _uncertainty_drawings(c: Calibration, lens: Intrinsics) -> dict[str, Markup]:
-    degrees = np.degrees(np.degrees(c.cov[3:, 3:]))
-    drawings = {
-        "rotation": draw_ellipsoid(degrees, "deg", "Uncertainty of the rotation"),
-        "translation": draw_ellipsoid(1e6 * c.cov[:3, :3], "mm", "Uncertainty of the translation"),
-        "by_distance": draw_by_distance(c, lens),
+        "worked": None if evidence is None else work_point(c, lens, evidence),
+        "captures": captures,
+        "clocks": _clock_rows(c),
+        "lens": [finding.sentence for finding in c.findings if finding.code in _LENS_CODES],
+        "scene": _scene_rows(c),
+        "cameras": _camera_rows(c),
+        "refused": [(name, why.stage, as_markup(why.sentence)) for name, why in c.captures_refused.items()],
+        "drawings": drawn,
     }
-    if c.contributions:
-        drawings["causes"] = draw_causes(c)
-    return drawings
 
 
-def _figures(r: CaptureResidual) -> tuple[tuple[str, str], ...]:
-    figures = [("planes", 1000 * r.plane_mean_m, "mm"), ("edges", 1000 * r.edge_mean_m, "mm")]
-    figures += [("held out", 1000 * r.held_out_m, "mm"), ("corners", r.reprojection_px, "px")]
-    return tuple(
-        (name, f"{value:.{1 if unit == 'mm' else 2}f} {unit}" if math.isfinite(value) else "")
-        for name, value, unit in figures
+def _statement(c: Calibration) -> str:
+    """Sum a result up in one paragraph that anyone can sign, with its figures."""
+    known = (
+        f"The pose of camera {c.camera} relative to {c.lidar} has a standard deviation of "
+        f"{c.sigma_rotation_deg:.2g} deg and {1000 * c.sigma_translation_m:.2g} mm, from "
+        f"{len(c.captures_used)} of {c.n_captures} captures of the board"
     )
+    if c.verdict == "fail":
+        return "Do not use this result: " + _reason(c) + _others(c, "error")
+    passed = "every check passed" if c.verdict == "pass" else "use it with care: " + _reason(c) + _others(c)
+    text = f"{known}; {passed.rstrip('.')}."
+    if not c.uncertainty:
+        return text
+    at = min(c.uncertainty, key=lambda point: abs(point.distance_m - _USUAL_M))
+    return (
+        f"{text} A LiDAR point {at.distance_m:g} m away falls onto the image with an expected error of "
+        f"{at.centre_px:.1f} px ({100 * at.centre_m:.1f} cm) in the middle and {at.corner_px:.1f} px "
+        f"({100 * at.corner_m:.1f} cm) in the corners."
+    )
+
+
+def _reason(c: Calibration) -> str:
+    reasons = [finding for finding in c.findings if finding.severity != "note"]
+    return f"{reasons[0].text}." if reasons else "its checks failed."
+
+
+def _others(c: Calibration, severity: str = "warning") -> str:
+    n = sum(finding.severity == severity for finding in c.findings) - 1
+    return f" {n} other reason{'s' if n > 1 else ''} below." if n > 0 else ""
+
+
+def _next_steps(c: Calibration) -> list[str]:
+    """List what to do next, the most urgent first: what findings ask for, then how to put it to use."""
+    asked = [finding.advice for finding in sorted(c.findings, key=lambda f: f.severity != "error")]
+    steps = [as_line(text) for text in dict.fromkeys(asked) if text]
+    if c.verdict == "fail":
+        return [*steps, "Then run `lce-rig calibrate` again. The last usable result is in `previous/`."]
+    return [
+        *steps,
+        "Look at the overlays (`lce-rig verify`): ring ends must lie on the board's outline on all sides.",
+        "Collect a second session on another day and compare both with `lce-rig repeat`.",
+    ]
 
 
 def _pose_rows(c: Calibration) -> list[Row]:
@@ -221,7 +199,7 @@ def _pose_rows(c: Calibration) -> list[Row]:
 
 def _axis_rows(cov: Array, unit: str, kind: str) -> list[Row]:
     """State the principal axes of a covariance (3, 3) in rad^2 or m^2."""
-    sigmas, directions = principal_axes(cov)
+    sigmas, directions = drawings.principal_axes(cov)
     sizes = [f"{np.degrees(s):.3f} deg" if unit == "deg" else f"{1000 * s:.1f} mm" for s in sigmas]
     return [
         (kind, "(" + ", ".join(f"{value + 0.0:+.2f}" for value in direction) + ")", size)
@@ -261,13 +239,69 @@ def _scene_rows(c: Calibration) -> list[Row]:
 def _camera_rows(c: Calibration) -> list[Row]:
     rows: list[Row] = []
     for other in c.other_cameras:
-        sigma = "" if other.cov is None else "{:.3f} deg, {:.1f} mm".format(*_in_mm(sigma_sizes(other.cov)))
-        apart = ""
+        sigma = apart = ""
+        if other.cov is not None:
+            rotation_deg, translation_m = sigma_sizes(other.cov)
+            sigma = f"{rotation_deg:.3f} deg, {1000 * translation_m:.1f} mm"
         if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
             apart = f"{other.apart_rotation_deg:.3f} deg, {1000 * other.apart_translation_m:.1f} mm"
         rows.append((other.camera, other.n_captures, sigma, apart, f"{1000 * other.board_rms_m:.1f} mm"))
     return rows
 
 
-def _in_mm(sizes: tuple[float, float]) -> tuple[float, float]:
-    return sizes[0], 1000 * sizes[1]
+def work_point(calibration: Calibration, lens: Intrinsics, evidence: Evidence) -> dict[str, Any]:
+    """Choose the point nearest to the middle of the board in the capture of median range, and project it.
+
+    The arithmetic starts from the digits that are printed.
+
+    Returns:
+        Capture and ring, the lines of the arithmetic, the pixel (u, v) that they lead to, and the point's
+        distance from the board's plane as the camera sees it (off_plane_mm, positive behind it).
+    """
+    k = int(np.argsort(evidence.range_m, kind="stable")[len(evidence.range_m) // 2])
+    lidar = evidence.observations[k].lidar
+    nearest = int(np.argmin(np.linalg.norm(lidar.points - lidar.T_lidar_board[:3, 3], axis=1)))
+    p = np.round(lidar.points[nearest], 4)
+    T = np.round(calibration.T_cam_lidar[:3], 6)
+    in_camera = T[:, :3] @ p + T[:, 3]
+    lines = ["p_lidar = ({:.4f}, {:.4f}, {:.4f}) m".format(*p)]
+    for axis, row, value in zip("xyz", T, in_camera, strict=True):
+        terms = [f"{a:.6f} * {_factor(b, 4)}" for a, b in zip(row[:3], p, strict=True)]
+        total = " + ".join([*terms, f"{row[3]:.6f}"]).replace("+ -", "- ")
+        lines.append(f"{axis}_cam = {total} = {value:.4f} m")
+    xy, steps = _onto_image(np.round(in_camera, 4), lens)
+    u, v = lens.fx_px * xy[0] + lens.cx_px, lens.fy_px * xy[1] + lens.cy_px
+    lines += steps
+    lines.append(f"u = fx x' + cx = {lens.fx_px:.2f} * {_factor(xy[0], 5)} + {lens.cx_px:.2f} = {u:.1f} px")
+    lines.append(f"v = fy y' + cy = {lens.fy_px:.2f} * {_factor(xy[1], 5)} + {lens.cy_px:.2f} = {v:.1f} px")
+    in_scan = np.flatnonzero(evidence.capture == k)[nearest]
+    return {
+        "capture": evidence.observations[k].capture,
+        "ring": int(lidar.ring[nearest]),
+        "lines": lines,
+        "pixel": (float(u), float(v)),
+        "off_plane_mm": 1000 * float(evidence.plane_m[in_scan]),
+    }
+
+
+def _factor(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if value >= 0 else f"({value:.{digits}f})"
+
+
+def _onto_image(p: Array, lens: Intrinsics) -> tuple[Array, list[str]]:
+    """Apply the lens to a point of the camera: x', y' before the camera matrix, and the steps."""
+    pixel, _ = lens.project(p)
+    distorted = (pixel - [lens.cx_px, lens.cy_px]) / [lens.fx_px, lens.fy_px]
+    x, y = p[0] / p[2], p[1] / p[2]
+    steps = [f"x / z = {x:.5f}, y / z = {y:.5f}"]
+    if lens.model == "equidistant":
+        steps.append(f"angle from the axis = atan(|(x / z, y / z)|) = {np.arctan(np.hypot(x, y)):.5f} rad")
+    coefficients = ", ".join(f"{value:g}" for value in lens.distortion)
+    if any(lens.distortion) or lens.model == "equidistant":
+        steps.append(
+            f"with the distortion ({lens.model}: {coefficients}) x' = {distorted[0]:.5f}, "
+            f"y' = {distorted[1]:.5f}"
+        )
+    else:
+        steps.append("the lens has no distortion: x' = x / z, y' = y / z")
+    return distorted, steps

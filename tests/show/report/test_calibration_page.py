@@ -9,8 +9,8 @@ import pytest
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import invert
 from lce_rig.rig import load_rig
+from lce_rig.show.report.calibration_page import work_point
 from lce_rig.show.report.evidence import gather
-from lce_rig.show.report.worked_point import work_point
 from tests.export.conftest import calibration as without_boards
 
 from .conftest import RLFS, page
@@ -55,13 +55,13 @@ def test_the_worked_point_can_be_worked_with_a_calculator(one):
     evidence = gather(one, board, lens)
     worked = work_point(one, lens, evidence)
     in_camera = []
-    for line in worked.lines:
+    for line in worked["lines"]:
         if found := re.fullmatch(r"[xyz]_cam = (.*) = (\S+) m", line):
             assert eval(found[1]) == pytest.approx(float(found[2]), abs=1e-4)
             in_camera.append(float(found[2]))
         if found := re.fullmatch(r"[uv] = .* = (.*) = (\S+) px", line):
             assert eval(found[1]) == pytest.approx(float(found[2]), abs=0.06)
-    assert worked.pixel == pytest.approx(lens.project(np.array(in_camera))[0], abs=0.01)
+    assert worked["pixel"] == pytest.approx(lens.project(np.array(in_camera))[0], abs=0.01)
 
 
 def test_points_on_the_board_lie_where_residuals_say(one):

@@ -1,0 +1,308 @@
+"""Drawings of a calibration: where its boards were, its residuals, its covariance."""
+
+from collections.abc import Mapping, Sequence
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from lce_rig.core.board import Board
+from lce_rig.core.calibration import Calibration
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.detect.events.figures import outline_px
+from lce_rig.judge.findings import cause_words
+from lce_rig.judge.reach import point_uncertainties
+from lce_rig.show.report.drawing import BLUE, FAINT, INK, ORANGE, QUIET, WIDTH_IN, drawing, new_axes
+from lce_rig.show.report.evidence import Evidence
+
+_LINE = 0.8
+# Cells along the width of the image, points or corners that one needs, names along an axis.
+_CELLS, _MIN_IN_CELL, _MOST_LABELS = 14, 5, 10
+_DISTANCES_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0)
+# Causes of less than this, in percent, are in the table only.
+_LEAST_SHARE = 0.5
+_CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 73)), np.sin(np.linspace(0, 2 * np.pi, 73))])
+# From behind, from above, from the side: what a view shows to the right and vertically, axes of the camera.
+_VIEWS = ((0, 1), (0, 2), (2, 1))
+_AXES = ("x right", "y down", "z forward")
+
+
+def _image_axes(lens: Intrinsics, below_in: float = 0.0) -> tuple[Any, Any]:
+    """Start a figure with axes as the camera's image, pixels, v down; `below_in` stays free below them."""
+    left_in, right_in, bottom_in, top_in = 0.42, 0.1, 0.42 + below_in, 0.25
+    image_in = (WIDTH_IN - left_in - right_in) * lens.height_px / lens.width_px
+    figure, (axes,) = new_axes(
+        image_in + bottom_in + top_in, left_in=left_in, right_in=right_in, bottom_in=bottom_in, top_in=top_in
+    )
+    axes.set_xlim(-0.5, lens.width_px - 0.5)
+    axes.set_ylim(lens.height_px - 0.5, -0.5)
+    axes.set_xlabel("u, px")
+    axes.set_title("v, px")
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+    return figure, axes
+
+
+def draw_in_image(evidence: Evidence, board: Board, lens: Intrinsics, links: Mapping[str, str]) -> Markup:
+    """Draw the outline of every board into the plane of the image."""
+    figure, axes = _image_axes(lens)
+    outlines = [outline_px(o.image.T_cam_board, board, lens) for o in evidence.observations]
+    alpha = float(np.clip(4 / len(outlines), 0.07, 0.3))
+    visible = [outline[np.isfinite(outline).all(axis=1)][::6] for outline in outlines]
+    _add_shapes(axes, visible, [links[o.capture] for o in evidence.observations], alpha)
+    return drawing(figure, "Outlines of the boards in the image")
+
+
+def draw_from_above(
+    calibration: Calibration, evidence: Evidence, board: Board, lens: Intrinsics, links: Mapping[str, str]
+) -> Markup:
+    """Draw the plates about the LiDAR as seen from above, with the camera's field of view."""
+    from matplotlib.patches import Circle
+
+    # Left is +y of the LiDAR, up is +x.
+    plates = [transform(o.lidar.T_lidar_board, board.outline())[:, 1::-1] for o in evidence.observations]
+    shown = np.concatenate([*plates, np.zeros((1, 2))])
+    far_m = float(np.linalg.norm(shown, axis=1).max())
+    low, high = shown.min(axis=0) - 0.1 * far_m, shown.max(axis=0) + 0.1 * far_m
+    wide_m, high_m = high - low
+    missing_m = max(0.5 * wide_m - high_m, 0.0) / 2, max(high_m - wide_m, 0.0) / 2
+    low, high = low - missing_m[::-1], high + missing_m[::-1]
+    wide_m, high_m = high - low
+    figure, (axes,) = new_axes(WIDTH_IN * high_m / wide_m, left_in=0, right_in=0, bottom_in=0, top_in=0)
+    # The direction with most room shows the circles' radii.
+    signs = np.concatenate([-np.eye(2), np.eye(2)])
+    radial = signs[int(np.argmax([-low[0], -low[1], high[0], high[1]]))]
+    step_m = next(step for step in (0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 1e6) if far_m / step <= 6)
+    for radius_m in np.arange(step_m, 1.5 * far_m, step_m):
+        axes.add_patch(Circle((0, 0), radius_m, fill=False, edgecolor=FAINT, linewidth=0.6))
+        axes.text(
+            *(radius_m * radial), f"{radius_m:g} m", color=QUIET, ha="center", va="center", clip_on=True
+        )
+    # The rays through the middles of the image's left and right borders.
+    T_lidar_cam, middle = invert(calibration.T_cam_lidar), (lens.height_px - 1) / 2
+    rays = lens.unproject(np.array([[0.0, middle], [lens.width_px - 1.0, middle]]))
+    start = T_lidar_cam[:3, 3]
+    for ray in rays[np.isfinite(rays).all(axis=1)]:
+        end = start + 2 * far_m * T_lidar_cam[:3, :3] @ ray
+        axes.plot([start[1], end[1]], [start[0], end[0]], color=ORANGE, linewidth=_LINE)
+    axes.plot(start[1], start[0], "s", color=ORANGE, markersize=3)
+    _add_shapes(axes, plates, [links[o.capture] for o in evidence.observations], 0.5)
+    axes.plot(0, 0, "o", color=INK, markersize=4)
+    axes.set_xlim(high[0], low[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_axis_off()
+    return drawing(figure, "Boards around the LiDAR, from above")
+
+
+def draw_ranges_and_angles(evidence: Evidence, links: Mapping[str, str]) -> Markup:
+    """Draw each board's distance from the LiDAR and the angle at which the beam meets it."""
+    figure, (axes,) = new_axes(2.4)
+    angle_deg = np.array([o.lidar.quality.incidence_deg for o in evidence.observations])
+    points = axes.scatter(evidence.range_m, angle_deg, s=26, color=BLUE, alpha=0.8, linewidths=0)
+    points.set_urls([links[o.capture] for o in evidence.observations])
+    axes.set_xlim(0, 1.1 * float(evidence.range_m.max()))
+    axes.set_ylim(0, max(60.0, 1.1 * float(angle_deg.max())))
+    axes.set_xlabel("distance from the LiDAR, m")
+    axes.set_title("angle to the beam, deg")
+    axes.grid()
+    return drawing(figure, "Distance and angle of the boards")
+
+
+def _add_shapes(axes: Any, shapes: Sequence[Array], links: list[str], alpha: float) -> None:
+    """Add polygons (N, 2), each a link."""
+    from matplotlib.collections import PolyCollection
+
+    drawn = PolyCollection(shapes, facecolors=BLUE, edgecolors=BLUE, alpha=alpha, linewidths=_LINE)
+    drawn.set_urls(links)
+    axes.add_collection(drawn, autolim=False)
+
+
+def draw_by_capture(calibration: Calibration, links: Mapping[str, str]) -> Markup:
+    """Draw two bars for each capture, planes and edges, which lead to its overlay."""
+    residuals = calibration.residuals
+    at = np.arange(len(residuals))
+    figure, (axes,) = new_axes(2.4)
+    for shift, colour, name, values in (
+        (-0.2, BLUE, "planes", [r.plane_mean_m for r in residuals]),
+        (0.2, ORANGE, "edges", [r.edge_mean_m for r in residuals]),
+    ):
+        bars = axes.bar(at + shift, 1000 * np.nan_to_num(values), 0.4, color=colour, label=name)
+        for bar, residual in zip(bars, residuals, strict=True):
+            bar.set_url(links[residual.capture])
+    every = -(-len(residuals) // _MOST_LABELS)
+    names = [r.capture.rpartition("/")[2].lstrip("0") or "0" for r in residuals]
+    axes.set_xticks(at[::every], names[::every])
+    axes.set_xlabel("capture")
+    axes.set_title("mean distance, mm")
+    axes.grid(axis="y")
+    axes.set_axisbelow(True)
+    axes.margins(x=0.01)
+    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0, handlelength=1.2)
+    return drawing(figure, "Residuals by capture")
+
+
+def draw_by_ring(evidence: Evidence) -> Markup:
+    """Draw how far each laser ring's points lie behind the camera's board planes on average."""
+    rings = np.unique(evidence.ring)
+    behind_mm = [1000 * evidence.plane_m[evidence.ring == ring] for ring in rings]
+    figure, (axes,) = new_axes(2.4)
+    _zero(axes)
+    axes.errorbar(
+        rings, [values.mean() for values in behind_mm], [values.std() for values in behind_mm],
+        fmt="o", color=BLUE, ecolor=FAINT, markersize=4, elinewidth=1.2,
+    )  # fmt: skip
+    axes.set_xlabel("ring, as the scan numbers it")
+    axes.set_title("behind the plane, mm")
+    return drawing(figure, "Residuals by ring")
+
+
+def draw_by_range(evidence: Evidence, links: Mapping[str, str]) -> Markup:
+    """Draw how far each board lies behind the camera's plane by its distance from the LiDAR."""
+    n = len(evidence.observations)
+    counts = np.bincount(evidence.capture, minlength=n)
+    mean_mm = 1000 * np.bincount(evidence.capture, evidence.plane_m, n) / counts
+    rms_mm = 1000 * np.sqrt(np.bincount(evidence.capture, evidence.plane_m**2, n) / counts)
+    spread_mm = np.sqrt(np.maximum(rms_mm**2 - mean_mm**2, 0))
+    figure, (axes,) = new_axes(2.4)
+    _zero(axes)
+    axes.errorbar(evidence.range_m, mean_mm, spread_mm, fmt="none", ecolor=FAINT, elinewidth=1.2)
+    points = axes.scatter(evidence.range_m, mean_mm, s=20, color=BLUE, zorder=3, linewidths=0)
+    points.set_urls([links[o.capture] for o in evidence.observations])
+    axes.set_xlim(0, 1.05 * float(evidence.range_m.max()))
+    axes.set_xlabel("distance from the LiDAR, m")
+    axes.set_title("behind the plane, mm")
+    return drawing(figure, "Residuals by range")
+
+
+def _zero(axes: Any) -> None:
+    axes.axhline(0, color=QUIET, linewidth=0.8)
+    axes.grid(axis="y")
+
+
+def draw_by_place(evidence: Evidence, lens: Intrinsics) -> Markup:
+    """Draw the mean residual of the points in each cell of the image."""
+    is_seen = lens.is_inside(evidence.points_px, -0.5)
+    cells, means_mm = _cell_means(evidence.points_px[is_seen], 1000 * evidence.plane_m[is_seen, None], lens)
+    figure, axes = _image_axes(lens, below_in=0.6)
+    size_px = lens.width_px / _CELLS
+    grid = np.full((int(np.ceil(lens.height_px / size_px)), _CELLS), np.nan)
+    for (u, v), value in zip(cells.astype(int), means_mm[:, 0], strict=True):
+        grid[v, u] = value
+    limit_mm = max(float(np.nanmax(np.abs(grid), initial=0.0)), 1.0)
+    edges_u, edges_v = (size_px * np.arange(n + 1) - 0.5 for n in grid.shape[::-1])
+    shown = axes.pcolormesh(edges_u, edges_v, grid, cmap="RdBu_r", vmin=-limit_mm, vmax=limit_mm)
+    height_in = figure.get_size_inches()[1]
+    place = figure.add_axes((0.25, 0.4 / height_in, 0.6, 0.1 / height_in))
+    bar = figure.colorbar(shown, cax=place, orientation="horizontal")
+    bar.set_label("behind the plane, mm")
+    bar.outline.set_visible(False)
+    return drawing(figure, "Residuals by place in the image")
+
+
+def draw_corners(evidence: Evidence, lens: Intrinsics) -> Markup:
+    """Draw the mean residual of the corners in each cell of the image as an arrow."""
+    cells, means = _cell_means(
+        evidence.corners_px, np.hstack([evidence.corners_px, evidence.corner_residuals_px]), lens
+    )
+    figure, axes = _image_axes(lens)
+    axes.plot(
+        *evidence.corners_px[:: max(1, len(evidence.corners_px) // 1500)].T, ".", color=FAINT, markersize=1
+    )
+    if len(cells):
+        usual_px = max(float(np.percentile(np.linalg.norm(means[:, 2:], axis=1), 90)), 1e-3)
+        scale = usual_px / (lens.width_px / _CELLS)
+        arrows = axes.quiver(
+            *means.T, color=BLUE, angles="xy", scale_units="xy", scale=scale, width=0.004, zorder=3
+        )
+        axes.quiverkey(arrows, 0.92, 1.05, usual_px, f"{usual_px:.2g} px ", labelpos="W", labelcolor=INK)
+    return drawing(figure, "Residuals of the corners in the image")
+
+
+def _cell_means(pixels: Array, values: Array, lens: Intrinsics) -> tuple[Array, Array]:
+    """Average values (N, K) over square cells of the image: cells (M, 2) by column and row, means (M, K)."""
+    at = np.floor((pixels + 0.5) * _CELLS / lens.width_px)
+    cells, index, counts = np.unique(at, axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(cells), values.shape[1]))
+    np.add.at(sums, index.ravel(), values)
+    is_full = counts >= _MIN_IN_CELL
+    return cells[is_full], (sums / counts[:, None])[is_full]
+
+
+def principal_axes(cov: Array) -> tuple[Array, Array]:
+    """Find the standard deviations (3,) along the principal axes (3, 3), columns, the largest first."""
+    variances, directions = np.linalg.eigh(cov)
+    order = np.argsort(variances)[::-1]
+    directions = directions[:, order]
+    # Eigenvectors have no sign of their own.
+    largest = np.abs(directions).argmax(axis=0)
+    directions = directions * np.sign(directions[largest, range(3)])
+    return np.sqrt(np.maximum(variances[order], 0)), directions
+
+
+def draw_ellipsoid(cov: Array, unit: str, label: str) -> Markup:
+    """Draw a covariance (3, 3) from three sides: 1 and 2 standard deviations, and its principal axes."""
+    sigmas, directions = principal_axes(cov)
+    limit = 2.3 * float(np.sqrt(np.diag(cov).max()))
+    figure, row = new_axes(1.65, 3, between_in=0.42)
+    for axes, (right, down) in zip(row, _VIEWS, strict=True):
+        shape = np.linalg.cholesky(cov[np.ix_([right, down], [right, down])] + 1e-12 * limit**2 * np.eye(2))
+        for n_sigmas, width in ((1, 1.4), (2, 0.7)):
+            axes.plot(*(n_sigmas * shape @ _CIRCLE), color=BLUE, linewidth=width)
+        for sigma, direction in zip(sigmas, directions.T, strict=True):
+            end = sigma * direction[[right, down]]
+            axes.plot(*np.stack([-end, end]).T, color=ORANGE, linewidth=1)
+        axes.set_xlim(-limit, limit)
+        axes.set_ylim(limit if down == 1 else -limit, -limit if down == 1 else limit)
+        axes.set_aspect("equal")
+        axes.set_xlabel(f"{_AXES[right]}, {unit}")
+        axes.set_title(f"{_AXES[down]}, {unit}")
+        axes.locator_params(nbins=3)
+    return drawing(figure, label)
+
+
+def draw_by_distance(calibration: Calibration, lens: Intrinsics) -> Markup:
+    """Draw the expected error of a LiDAR point in pixels and in centimetres by its distance."""
+    points = point_uncertainties(calibration.T_cam_lidar, calibration.cov, lens, _DISTANCES_M)
+    figure, (left, right) = new_axes(2.1, 2)
+    _draw_reach(left, [p.centre_px for p in points], [p.corner_px for p in points], "error in the image, px")
+    _draw_reach(
+        right, [100 * p.centre_m for p in points], [100 * p.corner_m for p in points], "error in space, cm"
+    )
+    left.legend(loc="best", handlelength=1.2)
+    return drawing(figure, "Error of a LiDAR point by its distance")
+
+
+def _draw_reach(axes: Any, centre: Sequence[float], corner: Sequence[float], title: str) -> None:
+    axes.plot(_DISTANCES_M, centre, color=BLUE, label="in the middle")
+    axes.plot(_DISTANCES_M, corner, color=ORANGE, label="in the worst corner")
+    axes.set_xlabel("distance, m")
+    axes.set_title(title)
+    axes.set_xlim(0, _DISTANCES_M[-1])
+    axes.set_ylim(0, 1.1 * max(*centre, *corner))
+    axes.grid()
+
+
+def draw_causes(calibration: Calibration) -> Markup:
+    """Draw what share of the variance each cause has, in rotation and in translation."""
+    causes = calibration.contributions
+    squares = np.array([[c.sigma_rotation_deg, c.sigma_translation_m] for c in causes]) ** 2
+    shares = 100 * squares / np.maximum(squares.sum(axis=0), 1e-30)
+    is_shown = shares.max(axis=1) >= _LEAST_SHARE
+    shares = shares[is_shown]
+    names = [
+        cause_words(c.source).removeprefix("the ") for c, shown in zip(causes, is_shown, strict=True) if shown
+    ]
+    at = np.arange(len(names))
+    figure, (axes,) = new_axes(0.75 + 0.42 * len(names), left_in=2.0)
+    axes.barh(at - 0.2, shares[:, 0], 0.38, color=BLUE, label="rotation")
+    axes.barh(at + 0.2, shares[:, 1], 0.38, color=ORANGE, label="translation")
+    axes.set_yticks(at, [fill(name, 28) for name in names], color=INK)
+    axes.tick_params(axis="y", length=0)
+    axes.invert_yaxis()
+    axes.set_xlabel("share of the variance, %")
+    axes.grid(axis="x")
+    axes.set_axisbelow(True)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0, handlelength=1.2)
+    return drawing(figure, "Causes of the uncertainty")
