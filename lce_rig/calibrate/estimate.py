@@ -4,7 +4,7 @@
     join_scans           the images of all channels that share a scan
     estimate_motion      time offsets and motion of the boards: one pose of the board at the time of each scan
     solve                Algorithm 1: extrinsics from planes and ring ends, certified, without outliers
-    refine               method "ml": extrinsics, board poses and constant errors of maximum likelihood
+    maximise_likelihood  method "ml": extrinsics, board poses and constant errors of maximum likelihood
     by_scatter,
     by_likelihood        uncertainty
 
@@ -19,8 +19,8 @@ import numpy as np
 
 from lce_rig.calibrate.algorithm_1.algorithm import Progress, solve
 from lce_rig.calibrate.consensus import Consensus, find_consensus
+from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
-from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.motion.board_motion import sample_poses
 from lce_rig.calibrate.motion.time_offsets import MIN_MOVING, Motion, estimate_motion
 from lce_rig.calibrate.observations import Clocks, join_scans, pooled_noise_px
@@ -161,7 +161,7 @@ def estimate_observations(
     if settings.method == "paper":
         return by_scatter(start, board, settings)
     priors, usual = what_is_known(settings)
-    joint = refine([start.observations], board, [start.T_cam_lidar], priors, usual)
+    joint = maximise_likelihood([start.observations], board, [start.T_cam_lidar], priors, usual)
     return by_likelihood(start, joint, board, settings)
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lce_rig.calibrate.findings import TWO_PLACES
+from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import PoseLevels, what_is_known
 from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
-from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.observations import group_shared_placements, scan_key
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.result import CalibrationEstimate, Start, report
@@ -68,7 +68,7 @@ def calibrate_together(
     usual = known[0][1]
     priors = replace(known[0][0], scale=tuple(float(np.ravel(each.scale)[0]) for each, _ in known))
     T_start = [start.T_cam_lidar for start in starts]
-    joint = refine(labelled, board, T_start, priors, usual, pose_ratios=_pose_ratios(starts))
+    joint = maximise_likelihood(labelled, board, T_start, priors, usual, pose_ratios=_pose_ratios(starts))
     order = {name: k for k, name in enumerate(sorted({o.capture for own in labelled for o in own}))}
     placement = group_shared_placements(labelled, order)
     J = joint.to_extrinsics.reshape(-1, joint.to_extrinsics.shape[2])

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.covariance import symmetric_inverse, systematic_covariances
-from lce_rig.calibrate.likelihood.along_rays import N_SHIFTS, SHIFTS, interior, stack_scans
+from lce_rig.calibrate.likelihood.fit import JointEstimate, stack_camera
+from lce_rig.calibrate.likelihood.layout import SHIFTS
 from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
-from lce_rig.calibrate.likelihood.refine import JointEstimate, stack_camera
-from lce_rig.calibrate.likelihood.system import PER_CAMERA, Assembly, linearise
+from lce_rig.calibrate.likelihood.model import Assembly, linearise
+from lce_rig.calibrate.likelihood.rays import interior, stack_scans
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
@@ -95,7 +96,7 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
     """
     n_cameras = len(joint.T_cam_lidar)
     order = [camera, *(c for c in range(n_cameras) if c != camera)]
-    mine = np.concatenate([np.arange(6) + PER_CAMERA * c for c in order])
+    mine = np.concatenate([joint.layout.camera(c) for c in order])
     # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
     prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
     return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)), placement=placement)
@@ -103,23 +104,23 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
 
 def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:
     """Replace the start's constant errors, noise levels and covariance parts by those of a joint estimate."""
-    levels, J = joint.levels, joint.to_extrinsics[camera]
-    shifts = dict(zip(SHIFTS, joint.shifts.tolist(), strict=True))
+    levels, state, J = joint.levels, joint.state, joint.to_extrinsics[camera]
+    shifts = dict(zip(SHIFTS, state.shifts.tolist(), strict=True))
     figures = replace(
         start,
         covariance_inflation=inflation,
         edge_shift_m=shifts["d_0"],
-        edge_shift_sigma_m=float(joint.constants_sigma[-N_SHIFTS]),
+        edge_shift_sigma_m=float(joint.sigma[joint.layout.z["shifts"]][0]),
         edge_shift_echo_m=shifts["d_1"],
         edge_shift_blended_m=shifts["d_2"],
         edge_shift_blended_echo_m=shifts["d_3"],
-        range_offset_m=float(np.mean(joint.lasers[0])),
-        laser_spread_m=float(np.std(joint.lasers[0])),
-        lens_lateral_m=float(joint.fields[0]),
-        lens_vertical_m_per_rad=float(joint.fields[1]),
-        bow_width_m=float(joint.fields[-2]),
-        bow_height_m=float(joint.fields[-1]),
-        camera_scale=1.0 - float(joint.scale[camera]),
+        range_offset_m=float(np.mean(state.lasers[0])),
+        laser_spread_m=float(np.std(state.lasers[0])),
+        lens_lateral_m=float(state.fields[0]),
+        lens_vertical_m_per_rad=float(state.fields[1]),
+        bow_width_m=float(state.fields[-2]),
+        bow_height_m=float(state.fields[-1]),
+        camera_scale=1.0 - float(state.scale[camera]),
         noise_range_m=levels.range_m,
         noise_ring_m=levels.ring_m,
         noise_ring_end_mrad=1e3 * levels.edge_rad,
@@ -154,7 +155,7 @@ def moves_under(
         lidars = {o.capture: o.lidar for o in variant.observations}
         is_of_image = variant.board == board and all(o.lidar is lidars[o.capture] for o in used)
         if is_of_image:
-            moved = here.with_images(images, joint.state)
+            moved = here.with_images(images)
         else:
             scans = stack_scans([interior(lidars[name], variant.board) for name in order], variant.board)
             terms = linearise(scans, images, variant.board, joint.state, joint.trust)

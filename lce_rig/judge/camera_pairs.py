@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lce_rig.calibrate.covariance import symmetric_inverse
-from lce_rig.calibrate.likelihood.image_terms import stack_images
+from lce_rig.calibrate.likelihood.images import stack_images
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.observations import group_placements, scan_key
 from lce_rig.calibrate.quadratics import Quadratics, without_prior
@@ -118,7 +118,7 @@ def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPai
 def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> RelativePose | None:
     """Estimate T_second_first from both cameras' images of the same boards.
 
-    An image's pose has the errors of its corners' noise and errors that corners share (`image_terms`).
+    An image's pose has the errors of its corners' noise and errors that corners share (`likelihood.images`).
 
     Returns:
         None for fewer than four placements.

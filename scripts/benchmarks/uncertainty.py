@@ -15,20 +15,13 @@ from benchmarks.profile_errors import with_profile_errors
 from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
 from lce_rig.calibrate import CalibrateOptions, EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.likelihood.along_rays import (
-    N_FIELDS,
-    N_OF_LASER,
-    N_SHIFTS,
-    SHIFTS,
-    EdgeRows,
-    interior,
-    stack_scans,
-)
 from lce_rig.calibrate.likelihood.end_density import density
-from lce_rig.calibrate.likelihood.image_terms import stack_images
+from lce_rig.calibrate.likelihood.fit import to_extrinsic
+from lce_rig.calibrate.likelihood.images import stack_images
+from lce_rig.calibrate.likelihood.layout import END, SHIFTS, State
 from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
-from lce_rig.calibrate.likelihood.refine import to_extrinsic
-from lce_rig.calibrate.likelihood.system import PER_CAMERA, State, Terms, assemble, linearise
+from lce_rig.calibrate.likelihood.model import Terms, assemble, linearise
+from lce_rig.calibrate.likelihood.rays import EdgeRows, interior, stack_scans
 from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.calibration import Method
 from lce_rig.core.data_sheets import VLP_16
@@ -213,7 +206,7 @@ def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: 
         T_cam_lidar: (4, 4) the truth.
     """
     information = assemble(terms, levels, priors).cost.information
-    J = to_extrinsic(T_cam_lidar, 0, len(information))
+    J = to_extrinsic(T_cam_lidar, 0, terms.state.layout)
     return np.asarray(J @ np.linalg.inv(information) @ J.T)
 
 
@@ -228,13 +221,12 @@ def _true_levels(noise: LidarNoise, edges: Sequence[EdgeRows]) -> Levels:
 def _at_truth(rig: Rig, session: StillSession) -> Terms:
     found = [item for item in session.candidates if is_board(session, item)]
     board = rig.board.to_board()
-    scans = stack_scans([interior(item.lidar[0], board) for item in found], board)
+    scans = stack_scans([interior(item.lidar, board) for item in found], board)
     pictures = stack_images(np.arange(len(found)), [item.image for item in found], board)
     T = session.T_cam_lidar
     T_lidar_board = invert(T) @ np.array([session.T_cam_board[item.capture] for item in found])
-    constants = np.zeros(PER_CAMERA + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)
     return linearise(
-        scans, (pictures,), board, State(T[None], T_lidar_board, np.zeros(len(found)), constants)
+        scans, (pictures,), board, State.without_errors(T[None], T_lidar_board, len(scans.rings))
     )
 
 
@@ -256,8 +248,7 @@ def _fit_ends(edges: Sequence[EdgeRows]) -> dict[str, float]:
     )
 
     # A displacement of all ring ends is the truth's to tell: none.
-    first = rows.shape[1] - 1 - N_SHIFTS
-    by_width_mm = rows[:, first : -1 - len(_DISPLACEMENT)] / 1e3
+    by_width_mm = rows[:, END["shifts"]][:, : -len(_DISPLACEMENT)] / 1e3
     n = by_width_mm.shape[1]
 
     def cost(x: Array) -> float:

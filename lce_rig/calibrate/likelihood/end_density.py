@@ -18,7 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.along_rays import EdgeRows
+from lce_rig.calibrate.likelihood.rays import EdgeRows
 from lce_rig.core.geometry import Array
 
 STRAY = 0.01

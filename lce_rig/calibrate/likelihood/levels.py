@@ -30,7 +30,7 @@ class Levels:
     Attributes:
         range_m: noise of a single range.
         ring_m: error that the returns of one ring in one capture share, beyond the laser's offset.
-        edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`along_rays`).
+        edge_rad: blur of the ends of a ring end's interval, across the beam, by range (`rays`).
         backed_rad: the same with an object close behind.
         lost_share: fraction of ring ends whose last returns are missing.
         own_shift_m: what each capture adds to the edge shift of all.
@@ -86,12 +86,12 @@ class Priors:
 
     Attributes:
         offset_m: range offset common to all lasers.
-        shift_m: edge shift d_0, `along_rays`.
+        shift_m: edge shift d_0, `rays`.
         growth: c, its change with range; recordings show none.
         background_m: d_1, d_2 and d_3, by the background of the edge.
         plate_m: p, half the difference of what its width and height are off by.
         displacement_m: displacement of all ring ends against the returns between them.
-        lateral_m: lens beside the LiDAR's axis, `along_rays`.
+        lateral_m: lens beside the LiDAR's axis, `rays`.
         vertical_m: its height, per rad of elevation.
         bow_m: height of the plate's middle over its ends, along its width and its height.
         azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
@@ -117,15 +117,14 @@ class Priors:
     profile_is_claimed: bool = True
 
     @property
-    def fields(self) -> Array:
-        """Deviations (4,) in the order of `along_rays.FIELDS`."""
-        return np.array([self.lateral_m, self.vertical_m, self.bow_m, self.bow_m])
-
-    @property
-    def shifts(self) -> Array:
-        """Deviations (8,) in the order of `along_rays.SHIFTS`."""
+    def independent(self) -> dict[str, Array]:
+        """Deviations of lens (2,), bow (2,) and shifts (8,), as `layout` names them."""
         of_width = [self.shift_m, self.growth, *self.background_m, self.plate_m]
-        return np.array([*of_width, self.displacement_m, self.displacement_m])
+        return {
+            "lens": np.array([self.lateral_m, self.vertical_m]),
+            "bow": np.array([self.bow_m, self.bow_m]),
+            "shifts": np.array([*of_width, self.displacement_m, self.displacement_m]),
+        }
 
 
 # Offsets of lasers without any in the profile.

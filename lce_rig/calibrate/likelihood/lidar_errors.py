@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.along_rays import ERRORS_OF_LASER, N_LENS, N_OF_LASER
+from lce_rig.calibrate.likelihood.fit import JointEstimate, maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
-from lce_rig.calibrate.likelihood.refine import JointEstimate, refine
 from lce_rig.calibrate.options import EstimateSettings, KnownLidar
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -64,26 +63,23 @@ def estimate_lidar(
         for k, observations in enumerate(sessions)
     ]
     priors, usual = what_is_known(replace(options, known=None))
-    joint = refine(apart, board, T_cam_lidar, priors, usual)
+    joint = maximise_likelihood(apart, board, T_cam_lidar, priors, usual)
     known, prior = lidar_of(joint), _prior_sigma(joint)
     rings = np.concatenate([o.lidar.ring for own in sessions for o in own])
-    n_points = np.array([np.count_nonzero(rings == ring) for ring in joint.rings])
-    assert len(prior) == len(ERRORS_OF_LASER)
+    n_points = np.array([np.count_nonzero(rings == ring) for ring in joint.terms.rings])
     return LidarErrors(known, prior, tuple(len(own) for own in sessions), n_points)
 
 
 def lidar_of(joint: JointEstimate) -> KnownLidar:
     """Read the LiDAR's constant errors from a joint estimate; a laser's deviations are about the mean."""
-    L = len(joint.rings)
-    cov = joint.cost.covariance()[-len(joint.constants_sigma) :, -len(joint.constants_sigma) :]
-    about_mean = np.eye(L) - 1 / L
-    parts = [cov[k * L : (k + 1) * L, k * L : (k + 1) * L] for k in range(N_OF_LASER)]
-    sigma = np.sqrt([np.diag(about_mean @ part @ about_mean) for part in parts])
+    layout, L = joint.layout, len(joint.terms.rings)
+    cov, about_mean = joint.cost.covariance(), np.eye(L) - 1 / L
+    sigma = np.sqrt([np.diag(about_mean @ cov[at[:, None], at] @ about_mean) for at in layout.lasers])
     # Lasers that met few boards are known as well as without them.
     sigma = np.minimum(sigma * WIDENED[:, None], np.maximum(sigma, _prior_sigma(joint)[:, None]))
-    lens = slice(N_OF_LASER * L, N_OF_LASER * L + N_LENS)
-    rings = joint.rings.astype(np.intp)
-    return KnownLidar(rings, joint.lasers, sigma, joint.fields[:N_LENS], joint.constants_sigma[lens])
+    lens = layout.z["lens"]
+    rings = joint.terms.rings.astype(np.intp)
+    return KnownLidar(rings, joint.state.lasers, sigma, joint.state.z[lens], joint.sigma[lens])
 
 
 def _prior_sigma(joint: JointEstimate) -> Array:

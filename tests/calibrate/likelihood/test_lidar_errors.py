@@ -7,9 +7,9 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings
 from lce_rig.calibrate.consensus import find_consensus
+from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.likelihood.lidar_errors import WIDENED, estimate_lidar
-from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.core.geometry import difference, exp_so3, pose
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
@@ -59,7 +59,7 @@ def test_errors_known_from_other_sessions_sharpen_a_later_one():
     known = measured(3).found
     later = observations(3, slice(16, 24), T_FORWARD)
     plain, helped = (
-        refine([later], BOARD, [T_FORWARD], Priors(known=k), replace(Levels(), laser_m=0.008))
+        maximise_likelihood([later], BOARD, [T_FORWARD], Priors(known=k), replace(Levels(), laser_m=0.008))
         for k in (None, known)
     )
     sizes = [np.sqrt(np.trace(joint.cov[0][:3, :3])) for joint in (plain, helped)]
@@ -67,7 +67,8 @@ def test_errors_known_from_other_sessions_sharpen_a_later_one():
     off = difference(helped.T_cam_lidar[0], T_FORWARD)
     assert off @ np.linalg.solve(helped.cov[0], off) < 22.5
     ranges = [
-        joint.lasers[0] - joint.lasers[0].mean() - true_ranges(3)[joint.rings] for joint in (plain, helped)
+        joint.state.lasers[0] - joint.state.lasers[0].mean() - true_ranges(3)[joint.terms.rings]
+        for joint in (plain, helped)
     ]
     assert np.std(ranges[1]) < np.std(ranges[0])
 

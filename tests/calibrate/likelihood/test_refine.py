@@ -8,9 +8,9 @@ import pytest
 from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.calibrate.consensus import find_consensus
 from lce_rig.calibrate.features import turn_about_z
-from lce_rig.calibrate.likelihood.along_rays import SHIFTS
+from lce_rig.calibrate.likelihood.fit import maximise_likelihood
+from lce_rig.calibrate.likelihood.layout import SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
-from lce_rig.calibrate.likelihood.refine import refine
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.tolerances import Tolerances, vary
 from lce_rig.calibrate.uncertainty import inflate
@@ -103,7 +103,7 @@ def test_pictures_that_err_by_more_than_their_corners_are_seen_to_do_so():
             observations(30, 1, REAL), np.radians([0.4, 0.4, 0]) * rng.standard_normal((30, 3)), strict=True
         )
     ]
-    joint = refine([tilted], BOARD, [T_FORWARD], usual=Levels(laser_m=0.008))
+    joint = maximise_likelihood([tilted], BOARD, [T_FORWARD], usual=Levels(laser_m=0.008))
     assert 0.3 < np.degrees(joint.levels.tilt_rad) < 0.55
     error = difference(joint.T_cam_lidar[0], T_FORWARD)
     assert error @ np.linalg.solve(joint.cov[0], error) < 25
@@ -114,8 +114,8 @@ def test_a_bent_plate_is_found_by_its_bow():
     flat = observations(20, 0, REAL)
     known = Tolerances(CAMERA, 0.0015, 0.9, 0.45, 0.001, 0.003, 0.002, 0.001)
     bent = next(each for each in vary(flat, BOARD, known) if each.source == "board_bow")
-    joints = [refine([each], BOARD, [T_FORWARD]) for each in (flat, bent.observations)]
-    found = joints[1].fields - joints[0].fields
+    joints = [maximise_likelihood([each], BOARD, [T_FORWARD]) for each in (flat, bent.observations)]
+    found = joints[1].state.fields - joints[0].state.fields
     assert found[-2:] == pytest.approx([bent.step, 0.0], abs=2e-4)
     moved = difference(joints[1].T_cam_lidar[0], joints[0].T_cam_lidar[0])
     assert np.linalg.norm(moved[:3]) < 5e-4
@@ -125,12 +125,12 @@ def test_captures_whose_ring_ends_lie_farther_out_than_the_others_are_seen_to_do
     """The beam reaches 6 mm over the edges of every second capture, 10 mm over those of the others."""
     near, far = (observations(20, 0, replace(REAL, footprint_m=reach_m)) for reach_m in (0.006, 0.010))
     mixed = [*near[::2], *far[1::2]]
-    joint = refine([mixed], BOARD, [T_FORWARD])
+    joint = maximise_likelihood([mixed], BOARD, [T_FORWARD])
     own_m = dict(zip(sorted(o.capture for o in mixed), joint.state.own_shift_m, strict=True))
     apart_m = np.mean([own_m[o.capture] for o in far[1::2]]) - np.mean([own_m[o.capture] for o in near[::2]])
     assert apart_m == pytest.approx(0.004, abs=5e-4)
     assert 0.001 < joint.levels.own_shift_m < 0.003
-    alike = refine([near], BOARD, [T_FORWARD])
+    alike = maximise_likelihood([near], BOARD, [T_FORWARD])
     assert alike.levels.own_shift_m < 0.0005
 
 
@@ -148,8 +148,8 @@ def test_cameras_that_share_captures_share_what_the_lidar_says():
     assert len(second) > 8
     priors, usual = Priors(), Levels(laser_m=0.008)
     start = perturb(T_second, np.array([0.01, -0.01, 0.01, 0.005, 0.005, -0.005]))
-    both = refine([first, second], BOARD, [T_FORWARD, start], priors, usual)
-    alone = refine([second], BOARD, [start], priors, usual)
+    both = maximise_likelihood([first, second], BOARD, [T_FORWARD, start], priors, usual)
+    alone = maximise_likelihood([second], BOARD, [start], priors, usual)
     for T, truth, cov in zip(both.T_cam_lidar, (T_FORWARD, T_second), both.cov, strict=True):
         error = difference(T, truth)
         assert error @ np.linalg.solve(cov, error) < 25
@@ -180,11 +180,11 @@ def test_captures_that_disagree_by_more_than_the_model_knows_widen_the_claim():
         for o, moves in zip(seen, 0.01 * rng.standard_normal((20, 6)) * [1, 1, 1, 0, 0, 0], strict=True)
     ]
     too_small = Levels(across_m=1e-4, depth_m=1e-4, tilt_rad=1e-4, spin_rad=1e-4)
-    joint = refine([shaken], BOARD, [T_FORWARD], levels=too_small)
+    joint = maximise_likelihood([shaken], BOARD, [T_FORWARD], levels=too_small)
     cov, factor = inflate(joint, group_placements(shaken))
     assert factor > 5
     assert np.allclose(cov, factor * joint.cov[0])
-    good = refine([seen], BOARD, [T_FORWARD])
+    good = maximise_likelihood([seen], BOARD, [T_FORWARD])
     assert inflate(good, group_placements(seen))[1] < 2
 
 
@@ -192,8 +192,8 @@ def test_edges_before_something_close_behind_have_a_shift_of_their_own():
     """In two of three captures a person stands behind the board's left half: it ends 6 mm sooner there."""
     plain = observations(20, 8, REAL)
     held = [hold_from_behind(o, 0.006) if k % 3 else o for k, o in enumerate(plain)]
-    joint = refine([held], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
-    assert abs(joint.shifts[SHIFTS.index("d_2")] + 0.006) < 0.0015
+    joint = maximise_likelihood([held], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
+    assert abs(joint.state.shifts[SHIFTS.index("d_2")] + 0.006) < 0.0015
     error = difference(joint.T_cam_lidar[0], T_FORWARD)
     assert error @ np.linalg.solve(joint.cov[0], error) < 25
     assert np.linalg.norm(error[:3]) < 0.003
@@ -203,12 +203,12 @@ def test_a_bright_background_takes_the_edges_and_is_allowed_for():
     """Two of three boards have a bright wall behind their left half, whose echo wins sooner, by 8 mm."""
     plain = observations(20, 9, REAL)
     lit = [lighten(o, share=0.5, sooner_m=0.008) if k % 3 else o for k, o in enumerate(plain)]
-    joint = refine([lit], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
-    assert abs(joint.shifts[SHIFTS.index("d_1")] + 0.016) < 0.003
+    joint = maximise_likelihood([lit], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
+    assert abs(joint.state.shifts[SHIFTS.index("d_1")] + 0.016) < 0.003
     error = difference(joint.T_cam_lidar[0], T_FORWARD)
     assert error @ np.linalg.solve(joint.cov[0], error) < 25
     blind = [replace(o, lidar=replace(o.lidar, edge_echo=np.zeros(len(o.lidar.edge_side)))) for o in lit]
-    unaware = refine([blind], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
+    unaware = maximise_likelihood([blind], BOARD, [T_FORWARD], Priors(), Levels(laser_m=0.008))
     # Shifts of single captures take its place, which say less.
     assert unaware.levels.own_shift_m > 2 * joint.levels.own_shift_m
     assert np.trace(unaware.cov[0]) > 1.1 * np.trace(joint.cov[0])

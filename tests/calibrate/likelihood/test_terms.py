@@ -8,11 +8,11 @@ import pytest
 from scipy.linalg import block_diag
 
 from lce_rig.calibrate.consensus import find_consensus
-from lce_rig.calibrate.likelihood.along_rays import (
-    N_FIELDS,
-    N_OF_LASER,
-    N_SHIFTS,
-    SHIFTS,
+from lce_rig.calibrate.likelihood.images import image_rows, stack_images
+from lce_rig.calibrate.likelihood.layout import END, IMAGE, RETURN, SHIFTS, State
+from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, Levels, Priors
+from lce_rig.calibrate.likelihood.model import Assembly, assemble, linearise
+from lce_rig.calibrate.likelihood.rays import (
     edge_rows,
     lens_fields,
     stack_scans,
@@ -20,37 +20,30 @@ from lce_rig.calibrate.likelihood.along_rays import (
     turn_rays,
     weigh_ranges,
 )
-from lce_rig.calibrate.likelihood.image_terms import image_rows, stack_images
-from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, Levels, Priors
-from lce_rig.calibrate.likelihood.system import Assembly, State, assemble, linearise
 from lce_rig.core.geometry import difference, invert, perturb
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 STEP = 1e-6
-NO_FIELDS, NO_SHIFTS = np.zeros(N_FIELDS), np.zeros(N_SHIFTS)
 
 
-def no_errors(scans):
-    return np.zeros((N_OF_LASER, len(scans.rings)))
+def without_errors(scans, T_lidar_board):
+    return State.without_errors(T_FORWARD[None], T_lidar_board, len(scans.rings))
 
 
-def ends(scans, T_lidar_board, lasers=None, fields=NO_FIELDS, shifts=NO_SHIFTS, own_shift_m=None):
-    """Ring ends at boards' poses, with no errors but those given."""
-    return edge_rows(
-        scans,
-        T_lidar_board,
-        BOARD,
-        no_errors(scans) if lasers is None else lasers,
-        fields,
-        shifts,
-        np.zeros(len(T_lidar_board)) if own_shift_m is None else own_shift_m,
-    )
+def off(state, name, index, value):
+    """Give one constant error a value."""
+    z = state.z.copy()
+    z[state.layout.z[name]][index] = value
+    return replace(state, z=z)
+
+
+def ends(scans, state):
+    return edge_rows(scans, BOARD, state)
 
 
 @pytest.fixture(scope="module")
 def observations():
     found = find_consensus(simulate(4, 0, Scenario(step_deg=1.0)), BOARD)
-    assert found is not None
     return found.observations
 
 
@@ -87,13 +80,14 @@ def freedoms(scans, T_lidar_board):
 def test_derivatives_by_a_boards_pose_are_those_of_differences(scans, T_lidar_board, axis):
     tangent = STEP * np.eye(6)[axis]
     ahead, behind = perturb(T_lidar_board, tangent), perturb(T_lidar_board, -tangent)
-    by_pose = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_FIELDS).by_pose[scans.capture]
+    states = [without_errors(scans, T) for T in (T_lidar_board, ahead, behind)]
+    by_pose = sum_ranges(scans, states[0]).by_pose[scans.capture]
     expected = (ranges_to(scans, ahead) - ranges_to(scans, behind)) / (2 * STEP)
     slopes = np.sum(freedoms(scans, T_lidar_board) * by_pose[:, :, axis], axis=1)
     assert np.allclose(slopes, expected, atol=1e-6)
-    rows = ends(scans, T_lidar_board)
-    inside = [(e.rows[:, -1] + e.step_m / 2) for e in (ends(scans, T) for T in (ahead, behind))]
-    assert np.allclose(rows.rows[:, axis], (inside[0] - inside[1]) / (2 * STEP), atol=1e-6)
+    here, *moved = (ends(scans, state) for state in states)
+    inside = [(e.rows[:, -1] + e.step_m / 2) for e in moved]
+    assert np.allclose(here.rows[:, axis], (inside[0] - inside[1]) / (2 * STEP), atol=1e-6)
 
 
 @pytest.mark.parametrize("lens", [0, 1])
@@ -113,14 +107,13 @@ def test_a_displaced_lens_moves_ranges_and_ends_as_its_derivatives_say(
         )
     there = stack_scans(moved, BOARD)
     gap = there.range_m - ranges_to(there, T_lidar_board) - (scans.range_m - ranges_to(scans, T_lidar_board))
-    sums = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_FIELDS).sums
-    assert sums.shape[2] == 11
     # Displacement along the normal over the ray's slope: what a range along the old ray would have to read.
     n = T_lidar_board[scans.capture, :3, 2]
     by_lens = -np.einsum("ni,ni->n", n, scans.fields[:, :, lens]) / np.sum(n * scans.rays, axis=1)
     assert np.allclose(-gap, theta * by_lens, atol=2e-5)
-    before, after = (ends(s, T_lidar_board).rows[:, -1] for s in (scans, there))
-    expected = theta * ends(scans, T_lidar_board).rows[:, 9 + lens]
+    state = without_errors(scans, T_lidar_board)
+    before, after = (ends(s, state).rows[:, -1] for s in (scans, there))
+    expected = theta * ends(scans, state).rows[:, END["lens"]][:, lens]
     # Points were moved, not rays: their rays meet the plane elsewhere, by less than a hundredth of the shift.
     assert np.allclose(after - before, expected, atol=4e-5)
 
@@ -128,29 +121,29 @@ def test_a_displaced_lens_moves_ranges_and_ends_as_its_derivatives_say(
 @pytest.mark.parametrize("error", [1, 2])
 def test_a_lasers_angles_move_its_ranges_and_ends_as_its_derivatives_say(scans, T_lidar_board, error):
     """One laser points elsewhere by 0.05 mrad: as if its rays were turned."""
-    lasers, ring = no_errors(scans), 3
-    lasers[error, ring] = 5e-5
+    plain_state, ring = without_errors(scans, T_lidar_board), 3
+    state = off(plain_state, ("range", "azimuth", "elevation")[error], ring, 5e-5)
     is_mine = scans.ring == ring
     turned = scans.rays + np.where(is_mine, 5e-5, 0.0)[:, None] * turn_rays(scans.rays)[:, :, error - 1]
     expected = ranges_to(replace(scans, rays=turned), T_lidar_board) - ranges_to(scans, T_lidar_board)
-    sums = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_FIELDS).sums
+    sums = sum_ranges(scans, plain_state).sums
+    first = RETURN["range"].start
     by_error = [np.sum(expected[is_mine & (scans.capture == k)]) / 5e-5 for k in range(scans.n_captures)]
-    assert np.allclose(sums[:, ring, 3, 3 + error], by_error, rtol=1e-3, atol=0.02)
-    plain, told = (ends(scans, T_lidar_board, each) for each in (None, lasers))
-    slopes = plain.rows[:, 6 + error] * np.where(plain.ring == ring, 5e-5, 0.0)
+    assert np.allclose(sums[:, ring, first, first + error], by_error, rtol=1e-3, atol=0.02)
+    plain, told = (ends(scans, each) for each in (plain_state, state))
+    slopes = plain.rows[:, END["range"].start + error] * np.where(plain.ring == ring, 5e-5, 0.0)
     assert np.allclose(told.rows[:, -1] - plain.rows[:, -1], slopes, atol=1e-7)
     assert np.abs(slopes).max() > 5e-5
 
 
 def test_a_displaced_lens_leaves_ring_ends_at_their_edges(scans, T_lidar_board):
     """Points 25 mm beside their rays, and boards as far the other way: each end keeps its edge and step."""
-    lens = np.array([0.025, 0.0, 0.0, 0.0])
-    plain = ends(scans, T_lidar_board)
+    plain = ends(scans, without_errors(scans, T_lidar_board))
     moved = T_lidar_board.copy()
     centres = moved[:, :3, 3]
     across = np.stack([-centres[:, 1], centres[:, 0], 0 * centres[:, 0]], axis=1)
-    moved[:, :3, 3] += lens[0] * across / np.linalg.norm(across, axis=1, keepdims=True)
-    there = ends(scans, moved, fields=lens)
+    moved[:, :3, 3] += 0.025 * across / np.linalg.norm(across, axis=1, keepdims=True)
+    there = ends(scans, off(without_errors(scans, moved), "lens", 0, 0.025))
     # The board is small: the displacement turns with azimuth by a few millimetres over its width.
     assert np.abs(there.rows[:, -1] - plain.rows[:, -1]).max() < 0.005
     assert np.allclose(there.step_m, plain.step_m, rtol=0.1)
@@ -159,14 +152,13 @@ def test_a_displaced_lens_leaves_ring_ends_at_their_edges(scans, T_lidar_board):
 @pytest.mark.parametrize(("shift", "axis"), [("along azimuth", 0), ("upwards", 2)])
 def test_ring_ends_displaced_against_all_returns_are_what_the_shifts_say(scans, T_lidar_board, shift, axis):
     """Ring ends lie half a millimetre farther along azimuth or upwards than reported; the board stays."""
-    by_shift = NO_SHIFTS.copy()
-    by_shift[SHIFTS.index(shift)] = 5e-4
+    state = without_errors(scans, T_lidar_board)
     direction = scans.end_fields[:, :, 0] if axis == 0 else np.tile([0.0, 0.0, 1.0], (len(scans.end_rays), 1))
-    plain, told = (ends(scans, T_lidar_board, shifts=s) for s in (NO_SHIFTS, by_shift))
+    plain, told = ends(scans, state), ends(scans, off(state, "shifts", SHIFTS.index(shift), 5e-4))
     moved = plain.range_m[:, None] * scans.end_rays + 5e-4 * direction
     there = replace(scans, end_rays=moved / np.linalg.norm(moved, axis=1, keepdims=True))
     there = replace(there, next_rays=there.end_rays + scans.next_rays - scans.end_rays)
-    expected = ends(there, T_lidar_board).rows[:, -1]
+    expected = ends(there, state).rows[:, -1]
     assert np.allclose(told.rows[:, -1], expected, atol=2e-5)
     assert np.ptp(expected - plain.rows[:, -1]) > 5e-4
 
@@ -181,12 +173,16 @@ def test_derivatives_of_pictures_are_those_of_differences(images, T_lidar_board)
         by_board = [
             difference(T_FORWARD @ perturb(T_lidar_board, s * tangent), images.T_cam_board) for s in (1, -1)
         ]
-        assert np.allclose(rows[:, :, axis], (by_camera[0] - by_camera[1]) / (2 * STEP), atol=1e-7)
-        assert np.allclose(rows[:, :, 6 + axis], (by_board[0] - by_board[1]) / (2 * STEP), atol=1e-7)
+        assert np.allclose(
+            rows[:, :, IMAGE["camera"]][..., axis], (by_camera[0] - by_camera[1]) / (2 * STEP), atol=1e-7
+        )
+        assert np.allclose(
+            rows[:, :, IMAGE["pose"]][..., axis], (by_board[0] - by_board[1]) / (2 * STEP), atol=1e-7
+        )
 
 
 def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans, T_lidar_board):
-    ranges = sum_ranges(scans, T_lidar_board, no_errors(scans), NO_FIELDS)
+    ranges = sum_ranges(scans, without_errors(scans, T_lidar_board))
     weighted, log_volume = weigh_ranges(ranges, 0.01, 0.004)
     ring = scans.ring[np.searchsorted(scans.capture, 1)]
     mine = (scans.capture == 1) & (scans.ring == ring)
@@ -194,7 +190,7 @@ def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans,
     by_plane = freedoms(scans, T_lidar_board)[mine]
     v = np.column_stack([by_plane, np.ones(len(r)), r - scans.range_m[mine]])
     cov = 0.01**2 * np.eye(len(r)) + 0.004**2
-    plain = [0, 1, 2, 3, 10]
+    plain = RETURN.of(["plane", "range", "residual"])
     assert np.allclose(weighted[1, ring][np.ix_(plain, plain)], v.T @ np.linalg.solve(cov, v), rtol=1e-8)
     total = 0.0
     for ring in range(len(scans.rings)):
@@ -205,25 +201,31 @@ def test_errors_shared_by_a_rings_returns_are_weighed_by_their_covariance(scans,
 
 def plain_rows(terms, scans, T_lidar_board, levels, r):
     """Rows [by z, by every board pose, residual] of all terms, and the covariance of their noise."""
-    F, L, G = len(terms.ranges.sums), terms.n_rings, len(terms.constants)
+    F, z = len(terms.trust), terms.state.layout.z
     rows, noise = [], []
     by_camera = terms.image_rows[0]
+    names = {"camera": "camera 0", "scale": "scale 0", "bow": "bow"}
+
+    def own_pose(k):
+        return slice(z.size + 6 * k, z.size + 6 * k + 6)
+
     for k in range(F):
-        own = np.zeros((6, G + 6 * F + 1))
-        own[:, :6], own[:, 6], own[:, -1] = by_camera[k, :, :6], by_camera[k, :, 12], by_camera[k, :, 15]
-        own[:, 7 + 3 * terms.n_rings + 2 : 7 + 3 * terms.n_rings + 4] = by_camera[k, :, 13:15]
-        own[:, G + 6 * k : G + 6 * k + 6] = by_camera[k, :, 6:12]
+        own = np.zeros((6, z.size + 6 * F + 1))
+        for name, common in names.items():
+            own[:, z[common]] = by_camera[k][:, IMAGE[name]]
+        own[:, own_pose(k)], own[:, -1] = by_camera[k][:, IMAGE["pose"]], by_camera[k, :, -1]
         rows.append(own)
         noise.append(terms.images[0].total_cov(levels.pose)[k])
     by_plane = freedoms(scans, T_lidar_board)
     for i, k in enumerate(scans.capture):
-        own = np.zeros((1, G + 6 * F + 1))
+        own = np.zeros((1, z.size + 6 * F + 1))
         n = T_lidar_board[k, :3, 2]
-        own[0, G + 6 * k : G + 6 * k + 6] = by_plane[i] @ terms.ranges.by_pose[k]
-        own[0, 7 + scans.ring[i]] = 1
+        own[0, own_pose(k)] = by_plane[i] @ terms.ranges.by_pose[k]
+        own[0, z["range"].start + scans.ring[i]] = 1
         turned = r[i] * turn_rays(scans.rays[i : i + 1])[0]
-        own[0, [7 + L + scans.ring[i], 7 + 2 * L + scans.ring[i]]] = -n @ turned / (n @ scans.rays[i])
-        own[0, 7 + 3 * L : 7 + 3 * L + 4] = -n @ scans.fields[i] / (n @ scans.rays[i])
+        angles = [z[name].start + scans.ring[i] for name in ("azimuth", "elevation")]
+        own[0, angles] = -n @ turned / (n @ scans.rays[i])
+        own[0, z.of(["lens", "bow"])] = -n @ scans.fields[i] / (n @ scans.rays[i])
         own[0, -1] = r[i] - scans.range_m[i]
         rows.append(own)
     same = scans.group[:, None] == scans.group[None]
@@ -240,11 +242,8 @@ def without_ends(edges):
 
 
 def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, images, T_lidar_board):
-    L = len(scans.rings)
-    G = 7 + N_OF_LASER * L + N_FIELDS + N_SHIFTS
-    terms = linearise(
-        scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(4), np.zeros(G))
-    )
+    terms = linearise(scans, (images,), BOARD, without_errors(scans, T_lidar_board))
+    L, G = len(scans.rings), terms.state.layout.z.size
     terms = replace(terms, edges=without_ends(terms.edges))
     priors = Priors()
     r = ranges_to(scans, T_lidar_board)
@@ -257,7 +256,7 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, image
         lasers = block_diag(
             *(a**2 * about_mean + b**2 + 1e-12 * np.eye(L) for a, b in zip(own, common, strict=True))
         )
-        constants = np.square([*priors.fields, *priors.shifts])
+        constants = np.square(np.concatenate(list(priors.independent.values())))
         known = block_diag(priors.scale**-2, np.linalg.inv(lasers), np.diag(1 / constants))
         A, e = rows[:, :-1], rows[:, -1]
         H, g = A.T @ np.linalg.solve(cov, A), A.T @ np.linalg.solve(cov, e)
@@ -277,11 +276,8 @@ def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, image
 
 
 def test_the_evidence_changes_with_each_level_as_its_derivative_says(scans, images, T_lidar_board):
-    zeros = np.zeros(7 + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)
     trust = np.linspace(0.4, 1.0, scans.n_captures)
-    terms = linearise(
-        scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(4), zeros), trust
-    )
+    terms = linearise(scans, (images,), BOARD, without_errors(scans, T_lidar_board), trust)
     assembly, base, step = Assembly(terms, Priors()), Levels(), 1e-3
     value, slopes = assembly.evidence(base, list(LOG_SIGMA))
     assert value == assembly.at(base).minus_2_log_evidence
@@ -294,8 +290,7 @@ def test_the_evidence_changes_with_each_level_as_its_derivative_says(scans, imag
 
 
 def test_what_a_search_for_levels_keeps_is_right_at_each_step_and_gone_with_it(scans, images, T_lidar_board):
-    zeros = np.zeros(7 + N_OF_LASER * len(scans.rings) + N_FIELDS + N_SHIFTS)
-    terms = linearise(scans, (images,), BOARD, State(T_FORWARD[None], T_lidar_board, np.zeros(4), zeros))
+    terms = linearise(scans, (images,), BOARD, without_errors(scans, T_lidar_board))
     assembly, base = Assembly(terms, Priors()), Levels()
     for changed in (base, replace(base, range_m=0.02), replace(base, lost_share=0.3), base):
         plainly = assemble(terms, changed, Priors()).minus_2_log_evidence

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.along_rays import N_BOW, Indices, bow_heights
+from lce_rig.calibrate.likelihood.layout import IMAGE, Indices
 from lce_rig.calibrate.likelihood.levels import PoseLevels
+from lce_rig.calibrate.likelihood.rays import bow_heights
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, difference, skew
 from lce_rig.core.results import ImageBoard
@@ -28,7 +29,7 @@ class StackedImages:
         capture: (P,) which of the stacked captures.
         T_cam_board: (P, 4, 4).
         cov: (P, 6, 6) of the corners' noise, tangent of T_cam_board.
-        by_bow: (P, 6, 2) how far the measured pose is off for a plate bent by 1 m (`along_rays.bow_heights`).
+        by_bow: (P, 6, 2) how far the measured pose is off for a plate bent by 1 m (`rays.bow_heights`).
         shapes: (P, 6, 6) each, derivative of Q by the square of each of `PoseLevels`, by name.
     """
 
@@ -70,7 +71,7 @@ def stack_images(capture: Indices, images: Sequence[ImageBoard], board: Board | 
         capture,
         T,
         cov,
-        np.zeros((len(T), 6, N_BOW)) if board is None else _by_bow(T, board),
+        np.zeros((len(T), 6, 2)) if board is None else _by_bow(T, board),
         shapes,
     )
 
@@ -99,18 +100,19 @@ def image_rows(
     """Linearise the tangent from T_cam_board to T_cam_lidar T_lidar_board.
 
     Returns:
-        (P, 6, 16): by extrinsic (6), by board pose (6), by scale, by bows (2), residual. A scale s
-        stretches what the camera measures to t_cam_board (1 + s): squares or a focal length that the
-        profile has wrong.
+        (P, 6, 16) in columns of `IMAGE`. A scale s stretches what the camera measures to t_cam_board (1 + s):
+        squares or a focal length that the profile has wrong.
     """
     Y = T_lidar_board[images.capture]
     R = T_cam_lidar[:3, :3]
-    rows = np.zeros((len(Y), 6, 16))
-    rows[:, :3, :3] = rows[:, 3:, 3:6] = np.eye(3)
-    rows[:, :3, 3:6] = -skew(Y[:, :3, 3] @ R.T)
-    rows[:, :3, 6:9] = rows[:, 3:, 9:12] = R
-    rows[:, :3, 12] = -images.T_cam_board[:, :3, 3]
-    rows[:, :, 13:15] = images.by_bow
-    rows[:, :, 15] = difference(T_cam_lidar @ Y, images.T_cam_board) + scale * rows[:, :, 12]
-    rows[:, :, 15] += images.by_bow @ bow_m
+    by_camera, by_pose, by_scale = (np.zeros((len(Y), 6, n)) for n in (6, 6, 1))
+    by_camera[:, :3, :3] = by_camera[:, 3:, 3:] = np.eye(3)
+    by_camera[:, :3, 3:] = -skew(Y[:, :3, 3] @ R.T)
+    by_pose[:, :3, :3] = by_pose[:, 3:, 3:] = R
+    by_scale[:, :3, 0] = -images.T_cam_board[:, :3, 3]
+    rows = np.zeros((len(Y), 6, IMAGE.size))
+    rows[:, :, IMAGE["camera"]], rows[:, :, IMAGE["pose"]] = by_camera, by_pose
+    rows[:, :, IMAGE["scale"]], rows[:, :, IMAGE["bow"]] = by_scale, images.by_bow
+    rows[:, :, -1] = difference(T_cam_lidar @ Y, images.T_cam_board) + scale * by_scale[..., 0]
+    rows[:, :, -1] += images.by_bow @ bow_m
     return rows

@@ -11,7 +11,7 @@ of products of
 
     v = [(1, x, y) / (n . u); 1; -r n . u' / (n . u); -n . f / (n . u); residual of (1)]
 
-(11 x 11) with x and y on the board, however many there are.
+(`layout.RETURN`, 11 x 11) with x and y on the board, however many there are.
 
 Ring ends. A ring's last ray on the board meets its plane s inside an edge, the next ray a step D
 farther out along the edge's normal. The beam has a width, so that the board is lost where the ray passes d
@@ -55,6 +55,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.features import turn_about_z
+from lce_rig.calibrate.likelihood.layout import END, LASER, RETURN, RING, Indices, State
 from lce_rig.calibrate.plane_and_ends import (
     BLENDS,
     describe_background,
@@ -66,24 +67,8 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
 
-Indices = NDArray[np.intp]
-FIELDS = ("lens beside the axis", "lens height", "bow along the width", "bow along the height")
-"""Displacements of points that all lasers share, (4) and (5)."""
-N_FIELDS, N_LENS, N_BOW = len(FIELDS), 2, 2
 # Half a beam's width, and what the outline found in the scan may be off by.
 _BORDER_M = 0.02
-ERRORS_OF_LASER = ("range", "azimuth", "elevation")
-"""Constant errors of each laser, in m and rad."""
-N_OF_LASER = len(ERRORS_OF_LASER)
-# Columns of a return: three freedoms of its plane, its laser's errors, the lens, the residual.
-_OWN = 3
-_OF_FIELDS = _OWN + N_OF_LASER
-_OF_RETURN = _OF_FIELDS + N_FIELDS + 1
-SHIFTS = ("d_0", "c", "d_1", "d_2", "d_3", "p", "along azimuth", "upwards")
-"""Unknowns of (3), the plate's shape, and the displacement of ring ends."""
-N_SHIFTS = len(SHIFTS)
-# Columns of a ring end: by board pose, by its laser's errors, by lens, by shifts, residual.
-_OF_END = 6 + N_OF_LASER + N_FIELDS + N_SHIFTS + 1
 # A ring end on an edge parallel to its ring has hardly a step, and determines the edge less accurately.
 _SHORTEST_STEP_M = 2e-4
 
@@ -98,7 +83,7 @@ class StackedScans:
         capture, ring: (N,) of each return; `ring` is an index into `rings`.
         rays: (N, 3) unit vectors, frame lidar.
         range_m: (N,).
-        fields: (N, 3, 4) displacement by (4) and (5), per unit of `FIELDS`.
+        fields: (N, 3, 4) displacement by (4) and (5), per unit of lens (2) and bow (2).
         end_capture, end_ring: (M,) of each ring end, ordered by capture.
         end_rays: (M, 3) unit vectors towards it.
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
@@ -200,7 +185,7 @@ def bow_heights(on_board: Array, board: Board) -> Array:
 def lens_fields(points: Array) -> Array:
     """Compute the displacements (4) of points (N, 3), frame lidar: (N, 3, 2)."""
     across = np.hypot(points[:, 0], points[:, 1])
-    fields = np.zeros((len(points), 3, N_LENS))
+    fields = np.zeros((len(points), 3, 2))
     fields[:, 0, 0], fields[:, 1, 0] = -points[:, 1] / across, points[:, 0] / across
     fields[:, 2, 1] = np.arctan2(points[:, 2], across)
     return fields
@@ -231,40 +216,35 @@ class RangeSums:
     @property
     def n_returns(self) -> Array:
         """Number (F, L) of returns."""
-        return np.asarray(self.sums[..., _OWN, _OWN])
+        return np.asarray(self.sums[..., RETURN["range"].start, RETURN["range"].start])
 
 
-def sum_ranges(scans: StackedScans, T_lidar_board: Array, lasers: Array, fields: Array) -> RangeSums:
-    """Sum the returns' terms.
-
-    Args:
-        scans: rays.
-        T_lidar_board: (F, 4, 4) board poses.
-        lasers: (3, L) `ERRORS_OF_LASER` of each ring.
-        fields: (4,) theta.
-    """
-    R, n = T_lidar_board[:, :3, :3], T_lidar_board[:, :3, 2]
+def sum_ranges(scans: StackedScans, state: State) -> RangeSums:
+    """Sum the returns' terms at a state."""
+    R, n = state.T_lidar_board[:, :3, :3], state.T_lidar_board[:, :3, 2]
     k = scans.capture
     # Rays and the boards' middles in the axes of each board; returns are ordered by capture.
     by_capture = np.split(scans.rays, np.searchsorted(k, np.arange(1, scans.n_captures)))
     x, y, cosine = np.concatenate([u @ axes for u, axes in zip(by_capture, R, strict=True)]).T
-    middle = np.einsum("fji,fj->fi", R, T_lidar_board[:, :3, 3])
+    middle = np.einsum("fji,fj->fi", R, state.T_lidar_board[:, :3, 3])
     r = middle[k, 2] / cosine
-    v = np.ones((len(r), _OF_RETURN))
-    v[:, 0], v[:, 1], v[:, 2] = 1 / cosine, r * x - middle[k, 0], r * y - middle[k, 1]
-    v[:, 1:_OWN] /= cosine[:, None]
     across = -n[k] / cosine[:, None]
-    v[:, _OWN + 1 : _OF_FIELDS] = r[:, None] * np.einsum("ni,nij->nj", across, scans.turned)
-    v[:, _OF_FIELDS:-1] = np.einsum("ni,nij->nj", across, scans.fields)
-    own = np.einsum("ni,ni->n", v[:, _OWN:_OF_FIELDS], lasers.T[scans.ring])
-    v[:, -1] = r + own + v[:, _OF_FIELDS:-1] @ fields - scans.range_m
-    sums = np.zeros((scans.n_captures * len(scans.rings), _OF_RETURN, _OF_RETURN))
+    v = np.empty((len(r), RETURN.size))
+    freedoms = np.column_stack([np.ones_like(r), r * x - middle[k, 0], r * y - middle[k, 1]])
+    v[:, RETURN["plane"]] = freedoms / cosine[:, None]
+    v[:, RETURN["range"]] = 1
+    v[:, RETURN.of(["azimuth", "elevation"])] = r[:, None] * np.einsum("ni,nij->nj", across, scans.turned)
+    v[:, RETURN.of(["lens", "bow"])] = np.einsum("ni,nij->nj", across, scans.fields)
+    by_laser, by_fields = v[:, RETURN.of(LASER)], v[:, RETURN.of(["lens", "bow"])]
+    off = np.einsum("ni,ni->n", by_laser, state.lasers.T[scans.ring]) + by_fields @ state.fields
+    v[:, -1] = r + off - scans.range_m
+    sums = np.zeros((scans.n_captures * len(scans.rings), RETURN.size, RETURN.size))
     bounds = np.flatnonzero(np.diff(scans.group, prepend=-1, append=-1))
     # A product of matrices for each ring: several times faster than sums of products of columns.
     sums[scans.group[bounds[:-1]]] = [v[a:b].T @ v[a:b] for a, b in pairwise(bounds.tolist())]
     K = freedoms_of_plane()
     by_pose = np.concatenate([K[:, :3] @ np.swapaxes(R, 1, 2), K[:, 3:] @ np.swapaxes(R, 1, 2)], axis=2)
-    return RangeSums(sums.reshape(scans.n_captures, len(scans.rings), _OF_RETURN, _OF_RETURN), by_pose)
+    return RangeSums(sums.reshape(scans.n_captures, len(scans.rings), RETURN.size, RETURN.size), by_pose)
 
 
 def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tuple[Array, Array]:
@@ -279,57 +259,20 @@ def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tupl
     """
     n = ranges.n_returns
     total = sigma_m**2 + n * sigma_ring_m**2
-    shared = ranges.sums[..., _OWN, :]
+    shared = ranges.sums[..., RETURN["range"].start, :]
     k = (sigma_ring_m**2 / total)[..., None, None]
     weighted = (ranges.sums - k * shared[..., :, None] * shared[..., None, :]) / sigma_m**2
     log_volume = np.where(n > 0, (n - 1) * np.log(sigma_m**2) + np.log(total), 0.0)
     return weighted, np.asarray(log_volume.sum(axis=1))
 
 
-def range_system(ranges: RangeSums, weighted: Array) -> Array:
-    """Expand weighted sums into the normal equations of each capture.
-
-    Args:
-        ranges: the sums at the poses where the system is wanted.
-        weighted: (F, L, 11, 11) from `weigh_ranges`.
-
-    Returns:
-        (F, n, n), n = 6 + 3 L + 5: sums of products of [by board pose, by the lasers' errors, by lens,
-        residual], in the order of `spread_rings`.
-    """
-    F = len(weighted)
-    # [by pose; by one laser's errors, by lens, residual] = v^T B, ring by ring.
-    B = np.zeros((F, 1, _OF_RETURN, 6 + _OF_RETURN - _OWN))
-    B[:, 0, :_OWN, :6] = ranges.by_pose
-    B[:, :, np.arange(_OWN, _OF_RETURN), np.arange(6, 6 + _OF_RETURN - _OWN)] = 1
-    return spread_rings(np.swapaxes(B, 2, 3) @ weighted @ B)
-
-
-def spread_rings(by_ring: Array) -> Array:
-    """Sum normal equations over the rings of each capture, with unknowns of its own for each.
-
-    Args:
-        by_ring: (F, L, c, c) with columns by board pose (6), by the ring's laser (3), and others, which all
-            rings share.
-
-    Returns:
-        (F, n, n), n = c + 3 (L - 1): by board pose, the first error of all lasers, the second, the third, the
-        others.
-    """
-    F, L, c = by_ring.shape[:3]
-    shared = np.r_[0:6, 6 + N_OF_LASER : c]
-    n_own = N_OF_LASER * L
-    at = np.r_[0:6, 6 + n_own : c - N_OF_LASER + n_own]
-    system = np.zeros((F, c - N_OF_LASER + n_own, c - N_OF_LASER + n_own))
-    system[:, at[:, None], at] = by_ring.sum(axis=1)[:, shared[:, None], shared]
-    ring = np.arange(6, 6 + L)
-    for i in range(N_OF_LASER):
-        cross = by_ring[:, :, 6 + i][:, :, shared]
-        system[:, (ring + i * L)[:, None], at] = cross
-        system[:, at[:, None], ring + i * L] = np.swapaxes(cross, 1, 2)
-        for j in range(N_OF_LASER):
-            system[:, ring + i * L, ring + j * L] = by_ring[:, :, 6 + i, 6 + j]
-    return system
+def ring_systems(ranges: RangeSums, weighted: Array) -> Array:
+    """Expand weighted sums (F, L, 11, 11) into normal equations by capture and ring, in columns of `RING`."""
+    B = np.zeros((len(weighted), 1, RETURN.size, RING.size))
+    B[:, 0, RETURN["plane"], RING["pose"]] = ranges.by_pose
+    names = [name for name in RETURN if name != "plane"]
+    B[:, :, RETURN.of(names), RING.of(names)] = 1
+    return np.asarray(np.swapaxes(B, 2, 3) @ weighted @ B)
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,7 +281,7 @@ class EdgeRows:
 
     Attributes:
         capture, ring: (M,).
-        rows: (M, 22) by board pose (6), by its laser's errors (3), by `FIELDS` (4), by `SHIFTS`, e in m.
+        rows: (M, 22) in columns of `END`, e in m.
         step_m: (M,) D.
         range_m: (M,) to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
@@ -363,40 +306,22 @@ class EdgeRows:
         return np.asarray(np.where(self.is_backed, backed_rad, edge_rad) * self.range_m)
 
 
-def edge_rows(
-    scans: StackedScans,
-    T_lidar_board: Array,
-    board: Board,
-    lasers: Array,
-    fields: Array,
-    shifts: Array,
-    own_shift_m: Array,
-) -> EdgeRows:
-    """Linearise (2).
-
-    Args:
-        scans: ring ends.
-        T_lidar_board: (F, 4, 4) board poses.
-        board: its size.
-        lasers: (3, L) `ERRORS_OF_LASER` of each ring.
-        fields: (4,) theta.
-        shifts: (8,) `SHIFTS`.
-        own_shift_m: (F,) what each capture adds to d_0.
-    """
-    T = T_lidar_board[scans.end_capture]
+def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
+    """Linearise (2) at a state; `board` is the plate's size."""
+    T = state.T_lidar_board[scans.end_capture]
     R, t, n = T[:, :3, :3], T[:, :3, 3], T[:, :3, 2]
     h = np.sum(n * t, axis=1)
     cosine = np.sum(n * scans.end_rays, axis=1)
     range_m = h / cosine
     turned = turn_rays(scans.end_rays)
-    off = scans.end_fields @ fields
-    off += range_m[:, None] * np.einsum("mij,jm->mi", turned, lasers[1:, scans.end_ring])
+    off = scans.end_fields @ state.fields
+    off += range_m[:, None] * np.einsum("mij,jm->mi", turned, state.lasers[1:, scans.end_ring])
     # A displaced point is where its displaced ray meets the plane.
     off -= (np.sum(n * off, axis=1) / cosine)[:, None] * scans.end_rays
     here = range_m[:, None] * scans.end_rays - t + off
     beyond = (h / np.sum(n * scans.next_rays, axis=1))[:, None] * scans.next_rays - t + off
     xy, xy_next = (np.einsum("mji,mj->mi", R[:, :, :2], p) for p in (here, beyond))
-    edge = _edges_crossed(board, xy, xy_next, shifts[0])
+    edge = _edges_crossed(board, xy, xy_next, state.shifts[0])
     outwards = board.edges()[1][edge, :2]
     inside_m = distance_inside(board, xy, edge)
     step_m = np.maximum(np.abs(np.sum((xy_next - xy) * outwards, axis=1)), _SHORTEST_STEP_M)
@@ -404,15 +329,20 @@ def edge_rows(
     # dr = (n . tau + phi . n x (t - r u) - n . f theta) / (n . u), dM = phi x M.
     M = np.einsum("mij,mj->mi", R[:, :, :2], outwards)
     sideways = M - (np.sum(M * scans.end_rays, axis=1) / cosine)[:, None] * n
-    rows = np.empty((len(M), _OF_END))
-    rows[:, :6] = -differentiate(sideways, here)
-    rows[:, 6] = 0
-    rows[:, 7 : 6 + N_OF_LASER] = -range_m[:, None] * np.einsum("mi,mij->mj", sideways, turned)
-    of_fields, of_shifts = np.split(np.arange(6 + N_OF_LASER, _OF_END - 1), [N_FIELDS])
-    rows[:, of_fields] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
-    rows[:, of_shifts] = _by_shifts(scans, sideways, range_m, outwards)
-    rows[:, -1] = inside_m + rows[:, of_shifts] @ shifts - step_m / 2
-    rows[:, -1] += rows[:, of_shifts[0]] * own_shift_m[scans.end_capture]
+    rows = np.zeros((len(M), END.size))
+    rows[:, END["pose"]] = -differentiate(sideways, here)
+    by_angle = -range_m[:, None] * np.einsum("mi,mij->mj", sideways, turned)
+    rows[:, END.of(["azimuth", "elevation"])] = by_angle
+    rows[:, END.of(["lens", "bow"])] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
+    # By the shifts of (3), the shape of the plate, and the displacement along azimuth and upwards.
+    across = np.linalg.norm(sideways, axis=1, keepdims=True)
+    of_width = np.column_stack([np.ones(len(range_m)), range_m, scans.end_background])
+    of_plate = outwards[:, 0] ** 2 - outwards[:, 1] ** 2
+    by_azimuth = np.sum(sideways * scans.end_fields[:, :, 0], axis=1)
+    by_shifts = np.column_stack([across * of_width, of_plate, -by_azimuth, -sideways[:, 2]])
+    rows[:, END["shifts"]] = by_shifts
+    own_shift_m = by_shifts[:, 0] * state.own_shift_m[scans.end_capture]
+    rows[:, -1] = inside_m + by_shifts @ state.shifts - step_m / 2 + own_shift_m
     is_backed = scans.end_background[:, BLENDS] > 0
     return EdgeRows(scans.end_capture, scans.end_ring, rows, step_m, range_m, is_backed, len(scans.rings))
 
@@ -431,12 +361,3 @@ def _edges_crossed(board: Board, xy_m: Array, xy_next_m: Array, shift_m: float) 
     inside_m = np.sum(anchors * outwards, axis=1) - xy_m @ outwards.T
     distance_m = np.where(step_m > 0, np.abs(inside_m + shift_m - step_m / 2), np.inf)
     return np.asarray(np.argmin(distance_m, axis=1))
-
-
-def _by_shifts(scans: StackedScans, sideways: Array, range_m: Array, outwards: Array) -> Array:
-    """Differentiate e by `SHIFTS`: (M, 8)."""
-    of_width = np.column_stack([np.ones(len(range_m)), range_m, scans.end_background])
-    of_plate = outwards[:, 0] ** 2 - outwards[:, 1] ** 2
-    displacement = np.stack([np.sum(sideways * scans.end_fields[:, :, 0], axis=1), sideways[:, 2]], axis=1)
-    across = np.linalg.norm(sideways, axis=1, keepdims=True)
-    return np.hstack([across * of_width, of_plate[:, None], -displacement])
