@@ -1,11 +1,9 @@
 """What a sync board's messages add up to: pulses, clocks, and what is wrong; no device, no thread."""
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping
 from enum import Enum
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from lce_rig.core.data import Pulse
 from lce_rig.core.findings import Finding
@@ -25,7 +23,7 @@ from lce_rig.devices.lce1 import (
 from lce_rig.devices.protocol import ClockState
 from lce_rig.rig.sync_settings import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S, ClockModel
-from lce_rig.timing.clock_fit import ClockTracker, fit_arrivals
+from lce_rig.timing.clock_fit import ClockTracker
 
 # Which times and running numbers can be, and which tell that the board restarted: a line may be damaged and
 # keep its sum. One odd value is skipped; two in a row that agree are believed.
@@ -36,7 +34,6 @@ _MOST_BACK_NS = NS_PER_S
 # Answers may overtake what the board had queued before; a board that has just started is not that far.
 _MOST_BACK_GREETED_NS = NS_PER_S // 10
 
-_N_ARRIVALS = 2048
 _STALLED_S = 3.0
 _DAMAGED = 0.01
 _MIN_DAMAGED = 5
@@ -180,7 +177,6 @@ class BoardState:
         self._time = BoardTime()
         self._numbers: dict[str, RunningNumber] = {}
         self._asked: tuple[int, int] | None = None
-        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_N_ARRIVALS)
 
     def opened(self, steady_ns: int) -> None:
         """Note that the port was opened: a board that was unplugged knows nothing any more."""
@@ -244,12 +240,8 @@ class BoardState:
 
     @property
     def host_clock(self) -> ClockModel | None:
-        """The computer's time of day on the board's clock; by time requests, or else by arrivals."""
-        model = self.host_tracker.model
-        if model is None and len(self._arrivals) > 0 and self.round_trip_ns is None:
-            stamps, arrivals = np.array(self._arrivals, dtype=np.int64).T
-            model = fit_arrivals(stamps, arrivals, "arrivals of pulses")
-        return model
+        """The computer's time of day on the board's clock, by time requests; None before it is known."""
+        return self.host_tracker.model
 
     @property
     def utc_clock(self) -> ClockModel | None:
@@ -321,10 +313,8 @@ class BoardState:
             problems.append(findings.PULSE_LINES_LOST(n=sum(self.n_lost_by_line.values()), by_line=by_line))
         if self.status is not None and self.status.n_lost:
             problems.append(findings.LINES_DROPPED_BY_BOARD(n=self.status.n_lost))
-        if self.host_clock is None:
-            problems += [findings.BOARD_NOT_TIED()] if has_waited else []
-        elif self.round_trip_ns is None:
-            problems.append(findings.BOARD_BY_ARRIVALS())
+        if self.host_clock is None and has_waited:
+            problems.append(findings.BOARD_NOT_TIED())
         steps = self.host_tracker.steps
         if steps:
             problems.append(findings.COMPUTER_JUMPED(n=len(steps), last_s=steps[-1].size_ns / NS_PER_S))
@@ -357,7 +347,6 @@ class BoardState:
         if number.n_lost > n_lost:
             self.n_lost_by_line[line] += number.n_lost - n_lost
         self.n_pulses[line] += 1
-        self._arrivals.append((t_us * 1000, arrival.host_ns))
         return [Pulse(line, t_us * 1000, count, arrival.host_ns)]
 
     def _restart(self, arrival: Arrival) -> None:
@@ -365,7 +354,6 @@ class BoardState:
         self.restarted_ns = arrival.steady_ns
         for number in self._numbers.values():
             number.begin()
-        self._arrivals.clear()
         self._asked = None
         self.host_tracker.restart()
         self.utc_tracker.restart()

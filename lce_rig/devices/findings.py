@@ -1,10 +1,14 @@
 """Kinds of findings on attached sensors: the device, its stream, its clock, its settings."""
 
+from functools import partial
+
 from lce_rig.core.findings import Figure, Finding, Kind
 
 _RAISE_LIMIT = (
     "raise the receive buffer limit, now {buffer_kib} KiB: sudo sysctl -w net.core.rmem_max=4194304"
 )
+
+_note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
 
 
 def _mid_exposure(finding: Finding) -> str:
@@ -70,268 +74,184 @@ def _pulse_lines_lost(finding: Finding) -> str:
     return f"messages of {finding.figures['n']} pulses lost ({_pairs(finding.figures['by_line'])})"
 
 
-CONTROL_DIFFERS = Kind(
-    "device.control_differs",
-    "control {control} is {given}, the profile's value is {expected}",
-    severity="warning",
+CONTROL_DIFFERS = _warning(
+    "device.control_differs", "control {control} is {given}, the profile's value is {expected}"
 )
-ROW_PADDING = Kind(
+ROW_PADDING = _warning(
     "device.row_padding",
     "rows of {row_bytes} bytes, GStreamer pads them to {padded_bytes}",
     "if the image is slanted, let the command write JPEG (jpegenc)",
-    severity="warning",
 )
-RECORDING_STOPPED = Kind(
-    "device.recording_stopped",
-    "recording to {path} stopped: {cause}",
-    "free some space",
-    severity="warning",
+RECORDING_STOPPED = _warning(
+    "device.recording_stopped", "recording to {path} stopped: {cause}", "free some space"
 )
-RECORDING_INCOMPLETE = Kind(
+RECORDING_INCOMPLETE = _warning(
     "device.recording_incomplete",
     "{n} samples missing in {path}: the disk is too slow",
     "record to a faster disk",
-    severity="warning",
 )
-BOARD_SILENT = Kind(
+BOARD_SILENT = _warning(
     "device.board_silent",
     "no message from the board for {silent_s:.0f} s",
     "check its cable and power, press its reset",
-    severity="warning",
 )
-COMMANDS_NOT_TAKEN = Kind(
-    "device.commands_not_taken",
-    "the board did not accept {n} commands",
-    "press its reset",
-    severity="warning",
+COMMANDS_NOT_TAKEN = _warning(
+    "device.commands_not_taken", "the board did not accept {n} commands", "press its reset"
 )
-BOARD_RESTARTED = Kind(
+BOARD_RESTARTED = _warning(
     "device.board_restarted",
     "the board restarted {n} times, last {ago_s:.0f} s ago",
     "check its power, and that no other program opens its port",
-    severity="warning",
 )
-BOARD_ERROR = Kind("device.board_error", "the board reports: {message} (error {number})", severity="warning")
+BOARD_ERROR = _warning("device.board_error", "the board reports: {message} (error {number})")
 
-PACKETS_LOST = Kind(
+PACKETS_LOST = _warning(
     "stream.packets_lost",
     "{share:1percent} of the packets lost (limit 1 %)",
     "check cable and switch, and that the LiDAR's field of view is 0 to 359",
-    severity="warning",
 )
-COMPUTER_TOO_SLOW = Kind(
+COMPUTER_TOO_SLOW = _warning(
     "stream.computer_too_slow",
     "this computer was too slow for {n} packets",
     f"close other programs, and {_RAISE_LIMIT}",
-    severity="warning",
 )
-ROTOR_RATE = Kind(
+ROTOR_RATE = _warning(
     "stream.rotor_rate",
     "rotor at {rotor_hz:.1f} Hz ({expected_hz:g} expected)",
     "set rate_hz in the profile, or rpm {expected_rpm:.0f} on the web page",
-    severity="warning",
 )
-RATE_REFUSED = Kind(
+RATE_REFUSED = _warning(
     "stream.rate_refused",
     "the camera sends {rate_hz:.4g} images/s ({expected_hz:g} expected)",
     "choose a rate that `v4l2-ctl --list-formats-ext` lists",
-    severity="warning",
 )
-FEW_BUFFERS = Kind(
-    "stream.few_buffers",
-    "the driver grants {n} buffers ({expected} expected): images may be lost",
-    severity="warning",
+FEW_BUFFERS = _warning(
+    "stream.few_buffers", "the driver grants {n} buffers ({expected} expected): images may be lost"
 )
-DAMAGED_IMAGES = Kind(
+DAMAGED_IMAGES = _warning(
     "stream.damaged_images",
     "{n} damaged images",
     "check the camera's cable and `dmesg | tail`",
-    severity="warning",
     actions={"command": "check the command"},
 )
-MESSAGES_SKIPPED = Kind(
+MESSAGES_SKIPPED = _warning(
     "stream.messages_skipped",
     "{n} messages damaged, repeated or late",
     "record a bag: `lce-rig collect --from` names the cause",
-    severity="warning",
 )
-DAMAGED_LINES = Kind(
+DAMAGED_LINES = _warning(
     "stream.damaged_lines",
     "{n} of {n_lines} messages damaged",
     "check cable, ground and sync.baud, and that nothing else reads the port",
-    severity="warning",
 )
-NO_PULSES = Kind(
-    "stream.no_pulses",
-    "no pulses for {line}",
-    "check sync.triggers.{line}.channel and that triggers are on",
-    severity="warning",
+NO_PULSES = _warning(
+    "stream.no_pulses", "no pulses for {line}", "check sync.triggers.{line}.channel and that triggers are on"
 )
-PULSE_LINES_LOST = Kind(
-    "stream.pulse_lines_lost", _pulse_lines_lost, "use a USB port of its own", severity="warning"
+PULSE_LINES_LOST = _warning("stream.pulse_lines_lost", _pulse_lines_lost, "use a USB port of its own")
+PPS_LINES_LOST = _warning(
+    "stream.pps_lines_lost", "messages of {n} pulses per second lost; the LiDAR received the pulses"
 )
-PPS_LINES_LOST = Kind(
-    "stream.pps_lines_lost",
-    "messages of {n} pulses per second lost; the LiDAR received the pulses",
-    severity="warning",
-)
-LINES_DROPPED_BY_BOARD = Kind(
+LINES_DROPPED_BY_BOARD = _warning(
     "stream.lines_dropped_by_board",
     "the board dropped {n} messages: the computer read too slowly",
     "close other programs",
-    severity="warning",
 )
-BUFFER_SMALL = Kind(
-    "buffer.small",
-    "the receive buffer holds {buffer_s:0ms} (minimum 250 ms)",
-    _RAISE_LIMIT,
-    severity="warning",
+BUFFER_SMALL = _warning(
+    "buffer.small", "the receive buffer holds {buffer_s:0ms} (minimum 250 ms)", _RAISE_LIMIT
 )
 
-ARRIVAL = Kind(
-    "clock.arrival",
-    "arrival at this computer, later than the exposure by an unknown time",
-    severity="note",
-)
-HEADER = Kind(
-    "clock.header",
-    "headers of the ROS 2 messages, {delay_ms:.3g} ms before their arrival",
-    severity="note",
-)
-MID_EXPOSURE = Kind("clock.mid_exposure", _mid_exposure, severity="note")
-DAVIS_CLOCK = Kind("clock.davis", _davis, severity="note")
-CLOCK_MISSING = Kind(
+ARRIVAL = _note("clock.arrival", "arrival at this computer, later than the exposure by an unknown time")
+HEADER = _note("clock.header", "headers of the ROS 2 messages, {delay_ms:.3g} ms before their arrival")
+MID_EXPOSURE = _note("clock.mid_exposure", _mid_exposure)
+DAVIS_CLOCK = _note("clock.davis", _davis)
+CLOCK_MISSING = _warning(
     "clock.missing",
     "this computer has no clock {clock}; arrival times are used",
     "set driver.frame_timing.clock",
-    severity="warning",
 )
-CLOCK_DOES_NOT_FIT = Kind(
+CLOCK_DOES_NOT_FIT = _warning(
     "clock.does_not_fit",
     "by clock {clock} images are {delay_ms:.3g} ms old",
     "correct driver.frame_timing.clock",
-    severity="warning",
 )
-NO_CLOCK_FITS = Kind(
-    "clock.none_fits", _none_fits, "set driver.frame_timing.clock if you know it", severity="warning"
+NO_CLOCK_FITS = _warning("clock.none_fits", _none_fits, "set driver.frame_timing.clock if you know it")
+CLOCK_AMBIGUOUS = _warning(
+    "clock.ambiguous", _ambiguous_clock, "set driver.frame_timing.clock if you know it"
 )
-CLOCK_AMBIGUOUS = Kind(
-    "clock.ambiguous", _ambiguous_clock, "set driver.frame_timing.clock if you know it", severity="warning"
+CLOCK_CHANGED = _warning(
+    "clock.changed", "the timestamps changed clock {n} times", "check the camera's driver (dmesg)"
 )
-CLOCK_CHANGED = Kind(
-    "clock.changed",
-    "the timestamps changed clock {n} times",
-    "check the camera's driver (dmesg)",
-    severity="warning",
-)
-EXPOSURE_UNKNOWN = Kind(
+EXPOSURE_UNKNOWN = _warning(
     "clock.exposure_unknown",
     "the camera does not report its exposure: timestamps are wrong by half of it",
     "set driver.frame_timing.exposure_us",
-    severity="warning",
 )
-TRIGGER_INPUT_OFF = Kind(
+TRIGGER_INPUT_OFF = _warning(
     "clock.trigger_input_off",
     "the trigger input cannot be switched on: no edges are detected, and the clock drifts",
     "update the camera's firmware",
-    severity="warning",
 )
-FOLLOWS_OTHER_CAMERA = Kind(
+FOLLOWS_OTHER_CAMERA = _warning(
     "clock.follows_other_camera",
     "it follows another camera's clock",
     "unplug the sync cable, or wire the trigger to that camera",
-    severity="warning",
 )
-CLOCK_DIFFERS = Kind(
+CLOCK_DIFFERS = _warning(
     "clock.differs_from_computer",
     "its clock and this computer's differ by {difference_s:.3g} s (limit 0.5 s)",
     "open the camera again; stop programs that set this computer's clock",
-    severity="warning",
 )
-CLOCK_RESTARTED = Kind(
-    "clock.restarted",
-    "its clock restarted {n} times: a sync cable sent a reset",
-    "open the camera again",
-    severity="warning",
+CLOCK_RESTARTED = _warning(
+    "clock.restarted", "its clock restarted {n} times: a sync cable sent a reset", "open the camera again"
 )
 
-BOARD_CLOCK = Kind("clock.board", _board_clock, severity="note")
-BOARD_NOT_TIED = Kind(
+BOARD_CLOCK = _note("clock.board", _board_clock)
+BOARD_NOT_TIED = _warning(
     "clock.board_not_tied",
     "the board's clock is not synchronised with the computer's: no answers to time requests, no pulses",
     "check its firmware",
-    severity="warning",
 )
-BOARD_BY_ARRIVALS = Kind(
-    "clock.board_by_arrivals",
-    "the board answers no time requests: its clock is synchronised by arrivals only, to about 1 ms",
-    severity="warning",
-)
-COMPUTER_JUMPED = Kind(
+COMPUTER_JUMPED = _warning(
     "clock.computer_jumped",
     "the computer's clock jumped {n} times, last by {last_s:+.3f} s",
     "do not set it while you collect (chrony slews, ntpdate jumps)",
-    severity="warning",
 )
-NO_PPS = Kind(
-    "clock.no_pps",
-    "no pulse per second: the LiDAR cannot be synchronised",
-    "press the board's reset",
-    severity="warning",
+NO_PPS = _warning(
+    "clock.no_pps", "no pulse per second: the LiDAR cannot be synchronised", "press the board's reset"
 )
-PPS_STOPPED = Kind(
-    "clock.pps_stopped",
-    "no pulse per second for {silent_s:.0f} s",
-    "press the board's reset",
-    severity="warning",
+PPS_STOPPED = _warning(
+    "clock.pps_stopped", "no pulse per second for {silent_s:.0f} s", "press the board's reset"
 )
-BOARD_WITHOUT_UTC = Kind(
-    "clock.board_without_utc",
-    "the board does not know UTC yet: the LiDAR's hour is unknown",
-    severity="warning",
+BOARD_WITHOUT_UTC = _warning(
+    "clock.board_without_utc", "the board does not know UTC yet: the LiDAR's hour is unknown"
 )
-PPS_OUTPUT_OFF = Kind(
-    "clock.pps_output_off",
-    "its output of pulses per second is off",
-    "press the board's reset",
-    severity="warning",
+PPS_OUTPUT_OFF = _warning(
+    "clock.pps_output_off", "its output of pulses per second is off", "press the board's reset"
 )
 
-OTHER_MODEL = Kind(
+OTHER_MODEL = _warning(
     "settings.other_model",
     "the LiDAR is a {model}, the profile says {expected}: its packets are not read",
     "correct the model in the profile",
-    severity="warning",
 )
-MOTOR_OFF = Kind("settings.motor_off", "the motor is off", "switch it on (rpm 600)", severity="warning")
-LASER_OFF = Kind("settings.laser_off", "the laser is off", "switch it on", severity="warning")
-ROTOR_SETTING = Kind(
+MOTOR_OFF = _warning("settings.motor_off", "the motor is off", "switch it on (rpm 600)")
+LASER_OFF = _warning("settings.laser_off", "the laser is off", "switch it on")
+ROTOR_SETTING = _warning(
     "settings.rotor_rate",
     "rotor set to {set_hz:.1f} Hz ({expected_hz:g} expected)",
     "set rpm to {expected_rpm:.0f}, or rate_hz in the profile",
-    severity="warning",
 )
-FOV_CUT = Kind(
-    "settings.fov_cut",
-    "field of view cut to {start_deg:.0f} to {end_deg:.0f} deg",
-    "set it to 0 to 359",
-    severity="warning",
+FOV_CUT = _warning(
+    "settings.fov_cut", "field of view cut to {start_deg:.0f} to {end_deg:.0f} deg", "set it to 0 to 359"
 )
-DATA_PORT = Kind(
+DATA_PORT = _warning(
     "settings.data_port",
     "data sent to port {port} ({expected_port} expected)",
     "set either of them to the other",
-    severity="warning",
 )
-POSITION_PORT = Kind(
+POSITION_PORT = _warning(
     "settings.position_port",
     "telemetry sent to port {port} ({expected_port} expected): PPS is unknown",
     "set driver.controls.position_port",
-    severity="warning",
 )
-PPS_SETTING = Kind(
-    "settings.pps",
-    "PPS is {pps}: the LiDAR's clock is not UTC",
-    "check pulse and NMEA",
-    severity="warning",
-)
+PPS_SETTING = _warning("settings.pps", "PPS is {pps}: the LiDAR's clock is not UTC", "check pulse and NMEA")

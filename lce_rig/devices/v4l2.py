@@ -149,11 +149,10 @@ class V4l2Source(LiveSource):
             )
         layout = device.set_layout(code, width, height)
         if (layout.width, layout.height) != (width, height):
-            sizes = ", ".join(device.sizes(code)) or "unknown"
             raise SourceError(
                 f"{where} sends {layout.width}x{layout.height} px in {code.strip()}, "
                 f"the intrinsics belong to {width}x{height} px",
-                f"Is it another camera? Its sizes: {sizes}. Choose another, or measure the intrinsics again.",
+                "Choose one of its sizes (`v4l2-ctl --list-formats-ext`), or measure the intrinsics again.",
             )
         if layout.code != code:
             raise SourceError(

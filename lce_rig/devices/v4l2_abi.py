@@ -38,8 +38,6 @@ INTEGER, BOOLEAN, MENU, BUTTON, INTEGER64, BITMASK, INTEGER_MENU = 1, 2, 3, 4, 5
 EXPOSURE_ABSOLUTE_ID = 0x009A_0902
 """V4l2Control of the exposure, in units of 100 us."""
 
-DISCRETE_SIZES = 1
-
 
 class Capability(Structure):
     """What a device is."""
@@ -66,18 +64,6 @@ class FormatDescription(Structure):
         ("pixelformat", c_char * 4),
         ("mbus_code", c_uint32),
         ("reserved", c_uint32 * 3),
-    )
-
-
-class FrameSize(Structure):
-    """One image size that a device offers: width and height, or least, most and step of both."""
-
-    _fields_ = (
-        ("index", c_uint32),
-        ("pixel_format", c_char * 4),
-        ("type", c_uint32),
-        ("sizes", c_uint32 * 6),
-        ("reserved", c_uint32 * 2),
     )
 
 
@@ -246,5 +232,4 @@ SET_PARAMETERS = _code(_BOTH, 22, CaptureParameters)
 QUERY_MENU = _code(_BOTH, 37, MenuQuery)
 GET_CONTROLS = _code(_BOTH, 71, V4l2Controls)
 SET_CONTROLS = _code(_BOTH, 72, V4l2Controls)
-ENUMERATE_SIZES = _code(_BOTH, 74, FrameSize)
 QUERY_CONTROL = _code(_BOTH, 103, ControlQuery)

@@ -119,17 +119,6 @@ class VideoDevice:
             ask.index += 1
         return codes
 
-    def sizes(self, code: str) -> list[str]:
-        """List the image sizes it offers in a pixel format, in words: "1280x720"."""
-        sizes = []
-        ask = abi.FrameSize(pixel_format=code.encode())
-        while self.grants(abi.ENUMERATE_SIZES, ask):
-            if ask.type != abi.DISCRETE_SIZES:
-                return [f"any from {ask.sizes[0]}x{ask.sizes[3]} to {ask.sizes[1]}x{ask.sizes[4]}"]
-            sizes.append(f"{ask.sizes[0]}x{ask.sizes[1]}")
-            ask.index += 1
-        return sizes
-
     def set_layout(self, code: str, width: int, height: int) -> Layout:
         """Ask for a form of images; gives what the device will deliver instead if it must.
 

@@ -1,5 +1,6 @@
 """Kinds of findings of the doctor: computer, each sensor's stream, clock, pulses and images, the board."""
 
+from functools import partial
 from textwrap import shorten
 
 from lce_rig.core.findings import Figure, Finding, Kind
@@ -8,6 +9,8 @@ _MAX_COMMAND = 50
 _EVERY_PULSE = (
     "make every pulse trigger one image: set the camera's trigger mode in driver.controls, check the line"
 )
+
+_note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
 
 
 def _packages(finding: Finding) -> str:
@@ -127,29 +130,24 @@ def _in_scan(finding: Finding) -> str:
     return f"{text}; {n:.0f} objects of its size" if n > 1 else text
 
 
-PYTHON = Kind(
-    "computer.python", "Python {python}, numpy {numpy}, {system} {machine}, {n_bits} bit", severity="note"
-)
+PYTHON = _note("computer.python", "Python {python}, numpy {numpy}, {system} {machine}, {n_bits} bit")
 NOT_LINUX_64 = Kind(
     "computer.not_linux_64", "not 64-bit Linux", "read live sensors on 64-bit Linux; recordings work"
 )
-PACKAGES = Kind("computer.packages", _packages, severity="note")
+PACKAGES = _note("computer.packages", _packages)
 PACKAGES_MISSING = Kind("computer.packages_missing", "missing: {packages}", _install_packages)
 DV_PROCESSING_MISSING = Kind(
     "computer.dv_processing_missing",
     "missing: dv-processing, which reads the DAVIS",
     "run: pip install 'lce-rig[davis]' (Linux, Python 3.10 to 3.13)",
 )
-LIBRARIES = Kind("computer.libraries", "{libraries}", severity="note")
-LIBRARIES_MISSING = Kind(
+LIBRARIES = _note("computer.libraries", "{libraries}")
+LIBRARIES_MISSING = _warning(
     "computer.libraries_missing",
     "missing: {libraries}; Open3D, which `lce-rig simulate` uses, does not load",
     _install_libraries,
-    severity="warning",
 )
-DISK = Kind(
-    "computer.disk", "{free_mb:.0f} MB free, {write_mbps:.0f} MB/s flushed, in {folder}", severity="note"
-)
+DISK = _note("computer.disk", "{free_mb:.0f} MB free, {write_mbps:.0f} MB/s flushed, in {folder}")
 DISK_FULL = Kind(
     "computer.disk_full", "too little space (minimum 5000 MB)", "make room, or choose another disk with -o"
 )
@@ -163,40 +161,34 @@ DISK_NOT_WRITABLE = Kind(
     "{folder} cannot be written: {cause}",
     "choose another folder with -o, or make room there",
 )
-BUFFER = Kind(
-    "computer.buffer", "{granted_kib} KiB granted: {buffer_s:.2f} s of a VLP-16's packets", severity="note"
-)
-BUFFER_SMALL = Kind(
+BUFFER = _note("computer.buffer", "{granted_kib} KiB granted: {buffer_s:.2f} s of a VLP-16's packets")
+BUFFER_SMALL = _warning(
     "computer.buffer_small",
     "too small (minimum 0.25 s)",
     "run: sudo sysctl -w net.core.rmem_max={wanted_bytes}\n"
     "to keep it: echo net.core.rmem_max={wanted_bytes} | sudo tee /etc/sysctl.d/60-lidar.conf",
-    severity="warning",
 )
-UDEV_RULES = Kind("computer.udev_rules", "installed for {devices}", severity="note")
-UDEV_RULES_MISSING = Kind(
+UDEV_RULES = _note("computer.udev_rules", "installed for {devices}")
+UDEV_RULES_MISSING = _warning(
     "computer.udev_rules_missing",
     "none for {devices}: only root may open it",
     "run: sudo cp {rules} /etc/udev/rules.d/ && sudo udevadm control --reload\n"
     "then unplug the device and plug it in again",
-    severity="warning",
 )
-COMPUTER_CLOCK = Kind("computer.clock", "synchronised, error at most {max_error_ms:.0f} ms", severity="note")
-COMPUTER_CLOCK_LOOSE = Kind(
+COMPUTER_CLOCK = _note("computer.clock", "synchronised, error at most {max_error_ms:.0f} ms")
+COMPUTER_CLOCK_LOOSE = _warning(
     "computer.clock_not_synchronised",
     "not synchronised, according to the kernel",
     "run: timedatectl set-ntp true, or let chrony follow the rig's GPS",
-    severity="warning",
 )
 
 FAILED = Kind("sensor.failed", "{what}", "{hint}")
-ANSWERS = Kind("sensor.answers", _answers, severity="note")
-RATE = Kind("stream.rate", _rate, severity="note")
-RATE_OFF = Kind(
+ANSWERS = _note("sensor.answers", _answers)
+RATE = _note("stream.rate", _rate)
+RATE_OFF = _warning(
     "stream.rate_off",
     _rate,
     "long exposures slow a camera down: set rate and exposure, or correct the profile",
-    severity="warning",
     actions={
         "rotor": "set rpm {expected_rpm:.0f} on its web page, or rate_hz in the profile",
         "trigger": "set its trigger mode in driver.controls, and check the line",
@@ -204,50 +196,44 @@ RATE_OFF = Kind(
 )
 NO_STREAM = Kind("stream.none", _none, "check its trigger line; a triggered camera waits for pulses")
 STOPPED = Kind("stream.stopped", _stopped, "check cable and power, and its trigger line")
-EVENT_RATE = Kind("stream.events", _events, severity="note")
+EVENT_RATE = _note("stream.events", _events)
 NO_EVENTS = Kind("stream.no_events", "no events", "uncover the lens, and check the biases in driver.controls")
-COMPLETE = Kind("stream.complete", _complete, severity="note")
+COMPLETE = _note("stream.complete", _complete)
 LOSSES = Kind(
     "stream.losses",
     _losses,
     "check its cable; close other programs (top shows which are busy)",
     actions={"named": ""},
 )
-SETTINGS_UNKNOWN = Kind(
+SETTINGS_UNKNOWN = _warning(
     "settings.unknown",
     "firmware and settings unknown: {what}",
     "check that driver.address is its own, and that no firewall blocks it",
-    severity="warning",
 )
-SETTINGS = Kind("settings.read", _settings, severity="note")
+SETTINGS = _note("settings.read", _settings)
 
-PULSE = Kind("clock.pulse", _pulse, severity="note")
-WITHOUT_PULSES = Kind(
+PULSE = _note("clock.pulse", _pulse)
+WITHOUT_PULSES = _note(
     "clock.without_pulses",
     "timestamps by arrival need still boards",
     "without hardware, set lidars.*.timestamps sync: none, clock: host, and hold boards still",
-    severity="note",
 )
-NO_TIMESTAMPS = Kind("clock.no_timestamps", "no timestamps yet", severity="note")
-OFFSET = Kind("clock.offset", _offset, severity="note")
-DRIFTS = Kind(
+NO_TIMESTAMPS = _note("clock.no_timestamps", "no timestamps yet")
+OFFSET = _note("clock.offset", _offset)
+DRIFTS = _warning(
     "clock.drifts",
     "the clock of {subject} drifts by {drift_ppm:+.0f} ppm (limit {limit_ppm:.0f} ppm)",
     "stop programs that set this computer's clock, and close other programs",
-    severity="warning",
 )
-EDGES_FITTED = Kind(
-    "edges.fitted",
-    "{n_edges} of {n_pulses} pulses, drift {drift_ppm:+.1f} ppm, scatter {rms_us:.1f} us",
-    severity="note",
+EDGES_FITTED = _note(
+    "edges.fitted", "{n_edges} of {n_pulses} pulses, drift {drift_ppm:+.1f} ppm, scatter {rms_us:.1f} us"
 )
 EDGES_NOT_FITTED = Kind("edges.not_fitted", "{n_edges} edges of {n_pulses} pulses detected, clock not fitted")
-LINE = Kind("pulses.line", "{line} {rate_hz:.3g} Hz", severity="note")
-LINE_OFF = Kind(
+LINE = _note("pulses.line", "{line} {rate_hz:.3g} Hz")
+LINE_OFF = _warning(
     "pulses.line_off",
     "{line} {rate_hz:.3g} Hz ({expected_hz:g} Hz expected)",
     "check sync.triggers.{line}, reset the board",
-    severity="warning",
     actions={"pps": "reset the board"},
 )
 LINE_NONE = Kind(
@@ -256,45 +242,36 @@ LINE_NONE = Kind(
     "check sync.triggers.{line}, reset the board",
     actions={"pps": ""},
 )
-PULSES_LOST = Kind("pulses.lost", "{n} lost", severity="note")
-FRAMES_OF_PULSES = Kind("pulses.frames", "{n_frames} images of {n_pulses} pulses", severity="note")
-COUNTED_ONLY = Kind("pulses.counted_only", "counted only, not matched yet", severity="note")
+PULSES_LOST = _note("pulses.lost", "{n} lost")
+FRAMES_OF_PULSES = _note("pulses.frames", "{n_frames} images of {n_pulses} pulses")
+COUNTED_ONLY = _note("pulses.counted_only", "counted only, not matched yet")
 UNEQUAL = Kind("pulses.unequal", "image and pulse counts differ", _EVERY_PULSE)
 NOT_MATCHED = Kind("pulses.not_matched", "not matched")
-DELAY = Kind("pulses.delay", "delay {delay_ms:.2f} +- {delay_scatter_ms:.2f} ms", severity="note")
+DELAY = _note("pulses.delay", "delay {delay_ms:.2f} +- {delay_scatter_ms:.2f} ms")
 MISSED = Kind("pulses.missed", "{n_missed} pulses missed, count slipped {n_slips} times", _EVERY_PULSE)
 
-GREY = Kind(
-    "exposure.grey",
-    "grey {grey_1:.0f} to {grey_99:.0f}, {white_share:percent} white, edges {edge_px:.1f} px",
-    severity="note",
+GREY = _note(
+    "exposure.grey", "grey {grey_1:.0f} to {grey_99:.0f}, {white_share:percent} white, edges {edge_px:.1f} px"
 )
 NOTHING_VISIBLE = Kind(
     "exposure.nothing_visible",
     "nothing visible",
     "take the lens cap off, and check that the cable is in the right port",
 )
-DARK = Kind(
+DARK = _warning(
     "exposure.dark",
     "underexposed ({black_share:percent} black)",
     "expose longer, open the lens, or add light",
-    severity="warning",
 )
-BRIGHT = Kind(
-    "exposure.bright", "overexposed", "expose shorter, or turn away from the light", severity="warning"
+BRIGHT = _warning("exposure.bright", "overexposed", "expose shorter, or turn away from the light")
+BLURRED = _warning(
+    "exposure.blurred", "blurred (limit {limit_px:.0f} px)", "focus the lens, clean it, and expose shorter"
 )
-BLURRED = Kind(
-    "exposure.blurred",
-    "blurred (limit {limit_px:.0f} px)",
-    "focus the lens, clean it, and expose shorter",
-    severity="warning",
-)
-EVENTS_FIT = Kind("exposure.events", "moving edges, no flicker, hardly any hot pixels", severity="note")
-BOARD_IN_SCAN = Kind("board.in_scan", _in_scan, severity="note")
-BOARD_IN_IMAGE = Kind(
+EVENTS_FIT = _note("exposure.events", "moving edges, no flicker, hardly any hot pixels")
+BOARD_IN_SCAN = _note("board.in_scan", _in_scan)
+BOARD_IN_IMAGE = _note(
     "board.in_image",
     "{distance_m:.2f} m away, {n_corners:.0f} corners to {corner_rms_px:.2f} px rms, "
     "sharpness {sharpness:.1f}",
-    severity="note",
 )
-BOARD_IN_EVENTS = Kind("board.in_events", "{distance_m:.2f} m away, detected in its events", severity="note")
+BOARD_IN_EVENTS = _note("board.in_events", "{distance_m:.2f} m away, detected in its events")

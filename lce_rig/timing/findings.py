@@ -1,6 +1,10 @@
 """Kinds of findings on the sensors' clocks: images and pulses, edges, synchronisation."""
 
+from functools import partial
+
 from lce_rig.core.findings import Finding, Kind
+
+_note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
 
 NOTHING_YET = Kind("pulses.nothing_yet", "no images and pulses yet")
 IMAGES_NOT_NUMBERED = Kind(
@@ -23,18 +27,17 @@ PULSES_NOT_FOLLOWED = Kind(
 )
 BOARD_RESTARTED = Kind("pulses.board_restarted", "the board restarted its count")
 CAMERA_RESTARTED = Kind("pulses.camera_restarted", "the camera restarted its count")
-IMAGE_UNMATCHED = Kind("pulses.image_unmatched", "{n} images match no pulse", severity="note")
-IMAGE_LOST = Kind("pulses.image_lost", "{n} images lost, by the camera's numbers", severity="note")
-MESSAGE_LOST = Kind("pulses.message_lost", "messages of {n} pulses lost, whose images came", severity="note")
-MISSED_BY_CAMERA = Kind("pulses.missed_by_camera", "{n} pulses made no image", severity="note")
-REPEATED = Kind("pulses.repeated", "{n} images and pulses came twice", severity="note")
-SLIP = Kind("pulses.slip", "the camera's count slipped {n} times", severity="note")
-RESTART = Kind("pulses.restart", "the camera or the board restarted its count {n} times", severity="note")
-SLIPPED = Kind(
+IMAGE_UNMATCHED = _note("pulses.image_unmatched", "{n} images match no pulse")
+IMAGE_LOST = _note("pulses.image_lost", "{n} images lost, by the camera's numbers")
+MESSAGE_LOST = _note("pulses.message_lost", "messages of {n} pulses lost, whose images came")
+MISSED_BY_CAMERA = _note("pulses.missed_by_camera", "{n} pulses made no image")
+REPEATED = _note("pulses.repeated", "{n} images and pulses came twice")
+SLIP = _note("pulses.slip", "the camera's count slipped {n} times")
+RESTART = _note("pulses.restart", "the camera or the board restarted its count {n} times")
+SLIPPED = _note(
     "pulses.slipped",
     "its count slipped against the pulses {n_slips} times and restarted {n_restarts} times; "
     "{n_matched} images matched, {n_unmatched} not",
-    severity="note",
 )
 
 NO_EDGES = Kind("edges.none_seen", "no edges detected yet", "wire its trigger input, and switch it on")
@@ -47,34 +50,28 @@ EDGES_NOT_THE_PULSES = Kind(
     "edges.not_the_pulses", "the detected edges are not the board's pulses", "check the wire"
 )
 
-BOARDS_MAY_MOVE = Kind("sync.boards_may_move", "boards may move while they are captured", severity="note")
-BOARDS_MUST_STAND = Kind(
+BOARDS_MAY_MOVE = _note("sync.boards_may_move", "boards may move while they are captured")
+BOARDS_MUST_STAND = _note(
     "sync.boards_must_stand",
     "boards must stand still while they are captured",
-    severity="note",
     actions={
         "add_board": "add `sync` to the profile (docs/wiring-and-sync.md) to let boards move",
         "see_lines": "see the lines of these sensors and of the sync board",
     },
 )
-NO_BOARD = Kind(
-    "sync.no_board",
-    "no sync board synchronises the cameras with the LiDAR",
-    severity="warning",
-    actions={"named": ""},
+NO_BOARD = _warning(
+    "sync.no_board", "no sync board synchronises the cameras with the LiDAR", actions={"named": ""}
 )
-NONE_IN_PROFILE = Kind("sync.none_in_profile", "{key} is none", severity="warning", actions={"named": ""})
-NOT_TIED = Kind(
+NONE_IN_PROFILE = _warning("sync.none_in_profile", "{key} is none", actions={"named": ""})
+NOT_TIED = _warning(
     "sync.not_tied",
     "the clock of {subject} is not synchronised with the rig's",
     "run `lce-rig doctor`",
-    severity="warning",
     actions={"named": ""},
 )
-TOO_UNCERTAIN = Kind(
+TOO_UNCERTAIN = _warning(
     "sync.too_uncertain",
     "time of {subject}: standard deviation {sigma_ms:.1f} ms (limit {limit_ms:.1f} ms)",
-    severity="warning",
     actions={"named": ""},
 )
 

@@ -80,7 +80,6 @@ def test_a_refused_source_leaves_nothing_open_and_can_be_tried_again() -> None:
 STRUCTURES = {
     "v4l2_capability": abi.Capability,
     "v4l2_fmtdesc": abi.FormatDescription,
-    "v4l2_frmsizeenum": abi.FrameSize,
     "v4l2_pix_format": abi.PixFormat,
     "v4l2_format": abi.Format,
     "v4l2_streamparm": abi.CaptureParameters,
@@ -106,7 +105,6 @@ NUMBERS = {
     "VIDIOC_QUERYMENU": abi.QUERY_MENU,
     "VIDIOC_G_EXT_CTRLS": abi.GET_CONTROLS,
     "VIDIOC_S_EXT_CTRLS": abi.SET_CONTROLS,
-    "VIDIOC_ENUM_FRAMESIZES": abi.ENUMERATE_SIZES,
     "VIDIOC_QUERY_EXT_CTRL": abi.QUERY_CONTROL,
     "V4L2_CAP_VIDEO_CAPTURE": abi.CAP_VIDEO_CAPTURE,
     "V4L2_CAP_VIDEO_CAPTURE_MPLANE": abi.CAP_VIDEO_CAPTURE_MPLANE,
@@ -133,7 +131,6 @@ OFFSETS = {
     "v4l2_query_ext_ctrl, flags": abi.ControlQuery.flags.offset,
     "v4l2_ext_control, value64": abi.V4l2Control.value.offset,
     "v4l2_ext_controls, controls": abi.V4l2Controls.controls.offset,
-    "v4l2_frmsizeenum, discrete": abi.FrameSize.sizes.offset,
     "v4l2_querymenu, name": abi.MenuQuery.item.offset,
 }
 
