@@ -64,15 +64,25 @@ def estimate_intrinsics(
         fitted, weights = _fit_weighted(setup.select(kept), state.select(kept), channels[kept])
         # Views rejected because of a bad start return if they fit after all.
         starts[kept] = fitted.T_cam_board
-        starts[~kept] = _posed_anew(setup.select(~kept), starts[~kept], fitted, start)
+        lens = model.intrinsics(fitted.lens, start.width_px, start.height_px)
+        for k in np.flatnonzero(~kept):
+            solved = solve_planar_pose(setup.corners_px[k], setup.corners_board, lens)
+            starts[k] = starts[k] if solved is None else solved.T_cam_board
         state = refine_poses(setup, fitted.with_poses(starts))
-        fits = _fitting(setup, state, channels)
+        # Boards that fit about as well as is typical of their channel.
+        variances = _variances(setup, state)
+        fits = variances <= _BAD**2 * _usual(variances, channels)
         if rounds_left == 0 or np.array_equal(fits, kept):
             break
         kept = fits
         _require_captures([view for view, is_kept in zip(views, kept, strict=True) if is_kept])
     used = tuple(view for view, is_kept in zip(views, kept, strict=True) if is_kept)
-    refused = _refusals(_distances(setup, state), kept, views)
+    distances_px = _distances(setup, state)
+    median_px = float(np.median(distances_px[kept]))
+    refused = {
+        views[k].name: OTHER_LENS.refusal(rms_px=float(distances_px[k]), median_px=median_px)
+        for k in np.flatnonzero(~kept).tolist()
+    }
     return _estimate(setup.select(kept), fitted, weights, used, refused, start, n_folds)
 
 
@@ -114,15 +124,6 @@ def _fit_weighted(setup: Setup, state: LensState, channels: NDArray[np.str_]) ->
     return fit(setup, state, weights), weights
 
 
-def _posed_anew(setup: Setup, poses: Array, fitted: LensState, size: Intrinsics) -> Array:
-    """Solve for poses (K, 4, 4) without a start; keep the given ones if corners fit no pose."""
-    lens = setup.model.intrinsics(fitted.lens, size.width_px, size.height_px)
-    solved = [solve_planar_pose(corners, setup.corners_board, lens) for corners in setup.corners_px]
-    return np.array(
-        [old if found is None else found.T_cam_board for old, found in zip(poses, solved, strict=True)]
-    ).reshape(-1, 4, 4)
-
-
 def _variances(setup: Setup, state: LensState) -> Array:
     residuals = residuals_px(setup, state).reshape(len(setup.corners_px), -1)
     # If the start cannot project a board, the board gets no weight in this round.
@@ -140,22 +141,6 @@ def _weights(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> Arra
     dof = 2 * setup.corners_px.shape[1] - 6
     usual = _usual(variances, channels)
     return np.asarray((dof + _PRIOR_DOF) / (dof * variances + _PRIOR_DOF * usual + 1e-12))
-
-
-def _fitting(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Return which boards fit about as well as is typical of their channel (K,)."""
-    variances = _variances(setup, state)
-    return np.asarray(variances <= _BAD**2 * _usual(variances, channels))
-
-
-def _refusals(distances_px: Array, kept: NDArray[np.bool_], views: Sequence[BoardView]) -> dict[str, Refusal]:
-    """State for each rejected view the error of its corners under the intrinsics from the others."""
-    usual = float(np.median(distances_px[kept]))
-    return {
-        view.name: OTHER_LENS.refusal(rms_px=float(px), median_px=usual)
-        for view, px, is_kept in zip(views, distances_px, kept, strict=True)
-        if not is_kept
-    }
 
 
 def _distances(setup: Setup, state: LensState) -> Array:
@@ -249,9 +234,6 @@ def _held_out(
     return distances
 
 
-# Choice of the lens model: the fewest parameters among those that predict held-out captures as well as the
-# best.
-
 # Models whose mean squared distances differ by less than this fraction are equivalent in practice.
 _ALIKE = 0.02
 
@@ -317,40 +299,33 @@ def choose_model(
             troubles.append(error)
     if not fitted:
         raise troubles[0]
-    scores = _scores(fitted)
-    equals = [score for score in scores if score.is_as_good_as_the_best]
-    chosen = min(equals, key=lambda s: (s.n_parameters, MODELS[s.name].family != start.model, s.held_out_px))
-    return fitted[chosen.name], Choice(chosen.name, _reason(chosen, scores), scores)
-
-
-def _scores(fitted: Mapping[str, IntrinsicsEstimate]) -> tuple[ModelScore, ...]:
-    """Compare the models on the captures that none of them refused; the best first."""
+    # Models are compared on the captures that none of them refused.
     squares = {name: _squares_by_capture(estimate) for name, estimate in fitted.items()}
     shared = sorted(set.intersection(*(set(by_capture) for by_capture in squares.values())))
     table = {name: np.array([squares[name][capture] for capture in shared]) for name in fitted}
     best = min(table, key=lambda name: (float(table[name].mean()), name))
     scores = []
     for name, estimate in fitted.items():
-        excess = table[name] - table[best]
+        excess, held_out_px = table[name] - table[best], float(np.sqrt(table[name].mean()))
         sigma = float(excess.std(ddof=1) / np.sqrt(len(excess))) if len(excess) > 1 else 0.0
-        held_out_px = float(np.sqrt(table[name].mean()))
-        mean = float(excess.mean())
-        scores.append(ModelScore(name, estimate.model.size, estimate.rms_px, held_out_px, mean, sigma))
-    return tuple(sorted(scores, key=lambda score: score.held_out_px))
+        size, mean = estimate.model.size, float(excess.mean())
+        scores.append(ModelScore(name, size, estimate.rms_px, held_out_px, mean, sigma))
+    scores.sort(key=lambda score: score.held_out_px)
+    equals = [score for score in scores if score.is_as_good_as_the_best]
+    chosen = min(equals, key=lambda s: (s.n_parameters, MODELS[s.name].family != start.model, s.held_out_px))
+
+    def listed(some: Sequence[ModelScore]) -> str:
+        return ", ".join(f"{score.name} {score.held_out_px:.3f} px" for score in some)
+
+    reason = f"{chosen.name}: {chosen.held_out_px:.3f} px on held-out captures"
+    alike = [score for score in equals if score.name != chosen.name]
+    worse = [score for score in scores if score not in equals]
+    reason += f"; not significantly better: {listed(alike)}" if alike else ", the lowest"
+    reason += f"; worse: {listed(worse)}" if worse else ""
+    return fitted[chosen.name], Choice(chosen.name, reason, tuple(scores))
 
 
 def _squares_by_capture(estimate: IntrinsicsEstimate) -> dict[str, float]:
     """Mean squared distance of each held-out capture's corners, px^2."""
     captures = np.array([view.capture for view in estimate.views])
     return {str(name): float(np.mean(estimate.held_out_px[captures == name] ** 2)) for name in set(captures)}
-
-
-def _reason(chosen: ModelScore, scores: Sequence[ModelScore]) -> str:
-    def listed(some: Sequence[ModelScore]) -> str:
-        return ", ".join(f"{score.name} {score.held_out_px:.3f} px" for score in some)
-
-    text = f"{chosen.name}: {chosen.held_out_px:.3f} px on held-out captures"
-    alike = [score for score in scores if score.is_as_good_as_the_best and score.name != chosen.name]
-    worse = [score for score in scores if not score.is_as_good_as_the_best]
-    text += f"; not significantly better: {listed(alike)}" if alike else ", the lowest"
-    return text + (f"; worse: {listed(worse)}" if worse else "")

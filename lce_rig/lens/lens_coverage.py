@@ -27,18 +27,44 @@ def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> t
         estimate: of the lens.
         certainty: of the same.
     """
-    return tuple(
-        text
-        for text in (
-            _few_captures(estimate),
-            _folds(certainty),
-            _border(estimate, certainty),
-            *_tilts(estimate),
-            _overfitted(estimate),
-            *_board(estimate),
+    texts, n = [], len({view.capture for view in estimate.views})
+    if n < ENOUGH_CAPTURES:
+        texts.append(f"only {n} captures: standard deviations are rough; collect 15 or more")
+    blank = np.isnan(certainty.sigma_px)
+    if blank.any():
+        texts.append(
+            f"the distortion folds back: {100 * blank.mean():.0f} % of the image, at its border, has no ray; "
+            "place the board there too, or choose a model with fewer parameters"
         )
-        if text
-    )
+    inside = float(np.sqrt(np.nanmean(certainty.sigma_px[certainty.is_covered] ** 2)))
+    outside = float(np.nanpercentile(certainty.sigma_px, _BORDER_PERCENTILE))
+    if outside >= max(_BORDER_PX, _BORDER_RATIO * inside):
+        texts.append(
+            f"boards reach {100 * reach(estimate):.0f} % of the way to the image's corners, the distortion "
+            f"is not determined beyond (pixel standard deviation {outside:.1f} px there, {inside:.1f} px "
+            "where boards were seen); place boards in all four corners"
+        )
+    texts += _tilts(estimate)
+    if estimate.held_out_rms_px >= _OVERFITTED * estimate.rms_px:
+        texts.append(
+            f"held-out captures fit worse ({estimate.held_out_rms_px:.2f} px) than captures used "
+            f"({estimate.rms_px:.2f} px): add captures, or choose a model with fewer parameters"
+        )
+    bow_m = max(estimate.shape[:2], key=abs)
+    if abs(bow_m) > _BOW_M:
+        way = "towards" if bow_m > 0 else "away from"
+        texts.append(
+            f"the board is bent: its middle is {1000 * abs(bow_m):.1f} mm {way} the viewer; "
+            "use a stiffer plate"
+        )
+    aspect, sigma = float(estimate.shape[2]), float(estimate.shape_sigma[2])
+    if abs(aspect) > _ASPECT + 2 * sigma:
+        way = "width" if aspect > 0 else "height"
+        texts.append(
+            f"the pattern is {100 * abs(aspect):.2f} +- {100 * sigma:.2f} % too long along the plate's "
+            f"{way}, compared with the other side: measure the squares both ways"
+        )
+    return tuple(texts)
 
 
 def tilts_deg(estimate: IntrinsicsEstimate) -> Array:
@@ -64,35 +90,6 @@ def reach(estimate: IntrinsicsEstimate) -> float:
     return float(np.linalg.norm(estimate.corners_px.reshape(-1, 2) - centre, axis=1).max() / farthest)
 
 
-def _few_captures(estimate: IntrinsicsEstimate) -> str:
-    n = len({view.capture for view in estimate.views})
-    if n >= ENOUGH_CAPTURES:
-        return ""
-    return f"only {n} captures: standard deviations are rough; collect 15 or more"
-
-
-def _folds(certainty: LensCertainty) -> str:
-    blank = np.isnan(certainty.sigma_px)
-    if not blank.any():
-        return ""
-    return (
-        f"the distortion folds back: {100 * blank.mean():.0f} % of the image, at its border, has no ray; "
-        "place the board there too, or choose a model with fewer parameters"
-    )
-
-
-def _border(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> str:
-    inside = float(np.sqrt(np.nanmean(certainty.sigma_px[certainty.is_covered] ** 2)))
-    outside = float(np.nanpercentile(certainty.sigma_px, _BORDER_PERCENTILE))
-    if outside < max(_BORDER_PX, _BORDER_RATIO * inside):
-        return ""
-    return (
-        f"boards reach {100 * reach(estimate):.0f} % of the way to the image's corners, the distortion is "
-        f"not determined beyond (pixel standard deviation {outside:.1f} px there, {inside:.1f} px where "
-        "boards were seen); place boards in all four corners"
-    )
-
-
 def _tilts(estimate: IntrinsicsEstimate) -> list[str]:
     focal_sigma = float(estimate.sigma[0] / estimate.intrinsics.fx_px)
     if focal_sigma < _FOCAL_SIGMA:
@@ -109,29 +106,3 @@ def _tilts(estimate: IntrinsicsEstimate) -> list[str]:
         way = "left and right" if abs(axes[1, 0]) > abs(axes[1, 1]) else "up and down"
         return [f"boards are hardly tilted {way} ({spread[1]:.0f} deg rms): {known}; tilt them that way too"]
     return [f"{known}: add captures, nearer and tilted by 30 to 45 deg"]
-
-
-def _overfitted(estimate: IntrinsicsEstimate) -> str:
-    if estimate.held_out_rms_px < _OVERFITTED * estimate.rms_px:
-        return ""
-    return (
-        f"held-out captures fit worse ({estimate.held_out_rms_px:.2f} px) than captures used "
-        f"({estimate.rms_px:.2f} px): add captures, or choose a model with fewer parameters"
-    )
-
-
-def _board(estimate: IntrinsicsEstimate) -> list[str]:
-    texts = []
-    bow_m = max(estimate.shape[:2], key=abs)
-    if abs(bow_m) > _BOW_M:
-        way = "towards" if bow_m > 0 else "away from"
-        text = f"the board is bent: its middle is {1000 * abs(bow_m):.1f} mm {way} the viewer"
-        texts.append(f"{text}; use a stiffer plate")
-    aspect, sigma = float(estimate.shape[2]), float(estimate.shape_sigma[2])
-    if abs(aspect) > _ASPECT + 2 * sigma:
-        way = "width" if aspect > 0 else "height"
-        text = (
-            f"the pattern is {100 * abs(aspect):.2f} +- {100 * sigma:.2f} % too long along the plate's {way}"
-        )
-        texts.append(f"{text}, compared with the other side: measure the squares both ways")
-    return texts

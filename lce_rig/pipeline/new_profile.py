@@ -12,7 +12,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import find_data_sheet
-from lce_rig.core.errors import UsageError
+from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.detect.lidar.segments import order_scan
 from lce_rig.export.camera_info import load_camera_info
 from lce_rig.io.folder.cloud import to_scan
@@ -75,7 +75,10 @@ def new_profile(
         lidars = [_with_beams(lidars[0], read_cloud(clouds[0]), str(clouds[0]))]
     groups = _by_camera([t for t in topics if t.kind != "scans"])
     if recording is not None and not clouds:
-        _require_both(recording, topics)
+        for kinds, what in ((("scans",), "point clouds"), (("frames", "events"), "images or events")):
+            if not any(topic.kind in kinds for topic in topics):
+                listed = "; ".join(map(_line, topics))
+                raise SourceError(f"{recording}: no {what}, so that it is no recording of a rig", listed)
         _require_count(len(cameras), len(groups), "names (--camera)", recording)
         _require_count(len(intrinsics), len(groups), "--intrinsics", recording)
     else:
@@ -240,15 +243,6 @@ def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
         f"no intrinsics of camera {camera} ({topic.topic}): {why}",
         f"Give --intrinsics for every camera: a camera_info file, or {_LENS_FORM}.",
     )
-
-
-def _require_both(recording: Path, topics: Sequence[SensorTopic]) -> None:
-    from lce_rig.core.errors import SourceError
-
-    for kinds, what in ((("scans",), "point clouds"), (("frames", "events"), "images or events")):
-        if not any(topic.kind in kinds for topic in topics):
-            found = "; ".join(map(_line, topics))
-            raise SourceError(f"{recording}: no {what}, so that it is no recording of a rig", found)
 
 
 def _require_count(n_given: int, n_there: int, what: str, recording: Path) -> None:

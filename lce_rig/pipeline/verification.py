@@ -8,8 +8,7 @@ from pathlib import Path
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Refusal
-from lce_rig.core.results import LidarBoard
-from lce_rig.detect.detection import Detections, LidarDetection, Pair
+from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.events.search import EventImage
 from lce_rig.judge.session_check import SessionCheck, check_session
 from lce_rig.pipeline.calibration import clocks_of
@@ -27,7 +26,6 @@ from lce_rig.pipeline.result_files import (
     stored_results,
 )
 from lce_rig.pipeline.witness import hear_scene
-from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import DEBUG
 from lce_rig.show.overlays.check_pictures import draw_check
@@ -92,7 +90,17 @@ class Verification:
                     f"{session.path.joinpath(*parts[:-1])} was calibrated again while overlays were drawn",
                     "Run `lce-rig verify` again.",
                 )
-            _keep_users_files(session.rig, earlier, draft)
+            # Files that `verify` did not draw are kept, beside its images and in its folders.
+            folders = {
+                Pair(camera, channel, lidar).folder_name
+                for camera, sensor in session.rig.cameras.items()
+                for channel in sensor.channels
+                for lidar in session.rig.lidars
+            }
+            keep_foreign(earlier, draft, lambda path: path.name in folders or is_overlay(path))
+            for name in folders:
+                if not (earlier / name).is_symlink():
+                    keep_foreign(earlier / name, draft / name, is_overlay)
 
         with session.replacing(*parts, finish=finish) as draft:
             drawn = self._draw(draft, progress)
@@ -138,24 +146,18 @@ def verify(
     """
     calibrations, own_result = _extrinsics(session, result, name)
     detections = detections or detect(session, event_image=event_image, progress=progress)
-    scenes = {(c.camera, c.lidar): hear_scene(session, detections, c) for c in calibrations}
-    checks = tuple(
-        check_session(
-            session.rig,
-            detections,
-            c,
-            channel,
-            clocks_of(session.rig, c.camera, c.lidar),
-            scenes[c.camera, c.lidar],
-        )
-        for c in calibrations
-        for channel in sorted(c.channels)
-        if Pair(c.camera, channel, c.lidar) in detections.pairs
-    )
+    checks = []
+    for c in calibrations:
+        scene, clocks = hear_scene(session, detections, c), clocks_of(session.rig, c.camera, c.lidar)
+        for channel in sorted(c.channels):
+            if Pair(c.camera, channel, c.lidar) in detections.pairs:
+                checks.append(check_session(session.rig, detections, c, channel, clocks, scene))
     if not checks:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
         raise SessionError(f"{session.path} holds no captures of {wanted}", "Check the result's session.")
-    return Verification(session, checks, tuple(calibrations), detections, event_image, own_result, name)
+    return Verification(
+        session, tuple(checks), tuple(calibrations), detections, event_image, own_result, name
+    )
 
 
 def _extrinsics(
@@ -186,20 +188,6 @@ def _extrinsics(
         # Names of captures differ between sessions: none of these was fitted.
         calibrations = tuple(replace(c, captures_used=(), captures_refused={}) for c in calibrations)
     return calibrations, content
-
-
-def _keep_users_files(rig: Rig, earlier: Path, draft: Path) -> None:
-    """Keep files that `verify` did not draw, beside its images and in its folders."""
-    folders = {
-        Pair(camera, channel, lidar).folder_name
-        for camera, sensor in rig.cameras.items()
-        for channel in sensor.channels
-        for lidar in rig.lidars
-    }
-    keep_foreign(earlier, draft, lambda path: path.name in folders or is_overlay(path))
-    for name in folders:
-        if not (earlier / name).is_symlink():
-            keep_foreign(earlier / name, draft / name, is_overlay)
 
 
 def write_debug_images(
@@ -238,6 +226,8 @@ def write_debug_images(
         except SessionError:
             # It is damaged; its detection says so.
             scan = None
+        candidates = lidar if isinstance(lidar, list) else []
+        index = next((k for k, each in enumerate(candidates) if each is chosen.get(name)), 0)
         picture = draw_debug(
             None if view is None else view.image,
             scan,
@@ -247,7 +237,7 @@ def write_debug_images(
             intrinsics=session.rig.cameras[pair.camera].to_intrinsics(),
             limits=session.rig.quality,
             title=f"{pair}  {name}",
-            chosen=_index_of(chosen.get(name), lidar),
+            chosen=index,
             mismatch=mismatch if mismatch is not None and mismatch.stage == "pair" else None,
             events=None if view is None else view.events,
         )
@@ -255,10 +245,6 @@ def write_debug_images(
         write_picture(place / f"{name}.png", picture)
         progress(done, len(jobs))
     return base
-
-
-def _index_of(chosen: LidarBoard | None, lidar: LidarDetection) -> int:
-    return next((k for k, each in enumerate(lidar) if each is chosen), 0) if isinstance(lidar, list) else 0
 
 
 def _view(
