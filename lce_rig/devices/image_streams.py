@@ -8,9 +8,7 @@ References:
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-
-import numpy as np
+from collections.abc import Callable, Iterator
 
 from lce_rig.core.limits import MAX_PIXELS
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, Pixels
@@ -19,7 +17,8 @@ from lce_rig.io.folder.image_file import decode_image
 _MAX_HEADER = 4096
 _MAX_JPEG = 1 << 26
 _PNM_HEADER = re.compile(rb"(P[56])\s+(?:#[^\n]*\n\s*)*(\d+)\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s")
-_420 = ("420", "420jpeg", "420mpeg2", "420paldv")  # they differ in where a chroma sample sits
+# They differ in where a chroma sample sits.
+_Y4M_COLOURS = ("mono", "420", "420jpeg", "420mpeg2", "420paldv")
 _SOI, _EOI, _SOS = b"\xff\xd8", b"\xff\xd9", 0xDA
 
 
@@ -30,8 +29,9 @@ class ImageStream(ABC):
         n_damaged: images that were there and could not be decoded.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, decode: Callable[[bytes], Pixels] = decode_image) -> None:
         self.n_damaged = 0
+        self._decode = decode
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Pixels]:
@@ -58,22 +58,12 @@ class ImageStream(ABC):
     def _cut(self) -> bytes | None:
         """Take the next image's bytes off the rest; None where they have not all come."""
 
-    @abstractmethod
-    def _decode(self, payload: bytes) -> Pixels:
-        """Decode one image; ValueError where it is damaged."""
-
-    def _take(self, n_bytes: int) -> bytes:
+    def _take(self, n_bytes: int) -> bytes | None:
+        if len(self._rest) < n_bytes:
+            return None
         taken = bytes(self._rest[:n_bytes])
         del self._rest[:n_bytes]
         return taken
-
-    def _line(self) -> str | None:
-        end = self._rest.find(b"\n", 0, _MAX_HEADER)
-        if end < 0:
-            if len(self._rest) >= _MAX_HEADER:
-                raise ValueError("a line of text was expected, other bytes came")
-            return None
-        return self._take(end + 1).decode("ascii", "backslashreplace").rstrip()
 
 
 class RawImages(ImageStream):
@@ -84,80 +74,67 @@ class RawImages(ImageStream):
     """
 
     def __init__(self, code: str, width: int, height: int) -> None:
-        super().__init__()
+        decoder = PixelDecoder(code, width, height)
+        super().__init__(decoder.decode)
         self.row_bytes = FORMATS[code].row_bytes(width)
-        self._decoder = PixelDecoder(code, width, height)
+        self._n_bytes = decoder.n_bytes
 
     def _cut(self) -> bytes | None:
-        n_bytes = self._decoder.n_bytes
-        return self._take(n_bytes) if len(self._rest) >= n_bytes else None
-
-    def _decode(self, payload: bytes) -> Pixels:
-        return self._decoder.decode(payload)
+        return self._take(self._n_bytes)
 
 
 class Y4mImages(ImageStream):
-    """YUV4MPEG2 of 8 bits; of finer chroma than 4:2:0 every other sample is taken."""
+    """YUV4MPEG2 of 8 bits, grey or 4:2:0."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._decoder: PixelDecoder | None = None
-        self._colour = ""
-        self._size = 0, 0
+        self._width = self._n_bytes = 0
         self._is_in_frame = False
 
     def _cut(self) -> bytes | None:
-        if self._decoder is None:
-            line = self._line()
-            if line is None:
+        if not self._n_bytes:
+            header = self._line()
+            if header is None:
                 return None
-            self._decoder = self._read_header(line)
+            self._read_header(header)
         if not self._is_in_frame:
             line = self._line()
             if line is None:
                 return None
             if not line.startswith("FRAME"):
-                width = self._size[0]
-                known = (
-                    f"; GStreamer writes broken Y4M at widths like {width}: use jpegenc" if width % 8 else ""
-                )
-                raise ValueError(f"a Y4M frame was expected, {line[:20]!r} came{known}")
+                hint = f"; GStreamer writes broken Y4M at widths like {self._width}: use jpegenc"
+                is_odd = self._width % 8 != 0
+                raise ValueError(f"a Y4M frame was expected, {line[:20]!r} came{hint if is_odd else ''}")
             self._is_in_frame = True
-        n_pixels = self._size[0] * self._size[1]
-        finer = {"444": 3 * n_pixels, "422": 2 * n_pixels}
-        n_bytes = finer.get(self._colour, self._decoder.n_bytes)
-        if len(self._rest) < n_bytes:
-            return None
-        self._is_in_frame = False
-        return self._take(n_bytes)
+        payload = self._take(self._n_bytes)
+        self._is_in_frame = payload is None
+        return payload
 
-    def _decode(self, payload: bytes) -> Pixels:
-        assert self._decoder is not None  # frames follow the header
-        if self._colour in ("444", "422"):
-            (width, height), step = self._size, 2 if self._colour == "444" else 1
-            n_luma = width * height
-            chroma = np.frombuffer(payload, np.uint8, offset=n_luma).reshape(2, height, -1)
-            payload = payload[:n_luma] + chroma[:, ::2, ::step].tobytes()
-        return self._decoder.decode(payload)
+    def _line(self) -> str | None:
+        end = self._rest.find(b"\n", 0, _MAX_HEADER)
+        if end < 0 and len(self._rest) >= _MAX_HEADER:
+            raise ValueError("a line of text was expected, other bytes came")
+        line = self._take(end + 1) if end >= 0 else None
+        return None if line is None else line.decode("ascii", "backslashreplace").rstrip()
 
-    def _read_header(self, line: str) -> PixelDecoder:
+    def _read_header(self, line: str) -> None:
         fields = {word[0]: word[1:] for word in line.split(" ")[1:] if word}
-        width, height = fields.get("W", ""), fields.get("H", "")
-        colour = fields.get("C", "420")
-        if not (width.isdigit() and height.isdigit() and 0 < int(width) < 65536 and 0 < int(height) < 65536):
-            raise ValueError(f"the Y4M header tells no size: {line[:80]!r}")
-        if colour not in ("mono", "444", "422", *_420):
+        sides, colour = (fields.get("W", ""), fields.get("H", "")), fields.get("C", "420")
+        if not all(side.isdigit() and 0 < int(side) < 65536 for side in sides):
+            raise ValueError(f"the Y4M header holds no size: {line[:80]!r}")
+        if colour not in _Y4M_COLOURS:
             raise ValueError(f"Y4M colour {colour} is not read here: let the command write 4:2:0, 8 bit")
-        if int(width) * int(height) > MAX_PIXELS:
+        width, height = (int(side) for side in sides)
+        if width * height > MAX_PIXELS:
             raise ValueError(f"Y4M images of {width}x{height} px are too large: at most {MAX_PIXELS} px")
-        if colour != "mono" and (int(width) % 2 or int(height) % 2):
+        if colour != "mono" and (width % 2 or height % 2):
             raise ValueError(f"Y4M images of {width}x{height} px in colour: both must be even")
-        self._colour, self._size = colour, (int(width), int(height))
-        return PixelDecoder("GREY" if colour == "mono" else "YU12", *self._size)
+        decoder = PixelDecoder("GREY" if colour == "mono" else "YU12", width, height)
+        self._width, self._n_bytes, self._decode = width, decoder.n_bytes, decoder.decode
 
 
 class PnmImages(ImageStream):
-    """PGM and PPM files of 8 or 16 bits, one behind the other."""
+    """PGM and PPM files of 8 bits, one behind the other."""
 
     def _cut(self) -> bytes | None:
         match = _PNM_HEADER.match(self._rest, 0, _MAX_HEADER)
@@ -166,21 +143,11 @@ class PnmImages(ImageStream):
                 raise ValueError(f"a PGM or PPM image was expected, {bytes(self._rest[:20])!r} came")
             return None
         width, height, most = (int(text) for text in match.groups()[1:])
-        n_channels = 3 if match.group(1) == b"P6" else 1
-        n_bytes = match.end() + width * height * n_channels * (1 if most < 256 else 2)
-        return self._take(n_bytes) if len(self._rest) >= n_bytes else None
-
-    def _decode(self, payload: bytes) -> Pixels:
-        match = _PNM_HEADER.match(payload)
-        assert match is not None  # it was cut by this
-        width, height, most = (int(text) for text in match.groups()[1:])
-        if not 0 < most < 65536 or width * height == 0:
-            raise ValueError(f"{width}x{height} px with values up to {most} is no image")
-        shape = (height, width, 3) if match.group(1) == b"P6" else (height, width)
-        values = np.frombuffer(payload, ">u2" if most > 255 else "u1", offset=match.end()).reshape(shape)
-        if most != 255:
-            values = np.rint(np.minimum(values * (255.0 / most), 255)).astype(np.uint8)
-        return np.array(values if values.ndim == 2 else values[:, :, ::-1])
+        if most > 255:
+            raise ValueError(
+                f"PGM or PPM with values up to {most} is not read here: let the command write 8 bit"
+            )
+        return self._take(match.end() + width * height * (3 if match.group(1) == b"P6" else 1))
 
 
 class JpegImages(ImageStream):
@@ -221,12 +188,9 @@ class JpegImages(ImageStream):
             return following if following > 0 else None
         return None
 
-    def _decode(self, payload: bytes) -> Pixels:
-        return decode_image(payload)
-
 
 def find_stream(begin: bytes) -> ImageStream | None:
-    """Tell by its first bytes what a stream holds; None where they do not tell."""
+    """Choose the kind of a stream by its first bytes; None where they fit none."""
     if begin.startswith(b"YUV4MPEG2 "):
         return Y4mImages()
     if begin.startswith((b"P5", b"P6")):

@@ -40,8 +40,7 @@ def grey_pictures(n: int) -> list[np.ndarray]:
 
 
 def y4m(pictures: list[np.ndarray], colour: str = "420jpeg") -> bytes:
-    n_chroma = {"mono": 0, "444": 2 * WIDTH * HEIGHT, "422": WIDTH * HEIGHT}.get(colour, WIDTH * HEIGHT // 2)
-    chroma = b"\x80" * n_chroma
+    chroma = b"" if colour == "mono" else b"\x80" * (WIDTH * HEIGHT // 2)
     frames = b"".join(b"FRAME Ip\n" + picture.tobytes() + chroma for picture in pictures)
     return f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F10:1 Ip A1:1 C{colour} XNOTE\n".encode() + frames
 
@@ -55,11 +54,6 @@ def ppm(pictures: list[np.ndarray]) -> bytes:
     return b"".join(head + np.dstack((p, p, p)).tobytes() for p in pictures)
 
 
-def deep_pgm(pictures: list[np.ndarray]) -> bytes:
-    head = f"P5 {WIDTH} {HEIGHT} 4095\n".encode()
-    return b"".join(head + (p.astype(float) * 4095 / 255).round().astype(">u2").tobytes() for p in pictures)
-
-
 def jpegs(pictures: list[np.ndarray]) -> bytes:
     return b"".join(cv2.imencode(".jpg", picture)[1].tobytes() for picture in pictures)
 
@@ -71,10 +65,7 @@ def raw(pictures: list[np.ndarray]) -> bytes:
 STREAMS: dict[str, tuple[Callable[[list[np.ndarray]], bytes], Callable[[], ImageStream]]] = {
     "y4m": (y4m, Y4mImages),
     "grey y4m": (lambda pictures: y4m(pictures, "mono"), Y4mImages),
-    "fine y4m": (lambda pictures: y4m(pictures, "444"), Y4mImages),
-    "wide y4m": (lambda pictures: y4m(pictures, "422"), Y4mImages),
     "pgm": (pgm, PnmImages),
-    "deep pgm": (deep_pgm, PnmImages),
     "ppm": (ppm, PnmImages),
     "jpeg": (jpegs, JpegImages),
     "raw": (raw, lambda: RawImages("GREY", WIDTH, HEIGHT)),
@@ -100,13 +91,13 @@ def test_the_same_pictures_come_however_the_bytes_are_cut(kind: str, data: st.Da
     assert stream.n_damaged == 0
 
 
-@pytest.mark.parametrize("kind", ["grey y4m", "pgm", "deep pgm", "ppm", "jpeg", "raw"])
+@pytest.mark.parametrize("kind", ["grey y4m", "pgm", "ppm", "jpeg", "raw"])
 def test_grey_values_are_kept(kind: str) -> None:
     write, make = STREAMS[kind]
     assert levels(list(make().feed(write(grey_pictures(3))))) == pytest.approx([30, 40, 50], abs=0.6)
 
 
-@pytest.mark.parametrize("colour", ["420", "420mpeg2", "422", "444"])
+@pytest.mark.parametrize("colour", ["420", "420mpeg2"])
 def test_y4m_luma_is_of_video_range(colour: str) -> None:
     came = levels(list(Y4mImages().feed(y4m(grey_pictures(3), colour))))
     assert came == pytest.approx([(level - 16) * 255 / 219 for level in (30, 40, 50)], abs=1)
@@ -136,25 +127,24 @@ def test_a_damaged_jpeg_is_counted_and_the_next_one_comes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("begin", "says"),
+    ("make", "begin"),
     [
-        (b"YUV4MPEG2 W32 H18 C411\n", "colour 411 is not read here"),
-        (b"YUV4MPEG2 W32 H18 C420p10\n", "colour 420p10 is not read here"),
-        (b"YUV4MPEG2 F25:1\n", "tells no size"),
-        (b"YUV4MPEG2 W346 H2 Cmono\nFRAME\n" + bytes(2 * 348) + b"FRAME\n", "use jpegenc"),
-        (b"YUV4MPEG2 W32 H18\n" + b"FROME\n", "a Y4M frame was expected"),
-        (b"YUV4MPEG2 " + b"x" * 5000, "a line of text was expected"),
+        (Y4mImages, b"YUV4MPEG2 W32 H18 C411\n"),
+        (Y4mImages, b"YUV4MPEG2 W32 H18 C420p10\n"),
+        (Y4mImages, b"YUV4MPEG2 F25:1\n"),
+        (Y4mImages, b"YUV4MPEG2 W64 H47 F30:1 C420jpeg\n"),
+        (Y4mImages, b"YUV4MPEG2 W63 H48 F30:1 C420jpeg\n"),
+        (Y4mImages, b"YUV4MPEG2 W60000 H60000 F30:1 C420jpeg\n"),
+        (Y4mImages, b"YUV4MPEG2 W346 H2 Cmono\nFRAME\n" + bytes(2 * 348) + b"FRAME\n"),
+        (Y4mImages, b"YUV4MPEG2 W32 H18\n" + b"FROME\n"),
+        (Y4mImages, b"YUV4MPEG2 " + b"x" * 5000),
+        (PnmImages, pgm(grey_pictures(1)) + b"Segmentation fault"),
+        (PnmImages, b"P5 32 18 4095\n" + bytes(100)),
     ],
 )
-def test_y4m_that_is_not_read_is_explained(begin: bytes, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        list(Y4mImages().feed(begin))
-
-
-def test_pnm_that_ends_in_something_else_is_explained() -> None:
-    stream = PnmImages()
-    with pytest.raises(ValueError, match="a PGM or PPM image was expected"):
-        list(stream.feed(pgm(grey_pictures(1)) + b"Segmentation fault"))
+def test_streams_that_cannot_be_read_are_refused(make: Callable[[], ImageStream], begin: bytes) -> None:
+    with pytest.raises(ValueError):
+        list(make().feed(begin))
 
 
 # What follows runs real programs at the other end of a real pipe.
@@ -233,22 +223,13 @@ def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path: Path) -> None
     assert "signal | bye" in caught.value.hint
 
 
-def test_a_program_that_is_killed_is_said_to_be(tmp_path: Path) -> None:
-    command = child(tmp_path, pgm(grey_pictures(1)), "import os; os.kill(os.getpid(), 9)")
-    with (
-        ImagePipeSource("cam", camera(*command)) as source,
-        pytest.raises(SourceError, match="was ended by SIGKILL after 1 images"),
-    ):
-        take(source, 5)
-
-
 def test_a_program_that_stops_writing_falls_silent(tmp_path: Path) -> None:
     # A program that starts at once: on a busy machine, others are silent before their first picture.
     (tmp_path / "picture.pgm").write_bytes(pgm(grey_pictures(1)))
     command = ("sh", "-c", 'cat "$0"; exec sleep 60', str(tmp_path / "picture.pgm"))
     with (
         ImagePipeSource("cam", camera(*command), silence_s=0.5) as source,
-        pytest.raises(SourceError, match=r"fell silent: nothing for 0\.5 s") as caught,
+        pytest.raises(SourceError, match=r"0\.5 s") as caught,
     ):
         take(source, 5)
     assert "picture.pgm" in caught.value.hint
@@ -258,18 +239,18 @@ def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:
     command = child(tmp_path, jpegs([np.zeros((20, 32), np.uint8)]))
     with (
         ImagePipeSource("cam", camera(*command)) as source,
-        pytest.raises(SourceError, match="writes 32x20 px, the intrinsics belong to 32x18 px"),
+        pytest.raises(SourceError, match="32x20 px"),
     ):
         take(source, 1)
 
 
 def test_a_program_that_is_not_there_is_named() -> None:
-    with pytest.raises(SourceError, match="no-such-program cannot be started: No such file") as caught:
+    with pytest.raises(SourceError, match="no-such-program") as caught:
         ImagePipeSource("cam", camera("no-such-program")).__enter__()
     assert "installed" in caught.value.hint
-    with pytest.raises(SourceError, match="cam: the profile does not say how it is reached"):
+    with pytest.raises(SourceError, match="cam"):
         ImagePipeSource("cam", camera()).__enter__()
-    with pytest.raises(SourceError, match="pixel_format 'H264' is not read here"):
+    with pytest.raises(SourceError, match="H264"):
         ImagePipeSource("cam", camera("true", pixel_format="H264")).__enter__()
 
 
@@ -298,20 +279,15 @@ def test_a_talkative_stubborn_program_and_its_children_are_stopped(tmp_path: Pat
             time.sleep(0.01)
 
 
-def test_a_program_that_ended_can_be_started_again(tmp_path: Path) -> None:
-    source = ImagePipeSource("cam", camera(*child(tmp_path, pgm(grey_pictures(2)), "sys.exit(1)")))
+def test_a_program_that_was_killed_can_be_started_again_and_leaves_nothing_open(tmp_path: Path) -> None:
+    n_open = len(list(Path("/proc/self/fd").iterdir()))
+    then = "import os; os.kill(os.getpid(), 9)"
+    source = ImagePipeSource("cam", camera(*child(tmp_path, pgm(grey_pictures(2)), then)))
     for _ in range(2):
         came = []
-        with source, pytest.raises(SourceError, match="after 2 images"):
+        with source, pytest.raises(SourceError, match="SIGKILL after 2 images"):
             came.extend(source.samples())
         assert [image.count for image in came if isinstance(image, Image)] == [0, 1]
-
-
-def test_nothing_stays_open_after_the_end(tmp_path: Path) -> None:
-    n_open = len(list(Path("/proc/self/fd").iterdir()))
-    for _ in range(2):
-        with ImagePipeSource("cam", camera(*child(tmp_path, pgm(grey_pictures(1))))) as source:
-            take(source, 1)
     assert len(list(Path("/proc/self/fd").iterdir())) == n_open
 
 
@@ -338,10 +314,3 @@ def test_ffmpeg_is_read(output: tuple[str, ...]) -> None:
         images = take(source, 5)
     assert {image.pixels.shape for image in images} == {(HEIGHT, WIDTH, 3)}
     assert images[0].pixels.std() > 20
-
-
-@pytest.mark.parametrize("size", ["W64 H47", "W63 H48", "W60000 H60000"])
-def test_y4m_of_a_size_that_cannot_be_is_refused_in_words(size: str) -> None:
-    stream = Y4mImages()
-    with pytest.raises(ValueError, match="Y4M images of"):
-        list(stream.feed(f"YUV4MPEG2 {size} F30:1 C420jpeg\n".encode()))
