@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from lce_rig.core.errors import NotEnoughDataError, ProfileError, UsageError
+from lce_rig.core.errors import NotEnoughDataError, ProfileError, UsageError, reason_of
 from lce_rig.core.limits import describe
 from lce_rig.fleet.storage import Storage
 from lce_rig.rig.loading import find_profile
@@ -29,8 +29,8 @@ class Job:
 
     Attributes:
         source: its path or address, absolute.
-        robot: its name; "" where only the profile may tell.
-        fallback_robot: used where the profile does not tell it either.
+        robot: its name by the manifest; "" if that does not name it.
+        fallback_robot: its name if the profile does not name it either: the first folder below the root.
         rig: profile that replaces the session's, or that a recording needs; "" for the session's.
         collector, site: who collected it, and where; "" if unknown.
     """
@@ -75,7 +75,7 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
     """List the sessions and recordings below a folder.
 
     A manifest, `fleet.yaml` or `fleet.csv` in the folder unless another is given, names them by patterns.
-    Without one, every session is taken, and named after its profile's robot or the first folder of its path.
+    Without one, every session is taken.
 
     Args:
         root: where they lie.
@@ -102,17 +102,10 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
 
 
 def _all_sessions(root: Storage) -> list[Job]:
-    prefix = root.path.rstrip("/") + "/"
-    jobs = []
-    for folder, inner, files in root.fs.walk(root.path):
-        if MARKER in files:
-            inner.clear()
-            own = str(folder).rstrip("/").removeprefix(prefix)
-            first, slash, _ = own.partition("/")
-            jobs.append(Job(root.url_of(str(folder).rstrip("/")), fallback_robot=first if slash else ""))
-        for name in [name for name in inner if name.startswith(".")]:
-            inner.pop(name) if isinstance(inner, dict) else inner.remove(name)
-    return sorted(jobs, key=lambda job: job.source)
+    return [
+        Job(f"{root.url}/{path}" if path else root.url, fallback_robot=path.partition("/")[0] or root.name)
+        for path in root.folders_with(MARKER)
+    ]
 
 
 def _entries(manifest: Storage, content: bytes) -> list[Entry]:
@@ -136,36 +129,43 @@ def _entries(manifest: Storage, content: bytes) -> list[Entry]:
             f"{manifest.url}: {key}: {first['msg']}; {describe(first['input'])} given",
             f"Keys: {', '.join(Entry.model_fields)}.",
         ) from None
-    except (ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+    except Exception as error:  # csv, yaml and pydantic raise many kinds about odd text
         raise UsageError(
-            f"{manifest.url} is not a manifest: {' '.join(str(error).split())}",
+            f"{manifest.url} is not a manifest: {reason_of(error)}",
             "List entries with `path` below `sessions:`.",
         ) from error
-    outside = next((e.path for e in entries if e.path.startswith("/") or ".." in e.path.split("/")), None)
-    if outside is not None:
-        raise UsageError(f"{manifest.url}: path: {outside} is not below the root", "Give a path below it.")
-    unknown = {name for entry in entries for name in _FIELD.findall(entry.path)} - set(_FIELDS)
-    if unknown:
-        raise UsageError(
-            f"{manifest.url}: {{{sorted(unknown)[0]}}} is not a field",
-            f"Choose one of: {', '.join(_FIELDS)}.",
+    for entry in entries:
+        parts, names = entry.path.split("/"), _FIELD.findall(entry.path)
+        unknown = sorted(set(names) - set(_FIELDS))
+        problem = (
+            "is not below the root"
+            if entry.path.startswith("/") or ".." in parts or "\0" in entry.path
+            else f"names no field {{{unknown[0]}}}; choose one of: {', '.join(_FIELDS)}"
+            if unknown
+            else "names a field twice"
+            if len(set(names)) < len(names)
+            else "has ** beside other characters"
+            if any("**" in part and part != "**" for part in parts)
+            else ""
         )
+        if problem:
+            raise UsageError(f"{manifest.url}: path: {entry.path} {problem}", "See docs/fleets.md.")
     return entries
 
 
 def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list[Job]:
     """Find what the entries name; the first entry that matches a path counts."""
-    prefix = root.path.rstrip("/") + "/"
     jobs: dict[str, Job] = {}
     for entry in entries:
-        given = entry.model_dump(include=set(_FIELDS))
+        stated = entry.model_dump(include=set(_FIELDS))
         rig = _profile_of(entry, manifest)
-        for path in sorted(map(str, root.fs.glob(prefix + entry.glob))):
-            own = path.rstrip("/").removeprefix(prefix)
-            if path not in jobs and own not in MANIFESTS:
-                told = {k: v for k, v in entry.fields_of(own).items() if k in _FIELDS}
-                fields = {k: given[k] or told.get(k, "") for k in _FIELDS}
-                jobs[path] = Job(root.url_of(path.rstrip("/")), rig=rig, **fields)
+        for path in root.matching(entry.glob):
+            if path not in jobs and path not in MANIFESTS:
+                read = entry.fields_of(path)
+                fields = {name: stated[name] or read.get(name, "") for name in _FIELDS}
+                jobs[path] = Job(
+                    f"{root.url}/{path}", fallback_robot=path.partition("/")[0], rig=rig, **fields
+                )
     return list(jobs.values())
 
 

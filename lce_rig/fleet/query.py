@@ -57,13 +57,13 @@ def _select(path: Path, where: str, columns: Sequence[str] | None) -> Any:
         try:
             # `filter` takes one condition and nothing else; rows keep the order of the file.
             chosen = connection.read_parquet(str(path)).filter(where)
-            found = chosen.project(", ".join(held)).to_arrow_table()
+            rows = chosen.project(", ".join(held)).to_arrow_table()
         except duckdb.Error as error:
             first = str(error).splitlines()[0]
             raise UsageError(f"--where {where!r}: {first}", _columns()) from error
     for name in set(names) - known:
-        found = found.append_column(name, pa.nulls(len(found), SCHEMA.field(name).type))
-    return found.select(names)
+        rows = rows.append_column(name, pa.nulls(len(rows), SCHEMA.field(name).type))
+    return rows.select(names)
 
 
 def _columns() -> str:

@@ -2,10 +2,10 @@
 
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,16 +14,19 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from lce_rig.core.calibration import read_result
 from lce_rig.core.documents import parse_json
-from lce_rig.core.errors import LceRigError, SessionError
+from lce_rig.core.errors import LceRigError, SessionError, reason_of
+from lce_rig.fleet.findings import DAMAGED
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import ROWS, TABLE, Row, as_table, merged, read_table, table_bytes, write_table
+from lce_rig.fleet.table import ROWS, TABLE, Row, as_table, merged, read_table, table_bytes, with_pairs
+from lce_rig.pipeline.result_files import RESULT
 from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import replacing
 
 FORMAT_VERSION = 1
-# Earlier results of sources that have a later one; no folder of a robot begins with a dot.
 SUPERSEDED = ".superseded"
+"""Folder of earlier results of sources that have a later one; no folder of a robot begins with a dot."""
 # Small files from an object store take their time, not the processor's.
 _READERS = 16
 
@@ -42,9 +45,9 @@ class Registry:
     def result(self, folder: str) -> Iterator[Path]:
         """Yield an empty folder on this computer that becomes a session's result when the block ends.
 
-        `ROWS` is what makes it a result; `write_rows` writes it. Here the folder appears in one step; in an
-        object store its files are written one by one, and `ROWS` last. What an earlier result in this folder
-        held, and the new one does not, is kept below `SUPERSEDED`.
+        `ROWS` makes it a result; `write_rows` writes it. On this computer the folder appears in one step; in
+        an object store its files are written one by one, `ROWS` last. An earlier result in this folder is
+        moved below `SUPERSEDED`, unless the new one holds all its files.
 
         Args:
             folder: "robot/date-hash".
@@ -64,26 +67,32 @@ class Registry:
                 draft.mkdir()
                 yield draft
                 self._keep(folder, draft)
-                self._upload(draft, self.place / folder)
+                (self.place / folder).upload(draft, last=ROWS)
         except OSError as error:
             raise SessionError(
                 f"{self.place.url}/{folder} cannot be written: {error.strerror or error}",
                 "Free space or choose another registry, and run again.",
             ) from error
 
-    def _upload(self, draft: Path, target: Storage) -> None:
-        files = {path.relative_to(draft).as_posix(): path for path in draft.rglob("*") if path.is_file()}
-        last = files.pop(ROWS, None)
-        if files:
-            target.fs.put([str(each) for each in files.values()], [f"{target.path}/{own}" for own in files])
-        target.fs.invalidate_cache()
-        prefix = target.path.rstrip("/") + "/"
-        held = {path.removeprefix(prefix) for path in target.fs.find(target.path)}
-        stale = [prefix + own for own in sorted(held - set(files) - {ROWS})]
-        if stale:
-            target.fs.rm(stale)
-        if last is not None:
-            target.fs.pipe_file(f"{target.path}/{ROWS}", last.read_bytes())
+    def _keep(self, folder: str, draft: Path) -> None:
+        """Set an earlier result of a folder aside, unless all its files are in the new one."""
+        place = self.place / folder
+        for name in place.files():
+            if name != ROWS and not (
+                (draft / name).is_file() and (place / name).read() == (draft / name).read_bytes()
+            ):
+                self.set_aside(folder)
+                return
+
+    def set_aside(self, folder: str) -> None:
+        """Move a result below `SUPERSEDED`, where the table does not find it; numbered, if one is there.
+
+        Raises:
+            SessionError: it cannot be written; the result stays.
+        """
+        endings = chain([""], (f"-{n}" for n in count(2)))
+        targets = (self.place / f"{SUPERSEDED}/{folder}{ending}" for ending in endings)
+        (self.place / folder).move(next(target for target in targets if not target.names()))
 
     def folders(self) -> list[str]:
         """List the folders of results, "robot/date-hash"."""
@@ -92,70 +101,38 @@ class Registry:
             inner = pool.map(lambda robot: (self.place / robot).names(), robots)
             return [f"{robot}/{name}" for robot, names in zip(robots, inner, strict=True) for name in names]
 
-    def rows(self, folder: str) -> list[dict[str, Any]]:
-        """Read the rows of one result; none if it is no result."""
-        content = (self.place / folder / ROWS).read()
-        if content is None:
-            return []
-        try:
-            document = parse_json(content)
-            rows = document["rows"] if document["format_version"] == FORMAT_VERSION else []
-        except (ValueError, KeyError, TypeError):
-            return []  # damaged by other hands: the session is run again
-        return [{**row, "folder": folder} for row in rows if isinstance(row, dict)]
-
     def found(self, robot: str, ending: str) -> str | None:
         """Find a robot's result by the end of its folder's name, its fingerprint."""
         names = [name for name in (self.place / robot).names() if name.endswith(f"-{ending}")]
         return f"{robot}/{names[-1]}" if names else None
 
-    def set_aside(self, folder: str) -> None:
-        """Move a result below `SUPERSEDED`, where the table does not find it.
-
-        Raises:
-            SessionError: it cannot be written; the result stays.
-        """
-        place, target = self.place / folder, self._aside(folder)
-        try:
-            if place.local is not None and target.local is not None:
-                target.local.parent.mkdir(parents=True, exist_ok=True)
-                with suppress(FileNotFoundError):  # another run was faster
-                    place.local.rename(target.local)
-                return
-            self._copy_aside(place, target)
-            if (place / ROWS).exists():
-                place.fs.rm_file((place / ROWS).path)
-            if place.exists():
-                place.fs.rm(place.path, recursive=True)
-        except OSError as error:
-            raise SessionError(
-                f"{place.url} cannot be moved to {target.url}: {error.strerror or error}",
-                "Free space, or see to the registry's permissions, and run again.",
-            ) from error
-
-    def _keep(self, folder: str, draft: Path) -> None:
-        """Copy an earlier result of a folder aside, unless all its files are in the new one."""
+    def rows(self, folder: str) -> list[Row]:
+        """Read the rows of one result: none if it is no result, one with a cause if its files are damaged."""
         place = self.place / folder
-        prefix = place.path.rstrip("/") + "/"
-        held = {path: draft / path.removeprefix(prefix) for path in place.fs.find(place.path)}
-        own = [(path, new) for path, new in held.items() if path != prefix + ROWS]
-        if any(not new.is_file() or place.fs.cat_file(path) != new.read_bytes() for path, new in own):
-            self._copy_aside(place, self._aside(folder))
-
-    def _aside(self, folder: str) -> Storage:
-        """Give the place of a result that is set aside: numbered, if there is one already."""
-        endings = chain([""], (f"-{n}" for n in count(2)))
-        places = (self.place / f"{SUPERSEDED}/{folder}{ending}" for ending in endings)
-        return next(place for place in places if not place.names())
-
-    def _copy_aside(self, place: Storage, target: Storage) -> None:
-        """Copy a result's files."""
-        prefix = place.path.rstrip("/") + "/"
-        for name in [path.removeprefix(prefix) for path in place.fs.find(place.path)]:
-            copy = target / name
-            if copy.local is not None:
-                copy.local.parent.mkdir(parents=True, exist_ok=True)
-            place.fs.cp_file((place / name).path, copy.path)
+        robot, _, name = folder.partition("/")
+        own = {"robot": robot, "folder": folder}
+        content, result = (place / ROWS).read(), (place / RESULT).read()
+        if content is None:
+            return []
+        try:
+            document = parse_json(content)
+            if document["format_version"] != FORMAT_VERSION:
+                raise ValueError(f"{ROWS} has format_version {document['format_version']!r}")
+            rows = [dict(row) for row in document["rows"]]
+            if any(row["status"] == "ok" for row in rows):
+                with TemporaryDirectory(prefix="lce-rig-") as scratch:
+                    copy = Path(scratch) / RESULT
+                    copy.write_bytes(result or b"")
+                    saved = read_result(copy)
+                rows = with_pairs(rows, saved.pairs, saved.provenance.serials)
+            rows = [{**row, **own} for row in rows]
+            as_table(rows)  # checks the types
+            return rows
+        except Exception as error:
+            cause = DAMAGED(what=error.what if isinstance(error, LceRigError) else reason_of(error))
+            date = f"{name[:4]}-{name[4:6]}-{name[6:11]}:{name[11:13]}:{name[13:16]}"
+            known = {"source": place.url, "date": date if name[:1].isdigit() else None}
+            return [{**own, **known, "status": "failed", "cause": cause.code, "detail": cause.text}]
 
     def read_table(self, columns: Iterable[str] | None = None) -> Any:
         """Read the table as a `pyarrow.Table`; raises as `lce_rig.fleet.table.read_table`."""
@@ -171,12 +148,9 @@ class Registry:
 
     def write_table(self, table: Any) -> None:
         """Write the table in one step; raises SessionError."""
-        if self.place.local is not None:
-            write_table(self.place.local / TABLE, table)
-        else:
-            self.place.fs.pipe_file((self.place / TABLE).path, table_bytes(table))
+        (self.place / TABLE).write(table_bytes(table))
 
-    def consolidate(self, fresh: Iterable[Mapping[str, Any]] = (), *, rebuild: bool = False) -> Any:
+    def consolidate(self, fresh: Iterable[Row] = (), *, rebuild: bool = False) -> Any:
         """Bring the table in line with the folders and write it.
 
         Rows of folders that are gone are dropped, those of folders that the table lacks are read. Of two
@@ -222,24 +196,18 @@ def _without(table: Any, folders: Any) -> Any:
 
 def _superseded(table: Any) -> list[str]:
     """List the folders of earlier results of a source that has a later one."""
-    each = table.select(["source", "folder", "finished"]).group_by(["source", "folder"])
-    each = each.aggregate([("finished", "max")])
-    counted = each.group_by("source").aggregate([("folder", "count")])
+    results = table.select(["source", "folder", "finished"]).group_by(["source", "folder"])
+    results = results.aggregate([("finished", "max")])
+    counted = results.group_by("source").aggregate([("folder", "count")])
     several = counted.filter(pc.greater(counted["folder_count"], 1))["source"].combine_chunks()
-    twice = each.filter(pc.is_in(each["source"], value_set=several)).to_pylist()
-    last: dict[str, dict[str, Any]] = {}
+    twice = results.filter(pc.is_in(results["source"], value_set=several)).to_pylist()
+    last: dict[str, Row] = {}
     for result in sorted(twice, key=lambda result: (result["finished_max"] or "", result["folder"])):
         last[result["source"]] = result
     return sorted(result["folder"] for result in twice if last[result["source"]] is not result)
 
 
-def write_rows(draft: Path, rows: Iterable[Row]) -> list[dict[str, Any]]:
-    """Write the rows of a result into its folder and return them as plain values.
-
-    Raises:
-        SessionError: a full disk, no permission.
-    """
-    documents = [asdict(row) for row in rows]
-    content = {"format_version": FORMAT_VERSION, "rows": documents}
+def write_rows(draft: Path, rows: Iterable[Row]) -> None:
+    """Write the rows of a result into its folder; raises SessionError on a full disk."""
+    content = {"format_version": FORMAT_VERSION, "rows": list(rows)}
     write_atomically(draft / ROWS, json.dumps(content, indent=1, allow_nan=False) + "\n")
-    return documents

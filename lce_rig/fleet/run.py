@@ -1,14 +1,12 @@
 """Run many sessions on a Dask cluster, one task each, and keep the registry's table."""
 
-import atexit
 import logging
-import threading
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from typing import Any
 
@@ -16,20 +14,20 @@ import dask
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 
 from lce_rig.core.errors import LceRigError, SourceError
-from lce_rig.core.findings import Figure, Finding
+from lce_rig.core.findings import Finding
+from lce_rig.fleet.findings import BUG, EXITED, OUT_OF_MEMORY, SIGNAL, TIMED_OUT, WORKER_LOST
 from lce_rig.fleet.jobs import Job
-from lce_rig.fleet.process import Ended, SessionServer
+from lce_rig.fleet.process import Ended, run_apart
 from lce_rig.fleet.table import Row, Status
-from lce_rig.fleet.work import Settings, first_row, publish, without_result, work
+from lce_rig.fleet.work import Settings, Used, first_row, publish, without_result
 from lce_rig.pipeline.detect_session import Progress, silent
 
 # Tasks that wait beside those that run: enough to keep workers busy, few enough for any scheduler.
 _WAITING_PER_THREAD, _FEWEST_TASKS = 4, 16
-# Sessions cannot end a worker: whoever does, does not mean them.
+# A session cannot kill its worker; a worker that died was killed from outside.
 _MOST_LOST_WORKERS = 100
 # The table is written again after so many times the time that it took; what is not in it is in the folders.
 _TABLE_SHARE, _TABLE_EVERY_S = 100, 60.0
-_local = threading.local()
 
 
 @dataclass
@@ -118,75 +116,52 @@ def run_fleet(
         SessionError: the registry cannot be written.
         SourceError: the scheduler is gone.
     """
-    registry = settings.opened()
-    run, fresh = FleetRun(), _Fresh(registry.consolidate)
-    fresh.write()
+    registry, run = settings.opened(), FleetRun()
+    fresh: list[Row] = []
+    run.table, due_s = registry.consolidate(), 0.0
     waiting = iter(jobs)
     by_key: dict[Any, Job] = {}
+
+    def send(job: Job) -> Any:
+        future = client.submit(run_job, job, settings, pure=False)
+        by_key[future.key] = job
+        return future
+
     try:
         n_threads = sum(client.nthreads().values()) or 1
         ahead = max(_FEWEST_TASKS, (1 + _WAITING_PER_THREAD) * n_threads)
-
-        def send(job: Job) -> Any:
-            future = client.submit(run_job, job, settings, pure=False)
-            by_key[future.key] = job
-            return future
-
         futures = as_completed([send(job) for job in islice(waiting, ahead)])
         for done, future in enumerate(futures, 1):
-            job = by_key.pop(future.key)
-            rows = _rows_of(future, job, settings)
+            rows = _rows_of(future, by_key.pop(future.key), settings)
             for following in islice(waiting, 1):
                 futures.add(send(following))
-            _count(run, rows)
-            fresh.add(rows)
+            if all(row["is_new"] for row in rows):
+                run.n_new += 1
+            else:
+                run.n_held += 1
+            worst = next((row for row in rows if row["status"] != "ok"), rows[0])
+            run.statuses[worst["status"]] += 1
+            if worst["status"] != "ok":
+                run.causes[worst["cause"]] += 1
+            fresh += rows
+            if time.monotonic() > due_s:
+                start_s = time.monotonic()
+                run.table, fresh = registry.consolidate(fresh), []
+                end_s = time.monotonic()
+                due_s = end_s + max(_TABLE_EVERY_S, _TABLE_SHARE * (end_s - start_s))
             progress(done, len(jobs))
     finally:
-        run.table = fresh.write()
+        run.table = registry.consolidate(fresh)
     return run
 
 
-class _Fresh:
-    """Rows that the table lacks; they are written from time to time."""
-
-    def __init__(self, consolidate: Callable[..., Any]) -> None:
-        self._consolidate = consolidate
-        self._rows: list[Mapping[str, Any]] = []
-        self._due_s = 0.0
-
-    def add(self, rows: list[dict[str, Any]]) -> None:
-        self._rows += rows
-        if time.monotonic() > self._due_s:
-            self.write()
-
-    def write(self) -> Any:
-        start_s = time.monotonic()
-        table = self._consolidate(self._rows)
-        self._rows = []
-        took_s = time.monotonic() - start_s
-        self._due_s = time.monotonic() + max(_TABLE_EVERY_S, _TABLE_SHARE * took_s)
-        return table
-
-
-def _count(run: FleetRun, rows: list[dict[str, Any]]) -> None:
-    if all(row["is_new"] for row in rows):
-        run.n_new += 1
-    else:
-        run.n_held += 1
-    worst = next((row for row in rows if row["status"] != "ok"), rows[0])
-    run.statuses[worst["status"]] += 1
-    if worst["status"] != "ok":
-        run.causes[worst["cause"]] += 1
-
-
-def _rows_of(future: Any, job: Job, settings: Settings) -> list[dict[str, Any]]:
+def _rows_of(future: Any, job: Job, settings: Settings) -> list[Row]:
     """Take a task's rows; of one that no worker survived, write the cause."""
     try:
-        rows: list[dict[str, Any]] = future.result()
+        rows: list[Row] = future.result()
         return rows
     except KilledWorker:
-        cause = Finding("fleet.worker_lost", figures={"n": _MOST_LOST_WORKERS})
-        row = without_result(first_row(job, settings), "crashed", cause)
+        row = without_result(first_row(job, settings), "crashed", WORKER_LOST(n=_MOST_LOST_WORKERS))
         return publish(settings.opened(), [row], time.monotonic())
     except LceRigError:
         raise
@@ -194,56 +169,32 @@ def _rows_of(future: Any, job: Job, settings: Settings) -> list[dict[str, Any]]:
         raise SourceError(f"the cluster cannot be reached: {error}", "Run it again to continue.") from error
 
 
-def run_job(job: Job, settings: Settings) -> list[dict[str, Any]]:
+def run_job(job: Job, settings: Settings) -> list[Row]:
     """Run one session in a process of its own, on a worker; return its rows.
 
     Raises:
         SessionError: the registry cannot be written.
     """
     start_s = time.monotonic()
-    ended = _own_server().run(
-        "lce_rig.fleet.run:run_order",
-        {"job": asdict(job), "settings": asdict(settings)},
-        settings.time_limit_s,
-        settings.memory_limit_mb,
-    )
+    order = {"job": asdict(job), "settings": asdict(settings)}
+    limits = (settings.time_limit_s, settings.memory_limit_mb)
+    ended = run_apart("lce_rig.fleet.work:work_order", order, *limits)
     if ended.rows is not None:
         return ended.rows
-    names = {each.name for each in fields(Row)}
-    known = {name: value for name, value in ended.known.items() if name in names}
-    row = Row(**known) if known else first_row(job, settings)
-    return publish(settings.opened(), [without_result(row, *_cause(ended, settings))], start_s, used=ended)
-
-
-def run_order(
-    arguments: Mapping[str, Any], tell: Callable[[Mapping[str, Any]], None]
-) -> list[dict[str, Any]]:
-    """Run one session in this process, from the JSON values of its job and settings."""
-    return work(Job(**arguments["job"]), Settings(**arguments["settings"]), tell)
+    row = without_result(ended.known or first_row(job, settings), *_cause(ended, settings))
+    used = Used(ended.cpu_s, ended.peak_memory_mb)
+    return publish(settings.opened(), [row], start_s, used=used)
 
 
 def _cause(ended: Ended, settings: Settings) -> tuple[Status, Finding]:
-    """Say why a session's process ended without rows."""
+    """Name the cause of a process that ended without rows."""
     if ended.reason == "timed_out":
-        return "timed_out", Finding("fleet.timed_out", figures={"limit_s": settings.time_limit_s})
-    # What C++ says where it finds no memory.
+        return "timed_out", TIMED_OUT(limit_s=settings.time_limit_s)
+    # The message of C++ without memory.
     if ended.reason == "out_of_memory" or "std::bad_alloc" in ended.detail:
-        return "out_of_memory", Finding("fleet.out_of_memory", figures={"limit_mb": settings.memory_limit_mb})
+        return "out_of_memory", OUT_OF_MEMORY(limit_mb=settings.memory_limit_mb)
     if ended.reason == "bug":
-        return "crashed", Finding("fleet.bug", figures={"what": ended.detail})
+        return "crashed", BUG(what=ended.detail)
     if ended.exit_code < 0:
-        figures: dict[str, Figure] = {"signal": -ended.exit_code, "what": ended.detail}
-        return "crashed", Finding("fleet.signal", figures=figures)
-    return "crashed", Finding("fleet.exited", figures={"code": ended.exit_code, "what": ended.detail})
-
-
-def _own_server() -> SessionServer:
-    """Return the server of this thread; start one where there is none."""
-    server: SessionServer | None = getattr(_local, "server", None)
-    if server is None or not server.is_alive:
-        if server is not None:
-            with suppress(OSError):
-                server.close()
-        server = _local.server = SessionServer()
-        atexit.register(server.close)
-    return server
+        return "crashed", SIGNAL(signal=-ended.exit_code, what=ended.detail)
+    return "crashed", EXITED(code=ended.exit_code, what=ended.detail)

@@ -1,5 +1,7 @@
 """Folders on this computer or in an object store (s3://...), by their address."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -7,14 +9,19 @@ from typing import Any
 
 from fsspec.core import url_to_fs
 
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import LceRigError, SourceError, reason_of
 from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import copy_over
+
+_ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 
 @dataclass(frozen=True)
 class Storage:
-    """A folder, by a path or by an address that fsspec knows.
+    """A folder or file, by a path or by an address that fsspec knows.
+
+    All methods raise SourceError with one line if the place cannot be reached, for whatever reason a library
+    gives: missing credentials, no network, no permission.
 
     Attributes:
         url: absolute; without a slash at its end.
@@ -43,58 +50,114 @@ class Storage:
 
     @cached_property
     def _opened(self) -> tuple[Any, str]:
+        return url_to_fs(self.url)  # type: ignore[no-any-return]
+
+    @contextmanager
+    def reached(self) -> Iterator[tuple[Any, str]]:
+        """Give the file system that fsspec has for the place, and the path there; see the class."""
         try:
-            return url_to_fs(self.url)  # type: ignore[no-any-return]
-        except (ImportError, ValueError) as error:
-            raise SourceError(f"{self.url} cannot be opened: {error}", "Give a path, or s3://...") from error
-
-    @property
-    def fs(self) -> Any:
-        """The file system that fsspec has for it."""
-        return self._opened[0]
-
-    @property
-    def path(self) -> str:
-        """Its path in that file system."""
-        return self._opened[1]
-
-    def url_of(self, path: str) -> str:
-        """Give the address of a path that the file system lists."""
-        return path if self.local is not None else f"{self.url.partition('://')[0]}://{path}"
+            yield self._opened
+        except (LceRigError, *_ABSENT):
+            raise
+        except Exception as error:
+            raise SourceError(
+                f"{self.url} cannot be reached: {reason_of(error)}",
+                ""
+                if self.local is not None
+                else "Check the address, the credentials and the endpoint (docs/fleets.md#object-stores).",
+            ) from error
 
     def exists(self) -> bool:
         """Return whether there is such a file or folder."""
-        return bool(self.fs.exists(self.path))
+        with self.reached() as (fs, path):
+            return bool(fs.exists(path))
 
     def is_folder(self) -> bool:
         """Return whether it is a folder."""
-        return bool(self.fs.isdir(self.path))
+        with self.reached() as (fs, path):
+            return bool(fs.isdir(path))
 
     def read(self) -> bytes | None:
         """Read it as a file; None if there is none."""
         try:
-            return bytes(self.fs.cat_file(self.path))
-        except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+            with self.reached() as (fs, path):
+                return bytes(fs.cat_file(path))
+        except _ABSENT:
             return None
 
     def write(self, content: bytes) -> None:
-        """Write it as a file, in one step."""
-        if self.local is None:
-            self.fs.pipe_file(self.path, content)
+        """Write it as a file, in one step; raises SessionError on a full disk, too."""
+        if self.local is not None:
+            self.local.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(self.local, content)
             return
-        self.local.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.local, content)
+        with self.reached() as (fs, path):
+            fs.pipe_file(path, content)
 
     def names(self) -> list[str]:
         """List what it holds as a folder, by name; nothing if there is no such folder."""
         try:
-            found = self.fs.ls(self.path, detail=False, refresh=True)
-        except TypeError:  # file systems without a cache of listings
-            found = self.fs.ls(self.path, detail=False)
-        except (FileNotFoundError, NotADirectoryError):
+            with self.reached() as (fs, path):
+                entries = fs.ls(path, detail=False, **({} if self.local is not None else {"refresh": True}))
+        except _ABSENT:
             return []
-        own = self.path.rstrip("/")
-        return sorted({str(each).rstrip("/").rpartition("/")[2] for each in found if each.rstrip("/") != own})
+        return sorted(
+            {str(e).rstrip("/").rpartition("/")[2] for e in entries if e.rstrip("/") != path.rstrip("/")}
+        )
+
+    def files(self) -> list[str]:
+        """List the files below it, by their path in it."""
+        with self.reached() as (fs, path):
+            fs.invalidate_cache()
+            return sorted(str(file).removeprefix(path.rstrip("/") + "/") for file in fs.find(path))
+
+    def folders_with(self, marker: str) -> list[str]:
+        """List the outermost folders below it that hold a file of this name, by their path in it.
+
+        The folder itself is "". Folders whose names begin with a dot are left out.
+        """
+        found = []
+        with self.reached() as (fs, path):
+            for folder, inner, files in fs.walk(path):
+                if marker in files:
+                    found.append(str(folder).rstrip("/").removeprefix(path.rstrip("/")).lstrip("/"))
+                for name in [name for name in inner if name.startswith(".") or marker in files]:
+                    inner.pop(name) if isinstance(inner, dict) else inner.remove(name)
+        return sorted(found)
+
+    def matching(self, pattern: str) -> list[str]:
+        """List files and folders that match a pattern of fsspec, by their path in it."""
+        with self.reached() as (fs, path):
+            prefix = path.rstrip("/") + "/"
+            return sorted(str(match).rstrip("/").removeprefix(prefix) for match in fs.glob(prefix + pattern))
+
+    def move(self, target: "Storage") -> None:
+        """Move a folder to another place of the same file system; nothing if it is gone."""
+        try:
+            with self.reached() as (fs, path):
+                if self.local is not None and target.local is not None:
+                    target.local.parent.mkdir(parents=True, exist_ok=True)
+                    self.local.rename(target.local)
+                    return
+                names = self.files()
+                for name in names:
+                    fs.cp_file(f"{path}/{name}", f"{target._opened[1]}/{name}")
+                fs.rm([f"{path}/{name}" for name in names])
+        except _ABSENT:
+            return  # another run was faster
+
+    def upload(self, folder: Path, last: str) -> None:
+        """Copy the files of a folder here to one in an object store, one by one, the file `last` last."""
+        files = {
+            path.relative_to(folder).as_posix(): str(path) for path in folder.rglob("*") if path.is_file()
+        }
+        end = files.pop(last, None)
+        with self.reached() as (fs, path):
+            if files:
+                fs.put([*files.values()], [f"{path}/{name}" for name in files])
+            if end is not None:
+                fs.put_file(end, f"{path}/{last}")
+            fs.invalidate_cache()
 
     def fetch(self, target: Path, *, without: frozenset[str] = frozenset()) -> None:
         """Copy it to this computer; on the same disk, files share their data.
@@ -104,7 +167,7 @@ class Storage:
             without: names in the folder that are left out.
 
         Raises:
-            OSError: it is not there, or cannot be read.
+            OSError: it is not there, or cannot be written here.
         """
         if self.local is not None:
             if not self.local.is_dir():
@@ -115,15 +178,14 @@ class Storage:
                 if entry.name not in without:
                     copy_over(entry, target / entry.name)
             return
-        if not self.is_folder():
-            self.fs.get_file(self.path, str(target))
-            return
-        target.mkdir(parents=True)
-        prefix = self.path.rstrip("/") + "/"
-        wanted = {path: path.removeprefix(prefix) for path in self.fs.find(self.path)}
-        kept = {p: own for p, own in wanted.items() if own.partition("/")[0] not in without}
-        for own in kept.values():
-            if ".." in own.split("/"):
-                raise OSError(f"{own} leads out of the folder")
-            (target / own).parent.mkdir(parents=True, exist_ok=True)
-        self.fs.get(list(kept), [str(target / own) for own in kept.values()])
+        with self.reached() as (fs, path):
+            if not fs.isdir(path):
+                fs.get_file(path, str(target))
+                return
+            target.mkdir(parents=True)
+            names = [name for name in self.files() if name.partition("/")[0] not in without]
+            for name in names:
+                if ".." in name.split("/"):
+                    raise OSError(f"{name} leads out of the folder")
+                (target / name).parent.mkdir(parents=True, exist_ok=True)
+            fs.get([f"{path.rstrip('/')}/{name}" for name in names], [str(target / name) for name in names])

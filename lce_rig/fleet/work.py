@@ -1,16 +1,16 @@
-"""The work on one session: detect, calibrate, verify, write. Runs in a process of its own (`process.py`)."""
+"""The work on one session: detect, calibrate, draw, write. Runs in a process of its own (`process.py`)."""
 
 import resource
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import lce_rig as lce
-from lce_rig.core.calibration import DEFAULT_METHOD, MADE_BY, Method, Provenance
+from lce_rig.core.calibration import DEFAULT_METHOD, MADE_BY, Method, Provenance, ResultFile
 from lce_rig.core.errors import (
     LceRigError,
     NotEnoughDataError,
@@ -20,16 +20,14 @@ from lce_rig.core.errors import (
     SourceError,
     UsageError,
 )
-from lce_rig.core.findings import Finding
-from lce_rig.detect.detection import Detections
-from lce_rig.fleet import findings as _kinds  # noqa: F401
+from lce_rig.core.findings import Finding, Kind
+from lce_rig.fleet import findings
 from lce_rig.fleet.jobs import Job, folder_name
-from lce_rig.fleet.process import Ended
 from lce_rig.fleet.registry import Registry, write_rows
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import Row, Status, result_columns
+from lce_rig.fleet.table import Row, Status, with_pairs
 from lce_rig.io.fingerprint import fingerprint
-from lce_rig.pipeline.result_files import OVERLAYS, Result
+from lce_rig.pipeline.result_files import OVERLAYS
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import Session
 from lce_rig.session.durable import replace_file
@@ -45,15 +43,16 @@ from lce_rig.session.session import (
     RESULTS,
 )
 
-# What no result depends on.
+# Files and folders on which no result depends.
 _NOT_NEEDED = frozenset({CALIBRATION, RESULTS, INTRINSICS, DEBUG, REJECTED, OVERLAYS, LOCK})
-_CODES: tuple[tuple[type[LceRigError], str], ...] = (
-    (ProfileError, "fleet.profile"),
-    (SessionError, "fleet.session"),
-    (SourceError, "fleet.source"),
-    (NotEnoughDataError, "fleet.not_enough_data"),
-    (ResultRefusedError, "fleet.refused"),
-    (UsageError, "fleet.usage"),
+_KINDS: tuple[tuple[type[LceRigError], Kind], ...] = (
+    (ProfileError, findings.PROFILE),
+    (SessionError, findings.SESSION),
+    (SourceError, findings.SOURCE),
+    (NotEnoughDataError, findings.NOT_ENOUGH_DATA),
+    (ResultRefusedError, findings.REFUSED),
+    (UsageError, findings.USAGE),
+    (LceRigError, findings.OTHER_ERROR),
 )
 _HASH_DIGITS = 12
 Pictures = Literal["all", "sheets", "none"]
@@ -61,13 +60,13 @@ Pictures = Literal["all", "sheets", "none"]
 
 @dataclass(frozen=True)
 class Settings:
-    """What holds for all sessions of a run.
+    """Settings of a run, for all its sessions.
 
     Attributes:
         registry: its path or address.
         method: of the estimates.
-        time_limit_s: that a session may take.
-        memory_limit_mb: that its process may hold.
+        time_limit_s: of a session.
+        memory_limit_mb: of its process.
         retry: whether sessions without a result are run again.
         pictures: whether overlays of all captures are kept, contact sheets of them only, or nothing is drawn.
     """
@@ -80,63 +79,77 @@ class Settings:
     pictures: Pictures = "sheets"
 
     def opened(self) -> Registry:
-        """The registry."""
+        """Open the registry."""
         return Registry(Storage.at(self.registry))
 
 
-def work(job: Job, settings: Settings, tell: Callable[[Mapping[str, Any]], None]) -> list[dict[str, Any]]:
+class Used(NamedTuple):
+    """Processor time and memory that a session used."""
+
+    cpu_s: float
+    peak_memory_mb: float
+
+
+def work_order(arguments: Mapping[str, Any], tell: Callable[[Row], None]) -> list[Row]:
+    """Run one session in this process, from the JSON values of its job and settings."""
+    return work(Job(**arguments["job"]), Settings(**arguments["settings"]), tell)
+
+
+def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]:
     """Run one session, unless the registry holds its result already.
 
     Args:
         job: the session.
         settings: of the run.
-        tell: called with what is known of the session before the work begins.
+        tell: called with the row of the session, as far as it is known, before the work begins.
 
     Returns:
-        Its rows, as `write_rows` gives them; status "failed" for what the user can repair.
+        Its rows, with `is_new`; status "failed" for errors that the user can repair.
     """
     start_s = time.monotonic()
     registry = settings.opened()
     row = first_row(job, settings)
-    tell(asdict(row))
+    tell(row)
     with TemporaryDirectory(prefix="lce-rig-") as scratch:
         try:
             opened = _Opened.of(job, Path(scratch))
             row = opened.row(job, row)
-            held = registry.found(row.robot, opened.ending)
+            held = registry.found(row["robot"], opened.ending)
             if held is not None:
                 rows = registry.rows(held)
-                if _is_done(rows, row, retry=settings.retry):
+                if rows and all(
+                    (each.get("program"), each.get("method")) == (row["program"], row["method"])
+                    and (each.get("status") == "ok" or not settings.retry)
+                    for each in rows
+                ):
                     return [{**each, "is_new": False} for each in rows]
-            tell(asdict(row))
+            tell(row)
             session = opened.session()
             row = _dated(row, provenance_of([session]), opened.ending)
-            tell(asdict(row))
-        except (LceRigError, OSError) as error:
-            return publish(registry, [_failed(row, error, Path(scratch))], start_s)
-        try:
+            tell(row)
             return _calibrate(registry, session, row, settings, start_s)
-        except LceRigError as error:
+        except (LceRigError, OSError) as error:
             return publish(registry, [_failed(row, error, Path(scratch))], start_s)
 
 
 def first_row(job: Job, settings: Settings) -> Row:
-    """Describe a session of which nothing is known but where it lies."""
+    """Describe a session that has not been read yet."""
     robot = folder_name(job.robot or job.fallback_robot or "unnamed")
-    return Row(
-        robot,
-        folder=f"{robot}/unread-{folder_name(job.source)[-40:]}",
-        source=job.source,
-        program=MADE_BY,
-        method=settings.method,
-        collector=job.collector or None,
-        site=job.site or None,
-    )
+    return {
+        "robot": robot,
+        "folder": f"{robot}/unread-{folder_name(job.source)[-40:]}",
+        "source": job.source,
+        "program": MADE_BY,
+        "method": settings.method,
+        "status": "ok",
+        "collector": job.collector or None,
+        "site": job.site or None,
+    }
 
 
 @dataclass(frozen=True)
 class _Opened:
-    """A session or recording as far as it has to be read to be recognised.
+    """A session or recording, read as far as its fingerprint needs.
 
     Attributes:
         ending: the fingerprint of captures and profile, as at the end of its folder's name.
@@ -184,10 +197,10 @@ class _Opened:
         )
 
     def row(self, job: Job, row: Row) -> Row:
-        """Add what is known now."""
-        told = job.robot or (self.provenance.robot if self.provenance is not None else self.rig.robot or "")
-        robot = folder_name(told or job.fallback_robot or self.rig.name)
-        row = replace(row, robot=robot, rig=self.rig.name, folder=f"{robot}/undated-{self.ending}")
+        """Add the robot, by the manifest, the profile or the first folder, and where the result goes."""
+        stated = self.rig.robot if self.provenance is None else self.provenance.robot
+        robot = folder_name(job.robot or stated or job.fallback_robot or "unnamed")
+        row = row | {"robot": robot, "rig": self.rig.name, "folder": f"{robot}/undated-{self.ending}"}
         return row if self.provenance is None else _dated(row, self.provenance, self.ending)
 
 
@@ -210,83 +223,55 @@ def _check_same_rig(session: Path, rig: Rig) -> None:
 
 
 def _dated(row: Row, provenance: Provenance, ending: str) -> Row:
-    date = provenance.date
-    compact = date.replace("-", "").replace(":", "") or "undated"
-    return replace(
-        row,
-        date=date or None,
-        session_sha256=provenance.session_sha256,
-        folder=f"{row.robot}/{compact}-{ending}",
-    )
-
-
-def _is_done(rows: list[dict[str, Any]], row: Row, *, retry: bool) -> bool:
-    """Return whether rows are of this version and method; `retry` counts only results."""
-    return bool(rows) and all(
-        (each.get("program"), each.get("method")) == (row.program, row.method)
-        and (not retry or each.get("status") == "ok")
-        for each in rows
-    )
+    compact = provenance.date.replace("-", "").replace(":", "") or "undated"
+    return row | {
+        "date": provenance.date or None,
+        "session_sha256": provenance.session_sha256,
+        "folder": f"{row['robot']}/{compact}-{ending}",
+    }
 
 
 def _failed(row: Row, error: LceRigError | OSError, scratch: Path) -> Row:
-    """Say why there is no result, by the names that files have where the session lies."""
+    """Add the cause, with the names that files have where the session lies."""
     if isinstance(error, OSError):
-        error = SourceError(f"{row.source} cannot be read: {error.strerror or error}")
-    own = error.finding if isinstance(error, NotEnoughDataError) else None
-    code = next((code for kind, code in _CODES if isinstance(error, kind)), "fleet.other_error")
-    cause = own or Finding(code, figures={"what": error.what, "hint": error.hint})
-    failed = without_result(row, "failed", cause)
-    return replace(failed, detail=(failed.detail or "").replace(str(scratch / "session"), row.source))
+        error = SourceError(f"{row['source']} cannot be read: {error.strerror or error}")
+    kind = next(kind for error_type, kind in _KINDS if isinstance(error, error_type))
+    cause = error.finding if isinstance(error, NotEnoughDataError) else None
+    failed = without_result(row, "failed", cause or kind(what=error.what, hint=error.hint))
+    return failed | {"detail": failed["detail"].replace(str(scratch / "session"), row["source"])}
 
 
 def without_result(row: Row, status: Status, cause: Finding) -> Row:
     """Describe a session, or one pair of its sensors, that has no result."""
-    return replace(row, status=status, cause=cause.code, detail=cause.text)
+    return row | {"status": status, "cause": cause.code, "detail": cause.text}
 
 
 def _calibrate(
     registry: Registry, session: Session, row: Row, settings: Settings, start_s: float
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     detections = lce.detect(session, n_threads=1)
-    options = lce.CalibrateOptions(settings.method)
-    result = lce.calibrate(session, detections, options=options)
-    verification = lce.verify(session, result, detections)
-    serials = provenance_of([session]).serials
-    profile = result.document()["inputs_sha256"][PROFILE]
-    row = replace(row, profile_sha256=profile)
-    doubts: dict[tuple[str, str], list[Finding]] = {}
-    for check in verification.checks:
-        doubts.setdefault((check.pair.camera, check.pair.lidar), []).extend(check.findings)
-    rows = []
-    for c in result.pairs:
-        own = doubts.get((c.camera, c.lidar), [])
-        known = replace(c, findings=(*c.findings, *own))
-        rows.append(replace(row, **result_columns(known, session.rig, serials)))
-    rows += _lacking(result, detections, row)
+    result = lce.calibrate(session, detections, options=lce.CalibrateOptions(settings.method))
+    saved = result.file()
+    verification = None if settings.pictures == "none" else lce.verify(session, result, detections)
+    row = row | {"profile_sha256": saved.inputs_sha256[PROFILE]}
+    solved = {(c.camera, c.lidar) for c in result.pairs}
+    pairs = dict.fromkeys((pair.camera, pair.lidar) for pair in detections.pairs)
+    # Shortages stand in the order of the pairs they belong to.
+    lacking = [
+        without_result(row | {"camera": camera, "lidar": lidar}, "failed", why)
+        for (camera, lidar), why in zip([p for p in pairs if p not in solved], result.shortages, strict=False)
+    ]
 
     def fill(folder: Path) -> None:
         result.write(folder)
         replace_file(folder / PROFILE, dump_rig(session.rig).encode())
-        if settings.pictures != "none":
+        if verification is not None:
             checks = verification.write(folder / OVERLAYS)
             for path in (path for check in checks for path in check.pictures):
                 if settings.pictures == "sheets":
                     path.unlink()
 
-    return publish(registry, rows, start_s, fill)
-
-
-def _lacking(result: Result, detections: Detections, row: Row) -> list[Row]:
-    """Give a row to each camera and LiDAR of the session without a result."""
-    solved = {(c.camera, c.lidar) for c in result.pairs}
-    pairs = dict.fromkeys((pair.camera, pair.lidar) for pair in detections.pairs)
-    # Shortages stand in the order of the pairs they belong to.
-    lacking = [pair for pair in pairs if pair not in solved]
-    return [
-        without_result(replace(row, camera=camera, lidar=lidar), "failed", why)
-        for (camera, lidar), why in zip(lacking, result.shortages, strict=False)
-    ]
+    return publish(registry, [row, *lacking], start_s, fill, saved=saved)
 
 
 def publish(
@@ -294,27 +279,32 @@ def publish(
     rows: list[Row],
     start_s: float,
     fill: Callable[[Path], None] = lambda _folder: None,
-    used: Ended | None = None,
-) -> list[dict[str, Any]]:
+    *,
+    saved: ResultFile | None = None,
+    used: Used | None = None,
+) -> list[Row]:
     """Write a result's folder and return its rows.
 
     Args:
         registry: where.
-        rows: of one folder.
-        start_s: when the work began, on the monotonic clock.
+        rows: of one folder, as `with_pairs` describes them.
+        start_s: begin of the work, on the monotonic clock.
         fill: writes the other files into the folder.
-        used: how another process ended that did the work; None for this one.
+        saved: the result of the session; None if it has none.
+        used: by another process that did the work; None for this one.
     """
-    with registry.result(rows[0].folder) as draft:
+    with registry.result(rows[0]["folder"]) as draft:
         fill(draft)
         own = resource.getrusage(resource.RUSAGE_SELF)
-        cpu_s = own.ru_utime + own.ru_stime if used is None else used.cpu_s
-        peak_mb = own.ru_maxrss / 1024 if used is None else used.peak_memory_mb
-        spent: dict[str, Any] = {
+        used = used or Used(own.ru_utime + own.ru_stime, own.ru_maxrss / 1024)
+        spent = {
             "duration_s": round(time.monotonic() - start_s, 3),
-            "cpu_s": round(cpu_s, 3),
-            "peak_memory_mb": round(peak_mb, 1),
+            "cpu_s": round(used.cpu_s, 3),
+            "peak_memory_mb": round(used.peak_memory_mb, 1),
             "finished": datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
         }
-        written = write_rows(draft, [replace(row, **spent) for row in rows])
-    return [{**row, "is_new": True} for row in written]
+        rows = [row | spent for row in rows]
+        write_rows(draft, rows)
+    if saved is not None:
+        rows = with_pairs(rows, saved.pairs, saved.provenance.serials)
+    return [row | {"is_new": True} for row in rows]

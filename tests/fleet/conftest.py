@@ -17,18 +17,22 @@ from lce_rig.simulate import simulate_captures
 def row() -> Callable[..., Row]:
     def make(robot: str = "r1", date: str | None = "2026-01-05T10:00:00Z", **changes: object) -> Row:
         known: dict[str, object] = {
+            "robot": robot,
+            "date": date,
+            "status": "ok",
+            "source": f"/sessions/{robot}/{date}",
             "rig": "rlfs",
             "folder": f"{robot}/{str(date)[:10]}-0123456789ab",
             "camera": "cam",
             "lidar": "lidar",
             "verdict": "pass",
-            "findings": ("verdict.largest_cause",),
-            "severities": ("note",),
-            "T_cam_lidar": tuple(np.eye(4).ravel().tolist()),
-            "cov": tuple(float(k) for k in range(21)),
+            "findings": ["verdict.largest_cause"],
+            "severities": ["note"],
+            "T_cam_lidar": np.eye(4).ravel().tolist(),
+            "cov": [float(k) for k in range(21)],
             "n_used": 8,
         }
-        return Row(robot, date=date, **(known | changes))  # type: ignore[arg-type]
+        return known | changes
 
     return make
 

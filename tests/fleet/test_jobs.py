@@ -17,7 +17,9 @@ def test_every_session_is_found_once_and_named_after_the_first_folder(tmp_path):
     lay_out(tmp_path, "r1/2026/a", "r2/b", "c", "r1/2026/a/results/inner", ".hidden/d")
     jobs = find_jobs(Storage.at(tmp_path))
     found = {job.source.removeprefix(f"{tmp_path}/"): job.fallback_robot for job in jobs}
-    assert found == {"r1/2026/a": "r1", "r2/b": "r2", "c": ""}
+    assert found == {"r1/2026/a": "r1", "r2/b": "r2", "c": "c"}
+    (job,) = find_jobs(Storage.at(tmp_path / "c"))
+    assert (job.source, job.fallback_robot) == (f"{tmp_path}/c", "c")
 
 
 def test_a_manifest_names_robot_profile_and_collector_by_patterns(tmp_path):
@@ -57,6 +59,12 @@ def test_a_table_of_comma_separated_values_serves_as_well(tmp_path):
         "sessions: [{path: '../*'}]",
         "sessions: [{path: /etc}]",
         "[",
+        "sessions: [{path: '{robot}/{robot}'}]",
+        "sessions: [{path: 'a**b'}]",
+        "sessions: [{path: a, robot: " + "1" * 5000 + "}]",
+        "sessions: " + "[" * 5000,
+        'sessions: [{path: "a\\0b"}]',
+        "sessions: [{path: 2026-13-45T99:99:99Z}]",
     ],
 )
 def test_a_manifest_that_cannot_be_used_is_refused(tmp_path, text):
@@ -64,6 +72,13 @@ def test_a_manifest_that_cannot_be_used_is_refused(tmp_path, text):
     (tmp_path / "fleet.yaml").write_text(text)
     with pytest.raises(UsageError):
         find_jobs(Storage.at(tmp_path))
+
+
+def test_entries_without_a_robot_are_named_by_their_first_folder(tmp_path):
+    lay_out(tmp_path, "r1/a", "b")
+    (tmp_path / "fleet.yaml").write_text("sessions: [{path: '**/*'}, {path: '*', site: hall}]")
+    jobs = {job.source.removeprefix(f"{tmp_path}/"): job for job in find_jobs(Storage.at(tmp_path))}
+    assert jobs["b"].fallback_robot == "b" and jobs["r1/a"].fallback_robot == "r1"
 
 
 @pytest.mark.parametrize("rig", ["nosuch.yaml", "/nosuch/r.yaml", "rlfz"])

@@ -1,4 +1,4 @@
-"""Sessions in processes of their own: whatever they do, the cause is known and the next one runs."""
+"""Sessions in processes of their own: each end has a known cause."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lce_rig.fleet.process import SessionServer
+from lce_rig.fleet.process import Ended, run_apart
 
 # What a session does, by name; the server imports this module by its path.
 _MODULE = """
@@ -38,55 +38,49 @@ def stumble(arguments, tell):
 """
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionServer]:
+@pytest.fixture(scope="module", autouse=True)
+def _acts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     folder = tmp_path_factory.mktemp("sessions")
     (folder / "acts_of_sessions.py").write_text(_MODULE)
     before = os.environ.get("PYTHONPATH", "")
     os.environ["PYTHONPATH"] = f"{folder}{os.pathsep}{before}"
-    server = SessionServer()
+    yield
     os.environ["PYTHONPATH"] = before
-    yield server
-    server.close()
 
 
-def act(server: SessionServer, name: str, limit_s: float = 60.0, limit_mb: float = 1000.0):
-    return server.run(f"acts_of_sessions:{name}", {"robot": "r1"}, limit_s, limit_mb)
+def act(name: str, limit_s: float = 60.0, limit_mb: float = 1000.0) -> Ended:
+    return run_apart(f"acts_of_sessions:{name}", {"robot": "r1"}, limit_s, limit_mb)
 
 
-def test_a_session_returns_its_rows_and_what_it_cost(server):
-    first, second = act(server, "done"), act(server, "done")
+def test_a_session_returns_its_rows_and_what_it_cost():
+    first, second = act("done"), act("done")
     assert first.rows and second.rows and first.rows[0]["pid"] != second.rows[0]["pid"]
     assert first.known == {"robot": "r1"} and first.exit_code == 0 and not first.reason
     assert first.peak_memory_mb > 10
 
 
-def test_one_that_hangs_is_ended_at_its_time_limit(server):
+def test_one_that_hangs_is_ended_at_its_time_limit():
     start_s = time.monotonic()
-    ended = act(server, "hang", limit_s=1.0)
+    ended = act("hang", limit_s=1.0)
     assert (ended.rows, ended.reason, ended.known) == (None, "timed_out", {"robot": "r1"})
     assert time.monotonic() - start_s < 20
 
 
 @pytest.mark.parametrize("way", ["eat", "gulp"])
-def test_one_that_eats_memory_is_ended_at_its_limit(server, way):
-    ended = act(server, way, limit_mb=700.0)
+def test_one_that_eats_memory_is_ended_at_its_limit(way):
+    ended = act(way, limit_mb=700.0)
     assert (ended.rows, ended.reason) == (None, "out_of_memory")
     assert ended.peak_memory_mb < 1500
 
 
-def test_one_that_crashes_names_its_signal_or_exit_code(server):
-    assert act(server, "crash").exit_code == -signal.SIGSEGV
-    assert act(server, "leave").exit_code == 3
+def test_one_that_crashes_names_its_signal_or_exit_code():
+    assert act("crash").exit_code == -signal.SIGSEGV
+    assert act("leave").exit_code == 3
 
 
-def test_a_bug_is_named_by_its_last_line(server):
-    ended = act(server, "stumble")
+def test_a_bug_is_named_by_its_last_line():
+    ended = act("stumble")
     assert ended.reason == "bug" and "ZeroDivisionError" in ended.detail
-
-
-def test_the_next_session_runs_after_all_of_these(server):
-    assert act(server, "done").rows
 
 
 def test_the_session_ends_with_whoever_started_it(tmp_path):
@@ -98,8 +92,8 @@ def test_the_session_ends_with_whoever_started_it(tmp_path):
     )
     pid_file = tmp_path / "pid"
     script = (
-        "from lce_rig.fleet.process import SessionServer\n"
-        f"SessionServer().run('acts_of_sessions:hang', {{'file': {str(pid_file)!r}}}, 60, 4000)\n"
+        "from lce_rig.fleet.process import run_apart\n"
+        f"run_apart('acts_of_sessions:hang', {{'file': {str(pid_file)!r}}}, 60, 4000)\n"
     )
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     worker = subprocess.Popen([sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": path})

@@ -14,10 +14,13 @@ def registry(tmp_path):
 
 
 def write(registry, row, *files):
-    with registry.result(row.folder) as draft:
+    """Write a result of a session that failed, with further files."""
+    row = row | {"status": "failed"}
+    with registry.result(row["folder"]) as draft:
         for name in files:
-            (draft / name).write_text(row.folder)
-        return write_rows(draft, [row])
+            (draft / name).write_text(row["folder"])
+        write_rows(draft, [row])
+    return [row]
 
 
 def folders(table):
@@ -71,7 +74,7 @@ def test_a_later_result_of_a_source_takes_the_place_of_the_earlier_which_is_kept
 def test_what_a_new_result_in_the_same_folder_lacks_is_kept(registry, row):
     write(registry, row(folder="r1/a"), "same.txt", "result.json")
     (registry.place.local / "r1/a/notes.txt").write_text("mine")
-    write(registry, row(folder="r1/a", status="timed_out"))
+    write(registry, row(folder="r1/a"))
     aside = registry.place / SUPERSEDED / "r1"
     assert (aside / "a").names() == [ROWS, "notes.txt", "result.json", "same.txt"]
     write(registry, row(folder="r1/a"), "same.txt", "result.json")
@@ -90,10 +93,37 @@ def test_a_folder_is_replaced_whole_and_stays_where_writing_fails(registry, row)
     assert registry.rows("r1/a")[0]["n_used"] == 2
 
 
-def test_rows_that_other_hands_damaged_count_as_missing(registry, row):
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{",
+        "[]",
+        '{"format_version": 9, "rows": []}',
+        '{"format_version": 1, "rows": [{}]}',
+        '{"format_version": 1, "rows": [{"status": "failed", "n_used": "many"}]}',
+        '{"format_version": 1, "rows": [{"status": "failed", "date": {"a": 1}}]}',
+        '{"format_version": 1, "rows": [{"status": "ok"}]}',
+        '{"format_version": 1, "rows": 1}',
+    ],
+)
+def test_a_damaged_file_costs_its_session_only(registry, row, content):
+    """Where a row says ok, result.json is damaged."""
+    folder = "r1/20260105T100000Z-0123456789ab"
+    write(registry, row(folder=folder), "result.json")
+    write(registry, row("r2", folder="r2/b"))
+    (registry.place.local / folder / ROWS).write_text(content)
+    table = registry.consolidate(rebuild=True)
+    assert folders(table) == [folder, "r2/b"]
+    (damaged,) = registry.rows(folder)
+    assert (damaged["status"], damaged["cause"]) == ("failed", "fleet.damaged")
+    assert damaged["date"] == "2026-01-05T10:00:00Z"
+
+
+def test_a_row_stays_within_its_folder(registry, row):
     write(registry, row(folder="r1/a"))
-    (registry.place.local / "r1/a" / ROWS).write_text("{")
-    assert registry.rows("r1/a") == [] and not len(registry.consolidate())
+    text = (registry.place.local / "r1/a" / ROWS).read_text()
+    (registry.place.local / "r1/a" / ROWS).write_text(text.replace('"r1', '"../../etc'))
+    assert [(each["robot"], each["folder"]) for each in registry.rows("r1/a")] == [("r1", "r1/a")]
 
 
 def test_a_registry_that_cannot_be_written_is_an_error(tmp_path, row):

@@ -3,8 +3,8 @@
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,7 +16,7 @@ from lce_rig.core.errors import ProfileError, UsageError
 from lce_rig.fleet.registry import Registry, write_rows
 from lce_rig.fleet.rollout import FleetDeployment, Rollout, newest_results, read_rollout
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import Row, as_table
+from lce_rig.fleet.table import as_table
 from lce_rig.rig import dump_rig, load_rig
 from tests.export.conftest import calibration, some_pose
 from tests.saved_results import result_file
@@ -34,19 +34,24 @@ def registry(tmp_path: Path) -> Registry:
 def add(registry: Registry) -> Add:
     """Put a result of a robot into the registry."""
 
-    def put(robot: str, date: str = "2026-01-05T10:00:00Z", x_m: float = 0.1, **changes: object) -> None:
-        known: dict[str, object] = {"camera": "davis", "lidar": "lidar", "verdict": "pass"}
-        known["source"] = f"/sessions/{robot}/{date[:10]}"
-        row = Row(robot, date=date, folder=f"{robot}/{date[:10]}-0f", **(known | changes))  # type: ignore[arg-type]
-        with registry.result(row.folder) as draft:
+    def put(
+        robot: str,
+        date: str = "2026-01-05T10:00:00Z",
+        x_m: float = 0.1,
+        verdict: Any = "pass",
+        **changes: object,
+    ) -> None:
+        known: dict[str, object] = {"status": "ok", "source": f"/sessions/{robot}/{date[:10]}"}
+        row = {"robot": robot, "date": date, "folder": f"{robot}/{date[:10]}-0f", **known, **changes}
+        with registry.result(str(row["folder"])) as draft:
             rig = load_rig("rles")
             origin = Provenance(robot, {}, date, "0f" * 32)
-            saved = result_file("rles", [calibration(some_pose(t=(x_m, 0, 0)))], provenance=origin)
+            pair = calibration(some_pose(t=(x_m, 0, 0)), verdict=verdict)
+            saved = result_file("rles", [pair], provenance=origin)
             (draft / "result.json").write_text(saved.text())
             (draft / "rig.yaml").write_text(dump_rig(rig))
-            written = write_rows(draft, [row])
-        registry.consolidate(written)
-        assert asdict(row)["robot"] == robot
+            write_rows(draft, [row])
+        registry.consolidate()
 
     return put
 
@@ -99,7 +104,7 @@ def test_every_robot_gets_its_own_newest_result(registry: Registry, targets: Pat
 @pytest.mark.usefixtures("whole")
 def test_a_robot_whose_newest_session_failed_is_left_out(registry: Registry, targets: Path, add: Add) -> None:
     add("r3", "2026-02-01T10:00:00Z", verdict="fail")
-    add("r5", "2026-02-01T10:00:00Z", status="failed", cause="fleet.session", verdict=None)
+    add("r5", "2026-02-01T10:00:00Z", status="failed", cause="fleet.session")
     rollout = deploy(registry, targets)
     assert states(rollout) == dict.fromkeys(ROBOTS, "in_place") | {"r3": "left_out", "r5": "left_out"}
     assert held(targets, "r3") is None and held(targets, "r5") is None
@@ -153,7 +158,13 @@ def test_the_output_of_a_check_is_bounded(registry: Registry, targets: Path) -> 
 def test_a_name_in_the_registry_becomes_no_yaml_no_path_and_no_command(
     registry: Registry, targets: Path, name: str
 ) -> None:
-    row = Row(name, date="2026-01-05T10:00:00Z", folder=f"{name}/a", camera="c", lidar="l", verdict="pass")
+    row = {
+        "robot": name,
+        "date": "2026-01-05T10:00:00Z",
+        "folder": f"{name}/a",
+        "status": "ok",
+        "verdict": "pass",
+    }
     registry.write_table(as_table([row]))
     before = sorted(targets.parent.rglob("*"))
     rollout = deploy(registry, targets)

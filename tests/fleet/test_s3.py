@@ -2,7 +2,9 @@
 
 import pytest
 from benchmarks.fleet import files_of, s3_server
+from s3fs import S3FileSystem
 
+from lce_rig.cli.main import run
 from lce_rig.fleet.jobs import find_jobs
 from lce_rig.fleet.registry import Registry, write_rows
 from lce_rig.fleet.storage import Storage
@@ -19,7 +21,8 @@ def bucket():
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 def test_the_same_sessions_give_the_same_files_in_a_store_and_on_a_disk(fleet_root, tmp_path, bucket):
     here = tmp_path / "registry"
-    bucket.fs.put(f"{fleet_root}/", f"{bucket.path}/sessions", recursive=True)
+    with bucket.reached() as (fs, path):
+        fs.put(f"{fleet_root}/", f"{path}/sessions", recursive=True)
     registries = {}
     for root, place in ((Storage.at(fleet_root), here), (bucket / "sessions", bucket / "registry")):
         settings = Settings(place.url if isinstance(place, Storage) else str(place))
@@ -41,21 +44,39 @@ def test_the_same_sessions_give_the_same_files_in_a_store_and_on_a_disk(fleet_ro
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 def test_a_result_in_a_store_counts_when_its_rows_are_there(row, bucket):
     registry = Registry(bucket / "registry")
-    with registry.result("r1/a") as draft:
-        (draft / "old.txt").write_text("1")
-        fresh = write_rows(draft, [row(folder="r1/a", source="s")])
-    assert registry.consolidate(fresh)["folder"].to_pylist() == ["r1/a"]
-    with registry.result("r1/a") as draft:
-        (draft / "new.txt").write_text("2")
-        write_rows(draft, [row(folder="r1/a", source="s", n_used=9)])
+
+    def write(name, **changes):
+        with registry.result("r1/a") as draft:
+            (draft / name).write_text(name)
+            write_rows(draft, [row(folder="r1/a", source="s", status="failed") | changes])
+
+    write("old.txt")
+    assert registry.consolidate()["folder"].to_pylist() == ["r1/a"]
+    write("new.txt", n_used=9)
     assert (registry.place / "r1/a").names() == ["fleet.json", "new.txt"]
     assert registry.consolidate(rebuild=True)["n_used"].to_pylist() == [9]
-    registry.place.fs.rm_file((registry.place / "r1/a/fleet.json").path)
+    with registry.place.reached() as (fs, path):
+        fs.rm_file(f"{path}/r1/a/fleet.json")
     assert registry.rows("r1/a") == [] and len(registry.consolidate(rebuild=True)) == 0
-    with registry.result("r1/a") as draft:
-        write_rows(draft, [row(folder="r1/a", source="s")])
     registry.set_aside("r1/a")
     assert registry.folders() == []
     aside = registry.place / ".superseded/r1"
     kept = {name: (aside / name).names() for name in aside.names()}
-    assert kept == {"a": ["fleet.json", "old.txt"], "a-2": ["new.txt"], "a-3": ["fleet.json"]}
+    assert kept == {"a": ["fleet.json", "old.txt"], "a-2": ["new.txt"]}
+
+
+@pytest.mark.parametrize("words", [["table"], ["run", "ROOT"], ["report"], ["deploy", "--target", "nav"]])
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+def test_a_store_that_cannot_be_reached_is_one_error(tmp_path, monkeypatch, capsys, words):
+    (tmp_path / "deploy.yaml").write_text("targets: {nav: {to: /tmp/x}}")
+    monkeypatch.chdir(tmp_path)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    S3FileSystem.clear_instance_cache()
+    root = "s3://nowhere/sessions"
+    words = [root if word == "ROOT" else word for word in words]
+    assert run(["fleet", *words, "--registry", "s3://nowhere/registry"]) == 5
+    assert "Traceback" not in capsys.readouterr().err
+    S3FileSystem.clear_instance_cache()
