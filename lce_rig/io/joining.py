@@ -1,16 +1,93 @@
-"""Simultaneous recordings of several recorders, read as one."""
+"""Simultaneous streams merged by the rig's time, and recordings of several recorders read as one."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from heapq import merge
 from pathlib import Path
 
 from lce_rig.core.data import Sample, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io.merging import merge_by_time
-from lce_rig.io.overlap import check_overlap
 from lce_rig.io.protocol import ContinuousRecording, Recording, Span, serials_of
 from lce_rig.rig import Rig
-from lce_rig.timing.rig_time import stream_of
+from lce_rig.timing.rig_time import rig_offset_ns, rig_time_ns, stream_of
+
+_MAX_OFFSET_S = 3600.0
+# Spans are read from a recording's ends, without reading what lies between.
+_ROUGH_S = 0.2
+# Sensors are switched on and off one after the other.
+_USUAL_LAG_S = 2.0
+
+
+def merge_by_time(parts: Iterable[Iterable[Sample]], rig: Rig) -> Iterator[Sample]:
+    """Yield the samples of all parts, the earliest first; each part's own order is kept.
+
+    Packets of events count by their first timestamp. Only one sample of each part is held.
+
+    Raises:
+        SourceError: a part is torn; after everything that the parts hold, it and the others.
+    """
+    torn: list[SourceError] = []
+
+    def keyed(part: Iterable[Sample]) -> Iterator[tuple[int, Sample]]:
+        time_ns = -(2**62)
+        try:
+            for sample in part:
+                sample_ns = rig_time_ns(sample, rig)
+                # A sample without a timestamp comes right after its predecessor.
+                time_ns = time_ns if sample_ns is None else sample_ns
+                yield time_ns, sample
+        except SourceError as error:
+            torn.append(error)
+
+    for _, sample in merge(*map(keyed, parts), key=lambda pair: pair[0]):
+        yield sample
+    if torn:
+        raise torn[0]
+
+
+def check_overlap(
+    scans: Mapping[Stream, Span | None], others: Mapping[Stream, Span | None], rig: Rig
+) -> list[str]:
+    """Check that images and events run while the LiDAR does.
+
+    Args:
+        scans: streams of LiDARs.
+        others: streams of cameras.
+        rig: its `expected_offset_s` are added to the timestamps.
+
+    Returns:
+        Notes on streams that cover only a part of the scans.
+
+    Raises:
+        SourceError: a stream lies wholly before or after the scans, with the distance and the remedy.
+    """
+    notes = []
+    for lidar, lidar_span in sorted(scans.items()):
+        for camera, camera_span in sorted(others.items()):
+            if lidar_span is None or camera_span is None:
+                continue
+            (scan_0, scan_1), (first, last) = (
+                tuple((t_ns + rig_offset_ns(stream, rig)) * 1e-9 for t_ns in span)
+                for stream, span in ((lidar, lidar_span), (camera, camera_span))
+            )
+            overlap_s, length_s = min(last, scan_1) - max(first, scan_0), scan_1 - scan_0
+            if overlap_s < -_ROUGH_S:
+                key = f"cameras.{camera.sensor}.channels.{camera.channel}.timestamps.expected_offset_s"
+                hint = "Record both at the same time on one computer's clock, preferably into one bag."
+                if abs(scan_0 - first) <= _MAX_OFFSET_S:
+                    hint = (
+                        "If they were recorded together, add the difference of their clocks to "
+                        f"{key} in the profile ({scan_0 - first:+.1f} s if both were started at once)."
+                    )
+                raise SourceError(
+                    f"{camera}: {camera.kind} run from {first:.3f} to {last:.3f} s, "
+                    f"scans from {scan_0:.3f} to {scan_1:.3f} s: {-overlap_s:.1f} s apart",
+                    hint,
+                )
+            if length_s - overlap_s > _USUAL_LAG_S:
+                covered = f"{max(overlap_s, 0.0):.1f} of the {length_s:.1f} s of {lidar}'s scans"
+                notes.append(f"{camera}: {camera.kind} cover {covered}")
+    return notes
 
 
 def join_recordings(recordings: Iterable[Recording], rig: Rig) -> list[Recording]:
@@ -25,27 +102,49 @@ def join_recordings(recordings: Iterable[Recording], rig: Rig) -> list[Recording
             groups[-1].append(recording)
         else:
             groups.append([recording])
-    return [_joined(group, rig) for group in groups]
+    return [
+        group[0]
+        if len(group) == 1
+        else JoinedRecording([part for part in group if isinstance(part, ContinuousRecording)], rig)
+        for group in groups
+    ]
+
+
+def _belongs(recording: Recording, group: Sequence[Recording], rig: Rig) -> bool:
+    parts = [other for other in group if isinstance(other, ContinuousRecording)]
+    if not isinstance(recording, ContinuousRecording) or len(parts) < len(group):
+        return False
+    held = {stream: span for part in parts for stream, span in part.streams.items()}
+    scans = {stream: span for stream, span in held.items() if stream.kind == "scans"}
+    if scans.keys() & recording.streams.keys():
+        return False
+    if recording.streams.keys() - held.keys():
+        return True
+    # All its cameras are there already: a copy, where it runs while a LiDAR does.
+    if not any(scans.values()) or not all(recording.streams.values()):
+        return False
+    try:
+        check_overlap(scans, recording.streams, rig)
+    except SourceError:
+        return False
+    return True
 
 
 def require_sensors(recording: ContinuousRecording) -> None:
     """Make sure that a recording holds a LiDAR and a camera.
 
     Raises:
-        SourceError: it does not; the hint says what to give as well.
+        SourceError: it does not; the hint names the recording to add.
     """
     kinds = {stream.kind for stream in recording.streams}
     holds = ", ".join(f"{stream.kind} of {stream}" for stream in sorted(recording.streams))
+    example = "recording of the same time: --from lidar.bag --from events.aedat4"
     if "scans" not in kinds:
-        raise SourceError(
-            f"{recording.path}: no scans of a LiDAR; it holds {holds}",
-            "Also give the LiDAR's recording of the same time: --from lidar.bag --from events.aedat4",
-        )
+        what = f"{recording.path}: no scans of a LiDAR; it holds {holds}"
+        raise SourceError(what, f"Also give the LiDAR's {example}")
     if kinds == {"scans"}:
-        raise SourceError(
-            f"{recording.path}: no images and no events; it holds {holds}",
-            "Also give the camera's recording of the same time: --from lidar.bag --from events.aedat4",
-        )
+        what = f"{recording.path}: no images and no events; it holds {holds}"
+        raise SourceError(what, f"Also give the camera's {example}")
 
 
 class JoinedRecording:
@@ -54,10 +153,10 @@ class JoinedRecording:
     Attributes:
         path: of the first.
         notes: those of all, and what was skipped.
-        key: fingerprint of all, in whatever order they were given.
+        key: fingerprint of all, in any order.
         n_samples: images and scans of all.
         streams: each from the first recording that holds it.
-        serials: serial numbers by sensor, as far as a part tells them.
+        serials: serial numbers by sensor, as far as the parts have them.
     """
 
     def __init__(self, parts: Sequence[ContinuousRecording], rig: Rig) -> None:
@@ -83,49 +182,21 @@ class JoinedRecording:
             SourceError: images or events of one part lie wholly before or after the scans of another; or,
                 after everything that can be read, a part is torn.
         """
-        self._check_overlap()
+        for part in self._parts:
+            scans = {s: span for s, span in part.streams.items() if s.kind == "scans"}
+            others = {
+                stream: self.streams[stream]
+                for stream, owner in self._owner.items()
+                if owner is not part and stream.kind != "scans"
+            }
+            self.notes += check_overlap(scans, others, self._rig)
         try:
-            yield from merge_by_time([self._own_samples(part) for part in self._parts], self._rig)
+            yield from merge_by_time([self._owned(part) for part in self._parts], self._rig)
         finally:
             self.notes += [n for part in self._parts for n in part.notes if n not in self.notes]
 
-    def _own_samples(self, part: ContinuousRecording) -> Iterator[Sample]:
+    def _owned(self, part: ContinuousRecording) -> Iterator[Sample]:
+        """Yield the samples of the streams that are taken from a part."""
         return (
             sample for sample in part.samples() if self._owner.get(stream_of(sample, self._rig), part) is part
         )
-
-    def _check_overlap(self) -> None:
-        for scans_part in self._parts:
-            scans = {s: span for s, span in scans_part.streams.items() if s.kind == "scans"}
-            others = {s: self.streams[s] for s, part in self._owner.items() if part is not scans_part}
-            self.notes += check_overlap(
-                scans, {s: o for s, o in others.items() if s.kind != "scans"}, self._rig
-            )
-
-
-def _belongs(recording: Recording, group: Sequence[Recording], rig: Rig) -> bool:
-    parts = [other for other in group if isinstance(other, ContinuousRecording)]
-    if not isinstance(recording, ContinuousRecording) or len(parts) < len(group):
-        return False
-    known = {stream for part in parts for stream in part.streams}
-    ours = set(recording.streams)
-    if any(stream.kind == "scans" for stream in known & ours):
-        return False
-    return bool(ours - known) or _is_copy(recording, parts, rig)
-
-
-def _is_copy(recording: ContinuousRecording, parts: Sequence[ContinuousRecording], rig: Rig) -> bool:
-    """Return whether all of a recording runs while a LiDAR does, whose cameras are there already."""
-    scans = {s: span for part in parts for s, span in part.streams.items() if s.kind == "scans"}
-    if not any(scans.values()) or not all(recording.streams.values()):
-        return False
-    try:
-        check_overlap(scans, recording.streams, rig)
-    except SourceError:
-        return False
-    return True
-
-
-def _joined(group: Sequence[Recording], rig: Rig) -> Recording:
-    parts = [recording for recording in group if isinstance(recording, ContinuousRecording)]
-    return group[0] if len(group) == 1 else JoinedRecording(parts, rig)

@@ -10,8 +10,7 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io.joining import JoinedRecording, join_recordings, require_sensors
-from lce_rig.io.merging import merge_by_time
+from lce_rig.io.joining import JoinedRecording, join_recordings, merge_by_time, require_sensors
 from lce_rig.io.protocol import ContinuousRecording, Span
 from lce_rig.rig import Rig, load_rig
 from tests.notes import has_note

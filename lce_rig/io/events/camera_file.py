@@ -12,7 +12,7 @@ from lce_rig.io.events.event_recording import CameraEvents
 from lce_rig.io.events.prophesee_raw import PropheseeEvents
 from lce_rig.io.events.stream import NoEventsError, damage, worded
 from lce_rig.io.fingerprint import fingerprint
-from lce_rig.io.merging import merge_by_time
+from lce_rig.io.joining import merge_by_time
 from lce_rig.io.protocol import SourceOptions, Span
 from lce_rig.io.sensor_choice import choose_event_camera
 from lce_rig.rig import Rig

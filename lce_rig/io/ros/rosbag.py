@@ -15,8 +15,7 @@ from lce_rig.io import findings
 from lce_rig.io.events.event_recording import CameraEvents, EventRecording
 from lce_rig.io.events.stream import NoEventsError, worded
 from lce_rig.io.folder.cloud import to_scan
-from lce_rig.io.merging import merge_by_time
-from lce_rig.io.overlap import check_overlap
+from lce_rig.io.joining import check_overlap, merge_by_time
 from lce_rig.io.protocol import SourceOptions, Span
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import BagEvents
