@@ -103,10 +103,10 @@ class Ros2Source(LiveSource):
         samples: list[LiveSample] = []
         for host_ns, data in came:
             message = RawMessage(self._topic, self._msgtype, "cdr", host_ns, data)
-            sample = self._decoder.decode(message)
-            if sample is not None and sample.stamp_ns is not None:
-                self._delay_ms = (host_ns - sample.stamp_ns) * 1e-6
-                samples.append(sample)
+            for sample in self._decoder.decode(message):
+                if sample.stamp_ns is not None:
+                    self._delay_ms = (host_ns - sample.stamp_ns) * 1e-6
+                    samples.append(sample)
         return samples
 
     def describe(self) -> SourceStatus:

@@ -44,88 +44,73 @@ class TopicDecoder:
 
     Attributes:
         n_yielded: samples so far.
-        losses: what was skipped.
-        notes: what was assumed, in words.
-        hint: what to do about the last message that could not be decoded.
+        losses: messages and points that were skipped.
+        notes: assumptions, in words.
+        hint: an action against the failure of the last message that could not be decoded.
     """
 
     def __init__(self, target: Target, settings: CameraSettings | LidarSettings) -> None:
         self.n_yielded = 0
         self.losses = Losses()
         self.notes: set[str] = set()
+        self.hint = ""
         self._target, self._settings = target, settings
         self._last_ns: int | None = None
         self._packets: Vlp16Stream | None = None
-        self._waiting: list[Scan] = []
-        self.hint = ""
 
-    def decode(self, message: RawMessage) -> Image | Scan | None:
-        """Decode one message; None, and counted, where it is damaged, sent twice or late."""
+    def decode(self, message: RawMessage) -> list[Image | Scan]:
+        """Decode one message; empty, and counted, where it is damaged, sent twice or late."""
         try:
             content = deserialize(message)
             if message.msgtype in PACKET_TYPES:
-                self._take_packets(content)
-                return self._oldest()
+                return self._in_order(self._assemble(content))
             stamp_ns = header_stamp_ns(content)
             if stamp_ns == 0:
                 self.notes.add("headers have no timestamps; the time of receipt is used")
                 stamp_ns = message.log_ns
-            sample = self._to_sample(message, content, stamp_ns)
+            return self._in_order([self._to_sample(message, content, stamp_ns)])
         except (SourceError, ValueError) as error:
             cause = error.what if isinstance(error, SourceError) else str(error)
-            self.hint = (error.hint or "") if isinstance(error, SourceError) else ""
+            self.hint = error.hint if isinstance(error, SourceError) else ""
             self.losses.add(findings.NOT_DECODED(where=cause))
-            return None
-        if not self._is_in_order(sample.stamp_ns):
-            return None
-        self.n_yielded += 1
-        return sample
+            return []
 
-    def finish(self) -> Iterator[Scan]:
-        """Yield the scans that wait: a revolution of packets may end with the recording."""
+    def finish(self) -> list[Image | Scan]:
+        """Return the last scan where a revolution of packets ends with the recording."""
         last = self._packets.finish() if self._packets else None
-        self._waiting += [] if last is None else [last]
-        while (scan := self._oldest()) is not None:
-            yield scan
+        return [] if last is None else self._in_order([last])
 
     def account(self) -> list[str]:
-        """Say what was assumed and skipped, in words."""
+        """List assumptions and losses, in words."""
         lines = sorted(self.notes) + worded(self.losses)
         return lines if self._packets is None else lines + self._packets.account()
 
-    def _take_packets(self, content: Any) -> None:
+    def _assemble(self, content: Any) -> list[Image | Scan]:
         """Assemble the packets of a message; a scan ends where the rotor passes the cut, not the message."""
         assert isinstance(self._settings, LidarSettings)  # as packets have no camera
         if self._packets is None:
             self._packets = Vlp16Stream(self._target.sensor, self._settings)
             self.notes |= {OFFSETS_NOTE, "scans are assembled from packets"}
+        scans: list[Image | Scan] = []
         for packet in content.packets:
             host_ns = int(packet.stamp.sec * 10**9 + packet.stamp.nanosec)
             scan = self._packets.push_data(np.asarray(packet.data).tobytes(), host_ns)
-            self._waiting += [] if scan is None else [scan]
+            scans += [] if scan is None else [scan]
         others = self._packets.other_models.most_common(1)
         if others and not self._packets.n_data:
             what = f"its packets are of a {others[0][0]}, not of a {self._packets.product.name}"
             raise SourceError(what, f"Set the model of {self._target.sensor!r} in the profile.")
-
-    def _oldest(self) -> Scan | None:
-        while self._waiting:
-            scan = self._waiting.pop(0)
-            if self._is_in_order(scan.stamp_ns):
-                self.n_yielded += 1
-                return scan
-        return None
+        return scans
 
     def _to_sample(self, message: RawMessage, content: Any, stamp_ns: int) -> Image | Scan:
         sensor, channel = self._target.sensor, self._target.channel
         if isinstance(self._settings, CameraSettings):
             assert channel is not None  # as every topic of a camera has
-            pixels = decode_ros_image(content)
             if self._settings.channels[channel].timestamps.reference == "start":
                 self.notes.add(
                     "messages have no exposure time; timestamps of its start are used as its middle"
                 )
-            return Image(sensor, channel, stamp_ns, pixels, message.log_ns)
+            return Image(sensor, channel, stamp_ns, decode_ros_image(content), message.log_ns)
         cloud = decode_pointcloud2(content)
         reading = to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns)
         self.notes.update(reading.notes)
@@ -133,20 +118,23 @@ class TopicDecoder:
         self.losses.add(findings.POINTS_WITHOUT_RETURN(), n_without_return)
         return reading.scan
 
-    def _is_in_order(self, stamp_ns: int | None) -> bool:
-        """Return whether a timestamp is later than its predecessor; count it where it is not."""
-        if stamp_ns is None or self._last_ns is None or stamp_ns > self._last_ns:
+    def _in_order(self, samples: list[Image | Scan]) -> list[Image | Scan]:
+        """Keep the samples with timestamps later than their predecessor's; count the others."""
+        kept = []
+        for sample in samples:
+            stamp_ns, last_ns = sample.stamp_ns, self._last_ns
+            if stamp_ns is not None and last_ns is not None and stamp_ns <= last_ns:
+                if stamp_ns == last_ns:
+                    self.losses.add(findings.SENT_TWICE())
+                    continue
+                if last_ns - stamp_ns < CLOCK_JUMP_NS:
+                    self.losses.add(findings.OUT_OF_ORDER())
+                    continue
+                self.losses.add(findings.CLOCK_SET_BACK())
             self._last_ns = stamp_ns
-            return True
-        if stamp_ns == self._last_ns:
-            self.losses.add(findings.SENT_TWICE())
-            return False
-        if self._last_ns - stamp_ns < CLOCK_JUMP_NS:
-            self.losses.add(findings.OUT_OF_ORDER())
-            return False
-        self.losses.add(findings.CLOCK_SET_BACK())
-        self._last_ns = stamp_ns
-        return True
+            kept.append(sample)
+        self.n_yielded += len(kept)
+        return kept
 
 
 class BagRecording:
@@ -154,10 +142,10 @@ class BagRecording:
 
     Attributes:
         path: the bag's file or folder.
-        notes: topics taken, and after reading what was skipped and why.
+        notes: the topics of each sensor, and after reading the losses.
         key: fingerprint of the bag.
-        n_samples: number of messages with images and scans on the topics taken.
-        streams: what is read, with its span where the bag holds events or is a part of a recording.
+        n_samples: number of messages with images and scans on these topics.
+        streams: of the sensors, with their spans where the bag holds events or is a part of a recording.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
@@ -174,7 +162,10 @@ class BagRecording:
         self._events = self._open_events()
         self.n_samples = sum(self._bag.topics[topic][1] for topic in self._targets)
         self.key = self._bag.fingerprint()
-        self.streams = self._list_streams(is_spanned=bool(self._events) or options.is_part)
+        self.streams: dict[Stream, Span | None] = {s: events.span_ns for s, events in self._events.items()}
+        spans = self._find_spans() if self._events or options.is_part else {}
+        for topic, target in self._targets.items():
+            self.streams[target.stream(self._bag.topics[topic][0])] = spans.get(topic)
         events, scans = (
             {s: span for s, span in self.streams.items() if s.kind == kind} for kind in ("events", "scans")
         )
@@ -195,7 +186,7 @@ class BagRecording:
 
         Raises:
             SourceError: no message of a topic could be decoded; or, after all that can be read, the bag is
-                torn.
+                damaged.
         """
         parts = [self._messages(), *(events.samples() for events in self._events.values())]
         try:
@@ -205,28 +196,25 @@ class BagRecording:
                 self.notes += [note for note in events.notes if note not in self.notes]
 
     def _messages(self) -> Iterator[Sample]:
-        decoders = {
-            topic: TopicDecoder(target, self._settings(target)) for topic, target in self._targets.items()
-        }
+        """Yield images and scans."""
+        decoders: dict[str, TopicDecoder] = {}
+        for topic, target in self._targets.items():
+            sensors = self._rig.lidars if target.channel is None else self._rig.cameras
+            decoders[topic] = TopicDecoder(target, sensors[target.sensor])
         try:
             for message in self._bag.messages(self._targets.keys()):
-                sample = decoders[message.topic].decode(message)
-                if sample is not None:
-                    yield sample
+                yield from decoders[message.topic].decode(message)
             for decoder in decoders.values():
                 yield from decoder.finish()
         finally:
-            self._summarise(decoders)
+            for topic, decoder in decoders.items():
+                self.notes += [f"{topic}: {line}" for line in decoder.account()]
         for topic, decoder in decoders.items():
-            found = {each.code: each for each in decoder.losses.findings()}
-            if decoder.n_yielded == 0 and found:
-                failed = found.get("recording.not_decoded")
+            losses = {loss.code: loss for loss in decoder.losses.findings()}
+            if decoder.n_yielded == 0 and losses:
+                failed = losses.get(findings.NOT_DECODED.code)
                 cause = failed.figures["where"] if failed else "its timestamps do not increase"
                 raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}", decoder.hint)
-
-    def _settings(self, target: Target) -> CameraSettings | LidarSettings:
-        is_lidar = target.channel is None
-        return self._rig.lidars[target.sensor] if is_lidar else self._rig.cameras[target.sensor]
 
     def _open_events(self) -> dict[Stream, CameraEvents]:
         """Take the topics of raw events out of the others and open them.
@@ -250,34 +238,21 @@ class BagRecording:
                 self.notes.append(f"{topic} of {error.what}; read without")
         return opened
 
-    def _list_streams(self, is_spanned: bool) -> dict[Stream, Span | None]:
-        streams: dict[Stream, Span | None] = {s: events.span_ns for s, events in self._events.items()}
-        begun = self._first_stamps() if is_spanned else {}
-        for topic, target in self._targets.items():
-            stamp_ns, log_ns = begun.get(topic, (None, None))
-            end_ns = self._bag.end_ns(topic) if topic in begun else None
-            stream = target.stream(self._bag.topics[topic][0])
-            if stamp_ns is None or log_ns is None or end_ns is None:
-                streams[stream] = None
-            else:
-                streams[stream] = stamp_ns, stamp_ns + end_ns - log_ns
-        return streams
-
-    def _first_stamps(self) -> dict[str, tuple[int, int]]:
-        """Find (timestamp, time of receipt) of the first message of each topic, as far as they come early."""
-        found: dict[str, tuple[int, int]] = {}
-        try:
+    def _find_spans(self) -> dict[str, Span]:
+        """Find the spans of topics that begin early, by the first timestamp and the times of receipt."""
+        first: dict[str, tuple[int, int]] = {}
+        # Damage is reported once everything before it has been read.
+        with suppress(SourceError):
             for message in islice(self._bag.messages(self._targets.keys()), _N_PROBED):
-                if message.topic not in found:
+                if message.topic not in first:
                     with suppress(ValueError):
                         stamp_ns = header_stamp_ns(deserialize(message)) or message.log_ns
-                        found[message.topic] = stamp_ns, message.log_ns
-                if len(found) == len(self._targets):
+                        first[message.topic] = stamp_ns, message.log_ns
+                if len(first) == len(self._targets):
                     break
-        except SourceError:
-            pass  # Reported once everything before the damage has been read.
-        return found
-
-    def _summarise(self, decoders: dict[str, TopicDecoder]) -> None:
-        for topic, decoder in decoders.items():
-            self.notes += [f"{topic}: {line}" for line in decoder.account()]
+        ends_ns = {topic: self._bag.end_ns(topic) for topic in first}
+        return {
+            topic: (stamp_ns, stamp_ns + end_ns - log_ns)
+            for topic, (stamp_ns, log_ns) in first.items()
+            if (end_ns := ends_ns[topic]) is not None
+        }

@@ -1,6 +1,6 @@
 """Assignment of a bag's topics to the sensors of the rig."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -33,7 +33,7 @@ class Target:
 
     @property
     def types(self) -> frozenset[str]:
-        """Message types that this sensor's data come as."""
+        """Message types of this sensor's data."""
         if self.channel is None:
             return CLOUD_TYPES | PACKET_TYPES
         return IMAGE_TYPES | EVENT_TYPES if self.has_events else IMAGE_TYPES
@@ -66,10 +66,27 @@ def choose_topics(
             left; the hint lists the topics that are there.
     """
     there = list_topics(topics)
-    asked = _parse_overrides(rig, options)
+    targets = [
+        (Target(name, channel, settings.kind == "events"), settings.topic)
+        for name, camera in rig.cameras.items()
+        for channel, settings in camera.channels.items()
+    ]
+    targets += [(Target(name, None), lidar.topic) for name, lidar in rig.lidars.items()]
+    # "cam.events", "lidar", and "cam" for the first channel of a camera.
+    by_name = {str(target): target for target, _ in targets}
+    for name, camera in rig.cameras.items():
+        by_name[name] = by_name[f"{name}.{next(iter(camera.channels))}"]
+    unknown = sorted(set(options.topics) - set(by_name))
+    if unknown:
+        sensors = ", ".join(sorted(by_name))
+        raise SourceError(f"rig {rig.name!r} has no sensor {unknown[0]!r}; it has {sensors}")
+    asked = {by_name[name]: topic for name, topic in options.topics.items()}
     chosen: dict[str, Target] = {}
-    for target, profile_topic in _targets(rig):
-        topic = _find_topic(target, asked.get(target), profile_topic, topics)
+    for target, profile_topic in targets:
+        candidates = [asked[target]] if target in asked else [profile_topic] if profile_topic else []
+        if target not in asked and profile_topic and target.channel is not None:
+            candidates.append(f"{profile_topic}/compressed")  # a recorder may have kept that one only
+        topic = next((topic for topic in candidates if topic in topics), None)
         if topic is None:
             if target in asked and not options.is_part:
                 raise SourceError(f"{path}: no topic {asked[target]} for {target}", there)
@@ -81,79 +98,52 @@ def choose_topics(
         elif topic in chosen:
             raise SourceError(f"{path}: {topic} is requested for both {chosen[topic]} and {target}", there)
         elif target in asked or target.channel is None:
-            wanted = " or ".join(sorted(target.types))
-            raise SourceError(f"{path}: {topic} for {target} is {msgtype}, not {wanted}", there)
+            types = " or ".join(sorted(target.types))
+            raise SourceError(f"{path}: {topic} for {target} is {msgtype}, not {types}", there)
         else:
             notes.append(f"{path.name}: {topic} is {msgtype} and is not read")
-    _add_only_events(path, topics, rig, chosen, notes)
-    _add_only_candidates(path, topics, rig, chosen, notes, options.is_part)
-    return chosen
-
-
-def _find_topic(target: Target, asked: str | None, profile_topic: str | None, topics: Topics) -> str | None:
-    """Name the topic of a sensor if it is in the bag; a recorder may have kept the compressed one only."""
-    if asked is not None:
-        return asked if asked in topics else None
-    candidates = [] if profile_topic is None else [profile_topic, f"{profile_topic}/compressed"]
-    n_candidates = 1 if target.channel is None else 2
-    return next((topic for topic in candidates[:n_candidates] if topic in topics), None)
-
-
-def _targets(rig: Rig) -> list[tuple[Target, str | None]]:
-    cameras = [
-        (Target(name, channel, settings.kind == "events"), settings.topic)
-        for name, camera in rig.cameras.items()
-        for channel, settings in camera.channels.items()
-    ]
-    return cameras + [(Target(name, None), lidar.topic) for name, lidar in rig.lidars.items()]
-
-
-def _parse_overrides(rig: Rig, options: SourceOptions) -> dict[Target, str]:
-    """Read "cam", "cam.events" and "lidar" as sensors; a camera alone means its first channel."""
-    known = {str(target): target for target, _ in _targets(rig)}
-    for name, camera in rig.cameras.items():
-        known[name] = known[f"{name}.{next(iter(camera.channels))}"]
-    unknown = sorted(set(options.topics) - set(known))
-    if unknown:
-        raise SourceError(f"rig {rig.name!r} has no sensor {unknown[0]!r}; it has {', '.join(sorted(known))}")
-    return {known[name]: topic for name, topic in options.topics.items()}
-
-
-def _add_only_events(
-    path: Path, topics: Topics, rig: Rig, chosen: dict[str, Target], notes: list[str]
-) -> None:
-    """Give a channel of events without a topic in the profile the only topic of events there is."""
-    for target, wanted_topic in _targets(rig):
+    for target, profile_topic in targets:
         fitting = [topic for topic in _fitting(topics, EVENT_TYPES) if topic not in chosen]
-        is_open = target.has_events and wanted_topic is None and target not in chosen.values()
+        is_open = target.has_events and profile_topic is None and target not in chosen.values()
         if is_open and len(fitting) == 1:
             chosen[fitting[0]] = target
             notes.append(f"{path.name}: {target} from {fitting[0]}, the only topic with events")
-
-
-def _add_only_candidates(
-    path: Path, topics: Topics, rig: Rig, chosen: dict[str, Target], notes: list[str], is_part: bool
-) -> None:
-    """Give the rig's first camera and LiDAR the only topic of their kind, where the profile names none."""
-    failures = []
-    for is_camera, what in ((True, "image"), (False, "point cloud")):
-        if any((target.channel is not None) == is_camera for target in chosen.values()):
-            continue
-        target, wanted_topic = next(
-            (t, name) for t, name in _targets(rig) if (t.channel is not None) == is_camera
-        )
-        # Packets are read where a driver's point clouds of them were not recorded.
-        clouds = _fitting(topics, target.types & CLOUD_TYPES)
-        fitting = clouds or _fitting(topics, target.types)
-        if wanted_topic is None and len(fitting) == 1:
-            chosen[fitting[0]] = target
-            notes.append(f"{path.name}: {target} from {fitting[0]}, the only topic with {what}s")
-            continue
-        asked = f"no topic {wanted_topic}" if wanted_topic else f"no single topic with {what}s"
-        hint = f"{list_topics(topics)}. Say which with --topic {target}=TOPIC, or set topic in the profile."
-        failures.append(SourceError(f"{path}: {asked} for {target}", hint))
-    if failures and not (is_part and chosen):
+    failures = [
+        failure
+        for what in ("image", "point cloud")
+        if (failure := _add_only_topic(path, topics, targets, chosen, notes, what)) is not None
+    ]
+    if failures and not (options.is_part and chosen):
         raise failures[0]
+    return chosen
+
+
+def _add_only_topic(
+    path: Path,
+    topics: Topics,
+    targets: Sequence[tuple[Target, str | None]],
+    chosen: dict[str, Target],
+    notes: list[str],
+    what: str,
+) -> SourceError | None:
+    """Give the rig's first camera or LiDAR the only topic of its kind, where the profile names none.
+
+    Returns:
+        The error for a rig without one; None where there is one.
+    """
+    of_kind = [pair for pair in targets if (pair[0].channel is not None) == (what == "image")]
+    if any(target in chosen.values() for target, _ in of_kind):
+        return None
+    target, profile_topic = of_kind[0]
+    # Packets are read where a driver's point clouds of them were not recorded.
+    fitting = _fitting(topics, target.types & CLOUD_TYPES) or _fitting(topics, target.types)
+    if profile_topic is None and len(fitting) == 1:
+        chosen[fitting[0]] = target
+        notes.append(f"{path.name}: {target} from {fitting[0]}, the only topic with {what}s")
+        return None
+    fault = f"no topic {profile_topic}" if profile_topic else f"no single topic with {what}s"
+    hint = f"{list_topics(topics)}. Say which with --topic {target}=TOPIC, or set topic in the profile."
+    return SourceError(f"{path}: {fault} for {target}", hint)
 
 
 def _fitting(topics: Topics, types: frozenset[str]) -> list[str]:
