@@ -88,10 +88,14 @@ def reconstruct(
     Reads AEDAT4, Prophesee RAW (EVT2, EVT3), ROS 1, ROS 2 and mcap bags, HDF5 in DSEC's layout, npz and
     E2VID's text. Skips the first images, until the network has settled, and prints how many.
     """
+    import cv2
+    import numpy as np
+
     from lce_rig.core.errors import SourceError, UsageError
     from lce_rig.detect.events.flicker import measure_flicker
     from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
     from lce_rig.io.events import open_events
+    from lce_rig.show.overlays.animation import write_gif, write_video
 
     if window_s is not None and window_events is not None:
         raise UsageError("--window-s and --window-events exclude each other")
@@ -120,7 +124,11 @@ def reconstruct(
             f"{recording}: no image reconstructed", "Record longer: the network needs time to settle."
         )
     show.note(f"{len(files)} images in {output}, timestamps in {output / STAMPS}")
-    _animate(files, every, gif, video)
+    for path, write in ((gif, write_gif), (video, write_video)):
+        if path is not None:
+            pictures = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files)
+            write(path, (np.asarray(picture, dtype=np.uint8) for picture in pictures), every)
+            show.note(f"written: {path}")
 
 
 def _stamps(
@@ -181,16 +189,3 @@ def _stretches(events: "EventRecording", stamps_ns: range) -> "Iterator[Events]"
         if stretch.t_ns[0] > until_ns:
             return
         yield stretch.between(from_ns, until_ns)
-
-
-def _animate(files: list[Path], period_s: float, gif: Path | None, video: Path | None) -> None:
-    import cv2
-    import numpy as np
-
-    from lce_rig.show.overlays.animation import write_gif, write_video
-
-    for path, write in ((gif, write_gif), (video, write_video)):
-        if path is not None:
-            pictures = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files)
-            write(path, (np.asarray(picture, dtype=np.uint8) for picture in pictures), period_s)
-            show.note(f"written: {path}")

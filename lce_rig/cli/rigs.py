@@ -252,8 +252,11 @@ def new_profile(
       lce-rig rigs new truck --from drive.bag --lidar OS1-64 --board 8x6,0.07,0.767x0.626
       lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset nominal_extrinsics
     """
-    from lce_rig.core.errors import UsageError
+    from lce_rig.core.errors import ProfileError, UsageError
+    from lce_rig.pipeline.new_profile import BOARD_FORM, parse_board, parse_intrinsics
+    from lce_rig.pipeline.new_profile import new_profile as draft
     from lce_rig.rig import derive_text, edit_text, find_profile, load_rig, read_profile, shipped_profiles
+    from lce_rig.session.durable import replace_file
 
     stem = name.removesuffix(".yaml").removesuffix(".yml")
     if stem != name:
@@ -271,7 +274,20 @@ def new_profile(
     has_sensors = bool(lidar or cameras or intrinsics)
     bag = None if origin is None or not _is_bag(Path(origin)) else Path(origin)
     if bag is not None or (origin is None and has_sensors):
-        text = _from_sensors(name, bag, lidar, cameras, intrinsics, board, target)
+        if board is None:
+            raise UsageError("the board is missing", f"Measure it, and add --board {BOARD_FORM}")
+        lenses = [parse_intrinsics(each) for each in intrinsics]
+        text, lines = draft(
+            name,
+            parse_board(board),
+            recording=bag,
+            lidar_model=lidar,
+            cameras=cameras,
+            intrinsics=lenses,
+            source=target,
+        )
+        for line in lines:
+            show.note(line)
         text = edit_text(text, values, removed, target)
     else:
         origin = origin or "rlfs"
@@ -282,7 +298,12 @@ def new_profile(
     if output == "-":
         click.echo(text, nl=False)
         return
-    _write_new(path, text)
+    try:
+        if path.exists():
+            raise ProfileError(f"{path}: exists already", "Choose another file with -o, or remove it first.")
+        replace_file(path, text.encode())
+    except OSError as error:
+        raise ProfileError(f"{path}: cannot be written: {error.strerror}") from error
     show.note(f"wrote {path}; compare it with your rig, then: lce-rig rigs check {path}")
     if name in shipped_profiles():
         show.warn(f"--rig {name} is the shipped profile: use --rig {path}")
@@ -309,35 +330,6 @@ def _is_bag(path: Path) -> bool:
     if path.suffix in SUFFIXES and not path.exists():
         raise SourceError(f"{path} does not exist")
     return path.suffix in SUFFIXES
-
-
-def _from_sensors(
-    name: str,
-    bag: Path | None,
-    lidar: str | None,
-    cameras: tuple[str, ...],
-    intrinsics: tuple[str, ...],
-    board: str | None,
-    target: str,
-) -> str:
-    """Write a profile's text from its parts; say what was found in a bag."""
-    from lce_rig.core.errors import UsageError
-    from lce_rig.pipeline.new_profile import BOARD_FORM, new_profile, parse_board, parse_intrinsics
-
-    if board is None:
-        raise UsageError("the board is missing", f"Measure it, and add --board {BOARD_FORM}")
-    text, found = new_profile(
-        name,
-        parse_board(board),
-        recording=bag,
-        lidar_model=lidar,
-        cameras=cameras,
-        intrinsics=[parse_intrinsics(each) for each in intrinsics],
-        source=target,
-    )
-    for line in found:
-        show.note(line)
-    return text
 
 
 def _sensor_settings(
@@ -368,23 +360,3 @@ def _sensor_settings(
         values += [(f"board.{key}", f"{getattr(plate, key)}") for key in ("square_m", "width_m", "height_m")]
         values += [("board.pattern_offset_m", f"{list(plate.pattern_offset_m)}")]
     return values
-
-
-def _write_new(path: Path, text: str) -> None:
-    from lce_rig.core.errors import ProfileError
-
-    try:
-        file = path.open("x", encoding="utf-8")
-        try:
-            with file:
-                file.write(text)
-        except BaseException:
-            # A partial profile on a full disk would block the next attempt.
-            path.unlink(missing_ok=True)
-            raise
-    except FileExistsError as error:
-        raise ProfileError(
-            f"{path}: exists already", "Choose another file with -o, or remove it first."
-        ) from error
-    except OSError as error:
-        raise ProfileError(f"{path}: cannot be written: {error.strerror}") from error

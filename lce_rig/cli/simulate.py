@@ -144,7 +144,9 @@ def simulate(
     if recording is None:
         if duration is not None or ros is not None:
             raise UsageError("--duration and --ros apply to recordings only", "Add --recording FOLDER.")
-        options = _options(rig, choices["motion"] or _usual_motion(rig), choices)
+        kinds = {channel.kind for camera in rig.cameras.values() for channel in camera.channels.values()}
+        usual = "moving" if kinds == {"events"} else "still"
+        options = _options(rig, choices["motion"] or usual, choices)
         _simulate_session(session or Path("session"), rig, captures or _CAPTURES, seed, options)
         return
     if session is not None or captures is not None:
@@ -156,11 +158,6 @@ def simulate(
     if options.hand.carry_mps <= 0:
         raise UsageError("--speed: MAX is 0, but the board moves in a recording", "Give a MAX above 0.")
     _simulate_recording(recording, rig, duration or _DURATION_S, seed, options, int(ros or 1))
-
-
-def _usual_motion(rig: "Rig") -> Any:
-    kinds = {channel.kind for camera in rig.cameras.values() for channel in camera.channels.values()}
-    return "moving" if kinds == {"events"} else "still"
 
 
 def _options(rig: "Rig", motion: Any, choices: dict[str, Any]) -> "SimulationOptions":

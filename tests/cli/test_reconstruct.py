@@ -114,7 +114,14 @@ def test_a_video_of_an_unknown_kind_is_refused_with_those_that_are_known(lce_rig
 
 
 def test_one_wild_stamp_does_not_ask_for_images_of_centuries(lce_rig, tmp_path):
-    np.savez(tmp_path / "a.npz", t_us=[0, 1000, 10**15], x=[1, 2, 3], y=[1, 2, 3], polarity=[0, 1, 1])
+    np.savez(
+        tmp_path / "a.npz",
+        t_us=[0, 1000, 10**15],
+        x=[1, 2, 3],
+        y=[1, 2, 3],
+        polarity=[0, 1, 1],
+        resolution_px=[346, 260],
+    )
     outcome = lce_rig("reconstruct", tmp_path / "a.npz", "-o", tmp_path / "out")
     assert outcome.code == 2
     assert "maximum 1000000" in outcome.err and "--duration" in outcome.err

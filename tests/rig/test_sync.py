@@ -1,9 +1,10 @@
 """The sync board's block of a profile."""
 
 import pytest
+from pydantic import ValidationError
 
 from lce_rig.core.errors import ProfileError
-from lce_rig.rig import dump_rig, find_profile, parse_rig
+from lce_rig.rig import SyncSettings, dump_rig, find_profile, parse_rig
 
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 SYNC = """
@@ -35,23 +36,21 @@ def test_a_profile_with_a_board_reads_back_the_same():
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "key"),
     [
-        ("cam: {", "kam: {", "sync.triggers.kam: no camera is called kam; there is cam"),
-        ("rate_hz: 20", "rate_hz: 20, pulse_us: 50000", "exceed the period of 50000 us"),
-        ("rate_hz: 20", "rate_hz: 20, phase_us: 50000", "beyond the period of 50000 us"),
-        ("rate_hz: 20", "rate: 20", "sync.triggers.cam.rate: unknown key; the nearest is rate_hz"),
-        ("channel: 0", "channel: 16", "sync.triggers.cam.channel: must be less than or equal to 15"),
-        ("device:", "type: nmea\n  device:", "sync.type:"),
+        ("cam: {", "kam: {", "sync.triggers.kam"),
+        ("rate_hz: 20", "rate_hz: 20, pulse_us: 50000", "sync.triggers.cam.pulse_us"),
+        ("rate_hz: 20", "rate_hz: 20, phase_us: 50000", "sync.triggers.cam.phase_us"),
+        ("rate_hz: 20", "rate: 20", "sync.triggers.cam.rate"),
+        ("channel: 0", "channel: 16", "sync.triggers.cam.channel"),
+        ("device:", "type: nmea\n  device:", "sync.type"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_with_its_key(old, new, said):
-    assert said in refusal(SYNC.replace(old, new))
+def test_what_cannot_be_meant_is_refused_with_its_key(old, new, key):
+    assert f"{key}: " in refusal(SYNC.replace(old, new))
 
 
 def test_one_line_cannot_trigger_two_cameras():
-    from lce_rig.rig.sync_settings import SyncSettings
-
     triggers = {name: {"channel": 3, "rate_hz": 10.0} for name in ("left", "right")}
-    with pytest.raises(ValueError, match="line 3 triggers left already"):
+    with pytest.raises(ValidationError):
         SyncSettings.model_validate({"device": "/dev/x", "triggers": triggers})
