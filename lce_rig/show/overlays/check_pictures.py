@@ -10,7 +10,7 @@ import numpy as np
 from lce_rig.core.calibration import Calibration, CaptureResidual
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SessionError
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.session_check import Meeting, SessionCheck
 from lce_rig.session import Capture, Session
@@ -62,22 +62,17 @@ def draw_check(
                     yield _draw(capture, capture.scan(lidar), session, check, view, image, limits_m)
             progress(done, len(names))
 
-    title = f"{session.rig.name}  {check.pair}"
-    head = SheetHead(title, check.calibration.verdict, _head_lines(check, len(names)), limits_m)
-    pictures, sheets = write_overlays(folder, overlays(), head)
-    return replace(check, pictures=tuple(pictures), contact_sheets=tuple(sheets))
-
-
-def _head_lines(check: SessionCheck, n_captures: int) -> list[str]:
-    """State the figures of all captures, and findings against the extrinsics."""
     c, m = check.calibration, check.metrics
     line = (
-        f"{n_captures} captures, {len(c.captures_used)} used; "
+        f"{len(names)} captures, {len(c.captures_used)} used; "
         f"uncertainty {c.sigma_rotation_deg:.2g} deg, {1000 * c.sigma_translation_m:.2g} mm (1 sigma)"
     )
     if m is not None:
         line += f"; mean over captures: {_residual_words(m.mpe_m, m.mee_m, m.reprojection_px)}"
-    return [line, *(finding.sentence for finding in (*c.findings, *check.findings))]
+    lines = [line, *(finding.sentence for finding in (*c.findings, *check.findings))]
+    head = SheetHead(f"{session.rig.name}  {check.pair}", c.verdict, lines, limits_m)
+    pictures, sheets = write_overlays(folder, overlays(), head)
+    return replace(check, pictures=tuple(pictures), contact_sheets=tuple(sheets))
 
 
 def _residual_words(plane_m: float, edge_m: float, corner_px: float) -> str:
@@ -103,9 +98,16 @@ def _draw(
         refusal = calibration.captures_refused.get(name)
         warning = "not used" if refusal is None else f"refused, {refusal.stage}: {refusal.sentence}"
     image_board = detected if isinstance(detected, ImageBoard) else None
+    if meeting is not None:
+        # The board's points are drawn separately, moved to the image's time.
+        points, on_board = (
+            np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, meeting.measured.lidar.points)
+        )
+        row = np.dtype((np.void, points.dtype.itemsize * 3))
+        scan = scan.select(~np.isin(points.view(row).ravel(), on_board.view(row).ravel()))
     picture = draw_overlay(
         view.image,
-        scan if meeting is None else _without(scan, meeting.measured.lidar),
+        scan,
         rig.cameras[calibration.camera].to_intrinsics(),
         calibration.T_cam_lidar,
         lidar_board=None if meeting is None else meeting.lidar_at_image_time,
@@ -119,13 +121,6 @@ def _draw(
     )
     words = "" if r is None else _residual_words(r.plane_mean_m, r.edge_mean_m, r.reprojection_px)
     return Overlay(name, picture, camera_part(picture, view.image), words, warning)
-
-
-def _without(scan: Scan, lidar: LidarBoard) -> Scan:
-    """Remove a board's points, which are drawn separately, moved to the image's time."""
-    points, on_board = (np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, lidar.points))
-    row = np.dtype((np.void, points.dtype.itemsize * 3))
-    return scan.select(~np.isin(points.view(row).ravel(), on_board.view(row).ravel()))
 
 
 def _legend(

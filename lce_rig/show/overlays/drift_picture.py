@@ -7,7 +7,7 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
-from lce_rig.core.geometry import Array, transform
+from lce_rig.core.geometry import transform
 from lce_rig.core.phrasing import motion_words
 from lce_rig.scene.alignment import AXES
 from lce_rig.scene.depth_edges import DepthEdges
@@ -48,7 +48,10 @@ def draw_drift(
     half = _PAGE_PX // 2
     panels = []
     for name, T in (("deployed", drift.T_cam_lidar), ("best fit", drift.T_best)):
-        picture = _draw_edges(image, edges, intrinsics, T)
+        picture, factor = canvas.enlarged(image.pixels)
+        pixels, _ = intrinsics.project(transform(T, edges.points))
+        at = (pixels[intrinsics.is_inside(pixels)] + 0.5) * factor - 0.5
+        canvas.draw_discs(picture, at, MAGENTA, 2.2e-3 * picture.shape[1], BLACK)
         picture = canvas.fitted(picture, half, round(half * picture.shape[0] / picture.shape[1]))
         strip = canvas.panel(half, 40)
         canvas.draw_text(strip, f"{title}  {name}", 12, 27, 13, INK)
@@ -57,15 +60,6 @@ def draw_drift(
     panels[0][:, -2:] = BLACK
     page = np.hstack(panels)
     return np.vstack([page, _draw_curves(drift, states, board)]) if drift.curves else page
-
-
-def _draw_edges(image: Image, edges: DepthEdges, intrinsics: Intrinsics, T_cam_lidar: Array) -> Picture:
-    picture, factor = canvas.enlarged(image.pixels)
-    pixels, _ = intrinsics.project(transform(T_cam_lidar, edges.points))
-    is_inside = intrinsics.is_inside(pixels)
-    unit = picture.shape[1] / 1000
-    canvas.draw_discs(picture, (pixels[is_inside] + 0.5) * factor - 0.5, MAGENTA, 2.2 * unit, BLACK)
-    return picture
 
 
 def _draw_curves(drift: Drift, states: Mapping[str, State], board: Sequence[AxisDrift]) -> Picture:

@@ -49,7 +49,13 @@ def draw_intrinsics(
     figure: Any = Figure(figsize=(15, height), dpi=_DPI, facecolor="white")
     canvas: Any = FigureCanvasAgg(figure)
     figure.text(0.035, 1 - 0.3 / height, title, fontsize=16, color=_INK, fontweight="bold", va="center")
-    figure.text(0.035, 1 - 0.65 / height, _summary(estimate), fontsize=11, color=_INK, va="center")
+    n = len({view.capture for view in estimate.views})
+    summary = (
+        f"{estimate.model.name}, {len(estimate.views)} images of {n} captures.   Corners lie "
+        f"{estimate.rms_px:.3f} px rms from their prediction, {estimate.held_out_rms_px:.3f} px on "
+        "held-out captures."
+    )
+    figure.text(0.035, 1 - 0.65 / height, summary, fontsize=11, color=_INK, va="center")
     lowest, highest = (0.7 + below) / height, 1 - 1.45 / height
     grid = figure.add_gridspec(
         2, 2, left=0.05, right=0.92, top=highest, bottom=lowest, hspace=0.36, wspace=0.16
@@ -64,15 +70,6 @@ def draw_intrinsics(
     canvas.draw()
     rgba = np.asarray(canvas.buffer_rgba())
     return np.ascontiguousarray(rgba[..., 2::-1])
-
-
-def _summary(estimate: IntrinsicsEstimate) -> str:
-    n = len({view.capture for view in estimate.views})
-    return (
-        f"{estimate.model.name}, {len(estimate.views)} images of {n} captures.   Corners lie "
-        f"{estimate.rms_px:.3f} px rms from their prediction, {estimate.held_out_rms_px:.3f} px on "
-        "held-out captures."
-    )
 
 
 def _frame(axis: Any, estimate: IntrinsicsEstimate, title: str, note: str) -> None:
@@ -123,7 +120,9 @@ def _arrows(axis: Any, at: Array, vectors_px: Array, reach_px: float, colour: st
     arrows = axis.quiver(
         *at.T, *shown.T, color=colour, angles="xy", scale_units="xy", scale=1.0, width=0.0026, zorder=3
     )
-    key_px = _round(usual)
+    # The key is 1, 2 or 5 times a power of ten, not above the usual length.
+    power = 10.0 ** np.floor(np.log10(usual))
+    key_px = float(max(step for step in (1.0, 2.0, 5.0) if step * power <= usual * (1 + 1e-9)) * power)
     axis.quiverkey(
         arrows,
         1.0 - 1.2 / _CELLS,
@@ -134,12 +133,6 @@ def _arrows(axis: Any, at: Array, vectors_px: Array, reach_px: float, colour: st
         labelcolor=_INK,
         fontproperties={"size": 9},
     )
-
-
-def _round(value: float) -> float:
-    """Round to 1, 2 or 5 times a power of ten, not above `value`."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9)) * power)
 
 
 def _draw_certainty(figure: Any, axis: Any, estimate: IntrinsicsEstimate, certainty: LensCertainty) -> None:

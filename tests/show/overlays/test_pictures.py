@@ -143,7 +143,7 @@ def test_an_empty_scan_and_missing_boards_are_drawn_too() -> None:
 @pytest.mark.parametrize("has_lidar", [True, False])
 def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar: bool) -> None:
     points = wall()
-    refusal = Refusal("image.text", figures={"text": "no board", "advice": "show the whole pattern " * 12})
+    refusal = Refusal("image.tilted", figures={"tilt_deg": 71.0, "max_tilt_deg": 70.0, "turn_deg": 6.0})
     drawn = draw_debug(
         Image("cam", "frames", None, grey(FOLDING)) if has_image else None,
         scan_of(points) if has_lidar else None,
