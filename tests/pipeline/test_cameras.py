@@ -8,17 +8,13 @@ import pytest
 
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.cli.calibrate import camera_lines, together_lines
-from lce_rig.core.calibration import read_result
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, invert
 from lce_rig.detect.detection import Detections
-from lce_rig.export import export
-from lce_rig.export.robot_files import read_robot_urdf
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import load_rig
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
-from tests.saved_results import write_result
 
 RIG = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
 ML, PAPER = CalibrateOptions(method="ml", n_draws=0), CalibrateOptions("paper", n_draws=0)
@@ -188,39 +184,3 @@ def test_boards_that_moved_keep_cameras_apart(session):
     for own in found.values():
         assert own.channel_results[0].time_offset_s is not None
         assert own.estimated_with == own.other_cameras == ()
-
-
-def test_the_result_file_holds_it_and_gives_it_back(together, by_paper, tmp_path):
-    for results in (together, by_paper):
-        path = tmp_path / "result.json"
-        write_result(path, RIG.name, list(results.values()))
-        for read in read_result(path).pairs:
-            written = results[read.camera]
-            assert read.estimated_with == written.estimated_with
-            (other,), (expected,) = read.other_cameras, written.other_cameras
-            assert np.array_equal(other.T_cam_other, expected.T_cam_other)
-            assert (other.cov is None) == (expected.cov is None)
-            assert other.cov is None or np.array_equal(other.cov, expected.cov)
-            assert other.apart_translation_m == expected.apart_translation_m
-
-
-def test_exports_put_both_cameras_where_they_are(together, tmp_path):
-    export(list(together.values()), RIG, tmp_path, is_forced=False)
-    read = read_robot_urdf(tmp_path / "two_cameras.urdf")
-    T = read.find_pose("right_optical_frame", "left_optical_frame")
-    assert np.allclose(T, together[RIGHT].other_cameras[0].T_cam_other, atol=1e-9)
-    assert read.frames >= {"velodyne", "left_link", "right_link"}
-
-
-def test_the_report_states_each_two_cameras_once(together, by_paper):
-    calibrations = list(together.values())
-    assert camera_lines(calibrations[0], calibrations) == []
-    text = "\n".join(camera_lines(calibrations[1], calibrations))
-    assert "left" in text and "right" in text
-    assert "T_right_left" in text
-    assert "uncertainty  0.00" in text
-    assert "estimated separately" in text
-    calibrations = list(by_paper.values())
-    text = "\n".join(camera_lines(calibrations[1], calibrations))
-    assert "uncertainty" not in text
-    assert "differ by 0.0" in text

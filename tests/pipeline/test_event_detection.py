@@ -87,14 +87,6 @@ def test_what_was_found_and_its_picture_are_remembered(seen):
     assert [file.stat().st_mtime_ns for file in files] == changed
 
 
-def test_a_picture_that_is_not_remembered_is_made_again_the_same(seen):
-    capture = seen.captures[0]
-    first = event_picture(seen, capture, "dvs", "events")
-    for file in (seen.path / "detections").rglob("*.picture.npz"):
-        file.unlink()
-    np.testing.assert_array_equal(event_picture(seen, capture, "dvs", "events").pixels, first.pixels)
-
-
 def test_the_event_map_can_be_asked_for_and_does_not_pass_for_the_networks_picture(seen):
     assert isinstance(found_in(seen, event_image="map"), Refusal)
     assert isinstance(found_in(seen), ImageBoard)

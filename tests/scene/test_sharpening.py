@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import lce_rig as lce
-from lce_rig.core.calibration import Calibration, ResultFile, SceneShare, read_result
+from lce_rig.core.calibration import Calibration, SceneShare
 from lce_rig.core.geometry import Array, difference, invert, perturb, transform
 from lce_rig.pipeline.witness import scene_views, share_of
 from lce_rig.scene.alignment import SceneView
@@ -83,13 +83,3 @@ def test_the_board_is_left_out(seen: Seen, room: Path) -> None:
         on_board = transform(invert(capture.T_lidar_board["lidar"]), view.edges.points)
         is_near = np.all(np.abs(on_board) < [*(0.5 * size_m + 0.03), 0.1], axis=1)
         assert len(view.edges) > 20 and not is_near.any()
-
-
-def test_the_share_is_written_and_read_back(seen: Seen, tmp_path: Path) -> None:
-    calibration = boards_alone(seen, np.zeros(6), WEAK)
-    found = share(seen, calibration)
-    fused = replace(calibration, T_cam_lidar=found.T_cam_lidar, cov=found.cov, scene_share=found)
-    (tmp_path / "result.json").write_text(ResultFile(rig=seen.rig.name, pairs=(fused,)).text())
-    saved = read_result(tmp_path / "result.json").pairs[0].scene_share
-    assert saved is not None and saved.state == found.state
-    assert np.array_equal(saved.cov_boards, WEAK) and np.allclose(saved.change, found.change)

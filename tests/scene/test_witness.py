@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.cli.calibrate import scene_texts
 from lce_rig.cli.main import run
 from lce_rig.core.calibration import AxisOpinion, ChannelResult, SceneOpinion, read_result
 from lce_rig.core.geometry import perturb
@@ -109,20 +108,6 @@ def test_a_damaged_capture_costs_itself_only(room, seen, tmp_path) -> None:
     assert opinion.n_captures == 3 and opinion.state != "contradicts"
 
 
-def test_opinions_are_written_and_read_back_unchanged(heard, seen, tmp_path) -> None:
-    results = [with_opinion(r, hear_scene(*heard, r)) for r in (seen.truth, turned(seen.truth, 1.0))]
-    results.append(replace(seen.truth, scene=SceneOpinion(2, 7)))
-    for k, result in enumerate(results):
-        write_result(tmp_path / f"{k}.json", seen.rig.name, [result])
-        (back,) = read_result(tmp_path / f"{k}.json").pairs
-        assert back.scene == result.scene
-        assert back.findings == result.findings and back.verdict == result.verdict
-
-
-def test_a_result_without_an_opinion_is_read_as_such(room) -> None:
-    assert read_result(room / "calibration" / "result.json").pairs[0].scene is None
-
-
 def test_verify_hears_the_session_s_own_scene(heard, seen, tmp_path) -> None:
     session, detections = heard
     write_result(tmp_path / "result.json", seen.rig.name, [turned(seen.truth, 1.0)])
@@ -139,33 +124,12 @@ def test_the_verbs_tell_the_opinion(heard, room, seen, tmp_path, capsys) -> None
     result = turned(seen.truth, 1.0)
     write_result(tmp_path / "result.json", seen.rig.name, [result])
     assert run(["verify", str(copy), "--result", str(tmp_path / "result.json")]) == 7
-    captured = capsys.readouterr()
-    assert "scene: contradicts" in captured.out
-    assert "rotation about the camera's y axis" in captured.err
     write_result(
         copy / "calibration" / "result.json",
         seen.rig.name,
         [with_opinion(result, hear_scene(*heard, result))],
     )
+    capsys.readouterr()
     assert run(["results", str(copy), "--json"]) == 0
     (stored,) = json.loads(capsys.readouterr().out)["results"]
     assert stored["pairs"][0]["scene"] == "contradicts"
-    assert run(["results", str(copy)]) == 0
-    assert "differs" in capsys.readouterr().out
-
-
-def test_the_report_names_axes_and_sizes() -> None:
-    axes = (
-        AxisOpinion("rotation_y", "contradicts", "deg", -1.004, 0.09, 0.43),
-        AxisOpinion("translation_x", "agrees", "m", 0.004, 0.007, 0.033),
-        AxisOpinion("translation_z", "agrees", "m", 0.004, 0.017, 0.076),
-        AxisOpinion("rotation_x", "unknown", "deg", 0.1, 0.4, 2.0),
-    )
-    assert scene_texts(SceneOpinion(6, 544, axes)) == [
-        "[red]contradicts[/] (6 captures, 544 edges)",
-        "rotation about the camera's y axis (down): -1.00 +- 0.09 deg",
-        "would see changes along x 33, z 76 mm",
-        "cannot tell changes about x",
-    ]
-    assert scene_texts(SceneOpinion(2, 7)) == ["cannot tell: too few edges (2 captures, 7 edges)"]
-    assert scene_texts(SceneOpinion(0, 0)) == ["cannot tell: no capture has a frame and a scan"]
