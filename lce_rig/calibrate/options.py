@@ -42,7 +42,7 @@ class KnownLidar:
 
     Attributes:
         rings: (K,) ring numbers.
-        lasers: (3, K) errors of range m, azimuth rad and elevation rad, as `along_rays.ERRORS_OF_LASER`.
+        lasers: (3, K) errors of range m, azimuth rad and elevation rad, as `likelihood.layout.LASER`.
         lasers_sigma: (3, K) their standard deviations about what is common to all lasers.
         lens: (2,) lateral m and vertical m per rad displacement of the lens.
         lens_sigma: (2,) of it.

@@ -16,8 +16,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.core.geometry import Array
+
+_RELATIVE_FLOOR = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,3 +144,10 @@ def jackknife_scatter(moves: Array) -> Array:
     """
     n_groups = len(moves)
     return np.asarray((n_groups - 1) / n_groups * moves.T @ moves)
+
+
+def symmetric_inverse(H: Array) -> Array:
+    """Invert symmetric positive semi-definite H (..., p, p), with a floor under its eigenvalues."""
+    values, vectors = np.linalg.eigh(H)
+    floor = _RELATIVE_FLOOR * np.maximum(values[..., -1:], 1e-300)
+    return np.asarray((vectors / np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2))

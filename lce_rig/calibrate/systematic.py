@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.moments import Problem, Solutions
-from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.features import CaptureFeatures, extract_features, see_lidar
+from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.calibrate.tolerances import Sensitivity, Tolerances, Variant, sensitivities_of, vary
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -160,3 +160,27 @@ def shift_rings(lidar: LidarBoard, rings: NDArray[np.int16], offset_m: float) ->
         )
         for plane, moved, moved_ends in zip(planes, is_ring, is_end, strict=True)
     ]
+
+
+def systematic_covariances(
+    sensitivities: Array, sigma_each: float, sigma_common: float
+) -> tuple[Array, Array]:
+    """Propagate errors common to all groups, which the scatter between groups cannot show.
+
+    Source r is off by e + e_r, with e the mean error of all L sources and e_r its own deviation from it, and
+    moves the estimate by s_r for each unit. Independent deviations less their mean leave
+
+        cov = sigma_each^2 sum_r (s_r - s) (s_r - s)^T + sigma_common^2 L^2 s s^T,   s = sum_r s_r / L
+
+    Args:
+        sensitivities: (..., p, L) s_r in columns.
+        sigma_each: standard deviation of e_r, before their mean is subtracted.
+        sigma_common: standard deviation of e.
+
+    Returns:
+        Its two terms (..., p, p).
+    """
+    common = sensitivities.sum(axis=-1, keepdims=True)
+    each = sensitivities - sensitivities.mean(axis=-1, keepdims=True)
+    of_each = sigma_each**2 * each @ np.swapaxes(each, -1, -2)
+    return of_each, sigma_common**2 * common @ np.swapaxes(common, -1, -2)

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from lce_rig.calibrate.covariance import symmetric_inverse
+from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, perturb, skew, transform

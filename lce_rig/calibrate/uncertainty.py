@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
-from lce_rig.calibrate.covariance import symmetric_inverse, systematic_covariances
 from lce_rig.calibrate.likelihood.fit import JointEstimate, stack_camera
 from lce_rig.calibrate.likelihood.layout import SHIFTS
 from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
@@ -15,9 +14,9 @@ from lce_rig.calibrate.likelihood.model import Assembly, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import EstimateSettings
-from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetric_inverse
 from lce_rig.calibrate.result import CalibrationEstimate, Start, error_to_reference, report, with_parts
-from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities
+from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities, systematic_covariances
 from lce_rig.calibrate.tolerances import Variant, sensitivities_of, vary
 from lce_rig.core.board import Board
 from lce_rig.core.diagnostics import Diagnostics

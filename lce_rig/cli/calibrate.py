@@ -189,7 +189,7 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
     "--draws",
     "n_draws",
     type=click.IntRange(0, 10_000),
-    help="Set the number of random subsets per size, I in the paper [default: 30; with --method paper 100].",
+    help="Set the number of random subsets per size, I in the paper [default: 0; with --method paper 100].",
 )
 def calibrate(
     sessions: tuple[Path, ...],

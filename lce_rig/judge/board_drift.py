@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from lce_rig.calibrate import Clocks
-from lce_rig.calibrate.local_quadratic import SCALE, expand
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import capture_residual, summarise
 from lce_rig.core.board import Board
@@ -16,6 +15,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections
+from lce_rig.judge.local_quadratic import SCALE, expand
 from lce_rig.judge.session_check import find_meetings
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION

@@ -9,17 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.likelihood.images import stack_images
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.observations import group_placements, scan_key
-from lce_rig.calibrate.quadratics import Quadratics, without_prior
-from lce_rig.calibrate.relative_pose import mean_pose, relative_covariance, relative_pose
+from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse, without_prior
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.judge.findings import CAMERAS_DIFFER, CAMERAS_SCATTER, failing
+from lce_rig.judge.relative_pose import mean_pose, relative_covariance, relative_pose
 from lce_rig.judge.split_consistency import contrast_halves, split_findings
 from lce_rig.judge.weighing import SURPRISING_CHI2
 from lce_rig.rig import CalibrationSettings, VerdictSettings

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.local_quadratic import FIRST_RING, SCALE, SHIFT
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
 from lce_rig.judge.findings import EDGE_SHIFT, LASER_OFFSET, SCALE_OFF, failing
+from lce_rig.judge.local_quadratic import FIRST_RING, SCALE, SHIFT
 from lce_rig.rig import LidarSettings, VerdictSettings
 
 # A scale error of this many times the limit fails.

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.local_quadratic import SCALE, expand
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.tolerances import Sensitivity
@@ -25,6 +24,7 @@ from lce_rig.judge.contributions import (
 )
 from lce_rig.judge.findings import WIDENED
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
+from lce_rig.judge.local_quadratic import SCALE, expand
 from lce_rig.judge.negative_control import NegativeControl, run_control, run_control_with_constants
 from lce_rig.judge.nuisances import Nuisances, estimate_nuisances
 from lce_rig.judge.split_consistency import Contrast, contrast_halves, find_groups

@@ -20,7 +20,6 @@ from lce_rig.calibrate import (
     estimate_extrinsics,
 )
 from lce_rig.calibrate.observability import find_weakest
-from lce_rig.calibrate.relative_pose import relative_pose
 from lce_rig.calibrate.result import error_to_reference
 from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.tolerances import Tolerances
@@ -33,6 +32,7 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.judge.reach import point_uncertainties
+from lce_rig.judge.relative_pose import relative_pose
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, share_findings, with_opinion
 from lce_rig.lens.lens_estimate import BoardView

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.still_sessions import StillSession, draw_corners
-from lce_rig.calibrate.covariance import symmetric_inverse
+from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.calibrate.tolerances import Tolerances, bend, bow
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from lce_rig.calibrate.covariance import symmetric_inverse, systematic_covariances
+from lce_rig.calibrate.quadratics import symmetric_inverse
+from lce_rig.calibrate.systematic import systematic_covariances
 
 
 def test_a_direction_without_information_gets_a_large_finite_variance():

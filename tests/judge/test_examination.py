@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
-from lce_rig.calibrate.local_quadratic import SCALE, expand
 from lce_rig.core.geometry import difference, perturb
+from lce_rig.judge.local_quadratic import SCALE, expand
 from lce_rig.judge.negative_control import control_findings, run_control
 from lce_rig.judge.nuisances import estimate_nuisances, nuisance_findings
 from lce_rig.judge.split_consistency import contrast_halves, find_groups, split_findings

@@ -11,11 +11,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.features import CaptureFeatures
-from lce_rig.calibrate.local_quadratic import SHIFT
 from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M, describe_background, end_residuals, end_rows
-from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetric_inverse
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
@@ -50,12 +48,15 @@ def estimate_shifts(
         T_cam_lidar: (4, 4) near the truth.
         board: the board.
     """
+    from scipy.special import fdtri
+
     parts = [end_rows(f, T_cam_lidar, board) for f in features]
     first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _ in parts]))
     inside = np.concatenate([r for r, _ in parts])
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
     # Inside distance = - (change of the extrinsics) - beam's width - shifts.
-    A = -np.column_stack([np.concatenate([J[:, : SHIFT + 1] for _, J in parts]), background])
+    by_pose_and_width = np.concatenate([J[:, :7] for _, J in parts])
+    A = -np.column_stack([by_pose_and_width, background])
     # Columns of few captures have no reliable scatter and stay zero, like insignificant ones.
     n_having = np.count_nonzero(np.add.reduceat(background, first, axis=0) > 0, axis=0)
     free = n_having >= _MIN_CAPTURES
@@ -63,9 +64,13 @@ def estimate_shifts(
         shifts, scatter = _fit_shifts(A, inside, first, free)
         is_sure = np.zeros(_N_SHIFTS, dtype=bool)
         for group in _TOGETHER:
-            seen = np.array([column for column in group if free[column]], dtype=int)
-            if len(seen):
-                is_sure[seen] |= _is_sure(shifts[seen], scatter[np.ix_(seen, seen)], n_having[seen].max())
+            columns = np.array([column for column in group if free[column]], dtype=int)
+            if len(columns):
+                # Hotelling's test.
+                freedoms, n_left = len(columns), n_having[columns].max() - len(columns)
+                T2 = shifts[columns] @ symmetric_inverse(scatter[np.ix_(columns, columns)]) @ shifts[columns]
+                limit = fdtri(freedoms, n_left, 1 - 1 / _ONE_IN) * freedoms * (n_left + freedoms - 1) / n_left
+                is_sure[columns] |= limit < T2
         if is_sure[free].all():
             return shifts
         free = is_sure
@@ -81,7 +86,7 @@ def _fit_shifts(
     """
     extrinsic = np.repeat([_SIGMA_TRANSLATION_M, _SIGMA_ROTATION_RAD], 3)
     sigmas = np.concatenate([extrinsic, [EDGE_SHIFT_SIGMA_M], BACKGROUND_SIGMAS_M])
-    A = A * np.concatenate([np.ones(SHIFT + 1), free])
+    A = A * np.concatenate([np.ones(7), free])
     prior, x = np.diag(np.square(_END_SIGMA_M / sigmas)), np.zeros(len(sigmas))
     for _ in range(_ROUNDS):
         weights = 1 / np.maximum(np.abs(inside_m - A @ x) / (_HUBER * _END_SIGMA_M), 1.0)
@@ -92,16 +97,6 @@ def _fit_shifts(
     cost = Quadratics(gradients, hessians, prior, prior @ x, np.arange(len(first)))
     scatter = jackknife_scatter(cost.moves())
     return x[-_N_SHIFTS:], scatter[-_N_SHIFTS:, -_N_SHIFTS:]
-
-
-def _is_sure(shifts: Array, scatter: Array, n_captures: int) -> bool:
-    """Return whether shifts (K,) are significant, by Hotelling's test with their scatter (K, K)."""
-    from scipy.special import fdtri
-
-    freedoms, n_left = len(shifts), n_captures - len(shifts)
-    T2 = shifts @ symmetric_inverse(scatter) @ shifts
-    limit = fdtri(freedoms, n_left, 1 - 1 / _ONE_IN) * freedoms * (n_captures - 1) / n_left
-    return bool(limit < T2)
 
 
 def move_ends(

@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import Layout, State
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, PoseLevels, Priors
 from lce_rig.calibrate.likelihood.model import Assembly, Reduced, Terms, assemble, linearise
 from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, stack_scans
 from lce_rig.calibrate.observations import group_shared_placements
-from lce_rig.calibrate.quadratics import Quadratics
+from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
 from lce_rig.core.results import Observation

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.observations import Clocks, SharedScan
+from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.core.geometry import Array, difference, fit_plane, perturb, rotation_angle, skew
 from lce_rig.core.results import LidarBoard, Observation
 

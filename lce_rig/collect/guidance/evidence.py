@@ -6,7 +6,7 @@ errs by -H^-1 sum_k (noise + D_k b), H = sum_k H_k + prior, hence
 
     cov = H^-1 (sum_k B_k) H^-1 + systematic(S),    S = -H^-1 sum_k D_k                                  (1)
 
-with the systematic part of lce_rig.calibrate.covariance. All are first built in the board's frame, in which a
+with the systematic part of lce_rig.calibrate.systematic. All are first built in the board's frame, in which a
 plane's residual depends on three freedoms b(u, v) = (1, u, v) only, and then moved to the camera's.
 """
 
@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.covariance import symmetric_inverse, systematic_covariances
 from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, differentiate, freedoms_of_plane
+from lce_rig.calibrate.quadratics import symmetric_inverse
+from lce_rig.calibrate.systematic import systematic_covariances
 from lce_rig.collect.guidance.sensor_noise import ErrorModel, SensorModel
 from lce_rig.core.geometry import Array, invert, skew
 

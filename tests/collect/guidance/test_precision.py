@@ -9,9 +9,9 @@ import pytest
 from lce_rig.calibrate import EstimateSettings
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.algorithm_1.registration import vec_rotation
-from lce_rig.calibrate.covariance import symmetric_inverse
 from lce_rig.calibrate.estimate import estimate_observations
 from lce_rig.calibrate.features import extract_features
+from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.calibrate.systematic import ring_sensitivities
 from lce_rig.collect.guidance import combine, sigmas, weigh_placements
 from lce_rig.collect.guidance.sensor_noise import ErrorModel

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from lce_rig.calibrate.relative_pose import mean_pose
 from lce_rig.core.geometry import difference, perturb
+from lce_rig.judge.relative_pose import mean_pose
 from tests.calibrate.boards import T_FORWARD
 
 RNG = np.random.default_rng(0)
