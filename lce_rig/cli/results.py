@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from lce_rig.core.calibration import Calibration
     from lce_rig.pipeline.result_files import StoredResult
 
+# Short, so that the table fits into 80 columns.
+_SCENE = {"agrees": "agrees", "contradicts": "[red]differs[/]", "unknown": "?"}
+
 
 @click.command()
 @session_argument
@@ -29,73 +32,61 @@ def results(session: Path, as_json: bool) -> None:
     opened = lce.Session.open(session)
     stored = stored_results(opened)
     if as_json:
-        document = [_document(each, opened.path) for each in stored]
+        document = [
+            {
+                "name": result.name,
+                "file": str((result.folder / "result.json").relative_to(opened.path)),
+                "written_s": result.written_s,
+                "is_outdated": result.is_outdated,
+                "problem": result.problem or None,
+                "pairs": [] if result.file is None else [_pair(c) for c in result.file.pairs],
+            }
+            for result in stored
+        ]
         show.print_json({"format_version": 1, "rig": opened.rig.name, "results": document})
         return
-    if stored:
-        for table in _tables(stored):
-            show.print_table(table)
-    else:
+    for table in _tables(stored):
+        show.print_table(table)
+    if not stored:
         show.say(f"no results in {session}: run `lce-rig calibrate`")
-    for each in stored:
-        if each.problem:
-            show.warn(each.problem)
-        elif each.is_outdated:
-            show.note(f"{each.name}: the profile or the captures that it used have changed since")
+    for result in stored:
+        if result.problem:
+            show.warn(result.problem)
+        elif result.is_outdated:
+            show.note(f"{result.name}: the profile or the captures that it used have changed since")
 
 
 def _tables(stored: list["StoredResult"]) -> list[Any]:
     """List results by camera and LiDAR, a table each, and those that cannot be read."""
     tables: dict[str, Any] = {}
-    for each in stored:
-        written = datetime.fromtimestamp(each.written_s).strftime("%Y-%m-%d %H:%M")
-        name = show.escape(each.name)
-        for calibration in () if each.file is None else each.file.pairs:
-            sensors = f"{calibration.camera} and {calibration.lidar}"
-            table = tables.setdefault(sensors, _empty_table(show.escape(sensors)))
-            table.add_row(name, *_cells(calibration), written)
-        if each.file is None:
+    for result in stored:
+        written = datetime.fromtimestamp(result.written_s).strftime("%Y-%m-%d %H:%M")
+        name = show.escape(result.name)
+        if result.file is None:
             tables.setdefault("", show.plain_table("", "result", "")).add_row(name, "[red]unreadable[/]")
+            continue
+        for c in result.file.pairs:
+            sensors = f"{c.camera} and {c.lidar}"
+            if sensors not in tables:
+                tables[sensors] = show.plain_table(show.escape(sensors), "result", "method", "channels")
+                for heading in ("used", "deg", "mm", "px"):
+                    tables[sensors].add_column(heading, justify="right")
+                for heading in ("verdict", "scene", "written"):
+                    tables[sensors].add_column(heading)
+            px = c.metrics.reprojection_px
+            tables[sensors].add_row(
+                name,
+                c.method,
+                show.escape("+".join(c.channels)),
+                f"{len(c.captures_used)}",
+                f"{c.sigma_rotation_deg:.3f}",
+                f"{1000 * c.sigma_translation_m:.1f}",
+                f"{px:.2f}" if math.isfinite(px) else "-",
+                f"[{show.COLOURS[c.verdict]}]{c.verdict}[/]",
+                "-" if c.scene is None else _SCENE[c.scene.state],
+                written,
+            )
     return list(tables.values())
-
-
-def _empty_table(title: str) -> Any:
-    table = show.plain_table(title, "result", "method", "channels")
-    for heading in ("used", "deg", "mm", "px"):
-        table.add_column(heading, justify="right")
-    table.add_column("verdict")
-    table.add_column("scene")
-    table.add_column("written")
-    return table
-
-
-# Short, so that the table fits into 80 columns.
-_SCENE = {"agrees": "agrees", "contradicts": "[red]differs[/]", "unknown": "?"}
-
-
-def _cells(c: "Calibration") -> list[str]:
-    px = c.metrics.reprojection_px
-    return [
-        c.method,
-        show.escape("+".join(c.channels)),
-        f"{len(c.captures_used)}",
-        f"{c.sigma_rotation_deg:.3f}",
-        f"{1000 * c.sigma_translation_m:.1f}",
-        f"{px:.2f}" if math.isfinite(px) else "-",
-        f"[{show.COLOURS[c.verdict]}]{c.verdict}[/]",
-        "-" if c.scene is None else _SCENE[c.scene.state],
-    ]
-
-
-def _document(stored: "StoredResult", session: Path) -> dict[str, Any]:
-    return {
-        "name": stored.name,
-        "file": str((stored.folder / "result.json").relative_to(session)),
-        "written_s": stored.written_s,
-        "is_outdated": stored.is_outdated,
-        "problem": stored.problem or None,
-        "pairs": [] if stored.file is None else [_pair(each) for each in stored.file.pairs],
-    }
 
 
 def _pair(c: "Calibration") -> dict[str, Any]:

@@ -163,7 +163,13 @@ def export_formats(
     exporters = [load_exporter(name) for name in (usual_formats(rig) if formats is None else formats)]
     remove_exports(folder)
     require_usable(calibrations, is_forced=is_forced)
-    job = ExportJob(calibrations, rig, folder, robot, session, _unused_mount(rig, robot))
+    job = ExportJob(calibrations, rig, folder, robot, session)
+    if rig.mount is not None and robot is not None and rig.mount.of in robot.above:
+        joint = robot.above[rig.mount.of]
+        angle_deg, distance_m = tangent_sizes(difference(joint.T_parent_child, rig.mount.to_matrix()))
+        if joint.parent == rig.mount.parent and (angle_deg >= 1e-4 or distance_m >= 1e-6):
+            figures = {"angle_deg": angle_deg, "distance_m": distance_m}
+            job.findings.append(MOUNT_UNUSED(source=robot.source, frame=rig.mount.of, **figures))
     paths: list[Path] = []
     try:
         for exporter in exporters:
@@ -172,17 +178,6 @@ def export_formats(
         remove_exports(folder)
         raise
     return paths, job.findings
-
-
-def _unused_mount(rig: Rig, robot: RobotTree | None) -> list[Finding]:
-    """Say where the robot's own tree has another pose than the profile's mount."""
-    if rig.mount is None or robot is None or rig.mount.of not in robot.above:
-        return []
-    joint = robot.above[rig.mount.of]
-    angle_deg, distance_m = tangent_sizes(difference(joint.T_parent_child, rig.mount.to_matrix()))
-    if joint.parent != rig.mount.parent or (angle_deg < 1e-4 and distance_m < 1e-6):
-        return []
-    return [MOUNT_UNUSED(source=robot.source, frame=rig.mount.of, angle_deg=angle_deg, distance_m=distance_m)]
 
 
 def require_usable(calibrations: Sequence[Calibration], *, is_forced: bool = False) -> None:
@@ -207,10 +202,7 @@ def remove_exports(folder: Path) -> None:
     for path in sorted(folder.glob("*")):
         if is_export(path):
             try:
-                if path.is_dir():
-                    shutil.rmtree(path)
-                else:
-                    path.unlink()
+                (shutil.rmtree if path.is_dir() else Path.unlink)(path)
             except OSError as error:
                 raise SessionError(
                     f"{path}: an earlier export cannot be removed: {error.strerror}"

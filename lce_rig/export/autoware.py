@@ -79,12 +79,19 @@ def _entries(tree: FrameTree, robot: RobotTree, job: ExportJob) -> list[_Entry]:
     entries = []
     for lidar in job.rig.lidars.values():
         if lidar.frame in tree.frames:
-            entries.append(_below_kit(robot, job, lidar.frame) or _housing(lidar.frame, lidar.model))
+            # The base of the housing, where the LiDAR's description is known to begin.
+            model = lidar.model.upper()
+            heights_m = [height for name, height in _CENTRE_M.items() if model.startswith(name)]
+            entry = _Entry(lidar.frame, lidar.frame, np.eye(4))
+            if heights_m and not lidar.frame.endswith("_base_link"):
+                T_base_lidar = pose(np.eye(3), np.array([0.0, 0.0, heights_m[0]]))
+                entry = _Entry(f"{lidar.frame}_base_link", lidar.frame, T_base_lidar)
+            entries.append(_below_kit(robot, job, lidar.frame) or entry)
     for name, camera in job.rig.cameras.items():
         if camera.frame in tree.frames:
             key = camera.frame if "/" in camera.frame else f"{name}/camera_link"
-            own = _Entry(key, camera.frame, np.eye(4))
-            entries.append(_below_kit(robot, job, camera.frame) or own)
+            entry = _Entry(key, camera.frame, np.eye(4))
+            entries.append(_below_kit(robot, job, camera.frame) or entry)
     return entries
 
 
@@ -103,32 +110,21 @@ def _below_kit(robot: RobotTree, job: ExportJob, frame: str) -> _Entry | None:
     return _Entry(key, frame, job.robot.find_pose(key, frame))
 
 
-def _housing(frame: str, model: str) -> _Entry:
-    """Name the base of a LiDAR's housing, where its description is known to begin."""
-    height_m = next((m for name, m in _CENTRE_M.items() if model.upper().startswith(name)), None)
-    if frame.endswith("_base_link") or height_m is None:
-        return _Entry(frame, frame, np.eye(4))
-    return _Entry(f"{frame}_base_link", frame, pose(np.eye(3), np.array([0.0, 0.0, height_m])))
-
-
 def _content(
     content: str, root: str, poses: Mapping[str, Array], entries: Sequence[_Entry], job: ExportJob
 ) -> list[str]:
     lines = [f"# {line}" for line in job.head(content, *job.chosen)]
     for entry in entries:
-        lines.append(f"# {entry.key}: {_described(entry)}")
+        place = "the frame of the profile"
+        if entry.key != entry.frame:
+            x, y, z = entry.T_key_frame[:3, 3]
+            is_same = np.allclose(entry.T_key_frame, np.eye(4))
+            at = f"lies at ({x:.4f}, {y:.4f}, {z:.4f}) m in it, as its description must say"
+            place = f"{entry.frame} {'of the profile' if is_same else at}"
+        lines.append(f"# {entry.key}: {place}")
     lines.append(f"{root}:")
     for frame, T in poses.items():
         values = (*T[:3, 3], *rpy(T[:3, :3]))
         lines.append(f"  {quoted(frame)}:")
         lines += [f"    {key}: {number(value)}" for key, value in zip(_KEYS, values, strict=True)]
     return lines
-
-
-def _described(entry: _Entry) -> str:
-    if entry.key == entry.frame:
-        return "the frame of the profile"
-    x, y, z = entry.T_key_frame[:3, 3]
-    if np.allclose(entry.T_key_frame, np.eye(4)):
-        return f"{entry.frame} of the profile"
-    return f"{entry.frame} lies at ({x:.4f}, {y:.4f}, {z:.4f}) m in it, as its description must say"

@@ -14,7 +14,6 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.export.findings import NO_IMAGES, NO_SESSION
 from lce_rig.export.job import ExportJob
 from lce_rig.scene.colouring import colour_points
-from lce_rig.session.capture import Capture
 from lce_rig.session.durable import write_atomically
 
 _FIELDS = [
@@ -47,11 +46,13 @@ def _write(job: ExportJob, name: str, *, is_split: bool) -> list[Path]:
         return []
     paths = []
     for calibration in job.chosen:
-        clouds = {
-            capture.name: cloud
-            for capture in job.session.captures
-            if (cloud := _coloured(capture, calibration, job)) is not None
-        }
+        clouds = {}
+        for capture in job.session.captures:
+            channels = [channel for camera, channel in capture.image_keys if camera == calibration.camera]
+            channels.sort(key=lambda channel, c=calibration: channel not in c.channels)  # type: ignore[misc]
+            if channels and calibration.lidar in capture.lidars:
+                image, scan = capture.image(calibration.camera, channels[0]), capture.scan(calibration.lidar)
+                clouds[capture.name] = coloured(image, scan, calibration, job, int(capture.name))
         if not clouds:
             job.findings.append(NO_IMAGES(calibration.camera, format=name))
             continue
@@ -59,19 +60,15 @@ def _write(job: ExportJob, name: str, *, is_split: bool) -> list[Path]:
         parts = {f"{stem}_{capture}": cloud for capture, cloud in clouds.items()}
         for file, points in parts.items() if is_split else [(stem, np.concatenate([*clouds.values()]))]:
             path = job.folder / f"{file}.ply"
-            write_atomically(path, _head(points, calibration, job) + points.tobytes())
+            lines = job.head("coloured point cloud", calibration, of_one_camera=True)
+            lines.append(f"points in frame {job.rig.lidars[calibration.lidar].frame}, m")
+            lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in lines)]
+            lines.append(f"element vertex {len(points)}")
+            lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in _FIELDS]
+            head = "\n".join([*lines, "end_header"]) + "\n"
+            write_atomically(path, head.encode("ascii", "replace") + points.tobytes())
             paths.append(path)
     return paths
-
-
-def _coloured(capture: Capture, calibration: Calibration, job: ExportJob) -> NDArray[np.void] | None:
-    """Give the points of a capture that lie in the camera's image their colours; None without an image."""
-    channels = [channel for camera, channel in capture.image_keys if camera == calibration.camera]
-    channels.sort(key=lambda channel: channel not in calibration.channels)
-    if not channels or calibration.lidar not in capture.lidars:
-        return None
-    image = capture.image(calibration.camera, channels[0])
-    return coloured(image, capture.scan(calibration.lidar), calibration, job, int(capture.name))
 
 
 def coloured(
@@ -87,14 +84,3 @@ def coloured(
         points[name] = colours[is_seen, place]
     points["intensity"], points["capture"] = scan.intensity[is_seen], number
     return points
-
-
-def _head(points: NDArray[np.void], calibration: Calibration, job: ExportJob) -> bytes:
-    head = job.head("coloured point cloud", calibration, of_one_camera=True)
-    frame = job.rig.lidars[calibration.lidar].frame
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {line}" for line in (*head, f"points in frame {frame}, m")]
-    lines.append(f"element vertex {len(points)}")
-    lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in _FIELDS]
-    text = "\n".join([*lines, "end_header"]) + "\n"
-    return text.encode("ascii", "replace")

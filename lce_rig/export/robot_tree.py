@@ -127,8 +127,16 @@ class RobotTree:
         roots = [link for link in counts if link not in above]
         if has_one_root and len(roots) > 1:
             faults.append(f"several roots: {', '.join(roots)}")
-        if not faults:
-            faults = _loops(roots, above)
+        rooted = set(roots)
+        for frame in () if faults else above:
+            way: dict[str, None] = {}
+            while frame not in rooted and frame not in way:
+                way[frame] = None
+                frame = above[frame].parent
+            if frame in way:
+                faults.append(f"a loop: {' < '.join([*way, frame])}")
+                break
+            rooted.update(way)
         if faults:
             raise SessionError(f"{source}: not a tree of frames: {faults[0]}")
         return cls(source, frozenset(counts), above)
@@ -179,20 +187,6 @@ class RobotTree:
         new = Joint(joint.parent, joint.child, joint.T_parent_child, name=old.name if old else "")
         frames = self.frames | {joint.parent, joint.child}
         return replace(self, frames=frames, above={**self.above, joint.child: new})
-
-
-def _loops(roots: Iterable[str], above: Mapping[str, Joint]) -> list[str]:
-    """Name the loop above the first frame that leads to no root."""
-    rooted = set(roots)
-    for frame in above:
-        way: dict[str, None] = {}
-        while frame not in rooted:
-            if frame in way:
-                return [f"a loop: {' < '.join([*way, frame])}"]
-            way[frame] = None
-            frame = above[frame].parent
-        rooted.update(way)
-    return []
 
 
 def choose_channels(calibrations: Sequence[Calibration], rig: Rig) -> list[Calibration]:
@@ -260,7 +254,13 @@ def fit_tree(
         if robot is None and not tree.frames.intersection(frames):
             root = rig.root_frame if rig.root_frame in frames else frames[0]
             tree = replace(tree, frames=tree.frames | {root})
-        placed = [_anchor(tree, frames)]
+        present = [frame for frame in frames if frame in tree.frames]
+        if not present:
+            raise SessionError(
+                f"{tree.source} has none of the sensors' frames: {', '.join(frames)}",
+                "Name the robot's frames in the profile (`frame` of each sensor), or set `mount` there.",
+            )
+        placed = [min(present, key=lambda frame: len(tree.chain(frame)))]
         for anchor in placed:  # which grows
             for calibration in chosen:
                 lidar = rig.lidars[calibration.lidar].frame
@@ -335,17 +335,6 @@ def _connected(chosen: Sequence[Calibration], bodies: Mapping[str, str]) -> list
         groups = [group for group in groups if not group & joined] + [joined.union(*touching)]
     ordered = [[name for name in bodies if name in group] for group in groups]
     return sorted(ordered, key=lambda names: list(bodies).index(names[0]))
-
-
-def _anchor(tree: RobotTree, frames: Sequence[str]) -> str:
-    """Choose the frame that stays: of those that the robot has, the one nearest to its root."""
-    present = [frame for frame in frames if frame in tree.frames]
-    if not present:
-        raise SessionError(
-            f"{tree.source} has none of the sensors' frames: {', '.join(frames)}",
-            "Name the robot's frames in the profile (`frame` of each sensor), or set `mount` there.",
-        )
-    return min(present, key=lambda frame: len(tree.chain(frame)))
 
 
 def _placed(

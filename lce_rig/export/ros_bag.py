@@ -20,7 +20,6 @@ from lce_rig.core.errors import SessionError
 from lce_rig.export.camera_info import ros_distortion
 from lce_rig.export.findings import NO_IMAGES, NO_SESSION
 from lce_rig.export.job import ExportJob
-from lce_rig.export.robot_tree import Joint
 from lce_rig.export.rotations import quaternion_wxyz
 from lce_rig.io.ros.bag_recorder import CLOUD_TYPE, IMAGE_TYPE, encode_image, encode_scan
 from lce_rig.io.ros.messages import typestore
@@ -199,7 +198,16 @@ def _write_tf_static(writer: Any, job: ExportJob, stamp_ns: int) -> None:
     store = typestore(False)
     topic = writer.add_connection(_TF_STATIC, _TF_TYPE, typestore=store, offered_qos_profiles=[latched])
     joints = [joint for tree in job.trees for joint in tree.joints]
-    message = store.types[_TF_TYPE](transforms=[_stamped(store, joint, stamp_ns) for joint in joints])
+    names = ("Vector3", "Quaternion", "Transform", "TransformStamped")
+    vector, quaternion, transform, stamped = (store.types[f"geometry_msgs/msg/{name}"] for name in names)
+    transforms = []
+    for joint in joints:
+        x, y, z = joint.T_parent_child[:3, 3].tolist()
+        qw, qx, qy, qz = quaternion_wxyz(joint.T_parent_child[:3, :3]).tolist()
+        pose = transform(translation=vector(x=x, y=y, z=z), rotation=quaternion(x=qx, y=qy, z=qz, w=qw))
+        header = _ros_header(stamp_ns, joint.parent)
+        transforms.append(stamped(header=header, child_frame_id=joint.child, transform=pose))
+    message = store.types[_TF_TYPE](transforms=transforms)
     writer.write(topic, stamp_ns, store.serialize_cdr(message, _TF_TYPE))
 
 
@@ -209,19 +217,6 @@ def _ros_header(stamp_ns: int, frame_id: str) -> Any:
     seconds, nanoseconds = divmod(stamp_ns, _NS_PER_S)
     stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
     return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id)
-
-
-def _stamped(store: Any, joint: Joint, stamp_ns: int) -> Any:
-    x, y, z = (float(value) for value in joint.T_parent_child[:3, 3])
-    qw, qx, qy, qz = (float(value) for value in quaternion_wxyz(joint.T_parent_child[:3, :3]))
-    geometry = {name: store.types[f"geometry_msgs/msg/{name}"] for name in ("Vector3", "Quaternion")}
-    transform = store.types["geometry_msgs/msg/Transform"](
-        translation=geometry["Vector3"](x=x, y=y, z=z),
-        rotation=geometry["Quaternion"](x=qx, y=qy, z=qz, w=qw),
-    )
-    return store.types["geometry_msgs/msg/TransformStamped"](
-        header=_ros_header(stamp_ns, joint.parent), child_frame_id=joint.child, transform=transform
-    )
 
 
 def _camera_info(job: ExportJob, camera: str, stamp_ns: int) -> Any:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lce_rig.core.calibration import Calibration, ResultFile, read_result
+from lce_rig.core.calibration import Calibration, Provenance, ResultFile, read_result
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.core.limits import read_file
@@ -82,17 +82,25 @@ class Result:
                 return pair
         raise NotEnoughDataError(f"no extrinsic of camera {camera}", "Collect more captures.")
 
+    @property
+    def provenance(self) -> Provenance:
+        """Robot, sensors and date.
+
+        Raises:
+            SessionError: captures are of different robots, or of different units of a sensor.
+        """
+        return provenance_of([*self.sessions.values()] or [self.session])
+
     def file(self) -> ResultFile:
         """Build result.json; other sessions are named by their path from the first.
 
         Raises:
-            SessionError: a capture that was used is missing; or captures are of different robots, or of
-                different units of a sensor.
+            SessionError: a capture that was used is missing, or `provenance` raises it.
         """
         main = self.session.path.resolve()
         return ResultFile(
             rig=self.session.rig.name,
-            provenance=provenance_of([*self.sessions.values()] or [self.session]),
+            provenance=self.provenance,
             inputs_sha256=inputs_sha256(self.session, self.pairs, self.sessions),
             sessions={
                 name: os.path.relpath(session.path.resolve(), main) for name, session in self.sessions.items()
