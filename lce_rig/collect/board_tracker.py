@@ -1,6 +1,7 @@
 """The board followed from frame to frame, in every image and scan."""
 
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -53,46 +54,19 @@ class BoardDetection:
         return bool(self.images.keys() - self.unfit.keys() and self.lidars)
 
 
-@dataclass(frozen=True)
-class HeldStill:
-    """A board that stood still: by how much it moved while the sensors saw it, m."""
-
-    motion_m: float
-
-
-@dataclass(frozen=True)
-class MovedSlowly:
-    """A board that moved before an event camera.
-
-    Attributes:
-        speed_mps: of its middle.
-        unsteady_m: rms distance of its way from a straight and steady one.
-        events_px: events per pixel of the board in the second before its image.
-    """
-
-    speed_mps: float
-    unsteady_m: float
-    events_px: float
-
-
-@dataclass(frozen=True)
-class TakenByHand:
-    """A board that somebody captured by a key, however it moved."""
-
-    by_hand: float = 1.0
-
-
 @dataclass(frozen=True, eq=False)
 class CaptureMoment:
-    """A detection worth a capture, and how the board moved; both are kept."""
+    """A detection worth a capture.
+
+    Attributes:
+        detection: the board in its frame.
+        figures: how the board moved, kept with the capture: motion_m of a board that stood still; speed_mps,
+            unsteady_m (rms from a straight and steady way) and events_px (events per pixel of the board in
+            the second before) of one that moved; by_hand of one captured by a key.
+    """
 
     detection: BoardDetection
-    motion: HeldStill | MovedSlowly | TakenByHand
-
-    @property
-    def figures(self) -> dict[str, float]:
-        """List the figures of the motion by name, as the capture keeps them."""
-        return asdict(self.motion)
+    figures: Mapping[str, float]
 
 
 @dataclass

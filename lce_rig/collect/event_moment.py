@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey, MovedSlowly
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
 from lce_rig.collect.findings import IMAGE_MADE_FEW_EVENTS, IMAGE_STOOD_STILL, READ_NO_EVENTS_AT_SCAN
 from lce_rig.core.data import Events
 from lce_rig.core.findings import Refusal
@@ -88,7 +88,11 @@ def _judge_camera(
         lamps = look_for_flicker(recent)
         if lamps is not None:
             return lamps
-    slow = MovedSlowly(round(speed_mps, 5), round(unsteady_m, 5), round(events_px, 5))
+    slow = {
+        "speed_mps": round(speed_mps, 5),
+        "unsteady_m": round(unsteady_m, 5),
+        "events_px": round(events_px, 5),
+    }
     return CaptureMoment(detection, slow)
 
 

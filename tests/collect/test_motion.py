@@ -38,9 +38,9 @@ def test_a_board_that_passes_slowly_is_taken_once_a_place(rig: Rig) -> None:
     assert len(moments) in (3, 4) and not refused
     assert np.diff(places_m(moments)).min() >= 0.15
     for moment in moments:
-        assert moment.motion.speed_mps == pytest.approx(0.1, abs=0.001)
-        assert moment.motion.unsteady_m < 1e-3
-        assert moment.motion.events_px == pytest.approx(2.0, rel=0.05)
+        assert moment.figures["speed_mps"] == pytest.approx(0.1, abs=0.001)
+        assert moment.figures["unsteady_m"] < 1e-3
+        assert moment.figures["events_px"] == pytest.approx(2.0, rel=0.05)
 
 
 def test_a_board_that_stands_still_is_refused_with_what_to_do(rig: Rig) -> None:
@@ -63,7 +63,7 @@ def test_few_events_of_a_board_that_moves_are_named(rig: Rig) -> None:
 def test_a_board_that_has_just_stopped_or_a_rig_that_moves_will_do_where_events_are_plenty(rig: Rig) -> None:
     moments, refused = choose(watch(rig, lambda _t: (0.0, 0.0), 2.0, PLENTY), rig)
     assert len(moments) == 1 and not refused
-    assert moments[0].motion.speed_mps < 0.01 and moments[0].motion.events_px > 4
+    assert moments[0].figures["speed_mps"] < 0.01 and moments[0].figures["events_px"] > 4
 
 
 def test_lamps_that_flicker_do_not_count_as_motion_and_are_named(rig: Rig) -> None:
@@ -79,7 +79,7 @@ def test_the_slowest_part_of_a_way_is_preferred_to_a_fast_one_through_the_same_p
 
     moments, _ = choose(watch(rig, way, 2.2, SOME), rig)
     near = [moment for moment in moments if abs(places_m([moment])[0]) < 0.15]
-    assert any(moment.motion.speed_mps == pytest.approx(0.1, abs=0.01) for moment in near)
+    assert any(moment.figures["speed_mps"] == pytest.approx(0.1, abs=0.01) for moment in near)
     assert all(np.diff(sorted(places_m(moments))) >= 0.15)
 
 

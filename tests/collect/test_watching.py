@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, HeldStill
+from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
 from lce_rig.collect.offline.search_ahead import RestingTracker, glance_at, sight_ahead
 from lce_rig.collect.offline.stillness import find_still_moments
 from lce_rig.core.findings import Refusal
@@ -95,14 +95,14 @@ def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
     watcher = BoardTracker(rig(), 0.3)
     for time_s in (0.0, 0.1, 0.2):
         detection = see(watcher, 0, time_s)
-    confirmed = watcher.confirm(CaptureMoment(detection, HeldStill(0.001)))
+    confirmed = watcher.confirm(CaptureMoment(detection, {"motion_m": 0.001}))
     assert isinstance(confirmed, CaptureMoment) and confirmed.figures == {"motion_m": 0.001}
     whole = watcher.finder.image(placements()[0].images[0])
     assert not isinstance(whole, Refusal)
     assert np.array_equal(confirmed.detection.images["davis", "frames"].corners_px, whole.corners_px)
     blank = replace(detection.frame.images[0], pixels=np.full_like(detection.frame.images[0].pixels, 90))
     gone = replace(detection, frame=replace(detection.frame, images=(blank,)))
-    refused = watcher.confirm(CaptureMoment(gone, HeldStill(0.001)))
+    refused = watcher.confirm(CaptureMoment(gone, {"motion_m": 0.001}))
     assert isinstance(refused, Refusal) and refused.stage == "image"
 
 
@@ -113,9 +113,9 @@ def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have
     # As if the LiDAR had missed the board, and seen another plate of its size.
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32)
     elsewhere = replace(whole, frame=replace(whole.frame, scans=(replace(scan, points=scan.points @ turn),)))
-    assert isinstance(watcher.confirm(CaptureMoment(elsewhere, HeldStill(0.001))), CaptureMoment)
-    assert isinstance(watcher.confirm(CaptureMoment(whole, HeldStill(0.001))), CaptureMoment)
-    refused = watcher.confirm(CaptureMoment(elsewhere, HeldStill(0.001)))
+    assert isinstance(watcher.confirm(CaptureMoment(elsewhere, {"motion_m": 0.001})), CaptureMoment)
+    assert isinstance(watcher.confirm(CaptureMoment(whole, {"motion_m": 0.001})), CaptureMoment)
+    refused = watcher.confirm(CaptureMoment(elsewhere, {"motion_m": 0.001}))
     assert isinstance(refused, Refusal) and refused.code == "lidar.elsewhere"
     assert float(refused.figures["distance_m"]) > 1
 

@@ -1,7 +1,5 @@
 """When a live board is captured: standing still, or moving slowly where events are wanted."""
 
-from typing import Protocol
-
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.narration import Narration, narrate_moving, narrate_still
@@ -18,37 +16,8 @@ from lce_rig.timing.event_buffer import EventCut
 LIVE_PATIENCE_S = 0.7
 
 
-class LiveGate(Protocol):
-    """Decides on moments as detections come."""
-
-    def take(self, detection: BoardDetection) -> list[CaptureMoment]:
-        """Take the next detection, and give the moments that are worth a capture by how the board moves."""
-        ...
-
-    def narrate(self, guide: Guide, present: Array) -> Narration:
-        """Say what to do with a board that is seen at (4, 4)."""
-        ...
-
-    def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
-        """Give the events of a moment that its capture keeps."""
-        ...
-
-    @property
-    def is_captured(self) -> bool:
-        """Whether the board still stands where it was captured."""
-        ...
-
-    def note_capture(self, detection: BoardDetection) -> None:
-        """Let a board that was captured, by a key too, be captured again elsewhere only."""
-        ...
-
-    def forget_capture(self, time_ns: int) -> None:
-        """Forget a capture of a detection at a time, as it was taken back."""
-        ...
-
-
 class StillBoards:
-    """Captures boards that stand still for `hold_s`; see `LiveGate`."""
+    """Captures boards that stand still for `hold_s`."""
 
     def __init__(self, rig: Rig, hold_s: float) -> None:
         self._hold_s = hold_s
@@ -100,7 +69,7 @@ class StillBoards:
 
 
 class SlowBoards:
-    """Captures boards that move slowly before a camera of events; see `LiveGate`."""
+    """Captures boards that move slowly before a camera of events."""
 
     def __init__(self, rig: Rig, novelty: Placements) -> None:
         self._novelty = novelty

@@ -17,10 +17,9 @@ from lce_rig.collect.board_tracker import (
     BoardTracker,
     CaptureMoment,
     ImageKey,
-    TakenByHand,
     without_samples,
 )
-from lce_rig.collect.live.capture_triggers import LiveGate, SlowBoards, StillBoards
+from lce_rig.collect.live.capture_triggers import SlowBoards, StillBoards
 from lce_rig.collect.live.capture_writer import CaptureWriter, Kept, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, count_in, make_guides
@@ -211,7 +210,7 @@ class _Loop:
         self._show = show
         self._began_s = time.monotonic()
         self._search, self._learning = search, learning
-        self._gate: LiveGate | None = None
+        self._gate: StillBoards | SlowBoards | None = None
         self._n_before = len(session.captures)
         self._number = int(session.next_name)
         self._asked: list[_Asked] = []
@@ -381,7 +380,7 @@ class _Loop:
             name = self._asked[-1].name
             self._monitor.cue("refused", f"not captured: {name} shows the board here; move it first")
             return
-        confirmed = self._search.confirm(CaptureMoment(detection, TakenByHand()))
+        confirmed = self._search.confirm(CaptureMoment(detection, {"by_hand": 1.0}))
         if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
         else:
@@ -462,7 +461,7 @@ class _Loop:
         """Choose who judges a placement: of the guides whose sensors see it that of fewest captures."""
         return min((g for g in self._guides if g.sees(detection)), key=lambda g: g.n_held, default=None)
 
-    def _find_gate(self) -> LiveGate:
+    def _find_gate(self) -> StillBoards | SlowBoards:
         """Choose how boards are captured: moving where events come and clocks are tied, else still."""
         has_events = self._last is not None and bool(self._last.frame.events)
         may_move = has_events and not self._clock.verdict().requires_still_boards

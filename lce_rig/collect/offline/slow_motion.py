@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, MovedSlowly
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.event_moment import BEST_SPEED_MPS, SPEED_WINDOW_S, judge_detection
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.findings import Refusal
@@ -121,10 +121,8 @@ class _Chooser:
 
     def _badness(self, moment: CaptureMoment) -> tuple[bool, float]:
         is_short = any(cut.missing_ns > 0 for cut in moment.detection.frame.events)
-        motion = moment.motion
-        assert isinstance(motion, MovedSlowly)
-        speed_ratio = max(motion.speed_mps, 1e-3) / BEST_SPEED_MPS
-        return is_short, abs(float(np.log(speed_ratio))) + motion.unsteady_m / _UNSTEADY_M
+        speed_ratio = max(moment.figures["speed_mps"], 1e-3) / BEST_SPEED_MPS
+        return is_short, abs(float(np.log(speed_ratio))) + moment.figures["unsteady_m"] / _UNSTEADY_M
 
 
 class _Neighbours:

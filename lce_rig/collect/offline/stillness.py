@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, HeldStill
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
@@ -63,7 +63,7 @@ class StillnessGate:
             self._since_ns = now_ns if self._best is None else self._since_ns
             if self._best is None or self.motion_m < self._best_m:
                 middle = self._window[len(self._window) // 2]
-                self._best = CaptureMoment(middle, HeldStill(round(self.motion_m, 6)))
+                self._best = CaptureMoment(middle, {"motion_m": round(self.motion_m, 6)})
                 self._best_m = self.motion_m
         self.held_s = (now_ns - self._since_ns) * 1e-9 if is_still else None
         if self._best is not None and (not is_still or now_ns - self._since_ns > self._dwell_ns):
