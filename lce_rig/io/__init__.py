@@ -29,7 +29,7 @@ RECORDINGS = {
     ".zip": "lce_rig.io.events.camera_file:EventCameraFile",
 }
 """Reader by suffix, or "folder"; imported when wanted."""
-_PACKETS, _OUSTER = (".pcap", ".pcapng"), "lce_rig.io.ouster.pcap:OusterRecording"
+_PACKETS, _OUSTER = (".pcap", ".pcapng"), "lce_rig.io.ouster:OusterRecording"
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:

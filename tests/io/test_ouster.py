@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.network import Datagram, PcapWriter
-from lce_rig.io.ouster.packets import PROFILES, OusterMetadata, read_metadata
-from lce_rig.io.ouster.pcap import OusterRecording
+from lce_rig.io.ouster import PROFILES, OusterMetadata, OusterRecording, read_metadata
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.rig import Rig, load_rig
 
@@ -118,9 +119,36 @@ def test_what_is_missing_or_not_read_is_named(tmp_path: Path, rig: Rig) -> None:
     with pytest.raises(SourceError, match="packets of profile FUSA"):
         write_metadata(tmp_path / "drive.json", "FUSA_RNG15_RFL8_NIR8_DUAL")
     (tmp_path / "drive.json").write_text('{"a": 1}')
-    with pytest.raises(SourceError, match="is not the metadata of an Ouster"):
+    with pytest.raises(SourceError, match=r"drive\.json"):
         open_recording(path, rig)
     (tmp_path / "drive.json").unlink()
     with pytest.raises(SourceError, match="metadata are missing") as caught:
         open_recording(path, rig)
     assert "drive.json" in (caught.value.hint or "")
+
+
+@settings(
+    max_examples=50,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(data=st.data())
+def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(
+    tmp_path: Path, rig: Rig, data: st.DataObject
+) -> None:
+    path = tmp_path / "drive.pcap"
+    path.unlink(missing_ok=True)
+    write_pcap(path, write_metadata(tmp_path / "drive.json", "LEGACY"), 1.0)
+    damaged = data.draw(st.sampled_from([path, path.with_suffix(".json")]), label="file")
+    content = bytearray(damaged.read_bytes())
+    if data.draw(st.booleans(), label="is cut"):
+        content = content[: data.draw(st.integers(0, len(content)), label="length")]
+    else:
+        place = st.one_of(st.integers(0, 200), st.integers(0, len(content) - 1))
+        content[data.draw(place, label="place")] ^= data.draw(st.integers(1, 255))
+    damaged.write_bytes(bytes(content))
+    try:
+        assert all(isinstance(scan, Scan) for scan in OusterRecording(path, rig, SourceOptions()).samples())
+    except SourceError as error:
+        assert "drive" in error.what

@@ -1,1 +1,0 @@
-"""Recorded packets of Ousters."""
