@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.findings import ELSEWHERE
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image, Scan
@@ -14,6 +15,7 @@ from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.detect.findings import IMAGE_TILTED
 from lce_rig.rig import QualitySettings
 from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, PANEL, Picture, round_ticks, text_width_px, wrapped
 from lce_rig.show.overlays.debug_image import draw_debug
@@ -143,7 +145,7 @@ def test_an_empty_scan_and_missing_boards_are_drawn_too() -> None:
 @pytest.mark.parametrize("has_lidar", [True, False])
 def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar: bool) -> None:
     points = wall()
-    refusal = Refusal("image.tilted", figures={"tilt_deg": 71.0, "max_tilt_deg": 70.0, "turn_deg": 6.0})
+    refusal = IMAGE_TILTED.refusal(tilt_deg=71.0, max_tilt_deg=70.0, turn_deg=6.0)
     drawn = draw_debug(
         Image("cam", "frames", None, grey(FOLDING)) if has_image else None,
         scan_of(points) if has_lidar else None,
@@ -161,7 +163,7 @@ def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar
 def test_corners_found_in_a_refused_image_are_drawn() -> None:
     camera = Intrinsics(349.57, 349.18, 172.49, 126.24, 346, 260)
     pixels = draw(BOARD, camera, looking(10, 0, 20, (0, 0, 2.0)))
-    refusal = Refusal("image.tilted", figures={"tilt_deg": 71.0, "max_tilt_deg": 70.0, "turn_deg": 6.0})
+    refusal = IMAGE_TILTED.refusal(tilt_deg=71.0, max_tilt_deg=70.0, turn_deg=6.0)
     drawn = debug_picture(Image("cam", "frames", None, pixels), refusal, camera)
     blank = debug_picture(Image("cam", "frames", None, np.full_like(pixels, 110)), refusal, camera)
     assert count(drawn[34:600, :800], ORANGE) > 100 > count(blank[34:600, :800], ORANGE)
@@ -175,7 +177,7 @@ def debug_picture(image: Image, refusal: Refusal, camera: Intrinsics) -> NDArray
 
 def test_a_candidate_that_is_elsewhere_is_not_drawn_as_the_board() -> None:
     points = wall()
-    figures = {"n_candidates": 2, "candidate": 1, "distance_m": 3.0, "rotation_deg": 20.0}
+    elsewhere = ELSEWHERE.refusal(n_candidates=2, candidate=1, distance_m=3.0, rotation_deg=20.0)
     arguments = (
         Image("cam", "frames", None, grey(FOLDING)),
         scan_of(points),
@@ -191,7 +193,7 @@ def test_a_candidate_that_is_elsewhere_is_not_drawn_as_the_board() -> None:
             title="",
             mismatch=mismatch,
         )
-        for mismatch in (None, Refusal("pair.elsewhere", figures=figures))
+        for mismatch in (None, elsewhere)
     )
     assert count(right[:, 800:], MAGENTA) > 100
     assert count(wrong[:, 800:], MAGENTA) == 0
