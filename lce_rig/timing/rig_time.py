@@ -2,7 +2,6 @@
 
 from lce_rig.core.data import Events, Image, Sample, Stream
 from lce_rig.rig import Rig
-from lce_rig.rig.sensors import TimestampSettings
 
 
 def event_channel(rig: Rig, camera: str) -> str | None:
@@ -28,16 +27,14 @@ def stream_of(sample: Sample, rig: Rig) -> Stream:
 
 def rig_offset_ns(stream: Stream, rig: Rig) -> int:
     """Return what the profile adds to a stream's timestamps to get the rig's time."""
-    return round(_timestamps(stream, rig).expected_offset_s * 1e9)
+    if stream.kind == "scans":
+        timestamps = rig.lidars[stream.sensor].timestamps
+    else:
+        timestamps = rig.cameras[stream.sensor].channels[stream.channel].timestamps
+    return round(timestamps.expected_offset_s * 1e9)
 
 
 def rig_time_ns(sample: Sample, rig: Rig) -> int | None:
     """Bring a sample's timestamp to the rig's time; None where it carries none."""
     stamp_ns = stamp_of(sample)
     return None if stamp_ns is None else stamp_ns + rig_offset_ns(stream_of(sample, rig), rig)
-
-
-def _timestamps(stream: Stream, rig: Rig) -> TimestampSettings:
-    if stream.kind == "scans":
-        return rig.lidars[stream.sensor].timestamps
-    return rig.cameras[stream.sensor].channels[stream.channel].timestamps

@@ -95,7 +95,13 @@ class _Pairing:
 
     def due_frames(self) -> Iterator[Frame]:
         """Yield the frames that nothing more can come for."""
-        while self._waiting and self._is_due(*self._waiting[0][:2]):
+        while self._waiting:
+            time_ns, half_ns, _ = self._waiting[0]
+            have_passed = all(buffer and buffer[-1][0] >= time_ns for buffer in self._buffers.values())
+            is_complete = bool(self._buffers) and have_passed
+            is_complete = is_complete and self._events.has_passed(time_ns + half_ns + AFTER_NS)
+            if not is_complete and self._position_ns <= time_ns + PATIENCE_NS:
+                return
             yield from self._frame(*self._waiting.popleft())
 
     def remaining_frames(self) -> Iterator[Frame]:
@@ -116,12 +122,6 @@ class _Pairing:
         else:
             key = (sample.sensor, sample.channel if isinstance(sample, Image) else "")
             self._buffers.setdefault(key, deque()).append((time_ns, sample))
-
-    def _is_due(self, time_ns: int, half_ns: int) -> bool:
-        if self._position_ns > time_ns + PATIENCE_NS:
-            return True
-        have_passed = all(buffer and buffer[-1][0] >= time_ns for buffer in self._buffers.values())
-        return bool(self._buffers) and have_passed and self._events.has_passed(time_ns + half_ns + AFTER_NS)
 
     def _frame(self, time_ns: int, half_ns: int, scan: Scan) -> Iterator[Frame]:
         images: list[Image] = []
