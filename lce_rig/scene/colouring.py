@@ -29,7 +29,12 @@ def colour_points(
     points_camera = transform(T_cam_lidar, np.asarray(scan.points, np.float64))
     at, _ = lens.project(points_camera)
     is_seen = lens.is_inside(at)
-    cell_px = max(_SMALLEST_CELL_PX, _ring_step_rad(scan) * lens.fx_px)
+    # The angle between neighbouring rings: the median step of their elevations.
+    points = np.asarray(scan.points, np.float64)
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    rings = [np.nanmedian(elevation[scan.ring == ring]) for ring in np.unique(scan.ring)]
+    step_rad = float(np.median(np.diff(np.sort(rings)))) if len(rings) > 1 else 0.0
+    cell_px = max(_SMALLEST_CELL_PX, step_rad * lens.fx_px)
     baseline_m = float(np.linalg.norm(T_cam_lidar[:3, 3]))
     is_seen[is_seen] = ~_is_hidden(at[is_seen], points_camera[is_seen, 2], cell_px, baseline_m * lens.fx_px)
     column, row = np.round(at[is_seen]).astype(int).T
@@ -37,14 +42,6 @@ def colour_points(
     seen = pixels[row, column]
     colours[is_seen] = seen[:, ::-1] if pixels.ndim == 3 else seen[:, None]
     return colours, is_seen
-
-
-def _ring_step_rad(scan: Scan) -> float:
-    """Estimate the angle between neighbouring rings, rad: the median step of their elevations."""
-    points = np.asarray(scan.points, np.float64)
-    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
-    rings = [np.nanmedian(elevation[scan.ring == ring]) for ring in np.unique(scan.ring)]
-    return float(np.median(np.diff(np.sort(rings)))) if len(rings) > 1 else 0.0
 
 
 def _is_hidden(at: Array, depth_m: Array, cell_px: float, baseline_m_px: float) -> NDArray[np.bool_]:

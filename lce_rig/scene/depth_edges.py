@@ -59,8 +59,21 @@ def leave_standing(captures: Sequence[DepthEdges]) -> list[DepthEdges]:
     An edge stays if a third of the other captures have one in its place; it may be hidden in the rest. Where
     few edges stay, the rig itself moves, and all are kept.
     """
+    from scipy.spatial import cKDTree
+
     compared = evenly(captures, _MAX_COMPARED)
-    keep = [_recurs(edges, [each for each in compared if each is not edges]) for edges in captures]
+    keep = []
+    for edges in captures:
+        # An edge recurs if a third of the other captures, and one at least, have it in the same place.
+        others = [each for each in compared if each is not edges]
+        tolerance_m = _SAME_PLACE_M + _SAME_PLACE_RAD * np.linalg.norm(edges.points, axis=1)
+        count = np.zeros(len(edges))
+        for other in others:
+            for channel in range(len(CHANNELS)):
+                own = edges.channel == channel
+                tree = cKDTree(other.points[other.channel == channel])
+                count[own] += tree.query(edges.points[own])[0] < tolerance_m[own]
+        keep.append(count >= max(len(others) / 3, 1))
     if not any(map(len, captures)) or np.mean(np.concatenate(keep)) < _STANDING_SHARE:
         return list(captures)
     return [edges.select(each) for edges, each in zip(captures, keep, strict=True)]
@@ -71,20 +84,6 @@ def evenly(items: Sequence[_Item], n: int) -> list[_Item]:
     if len(items) <= n:
         return list(items)
     return [items[k] for k in np.linspace(0, len(items) - 1, n).round().astype(int)]
-
-
-def _recurs(edges: DepthEdges, others: Sequence[DepthEdges]) -> NDArray[np.bool_]:
-    """Find which edges a third of the other captures, and one at least, have in the same place."""
-    from scipy.spatial import cKDTree
-
-    tolerance_m = _SAME_PLACE_M + _SAME_PLACE_RAD * np.linalg.norm(edges.points, axis=1)
-    count = np.zeros(len(edges))
-    for other in others:
-        for channel in range(len(CHANNELS)):
-            own = edges.channel == channel
-            tree = cKDTree(other.points[other.channel == channel])
-            count[own] += tree.query(edges.points[own])[0] < tolerance_m[own]
-    return np.asarray(count >= max(len(others) / 3, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,15 +167,11 @@ def _find_changes(rings: _Rings) -> tuple[Array, Array]:
     is_edge = is_joint[:-2] & is_joint[1:-1] & is_joint[2:]
     is_edge &= (change > _LEAST_CHANGE) & (change > _CHANGE_SIGMAS * scatter)
     contrast = np.where(is_edge, change / ((outer + left + right + far) / 2 + 2 * _FAINT), 0.0)
-    is_edge &= (contrast > _CONTRAST) & (contrast >= _largest_near(contrast))
+    # The largest of each value and the two on either side.
+    largest = np.max([np.pad(contrast, 2)[k : k + len(contrast)] for k in range(5)], axis=0)
+    is_edge &= (contrast > _CONTRAST) & (contrast >= largest)
     first = np.flatnonzero(is_edge) + 1
     return (rings.points[first] + rings.points[first + 1]) / 2, np.sqrt(contrast[first - 1])
-
-
-def _largest_near(values: Array) -> Array:
-    """Find the largest of each value and the two on either side, (N,)."""
-    padded = np.pad(values, 2)
-    return np.asarray(np.max([padded[k : k + len(values)] for k in range(5)], axis=0))
 
 
 def _joint_m(range_m: Array) -> Array:

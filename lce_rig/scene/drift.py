@@ -36,6 +36,7 @@ LARGEST = np.where(IS_ROTATION, np.radians(1.5), 0.10)
 NEARLY = 0.1
 """What scores so much less alone, as a share, may be what changed."""
 _MIN_EDGES = 60
+_LEAST_SHARE = 0.05  # of the edges in a third of the image
 _MIN_PARTS = 6  # of the image, that carry edges
 _MIN_SCORE = 0.10  # mean log-likelihood ratio of a depth edge; 0 where edges do not belong together
 # Upright outlines hardly show pitch: without a slanted one the curve is nearly flat, its peak meaningless.
@@ -153,7 +154,14 @@ def watch(
     if views and any(len(view.edges) for view in views):
         alignment = Alignment(views, intrinsics, T_cam_lidar)
         n_edges = len(alignment)
-        missing = _sides_without_edges(alignment)
+        # Thirds of the image without edges.
+        thirds = [part.sum() for part in np.array_split(alignment.weight_of_parts.sum(axis=1), 3)]
+        shares = np.array(thirds) / max(sum(thirds), 1e-12)
+        missing = [
+            SIDE_WITHOUT_EDGES(side, share=float(share))
+            for side, share in zip(("left", "middle", "right"), shares, strict=True)
+            if share < _LEAST_SHARE
+        ]
     # The parts of the image that carry edges.
     n_parts = int(np.count_nonzero(alignment.weight_of_parts)) if n_edges else 0
     if n_edges < _MIN_EDGES * max(len(views), 1) ** 0.5 or n_parts < _MIN_PARTS:
@@ -233,15 +241,3 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
     state: State = "changed" if is_changed else "unknown" if reason else "unchanged"
     figures = (unit * peak, unit * sigma, unit * smallest)
     return AxisDrift(AXES[axis], state, *figures, "" if is_changed else reason)
-
-
-def _sides_without_edges(alignment: Alignment) -> list[Finding]:
-    """Name the thirds of the image in which nothing tells."""
-    columns = alignment.weight_of_parts.sum(axis=1)
-    thirds = [part.sum() for part in np.array_split(columns, 3)]
-    total = max(sum(thirds), 1e-12)
-    return [
-        SIDE_WITHOUT_EDGES(side, share=float(third / total))
-        for side, third in zip(("left", "middle", "right"), thirds, strict=True)
-        if third < 0.05 * total
-    ]

@@ -79,7 +79,14 @@ def estimate(
     alignment = Alignment(views, intrinsics, T_start, _BESIDE_RAD if is_far else BESIDE_RAD)
     starts = _sweep(views, intrinsics, T_start) if is_far else []
     maxima = _search(alignment, [T_start, *starts], T_prior, held)
-    cells = [_cells(alignment.points, shift) for shift in _SHIFTS]
+    # The parts of the scene that points (N, 3) belong to, (N,) each: cells of shifted grids.
+    x, y, _ = alignment.points.T
+    log_range = np.log(np.linalg.norm(alignment.points, axis=1))
+    grid = np.stack([np.arctan2(y, x) / _CELL_RAD, log_range / _CELL_LOG], axis=1)
+    cells = [
+        np.unique(np.floor(grid + shift), axis=0, return_inverse=True)[1].ravel().astype(np.intp)
+        for shift in _SHIFTS
+    ]
     T, information = _balance(alignment, cells, maxima[0], T_prior, held)
     cov = np.linalg.inv(information + held) + _rivalry(alignment, cells, maxima)
     unit = np.outer(_UNIT, _UNIT)
@@ -180,13 +187,6 @@ def _balance(
     off = difference(T, T_prior) / _UNIT
     step = np.linalg.solve(information + held, weight @ gradients.sum(axis=0) - held @ off)
     return perturb(T, step * _UNIT), _symmetric(information)
-
-
-def _cells(points: Array, shift: float) -> NDArray[np.intp]:
-    """Number the parts of the scene that points (N, 3) belong to, (N,)."""
-    azimuth, distance = np.arctan2(points[:, 1], points[:, 0]), np.linalg.norm(points, axis=1)
-    grid = np.floor(np.stack([azimuth / _CELL_RAD, np.log(distance) / _CELL_LOG], axis=1) + shift)
-    return np.unique(grid, axis=0, return_inverse=True)[1].ravel().astype(np.intp)
 
 
 def _sums(values: Array, cell: NDArray[np.intp]) -> Array:

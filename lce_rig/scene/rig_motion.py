@@ -141,7 +141,11 @@ def clocks_apart_s(
     """
     rows = []
     for after_s in _CLOCKS_S:
-        later = [_later(each, float(after_s)) for each in views]
+        later = []
+        for each in views:
+            edges = each.view.edges
+            points = each.motion.moved(edges.points, np.full(len(edges), after_s))
+            later.append(replace(each.view, edges=replace(edges, points=points)))
         alignment = Alignment(later, intrinsics, T_cam_lidar)
         rows.append(alignment.split(alignment.shares(T_cam_lidar)))
     curve = Curve(_CLOCKS_S, np.array([parts for parts, _ in rows]), np.array([each for _, each in rows]))
@@ -152,9 +156,3 @@ def clocks_apart_s(
     peak_s = curve.peak
     is_apart = abs(peak_s) > max(_APART_S, _APART_SIGMAS * curve.sigma())
     return peak_s if is_apart and curve.significance(peak_s, 0.0) > _APART_SIGNIFICANCE else None
-
-
-def _later(each: MovingView, after_s: float) -> SceneView:
-    edges = each.view.edges
-    points = each.motion.moved(edges.points, np.full(len(edges), after_s))
-    return replace(each.view, edges=replace(edges, points=points))
