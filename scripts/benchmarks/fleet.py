@@ -1,8 +1,7 @@
-"""Fleets: hundreds of simulated sessions, lost workers and clients, broken sessions, large tables, S3."""
+"""Fleets: hundreds of simulated sessions, lost workers and clients, broken sessions, large tables."""
 
 import contextlib
 import json
-import logging
 import os
 import resource
 import shutil
@@ -10,10 +9,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.request import Request, urlopen
 
 import numpy as np
 
@@ -28,8 +25,6 @@ from lce_rig.fleet.table import SCHEMA, TABLE, as_table, merged, table_bytes
 _KILL_EVERY_S, _CLIENT_LIVES_S = 20.0, 45.0
 _FEW_ROBOTS, _FEW_SESSIONS = 10, 30
 _TABLE_ROWS = 1_000_000
-# Figures of a run, not of a session.
-_OF_A_RUN = ("duration_s", "cpu_s", "peak_memory_mb", "finished", "source")
 
 
 def bench_fleet(folder: Path, only: str = "") -> None:
@@ -37,16 +32,14 @@ def bench_fleet(folder: Path, only: str = "") -> None:
 
     Args:
         folder: where simulated captures, sessions and registries are kept.
-        only: one of the parts: sessions, workers, kills, broken, table, s3.
+        only: one of the parts: sessions, kills, broken, table.
     """
     folder = folder.resolve()
     parts = {
         "sessions": bench_sessions,
-        "workers": bench_workers,
         "kills": bench_kills,
         "broken": bench_broken,
         "table": bench_table,
-        "s3": bench_s3,
     }
     for name, part in parts.items():
         if only in ("", name):
@@ -121,25 +114,6 @@ def compare_with_truth(root: Path, registry: Path) -> None:
     print_row(
         len(truth), len(nudged), len(named & nudged), len(right), len(unchanged), len(named & unchanged)
     )
-
-
-def bench_workers(folder: Path) -> None:
-    """Two workers against one on the same sessions, and what is not the sessions' own work."""
-    root = few_sessions(folder)
-    print_head("workers", "sessions", "s", "s of a core", "of it in sessions", "rest", "load before")
-    took = {}
-    for workers in (1, 2):
-        registry = folder / f"registry-{workers}"
-        shutil.rmtree(registry, ignore_errors=True)
-        load = os.getloadavg()[0]
-        summary, took[workers], cpu_s = run_cli(root, registry, "--workers", str(workers))
-        in_sessions_s = sum(row["cpu_s"] for row in rows_of(registry))
-        rest = (cpu_s - in_sessions_s) / cpu_s
-        print_row(
-            workers, summary["n_run"], f"{took[workers]:.1f}", f"{cpu_s:.1f}", f"{in_sessions_s:.1f}",
-            f"{100 * rest:.1f} %", f"{load:.1f}",
-        )  # fmt: skip
-    print(f"\ntwo workers are {took[1] / took[2]:.2f} x as fast as one", flush=True)
 
 
 def bench_kills(folder: Path) -> None:
@@ -329,84 +303,3 @@ def _print_cost(what: str, *words: str) -> None:
     if status:
         raise RuntimeError(done.stderr)
     print_row(what, n, f"{took_s:.1f}", f"{cpu_s:.1f}", f"{peak_mb:.0f}")
-
-
-@contextlib.contextmanager
-def s3_server() -> Iterator[str]:
-    """Serve S3 on loopback, with a bucket `fleet`; the environment names it while the block lasts."""
-    from moto.server import ThreadedMotoServer
-    from s3fs import S3FileSystem
-
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    settings = {
-        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-        "AWS_ACCESS_KEY_ID": "test",
-        "AWS_SECRET_ACCESS_KEY": "test",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }
-    before = {name: os.environ.get(name) for name in settings}
-    os.environ |= settings
-    S3FileSystem.clear_instance_cache()  # an instance keeps the address that it was made with
-    try:
-        # Servers of one process share what they hold.
-        urlopen(Request(f"http://{host}:{port}/moto-api/reset", method="POST")).close()
-        S3FileSystem().mkdir("fleet")
-        yield "s3://fleet"
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
-        server.stop()
-
-
-def files_of(place: Storage) -> dict[str, bytes]:
-    """Read every file of a registry but the table, without the figures that differ between runs."""
-    files = {}
-    for name in place.files():
-        data = (place / name).read() or b""
-        if name.endswith("fleet.json"):
-            document = json.loads(data)
-            for row in document["rows"]:
-                for key in _OF_A_RUN:
-                    row.pop(key)
-            data = json.dumps(document).encode()
-        if name != TABLE:
-            files[name] = data
-    return files
-
-
-def bench_s3(folder: Path) -> None:
-    """The same sessions and registry on a disk and in an S3 server on loopback."""
-    root, registry = folder / "few", folder / "registry-2"
-    if not registry.exists():
-        run_cli(few_sessions(folder), registry, "--workers", "2")
-    from s3fs import S3FileSystem
-
-    with s3_server() as bucket:
-        store = Storage(bucket)
-        S3FileSystem().put(f"{root}/", "fleet/sessions", recursive=True)
-        summary, took_s, _ = run_cli(f"{bucket}/sessions", f"{bucket}/registry", "--workers", "2")
-        there, here = files_of(store / "registry"), files_of(Storage.at(registry))
-        columns = [name for name in SCHEMA.names if name not in _OF_A_RUN]
-        tables = [
-            table_bytes_of(Registry(place).read_table(columns))
-            for place in (store / "registry", Storage.at(registry))
-        ]
-    same = sum(there.get(name) == data for name, data in here.items())
-    print_head("sessions", "s", "files on the disk", "the same in S3", "more in S3", "tables")
-    equal = "the same" if tables[0] == tables[1] else "differ"
-    print_row(summary["n_run"], f"{took_s:.0f}", len(here), same, len(set(there) - set(here)), equal)
-
-
-def table_bytes_of(table: Any) -> bytes:
-    """Write some columns of a table as bytes that can be compared."""
-    import pyarrow as pa
-
-    buffer = pa.BufferOutputStream()
-    with pa.ipc.new_stream(buffer, table.schema) as writer:
-        writer.write_table(table.combine_chunks())
-    return bytes(buffer.getvalue())

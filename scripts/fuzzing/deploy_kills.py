@@ -25,6 +25,7 @@ from wire.sshd import NoServerError, Sshd
 from fuzzing.report import Report
 from fuzzing.started import PATIENCE_S, must_end_well, said, start
 from lce_rig.core.errors import TargetError
+from lce_rig.fleet.deploy.place import RECORD, USED
 from lce_rig.fleet.deploy.releases import content_of
 
 _N_CAPTURES = 8
@@ -264,13 +265,10 @@ def _named(found: Content) -> str:
 
 
 def _left(folder: Path) -> list[str]:
-    """List what a deployment that ended does not leave: drafts, and releases that never were current."""
-    found = [entry.name for entry in folder.glob(".*") if entry.name not in (".lock", ".pending")]
+    """List what a deployment that ended does not leave: releases that never were current."""
     current = (folder / "current").resolve().name
-    for release in (folder / "releases").iterdir():
-        if release.name != current and not (release / ".used").exists():
-            found.append(release.name)
-    return found
+    releases = [path.parent for path in folder.glob(f"releases/*/{RECORD}")]
+    return [path.name for path in releases if path.name != current and not (path / USED).exists()]
 
 
 def _deploy(session: Path, robot: _Robot, variant: int) -> "subprocess.Popen[bytes]":
@@ -282,7 +280,7 @@ def _wait_for_draft(robot: _Robot, process: "subprocess.Popen[bytes]") -> float 
     """Wait until new files appear at the target; gives when, None where the process ends first."""
     deadline_s = time.monotonic() + PATIENCE_S
     while process.poll() is None and time.monotonic() < deadline_s:
-        if any(robot.folder.glob(".new-*")):
+        if _left(robot.folder):
             return time.monotonic()
         time.sleep(0.001)
     return None

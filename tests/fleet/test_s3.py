@@ -1,14 +1,67 @@
 """Sessions and registry in an S3 store: the same results as on a disk, byte for byte."""
 
+import contextlib
+import json
+import logging
+import os
+from collections.abc import Iterator
+from urllib.request import Request, urlopen
+
 import pytest
-from benchmarks.fleet import files_of, s3_server
+from moto.server import ThreadedMotoServer
 from s3fs import S3FileSystem
 
 from lce_rig.cli.main import run
 from lce_rig.fleet.jobs import find_jobs
 from lce_rig.fleet.registry import Registry, write_rows
 from lce_rig.fleet.storage import Storage
+from lce_rig.fleet.table import TABLE
 from lce_rig.fleet.work import Settings, work
+
+
+@contextlib.contextmanager
+def s3_server() -> Iterator[str]:
+    """Serve S3 on loopback, with a bucket `fleet`; the environment names it while the block lasts."""
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    settings = {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ |= settings
+    S3FileSystem.clear_instance_cache()  # an instance keeps the address that it was made with
+    try:
+        # Servers of one process share what they hold.
+        urlopen(Request(f"http://{host}:{port}/moto-api/reset", method="POST")).close()
+        S3FileSystem().mkdir("fleet")
+        yield "s3://fleet"
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+        server.stop()
+
+
+def files_of(place: Storage) -> dict[str, bytes]:
+    """Read every file of a registry but the table, without the figures that differ between runs."""
+    files = {}
+    for name in place.files():
+        data = (place / name).read() or b""
+        if name.endswith("fleet.json"):
+            document = json.loads(data)
+            for row in document["rows"]:
+                for key in ("duration_s", "cpu_s", "peak_memory_mb", "finished", "source"):
+                    row.pop(key)
+            data = json.dumps(document).encode()
+        if name != TABLE:
+            files[name] = data
+    return files
 
 
 @pytest.fixture
