@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from lce_rig.pipeline.verification import Verification, verify
     from lce_rig.rig import Rig, load_rig
     from lce_rig.session import Session
-    from lce_rig.words import describe, recommend, sentence
 
 __all__ = [
     "CalibrateOptions",
@@ -75,16 +74,13 @@ __all__ = [
     "Verification",
     "calibrate",
     "collect_from",
-    "describe",
     "detect",
     "drift",
     "export",
     "load_rig",
     "read_reference",
     "read_result",
-    "recommend",
     "repeat",
-    "sentence",
     "verify",
 ]
 __version__ = "0.1.0"
@@ -113,7 +109,6 @@ _HOMES = {
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),
     "lce_rig.io.protocol": ("SourceOptions",),
-    "lce_rig.words": ("describe", "recommend", "sentence"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

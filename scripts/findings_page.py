@@ -4,9 +4,11 @@
 import string
 import sys
 from importlib import import_module
+from itertools import groupby
 from pathlib import Path
 
-from lce_rig.words.rendering import FAMILIES, Phrase, Template
+import lce_rig
+from lce_rig.core.findings import KINDS, Kind, Template
 
 PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
 HEAD = """# Findings
@@ -39,33 +41,30 @@ from results of earlier versions, which held words only.
 
 Exit codes are the same with and without `--json`.
 
-`scripts/findings_page.py` writes this page from the tables in `lce_rig/words/`.
+`scripts/findings_page.py` writes this page from the kinds in `lce_rig/ROOM/findings.py`.
 """
 
 
 def page() -> str:
     """Build the page."""
+    for path in sorted(Path(lce_rig.__file__).parent.glob("*/findings.py")):
+        import_module(f"lce_rig.{path.parent.name}.findings")
     parts = [HEAD]
-    for family in FAMILIES:
-        module = import_module(f"lce_rig.words.{family}")
-        title = (module.__doc__ or family).splitlines()[0].rstrip(".")
-        parts.append(f"## {title}\n| code | figures | text | action |\n|---|---|---|---|")
-        parts.extend(_row(code, phrase) for code, phrase in sorted(module.PHRASES.items()))
+    for family, codes in groupby(sorted(KINDS), key=lambda code: code.partition(".")[0]):
+        parts.append(f"## {family}\n| code | figures | text | action |\n|---|---|---|---|")
+        parts.extend(_row(KINDS[code]) for code in codes)
         parts.append("")
     return "\n".join(parts)
 
 
-def _row(code: str, phrase: Phrase) -> str:
-    actions = [
-        _said(phrase.action),
-        *(f"`{name}`: {_said(each)}" for name, each in (phrase.actions or {}).items()),
-    ]
-    templates = [phrase.text, phrase.action, *(phrase.actions or {}).values()]
+def _row(kind: Kind) -> str:
+    actions = [_shown(kind.action), *(f"`{name}`: {_shown(action)}" for name, action in kind.actions.items())]
+    templates = [kind.text, kind.action, *kind.actions.values()]
     names = dict.fromkeys(name for template in templates for name in _figures(template))
     cells = (
-        f"`{code}`",
+        f"`{kind.code}`",
         ", ".join(names),
-        _said(phrase.text),
+        _shown(kind.text),
         "<br>".join(action for action in actions if action),
     )
     return f"| {' | '.join(cell.replace('|', '/').replace(chr(10), '<br>') for cell in cells)} |"
@@ -77,7 +76,7 @@ def _figures(template: Template) -> list[str]:
     return [name for _, name, _, _ in string.Formatter().parse(text) if name and name != "subject"]
 
 
-def _said(template: Template) -> str:
+def _shown(template: Template) -> str:
     """Show a template with the names of its figures in place of their values."""
     text = template if isinstance(template, str) else (template.__doc__ or "").splitlines()[0].rstrip(".")
     return "".join(

@@ -20,12 +20,12 @@ def main(rig_name: str, folder: str, session_folder: str) -> None:
         print(np.array_str(pair.T_cam_lidar, precision=4, suppress_small=True))
         print(f"1 sigma: {pair.sigma_rotation_deg:.3f} deg, {1000 * pair.sigma_translation_m:.1f} mm")
         for finding in pair.findings:
-            print(f"  {lce.sentence(finding)}")
+            print(f"  {finding.sentence}")
         # A point 5 m ahead of the LiDAR, in the camera's frame: p_cam = R p_lidar + t.
         point_cam = pair.T_cam_lidar @ [5.0, 0.0, 0.0, 1.0]
         print(f"p_lidar (5, 0, 0) m is p_cam {np.round(point_cam[:3], 3)} m")
     for shortage in result.shortages:
-        print(f"{shortage.subject}: {lce.sentence(shortage)}")
+        print(f"{shortage.subject}: {shortage.sentence}")
     written = result.write()
     print(f"{len(written.files)} files in {written.files[0].parent}")
     overlays = lce.verify(session, result).write()

@@ -19,7 +19,7 @@ def main(first: str, second: str) -> None:
     result = lce.calibrate(lce.Session.open(first))
     verification = lce.verify(lce.Session.open(second), result)
     for check in verification.checks:
-        doubts = "; ".join(map(lce.describe, check.findings))
+        doubts = "; ".join(finding.text for finding in check.findings)
         print(f"{check.pair} on the captures of {second}: {doubts or 'no contradiction'}")
         for residual in check.residuals:
             plane_mm, edge_mm = 1000 * residual.plane_mean_m, 1000 * residual.edge_mean_m

@@ -11,7 +11,6 @@ and called with its figures: `TOO_DARK("camera", grey_99=12.0)` is a `Finding`,
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import Any, Literal, cast
 
 from lce_rig.core.phrasing import fill
@@ -25,12 +24,6 @@ _ORDER: tuple[Severity, ...] = ("note", "warning", "error")
 
 KINDS: dict[str, "Kind"] = {}
 """Every declared kind by its code, as far as its module is imported."""
-
-
-def _kind(code: str) -> "Kind":
-    if code not in KINDS:
-        import_module("lce_rig.words.rendering").phrases()
-    return KINDS[code]
 
 
 class Kind:
@@ -113,14 +106,14 @@ class Finding:
     @property
     def text(self) -> str:
         """The fact in words, without an action."""
-        return self.stored[0] if self.stored else self._render(_kind(self.code).text)
+        return self.stored[0] if self.stored else self._render(KINDS[self.code].text)
 
     @property
     def advice(self) -> str:
         """The action in words; "" for none."""
         if self.stored:
             return self.stored[1]
-        kind = _kind(self.code)
+        kind = KINDS[self.code]
         return self._render(kind.actions[self.action] if self.action else kind.action)
 
     @property

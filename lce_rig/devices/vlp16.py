@@ -22,7 +22,6 @@ from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.velodyne.driver_controls import read_controls
 from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings
-from lce_rig.words import describe
 
 SILENCE_S = 2.0
 # Half a second of scans: whoever is slower wants the newest.
@@ -146,7 +145,7 @@ def explain_silence(
         )
     flaws = stream.flaws()
     if flaws:
-        bad = ", ".join(describe(flaw) for flaw in flaws[:_MAX_SHOWN])
+        bad = ", ".join(flaw.text for flaw in flaws[:_MAX_SHOWN])
         return SourceError(f"{what}: only {bad}", "Check which program sends to this port.")
     if reception.strangers:
         there = ", ".join(sorted(reception.strangers))

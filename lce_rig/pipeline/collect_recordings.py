@@ -12,7 +12,6 @@ from lce_rig.io.protocol import Recording, SourceOptions
 from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.words import describe
 
 Source = Path | str | Recording
 
@@ -59,7 +58,7 @@ def collect_from(
         refused.update(report.counts)
         for refusal in report.refused.values():
             refused.add(refusal)
-        causes = "\n".join(f"{n} x {describe(why)}" for why, n in refused.counts()[:3])
+        causes = "\n".join(f"{n} x {why.text}" for why, n in refused.counts()[:3])
         raise NotEnoughDataError(f"{session}: no capture could be made", causes)
     return filled
 

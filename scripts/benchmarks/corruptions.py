@@ -17,7 +17,6 @@ from lce_rig.detect.detection import Detections
 from lce_rig.judge.weighing import Verdict
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig
-from lce_rig.words import sentence
 
 METHODS: tuple[Method, ...] = ("paper", "ml")
 _SIMULATED = ("rlfs", "rles")
@@ -179,7 +178,7 @@ def _judge(
         method,
         kind.unobservable,
         calibration.verdict,
-        sentence(calibration.findings[0]) if calibration.findings else "",
+        calibration.findings[0].sentence if calibration.findings else "",
         (error_deg, error_mm),
         (sigma_deg, sigma_mm),
         max(error_deg / sigma_deg, error_mm / sigma_mm),

@@ -19,7 +19,6 @@ from wire.vlp16_packets import Vlp16Clock
 
 from lce_rig.core.findings import Finding
 from lce_rig.rig import dump_rig
-from lce_rig.words import sentence
 from tests.doctor.attached import Attached, attach, picture_of, scan_of
 from tests.doctor.observed import make_rig
 
@@ -129,7 +128,7 @@ def test_words_decide_nothing(lce_rig, tmp_path, is_attached, request):
         said = judged(lce_rig, path, n_lines)
         request.getfixturevalue("mute")
         code = "clock.missing"
-        assert sentence(Finding(code)) == f"{code}: {code}"
+        assert Finding(code).sentence == f"{code}: {code}"
         assert judged(lce_rig, path, n_lines) == said
     assert said[0] == 5 and said[1]["lidar", "PPS" if is_attached else "device"][0] == "error"
 

@@ -1,8 +1,14 @@
+import re
+from collections import Counter
+from pathlib import Path
+
 import pytest
 
+import lce_rig
 from lce_rig.core.findings import Finding, Kind, ranked, worst
 from lce_rig.core.phrasing import figures_apart
 
+PACKAGE = Path(lce_rig.__file__).parent
 RINGS = Kind("t.rings", "{n} rings at {distance_m:.1f} m", "come {closer_m:1cm} closer")
 RMS = Kind("t.rms", lambda finding: f"rms of {finding.subject}", actions={"hold": "hold it still"})
 LIMIT = Kind(
@@ -60,3 +66,13 @@ def test_the_worst_finding_decides_and_order_is_kept_otherwise() -> None:
 def test_a_figure_asked_for_as_a_number_must_be_one() -> None:
     with pytest.raises(TypeError):
         Finding("a", figures={"axis": "x"}).figure("axis")
+
+
+def test_every_declared_kind_is_made_somewhere() -> None:
+    sources = {path: path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
+    declared = [
+        name for text in sources.values() for name in re.findall(r"^(\w+) = Kind\(", text, re.MULTILINE)
+    ]
+    assert len(declared) > 200
+    words = Counter(word for text in sources.values() for word in re.findall(r"\w+", text))
+    assert [name for name in declared if words[name] < 2] == []

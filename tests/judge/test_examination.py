@@ -13,7 +13,6 @@ from lce_rig.judge.nuisances import estimate_nuisances, nuisance_findings
 from lce_rig.judge.split_consistency import contrast_halves, find_groups, split_findings
 from lce_rig.judge.validate import resample, validate, widening
 from lce_rig.rig import CalibrationSettings, VerdictSettings, load_rig
-from lce_rig.words import describe
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
 RIG = load_rig("rlfs")
@@ -135,7 +134,7 @@ def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest():
     (finding,) = split_findings(found, [seen.capture for seen in nudged], TARGET, LIMITS)
     assert finding.code == "verdict.two_groups"
     assert finding.figures["captures"] == tuple(f"{k:06d}" for k in away)
-    assert "5 captures (000001, 000004, 000005, 000009, 000013) fit" in describe(finding)
+    assert "5 captures (000001, 000004, 000005, 000009, 000013) fit" in finding.text
     assert finding.figures["rotation_deg"] == pytest.approx(1.0, abs=0.3)
 
 

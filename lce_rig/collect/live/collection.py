@@ -39,7 +39,6 @@ from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock, pair_times
 from lce_rig.timing.scan_pairing import Frame
-from lce_rig.words import describe, sentence
 
 # The board searched for in a process of its own, while this one reads sensors.
 
@@ -156,7 +155,7 @@ def collect_live(
             report = loop.close_books()
     if recorded is not None:
         report.n_recorded, report.recording_error = recorded.n_written, recorded.failure
-        report.notes += [sentence(each) for each in recorded.findings()]
+        report.notes += [each.sentence for each in recorded.findings()]
     return report
 
 
@@ -267,7 +266,7 @@ class _Loop:
         report.predicted = [found for guide in self._guides if (found := guide.predict()) is not None]
         ties = self._clock.problems() + self._clock.account()
         report.notes += self._keeper.notes() + self._learning.notes()
-        report.notes += [f"{each.subject}: {sentence(each)}" for each in ties]
+        report.notes += [f"{each.subject}: {each.sentence}" for each in ties]
         self._session.journal(
             "collected live",
             ending=report.ending,
@@ -313,7 +312,7 @@ class _Loop:
                 self._capture(confirmed)
                 return Narration("saving", "captured")
             refusal = confirmed
-        self._monitor.cue("refused", f"not captured: {describe(refusal)}")
+        self._monitor.cue("refused", f"not captured: {refusal.text}")
         guide.note_refusal(present)
         guide.plan(present, _time_s(detection))
         return narrate_refused(guide, present, refusal)
@@ -384,7 +383,7 @@ class _Loop:
         if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
         else:
-            self._monitor.cue("refused", f"not captured: {sentence(confirmed)}")
+            self._monitor.cue("refused", f"not captured: {confirmed.sentence}")
 
     def _is_repeated(self, detection: BoardDetection) -> bool:
         """Check whether a board stands where the last capture has it, or was there within the hold."""
@@ -444,7 +443,7 @@ class _Loop:
         if not lacking:
             return ""
         most = max(lacking, key=lambda why: why.figures.get("n_more") or 0)
-        return (f"{most.subject}: " if len(self._guides) > 1 else "") + sentence(most)
+        return (f"{most.subject}: " if len(self._guides) > 1 else "") + most.sentence
 
     def _active_guide(self, detection: BoardDetection) -> Guide:
         """Choose whose words are said: of the guides whose camera sees the board that of fewest captures.

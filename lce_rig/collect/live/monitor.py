@@ -15,7 +15,6 @@ from lce_rig.devices.protocol import SourceStatus
 from lce_rig.devices.reading import AttachedSensors
 from lce_rig.session import Session
 from lce_rig.timing.rig_clock import RigClock
-from lce_rig.words import enumerated, sentence
 
 _EVERY_S = 0.5
 _N_CUES, _N_LOG = 8, 40
@@ -225,7 +224,7 @@ class Monitor:
         board = detection.images.get((camera, channel))
         if board is None or (camera, channel) in detection.unfit:
             why = self.reasons.get(name)
-            reason = self._trouble(camera) or (sentence(why) if why else "no board")
+            reason = self._trouble(camera) or (why.sentence if why else "no board")
             return StreamState(name, rate_hz, n_lost, False, reason)
         return StreamState(name, rate_hz, n_lost, True, self._trouble(camera), image_figures(board))
 
@@ -236,7 +235,7 @@ class Monitor:
         boards = detection.lidars.get(lidar)
         if not boards:
             why = self.reasons.get(lidar)
-            reason = self._trouble(lidar) or (sentence(why) if why else "no board")
+            reason = self._trouble(lidar) or (why.sentence if why else "no board")
             return StreamState(lidar, status.rate_hz, n_lost, False, reason)
         return StreamState(lidar, status.rate_hz, n_lost, True, self._trouble(lidar), scan_figures(boards[0]))
 
@@ -247,13 +246,16 @@ class Monitor:
 
     def _notes(self) -> tuple[str, ...]:
         verdict = self._clock.verdict()
-        notes = [enumerated(verdict.finding, verdict.reasons)] if verdict.requires_still_boards else []
-        notes += [f"{each.subject}: {sentence(each)}" for each in self._clock.problems()]
+        notes = []
+        if verdict.requires_still_boards:
+            reasons = "; ".join(reason.sentence for reason in verdict.reasons)
+            notes.append(f"{verdict.finding.text}: {reasons}")
+        notes += [f"{each.subject}: {each.sentence}" for each in self._clock.problems()]
         named: dict[str, list[str]] = {}
         for name, status in self._statuses.items():
             for problem in status.problems:
-                named.setdefault(sentence(problem), []).append(name)
+                named.setdefault(problem.sentence, []).append(name)
         notes += [f"{', '.join(names)}: {problem}" for problem, names in named.items()]
         if self._guide is not None and self._guide.problem:
-            notes.append(sentence(self._guide.problem))
+            notes.append(self._guide.problem.sentence)
         return tuple(notes)

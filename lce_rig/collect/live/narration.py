@@ -10,7 +10,6 @@ from lce_rig.collect.live.state import Phase
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
-from lce_rig.words import describe, recommend, sentence
 
 _HOLD = "hold still"
 _SHOW = "show the board to the camera"
@@ -43,14 +42,14 @@ def narrate_unseen(detection: BoardDetection, guide: Guide, reasons: dict[str, R
         why = reasons.get(stream_name(guide.key))
         # An image without a board hardly tells why; one with half a board does.
         headline = f"show the board to {guide.key[0]}" if detection.images else _SHOW
-        return Narration("searching", headline, sentence(why) if why else "")
+        return Narration("searching", headline, why.sentence if why else "")
     if guide.key in detection.unfit:
         why = detection.unfit[guide.key]
-        headline = _next(guide, detection.images[guide.key].T_cam_board, recommend(why))
-        return Narration("moving", headline, f"cannot be used here: {describe(why)}")
+        headline = _next(guide, detection.images[guide.key].T_cam_board, why.advice)
+        return Narration("moving", headline, f"cannot be used here: {why.text}")
     why = reasons.get(guide.lidar)
-    headline = recommend(why) if why else "the LiDAR does not see the board"
-    return Narration("searching", headline, f"{guide.lidar}: {describe(why)}" if why else "")
+    headline = why.advice if why else "the LiDAR does not see the board"
+    return Narration("searching", headline, f"{guide.lidar}: {why.text}" if why else "")
 
 
 def narrate_still(
@@ -74,14 +73,14 @@ def narrate_still(
 
 def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration:
     """Say why a board is not captured where it is, and where it goes instead."""
-    return Narration("refused", _next(guide, present, recommend(refusal)), f"not here: {describe(refusal)}")
+    return Narration("refused", _next(guide, present, refusal.advice), f"not here: {refusal.text}")
 
 
 def narrate_moving(guide: Guide, present: Array, judged: CaptureMoment | Refusal | None) -> Narration:
     """Say where a board goes that has to move slowly to be captured."""
     headline = _next(guide, present, f"move it slowly, about {100 * BEST_SPEED_MPS:.0f} cm/s")
     if isinstance(judged, Refusal):
-        return Narration("moving", headline, sentence(judged))
+        return Narration("moving", headline, judged.sentence)
     if isinstance(judged, CaptureMoment) and guide.is_there(present):
         return Narration("holding", "good: go on slowly", f"{judged.figures['speed_mps']:.2f} m/s")
     return Narration("moving", headline, _problem(guide))
@@ -104,7 +103,7 @@ def scan_figures(board: LidarBoard) -> str:
 
 def _problem(guide: Guide) -> str:
     """Say why there is no guidance; "" while there is."""
-    return sentence(guide.problem) if guide.problem else ""
+    return guide.problem.sentence if guide.problem else ""
 
 
 def _next(guide: Guide, present: Array, otherwise: str) -> str:

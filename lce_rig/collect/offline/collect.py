@@ -29,7 +29,6 @@ from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time
-from lce_rig.words import describe
 
 # The moments of a recording that are worth a capture.
 
@@ -299,7 +298,7 @@ class _Collector:
             resumed=report.n_resumed,
             rejected=report.n_rejected,
             duplicates=report.duplicates,
-            refused={label: describe(refusal) for label, refusal in report.refused.items()},
+            refused={label: refusal.text for label, refusal in report.refused.items()},
             counts=report.counts.by_code(),
             errors=[error.what for error in report.errors],
         )

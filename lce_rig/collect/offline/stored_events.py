@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 from lce_rig.detect.events.event_limits import look_for_flicker
 from lce_rig.timing.event_buffer import BEFORE_NS, EventCut
-from lce_rig.words import sentence
 
 
 @dataclass
@@ -26,7 +25,7 @@ class StoredEvents:
                 self._shortest_ns[cut.sensor] = min(before_ns, self._shortest_ns.get(cut.sensor, before_ns))
             lamps = look_for_flicker(cut.events)
             if lamps is not None:
-                self._lamps[cut.sensor, sentence(lamps)] += 1
+                self._lamps[cut.sensor, lamps.sentence] += 1
 
     def notes(self) -> list[str]:
         """Say how many captures have less than 1.2 s of events before their scan, and which lamps flicker."""

@@ -11,7 +11,6 @@ from lce_rig.core.data import MAX_TIME_NS, EventColumns, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.core.losses import Losses
-from lce_rig.words import sentence
 
 NS_PER_US = 1000
 MAX_EVENT_PIXELS = 1 << 22
@@ -48,7 +47,7 @@ def damage(code: str, where: str = "") -> Finding:
 
 def worded(losses: Losses) -> list[str]:
     """List the losses, a line each."""
-    return [sentence(finding) for finding in losses.findings()]
+    return [finding.sentence for finding in losses.findings()]
 
 
 class EventStream(Protocol):
