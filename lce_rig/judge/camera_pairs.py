@@ -17,10 +17,9 @@ from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
-from lce_rig.judge.findings import CAMERAS_DIFFER, CAMERAS_SCATTER, failing
+from lce_rig.judge.findings import CAMERAS_DIFFER, CAMERAS_SCATTER, SURPRISING_CHI2, failing
 from lce_rig.judge.relative_pose import mean_pose, relative_covariance, relative_pose
 from lce_rig.judge.split_consistency import contrast_halves, split_findings
-from lce_rig.judge.weighing import SURPRISING_CHI2
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 
 # Fewer placements do not determine the scatter.

@@ -20,11 +20,10 @@ from lce_rig.core.calibration import Contribution
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes, tangent_sizes
-from lce_rig.judge.findings import KNOWN_BETTER, LARGEST_CAUSE
+from lce_rig.judge.findings import KNOWN_BETTER, LARGEST_CAUSE, SURPRISING_CHI2
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck
 from lce_rig.judge.nuisances import Nuisances
 from lce_rig.judge.split_consistency import Contrast, objections
-from lce_rig.judge.weighing import SURPRISING_CHI2
 from lce_rig.rig import CalibrationSettings, VerdictSettings
 
 # A lens differs significantly below this probability, scales beyond this many standard deviations.

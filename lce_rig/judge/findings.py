@@ -1,11 +1,17 @@
 """Kinds of findings against extrinsics and intrinsics: reasons and notes of a verdict."""
 
 import math
+from collections.abc import Iterable, Mapping
+from typing import Literal
 
 from lce_rig.core.calibration import WeakestMotion
-from lce_rig.core.findings import Finding, Kind, Severity
+from lce_rig.core.findings import Finding, Kind, Severity, worst
 from lce_rig.core.phrasing import as_line, figures_apart, fill
 
+Verdict = Literal["pass", "marginal", "fail"]
+SURPRISING_CHI2 = 16.81
+"""99 % of the chi-squared distribution with six degrees of freedom: differences beyond it are significant."""
+_VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}
 _APART = "{rotation_deg:deg}, {translation_m:mm}"
 _LENS = "check that the intrinsics belong to this lens and that the board is flat"
 _NEAR = {"near": "check the squares' size and the focal length, and that the board is flat"}
@@ -54,6 +60,11 @@ _CONTRADICTIONS = {
 }
 _LEAST_ROTATION = "{weakest:motion}, sigma {weakest_sigma_deg:3deg}"
 _LEAST_TRANSLATION = "{weakest:motion}, sigma {weakest_sigma_m:1mm}"
+
+
+def verdict_of(findings: Iterable[Finding]) -> Verdict:
+    """Return the verdict that results from findings."""
+    return _VERDICTS[worst(findings)]
 
 
 def failing(is_fail: bool) -> Severity:

@@ -21,9 +21,9 @@ from lce_rig.judge.findings import (
     INTRINSICS_BETTER,
     INTRINSICS_FIT,
     INTRINSICS_UNDETERMINED,
+    Verdict,
     failing,
 )
-from lce_rig.judge.weighing import Verdict
 from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
 from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses, lens_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate

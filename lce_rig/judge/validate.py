@@ -1,7 +1,7 @@
 """Checks of a result on its own captures, before the verdict.
 
 A covariance is compared with the scatter of its own cost. Subsets of captures, the negative control and the
-nuisance parameters are judged by another one (`calibrate/local_quadratic.py`), on purpose: the likelihood
+nuisance parameters are judged by another one (`local_quadratic.py`), on purpose: the likelihood
 gives contradicting captures less weight, and so hides them from a check by its own cost. By that cost, two
 groups of captures that disagree by 1.1 and 1.2 deg (acfr_vlp16, os1_64) are not found; acfr_vlp16, 1.0 deg
 and 51 mm from its reference, would be reported to 0.22 deg and 10 mm instead of 0.59 deg and 24 mm.

@@ -31,15 +31,17 @@ from lce_rig.judge.findings import (
     SCENE_UNKNOWN,
     SCENE_USED,
     SENSORS_DISAGREE,
+    SURPRISING_CHI2,
     TRANSLATION_UNCERTAIN,
+    Verdict,
     failing,
+    verdict_of,
 )
 from lce_rig.judge.intrinsics_check import lens_findings
 from lce_rig.judge.negative_control import control_findings
 from lce_rig.judge.nuisances import nuisance_findings
 from lce_rig.judge.split_consistency import split_findings
 from lce_rig.judge.validate import Validation
-from lce_rig.judge.weighing import SURPRISING_CHI2, Verdict, verdict_of
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
 # A side of the plate counts as measured below this standard deviation; 5 % of it exceeds the beam's spot.

@@ -16,7 +16,7 @@ from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.phrasing import as_line
 from lce_rig.export.camera_info import camera_info_text
 from lce_rig.export.files import number, numbers
-from lce_rig.judge.weighing import verdict_of
+from lce_rig.judge.findings import verdict_of
 from lce_rig.lens.difference import lens_errors
 from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_earlier

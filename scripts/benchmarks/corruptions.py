@@ -14,7 +14,7 @@ from lce_rig.core.calibration import Calibration, Method
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array
 from lce_rig.detect.detection import Detections
-from lce_rig.judge.weighing import Verdict
+from lce_rig.judge.findings import Verdict
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig
 
