@@ -49,7 +49,7 @@ def _write(job: ExportJob, name: str, *, is_split: bool) -> list[Path]:
         clouds = {}
         for capture in job.session.captures:
             channels = [channel for camera, channel in capture.image_keys if camera == calibration.camera]
-            channels.sort(key=lambda channel, c=calibration: channel not in c.channels)  # type: ignore[misc]
+            channels.sort(key=calibration.channels.__contains__, reverse=True)
             if channels and calibration.lidar in capture.lidars:
                 image, scan = capture.image(calibration.camera, channels[0]), capture.scan(calibration.lidar)
                 clouds[capture.name] = coloured(image, scan, calibration, job, int(capture.name))

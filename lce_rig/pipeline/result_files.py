@@ -13,7 +13,6 @@ from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, U
 from lce_rig.core.findings import Finding
 from lce_rig.core.limits import read_file
 from lce_rig.export import export_formats, is_export, remove_exports
-from lce_rig.pipeline.report_file import REPORT, report_text
 from lce_rig.session import Session
 from lce_rig.session.capture import SAFE_NAME
 from lce_rig.session.capture_files import MANIFEST
@@ -22,7 +21,7 @@ from lce_rig.session.provenance import provenance_of
 from lce_rig.session.replacing import check_folder, copy_over
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
 
-RESULT, OVERLAYS, PREVIOUS = "result.json", "overlays", "previous"
+RESULT, REPORT, OVERLAYS, PREVIOUS = "result.json", "report.html", "overlays", "previous"
 UNION = "union"
 """How the result of several sessions is called in the first of them, unless it is named."""
 CURRENT = "current"
@@ -183,6 +182,8 @@ class Result:
         Returns:
             The files' names without the report's, and what exports lack.
         """
+        from lce_rig.show.report.calibration_page import report_text
+
         file = self.file()
         text = file.text()
         write_atomically(folder / RESULT, text)

@@ -1,18 +1,23 @@
 """The report of a calibration: its verdict, its effect on a point, and the evidence, on one page."""
 
+import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
-from lce_rig.core.calibration import Calibration
+from lce_rig.core.board import Board
+from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
 from lce_rig.core.phrasing import as_line
+from lce_rig.detect.detection import Pair
 from lce_rig.export.rotations import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words, weakest_words
 from lce_rig.rig import Rig
+from lce_rig.session import Session
 from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.drawing import style
 from lce_rig.show.report.evidence import Evidence, gather
@@ -27,6 +32,48 @@ _AXES = {"x": "x right", "y": "y down", "z": "z forward"}
 _LENS_CODES = ("verdict.intrinsics", "verdict.known_better", "verdict.scale")
 # The statement names the expected error at this distance.
 _USUAL_M = 10.0
+
+
+def report_text(
+    session: Session, sessions: Mapping[str, Session], file: ResultFile, text: str, overlays: str
+) -> str:
+    """Write the report of a result; the same result gives the same bytes.
+
+    Args:
+        session: whose result it is.
+        sessions: of an estimate from several, by name, `session` first.
+        file: the result; text: the same as it is written.
+        overlays: the folder of overlays beside the report.
+    """
+    n_pairs = sum(len(c.channels) for c in file.pairs)
+
+    def paths(c: Calibration, capture: str) -> list[str]:
+        """Name a capture's overlays as `verify` of the session does."""
+        name = capture.rpartition("/")[2]
+        if sessions and capture != f"{next(iter(sessions))}/{name}":
+            return []
+        held = session.capture(name)
+        paths = []
+        for channel in c.channels:
+            if held.has_image(c.camera, channel) or (channel == "events" and c.camera in held.event_cameras):
+                folder = f"{Pair(c.camera, channel, c.lidar).folder_name}/" if n_pairs > 1 else ""
+                paths.append(f"{overlays}/{folder}{name}.png")
+        return paths
+
+    origin = file.provenance
+    facts = [
+        ("rig", file.rig),
+        ("robot", origin.robot),
+        ("date of the captures", origin.date),
+        *((f"serial number of {name}", serial) for name, serial in sorted(origin.serials.items())),
+        ("sessions", ", ".join(file.sessions)),
+        ("method", ", ".join(dict.fromkeys(c.method for c in file.pairs))),
+        ("made by", file.made_by),
+        ("SHA-256 of the session", origin.session_sha256),
+        ("SHA-256 of result.json", hashlib.sha256(text.encode()).hexdigest()),
+    ]
+    facts = [(name, value) for name, value in facts if value]
+    return calibration_page(session.rig, file.pairs, facts=facts, overlays=paths)
 
 
 def calibration_page(
@@ -72,27 +119,6 @@ def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str
                 "overlays": overlays(c, residual.capture),
             }
         )
-    links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}
-    drawn = {
-        "rotation": drawings.draw_ellipsoid(
-            np.degrees(np.degrees(c.cov[3:, 3:])), "deg", "Uncertainty of the rotation"
-        ),
-        "translation": drawings.draw_ellipsoid(1e6 * c.cov[:3, :3], "mm", "Uncertainty of the translation"),
-        "by_distance": drawings.draw_by_distance(c, lens),
-    }
-    if c.contributions:
-        drawn["causes"] = drawings.draw_causes(c)
-    if evidence is not None:
-        drawn |= {
-            "in_image": drawings.draw_in_image(evidence, board, lens, links),
-            "from_above": drawings.draw_from_above(c, evidence, board, lens, links),
-            "ranges": drawings.draw_ranges_and_angles(evidence, links),
-            "by_capture": drawings.draw_by_capture(c, links),
-            "by_ring": drawings.draw_by_ring(evidence),
-            "by_range": drawings.draw_by_range(evidence, links),
-            "by_place": drawings.draw_by_place(evidence, lens),
-            "corners": drawings.draw_corners(evidence, lens),
-        }
     return {
         "calibration": c,
         "anchor": anchor,
@@ -125,8 +151,36 @@ def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str
         "scene": _scene_rows(c),
         "cameras": _camera_rows(c),
         "refused": [(name, why.stage, as_markup(why.sentence)) for name, why in c.captures_refused.items()],
-        "drawings": drawn,
+        "drawings": _drawings(c, board, lens, evidence, anchor),
     }
+
+
+def _drawings(
+    c: Calibration, board: Board, lens: Intrinsics, evidence: Evidence | None, anchor: str
+) -> dict[str, Markup]:
+    """Draw a result; without its boards its uncertainty alone."""
+    drawn = {
+        "rotation": drawings.draw_ellipsoid(
+            np.degrees(np.degrees(c.cov[3:, 3:])), "deg", "Uncertainty of the rotation"
+        ),
+        "translation": drawings.draw_ellipsoid(1e6 * c.cov[:3, :3], "mm", "Uncertainty of the translation"),
+        "by_distance": drawings.draw_by_distance(c, lens),
+    }
+    if c.contributions:
+        drawn["causes"] = drawings.draw_causes(c)
+    if evidence is not None:
+        links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}
+        drawn |= {
+            "in_image": drawings.draw_in_image(evidence, board, lens, links),
+            "from_above": drawings.draw_from_above(c, evidence, board, lens, links),
+            "ranges": drawings.draw_ranges_and_angles(evidence, links),
+            "by_capture": drawings.draw_by_capture(c, links),
+            "by_ring": drawings.draw_by_ring(evidence),
+            "by_range": drawings.draw_by_range(evidence, links),
+            "by_place": drawings.draw_by_place(evidence, lens),
+            "corners": drawings.draw_corners(evidence, lens),
+        }
+    return drawn
 
 
 def _statement(c: Calibration) -> str:
