@@ -13,9 +13,6 @@ points; `differentiate` gives their derivatives by the tangent of (R, t). Algori
 validation, the estimate of time offsets and the guidance take them from here.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,8 +29,6 @@ BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
 BLENDS = 1
 """Column of `describe_background` that tells whether the background's echo blends into the board's."""
-# Errors of a board's plane and of its ring ends are at least as large as this.
-_PLANE_FLOOR_M, _END_FLOOR_M = 0.001, 0.002
 
 
 def residual_rows(normals: Array, anchors: Array, points: Array, nuisances: Array | None = None) -> Array:
@@ -117,18 +112,6 @@ def ends_on_board(f: CaptureFeatures, T_cam_lidar: Array) -> Array:
     return transform(f.T_board_cam @ T_cam_lidar, f.edge_points)
 
 
-def plane_rows(f: CaptureFeatures, T_cam_lidar: Array, points: Array) -> tuple[Array, Array]:
-    """Linearise (1) for points (N, 3) of a capture.
-
-    Returns:
-        Values (N,), and derivatives (N, 7) by the tangent (6) and by s, which shrinks the camera's distances
-        to (1 - s) g.
-    """
-    by_scale = np.full((len(points), 1), -f.normal @ f.centre)
-    by_tangent = differentiate(f.normal, points @ T_cam_lidar[:3, :3].T)
-    return plane_residuals(f, T_cam_lidar, points), np.hstack([by_tangent, by_scale])
-
-
 def end_rows(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple[Array, Array]:
     """Linearise (2) for a capture's ring ends.
 
@@ -166,38 +149,3 @@ def freedoms_of_plane() -> Array:
     """
     at = -differentiate(np.array([0.0, 0.0, 1.0]), np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
     return np.asarray(at - np.array([[0.0], [1], [1]]) * at[0])
-
-
-@dataclass(frozen=True)
-class FeatureSigmas:
-    """Standard deviations for the weights of planes and ring ends, from their distances.
-
-    Attributes:
-        plane_m: of a capture's plane, rms over the board.
-        end_m: of a ring end.
-    """
-
-    plane_m: float
-    end_m: float
-
-
-def feature_sigmas(features: Sequence[CaptureFeatures], board: Board, T_cam_lidar: Array) -> FeatureSigmas:
-    """Return the typical errors of captures' planes and ring ends under extrinsics (4, 4)."""
-    planes_m = [np.sqrt(np.mean(plane_residuals(f, T_cam_lidar) ** 2)) for f in features]
-    inside_m = np.concatenate([end_residuals(f, T_cam_lidar, board)[0] for f in features])
-    # Ring ends reach beyond the plate by the beam's width, which is no error.
-    end_m = 1.4826 * float(np.median(np.abs(inside_m - np.median(inside_m))))
-    return FeatureSigmas(max(float(np.median(planes_m)), _PLANE_FLOOR_M), max(end_m, _END_FLOOR_M))
-
-
-def capture_costs(f: CaptureFeatures, board: Board, T_cam_lidar: Array, sigmas: FeatureSigmas) -> Array:
-    """Sum the squares of a capture's residuals under extrinsics (B, 4, 4): (B,).
-
-    The mean square over the plane's points counts `PLANE_FREEDOMS` / sigma^2, each ring end 1 / sigma^2 after
-    their mean is subtracted: they reach beyond the plate by the beam's width, alike on all sides.
-    """
-    plane_m = plane_residuals(f, T_cam_lidar)
-    inside_m, _ = end_residuals(f, T_cam_lidar, board)
-    own_m = inside_m - inside_m.mean(axis=1, keepdims=True) if inside_m.shape[1] else inside_m
-    by_plane = PLANE_FREEDOMS * np.mean(plane_m**2, axis=1) / sigmas.plane_m**2
-    return np.asarray(by_plane + np.sum(own_m**2, axis=1) / sigmas.end_m**2)

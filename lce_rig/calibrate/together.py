@@ -1,6 +1,6 @@
 """Several cameras that share scans of one LiDAR, estimated as one: they share board poses and its errors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,7 +68,11 @@ def calibrate_together(
     usual = known[0][1]
     priors = replace(known[0][0], scale=tuple(float(np.ravel(each.scale)[0]) for each, _ in known))
     T_start = [start.T_cam_lidar for start in starts]
-    joint = maximise_likelihood(labelled, board, T_start, priors, usual, pose_ratios=_pose_ratios(starts))
+    # Pose errors of the cameras' images, as each alone estimates them, compared with their geometric mean.
+    figures = [start.diagnostics for start in starts]
+    logs = np.log([[d.noise_tilt_deg, d.noise_spin_deg, d.noise_depth_m, d.noise_across_m] for d in figures])
+    ratios = [PoseLevels(*of_camera) for of_camera in np.exp(logs - logs.mean(axis=0)).tolist()]
+    joint = maximise_likelihood(labelled, board, T_start, priors, usual, pose_ratios=ratios)
     order = {name: k for k, name in enumerate(sorted({o.capture for own in labelled for o in own}))}
     placement = group_shared_placements(labelled, order)
     J = joint.to_extrinsics.reshape(-1, joint.to_extrinsics.shape[2])
@@ -78,9 +82,9 @@ def calibrate_together(
         n_seen = len(np.unique(placement[[order[o.capture] for o in labelled[k]]]))
         cov, inflation = inflate(joint, placement, k, n_seen)
         scales.append(np.full(6, np.sqrt(inflation)))
-        figures = add_figures(start.diagnostics, joint, k, inflation)
+        with_noise = add_figures(start.diagnostics, joint, k, inflation)
         estimates[name] = replace(
-            report(start, joint.T_cam_lidar[k], cov, board, figures),
+            report(start, joint.T_cam_lidar[k], cov, board, with_noise),
             method=own.method,
             lidar=lidar_of(joint),
             sensitivities=own.sensitivities,
@@ -120,11 +124,3 @@ def _conflicts(alone: Mapping[str, CalibrationEstimate]) -> dict[str, Refusal]:
                 if held != key:
                     conflicts[capture] = TWO_PLACES.refusal(first=other, second=camera)
     return conflicts
-
-
-def _pose_ratios(starts: Sequence[Start]) -> list[PoseLevels]:
-    """Compare cameras' pose errors, as each alone estimates them, with their geometric mean."""
-    figures = [start.diagnostics for start in starts]
-    logs = np.log([[d.noise_tilt_deg, d.noise_spin_deg, d.noise_depth_m, d.noise_across_m] for d in figures])
-    ratios = np.exp(logs - logs.mean(axis=0))
-    return [PoseLevels(*of_camera) for of_camera in ratios.tolist()]

@@ -6,6 +6,7 @@ disagreement between captures.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,10 @@ from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.plane_and_ends import (
     EDGE_SHIFT_SIGMA_M,
     PLANE_FREEDOMS,
+    differentiate,
+    end_residuals,
     end_rows,
-    feature_sigmas,
-    plane_rows,
+    plane_residuals,
 )
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.board import Board
@@ -28,6 +30,8 @@ SHIFT, FIRST_RING, SCALE = 6, 7, -1
 """Indices in the x of `expand`, after the tangent (translation m, rotation rad): edge shift m, range offset m
 of each ring, and last the camera's scale."""
 
+# Errors of a board's plane and of its ring ends are at least as large as this.
+_PLANE_FLOOR_M, _END_FLOOR_M = 0.001, 0.002
 # Minimum range error of lasers, if a profile states none.
 _RANGE_FLOOR_M = 0.0005
 
@@ -73,14 +77,17 @@ def expand(
 def _plane_rows(
     f: CaptureFeatures, T: Array, lidar: LidarBoard, rings: NDArray[np.int16]
 ) -> tuple[Array, Array]:
-    """Linearise the plane's residual for points as measured, their rays b too long: values, derivatives."""
+    """Linearise the plane's residual for points as measured: values, derivatives by the x of `expand`.
+
+    A ring's rays are its offset too long; the scale s shrinks the camera's distances to (1 - s) g.
+    """
     points = np.asarray(lidar.points, dtype=np.float64)
-    values, by_plane = plane_rows(f, T, points)
     J = np.zeros((len(points), FIRST_RING + len(rings) + 1))
-    J[:, [*range(SHIFT), SCALE]] = by_plane
+    J[:, :SHIFT] = differentiate(f.normal, points @ T[:3, :3].T)
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
     J[np.arange(len(points)), FIRST_RING + np.searchsorted(rings, lidar.ring)] = rays @ T[:3, :3].T @ f.normal
-    return values, J
+    J[:, SCALE] = -f.normal @ f.centre
+    return plane_residuals(f, T, points), J
 
 
 def _prior(n_rings: int, laser_m: float, offset_m: float) -> Array:
@@ -90,3 +97,37 @@ def _prior(n_rings: int, laser_m: float, offset_m: float) -> Array:
     cov = max(laser_m, _RANGE_FLOOR_M) ** 2 * (np.eye(n_rings) - 1 / n_rings)
     prior[FIRST_RING:SCALE, FIRST_RING:SCALE] = np.linalg.inv(cov + max(offset_m, _RANGE_FLOOR_M) ** 2)
     return prior
+
+
+class FeatureSigmas(NamedTuple):
+    """Standard deviations for the weights of planes and ring ends, from their distances.
+
+    Attributes:
+        plane_m: of a capture's plane, rms over the board.
+        end_m: of a ring end.
+    """
+
+    plane_m: float
+    end_m: float
+
+
+def feature_sigmas(features: Sequence[CaptureFeatures], board: Board, T_cam_lidar: Array) -> FeatureSigmas:
+    """Return the typical errors of captures' planes and ring ends under extrinsics (4, 4)."""
+    planes_m = [np.sqrt(np.mean(plane_residuals(f, T_cam_lidar) ** 2)) for f in features]
+    inside_m = np.concatenate([end_residuals(f, T_cam_lidar, board)[0] for f in features])
+    # Ring ends reach beyond the plate by the beam's width, which is no error.
+    end_m = 1.4826 * float(np.median(np.abs(inside_m - np.median(inside_m))))
+    return FeatureSigmas(max(float(np.median(planes_m)), _PLANE_FLOOR_M), max(end_m, _END_FLOOR_M))
+
+
+def capture_costs(f: CaptureFeatures, board: Board, T_cam_lidar: Array, sigmas: FeatureSigmas) -> Array:
+    """Sum the squares of a capture's residuals under extrinsics (B, 4, 4): (B,).
+
+    The mean square over the plane's points counts `PLANE_FREEDOMS` / sigma^2, each ring end 1 / sigma^2 after
+    their mean is subtracted: they reach beyond the plate by the beam's width, alike on all sides.
+    """
+    plane_m = plane_residuals(f, T_cam_lidar)
+    inside_m, _ = end_residuals(f, T_cam_lidar, board)
+    own_m = inside_m - inside_m.mean(axis=1, keepdims=True) if inside_m.shape[1] else inside_m
+    by_plane = PLANE_FREEDOMS * np.mean(plane_m**2, axis=1) / sigmas.plane_m**2
+    return np.asarray(by_plane + np.sum(own_m**2, axis=1) / sigmas.end_m**2)

@@ -11,7 +11,6 @@ import numpy as np
 
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.observability import main_motion
-from lce_rig.calibrate.plane_and_ends import capture_costs, feature_sigmas
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import lever_arm
 from lce_rig.core.board import Board
@@ -19,6 +18,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.judge.findings import CONTROL, failing
+from lce_rig.judge.local_quadratic import capture_costs, feature_sigmas
 from lce_rig.rig import CalibrationSettings
 
 # A gain in the wrong direction of this many standard errors is significant.

@@ -174,20 +174,15 @@ def _constraints() -> Array:
     return np.stack(matrices)
 
 
-def _turn_to_identity(Q: Array, R: Array) -> Array:
-    """Rewrite the problem in R' = R^T R, so that the candidate becomes the identity."""
-    # vec(R R') = (I kron R) vec R'.
+def _least_norm_dual(Q: Array, R: Array) -> tuple[Array, Array, Array]:
+    """Find the least-norm multipliers with Z E = 0: P^T Z P (B, 9, 9), g (B,) and |Z E| (B,)."""
+    dual = _dual()
+    # In R' = R^T R the candidate becomes the identity; vec(R R') = (I kron R) vec R'.
     T = np.zeros((*R.shape[:-2], 10, 10))
     for k in range(3):
         T[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = R
     T[..., 9, 9] = 1
-    return np.swapaxes(T, -1, -2) @ Q @ T
-
-
-def _least_norm_dual(Q: Array, R: Array) -> tuple[Array, Array, Array]:
-    """Find the least-norm multipliers with Z E = 0: P^T Z P (B, 9, 9), g (B,) and |Z E| (B,)."""
-    dual = _dual()
-    turned = _turn_to_identity(Q, R)
+    turned = np.swapaxes(T, -1, -2) @ Q @ T
     wanted = -(turned @ dual.at_identity)
     multipliers = wanted @ dual.pseudo_inverse.T
     Z = dual.complement.T @ turned @ dual.complement + np.tensordot(wanted, dual.particular, axes=1)

@@ -112,7 +112,13 @@ class Problem:
                 for f in features
             ]
         )
-        self._to_board = np.concatenate([_board_coordinates(f) for f in features])
+        # Board coordinates x, y of ring ends (n, 2, 14): rows that multiply [vec R; t; d; 1].
+        self._to_board = np.zeros((len(self.edge_capture), 2, _SIZE))
+        for k, f in enumerate(features):
+            rows, R = self._to_board[self.edge_capture == k], f.T_board_cam[:2, :3]
+            rows[:, :, :9] = (f.edge_points[:, None, :, None] * R[None, :, None, :]).reshape(-1, 2, 9)
+            rows[:, :, 9:12], rows[:, :, -1] = R, f.T_board_cam[:2, 3]
+            self._to_board[self.edge_capture == k] = rows
         # In place: with hundreds of captures, this is the largest array of a calibration.
         self.edge = edge_rows[..., self._upper[0]]
         self.edge *= edge_rows[..., self._upper[1]]
@@ -228,13 +234,3 @@ class Problem:
         inside_m = self._board.inside_nearest_edge(self._on_board(x)) + x[:, 12, None]
         edge = self._by_capture((inside_m**2 * self._edge_weight).T).T
         return np.sqrt(plane), np.sqrt(edge)
-
-
-def _board_coordinates(f: CaptureFeatures) -> Array:
-    """Write the board coordinates x, y of ring ends as rows (M, 2, 14) that multiply [vec R; t; d; 1]."""
-    R, t = f.T_board_cam[:2, :3], f.T_board_cam[:2, 3]
-    rows = np.zeros((len(f.edge_points), 2, _SIZE))
-    rows[:, :, :9] = (f.edge_points[:, None, :, None] * R[None, :, None, :]).reshape(-1, 2, 9)
-    rows[:, :, 9:12] = R
-    rows[:, :, -1] = t
-    return rows

@@ -321,8 +321,12 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     here = range_m[:, None] * scans.end_rays - t + off
     beyond = (h / np.sum(n * scans.next_rays, axis=1))[:, None] * scans.next_rays - t + off
     xy, xy_next = (np.einsum("mji,mj->mi", R[:, :, :2], p) for p in (here, beyond))
-    edge = _edges_crossed(board, xy, xy_next, state.shifts[0])
-    outwards = board.edges()[1][edge, :2]
+    # A ring leaves the board by the nearest of the edges that it crosses outwards.
+    anchors, normals = (of_edges[:, :2] for of_edges in board.edges())
+    steps_m = (xy_next - xy) @ normals.T
+    distances_m = np.sum(anchors * normals, axis=1) - xy @ normals.T + state.shifts[0] - steps_m / 2
+    edge = np.argmin(np.where(steps_m > 0, np.abs(distances_m), np.inf), axis=1)
+    outwards = normals[edge]
     inside_m = distance_inside(board, xy, edge)
     step_m = np.maximum(np.abs(np.sum((xy_next - xy) * outwards, axis=1)), _SHORTEST_STEP_M)
     # With M = R m_e: s = anchor - M . (r u + f theta - t),
@@ -345,19 +349,3 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     rows[:, -1] = inside_m + by_shifts @ state.shifts - step_m / 2 + own_shift_m
     is_backed = scans.end_background[:, BLENDS] > 0
     return EdgeRows(scans.end_capture, scans.end_ring, rows, step_m, range_m, is_backed, len(scans.rings))
-
-
-def _edges_crossed(board: Board, xy_m: Array, xy_next_m: Array, shift_m: float) -> Indices:
-    """Number the edge (M,) that each ring leaves the board by: of those it crosses outwards, the nearest.
-
-    Args:
-        board: its size.
-        xy_m: (M, 2) last ray on the board.
-        xy_next_m: (M, 2) the next ray.
-        shift_m: by which ring ends lie beyond an edge.
-    """
-    anchors, outwards = (of_edges[:, :2] for of_edges in board.edges())
-    step_m = (xy_next_m - xy_m) @ outwards.T
-    inside_m = np.sum(anchors * outwards, axis=1) - xy_m @ outwards.T
-    distance_m = np.where(step_m > 0, np.abs(inside_m + shift_m - step_m / 2), np.inf)
-    return np.asarray(np.argmin(distance_m, axis=1))
