@@ -1,10 +1,11 @@
-"""Entry point of the installed command: handle Ctrl-C before anything else is imported."""
+"""Entry point of the installed command: Ctrl-C and the memory limit come before any other import."""
 
 import os
 import sys
 from contextlib import suppress
 
 from lce_rig.core.interrupts import EXIT_INTERRUPTED, INTERRUPTED, interrupt_no_more, watch_for_interrupts
+from lce_rig.core.memory import limit_memory
 
 
 def main() -> None:
@@ -12,6 +13,7 @@ def main() -> None:
     _open_closed_streams()
     try:
         watch_for_interrupts()
+        limit_memory()
         from lce_rig.cli.main import run
 
         code = run(sys.argv[1:])

@@ -141,6 +141,8 @@ def _report(error: BaseException, *, show_traceback: bool) -> int:
     elif isinstance(error, ModuleNotFoundError):
         what, hint, code = f"the package '{error.name}' is missing", f"pip install {error.name}", 5
         show_traceback |= (error.name or "").startswith("lce_rig")
+    elif isinstance(error, MemoryError):
+        what = str(error) or "more memory is needed than is free"
     elif not isinstance(error, OSError):
         traceback.print_exception(error)
         click.secho("this is a bug in lce-rig: report it with these lines", fg="red", err=True)
