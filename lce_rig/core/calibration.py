@@ -31,7 +31,6 @@ from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
 from lce_rig.core.findings import Figure, Finding, Refusal, Severity, Stage
 from lce_rig.core.geometry import Array, parse_pose, sigma_sizes
-from lce_rig.core.limits import read_file
 from lce_rig.core.results import Observation
 
 MADE_BY = f"lce-rig {lce_rig.__version__}"
@@ -670,7 +669,7 @@ def read_result(path: Path | str) -> ResultFile:
         raise SessionError(f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it")
     again = "Run `lce-rig calibrate SESSION` again."
     with reading(path, SessionError, again):
-        data = read_file(path)
+        data = path.read_bytes()
     try:
         return _file().validate_json(data)
     except ValidationError as error:

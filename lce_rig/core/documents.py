@@ -37,15 +37,6 @@ def parse_json(data: bytes, *, is_finite: bool = True) -> Any:
     return document
 
 
-def is_printable(text: str) -> bool:
-    """Return whether a text can be encoded: an escape may give half a surrogate pair."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def _integer(text: str) -> int:
     value = int(text)
     float(value)  # raises OverflowError

@@ -10,9 +10,9 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 
-from lce_rig.core.limits import MAX_PIXELS
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, Pixels
 from lce_rig.io.folder.image_file import decode_image
+from lce_rig.rig.sensors import MAX_PIXELS
 
 _MAX_HEADER = 4096
 _MAX_JPEG = 1 << 26

@@ -8,7 +8,6 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.limits import MAX_DOCUMENT_BYTES, read_file
 from lce_rig.export.files import numbers, quoted
 from lce_rig.export.job import ExportJob
 from lce_rig.session.durable import write_atomically
@@ -67,7 +66,7 @@ def load_camera_info(path: Path) -> Intrinsics:
     import yaml
 
     try:
-        data = yaml.safe_load(read_file(path, MAX_DOCUMENT_BYTES))
+        data = yaml.safe_load(path.read_bytes())
         coefficients = tuple(float(value) for value in data["distortion_coefficients"]["data"])
         size = int(data["image_width"]), int(data["image_height"])
         K = np.array(data["camera_matrix"]["data"], dtype=np.float64)

@@ -12,7 +12,6 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, UsageError, reason_of
-from lce_rig.core.limits import describe
 from lce_rig.fleet.storage import Storage
 from lce_rig.rig.loading import find_profile
 from lce_rig.session.identity import MARKER
@@ -126,7 +125,7 @@ def _entries(manifest: Storage, content: bytes) -> list[Entry]:
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"]))
         raise UsageError(
-            f"{manifest.url}: {key}: {first['msg']}; {describe(first['input'])} given",
+            f"{manifest.url}: {key}: {first['msg']}; {first['input']!r:.60} given",
             f"Keys: {', '.join(Entry.model_fields)}.",
         ) from None
     except Exception as error:  # csv, yaml and pydantic raise many kinds about odd text

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 from lce_rig.core.calibration import Calibration, Provenance, ResultFile, read_result
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
-from lce_rig.core.limits import read_file
 from lce_rig.export import export_formats, is_export, remove_exports
 from lce_rig.session import Session
 from lce_rig.session.capture import SAFE_NAME
@@ -300,7 +299,7 @@ def as_named_in(
 
 
 def _inputs(session: Session, used: Sequence[str]) -> dict[str, str]:
-    profile = hashlib.sha256(read_file(session.path / PROFILE)).hexdigest()
+    profile = hashlib.sha256((session.path / PROFILE).read_bytes()).hexdigest()
     held = {capture.name: capture for capture in session.captures}
     # `Session.capture` raises where one is missing; it lists the folder each time.
     manifests = {
@@ -449,5 +448,5 @@ def _is_of_a_result(path: Path) -> bool:
 def _content(path: Path) -> bytes | None:
     """Read a file; None if there is none, or if lce-rig did not write it: a folder, a pipe, too large."""
     with suppress(FileNotFoundError, IsADirectoryError, ValueError):
-        return read_file(path)
+        return path.read_bytes()
     return None

@@ -8,7 +8,6 @@ from pydantic import Field, model_validator
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import TYPICAL, VLP_16, DataSheet, find_data_sheet
-from lce_rig.core.limits import MAX_EVENTS, MAX_PIXELS
 from lce_rig.rig.settings import (
     Figure,
     FrameName,
@@ -21,6 +20,9 @@ from lce_rig.rig.settings import (
     TopicName,
     problem,
 )
+
+MAX_PIXELS = 1 << 26
+"""Of a camera; OpenCV reads no larger images (`lce_rig/__init__.py`)."""
 
 LIDAR_DRIVERS, CAMERA_DRIVERS = ("vlp16", "ros2"), ("v4l2", "command", "davis", "ros2")
 """Values of `driver.type`."""
@@ -244,7 +246,7 @@ class ReconstructionSettings(Settings):
     method: Literal["network", "map"] = "network"
     model: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
     window_s: Annotated[float, Field(ge=0.001, le=10)] | None = None
-    window_events: Annotated[int, Field(ge=1, le=MAX_EVENTS)] | None = None
+    window_events: Annotated[int, Field(ge=1, le=1 << 26)] | None = None
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "ReconstructionSettings":
