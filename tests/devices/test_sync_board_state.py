@@ -68,14 +68,6 @@ def test_every_gap_that_had_the_time_to_happen_is_believed_and_counted(steps):
     assert judge.n_lost == sum(steps) - len(steps)
 
 
-def test_numbers_that_begin_anew_are_believed_at_the_second():
-    judge = RunningNumber()
-    for number in range(10):
-        judge.judge(number, number * 1000)
-    verdicts = [judge.judge(number, 10_000 + number * 1000) for number in (1, 2, 3)]
-    assert verdicts == [Verdict.ODD, Verdict.ANEW, Verdict.SOUND]
-
-
 def test_a_computer_that_was_busy_and_reads_all_at_once_is_no_new_beginning():
     state = BoardState({0: "cam"})
     pulses(state, range(20))

@@ -47,10 +47,6 @@ def camera(controls: dict[str, Any] | None = None, **driver: Any) -> CameraSetti
     return settings.model_copy(update={"driver": changed, "resolution_px": SIZE})
 
 
-def n_open_files() -> int:
-    return len(list(Path("/proc/self/fd").iterdir()))
-
-
 def take(source: V4l2Source, n: int) -> list[Image]:
     return [sample for sample in islice(source.samples(), n) if isinstance(sample, Image)]
 
@@ -72,47 +68,37 @@ def test_pictures_come_counted_stamped_and_in_order(device_name: str) -> None:
 
 def test_a_running_camera_is_busy_for_others() -> None:
     with V4l2Source("cam", camera()):
-        with pytest.raises(SourceError, match="is busy") as caught, V4l2Source("cam", camera()):
+        with pytest.raises(SourceError, match=DEVICE) as caught, V4l2Source("cam", camera()):
             pass
         assert "fuser -v" in caught.value.hint
 
 
-def test_it_can_be_opened_again_and_again() -> None:
-    n_open = n_open_files()
-    for _ in range(3):
-        with V4l2Source("cam", camera()) as source:
-            assert len(take(source, 2)) == 2
-    assert n_open_files() == n_open
-
-
 def test_a_size_that_it_does_not_have_is_refused() -> None:
     odd = camera().model_copy(update={"resolution_px": (642, 362)})
-    with pytest.raises(SourceError, match="the intrinsics belong to 642x362 px"), V4l2Source("cam", odd):
+    with pytest.raises(SourceError, match="642x362"), V4l2Source("cam", odd):
         pass
-
-
-def test_an_unknown_control_names_the_nearest(vivid: None) -> None:
-    with (
-        pytest.raises(SourceError, match="no such setting") as caught,
-        V4l2Source("cam", camera({"brightnes": 1})),
-    ):
-        pass
-    assert "mean brightness?" in caught.value.hint
 
 
 @pytest.mark.parametrize(
-    ("controls", "says"),
+    ("controls", "hint"),
     [
-        ({"brightness": 300}, "out of range"),
-        ({"brightness": 1.5}, "no whole number"),
-        ({"timestamp_source": "Dawn"}, "is no choice"),
-        ({"menu": 2}, "is no choice"),
-        ({"read_only_integer_32_bits": 1}, "is refused"),
+        ({"brightnes": 1}, "brightness?"),
+        ({"brightness": 300}, "255"),
+        ({"brightness": 1.5}, ""),
+        ({"timestamp_source": "Dawn"}, "End of Frame"),
+        ({"menu": 2}, "Menu Item 4"),
+        ({"read_only_integer_32_bits": 1}, "driver.controls"),
     ],
 )
-def test_values_it_cannot_take_are_refused(controls: dict[str, Any], says: str, vivid: None) -> None:
-    with pytest.raises(SourceError, match=says), V4l2Source("cam", camera(controls)):
+def test_controls_it_cannot_take_are_refused_by_name(
+    controls: dict[str, Any], hint: str, vivid: None
+) -> None:
+    with (
+        pytest.raises(SourceError, match=next(iter(controls))) as caught,
+        V4l2Source("cam", camera(controls)),
+    ):
         pass
+    assert hint in caught.value.hint
 
 
 def test_controls_are_set_by_number_and_by_name(vivid: None) -> None:
@@ -174,7 +160,7 @@ def test_stamps_in_the_future_are_not_trusted(vivid: None) -> None:
 
 def test_a_camera_without_pulses_falls_silent(vivid: None) -> None:
     with V4l2Source("cam", camera({"percentage_of_dropped_buffers": 100}), silence_s=1.5) as source:
-        with pytest.raises(SourceError, match=r"nothing for 1\.5 s") as caught:
+        with pytest.raises(SourceError, match=r"1\.5 s") as caught:
             take(source, 5)
         assert "FSYNC" in caught.value.hint
     with V4l2Source("cam", camera({"percentage_of_dropped_buffers": 0})):

@@ -175,13 +175,6 @@ def test_the_serial_number_is_asked_of_the_web_page_beside_the_packets(lidar: Li
         assert source.status().serial == ""
 
 
-def test_a_dual_return_sensor_is_read_at_twice_the_rate(lidar: LidarSettings) -> None:
-    with streaming(lidar, Room(5, velodyne.DUAL)) as source:
-        scans = take(source, 4)
-        status = source.status()
-    assert len(scans) == 4 and status.n_lost == 0 and status.figures["is_dual"] == 1
-
-
 def test_a_sensor_without_pulses_is_stamped_by_arrival_and_said_so(lidar: LidarSettings) -> None:
     room = Room(5, clock=Vlp16Clock("absent", has_nmea=False, error_us=721_000_000))
     with streaming(lidar, room) as source:
@@ -195,34 +188,26 @@ def test_a_sensor_without_pulses_is_stamped_by_arrival_and_said_so(lidar: LidarS
     assert found == status.clock.finding
 
 
-def test_only_packets_of_the_profiles_address_are_taken(lidar: LidarSettings) -> None:
-    room = Room(3)
-    source = Vlp16Source("lidar", lidar, silence_s=PATIENT_S, n_slots=100)
+@pytest.mark.parametrize("address", [HERE, None])
+def test_only_packets_of_the_profiles_address_or_the_first_heard_are_taken(
+    lidar: LidarSettings, address: str | None
+) -> None:
+    driver, room = lidar.driver.model_copy(update={"address": address}), Room(3)
+    source = Vlp16Source(
+        "lidar", lidar.model_copy(update={"driver": driver}), silence_s=PATIENT_S, n_slots=100
+    )
     stranger = Sender(lidar, source, ELSEWHERE)
-    with stranger.sending(lambda _: packets_of(room_scans(1))), Sender(lidar, source).sending(room), source:
+
+    def make_later(start_ns: int) -> list[SensorPacket]:
+        wait_for(lambda: HERE in source.status().device)
+        return packets_of(room_scans(1))
+
+    with stranger.sending(make_later), Sender(lidar, source).sending(room), source:
         scans = take(source, 2)
         wait_for(lambda: source.status().figures["stranger_packets"] == 82)
         status = source.status()
     assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:2]]
     assert status.figures["clock_steps"] == 0
-
-
-def test_without_an_address_the_sensor_heard_first_is_taken(lidar: LidarSettings) -> None:
-    driver = lidar.driver.model_copy(update={"address": None})
-    room = Room(4)
-    source = Vlp16Source(
-        "lidar", lidar.model_copy(update={"driver": driver}), silence_s=PATIENT_S, n_slots=100
-    )
-    second = Sender(lidar, source, ELSEWHERE)
-
-    def make_late(start_ns: int) -> list[SensorPacket]:
-        wait_for(lambda: HERE in source.status().device)
-        return packets_of(room_scans(1))
-
-    with Sender(lidar, source).sending(room), second.sending(make_late), source:
-        scans = take(source, 3)
-        wait_for(lambda: source.status().figures["stranger_packets"] == 82)
-    assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:3]]
 
 
 def test_a_slow_taker_gets_the_newest_scans_and_the_others_are_counted(lidar: LidarSettings) -> None:
