@@ -118,28 +118,6 @@ def test_a_profile_without_topics_gets_some_of_its_sensors_names(tmp_path: Path)
     assert (len(images), len(scans)) == (1, 2)
 
 
-def test_long_stretches_of_events_become_messages_of_33_ms_that_arrive_one_after_the_other(
-    tmp_path: Path, rles: Rig
-) -> None:
-    from rosbags.rosbag1 import Reader
-
-    t_ns = T0_NS // 1000 * 1000 + np.arange(0, 200_000_000, 10_000)
-    zeros = np.zeros(len(t_ns), np.uint16)
-    stretch = Events("davis", t_ns, zeros, zeros, zeros > 0, 346, 260, T0_NS + 10**9)
-    path = record(tmp_path / "r.bag", rles, [stretch])
-    with Reader(path) as reader:
-        received_ns = np.array([t for _, t, _ in reader.messages()])
-    assert received_ns[0] == T0_NS + 10**9
-    assert set(np.diff(received_ns)) == {33_000_000}
-    assert np.array_equal(read_events(path)["t_ns"], t_ns)
-
-
-def test_the_same_samples_give_the_same_bytes(tmp_path: Path, rles: Rig) -> None:
-    samples = one_second()[:30]
-    one, other = (record(tmp_path / f"{name}.bag", rles, samples).read_bytes() for name in ("one", "other"))
-    assert one == other
-
-
 @pytest.mark.parametrize("name", KINDS)
 def test_nothing_is_ever_overwritten(tmp_path: Path, rles: Rig, name: str) -> None:
     path = record(tmp_path / name, rles, [picture(0)])

@@ -2,23 +2,19 @@
 
 import resource
 import shutil
-import signal
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.folder.folder_recorder import FolderRecorder
-from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig, load_rig
 
-from .rig_samples import KINDS, T0_NS, packet, picture, record, sweep
+from .rig_samples import KINDS, packet, picture, record, sweep
 
 
 @pytest.fixture(scope="module")
@@ -78,35 +74,6 @@ def test_an_error_of_the_user_of_a_recorder_is_not_hidden_by_a_full_disk(tmp_pat
         recorder.write(picture(0))
         recorder.write(picture(1))
         raise KeyError
-
-
-# An interrupt may land while a generator is set up, which Python then reports and drops.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("name", KINDS)
-def test_an_interrupt_at_any_moment_leaves_a_bag_that_is_read_up_to_there(
-    tmp_path: Path, rles: Rig, name: str
-) -> None:
-    given = [picture(k) for k in range(10)]
-    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    try:
-        for attempt in range(8):
-            folder = tmp_path / str(attempt)
-            folder.mkdir()
-            with pytest.raises(KeyboardInterrupt), BagRecorder(folder / name, rles) as recorder:
-                recorder.write(sweep(0))
-                signal.setitimer(signal.ITIMER_REAL, 0.002 + 0.0031 * attempt)
-                for k in range(10_000):
-                    recorder.write(replace(given[k % 10], stamp_ns=T0_NS + k, host_ns=None))
-            found = []
-            with suppress(SourceError):
-                recording = open_recording(folder / name, rles)
-                assert isinstance(recording, ContinuousRecording)
-                found.extend(recording.samples())
-            for k, image in enumerate(sample for sample in found if isinstance(sample, Image)):
-                assert (image.stamp_ns, image.pixels.tobytes()) == (T0_NS + k, given[k % 10].pixels.tobytes())
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def test_a_full_disk_stops_a_folder_with_one_error(tmp_path: Path, rles: Rig) -> None:

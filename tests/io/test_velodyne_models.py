@@ -12,6 +12,7 @@ from lce_rig.core.data_sheets import find_data_sheet
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.ros.messages import typestore
 from lce_rig.io.ros.rosbag import BagRecording
 from lce_rig.io.velodyne.pcap import PcapRecording
 from lce_rig.io.velodyne.stream import Vlp16Stream
@@ -77,34 +78,16 @@ def write_packets(path: Path, kind: str, payloads: list[bytes], arrivals_ns: lis
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     is_ros1 = kind == "ros1"
-    store: Any = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    packet_text, scan_text = (
-        "time stamp\nuint8[1206] data",
-        "std_msgs/Header header\nVelodynePacket[] packets",
-    )
-    if not is_ros1:
-        packet_text = packet_text.replace("time stamp", "builtin_interfaces/Time stamp")
-    store.register(get_types_from_msg(packet_text, "velodyne_msgs/msg/VelodynePacket"))
-    store.register(get_types_from_msg(scan_text, "velodyne_msgs/msg/VelodyneScan"))
-    packet_type, scan_type, header_type, time_type = (
-        store.types[name]
-        for name in (
-            "velodyne_msgs/msg/VelodynePacket",
-            "velodyne_msgs/msg/VelodyneScan",
-            "std_msgs/msg/Header",
-            "builtin_interfaces/msg/Time",
-        )
-    )
-    writer: Any
-    if is_ros1:
-        writer = Writer1(path.with_suffix(".bag"))
-    else:
-        writer = Writer2(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
+    store, name = typestore(is_ros1), "velodyne_msgs/msg/VelodyneScan"
+    packet_type = store.types["velodyne_msgs/msg/VelodynePacket"]
+    header_type, time_type = (store.types[t] for t in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"))
+    serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+    path = path.with_suffix(".bag") if is_ros1 else path
+    ros2 = {} if is_ros1 else {"version": 9, "storage_plugin": StoragePlugin[kind.upper()]}
+    writer: Any = (Writer1 if is_ros1 else Writer2)(path, **ros2)
     with writer:
-        name = "velodyne_msgs/msg/VelodyneScan"
         topic = writer.add_connection("/velodyne_packets", name, typestore=store)
         for first in range(0, len(payloads), 40):
             stamps = [time_type(t // 10**9, t % 10**9) for t in arrivals_ns[first : first + 40]]
@@ -113,10 +96,9 @@ def write_packets(path: Path, kind: str, payloads: list[bytes], arrivals_ns: lis
                 for stamp, payload in zip(stamps, payloads[first : first + 40], strict=True)
             ]
             header = header_type(**({"seq": 0} if is_ros1 else {}), stamp=stamps[-1], frame_id="velodyne")
-            serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
-            data = serialize(scan_type(header, packets), name)
+            data = serialize(store.types[name](header, packets), name)
             writer.write(topic, arrivals_ns[first : first + 40][-1], data)
-    return path.with_suffix(".bag") if is_ros1 else path
+    return path
 
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
