@@ -31,16 +31,21 @@ def layers() -> list[list[str]]:
 def imports(rooms: Iterable[str]) -> dict[str, set[str]]:
     """Find which rooms each room imports."""
     known = set(rooms)
-    found: dict[str, set[str]] = {room: set() for room in known}
+    found: dict[str, set[str]] = {}
     for room in known:
-        folder, module = ROOT / "lce_rig" / room, ROOT / "lce_rig" / f"{room}.py"
-        for path in sorted(folder.rglob("*.py")) if folder.is_dir() else [module]:
+        names: set[str] = set()
+        for path in sorted((ROOT / "lce_rig" / room.replace(".", "/")).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text())):
-                names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-                if isinstance(node, ast.Import):
-                    names = [alias.name for alias in node.names]
-                found[room] |= {name.split(".")[1] for name in names if name.startswith("lce_rig.")}
-    return {room: (targets & known) - {room} for room, targets in found.items()}
+                if isinstance(node, ast.ImportFrom):
+                    names.add(node.module or "")
+                elif isinstance(node, ast.Import):
+                    names |= {alias.name for alias in node.names}
+        found[room] = {
+            other
+            for other in known - {room}
+            if any(f"{name}.".startswith(f"lce_rig.{other}.") for name in names)
+        }
+    return found
 
 
 def reduced(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
@@ -57,7 +62,10 @@ def reduced(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
 
 def summary(room: str) -> str:
     """Take the first clause of a room's docstring."""
-    text = ast.get_docstring(ast.parse((ROOT / "lce_rig" / room / "__init__.py").read_text())) or ""
+    text = (
+        ast.get_docstring(ast.parse((ROOT / "lce_rig" / room.replace(".", "/") / "__init__.py").read_text()))
+        or ""
+    )
     return text.partition("\n")[0].partition(":")[0].partition(";")[0].rstrip(".")
 
 
