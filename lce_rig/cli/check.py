@@ -154,8 +154,8 @@ def _summarise(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[st
     for name, refusal in sorted(refused.items()):
         text = f"{refusal.stage}: {refusal.text}\n    -> {refusal.advice}"
         names.setdefault(text, []).append(name)
-    for text, own in names.items():
-        show.say(f"  {', '.join(own)}: {text}")
+    for text, captured in names.items():
+        show.say(f"  {', '.join(captured)}: {text}")
     by_stage = Counter(refusal.stage for refusal in refused.values())
     if len(by_stage) > 1:
         show.say("  refused by stage: " + ", ".join(f"{stage} {n}" for stage, n in sorted(by_stage.items())))

@@ -199,7 +199,7 @@ _OF_RECORDINGS = ("pair", "pair_tolerance", "topics", "cameras", "channels", "li
 
 
 def _one_for_each(
-    paths: Sequence[Path], option: str, names: Sequence[str], known: Collection[str] | None = None
+    paths: Sequence[Path], option: str, names: Sequence[str], sensors_of_rig: Collection[str] | None = None
 ) -> list[str | None]:
     """Return the sensor name for each recording: the only one given, its own, or None.
 
@@ -208,8 +208,8 @@ def _one_for_each(
     """
     from lce_rig.core.errors import UsageError
 
-    if known is not None:
-        require_sensors(option.removeprefix("--"), names, known)
+    if sensors_of_rig is not None:
+        require_sensors(option.removeprefix("--"), names, sensors_of_rig)
     if len(names) < 2:
         return [*names, None][:1] * len(paths)
     if len(names) != len(paths):

@@ -227,11 +227,11 @@ def _tell(
 
 def show_next(path: Path, rig: "Rig", predicted: "Sequence[Finding]", n_captures: int) -> None:
     """Print the predicted standard deviations and the next command."""
-    for found in predicted:
-        show.note(found.sentence)
+    for prediction in predicted:
+        show.note(prediction.sentence)
     if n_captures < rig.quality.min_captures:
         show.note(f"{show.counted(n_captures, 'capture')} (minimum {rig.quality.min_captures}): collect more")
-    elif predicted and not all(found.figures["is_enough"] for found in predicted):
+    elif predicted and not all(prediction.figures["is_enough"] for prediction in predicted):
         show.note("the target is not predicted to be met: collect more, or see what these captures give")
     if n_captures >= rig.quality.min_captures:
         show.note(f"next: lce-rig calibrate {path}")

@@ -75,9 +75,9 @@ def drift(
         assert rig is not None and saved is not None
         report = _watch_live(rig, saved, seconds)
     else:
-        given = recordings or (Path("session"),)
+        sources = recordings or (Path("session"),)
         with show.progress_bar("reading") as progress:
-            report = watch_drift(given, saved, rig=rig, progress=progress)
+            report = watch_drift(sources, saved, rig=rig, progress=progress)
     for text in report.notes:
         show.note(text)
     files = [] if output is None else report.write(output)

@@ -116,10 +116,10 @@ def _table(measured: "MeasuredIntrinsics") -> Any:
     """List the parameters, with the profile's if model and resolution are the same."""
     from lce_rig.pipeline.intrinsics_files import final
 
-    estimate, given = measured.estimate, measured.given
+    estimate, lens = measured.estimate, measured.given
     values = estimate.model.vector(final(measured))
     try:
-        old = None if measured.check is None else estimate.model.vector(given)
+        old = None if measured.check is None else estimate.model.vector(lens)
     except ValueError:
         old = None
     table = show.plain_table("", "", ">measured", ">sigma", ">profile", ">difference")
@@ -139,8 +139,8 @@ def _findings(measured: "MeasuredIntrinsics") -> list[str]:
 
     lines = []
     if measured.check is None:
-        given = measured.given
-        size = f"{given.width_px}x{given.height_px}"
+        lens = measured.given
+        size = f"{lens.width_px}x{lens.height_px}"
         lines.append(f"  [red]the profile's intrinsics are for {size} px, the images have another size[/]")
     else:
         lines.append(f"  {figures_of(measured.check)}")

@@ -76,11 +76,11 @@ def _print(document: dict[str, Any]) -> None:
 def _document(errors: "LidarErrors") -> dict[str, Any]:
     import numpy as np
 
-    found = errors.found
-    values, sigmas = found.lasers.copy(), found.lasers_sigma.copy()
+    estimate = errors.found
+    values, sigmas = estimate.lasers.copy(), estimate.lasers_sigma.copy()
     values[1:], sigmas[1:] = np.degrees(values[1:]), np.degrees(sigmas[1:])
     lasers = []
-    for k, ring in enumerate(found.rings.tolist()):
+    for k, ring in enumerate(estimate.rings.tolist()):
         row: dict[str, Any] = {"ring": ring, "n_points": int(errors.n_points[k])}
         row |= zip(("range_m", "azimuth_deg", "elevation_deg"), values[:, k].tolist(), strict=True)
         row |= zip(
@@ -89,9 +89,9 @@ def _document(errors: "LidarErrors") -> dict[str, Any]:
         lasers.append(row)
     return {
         "n_captures": list(errors.n_captures),
-        "lens_lateral_m": float(found.lens[0]),
-        "lens_lateral_sigma_m": float(found.lens_sigma[0]),
-        "lens_vertical_m_per_rad": float(found.lens[1]),
-        "lens_vertical_sigma_m_per_rad": float(found.lens_sigma[1]),
+        "lens_lateral_m": float(estimate.lens[0]),
+        "lens_lateral_sigma_m": float(estimate.lens_sigma[0]),
+        "lens_vertical_m_per_rad": float(estimate.lens[1]),
+        "lens_vertical_sigma_m_per_rad": float(estimate.lens_sigma[1]),
         "lasers": lasers,
     }

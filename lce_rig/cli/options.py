@@ -45,7 +45,7 @@ cameras_option = click.option(
 )
 
 
-def require_sensors(what: str, names: Sequence[str], known: Collection[str]) -> None:
+def require_sensors(what: str, names: Sequence[str], choices: Collection[str]) -> None:
     """Check that the rig has the requested sensors.
 
     Raises:
@@ -53,9 +53,9 @@ def require_sensors(what: str, names: Sequence[str], known: Collection[str]) -> 
     """
     from lce_rig.core.errors import UsageError
 
-    unknown = sorted(set(names) - set(known))
+    unknown = sorted(set(names) - set(choices))
     if unknown:
-        raise UsageError(f"the rig has no {what} {unknown[0]!r}", f"Choose one of: {', '.join(known)}")
+        raise UsageError(f"the rig has no {what} {unknown[0]!r}", f"Choose one of: {', '.join(choices)}")
 
 
 EVENT_IMAGES = click.Choice(["network", "map"])

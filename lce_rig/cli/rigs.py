@@ -85,8 +85,8 @@ def _sensor_tables(rig: "Rig") -> tuple[Any, Any]:
         sensors.add_row(name, lidar.model, lidar.frame, f"{lidar.min_range_m:g}-{lidar.max_range_m:g} m")
         sources.add_row(name, lidar.topic or "-", stamps(lidar.timestamps))
     for name, camera in rig.cameras.items():
-        given, (width, height) = camera.intrinsics, camera.resolution_px
-        optics = f"{width}x{height}, f {given.fx_px:.1f} {given.fy_px:.1f} px, {given.model}"
+        lens, (width, height) = camera.intrinsics, camera.resolution_px
+        optics = f"{width}x{height}, f {lens.fx_px:.1f} {lens.fy_px:.1f} px, {lens.model}"
         sensors.add_row(name, camera.model, camera.optical_frame, optics)
         for channel, settings in camera.channels.items():
             sources.add_row(f"{name}/{channel}", settings.topic or "-", stamps(settings.timestamps))
@@ -176,13 +176,13 @@ def check_profile(file: str, as_json: bool) -> None:
             show.print_json({"is_valid": False, "problems": problems, "warnings": [], "findings": []})
         raise
     if as_json:
-        found = rig.warnings()
+        warnings = rig.warnings()
         show.print_json(
             {
                 "is_valid": True,
                 "problems": [],
-                "warnings": [warning.sentence for warning in found],
-                "findings": [warning.as_json() for warning in found],
+                "warnings": [warning.sentence for warning in warnings],
+                "findings": [warning.as_json() for warning in warnings],
             }
         )
         return

@@ -150,8 +150,8 @@ def simulate(
         _simulate_session(session or Path("session"), rig, captures or _CAPTURES, seed, options)
         return
     if session is not None or captures is not None:
-        given = f"the session {session}" if session is not None else "--captures"
-        raise UsageError(f"--recording and {given} exclude each other", "Run it twice, with the same --seed.")
+        other = f"the session {session}" if session is not None else "--captures"
+        raise UsageError(f"--recording and {other} exclude each other", "Run it twice, with the same --seed.")
     if choices["motion"] == "still":
         raise UsageError("--motion still: the board moves in a recording", "Omit --motion, or --recording.")
     options = _options(rig, "moving", choices)
@@ -277,5 +277,5 @@ def require_kind(session: Path, seed: int | None) -> None:
 def write_truth(path: Path, document: dict[str, Any]) -> None:
     """Write indented JSON with each innermost list, such as a row of a matrix, on a line of its own."""
     text = json.dumps(document, indent=1)
-    text = re.sub(r"\[([^\[\]{}\"]+)\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+    text = re.sub(r"\[([^\[\]{}\"]+)\]", lambda match: f"[{' '.join(match[1].split())}]", text)
     path.write_text(text + "\n", encoding="utf-8")

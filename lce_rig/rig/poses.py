@@ -64,10 +64,12 @@ class NominalExtrinsic(Settings):
 
     @model_validator(mode="after")
     def _is_a_pose(self) -> "NominalExtrinsic":
-        given = [key for key in ("quaternion_wxyz", "rpy_deg", "matrix") if getattr(self, key) is not None]
-        if len(given) != 1:
-            found = " and ".join(given) if given else "none"
-            raise problem(f"{found} given; give the rotation as one of quaternion_wxyz, rpy_deg, matrix")
+        rotations = [
+            key for key in ("quaternion_wxyz", "rpy_deg", "matrix") if getattr(self, key) is not None
+        ]
+        if len(rotations) != 1:
+            names = " and ".join(rotations) if rotations else "none"
+            raise problem(f"{names} given; give the rotation as one of quaternion_wxyz, rpy_deg, matrix")
         if self.quaternion_wxyz is not None:
             norm = float(np.linalg.norm(self.quaternion_wxyz))
             if abs(norm - 1) > _ROUNDING:

@@ -74,20 +74,22 @@ class Rig(Settings):
 
     @model_validator(mode="after")
     def _frames_are_unique(self) -> "Rig":
-        seen: dict[str, str] = {}
+        used: dict[str, str] = {}
         for key, frame in self._frames():
-            if frame in seen:
-                own = key.split(".")[1] + ("_optical_frame" if key.endswith("optical_frame") else "_link")
-                raise problem(f"frame {frame} is used already by {seen[frame]}; give it its own: {own}", key)
-            seen[frame] = key
+            if frame in used:
+                usual = key.split(".")[1] + ("_optical_frame" if key.endswith("optical_frame") else "_link")
+                raise problem(
+                    f"frame {frame} is used already by {used[frame]}; give it its own: {usual}", key
+                )
+            used[frame] = key
         roots = [frame for key, frame in self._frames() if not key.endswith("optical_frame")]
         if self.base_frame is not None and self.base_frame not in roots:
             raise problem(f"no sensor has frame {self.base_frame}; there is {', '.join(roots)}", "base_frame")
         if self.mount is not None:
             if self.mount.of not in roots:
                 raise problem(f"no sensor has frame {self.mount.of}; there is {', '.join(roots)}", "mount.of")
-            if self.mount.parent in seen:
-                what = f"{self.mount.parent} is the frame of {seen[self.mount.parent]}, not of the robot"
+            if self.mount.parent in used:
+                what = f"{self.mount.parent} is the frame of {used[self.mount.parent]}, not of the robot"
                 raise problem(what, "mount.parent")
             if self.base_frame not in (None, self.mount.of):
                 what = f"differs from mount.of, {self.mount.of}, which would give it two parents; remove it"
@@ -126,19 +128,19 @@ class Rig(Settings):
         for name in self.cameras:
             if name in self.lidars:
                 raise problem(f"{name} is the name of a LiDAR already", f"cameras.{name}")
-        seen: set[tuple[str, str]] = set()
+        used: set[tuple[str, str]] = set()
         for index, entry in enumerate(self.nominal_extrinsics):
-            for kind, name, known in (
+            for kind, name, names_of_rig in (
                 ("camera", entry.camera, list(self.cameras)),
                 ("lidar", entry.lidar, list(self.lidars)),
             ):
-                if name not in known:
-                    what = f"no {kind} is called {name}; there is {', '.join(known)}"
+                if name not in names_of_rig:
+                    what = f"no {kind} is called {name}; there is {', '.join(names_of_rig)}"
                     raise problem(what, f"nominal_extrinsics.{index}.{kind}")
-            if (entry.camera, entry.lidar) in seen:
+            if (entry.camera, entry.lidar) in used:
                 what = f"a second entry for {entry.camera} and {entry.lidar}"
                 raise problem(what, f"nominal_extrinsics.{index}")
-            seen.add((entry.camera, entry.lidar))
+            used.add((entry.camera, entry.lidar))
         for name in self.sync.triggers if self.sync else ():
             if name not in self.cameras:
                 what = f"no camera is called {name}; there is {', '.join(self.cameras)}"

@@ -167,10 +167,10 @@ class LidarSettings(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _follows_its_data_sheet(cls, given: Any) -> Any:
-        if not isinstance(given, dict):
-            return given
-        model = given.get("model", VLP_16.name)
+    def _follows_its_data_sheet(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        model = values.get("model", VLP_16.name)
         sheet = (find_data_sheet(model) if isinstance(model, str) else None) or TYPICAL
         return {
             "min_range_m": sheet.range_m[0],
@@ -179,7 +179,7 @@ class LidarSettings(Settings):
             "beam_divergence_rad": sheet.divergence_rad[0],
             "laser_bias_sigma_m": sheet.laser_bias_sigma_m,
             "range_offset_sigma_m": sheet.range_offset_sigma_m,
-        } | given
+        } | values
 
     def data_sheet(self) -> DataSheet | None:
         """Give the model's data sheet, with the profile's own beams; None where beams are not known."""
@@ -322,12 +322,12 @@ class CameraSettings(Settings):
 
     @model_validator(mode="after")
     def _intrinsics_belong_to_resolution(self) -> "CameraSettings":
-        given, size = self.intrinsics, self.resolution_px
+        lens, size = self.intrinsics, self.resolution_px
         if size[0] * size[1] > MAX_PIXELS:
             raise problem(f"{size[0]}x{size[1]} px exceed the limit of {MAX_PIXELS} pixels", "resolution_px")
         sides = (
-            ("x", "width", given.cx_px, given.fx_px, size[0]),
-            ("y", "height", given.cy_px, given.fy_px, size[1]),
+            ("x", "width", lens.cx_px, lens.fx_px, size[0]),
+            ("y", "height", lens.cy_px, lens.fy_px, size[1]),
         )
         for axis, side, centre, focal, length in sides:
             if not 0 < centre < length - 1:
@@ -339,9 +339,9 @@ class CameraSettings(Settings):
                 )
                 raise problem(what + self._other_resolution(), f"intrinsics.f{axis}_px")
         # A lens is near the middle; numbers of another resolution differ by the same factor in x and y.
-        x, y = given.cx_px / size[0], given.cy_px / size[1]
+        x, y = lens.cx_px / size[0], lens.cy_px / size[1]
         if max(x, y) < 0.4 or min(x, y) > 0.6 or not (0.2 < x < 0.8 and 0.2 < y < 0.8):
-            point = f"{given.cx_px:g}, {given.cy_px:g}"
+            point = f"{lens.cx_px:g}, {lens.cy_px:g}"
             what = f"the principal point {point} is far from the middle of {size[0]}x{size[1]} px"
             raise problem(what + self._other_resolution(), "intrinsics")
         if not 0.5 < self.intrinsics.fx_px / self.intrinsics.fy_px < 2:
@@ -363,13 +363,13 @@ class CameraSettings(Settings):
 
     def to_intrinsics(self) -> Intrinsics:
         """Build the camera model for the algorithms."""
-        given = self.intrinsics
+        lens = self.intrinsics
         return Intrinsics(
-            given.fx_px,
-            given.fy_px,
-            given.cx_px,
-            given.cy_px,
+            lens.fx_px,
+            lens.fy_px,
+            lens.cx_px,
+            lens.cy_px,
             *self.resolution_px,
-            model=given.model,
-            distortion=given.distortion,
+            model=lens.model,
+            distortion=lens.distortion,
         )

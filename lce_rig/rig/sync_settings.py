@@ -56,12 +56,12 @@ class SyncSettings(Settings):
 
     @model_validator(mode="after")
     def _lines_are_used_once(self) -> "SyncSettings":
-        seen: dict[int, str] = {}
+        cameras: dict[int, str] = {}
         for camera, trigger in self.triggers.items():
-            if trigger.channel in seen:
-                what = f"line {trigger.channel} triggers {seen[trigger.channel]} already"
+            if trigger.channel in cameras:
+                what = f"line {trigger.channel} triggers {cameras[trigger.channel]} already"
                 raise problem(what, f"triggers.{camera}.channel")
-            seen[trigger.channel] = camera
+            cameras[trigger.channel] = camera
         return self
 
     @property

@@ -155,9 +155,9 @@ class Capture:
     @property
     def serials(self) -> dict[str, str]:
         """Serial numbers by sensor, as far as the devices told them when it was taken."""
-        told = self._manifest.meta.get(SERIALS)
-        found = told.items() if isinstance(told, dict) else ()
-        return {name: serial for name, serial in found if isinstance(serial, str) and serial}
+        serials = self._manifest.meta.get(SERIALS)
+        items = serials.items() if isinstance(serials, dict) else ()
+        return {name: serial for name, serial in items if isinstance(serial, str) and serial}
 
     @property
     def manifest_sha256(self) -> str:

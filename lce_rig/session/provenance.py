@@ -40,19 +40,19 @@ def serials_of(sessions: Iterable[Session]) -> dict[str, str]:
     Raises:
         SessionError: two units of one sensor took the captures.
     """
-    found: dict[str, tuple[str, str]] = {}
+    sources: dict[str, tuple[str, str]] = {}
     for session in sessions:
-        told = [(c.name, c.serials) for c in _readable(session.captures)]
-        for where, serials in (("the profile", stated_serials(session.rig)), *told):
+        devices = [(c.name, c.serials) for c in _readable(session.captures)]
+        for where, serials in (("the profile", stated_serials(session.rig)), *devices):
             for sensor, serial in serials.items():
-                first, known = found.setdefault(sensor, (where, serial))
-                if known != serial:
+                first, other = sources.setdefault(sensor, (where, serial))
+                if other != serial:
                     raise SessionError(
-                        f"{session.path}: {sensor} has serial number {known} in {first}, {serial} in {where}",
+                        f"{session.path}: {sensor} has serial number {other} in {first}, {serial} in {where}",
                         "One result requires one set of sensors: reject the captures of the other unit with "
                         "`lce-rig captures`, or correct `serial` in rig.yaml.",
                     )
-    return {sensor: serial for sensor, (_, serial) in sorted(found.items())}
+    return {sensor: serial for sensor, (_, serial) in sorted(sources.items())}
 
 
 def stated_serials(rig: Rig) -> dict[str, str]:

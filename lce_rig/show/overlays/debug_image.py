@@ -192,12 +192,12 @@ def _panorama(
     ranges_m = np.linalg.norm(points, axis=1)
     order = np.argsort(-ranges_m, kind="stable")
     canvas.draw_discs(pane, place(points[order]), canvas.turbo(ranges_m[order], *limits_m), 0.9)
-    for index, found in enumerate(candidates):
-        pixels = place(found.points)
-        own = colour if index == chosen else WHITE
-        canvas.draw_discs(pane, pixels, own, 1.4)
+    for index, plate in enumerate(candidates):
+        pixels = place(plate.points)
+        tone = colour if index == chosen else WHITE
+        canvas.draw_discs(pane, pixels, tone, 1.4)
         centre = pixels.mean(axis=0)
-        _draw_number(pane, index, own, (float(centre[0]), float(pixels[:, 1].min() - 6)))
+        _draw_number(pane, index, tone, (float(centre[0]), float(pixels[:, 1].min() - 6)))
     _label(pane, "LiDAR, unrolled")
     for degrees in (135, 90, 45, 0, -45, -90, -135):
         u = (0.5 - degrees / 360) * (width_px - 1)
@@ -218,7 +218,8 @@ def _top_view(
     reach_m = 6.0
     if candidates:
         reach_m = max(
-            3.0, 1.25 * max(float(np.linalg.norm(found.points.mean(axis=0)[:2])) for found in candidates)
+            3.0,
+            1.25 * max(float(np.linalg.norm(plate.points.mean(axis=0)[:2])) for plate in candidates),
         )
     scale = size_px / 2 / reach_m
     pane = canvas.panel(size_px, size_px, BLACK)
@@ -235,12 +236,12 @@ def _top_view(
     near = points[np.abs(points[:, :2]).max(axis=1, initial=0) < reach_m]
     colours = canvas.turbo(np.linalg.norm(near, axis=1), *limits_m)
     canvas.draw_discs(pane, place(near), colours, 0.8)
-    for index, found in enumerate(candidates):
-        outline = transform(found.T_lidar_board, board.outline())[[0, 1, 2, 3, 0]]
-        own = colour if index == chosen else WHITE
-        canvas.draw_line(pane, place(outline), own, 2)
-        centre = place(found.points.mean(axis=0)[None])[0]
-        _draw_number(pane, index, own, (float(centre[0]) + 12, float(centre[1]) - 8))
+    for index, plate in enumerate(candidates):
+        outline = transform(plate.T_lidar_board, board.outline())[[0, 1, 2, 3, 0]]
+        tone = colour if index == chosen else WHITE
+        canvas.draw_line(pane, place(outline), tone, 2)
+        centre = place(plate.points.mean(axis=0)[None])[0]
+        _draw_number(pane, index, tone, (float(centre[0]) + 12, float(centre[1]) - 8))
     middle = np.array([[size_px / 2, size_px / 2]])
     canvas.draw_discs(pane, middle, WHITE, 4, BLACK)
     _label(pane, "from above, x up")
@@ -260,10 +261,10 @@ def _board_view(
     if chosen >= len(candidates):
         canvas.draw_text(pane, "no board", size_px / 2, size_px / 2, 14, FAINT, align=0.5)
         return pane
-    found = candidates[chosen]
-    centre = found.T_lidar_board[:3, 3]
+    plate = candidates[chosen]
+    centre = plate.T_lidar_board[:3, 3]
     # Seen from the LiDAR, up stays up: the room's axes rotated into the board's plane.
-    normal = found.plane[:3]
+    normal = plate.plane[:3]
     right = np.cross([0.0, 0.0, 1.0], normal)
     right /= np.linalg.norm(right)
     axes = np.stack([right, -np.cross(normal, right)], axis=1)
@@ -274,10 +275,10 @@ def _board_view(
 
     around = points[np.linalg.norm(points - centre, axis=1) < np.hypot(board.width_m, board.height_m)]
     canvas.draw_discs(pane, place(around), (110, 110, 110), 1.5)
-    canvas.draw_line(pane, place(transform(found.T_lidar_board, board.outline())[[0, 1, 2, 3, 0]]), WHITE, 2)
-    canvas.draw_discs(pane, place(found.points), colour, 2.0)
+    canvas.draw_line(pane, place(transform(plate.T_lidar_board, board.outline())[[0, 1, 2, 3, 0]]), WHITE, 2)
+    canvas.draw_discs(pane, place(plate.points), colour, 2.0)
     if colour == MAGENTA:
-        canvas.draw_diamonds(pane, place(found.edge_points), ORANGE, 4.5)
+        canvas.draw_diamonds(pane, place(plate.edge_points), ORANGE, 4.5)
     refused = "" if colour == MAGENTA else ", refused"
     _label(pane, f"candidate {chosen + 1} of {len(candidates)}, face on{refused}")
     return pane

@@ -98,9 +98,9 @@ def _draw_curves(drift: Drift, states: Mapping[str, State], board: Sequence[Axis
         axes.set_title(f"{motion_words(AXES[index])}: {STATES[state]}{by_board}", fontsize=8)
         axes.set_xlabel(unit, fontsize=8)
         axes.tick_params(labelsize=8)
-    said = "; diamond: what the board says, 1 standard deviation" if board else ""
+    of_board = "; diamond: what the board says, 1 standard deviation" if board else ""
     figure.suptitle(
-        f"score of the scene along each axis; shaded: changes too small to be seen{said}", fontsize=10
+        f"score of the scene along each axis; shaded: changes too small to be seen{of_board}", fontsize=10
     )
     figure.tight_layout()
     chart.draw()

@@ -163,6 +163,6 @@ def _look_from_behind(o3d: Any, window: Any, T_lidar_cam: Array) -> None:
     # Else what lies beyond the cloud's own size is cut off.
     view.set_constant_z_near(_NEAREST_M)
     view.set_constant_z_far(_FARTHEST_M)
-    seen = view.convert_to_pinhole_camera_parameters()
-    seen.extrinsic = invert(pose(np.stack([x, np.cross(z, x), z], axis=1), eye))
-    view.convert_from_pinhole_camera_parameters(seen, allow_arbitrary=True)
+    parameters = view.convert_to_pinhole_camera_parameters()
+    parameters.extrinsic = invert(pose(np.stack([x, np.cross(z, x), z], axis=1), eye))
+    view.convert_from_pinhole_camera_parameters(parameters, allow_arbitrary=True)

@@ -260,10 +260,10 @@ class Pages:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        given = (request.query.get("token", ""), request.cookies.get(self._cookie(request), ""))
+        tokens = (request.query.get("token", ""), request.cookies.get(self._cookie(request), ""))
         # In constant time, so that a wrong token does not tell how much of it is right.
         if not any(
-            hmac.compare_digest(text.encode(errors="replace"), self._token.encode()) for text in given
+            hmac.compare_digest(text.encode(errors="replace"), self._token.encode()) for text in tokens
         ):
             text = "This page needs the whole link that lce-rig shows, with its token.\n"
             answer = web.Response(status=403, text=text)

@@ -121,7 +121,7 @@ def _outline(points_px: Array | None) -> list[list[float] | None] | None:
         return None
     is_seen = np.asarray(np.isfinite(points_px).all(axis=1))
     rounded = np.round(np.where(is_seen[:, None], points_px, 0.0), 1).tolist()
-    return [point if seen else None for point, seen in zip(rounded, is_seen, strict=True)]
+    return [point if is_point else None for point, is_point in zip(rounded, is_seen, strict=True)]
 
 
 def _number(value: float) -> float | None:

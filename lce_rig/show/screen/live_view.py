@@ -183,12 +183,12 @@ class PlainView:
         if state.goes_on and state.n_captures != self._n_explained:
             self._n_explained = state.n_captures
             _print(f"{_clock(state)} {state.goes_on}")
-        said = (state.phase, state.headline)
+        texts = (state.phase, state.headline)
         is_due = (
-            self._said is None or said[0] != self._said[0] or state.elapsed_s - self._said_s > _PLAIN_EVERY_S
+            self._said is None or texts[0] != self._said[0] or state.elapsed_s - self._said_s > _PLAIN_EVERY_S
         )
-        if said != self._said and is_due and state.phase != "ended":
-            self._said, self._said_s = said, state.elapsed_s
+        if texts != self._said and is_due and state.phase != "ended":
+            self._said, self._said_s = texts, state.elapsed_s
             detail = f" ({state.detail})" if state.detail else ""
             _print(f"{_clock(state)} {state.phase}: {state.headline}{detail}")
 
@@ -232,8 +232,8 @@ def render_code(link: str, state: LiveState, *, height: int = _HEIGHT, width: in
     from rich.text import Text
 
     code = qr_lines(link)
-    said = [f"page: {link}", state.headline]
-    lines = [line for text in said for line in _folded(text, width)]
+    texts = [f"page: {link}", state.headline]
+    lines = [line for text in texts for line in _folded(text, width)]
     if not code or len(code) + len(lines) > height or len(code[0]) > width:
         return None
     return Group(*(Text(line, style=CODE_STYLE) for line in code), *map(Text, lines))
@@ -305,8 +305,8 @@ def render(
     messages = _fill(notes, state.log, n_room, width)
     n_room -= len(messages)
     drawing = _drawing(state, (width - _SIDE_WIDTH - 2, len(side) + n_room))
-    said = Text("\n".join(banner), style="bold", justify="center")
-    parts: list[Any] = [title, Padding(said, (edge, 2), style=_STYLES[state.phase])]
+    texts = Text("\n".join(banner), style="bold", justify="center")
+    parts: list[Any] = [title, Padding(texts, (edge, 2), style=_STYLES[state.phase])]
     parts += [Text("\n".join(detail), style="italic"), streams]
     beside = Table.grid(padding=(0, 1, 0, 0))
     beside.add_column(width=min(_SIDE_WIDTH, width))
@@ -343,8 +343,8 @@ def _fill(notes: list[list[str]], log: tuple[str, ...], n_lines: int, width: int
         if len(older) + len(lines) > n_old:
             break
         older = lines + older
-    said = [Text(line, style="yellow") for line in warnings]
-    return said + [Text(line, style="dim") for line in (*older, *newest)]
+    texts = [Text(line, style="yellow") for line in warnings]
+    return texts + [Text(line, style="dim") for line in (*older, *newest)]
 
 
 def _stream_table(streams: tuple[StreamState, ...], width: int) -> tuple[Any, int]:
@@ -370,9 +370,9 @@ def _stream_table(streams: tuple[StreamState, ...], width: int) -> tuple[Any, in
         lost = (
             [Text(f"{stream.n_lost} lost" if stream.n_lost else "", style="red")] if len(widths) > 2 else []
         )
-        said = _wrap(stream.reason or stream.figures or " ", left)
-        n_lines += len(said)
-        reason = Text("\n".join(said), style="red" if is_bad else "")
+        texts = _wrap(stream.reason or stream.figures or " ", left)
+        n_lines += len(texts)
+        reason = Text("\n".join(texts), style="red" if is_bad else "")
         table.add_row(Text(f"{mark} {stream.name}", style=style), rate, *lost, reason)
     return table, n_lines
 
