@@ -9,9 +9,8 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
 
 if TYPE_CHECKING:
-    from lce_rig.fleet.deploy.deployment import Deployed, Plan, SensorChange, Standing
+    from lce_rig.fleet.deploy.deployment import Deployed, Plan, Standing
     from lce_rig.fleet.deploy.releases import ReleaseRecord
-    from lce_rig.rig import Rig
     from lce_rig.rig.target_settings import TargetSettings
 
 
@@ -66,39 +65,33 @@ def deploy(
         raise UsageError("--force requires a reason", "Add --reason TEXT; it is written down at the target.")
     if reason and not (force or rollback):
         raise UsageError("--reason applies to --force and --rollback only", "Add one of them, or omit it.")
-    if status or rollback:
-        target = _target(target_name, targets, session, None)
-        if status:
-            _tell_standing(deployment.standing(target), target, as_json=as_json)
-        else:
-            _tell_done(deployment.rollback(target, release, reason=reason), target, as_json=as_json)
-        return
     import lce_rig as lce
+    from lce_rig.fleet.deploy.targets import find_target
     from lce_rig.pipeline.result_files import result_parts
 
+    if status or rollback:
+        # A session is opened for its profile only.
+        is_read = targets is None and (session / "session.json").exists()
+        rig = lce.Session.open(session).rig if is_read else None
+        target = find_target(target_name, targets, session, rig)
+        if status:
+            _show_standing(deployment.standing(target), target, as_json=as_json)
+        else:
+            _show_done(deployment.rollback(target, release, reason=reason), target, as_json=as_json)
+        return
     opened = lce.Session.open(session)
-    target = _target(target_name, targets, session, opened.rig)
+    target = find_target(target_name, targets, session, opened.rig)
     result = opened.path.joinpath(*result_parts(name))
     if dry_run:
-        _tell_plan(deployment.plan(result, opened.rig, target, session=opened), target, as_json=as_json)
+        _show_plan(deployment.plan(result, opened.rig, target, session=opened), target, as_json=as_json)
         return
     if target.run is not None:
         show.note(f"afterwards there: {target.run}")
     done = deployment.deploy(result, opened.rig, target, session=opened, reason=reason.strip())
-    _tell_done(done, target, as_json=as_json)
+    _show_done(done, target, as_json=as_json)
 
 
-def _target(name: str, file: Path | None, session: Path, rig: "Rig | None") -> "TargetSettings":
-    """Find the target; its session is opened for its profile only if there is no file."""
-    import lce_rig as lce
-    from lce_rig.fleet.deploy.targets import find_target
-
-    if rig is None and file is None and (session / "session.json").exists():
-        rig = lce.Session.open(session).rig
-    return find_target(name, file, session, rig)
-
-
-def _tell_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None:
+def _show_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None:
     if as_json:
         show.print_json(
             {
@@ -108,17 +101,29 @@ def _tell_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None
                 "new": plan.record.model_dump(),
                 "changed": dict(plan.changed),
                 "changed_there": dict(plan.changed_there),
-                "sensors": [_sensor(change) for change in plan.sensors],
+                "sensors": [
+                    {
+                        "camera": change.camera,
+                        "lidar": change.lidar,
+                        "is_new": change.is_new,
+                        "rotation_deg": None if change.moved is None else change.moved[0],
+                        "translation_m": None if change.moved is None else change.moved[1],
+                    }
+                    for change in plan.sensors
+                ],
                 "objections": [each.as_json() for each in plan.objections],
                 "diff": list(plan.text),
             }
         )
         return
     current = plan.state.current
-    show.say(f"{target.to}: {'nothing deployed yet' if current is None else _told(current)}")
+    show.say(f"{target.to}: {'nothing deployed yet' if current is None else _described(current)}")
     for change in plan.sensors:
-        show.say(f"  {change.camera} and {change.lidar}: {_moved(change)}")
-    _tell_changed_there(plan.changed_there)
+        how = "new" if change.is_new else "removed"
+        if change.moved is not None:
+            how = f"moves by {change.moved[0]:.3f} deg, {1000 * change.moved[1]:.1f} mm"
+        show.say(f"  {change.camera} and {change.lidar}: {how}")
+    _warn_of_changes(plan.changed_there)
     if plan.is_in_place:
         show.say("nothing to change: these very files are in place")
     for line in plan.text:
@@ -127,33 +132,15 @@ def _tell_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None
         show.warn(f"would be refused: {each.text}")
 
 
-def _moved(change: "SensorChange") -> str:
-    if change.moved is None:
-        return "new" if change.is_new else "removed"
-    angle_deg, distance_m = change.moved
-    return f"moves by {angle_deg:.3f} deg, {1000 * distance_m:.1f} mm"
-
-
-def _sensor(change: "SensorChange") -> dict[str, Any]:
-    angle_deg, distance_m = (None, None) if change.moved is None else change.moved
-    return {
-        "camera": change.camera,
-        "lidar": change.lidar,
-        "is_new": change.is_new,
-        "rotation_deg": angle_deg,
-        "translation_m": distance_m,
-    }
-
-
-def _tell_standing(found: "Standing", target: "TargetSettings", *, as_json: bool) -> None:
-    state = found.state
+def _show_standing(standing: "Standing", target: "TargetSettings", *, as_json: bool) -> None:
+    state = standing.state
     if as_json:
         show.print_json(
             {
                 "format_version": 1,
                 "to": target.to,
                 "current": _release(state.current),
-                "changed_there": dict(found.changed),
+                "changed_there": dict(standing.changed),
                 "is_pending": state.is_pending,
                 "releases": [_release(each) for each in state.releases],
             }
@@ -162,28 +149,28 @@ def _tell_standing(found: "Standing", target: "TargetSettings", *, as_json: bool
     if state.current is None:
         show.say(f"{target.to}: nothing deployed yet")
         return
-    show.say(f"{target.to}: {_told(state.current)}")
+    show.say(f"{target.to}: {_described(state.current)}")
     table = show.plain_table("", "release", "deployed", "by", "robot", "captures of")
-    for each in state.releases:
-        mark = " *" if each.name == state.current.name else ""
-        cells = (f"{each.name}{mark}", each.time, each.by, each.robot or "-", each.date[:10] or "-")
+    for kept in state.releases:
+        mark = " *" if kept.name == state.current.name else ""
+        cells = (f"{kept.name}{mark}", kept.time, kept.by, kept.robot or "-", kept.date[:10] or "-")
         table.add_row(*map(show.escape, cells))
     show.print_table(table)
-    _tell_changed_there(found.changed)
-    for each in state.releases:
-        if each.reason:
-            show.note(f"{each.name} was forced: {each.reason}")
+    _warn_of_changes(standing.changed)
+    for kept in state.releases:
+        if kept.reason:
+            show.note(f"{kept.name} was forced: {kept.reason}")
     if state.is_pending:
         show.warn("the command after the deployment has not succeeded; the same deployment runs it again")
 
 
-def _tell_changed_there(changed: "Any") -> None:
+def _warn_of_changes(changed: "Any") -> None:
     if changed:
-        told = ", ".join(f"{file} {how}" for file, how in changed.items())
-        show.warn(f"not as it was deployed: {told}")
+        listed = ", ".join(f"{file} {how}" for file, how in changed.items())
+        show.warn(f"not as it was deployed: {listed}")
 
 
-def _told(release: "ReleaseRecord") -> str:
+def _described(release: "ReleaseRecord") -> str:
     verdicts = ", ".join(f"{pair} {verdict}" for pair, verdict in release.verdicts.items())
     robot = f"robot {release.robot}, " if release.robot else ""
     dated = f"captures of {release.date}, " if release.date else ""
@@ -194,7 +181,7 @@ def _release(release: "ReleaseRecord | None") -> dict[str, Any] | None:
     return None if release is None else release.model_dump() | {"set_sha256": release.set_sha256}
 
 
-def _tell_done(done: "Deployed", target: "TargetSettings", *, as_json: bool) -> None:
+def _show_done(done: "Deployed", target: "TargetSettings", *, as_json: bool) -> None:
     if as_json:
         show.print_json(
             {
@@ -209,11 +196,11 @@ def _tell_done(done: "Deployed", target: "TargetSettings", *, as_json: bool) -> 
         )
         return
     state = "in place" if done.is_new else "in place already"
-    show.say(f"{target.to}: {_told(done.release)} {state}")
+    show.say(f"{target.to}: {_described(done.release)} {state}")
     if done.is_new and done.replaces == done.release.replaces != "":
         show.note(f"replaces {done.replaces}; `--rollback` restores it")
     if done.changed_there:
-        _tell_changed_there(done.changed_there)
+        _warn_of_changes(done.changed_there)
         show.note(f"the changed files stay there in releases/{done.replaces}/")
     if done.output:
         show.say(done.output.rstrip())

@@ -1,10 +1,11 @@
 """`lce-rig fleet`: run the sessions of many robots, and ask questions of their results."""
 
+import csv
 import json
 import math
 import os
 import sys
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import click
 
@@ -13,9 +14,6 @@ from lce_rig.cli.fleet_deploy import deploy
 from lce_rig.cli.fleet_report import report
 from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
 from lce_rig.core.calibration import DEFAULT_METHOD, Method
-
-if TYPE_CHECKING:
-    from lce_rig.fleet.run import FleetRun
 
 # Ctrl-C: sessions end at once, workers and the table take their time.
 _GRACE_S = 20.0
@@ -131,28 +129,22 @@ def run(
         with show.progress_bar("sessions", has_rate=True) as progress:
             done = run_fleet(jobs, settings, client, progress=progress)
     if as_json:
-        show.print_json(_document(done))
-    else:
-        _print_summary(done, place.url)
-
-
-def _document(done: "FleetRun") -> dict[str, Any]:
-    return {
-        "format_version": 1,
-        "n_run": done.n_new,
-        "n_held": done.n_held,
-        "statuses": dict(sorted(done.statuses.items())),
-        "causes": dict(done.causes.most_common()),
-        "n_rows": len(done.table),
-    }
-
-
-def _print_summary(done: "FleetRun", registry: str) -> None:
+        show.print_json(
+            {
+                "format_version": 1,
+                "n_run": done.n_new,
+                "n_held": done.n_held,
+                "statuses": dict(sorted(done.statuses.items())),
+                "causes": dict(done.causes.most_common()),
+                "n_rows": len(done.table),
+            }
+        )
+        return
     statuses = ", ".join(f"{status} {n}" for status, n in done.statuses.most_common())
     show.say(f"{show.counted(done.n_new, 'session')} run, {done.n_held} held already: {statuses}")
     for cause, n in done.causes.most_common():
         show.say(f"  {n} x {cause}")
-    show.say(f"{registry}: {show.counted(len(done.table), 'row')} in the table")
+    show.say(f"{place.url}: {show.counted(len(done.table), 'row')} in the table")
 
 
 @fleet.command()
@@ -189,46 +181,31 @@ def table(
             raise SessionError(f"{opened.place.url} does not exist", "`lce-rig fleet run` writes a registry.")
         opened.consolidate(rebuild=True)
     chosen = query(opened, where, columns or (None if as_csv or as_json else _SHOWN))
+    batches = chosen.to_batches(max_chunksize=10_000)
     if as_csv:
-        _print_csv(chosen)
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow(chosen.column_names)
+        for row in (row for batch in batches for row in batch.to_pylist()):
+            # A list is JSON in a cell.
+            writer.writerow(
+                [json.dumps(value) if isinstance(value, list) else value for value in row.values()]
+            )
     elif as_json:
-        _print_json(chosen)
-    else:
-        _print_table(chosen)
-
-
-def _print_csv(chosen: Any) -> None:
-    """Print CSV; lists are JSON in a cell."""
-    import csv
-
-    writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(chosen.column_names)
-    for batch in chosen.to_batches(max_chunksize=10_000):
-        for row in batch.to_pylist():
-            writer.writerow([json.dumps(v) if isinstance(v, list) else v for v in row.values()])
-
-
-def _print_json(chosen: Any) -> None:
-    """Print {"rows": [...]}, a row a line."""
-    sys.stdout.write('{"format_version": 1, "rows": [')
-    end = "\n"
-    for batch in chosen.to_batches(max_chunksize=10_000):
-        for row in batch.to_pylist():
+        sys.stdout.write('{"format_version": 1, "rows": [')
+        end = "\n"
+        for row in (row for batch in batches for row in batch.to_pylist()):
             sys.stdout.write(end + json.dumps(row, allow_nan=False))
             end = ",\n"
-    sys.stdout.write("\n]}\n")
-
-
-def _print_table(chosen: Any) -> None:
-    rows = chosen.slice(0, _MOST_SHOWN).to_pylist()
-    shown = show.plain_table("", *chosen.column_names)
-    for row in rows:
-        shown.add_row(*(_cell(value) for value in row.values()))
-    show.print_table(shown)
-    if len(chosen) > len(rows):
-        show.note(f"{len(rows)} of {len(chosen)} rows; add --where, --csv or --json")
+        sys.stdout.write("\n]}\n")
     else:
-        show.note(show.counted(len(chosen), "row"))
+        rows = chosen.slice(0, _MOST_SHOWN).to_pylist()
+        shown = show.plain_table("", *chosen.column_names)
+        for row in rows:
+            shown.add_row(*(_cell(value) for value in row.values()))
+        show.print_table(shown)
+        is_whole = len(chosen) == len(rows)
+        count = show.counted(len(chosen), "row")
+        show.note(count if is_whole else f"{len(rows)} of {count}; add --where, --csv or --json")
 
 
 def _cell(value: Any) -> str:
@@ -239,6 +216,3 @@ def _cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if math.isfinite(value) else "-"
     return show.escape(str(value))
-
-
-__all__ = ["fleet"]

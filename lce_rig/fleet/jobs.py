@@ -91,20 +91,18 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
     text = next(((each, content) for each in named if (content := each.read()) is not None), None)
     if text is None and manifest is not None:
         raise UsageError(f"{manifest.url} does not exist", "Give a manifest, fleet.yaml or fleet.csv.")
-    jobs = _all_sessions(root) if text is None else _matches(root, text[0], _entries(*text))
+    if text is None:
+        paths = root.folders_with(MARKER)
+        names = {path: path.partition("/")[0] or root.name for path in paths}
+        jobs = [Job(f"{root.url}/{path}".rstrip("/"), fallback_robot=names[path]) for path in paths]
+    else:
+        jobs = _matches(root, text[0], _entries(*text))
     if not jobs:
         raise NotEnoughDataError(
             f"{root.url} holds no session" + ("" if text is None else f" that {text[0].url} names"),
             "A session is a folder with session.json; recordings are named in a manifest (docs/fleets.md).",
         )
     return jobs
-
-
-def _all_sessions(root: Storage) -> list[Job]:
-    return [
-        Job(f"{root.url}/{path}" if path else root.url, fallback_robot=path.partition("/")[0] or root.name)
-        for path in root.folders_with(MARKER)
-    ]
 
 
 def _entries(manifest: Storage, content: bytes) -> list[Entry]:

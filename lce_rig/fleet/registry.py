@@ -181,7 +181,13 @@ class Registry:
             unknown = as_table(row for rows in read for row in rows)
         table = pa.concat_tables([old, new, unknown])
         table = table.filter(pc.is_in(table["folder"], value_set=pa.array(folders, pa.string())))
-        outdated = _superseded(table)
+        # Of the results of one source, the last stays.
+        finished = table.select(["source", "folder", "finished"]).group_by(["source", "folder"])
+        finished = finished.aggregate([("finished", "max")])
+        order = [("source", "ascending"), ("finished_max", "ascending"), ("folder", "ascending")]
+        finished = finished.sort_by(order)
+        sources, n = finished["source"].combine_chunks(), max(len(finished) - 1, 0)
+        outdated = finished["folder"].slice(0, n).filter(pc.equal(sources[:n], sources[1:])).to_pylist()
         for folder in outdated:
             self.set_aside(folder)
         table = merged([_without(table, pa.array(outdated, pa.string()))])
@@ -192,19 +198,6 @@ class Registry:
 def _without(table: Any, folders: Any) -> Any:
     values = folders.combine_chunks() if isinstance(folders, pa.ChunkedArray) else folders
     return table.filter(pc.invert(pc.is_in(table["folder"], value_set=values)))
-
-
-def _superseded(table: Any) -> list[str]:
-    """List the folders of earlier results of a source that has a later one."""
-    results = table.select(["source", "folder", "finished"]).group_by(["source", "folder"])
-    results = results.aggregate([("finished", "max")])
-    counted = results.group_by("source").aggregate([("folder", "count")])
-    several = counted.filter(pc.greater(counted["folder_count"], 1))["source"].combine_chunks()
-    twice = results.filter(pc.is_in(results["source"], value_set=several)).to_pylist()
-    last: dict[str, Row] = {}
-    for result in sorted(twice, key=lambda result: (result["finished_max"] or "", result["folder"])):
-        last[result["source"]] = result
-    return sorted(result["folder"] for result in twice if last[result["source"]] is not result)
 
 
 def write_rows(draft: Path, rows: Iterable[Row]) -> None:

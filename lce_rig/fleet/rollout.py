@@ -8,8 +8,8 @@ import re
 import shlex
 import subprocess
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -214,7 +214,9 @@ class FleetDeployment:
         try:
             target = self._target_of(state.robot)
             state = state.model_copy(update={"to": target.to})
-            with self._result(state.folder) as folder:
+            with TemporaryDirectory(prefix="lce-rig-") as scratch:
+                place, folder = self._registry.place / state.folder, Path(scratch) / "result"
+                place.fetch(folder)
                 done = deployment.deploy(folder, load_rig(folder / PROFILE), target)
                 releases = {"release": done.release.name, "replaces": done.replaces}
                 return self._checked(state.model_copy(update=releases), folder)
@@ -224,7 +226,7 @@ class FleetDeployment:
                 current = deployment.standing(target).state.current
             releases = {} if current is None else {"release": current.name, "replaces": current.replaces}
             return state.ended("failed", error, **releases)
-        except LceRigError as error:
+        except (LceRigError, OSError) as error:
             return state.ended("failed", error)
 
     def _checked(self, state: RobotState, folder: Path) -> RobotState:
@@ -267,16 +269,6 @@ class FleetDeployment:
             raise UsageError(
                 f"robot {robot!r} cannot be part of {self._target.to}", "Rename the robot."
             ) from error
-
-    @contextmanager
-    def _result(self, folder: str) -> Iterator[Path]:
-        place = self._registry.place / folder
-        if place.local is not None:
-            yield place.local
-            return
-        with TemporaryDirectory(prefix="lce-rig-") as scratch:
-            place.fetch(Path(scratch) / "result")
-            yield Path(scratch) / "result"
 
     def _keep(self, state: RobotState) -> None:
         """Keep a robot's state in the registry."""

@@ -14,10 +14,9 @@ import dask
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 
 from lce_rig.core.errors import LceRigError, SourceError
-from lce_rig.core.findings import Finding
 from lce_rig.fleet.findings import BUG, EXITED, OUT_OF_MEMORY, SIGNAL, TIMED_OUT, WORKER_LOST
 from lce_rig.fleet.jobs import Job
-from lce_rig.fleet.process import Ended, run_apart
+from lce_rig.fleet.process import run_apart
 from lce_rig.fleet.table import Row, Status
 from lce_rig.fleet.work import Settings, Used, first_row, publish, without_result
 from lce_rig.pipeline.detect_session import Progress, silent
@@ -181,20 +180,16 @@ def run_job(job: Job, settings: Settings) -> list[Row]:
     ended = run_apart("lce_rig.fleet.work:work_order", order, *limits)
     if ended.rows is not None:
         return ended.rows
-    row = without_result(ended.known or first_row(job, settings), *_cause(ended, settings))
-    used = Used(ended.cpu_s, ended.peak_memory_mb)
-    return publish(settings.opened(), [row], start_s, used=used)
-
-
-def _cause(ended: Ended, settings: Settings) -> tuple[Status, Finding]:
-    """Name the cause of a process that ended without rows."""
+    status: Status = "crashed"
     if ended.reason == "timed_out":
-        return "timed_out", TIMED_OUT(limit_s=settings.time_limit_s)
-    # The message of C++ without memory.
-    if ended.reason == "out_of_memory" or "std::bad_alloc" in ended.detail:
-        return "out_of_memory", OUT_OF_MEMORY(limit_mb=settings.memory_limit_mb)
-    if ended.reason == "bug":
-        return "crashed", BUG(what=ended.detail)
-    if ended.exit_code < 0:
-        return "crashed", SIGNAL(signal=-ended.exit_code, what=ended.detail)
-    return "crashed", EXITED(code=ended.exit_code, what=ended.detail)
+        status, cause = "timed_out", TIMED_OUT(limit_s=settings.time_limit_s)
+    elif ended.reason == "out_of_memory" or "std::bad_alloc" in ended.detail:  # C++ without memory
+        status, cause = "out_of_memory", OUT_OF_MEMORY(limit_mb=settings.memory_limit_mb)
+    elif ended.reason == "bug":
+        cause = BUG(what=ended.detail)
+    elif ended.exit_code < 0:
+        cause = SIGNAL(signal=-ended.exit_code, what=ended.detail)
+    else:
+        cause = EXITED(code=ended.exit_code, what=ended.detail)
+    row = without_result(ended.known or first_row(job, settings), status, cause)
+    return publish(settings.opened(), [row], start_s, used=Used(ended.cpu_s, ended.peak_memory_mb))

@@ -167,11 +167,21 @@ class _Opened:
     @classmethod
     def of(cls, job: Job, scratch: Path) -> "_Opened":
         source, copy = Storage.at(job.source), scratch / "session"
-        rig = None if not job.rig else _profile(job.rig, scratch)
+        rig = None
+        if "://" in job.rig:
+            Storage(job.rig).fetch(scratch / "profile.yaml")
+            rig = load_rig(scratch / "profile.yaml")
+        elif job.rig:
+            rig = load_rig(job.rig)
         if (source / MARKER).exists():
             source.fetch(copy, without=_NOT_NEEDED)
             if rig is not None:
-                _check_same_rig(copy, rig)
+                own = load_rig(copy / PROFILE)
+                if own.name != rig.name:
+                    raise ProfileError(
+                        f"the manifest's profile is of rig {rig.name!r}, the session's of rig {own.name!r}",
+                        "Name the profile of the session's rig, or none.",
+                    )
                 replace_file(copy / PROFILE, dump_rig(rig).encode())
             opened = Session.open(copy)
             provenance = provenance_of([opened])
@@ -202,24 +212,6 @@ class _Opened:
         robot = folder_name(job.robot or stated or job.fallback_robot or "unnamed")
         row = row | {"robot": robot, "rig": self.rig.name, "folder": f"{robot}/undated-{self.ending}"}
         return row if self.provenance is None else _dated(row, self.provenance, self.ending)
-
-
-def _profile(name: str, scratch: Path) -> Rig:
-    """Load a profile by its name, path or address."""
-    if "://" not in name:
-        return load_rig(name)
-    file = scratch / "profile.yaml"
-    Storage(name).fetch(file)
-    return load_rig(file)
-
-
-def _check_same_rig(session: Path, rig: Rig) -> None:
-    own = load_rig(session / PROFILE)
-    if own.name != rig.name:
-        raise ProfileError(
-            f"the manifest's profile is of rig {rig.name!r}, the session's of rig {own.name!r}",
-            "Name the profile of the session's rig, or none.",
-        )
 
 
 def _dated(row: Row, provenance: Provenance, ending: str) -> Row:
