@@ -24,7 +24,7 @@ from lce_rig.judge.findings import KNOWN_BETTER, LARGEST_CAUSE, SURPRISING_CHI2
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck
 from lce_rig.judge.nuisances import Nuisances
 from lce_rig.judge.split_consistency import Contrast, objections
-from lce_rig.rig import CalibrationSettings, VerdictSettings
+from lce_rig.rig import CalibrationSettings, Rig
 
 # A lens differs significantly below this probability, scales beyond this many standard deviations.
 _CHANCE, _SURE = 0.002, 3.0
@@ -58,66 +58,53 @@ def profile_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
     return np.asarray(sum((each.covariance() for each in sensitivities), np.zeros((6, 6))))
 
 
-def lens_contradiction(
-    check: IntrinsicsCheck | None, sensitivities: Sequence[Sensitivity], target_deg: float
+def find_contradictions(
+    estimate: CalibrationEstimate,
+    check: IntrinsicsCheck | None,
+    nuisances: Nuisances | None,
+    contrasts: Sequence[Contrast],
+    rig: Rig,
 ) -> Iterator[Contradiction]:
-    """Compare the profile's lens with the session's boards, within the standard deviations of both.
+    """List the checks that contradict an estimate, each with the move of the extrinsics that resolves it.
 
-    A lens that the verdict objects to contradicts as well, whatever the profile's standard deviations.
+    Args:
+        estimate: with the sensitivities to errors of the profile.
+        check: the profile's lens compared with the session's boards.
+        nuisances: the camera's scale.
+        contrasts: subsets of the captures that should agree.
+        rig: targets and limits.
     """
     from scipy.special import fdtrc
 
-    if check is None or check.errors is None or check.errors_cov is None:
-        return
-    of_lens = {each.source: each for each in sensitivities}
-    if not of_lens:
-        return
-    mine = [of_lens[name] for name in ("focal_length", "principal_point", "distortion")]
-    moves = np.concatenate([each.moves for each in mine])
-    sigmas = np.concatenate([np.full(len(each.moves), each.sigma) for each in mine])
-    errors, expected = np.array(check.errors), np.array(check.errors_cov) + np.diag(sigmas**2)
-    mean_square = float(errors @ np.linalg.solve(expected, errors)) / len(errors)
-    # The deviations come from few captures.
-    chance = float(fdtrc(len(errors), max(check.n_captures - 1, 1), mean_square))
-    if chance < _CHANCE or check.verdict(target_deg) != "pass":
-        yield Contradiction("intrinsics", (errors @ moves)[None])
-
-
-def scale_contradiction(
-    found: Nuisances | None, sensitivities: Sequence[Sensitivity]
-) -> Iterator[Contradiction]:
-    """Compare the camera's distances with the LiDAR's, within what focal length and squares allow."""
-    of_source = {each.source: each for each in sensitivities}
-    if found is None or not of_source:
-        return
-    squares, focal = of_source["square_size"], of_source["focal_length"]
-    expected = found.scale_sigma**2 + squares.sigma**2 + focal.sigma**2
-    if found.scale**2 > _SURE**2 * expected:
-        yield Contradiction("scale", found.scale * squares.moves)
-
-
-def split_contradictions(
-    contrasts: Sequence[Contrast], target: CalibrationSettings, limits: VerdictSettings
-) -> Iterator[Contradiction]:
-    """Compare subsets that should agree: the result lies between both.
-
-    Where the extrinsics change on the way, it lies a whole change from one of the two that may hold now.
-    """
-    for contrast in objections(contrasts, target, limits):
+    target, of_source = rig.calibration, {each.source: each for each in estimate.sensitivities}
+    if of_source and check is not None and check.errors is not None and check.errors_cov is not None:
+        lens = [of_source[name] for name in ("focal_length", "principal_point", "distortion")]
+        moves = np.concatenate([each.moves for each in lens])
+        sigmas = np.concatenate([np.full(len(each.moves), each.sigma) for each in lens])
+        errors, expected = np.array(check.errors), np.array(check.errors_cov) + np.diag(sigmas**2)
+        mean_square = float(errors @ np.linalg.solve(expected, errors)) / len(errors)
+        # The deviations come from few captures.
+        chance = float(fdtrc(len(errors), max(check.n_captures - 1, 1), mean_square))
+        # A lens that the verdict objects to contradicts as well, whatever the profile's standard deviations.
+        if chance < _CHANCE or check.verdict(target.target_sigma_deg) != "pass":
+            yield Contradiction("intrinsics", (errors @ moves)[None])
+    if of_source and nuisances is not None:
+        # The camera's distances and the LiDAR's, within the errors of focal length and squares.
+        squares, focal = of_source["square_size"], of_source["focal_length"]
+        variance = nuisances.scale_sigma**2 + squares.sigma**2 + focal.sigma**2
+        if nuisances.scale**2 > _SURE**2 * variance:
+            yield Contradiction("scale", nuisances.scale * squares.moves)
+    for contrast in objections(contrasts, target, rig.verdict):
+        # The result lies between both subsets; where the extrinsics change on the way, it lies a whole change
+        # from one of the two that may hold now.
         share = 1.0 if contrast.is_change else _HALF
-        source = f"{contrast.first}_{contrast.second}"
-        yield Contradiction(source, share * np.array([contrast.apart]))
-
-
-def channels_contradiction(
-    estimate: CalibrationEstimate, target: CalibrationSettings
-) -> Iterator[Contradiction]:
-    """Compare the channels of one camera, which has one pose: the result lies between both."""
+        yield Contradiction(f"{contrast.first}_{contrast.second}", share * np.array([contrast.apart]))
+    # Channels of one camera have one pose: the result lies between both.
     apart, cov = estimate.channel_difference, estimate.channel_difference_cov
-    if apart is None or cov is None or apart @ np.linalg.solve(cov, apart) <= SURPRISING_CHI2:
-        return
-    if target.in_targets(*tangent_sizes(apart)) > 1:
-        yield Contradiction("channels", _HALF * apart[None])
+    if apart is not None and cov is not None:
+        is_significant = apart @ np.linalg.solve(cov, apart) > SURPRISING_CHI2
+        if is_significant and target.in_targets(*tangent_sizes(apart)) > 1:
+            yield Contradiction("channels", _HALF * apart[None])
 
 
 def list_contributions(

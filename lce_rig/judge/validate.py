@@ -21,13 +21,10 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
 from lce_rig.judge.contributions import (
     KnownBetter,
-    channels_contradiction,
+    find_contradictions,
     known_better,
-    lens_contradiction,
     list_contributions,
     profile_covariance,
-    scale_contradiction,
-    split_contradictions,
 )
 from lce_rig.judge.findings import WIDENED
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
@@ -206,12 +203,7 @@ def validate(
         centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
         contrasts = (*contrast_halves(settled, centres), *find_groups(settled))
         nuisances = estimate_nuisances(expansion, rings)
-    contradictions = [
-        *lens_contradiction(intrinsics, known, rig.calibration.target_sigma_deg),
-        *scale_contradiction(nuisances, known),
-        *split_contradictions(contrasts, rig.calibration, rig.verdict),
-        *channels_contradiction(estimate, rig.calibration),
-    ]
+    contradictions = list(find_contradictions(estimate, intrinsics, nuisances, contrasts, rig))
     cov_shared = profile_covariance(known)
     cov_agreed = widened_by**2 * estimate.cov + cov_shared
     return Validation(

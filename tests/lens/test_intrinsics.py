@@ -314,10 +314,6 @@ def test_a_slight_difference_is_marginal_and_a_lower_target_makes_it_fail(views)
     assert check.verdict(target_deg=1.0) == "pass"
 
 
-def test_captures_that_fit_no_lens_say_nothing_about_it(views):
-    assert check_intrinsics(views[:3], WIDE, BOARD) is None
-
-
 @pytest.mark.dataset
 @pytest.mark.parametrize(
     ("recording", "profile", "worst_focal_error"),

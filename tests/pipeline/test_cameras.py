@@ -83,12 +83,6 @@ def test_where_one_camera_sits_to_the_other_is_told_from_both_sides(together):
     assert np.allclose(to_left.T_cam_other, invert(to_right.T_cam_other))
 
 
-def test_what_is_told_agrees_with_the_extrinsics(together, by_paper):
-    for results in (together, by_paper):
-        T = results[RIGHT].T_cam_lidar @ invert(results[LEFT].T_cam_lidar)
-        assert np.allclose(results[RIGHT].other_cameras[0].T_cam_other, T)
-
-
 def test_other_methods_estimate_each_camera_by_itself_but_compare_them(session, together, by_paper):
     for name in (LEFT, RIGHT):
         alone = detections({name: session[name]})
@@ -109,14 +103,6 @@ def only(camera):
     data["cameras"] = {camera: data["cameras"][camera]}
     data["nominal_extrinsics"] = [e for e in data["nominal_extrinsics"] if e["camera"] == camera]
     return type(RIG).model_validate(data)
-
-
-def test_one_camera_alone_is_what_it_is_without_another_in_the_profile(session):
-    left = {LEFT: session[LEFT]}
-    alone, beside = (calibrated(detections(left), ML, rig)[LEFT] for rig in (only(LEFT), RIG))
-    assert np.array_equal(alone.T_cam_lidar, beside.T_cam_lidar)
-    assert np.array_equal(alone.cov, beside.cov)
-    assert alone.other_cameras == alone.estimated_with == ()
 
 
 def test_cameras_without_a_common_board_stay_by_themselves(session):

@@ -87,14 +87,6 @@ def test_what_was_found_and_its_picture_are_remembered(seen):
     assert [file.stat().st_mtime_ns for file in files] == changed
 
 
-def test_the_event_map_can_be_asked_for_and_does_not_pass_for_the_networks_picture(seen):
-    assert isinstance(found_in(seen, event_image="map"), Refusal)
-    assert isinstance(found_in(seen), ImageBoard)
-    capture = seen.captures[0]
-    pictures = [event_picture(seen, capture, "dvs", "events", which).pixels for which in (None, "map")]
-    assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 20
-
-
 def test_stamps_of_either_clock_are_brought_to_the_rigs_time(tmp_path, stream):
     profile = PROFILE.replace("first_firing, expected_offset_s: 0.0", "first_firing, expected_offset_s: 0.02")
     profile = profile.replace("mid_exposure, expected_offset_s: 0.0", "mid_exposure, expected_offset_s: 3.5")

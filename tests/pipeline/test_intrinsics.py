@@ -11,7 +11,6 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.export.camera_info import load_camera_info
 from lce_rig.judge.intrinsics_check import judge_lens
-from lce_rig.lens.models import MODELS
 from lce_rig.pipeline.intrinsics import measure_intrinsics
 from lce_rig.pipeline.intrinsics_files import final, profile_block, save_profile, write_intrinsics
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
@@ -187,20 +186,3 @@ def test_the_block_can_be_pasted_into_the_profile(measured):
     end = next(k for k in range(first, len(lines)) if lines[k].startswith("    channels:"))
     pasted = [*lines[:first], *profile_block(RIG, measured).splitlines(), *lines[end:]]
     assert parse_rig("\n".join(pasted)).cameras["davis"].to_intrinsics() == final(measured)
-
-
-def test_a_lens_of_another_family_goes_into_the_profile_too(session, measured, tmp_path):
-    fisheye = replace(LENS, model="equidistant", distortion=(-0.05, 0.01, -0.002, 1e-5))
-    fitted = replace(
-        measured.estimate,
-        intrinsics=fisheye,
-        model=MODELS["equidistant"],
-        cov=np.diag([1.0, 1.0, 0.25, 0.25, *4 * [1e-8]]),
-    )
-    other = replace(measured, estimate=fitted)
-    save_profile(session, [other], tmp_path / "new.yaml", is_forced=True)
-    davis = load_rig(tmp_path / "new.yaml").cameras["davis"]
-    assert davis.to_intrinsics() == fisheye
-    # Without correlations, and with certain distortion, they are those of the fit.
-    assert davis.intrinsics.focal_sigma_px == pytest.approx(np.sqrt(0.5), rel=0.2)
-    assert davis.intrinsics.principal_point_sigma_px == pytest.approx(0.5, rel=0.2)

@@ -36,13 +36,6 @@ def test_upright_outlines_lie_between_the_last_return_and_the_next() -> None:
     assert edges.weight == pytest.approx(np.sqrt(3.0), abs=1e-3)
 
 
-def test_a_wide_beam_moves_outlines_inwards_by_its_radius() -> None:
-    scan = scan_of(pillar, range(-15, 16, 2))
-    thin, wide = (find_depth_edges(scan, beam) for beam in (NEEDLE, Beam(0.012, 0.004)))
-    spread = [np.abs(np.arctan2(e.points[:, 1], e.points[:, 0])) for e in (thin, wide)]
-    assert spread[0] - spread[1] == pytest.approx((0.012 + 0.004 * 3.0) / 2 / 3.0, abs=1e-4)
-
-
 def test_a_floor_has_no_outlines_though_its_rings_lie_far_apart() -> None:
     floor = scan_of(lambda az, el: 1.0 / np.sin(-el) + 0 * az, np.arange(-20, -4, 0.5))
     assert len(find_depth_edges(floor, NEEDLE)) == 0

@@ -66,14 +66,6 @@ def test_the_scene_does_not_reduce_errors_of_lens_and_print(seen: Seen) -> None:
     assert split.surprise < share(seen, boards_alone(seen, off, WEAK)).surprise
 
 
-def test_without_edges_the_boards_decide(seen: Seen) -> None:
-    empty = [replace(view, edges=view.edges.select(np.zeros(len(view.edges), bool))) for view in seen.views]
-    calibration = boards_alone(seen, np.zeros(6), WEAK)
-    found = share(seen, calibration, empty)
-    assert (found.state, found.n_edges) == ("unknown", 0)
-    assert np.allclose(found.T_cam_lidar, calibration.T_cam_lidar) and np.allclose(found.cov, WEAK)
-
-
 def test_the_board_is_left_out(seen: Seen, room: Path) -> None:
     session = Session.open(room)
     views = scene_views(session, lce.detect(session), seen.truth, 60)
