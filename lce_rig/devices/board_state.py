@@ -1,4 +1,4 @@
-"""What a sync board's messages add up to: pulses, clocks, and what is wrong; no device, no thread."""
+"""The state of a sync board from its messages: pulses, clocks, problems; no device, no thread."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ from lce_rig.timing.clock_fit import ClockTracker
 # Which times and running numbers can be, and which tell that the board restarted: a line may be damaged and
 # keep its sum. One odd value is skipped; two in a row that agree are believed.
 
-# A line is written within milliseconds of what it tells, and read whenever the computer gets to it.
+# A line is written within milliseconds of its event, and read whenever the computer gets to it.
 ROOM_NS = 2 * NS_PER_S
 _MOST_BACK_NS = NS_PER_S
 # Answers may overtake what the board had queued before; a board that has just started is not that far.
@@ -42,7 +42,7 @@ _NO_CLOCK_S = 5.0
 
 
 class Verdict(Enum):
-    """What to make of a value."""
+    """The judgement of a value: believed, skipped, or the first after a restart."""
 
     SOUND = "sound"
     ODD = "odd"
@@ -249,7 +249,7 @@ class BoardState:
         return self.utc_tracker.model
 
     def clock_state(self) -> ClockState:
-        """Say whose clock the timestamps are on, and how it is tied to others."""
+        """Report the clock of the timestamps and its synchronisation with others."""
         figures: dict[str, Any] = {}
         for name, model in (("host", self.host_clock), ("utc", self.utc_clock)):
             if model is not None:
@@ -263,7 +263,7 @@ class BoardState:
         return ClockState(findings.BOARD_CLOCK(**figures))
 
     def figures(self, now_ns: int) -> dict[str, float]:
-        """Give the board's figures by name at a moment of the steady clock."""
+        """Return the board's figures by name at a moment of the steady clock."""
         faults, host = self.reader.faults, self.host_clock
         figures: dict[str, float] = {
             "n_messages": self.reader.n_messages,
@@ -282,7 +282,7 @@ class BoardState:
         return figures
 
     def problems(self, now_ns: int, n_unwritten: int = 0) -> tuple[Finding, ...]:
-        """Find what is wrong at a moment of the steady clock.
+        """List the problems at a moment of the steady clock.
 
         Args:
             now_ns: that moment.

@@ -184,7 +184,7 @@ class DavisSource(LiveSource):
         self._opened = self._opened._replace(input=None)
 
     def describe(self) -> SourceStatus:
-        """Say how the camera does."""
+        """Report the state of the camera."""
         samples = self._samples
         figures = {
             "pulses_hz": self._rates["pulses"].rate_hz,

@@ -49,7 +49,7 @@ class Sink(Generic[T]):
         return self._writer.is_writing(self)
 
     def findings(self) -> list[Finding]:
-        """List what is missing in what was written, and why."""
+        """List the gaps in the written data and their causes."""
         path, missing = str(self.path), list[Finding]()
         if self.n_dropped:
             missing.append(findings.RECORDING_INCOMPLETE(n=self.n_dropped, path=path))

@@ -29,7 +29,7 @@ _TEXT = re.compile(rb"[!-)+-~ ]{0,80}\Z")
 
 
 class Hello(NamedTuple):
-    """The board has started, or was asked who it is; `tick_hz` are the steps of its clock a second."""
+    """The board has started, or identifies itself on request; `tick_hz` are its clock's steps per second."""
 
     version: int
     firmware: str
@@ -79,7 +79,7 @@ class BoardStatus(NamedTuple):
 
 
 class BoardError(NamedTuple):
-    """What the board could not do."""
+    """A command that the board could not carry out."""
 
     code: int
     text: str
@@ -155,9 +155,9 @@ def write_sentence(body: str) -> bytes:
 
 
 def read_sentence(line: bytes) -> bytes | LineFault:
-    """Return what a line holds between `$` and `*`.
+    """Return the body of a sentence, between `$` and `*`.
 
-    What stands before the last `$` is skipped: a board that restarts breaks off in the middle of a line.
+    Anything before the last `$` is skipped: a board that restarts breaks off in the middle of a line.
     """
     start = line.rfind(b"$")
     if start < 0:
@@ -189,7 +189,7 @@ def read_line(line: bytes) -> Message | LineFault:
 
 
 class LineReader:
-    """Bytes of a serial line in, messages out; what is no message is counted and survived.
+    """Bytes of a serial line in, messages out; damaged lines are counted and skipped.
 
     Attributes:
         n_messages: messages so far.

@@ -109,7 +109,7 @@ class ImagePipeSource(LiveSource):
         self._stack.close()
 
     def describe(self) -> SourceStatus:
-        """Say how the camera does."""
+        """Report the state of the camera."""
         n_damaged = self._n_damaged_before + (self._stream.n_damaged if self._stream else 0)
         problems = []
         if n_damaged:
@@ -150,7 +150,7 @@ class ImagePipeSource(LiveSource):
         return self._process.stdout, self._process.stderr
 
     def read(self) -> list[LiveSample]:
-        """Give what came; see `LiveSource`."""
+        """Return the images that came; see `LiveSource`."""
         pictures, complaints = self._pipes()
         samples: list[LiveSample] = []
         for key, _ in self._selector.select(_WAIT_S):
@@ -189,7 +189,7 @@ class ImagePipeSource(LiveSource):
             raise SourceError(f"{self._who}: its command's images: {error}", self._complaint()) from None
 
     def _raise_end(self, pictures: IO[bytes]) -> None:
-        """Say how the command ended.
+        """Report the end of the command.
 
         Raises:
             SourceError: always.

@@ -1,4 +1,4 @@
-"""What every attached sensor offers, and the queue between its reader thread and its taker."""
+"""The state of an attached sensor, and the queue between its reader thread and its taker."""
 
 import threading
 from collections import deque
@@ -63,7 +63,7 @@ class SourceStatus:
 
 
 class Waiting(Generic[T]):
-    """What reader threads put in and one taker takes out, oldest first, until it is closed and empty."""
+    """A queue from reader threads to one taker, oldest first; it ends when it is closed and empty."""
 
     def __init__(self) -> None:
         self._items: deque[T] = deque()
@@ -72,7 +72,7 @@ class Waiting(Generic[T]):
         self._changed = threading.Condition()
 
     def close(self, error: SourceError | None = None) -> None:
-        """End the queue; what is in it can still be taken, then `error` is raised if there is one."""
+        """End the queue: items in it can still be taken, then `error` is raised if there is one."""
         with self._changed:
             self._is_closed = True
             self._error = self._error or error

@@ -1,4 +1,4 @@
-"""How attached sensors are read: one thread each, one queue, and what is counted on the way."""
+"""Reading attached sensors: a thread each, one queue, counts of samples and losses."""
 
 import threading
 import time
@@ -146,7 +146,7 @@ class LiveSource(ABC):
 
     @abstractmethod
     def read(self) -> Iterable[LiveSample]:
-        """Give the samples that came; waits a moment at most.
+        """Return the samples that came; waits a moment at most.
 
         Raises:
             SourceError: the device failed for good.
@@ -158,7 +158,7 @@ class LiveSource(ABC):
 
     @abstractmethod
     def describe(self) -> SourceStatus:
-        """Say how the device does; asked from any thread, open or not. What was taken is counted here."""
+        """Report the state of the device, open or not; any thread may ask. Taken samples are counted here."""
 
     def record_packets(self, folder: Path, disk: DiskWriter) -> bool:
         """Have what the device sends recorded as it comes, from opening on; False where it sends no packets.
@@ -169,12 +169,12 @@ class LiveSource(ABC):
         return False
 
     def explain_silence(self, *, has_sent: bool) -> SourceError:
-        """Say what to check where nothing has come for `silence_s`, since it was opened or since it sent."""
+        """Explain a silence of `silence_s` since the device was opened or last sent."""
         what = "fell silent" if has_sent else "sends nothing"
         return SourceError(f"{self._who} {what}: nothing for {self._silence_s:g} s", self._what_to_check)
 
     def feed(self, inbox: Inbox, reopen_every_s: float) -> None:
-        """Feed a queue that others feed, too, and open what is lost again and again; before it is opened."""
+        """Feed a shared queue, and reopen the device whenever it is lost; call before opening."""
         self._inbox, self._is_shared, self._reopen_every_s = inbox, True, reopen_every_s
         self._n_slots = max(self._n_slots, _N_SHARED_SLOTS)
 
@@ -227,7 +227,7 @@ class LiveSource(ABC):
         self.take(0)
 
     def status(self) -> SourceStatus:
-        """Say how the sensor does; may be called from any thread."""
+        """Report the state of the sensor; may be called from any thread."""
         counts = self._inbox
         return replace(
             self.describe(),
@@ -258,7 +258,7 @@ class LiveSource(ABC):
             raise
 
     def _run(self) -> None:
-        """Read until asked to stop; what is lost is opened again where others feed the queue, too."""
+        """Read until asked to stop; a lost device is reopened if the queue is shared."""
         while True:
             try:
                 failure = self._read_on()

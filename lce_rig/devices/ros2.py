@@ -97,7 +97,7 @@ class Ros2Source(LiveSource):
         self._stack.close()
 
     def read(self) -> list[LiveSample]:
-        """Give what came; see `LiveSource`."""
+        """Return the samples that came; see `LiveSource`."""
         self._executor.spin_once(timeout_sec=_WAIT_S)
         came, self._waiting = self._waiting, []
         samples: list[LiveSample] = []
@@ -110,7 +110,7 @@ class Ros2Source(LiveSource):
         return samples
 
     def describe(self) -> SourceStatus:
-        """Say how the topic does."""
+        """Report the state of the topic."""
         n_lost = sum(
             int(str(loss.figures["n"]))
             for loss in self._decoder.losses.findings()

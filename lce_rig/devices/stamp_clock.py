@@ -49,7 +49,7 @@ class FrameTiming:
     trigger_delay_ns: float = 0.0
 
     def to_mid_ns(self, mark: Mark) -> int:
-        """Give what to add to a timestamp of a kind to come to the middle of the exposure, (1) to (4).
+        """Return the time from a timestamp's moment to the middle of the exposure, (1) to (4).
 
         An unknown exposure counts as none.
         """
@@ -66,13 +66,13 @@ class FrameTiming:
 
 def frame_timing(settings: DriverSettings, n_rows: int, exposure_us: float | None = None) -> FrameTiming:
     """Take the timing from the profile; the exposure from the camera where the profile has none."""
-    given = settings.frame_timing
-    exposure_us = given.exposure_us or exposure_us
+    timing = settings.frame_timing
+    exposure_us = timing.exposure_us or exposure_us
     return FrameTiming(
         n_rows,
         None if exposure_us is None else 1000 * exposure_us,
-        1000 * given.line_time_us,
-        1000 * given.trigger_delay_us,
+        1000 * timing.line_time_us,
+        1000 * timing.trigger_delay_us,
     )
 
 
@@ -200,7 +200,7 @@ class StampClock:
         return None if self._is_missing else self.clock
 
     def problems(self) -> list[Finding]:
-        """Find what is doubtful about the timestamps."""
+        """List the problems of the timestamps."""
         if self._is_missing:
             return [findings.CLOCK_MISSING(clock=self.clock)]
         if self._is_fixed:

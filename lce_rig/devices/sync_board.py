@@ -71,7 +71,7 @@ class BoardPort:
             raise _explained(who, device, error) from None
 
     def read(self) -> bytes:
-        """Wait for bytes, 20 ms at most, and give what is there.
+        """Wait for bytes, 20 ms at most, and return them.
 
         Raises:
             SourceError: the board was unplugged.
@@ -198,7 +198,7 @@ class SyncBoard(LiveSource):
             self._port.close()
 
     def read(self) -> list[Pulse]:
-        """Give the pulses that came, and say to the board what is due.
+        """Return the pulses that came, and send the commands that are due.
 
         Their `sensor` is the camera, or "pps"; timestamps are the board's own time.
 
@@ -229,7 +229,7 @@ class SyncBoard(LiveSource):
         return early + pulses
 
     def describe(self) -> SourceStatus:
-        """Say how the board does."""
+        """Report the state of the board."""
         now_ns = time.monotonic_ns()
         with self._lock:
             state, hello = self._state, self._state.hello
@@ -275,7 +275,7 @@ class SyncBoard(LiveSource):
             self._outbox.append(lce1.START)
 
     def _talk(self, port: BoardPort, now_ns: int) -> None:
-        """Send what is due: greetings, commands, UTC, a time request."""
+        """Send the greetings, commands, UTC and time requests that are due."""
         if not self._is_set_up:
             if now_ns - self._greeted_ns > _GREET_AGAIN_NS:
                 self._greeted_ns = now_ns

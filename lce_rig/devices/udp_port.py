@@ -1,4 +1,4 @@
-"""A UDP port of the host, with the kernel's own arrival timestamps and its count of what it had to drop.
+"""A UDP port of the host, with the kernel's arrival timestamps and its count of dropped datagrams.
 
 Many datagrams are taken in one system call: recvmmsg, which Python does not offer.
 
@@ -110,7 +110,7 @@ class UdpPort:
         self.granted_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
     def fileno(self) -> int:
-        """Give the file descriptor, to wait on."""
+        """Return the file descriptor, to wait on."""
         return self._socket.fileno()
 
     def receive_many(self) -> list[Datagram]:

@@ -100,7 +100,7 @@ class V4l2Source(LiveSource):
         self._stack.close()
 
     def describe(self) -> SourceStatus:
-        """Say how the camera does."""
+        """Report the state of the camera."""
         figures = {
             "n_damaged": float(self._n_damaged),
             "stamp_to_mid_exposure_ms": self._timing.to_mid_ns(self._mark) * 1e-6,
@@ -162,7 +162,7 @@ class V4l2Source(LiveSource):
         return PixelDecoder(code, width, height, layout.stride)
 
     def read(self) -> list[LiveSample]:
-        """Give what came; see `LiveSource`."""
+        """Return the image that came; see `LiveSource`."""
         try:
             frame = self._device.read(_WAIT_S)
         except OSError:

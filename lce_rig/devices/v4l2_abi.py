@@ -40,7 +40,7 @@ EXPOSURE_ABSOLUTE_ID = 0x009A_0902
 
 
 class Capability(Structure):
-    """What a device is."""
+    """Identity and capabilities of a device."""
 
     _fields_ = (
         ("driver", c_char * 16),

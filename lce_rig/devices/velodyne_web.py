@@ -1,4 +1,4 @@
-"""The web page of a Velodyne: what it is, how it does and how it is set.
+"""The web page of a Velodyne: identity, state and settings.
 
 Firmware differs in what it tells and in the types of its values: every field may be missing, numbers come as
 text, switches as "On", "on" or true.

@@ -226,7 +226,7 @@ class VideoDevice:
             raise SourceError(f"{where} delivers no images; it is another end of some device", _attached())
 
     def _explain(self, error: OSError, what: str) -> SourceError:
-        """Say what a failure of the device means and what to check."""
+        """Explain a failure of the device, with an action."""
         where = f"camera {self._sensor!r}: {self.path}"
         if error.errno in (errno.ENODEV, errno.ENXIO) or not Path(self.path).exists():
             if self._buffers:
@@ -257,7 +257,7 @@ def video_devices() -> list[str]:
 
 
 def serial_number(name: str, system: Path = Path("/sys/class/video4linux")) -> str:
-    """Give the serial number of the USB device behind a video device; "" where the kernel knows none.
+    """Return the serial number of the USB device behind a video device; "" where the kernel knows none.
 
     Args:
         name: of the video device: "video0".

@@ -24,7 +24,7 @@ from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings
 
 SILENCE_S = 2.0
-# Half a second of scans: whoever is slower wants the newest.
+# Half a second of scans: a slower taker wants the newest.
 N_SLOTS = 5
 
 # A computer that is busy elsewhere for longer than this is too slow anyhow.
@@ -41,7 +41,7 @@ _MAX_SHOWN = 3
 
 @dataclass
 class Reception:
-    """What the host saw of the packets.
+    """Figures of the packets' reception by the host.
 
     Attributes:
         address: whose packets are taken; "" before the first.
@@ -290,7 +290,7 @@ class Vlp16Source(LiveSource):
         )
 
     def describe(self) -> SourceStatus:
-        """Say how the sensor does; may be called from any thread."""
+        """Report the state of the sensor; may be called from any thread."""
         with self._lock:
             reception, ports = self._reception, self._ports
             reception.n_overflowed = sum(port.n_overflowed for port in ports)

@@ -28,7 +28,7 @@ _STREAMS = ("scans", "events", "frames")
 
 
 def check_clock(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Say what a camera's or sync board's timestamps are tied to."""
+    """Report the clock of a camera's or sync board's timestamps."""
     status = exam.seen[sensor].status
     if status is not None:
         yield findings.NO_TIMESTAMPS() if status.clock is None else status.clock.finding

@@ -1,4 +1,4 @@
-"""What a check looks at and what it gives: the observed sensors of a rig, and one line of findings."""
+"""The input and output of a check: a rig's observed sensors, and one line of findings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -53,7 +53,7 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """What is known of a rig.
+    """Observations of a rig.
 
     Attributes:
         rig: the profile.
@@ -71,7 +71,7 @@ class Examination:
     boards: Mapping[tuple[str, str], Finding] = field(default_factory=dict)
 
     def problems(self, sensor: str, *families: str) -> list[Finding]:
-        """Give the problems that a sensor's driver names, of some families of codes."""
+        """Return the problems that a sensor's driver names, of some families of codes."""
         status = self.seen[sensor].status
         return [] if status is None else [each for each in status.problems if each.family in families]
 

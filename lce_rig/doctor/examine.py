@@ -125,26 +125,26 @@ def look_for_boards(rig: Rig, seen: Mapping[str, ObservedSensor]) -> dict[tuple[
 
 def _sight_in_scan(rig: Rig, seen: ObservedSensor) -> Finding:
     assert seen.scan is not None
-    found = BoardFinder(rig).scan(seen.scan)
-    if isinstance(found, Refusal):
-        return found
-    best = found[0].quality
+    boards = BoardFinder(rig).scan(seen.scan)
+    if isinstance(boards, Refusal):
+        return boards
+    best = boards[0].quality
     return findings.BOARD_IN_SCAN(
         distance_m=best.distance_m,
         n_rings=best.n_rings,
         n_points=best.n_points,
-        n_candidates=len(found),
+        n_candidates=len(boards),
     )
 
 
 def _sight_in_image(rig: Rig, image: Image) -> Finding:
     try:
-        found = BoardFinder(rig).image(image)
+        board = BoardFinder(rig).image(image)
     except LceRigError as error:
-        found = refusal_of("image", error)
-    if isinstance(found, Refusal):
-        return found
-    names, figures = ("distance_m", "n_corners", "corner_rms_px", "sharpness"), found.figures()
+        board = refusal_of("image", error)
+    if isinstance(board, Refusal):
+        return board
+    names, figures = ("distance_m", "n_corners", "corner_rms_px", "sharpness"), board.figures()
     shown: dict[str, Any] = {name: figures[name] for name in names}
     return findings.BOARD_IN_IMAGE(**shown)
 
@@ -157,7 +157,7 @@ def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
         reconstructor = reconstructor_for(
             camera.channels[channel].reconstruction if channel in camera.channels else None, channel
         )
-        found = find_event_board(
+        board = find_event_board(
             events,
             int(events.t_ns[-1]) - 1,
             reconstructor,
@@ -166,7 +166,7 @@ def _sight_in_events(rig: Rig, seen: ObservedSensor) -> Finding:
             rig.quality,
         ).board
     except LceRigError as error:
-        found = refusal_of("image", error)
-    if isinstance(found, Refusal):
-        return found
-    return findings.BOARD_IN_EVENTS(distance_m=found.distance_m)
+        board = refusal_of("image", error)
+    if isinstance(board, Refusal):
+        return board
+    return findings.BOARD_IN_EVENTS(distance_m=board.distance_m)

@@ -26,7 +26,7 @@ _NO_PIXELS = np.zeros((1, 1), dtype=np.uint8)
 
 @dataclass
 class ObservedSensor:
-    """What was seen of one sensor.
+    """Observations of one sensor.
 
     Attributes:
         sensor: its name in the profile.
@@ -63,7 +63,7 @@ class ObservedSensor:
         return self.status is not None
 
     def times(self, stream: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Give the timestamps (N,) and arrivals (N,) of a stream, ns."""
+        """Return the timestamps (N,) and arrivals (N,) of a stream, ns."""
         pairs = np.array(self.stamps.get(stream, []), dtype=np.int64).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
 

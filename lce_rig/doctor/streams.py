@@ -1,4 +1,4 @@
-"""Each sensor: whether it answers and what it is, whether its stream comes whole, and what is in it."""
+"""Checks of each sensor: its identity, the rate and completeness of its stream, the contents."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -30,7 +30,7 @@ _US_PER_S = 1e6
 
 
 def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """Say what answers, or why nothing does."""
+    """Report the device that answers, or the reason of its failure."""
     seen = exam.seen[sensor]
     if seen.failure is not None:
         yield findings.FAILED(what=seen.failure.what, hint=seen.failure.hint)
@@ -98,7 +98,7 @@ def check_stream(exam: Examination, sensor: str) -> Iterator[Finding]:
 
 
 def wanted_rate_hz(rig: Rig, sensor: str) -> float | None:
-    """Give how many scans or images a second the profile wants; None where it does not say."""
+    """Return how many scans or images a second the profile wants; None where it does not say."""
     if sensor in rig.lidars:
         return rig.lidars[sensor].rate_hz
     driver = rig.cameras[sensor].driver

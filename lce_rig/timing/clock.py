@@ -69,11 +69,11 @@ class ClockModel:
         return np.asarray(self.reference_ns + elapsed_ns + drifted_ns)
 
     def sigma_ns(self, source_ns: int) -> float:
-        """Give the standard deviation of `convert`, within the data or beyond them."""
+        """Return the standard deviation of `convert`, within the data or beyond them."""
         return float(self.sigmas_ns(np.array([source_ns], dtype=np.int64))[0])
 
     def sigmas_ns(self, source_ns: NDArray[np.int64]) -> Array:
-        """Give the standard deviations (N,) of `convert_all`.
+        """Return the standard deviations (N,) of `convert_all`.
 
             sigma(t)^2 = c00 + 2 c01 dt + c11 dt^2 + bias^2 + (WANDER outside)^2
 

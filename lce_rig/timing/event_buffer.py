@@ -14,7 +14,7 @@ AFTER_NS = 150_000_000
 """... and after its last, for the board to be followed."""
 
 _LEAST_EVENTS = 1 << 16
-# Of what is held: more room costs memory, less of it copies more often.
+# Factor of the buffered events: more room costs memory, less of it copies more often.
 _ROOM = 1.5
 # A clock that is fitted again while events come may move them back by microseconds.
 _MAX_BACK_NS = 1_000_000
@@ -123,7 +123,7 @@ class _Stream:
         self._start += min(int(np.searchsorted(t_ns, time_ns)), len(t_ns) - 1)
 
     def between(self, start_ns: int, end_ns: int) -> Events:
-        """Give the events with start_ns <= t < end_ns."""
+        """Return the events with start_ns <= t < end_ns."""
         return self._held().between(start_ns, end_ns)
 
     def _held(self) -> Events:

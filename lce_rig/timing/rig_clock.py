@@ -65,7 +65,7 @@ class CommonClock:
         self.models = dict(models or {})
 
     def place(self, sample: LiveSample) -> LiveSample:
-        """Give a sample with its timestamps on the rig's clock; as it is where its sensor is not tied."""
+        """Return a sample with its timestamps on the rig's clock; as it is where its sensor is not tied."""
         model = self.models.get(sample.sensor)
         if model is None:
             return sample
@@ -76,7 +76,7 @@ class CommonClock:
         return replace(sample, stamp_ns=model.convert(sample.stamp_ns))
 
     def sigma_ns(self, sensor: str, time_ns: int) -> float | None:
-        """Give a timestamp's standard deviation at a time of the rig's clock; None where not tied."""
+        """Return a timestamp's standard deviation at a time of the rig's clock; None where not tied."""
         model = self.models.get(sensor)
         return None if model is None else model.inverse().sigma_ns(time_ns)
 
@@ -314,7 +314,7 @@ class RigClock:
             self._is_slow = False
 
     def edge_clock(self, camera: str) -> tuple[ClockModel | None, Finding | None]:
-        """Give the board's time on the clock of a camera that stamps its edges; or why there is none."""
+        """Return the board's time on the clock of a camera that stamps its edges; or why there is none."""
         return self._edge_models.get(camera), self._edges[camera].problem
 
     def problems(self) -> list[Finding]:

@@ -26,7 +26,7 @@ def stream_of(sample: Sample, rig: Rig) -> Stream:
 
 
 def rig_offset_ns(stream: Stream, rig: Rig) -> int:
-    """Return what the profile adds to a stream's timestamps to get the rig's time."""
+    """Return the profile's offset from a stream's timestamps to the rig's time."""
     if stream.kind == "scans":
         timestamps = rig.lidars[stream.sensor].timestamps
     else:

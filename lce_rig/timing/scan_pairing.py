@@ -20,7 +20,7 @@ _Buffers: TypeAlias = dict[tuple[str, str], deque[tuple[int, Image | Scan]]]
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What the rig saw at one time.
+    """The samples of all sensors at one time.
 
     Attributes:
         time_ns: middle of the first LiDAR's scan, rig time (timestamps plus the profile's expected offsets).
@@ -43,7 +43,7 @@ def pair_by_time(
     *,
     are_events_enough: bool = False,
 ) -> Iterator[Frame]:
-    """Give each scan of the first LiDAR heard the nearest image of each camera channel, and its events.
+    """Return each scan of the first LiDAR heard the nearest image of each camera channel, and its events.
 
     Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
     has gone by. Where clocks are set back, what waits is given up.

@@ -249,7 +249,7 @@ class TriggerMatcher:
         self._slipped_at.clear()
 
     def figures(self) -> dict[str, Figure]:
-        """Give how matching went: n_matched, and what was lost by its name."""
+        """Return how matching went: n_matched, and what was lost by its name."""
         return {
             "n_matched": self.n_matched,
             **{name: self.losses.n(kind.code) for name, kind in _LOSSES.items()},
