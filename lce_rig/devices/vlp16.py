@@ -19,8 +19,7 @@ from lce_rig.devices.reading import LiveSource
 from lce_rig.devices.udp_port import PACKET_COST_BYTES, UdpPort
 from lce_rig.devices.velodyne_web import VelodyneWeb, find_problems
 from lce_rig.io.network import Datagram, PcapWriter
-from lce_rig.io.velodyne.driver_controls import read_controls
-from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.io.velodyne.stream import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
 
 SILENCE_S = 2.0
@@ -170,7 +169,7 @@ class Vlp16Source(LiveSource):
     """The scans of an attached VLP-16; open while its `with` block lasts.
 
     `driver.address` is whose packets are taken, those of the VLP-16 heard first where it is not set;
-    `driver.port` is the port of data packets (2368); `driver.controls` may hold what `Vlp16Controls` does.
+    `driver.port` is the port of data packets (2368); `driver.controls` as `read_controls` reads them.
 
     Attributes:
         sensor: its name in the profile.
@@ -231,7 +230,7 @@ class Vlp16Source(LiveSource):
         with self._lock:
             self._n_lost_before += self._stream.losses.n("packet.lost") if self._stream is not None else 0
             self._stream, self._reception = Vlp16Stream(self.sensor, self._settings), Reception()
-        position_port = read_controls(self.sensor, self._settings).position_port
+        position_port, _ = read_controls(self.sensor, self._settings)
         data = UdpPort(self._settings.driver.port or velodyne.DATA_PORT, f"{self.sensor}: data packets")
         self._ports = (data,)
         self._ports = data, UdpPort(position_port, f"{self.sensor}: position packets")
@@ -307,7 +306,7 @@ class Vlp16Source(LiveSource):
             self._recorder.put(datagram, len(datagram.payload))
         with self._lock:
             if not is_data:
-                stream.push_position(datagram.payload, datagram.host_ns)
+                stream.push_position(datagram.payload)
                 return None
             scan = stream.push_data(datagram.payload, datagram.host_ns)
             if stream.n_data and not self._reception.address:

@@ -29,7 +29,6 @@ RECORDINGS = {
     ".zip": "lce_rig.io.events.camera_file:EventCameraFile",
 }
 """Reader by suffix, or "folder"; imported when wanted."""
-_PACKETS, _OUSTER = (".pcap", ".pcapng"), "lce_rig.io.ouster:OusterRecording"
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
@@ -47,15 +46,12 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
         hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
         raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
     options = options or SourceOptions()
-    reader = _OUSTER if kind in _PACKETS and _is_of_ouster(rig, options) else RECORDINGS[kind]
+    reader = RECORDINGS[kind]
+    if kind in (".pcap", ".pcapng"):
+        model = rig.lidars[choose_lidar(rig, options, [])].model.upper().removeprefix("OUSTER").lstrip(" -_")
+        reader = "lce_rig.io.ouster:OusterRecording" if model.startswith("OS") else reader
     recording: Recording = resolve_name(reader)(path, rig, options)
     return recording
-
-
-def _is_of_ouster(rig: Rig, options: SourceOptions) -> bool:
-    """Return whether the LiDAR that packets belong to is an Ouster: OS0, OS1, OS2."""
-    lidar = rig.lidars[choose_lidar(rig, options, [])]
-    return lidar.model.upper().removeprefix("OUSTER").lstrip(" -_").startswith("OS")
 
 
 def open_recordings(
@@ -74,22 +70,18 @@ def open_recordings(
     paths, options = list(paths), options or SourceOptions()
     by_path = [options] * len(paths) if isinstance(options, SourceOptions) else options
     recordings: list[Recording] = []
-    for path, own in zip(paths, by_path, strict=True):
-        own = replace(own, is_part=own.is_part or len(paths) > 1)
-        recordings += _open_parts(list_parts(path, rig, own), rig)
+    for path, path_options in zip(paths, by_path, strict=True):
+        is_part = path_options.is_part or len(paths) > 1
+        opened: list[Recording] = []
+        failures: list[SourceError] = []
+        for part, part_options in list_parts(path, rig, replace(path_options, is_part=is_part)):
+            try:
+                opened.append(open_recording(part, rig, part_options))
+            except SourceError as error:
+                failures.append(error)
+        if not opened:
+            raise failures[0]
+        # A file that a killed recorder left empty is skipped.
+        opened[0].notes.extend(f"skipped: {error.what}" for error in failures)
+        recordings += opened
     return recordings
-
-
-def _open_parts(parts: list[tuple[Path, SourceOptions]], rig: Rig) -> list[Recording]:
-    """Open the recordings of one folder; a file that a killed recorder left empty is skipped."""
-    opened: list[Recording] = []
-    failures: list[SourceError] = []
-    for path, options in parts:
-        try:
-            opened.append(open_recording(path, rig, options))
-        except SourceError as error:
-            failures.append(error)
-    if not opened:
-        raise failures[0]
-    opened[0].notes.extend(f"skipped: {error.what}" for error in failures)
-    return opened

@@ -20,7 +20,15 @@ def choose_camera(
     Raises:
         SourceError: the rig has no such camera or channel, or several cameras and none was named.
     """
-    camera = camera or options.camera or _only_camera(rig)
+    camera = camera or options.camera
+    if camera is None:
+        camera, *others = rig.cameras
+        if others:  # Images of one that are taken for another's would spoil both extrinsics.
+            raise SourceError(
+                f"rig {rig.name!r} has cameras {', '.join(rig.cameras)}: the images' camera is not known",
+                f"Name it with --camera {camera}, or put each camera's images into a folder of its name: "
+                f"img/{camera}/, img/{others[0]}/ and pcd/.",
+            )
     if camera not in rig.cameras:
         raise SourceError(f"rig {rig.name!r} has no camera {camera!r}; it has {', '.join(rig.cameras)}")
     channels = rig.cameras[camera].channels
@@ -30,22 +38,6 @@ def choose_camera(
     if len(channels) > 1 and not options.channel:
         notes.append(f"images assigned to camera {camera}, channel {channel}")
     return camera, channel
-
-
-def _only_camera(rig: Rig) -> str:
-    """Name the rig's camera; images of one that were taken for another's would spoil both extrinsics.
-
-    Raises:
-        SourceError: it has several.
-    """
-    first, *others = rig.cameras
-    if others:
-        raise SourceError(
-            f"rig {rig.name!r} has cameras {', '.join(rig.cameras)}: the images' camera is not known",
-            f"Name it with --camera {first}, or put each camera's images into a folder of its name: "
-            f"img/{first}/, img/{others[0]}/ and pcd/.",
-        )
-    return first
 
 
 def choose_lidar(rig: Rig, options: SourceOptions, notes: list[str]) -> str:

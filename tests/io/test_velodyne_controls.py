@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.io.velodyne.driver_controls import read_controls
-from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.io.velodyne.stream import Vlp16Stream, read_controls
 from lce_rig.rig.sensors import DriverSettings
 
 from .vlp16_room import packets_of, push, room_scans, settings

@@ -79,7 +79,7 @@ def test_other_velodynes_are_refused_by_name(product: int, name: str, payload: b
 def test_whatever_comes_as_a_position_packet_is_read_or_refused(payload: bytes) -> None:
     for body in (payload, payload.ljust(velodyne.POSITION_BYTES, b"\0")[: velodyne.POSITION_BYTES]):
         try:
-            read = read_position_packet(body, 1)
+            read = read_position_packet(body)
         except BadPacketError:
             continue
         assert 0 <= read.us < velodyne.HOUR_US and read.pps in range(4)
@@ -100,4 +100,4 @@ def test_whatever_comes_as_a_position_packet_is_read_or_refused(payload: bytes) 
 def test_only_sound_sentences_tell_the_time(sentence: bytes, second: int | None) -> None:
     body = bytearray(velodyne.POSITION_BYTES)
     body[0xCE : 0xCE + len(sentence)] = sentence
-    assert read_position_packet(bytes(body), 0).nmea_s == second
+    assert read_position_packet(bytes(body)).nmea_s == second

@@ -66,7 +66,7 @@ def push(
     for packet in packets:
         host_ns = 0 if delay_ns is None else packet.sent_ns + delay_ns
         if packet.port == velodyne.POSITION_PORT:
-            stream.push_position(packet.payload, host_ns)
+            stream.push_position(packet.payload)
         elif (scan := stream.push_data(packet.payload, host_ns)) is not None:
             scans.append(scan)
     last = stream.finish()

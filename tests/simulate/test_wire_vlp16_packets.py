@@ -86,13 +86,13 @@ def test_position_packets_tell_of_the_clock() -> None:
     positions = [packet for packet in packets if packet.port == velodyne.POSITION_PORT]
     assert len(positions) == 6
     for packet in positions:
-        read = read_position_packet(packet.payload, packet.sent_ns)
+        read = read_position_packet(packet.payload)
         assert velodyne.PPS_STATES[read.pps] == "synchronising"
         assert read.us == packet.sent_ns // 1000 % velodyne.HOUR_US + 5_000_000
         assert read.nmea.startswith("$GPRMC,2213") and not read.is_fix
         assert read.nmea_s is not None and read.nmea_s in (13 * 60 + 19, 13 * 60 + 20)
     silent = packets_of(room_scans(1), clock=Vlp16Clock("absent", has_nmea=False))
-    read = read_position_packet(silent[1].payload, 0)
+    read = read_position_packet(silent[1].payload)
     assert (read.pps, read.nmea, read.nmea_s) == (0, "", None)
 
 

@@ -5,7 +5,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,12 +83,10 @@ class DataPacket:
         return self.product.packet_ns(self.is_dual)
 
 
-@dataclass(frozen=True)
-class PositionPacket:
+class PositionPacket(NamedTuple):
     """The sensor's report on its clock.
 
     Attributes:
-        host_ns: arrival at the host; 0 where unknown.
         us: time past the hour on the sensor's counter.
         pps: index into velodyne.PPS_STATES.
         nmea: the sentence it last received, without its line end; "" for none.
@@ -96,7 +94,6 @@ class PositionPacket:
         is_fix: whether that sentence claims to be valid (status A).
     """
 
-    host_ns: int
     us: int
     pps: int
     nmea: str
@@ -156,7 +153,7 @@ def _is_even(azimuth: Sequence[int], is_dual: bool, block_ns: int) -> bool:
     return max(middle - min(steps), max(steps) - middle) <= most
 
 
-def read_position_packet(payload: bytes | memoryview, host_ns: int) -> PositionPacket:
+def read_position_packet(payload: bytes | memoryview) -> PositionPacket:
     """Read what the sensor reports of its clock.
 
     Raises:
@@ -173,7 +170,7 @@ def read_position_packet(payload: bytes | memoryview, host_ns: int) -> PositionP
     raw = bytes(fields["nmea"]).split(b"\0")[0]
     nmea_s, is_fix = _read_rmc(raw)
     nmea = raw.strip().decode("ascii", "replace")
-    return PositionPacket(host_ns, us, pps, nmea, nmea_s, is_fix)
+    return PositionPacket(us, pps, nmea, nmea_s, is_fix)
 
 
 def _read_rmc(raw: bytes) -> tuple[int | None, bool]:

@@ -65,7 +65,7 @@ class PcapRecording:
                 if datagram.source != self._address:
                     continue
                 if len(datagram.payload) == velodyne.POSITION_BYTES:
-                    stream.push_position(datagram.payload, datagram.host_ns)
+                    stream.push_position(datagram.payload)
                 elif len(datagram.payload) == velodyne.DATA_BYTES:
                     scan = stream.push_data(datagram.payload, datagram.host_ns)
                     if scan is not None:

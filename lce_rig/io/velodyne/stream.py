@@ -6,6 +6,7 @@ packet, where drivers interpolate block by block (up to 0.025 deg apart). Its St
 cuts revolutions at packets, hands on partial ones, and keeps both returns of a firing.
 """
 
+import math
 from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,7 +20,6 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding, Kind
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.velodyne.driver_controls import read_controls
 from lce_rig.io.velodyne.packet import (
     BadPacketError,
     DataPacket,
@@ -34,6 +34,7 @@ from lce_rig.timing.clock import resolve_hour
 #: What a recording made elsewhere may lack.
 OFFSETS_NOTE = "points include the lasers' vertical offsets (VLP-16: up to 11 mm), which ROS 1 drivers omit"
 DUAL_NOTE = "dual returns: of each firing the brighter one is kept"
+_CONTROLS = ("position_port", "cut_deg")
 _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "VLP-32C": "VLP32C"}
 #: Clocks further apart than this do not both show UTC.
 MAX_DISAGREEMENT_NS = 100_000_000
@@ -48,6 +49,35 @@ _N_WINDOWS = 20
 _MIN_COVERAGE = 0.5
 # Timestamps by arrival and by the sensor may differ by 0.1 s when one takes over from the other.
 _MAX_OVERLAP_NS = 1_000_000_000
+
+
+def read_controls(sensor: str, settings: LidarSettings) -> tuple[int, float]:
+    """Read the `driver.controls` of a Velodyne.
+
+    Args:
+        sensor: the LiDAR's name in the profile, for messages.
+        settings: its block of the profile.
+
+    Returns:
+        The UDP port of position packets (`position_port`), and the direction of the seam between two scans
+        (`cut_deg`), rad from the lidar frame's x axis towards y; by default behind the sensor, where no
+        camera looks.
+
+    Raises:
+        SourceError: a key is unknown, or its value cannot be meant.
+    """
+    controls = settings.driver.controls
+    where = f"lidars.{sensor}.driver.controls"
+    unknown = sorted(set(controls) - set(_CONTROLS))
+    if unknown:
+        raise SourceError(f"{where}: a VLP-16 has no {unknown[0]!r}; it has {', '.join(_CONTROLS)}")
+    port = controls.get("position_port", velodyne.POSITION_PORT)
+    if not isinstance(port, int) or not 1 <= port <= 65535:
+        raise SourceError(f"{where}.position_port is {port!r}, not a port from 1 to 65535")
+    cut_deg = controls.get("cut_deg", 180.0)
+    if isinstance(cut_deg, bool | str) or not -360 <= cut_deg <= 360:
+        raise SourceError(f"{where}.cut_deg is {cut_deg!r}, not an angle from -360 to 360 degrees")
+    return port, math.radians(cut_deg)
 
 
 class VelodyneClock:
@@ -198,8 +228,8 @@ class Vlp16Stream:
         self._order = PacketOrder(self.losses)
         self._decoder = Vlp16Decoder(settings.min_range_m, settings.max_range_m, self.product)
         # The sensor counts clockwise.
-        cut_rad = -read_controls(sensor, settings).cut_azimuth_rad
-        self._cut = round(cut_rad / velodyne.AZIMUTH_STEP_RAD) % velodyne.AZIMUTH_STEPS
+        _, cut_rad = read_controls(sensor, settings)
+        self._cut = round(-cut_rad / velodyne.AZIMUTH_STEP_RAD) % velodyne.AZIMUTH_STEPS
         self._pieces: list[_Piece] = []
         self._is_from_cut = False
         self._last_stamp_ns: int | None = None
@@ -217,10 +247,10 @@ class Vlp16Stream:
         lost = [loss for loss in self.losses.findings() if not loss.subject]
         return [loss.text for loss in lost + self.flaws()]
 
-    def push_position(self, payload: bytes | memoryview, host_ns: int) -> None:
+    def push_position(self, payload: bytes | memoryview) -> None:
         """Take a position packet; a bad one is counted."""
         try:
-            self.clock.position = read_position_packet(payload, host_ns)
+            self.clock.position = read_position_packet(payload)
         except BadPacketError as error:
             self.losses.add(error.kind("position"))
             return
