@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.losses import Losses
-from lce_rig.io.events.stream import NS_PER_US, NoEventsError, damage, join_small, parse_size, to_ns
+from lce_rig.io import findings
+from lce_rig.io.events.stream import NS_PER_US, NoEventsError, join_small, parse_size, to_ns
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 EVENT = np.dtype({"names": ["t", "x", "y", "on"], "formats": ["<i8", "<i2", "<i2", "?"], "itemsize": 16})
@@ -117,11 +118,11 @@ class Aedat4File:
                     raise
                 except Exception as error:  # of lz4, zstd, struct or numpy
                     where = f"packet {number} at byte {at - 8}: {reason_of(error)}"
-                    losses.add(damage("recording.broken_packets", where))
+                    losses.add(findings.BROKEN_PACKETS(where=where))
                     continue
                 yield content
         if self._torn:
-            losses.add(damage("recording.torn_end", self._torn))
+            losses.add(findings.TORN_END(where=self._torn))
 
     def last_packet(self, stream: int, decode: Callable[[bytes], _Content]) -> _Content | None:
         """Decode the last whole packet of a stream; None if there is none."""

@@ -6,11 +6,12 @@ from pathlib import Path
 
 from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.core.losses import Losses
+from lce_rig.io import findings
 from lce_rig.io.events import open_events
 from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
 from lce_rig.io.events.event_recording import CameraEvents
 from lce_rig.io.events.prophesee_raw import PropheseeEvents
-from lce_rig.io.events.stream import NoEventsError, damage, worded
+from lce_rig.io.events.stream import NoEventsError, worded
 from lce_rig.io.fingerprint import fingerprint
 from lce_rig.io.joining import merge_by_time
 from lce_rig.io.protocol import SourceOptions, Span
@@ -117,7 +118,7 @@ class EventCameraFile:
         last_ns: int | None = None
         for frame in self._file.packets(self._number, losses, decode_frame):
             if last_ns is not None and frame.mid_exposure_ns <= last_ns:
-                losses.add(damage("recording.frames_out_of_order"))
+                losses.add(findings.FRAMES_OUT_OF_ORDER())
                 continue
             last_ns = frame.mid_exposure_ns
             yield Image(self._camera, self._channel, last_ns, frame.pixels)

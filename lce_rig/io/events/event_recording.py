@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lce_rig.core.data import MAX_TIME_NS, EventColumns, Events, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
+from lce_rig.io import findings
 from lce_rig.io.events.stream import (
     MAX_EVENT_PIXELS,
     NO_EVENTS,
@@ -18,7 +19,6 @@ from lce_rig.io.events.stream import (
     EventStream,
     KnowsItsLength,
     NoEventsError,
-    damage,
     seconds_in,
     worded,
 )
@@ -28,8 +28,8 @@ from lce_rig.io.protocol import Span
 REORDER_NS = 20_000_000
 # Counters of 31 and 32 bits of microseconds are common; they wrap after 36 and 72 minutes.
 _WRAPS_NS = {
-    "recording.clock_wrapped_31": (1 << 31) * NS_PER_US,
-    "recording.clock_wrapped_32": (1 << 32) * NS_PER_US,
+    findings.CLOCK_WRAPPED_31: (1 << 31) * NS_PER_US,
+    findings.CLOCK_WRAPPED_32: (1 << 32) * NS_PER_US,
 }
 _MAX_GAP_NS = 60_000_000_000
 # Cameras may send a little before their clock is set at the start.
@@ -211,7 +211,7 @@ class EventRecording:
                 f"row {bottom}; camera {self.sensor!r} has {_size(self.resolution_px)} pixels",
                 "Give this camera's recording, or correct resolution_px in the profile.",
             )
-        losses.add(damage("recording.events_off_sensor", f"column {right}, row {bottom}"), n_off)
+        losses.add(findings.EVENTS_OFF_SENSOR(where=f"column {right}, row {bottom}"), n_off)
         return stretch.select(is_on)
 
 
@@ -278,7 +278,7 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
     for stretch in stretches:
         if len(stretch) and not -MAX_TIME_NS < stretch.t_ns.min() <= stretch.t_ns.max() < MAX_TIME_NS:
             is_time = (stretch.t_ns > -MAX_TIME_NS) & (stretch.t_ns < MAX_TIME_NS)
-            losses.add(damage("recording.events_beyond_clocks"), int(np.count_nonzero(~is_time)))
+            losses.add(findings.EVENTS_BEYOND_CLOCKS(), int(np.count_nonzero(~is_time)))
             stretch = stretch.select(is_time)
         if not len(stretch):
             continue
@@ -310,7 +310,7 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
                     "The clock was set, or two recordings were joined: split the recording there.",
                 )
             # Next to nothing came before the clock was set.
-            losses.add(damage("recording.events_before_clock_set", where), reset)
+            losses.add(findings.EVENTS_BEFORE_CLOCK_SET(where=where), reset)
             held, first_ns = held.select(slice(reset, None)), after_ns
         held = _sorted(held, first_ns, delivered_ns, losses)
         cut = int(np.searchsorted(held.t_ns, held.t_ns[-1] - REORDER_NS)) if len(held) else 0
@@ -328,10 +328,10 @@ def _wraps_ns(t_ns: NDArray[np.int64], before_ns: int | None, losses: Losses) ->
     has_wraps = steps.min() < _MAX_GAP_NS - min(_WRAPS_NS.values())
     shifts = np.zeros(len(t_ns) if has_wraps else 1, np.int64)
     if has_wraps:
-        for code, wrap_ns in _WRAPS_NS.items():
+        for kind, wrap_ns in _WRAPS_NS.items():
             is_wrap = (steps < _MAX_GAP_NS - wrap_ns) & (steps >= -wrap_ns)
             shifts[is_wrap] = wrap_ns
-            losses.add(damage(code), int(np.count_nonzero(is_wrap)))
+            losses.add(kind(), int(np.count_nonzero(is_wrap)))
     return np.cumsum(shifts)
 
 
@@ -340,14 +340,14 @@ def _sorted(events: EventColumns, first_ns: int, delivered_ns: int | None, losse
     stray = _stray(events.t_ns)
     if stray.any():
         where = seconds_in(int(events.t_ns[max(int(np.argmax(stray)) - 1, 0)]), first_ns)
-        losses.add(damage("recording.events_stray", where), int(np.count_nonzero(stray)))
+        losses.add(findings.EVENTS_STRAY(where=where), int(np.count_nonzero(stray)))
         events = events.select(~stray)
     if delivered_ns is not None:
         is_late = events.t_ns < delivered_ns
-        losses.add(damage("recording.events_late"), int(np.count_nonzero(is_late)))
+        losses.add(findings.EVENTS_LATE(), int(np.count_nonzero(is_late)))
         events = events.select(~is_late)
     n_back = int(np.count_nonzero(np.diff(events.t_ns) < 0))
-    losses.add(damage("recording.events_sorted"), n_back)
+    losses.add(findings.EVENTS_SORTED(), n_back)
     return events.select(np.argsort(events.t_ns, kind="stable")) if n_back else events
 
 

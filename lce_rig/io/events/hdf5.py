@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.losses import Losses
-from lce_rig.io.events.stream import damage, to_ns
+from lce_rig.io import findings
+from lce_rig.io.events.stream import to_ns
 
 _BLOCK_EVENTS = 1 << 20
 _COLUMNS = ("events/t", "events/x", "events/y", "events/p")
@@ -58,7 +59,7 @@ class Hdf5Events:
                 except (OSError, RuntimeError, ValueError) as error:
                     if not begin:
                         raise
-                    losses.add(damage("recording.torn_end", f"event {begin}: {reason_of(error)}"))
+                    losses.add(findings.TORN_END(where=f"event {begin}: {reason_of(error)}"))
                     return
 
     def _to_columns(self, block: list[NDArray[Any]], losses: Losses) -> EventColumns:
@@ -67,7 +68,7 @@ class Hdf5Events:
             raise ValueError("events/t holds fractions, not whole microseconds")
         is_pixel = (x >= 0) & (x < 1 << 16) & (y >= 0) & (y < 1 << 16)
         if not is_pixel.all():
-            losses.add(damage("recording.events_beyond_sensors"), int(np.count_nonzero(~is_pixel)))
+            losses.add(findings.EVENTS_BEYOND_SENSORS(), int(np.count_nonzero(~is_pixel)))
             t_us, x, y, polarity = (column[is_pixel] for column in (t_us, x, y, polarity))
         t_ns = to_ns(t_us, self._offset_us)
         return EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.losses import Losses
-from lce_rig.io.events.stream import damage, parse_size
+from lce_rig.io import findings
+from lce_rig.io.events.stream import parse_size
 from lce_rig.io.events.word_codec import EVT3, Evt2Decoder, WordDecoder
 
 _BLOCK_BYTES = 1 << 18
@@ -84,10 +85,10 @@ class PropheseeEvents:
                 words: NDArray[Any] = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
                 yield decoder.decode(words)
                 if n_torn:
-                    losses.add(damage("recording.torn_word"), n_torn)
-        losses.add(damage("recording.events_untimed"), decoder.n_untimed)
-        losses.add(damage("recording.time_words_repaired"), decoder.n_repaired)
-        losses.add(damage("recording.unknown_words"), decoder.n_unknown)
+                    losses.add(findings.TORN_WORD(), n_torn)
+        losses.add(findings.EVENTS_UNTIMED(), decoder.n_untimed)
+        losses.add(findings.TIME_WORDS_REPAIRED(), decoder.n_repaired)
+        losses.add(findings.UNKNOWN_WORDS(), decoder.n_unknown)
 
 
 def _read_header(file: BinaryIO) -> dict[str, str]:

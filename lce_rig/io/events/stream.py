@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import MAX_TIME_NS, EventColumns, join_events
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Finding
 from lce_rig.core.losses import Losses
 
 NS_PER_US = 1000
@@ -38,11 +37,6 @@ def join_small(stretches: Iterator[EventColumns], n_events: int) -> Iterator[Eve
             parts, n_held = [], 0
     if parts:
         yield join_events(parts)
-
-
-def damage(code: str, where: str = "") -> Finding:
-    """Make the finding of data skipped or lost while reading, with the first place and the cause."""
-    return Finding(code, "warning", figures={"where": where} if where else {})
 
 
 def worded(losses: Losses) -> list[str]:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.losses import Losses
-from lce_rig.io.events.stream import damage, parse_size, to_ns
+from lce_rig.io import findings
+from lce_rig.io.events.stream import parse_size, to_ns
 
 _BLOCK_LINES = 1 << 16
 
@@ -56,7 +57,7 @@ class TextEvents:
             except Exception as error:  # of zipfile and zlib; the events before it have been yielded
                 if not n_lines > self._has_size:
                     raise
-                losses.add(damage("recording.torn_end", f"line {n_lines}: {reason_of(error)}"))
+                losses.add(findings.TORN_END(where=f"line {n_lines}: {reason_of(error)}"))
 
 
 @contextmanager
@@ -88,7 +89,7 @@ def _parse_block(lines: Sequence[bytes], first_line: int, losses: Losses) -> NDA
             rows.append(row)
         elif line.strip() and not line.lstrip().startswith(b"#"):
             text = line[:60].decode(errors="replace").strip()
-            losses.add(damage("recording.broken_lines", f"line {number}: {text!r}"))
+            losses.add(findings.BROKEN_LINES(where=f"line {number}: {text!r}"))
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
 
 
