@@ -93,7 +93,7 @@ def progress_bar(title: str, *, has_rate: bool = False) -> Iterator[Progress]:
     """Show a progress bar on stderr; nothing if stderr is not a terminal.
 
     Args:
-        title: what is counted.
+        title: of the bar.
         has_rate: whether to show how many are done per second, too.
 
     Yields:

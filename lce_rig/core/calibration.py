@@ -193,7 +193,7 @@ class ChannelResult:
         cov: (6, 6) of it, as `Calibration.cov`.
         depth_scatter_m: standard deviation over captures of the LiDAR's distance from the board's plane.
         depth_scatter_still_m: the same if boards are taken to have stood still.
-        time_offset_s: what to add to its timestamps beyond the profile's expected offset to come to the
+        time_offset_s: correction to add to its timestamps, beyond the profile's expected offset, to reach the
             LiDAR's time; images without timestamps count from the scan's first firing. None if nothing moved.
         time_offset_sigma_s: standard deviation of that.
     """
@@ -233,7 +233,7 @@ class Contribution:
     Attributes:
         source: "captures" (their scatter), "lidar_ranges", an error of the profile's lens or board such as
             "focal_length" or "square_size", or "contradiction_" with the check that contradicts.
-        sigma_rotation_deg, sigma_translation_m: what it contributes.
+        sigma_rotation_deg, sigma_translation_m: its contribution.
     """
 
     source: str
@@ -251,10 +251,10 @@ class OtherCamera:
         T_cam_other: (4, 4) to which the extrinsics of both with the LiDAR compose, p_cam = R p_other + t.
         cov: (6, 6) of it, tangent (translation m, rotation rad), axes of the camera; None if the
             extrinsics were not estimated together.
-        T_cam_other_pictures: (4, 4) from the images of both alone; None if too few boards tell.
-        apart_rotation_deg, apart_translation_m: how far that lies from what the extrinsics compose to, each
+        T_cam_other_pictures: (4, 4) from the images of both alone; None with too few boards.
+        apart_rotation_deg, apart_translation_m: distance of that from the composition of the extrinsics, each
             estimated separately.
-        board_rms_m: how far apart those put the middle of the same board, rms.
+        board_rms_m: distance between their middles of the same board, rms.
     """
 
     camera: str
@@ -326,18 +326,18 @@ class WeakestMotion:
 
 @dataclass(frozen=True, eq=False)
 class SceneShare:
-    """What the edges of the scene did to extrinsics that boards gave.
+    """The change of the boards' extrinsics by the edges of the scene.
 
     Attributes:
-        state: "used", or why the extrinsics are those of the boards alone: the scene "contradicts" them
-            beyond what both claim, or is "unknown", showing nothing that the boards do not show better.
+        state: "used"; else the extrinsics are those of the boards alone, because the scene "contradicts" them
+            beyond both covariances, or is "unknown": it determines no direction better than the boards.
         n_captures, n_edges: of the scene.
         T_cam_lidar, cov: (4, 4), (6, 6) by boards and scene, used or not.
         T_cam_lidar_boards, cov_boards: by the boards alone.
         change: (6,) tangent from the boards' extrinsics to those of both, m and rad, axes of the camera.
         change_sigma: (6,) standard deviation that it should have.
         surprise: its square in units of that, over `n_directions`: chi-squared if both are right.
-        n_directions: in which the scene knows anything, of six.
+        n_directions: determined by the scene, of six.
     """
 
     state: Literal["used", "contradicts", "unknown"]
@@ -443,7 +443,7 @@ class Calibration:
 
     Attributes:
         channels: of the camera, names.
-        channel_results: what each of these says alone.
+        channel_results: the result of each of these alone.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
         cov_shared: (6, 6) the part of it that all sessions of one lens and board have in common, as the
@@ -453,23 +453,23 @@ class Calibration:
         verdict: "pass", "marginal" or "fail".
         findings: the reasons for it, worst first, and notes.
         captures_used: names of the captures behind the estimate.
-        captures_refused: why each other capture is not.
+        captures_refused: the reason for refusing each other capture.
         diagnostics: further figures.
         method: that found the extrinsics, as `CalibrateOptions.method`.
-        uncertainty: what `cov` means for points at several distances; empty if no lens was at hand.
+        uncertainty: `cov` as errors of points at several distances; empty if no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
-        scene_share: what the scene did to them; None if it was not asked.
-        scene: what the edges of the scene say of it; None if they were not compared.
+        scene_share: the change of the extrinsics by the scene; None without `--use-scene`.
+        scene: the opinion of the scene's edges; None if they were not compared.
         weakest: the least determined motion; None if it is read back.
-        held_out_m: rms residual of captures where they were not fitted; NaN if no method knows it.
+        held_out_m: rms residual of captures where they were not fitted; NaN if the method has none.
         residuals: of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
-        lens_error, lens_error_sigma: errors of the profile's intrinsics as the boards see them, given less
-            seen: focal length (relative), principal point x and y (px), distortion (px in the image's
-            corner); their standard deviations.
+        lens_error, lens_error_sigma: errors of the profile's intrinsics, profile less boards: focal length
+            (relative), principal point x and y (px), distortion (px in the image's corner); their standard
+            deviations.
         laser_range_m, laser_range_sigma_m: range offset of each of the LiDAR's lasers, by ring; its standard
-            deviation about their mean. Empty where the method knows none, the boards moved, or the profile
+            deviation about their mean. Empty where the method has none, the boards moved, or the profile
             states them.
     """
 

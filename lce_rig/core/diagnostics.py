@@ -25,8 +25,8 @@ class Diagnostics:
         sigma_systematic_rotation_deg, sigma_systematic_translation_m: the part that errors common to all
             captures add.
         edge_shift_m, edge_shift_sigma_m: by how much ring ends lie beyond the board's edges.
-        edge_shift_echo_m, edge_shift_blended_m, edge_shift_blended_echo_m: what the background behind the
-            board adds to that.
+        edge_shift_echo_m, edge_shift_blended_m, edge_shift_blended_echo_m: additions to that by the
+            background behind the board.
         best_subset_size: captures in the subsets of Algorithm 1 that fit held-out captures best.
         n_solved: subsets that were solved.
         certified_share: share 0..1 of them that are proven to be global minima.
@@ -43,7 +43,7 @@ class Diagnostics:
         ring_ends_lost: share 0..1.
         noise_edge_shift_m: of the edge shift from one capture to the next.
         noise_tilt_deg, noise_spin_deg, noise_depth_m, noise_across_m: of the board's pose by the camera,
-            beyond what its corners' noise explains.
+            beyond its corners' noise.
         alone_sigma_rotation_deg, alone_sigma_translation_m: standard deviations without the other cameras.
         sigma_widened: factor on the standard deviations, from resampling.
         channels_rotation_deg, channels_translation_m: between the extrinsics of two channels of the camera.
@@ -99,7 +99,7 @@ class Diagnostics:
     channels_translation_m: float = _NONE
 
     def figures(self) -> dict[str, float]:
-        """List what is known by name, sorted."""
+        """List the figures that are not NaN by name, sorted."""
         return {name: value for name, value in sorted(asdict(self).items()) if not math.isnan(value)}
 
     @classmethod

@@ -27,7 +27,7 @@ class Format:
 
     Attributes:
         home: module and function, imported when used.
-        about: its files and what they are for, one line.
+        about: its files and their purpose, one line.
         is_usual: whether it is written unless others are named.
     """
 
@@ -136,7 +136,7 @@ def export_formats(
     for this result.
 
     Args:
-        calibrations: what to write, one for each camera channel and LiDAR.
+        calibrations: one for each camera channel and LiDAR.
         rig: the profile the calibrations belong to.
         folder: usually the session's `calibration/`.
         formats: keys of EXPORTS; by default the profile's `exports`, else the usual ones.

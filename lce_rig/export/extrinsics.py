@@ -78,7 +78,7 @@ def _judgement(calibration: Calibration) -> list[str]:
         "of T_cam_lidar: translation in m, then rotation vector in rad, both along the optical frame's axes, "
         "with R = exp(phi) R0 and t = t0 + tau, as in ROS PoseWithCovariance"
     )
-    what = "start_is_globally_optimal" if calibration.is_start_certified else "is_globally_optimal"
+    proven = "start_is_globally_optimal" if calibration.is_start_certified else "is_globally_optimal"
     return [
         "    covariance:",
         f"      meaning: {quoted(meaning)}",
@@ -86,7 +86,7 @@ def _judgement(calibration: Calibration) -> list[str]:
         *rows(calibration.cov, "        "),
         f"    sigma_rotation_deg: {number(calibration.sigma_rotation_deg)}",
         f"    sigma_translation_m: {number(calibration.sigma_translation_m)}",
-        f"    {what}: {'true' if calibration.certificate.is_optimal else 'false'}",
+        f"    {proven}: {'true' if calibration.certificate.is_optimal else 'false'}",
         f"    n_captures: {calibration.n_captures}",
         f"    captures_used: {texts(calibration.captures_used)}",
     ]

@@ -1,4 +1,4 @@
-"""Findings of exports: what a format leaves out or puts differently."""
+"""Findings of exports: content that a format leaves out or changes."""
 
 from lce_rig.core.findings import Kind
 

@@ -13,7 +13,7 @@ from lce_rig.export.job import ExportJob
 _GRID = 24
 # A pixel that a trial model cannot draw counts as this far off.
 _UNDRAWN_PX = 100.0
-# Above this a pixel lies outside of what a matcher or a colour forgives.
+# Above this the error is visible in matching and colouring.
 _COARSE_PX = 0.5
 
 
@@ -40,11 +40,11 @@ def fit_coefficients(intrinsics: Intrinsics, n_coefficients: int) -> FittedLens:
         intrinsics: any model; one that needs no more coefficients is returned as it is, filled with zeros.
         n_coefficients: 4 (k1 k2 p1 p2) or 5 (and k3).
     """
-    given = intrinsics.distortion
+    coefficients = intrinsics.distortion
     if intrinsics.model == "equidistant":
         return FittedLens(intrinsics)
-    if not any(given[n_coefficients:]):
-        filled = (*given, *(0.0,) * n_coefficients)[:n_coefficients]
+    if not any(coefficients[n_coefficients:]):
+        filled = (*coefficients, *(0.0,) * n_coefficients)[:n_coefficients]
         return FittedLens(replace(intrinsics, distortion=filled))
     from scipy.optimize import least_squares
 

@@ -138,16 +138,16 @@ def _write_projected(
     import cv2
 
     scan = next((scan for scan in scans if scan.sensor == calibration.lidar), None)
-    own = [image for image in images if image.sensor == calibration.camera]
-    own.sort(key=lambda image: image.channel not in calibration.channels)
-    if scan is None or not own:
+    of_camera = [image for image in images if image.sensor == calibration.camera]
+    of_camera.sort(key=lambda image: image.channel not in calibration.channels)
+    if scan is None or not of_camera:
         return
     camera = job.rig.cameras[calibration.camera]
-    picture = draw_projection(own[0], scan, camera.to_intrinsics(), calibration.T_cam_lidar, limits_m)
+    picture = draw_projection(of_camera[0], scan, camera.to_intrinsics(), calibration.T_cam_lidar, limits_m)
     is_done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     assert is_done
     message = typestore(False).types[_JPEG_TYPE](
-        header=_ros_header(own[0].stamp_ns or time_ns, camera.optical_frame),
+        header=_ros_header(of_camera[0].stamp_ns or time_ns, camera.optical_frame),
         format="jpeg",
         data=np.asarray(data, dtype=np.uint8).ravel(),
     )
@@ -157,7 +157,7 @@ def _write_projected(
 
 @contextmanager
 def _bag_writer(folder: Path, content: str, job: ExportJob) -> Iterator[Any]:
-    """Begin a ROS 2 bag (mcap) in place of an earlier one; metadata.yaml says who wrote it.
+    """Begin a ROS 2 bag (mcap) in place of an earlier one; metadata.yaml names lce-rig as its writer.
 
     Raises:
         SessionError: a full disk, no permission.

@@ -33,7 +33,7 @@ class WrittenResult(NamedTuple):
 
     Attributes:
         files: result.json and the exports.
-        findings: what exports leave out or put differently, and why.
+        findings: content that exports leave out or change.
         report: the page; None if it was not asked for.
         previous: the folder with the earlier run's files; None if there was none.
         has_usable_previous: whether that run had a usable result.
@@ -179,7 +179,7 @@ class Result:
         """Write result.json, the report and the exports of usable results.
 
         Returns:
-            The files' names without the report's, and what exports lack.
+            The files' names without the report's, and the exports' findings.
         """
         from lce_rig.show.report.calibration_page import report_text
 
@@ -211,13 +211,13 @@ def result_parts(name: str | None) -> tuple[str, ...]:
         return (CALIBRATION,)
     if name == PREVIOUS:
         return (CALIBRATION, PREVIOUS)
-    own, slash, rest = name.partition("/")
-    if not SAFE_NAME.fullmatch(own) or len(own) > _LONGEST_NAME or (slash and rest != PREVIOUS):
+    folder, slash, rest = name.partition("/")
+    if not SAFE_NAME.fullmatch(folder) or len(folder) > _LONGEST_NAME or (slash and rest != PREVIOUS):
         raise UsageError(
             f"{name!r} cannot name a result",
             f"Use up to {_LONGEST_NAME} letters, digits, dots, dashes and underscores, such as `events-ml`.",
         )
-    return (RESULTS, own, PREVIOUS) if slash else (RESULTS, own)
+    return (RESULTS, folder, PREVIOUS) if slash else (RESULTS, folder)
 
 
 def new_result_parts(name: str | None) -> tuple[str, ...]:
@@ -251,15 +251,15 @@ def inputs_sha256(
         return _inputs(session, used)
     return {
         f"{name}/{path}": digest
-        for name, each in sessions.items()
-        for path, digest in _inputs(each, _of_session(name, used)).items()
+        for name, part in sessions.items()
+        for path, digest in _inputs(part, _of_session(name, used)).items()
     }
 
 
 def _of_session(name: str, captures: Iterable[str]) -> list[str]:
     """Give a session's own names of its captures among those of several sessions."""
     split = (capture.rpartition("/") for capture in captures)
-    return [own for session, _, own in split if session == name]
+    return [capture for session, _, capture in split if session == name]
 
 
 def as_named_in(
@@ -279,11 +279,11 @@ def as_named_in(
         sessions: their names.
         inputs: as `inputs_sha256` gives them.
     """
-    held: set[str] = set()
+    manifests: set[str] = set()
     for capture in session.captures:
         with suppress(SessionError):  # a damaged capture is reported when it is read
-            held.add(capture.manifest_sha256)
-    shared = [path for path, digest in inputs.items() if digest in held]
+            manifests.add(capture.manifest_sha256)
+    shared = [path for path, digest in inputs.items() if digest in manifests]
     is_part = [name for name in sessions if any(p.startswith(f"{name}/{CAPTURES}/") for p in shared)]
     name = is_part[0] if is_part else ""
     return tuple(
@@ -291,7 +291,9 @@ def as_named_in(
             c,
             captures_used=tuple(_of_session(name, c.captures_used)),
             captures_refused={
-                own: why for each, why in c.captures_refused.items() for own in _of_session(name, [each])
+                capture: refusal
+                for qualified, refusal in c.captures_refused.items()
+                for capture in _of_session(name, [qualified])
             },
         )
         for c in calibrations

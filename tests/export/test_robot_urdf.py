@@ -88,31 +88,41 @@ def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(
 
 
 @pytest.mark.parametrize(
-    ("text", "what"),
+    "text",
     [
-        *(
-            (HEAD + BASE + MAST.replace("0.9", bad) + "</robot>", "joint mast")
-            for bad in ("nan", "1e999", "")
-        ),
-        ((HEAD.replace("?>", ' encoding="utf-16"?>') + BASE + MAST + "</robot>").encode("utf-16"), "UTF-8"),
-        (HEAD + BASE + MAST + CAMERA.format(kind="revolute") + "</robot>", "moves"),
-        (HEAD + '<link name="base_link"/></robot>', "none of the sensors' frames"),
-        (HEAD + BASE + MAST + MAST.replace("mast", "other") + "</robot>", "two parents"),
-        (HEAD + BASE + MAST + OPTICAL.replace("davis_link", "base_link") + "</robot>", "is not below"),
-        (HEAD + "<xacro:include/>" + BASE + MAST + "</robot>", "xacro"),
-        (HEAD + BASE, ""),
-        ("", ""),
+        *(HEAD + BASE + MAST.replace("0.9", bad) + "</robot>" for bad in ("nan", "1e999", "")),
+        (HEAD.replace("?>", ' encoding="utf-16"?>') + BASE + MAST + "</robot>").encode("utf-16"),
+        HEAD + BASE + MAST + CAMERA.format(kind="revolute") + "</robot>",
+        HEAD + '<link name="base_link"/></robot>',
+        HEAD + BASE + MAST + MAST.replace("mast", "other") + "</robot>",
+        HEAD + BASE + MAST + OPTICAL.replace("davis_link", "base_link") + "</robot>",
+        HEAD + "<xacro:include/>" + BASE + MAST + "</robot>",
+        HEAD + BASE,
+        "",
+    ],
+    ids=[
+        "nan",
+        "infinite",
+        "absent",
+        "utf-16",
+        "moves",
+        "no-sensor",
+        "two-parents",
+        "optical-elsewhere",
+        "xacro",
+        "torn",
+        "empty",
     ],
 )
-def test_what_does_not_fit_is_refused_and_stays_as_it_was(
-    rles: Rig, make: Make, tmp_path: Path, text: str | bytes, what: str
+def test_a_urdf_that_does_not_fit_is_refused_and_stays_as_it_was(
+    rles: Rig, make: Make, tmp_path: Path, text: str | bytes
 ) -> None:
     path = tmp_path / "cart.urdf"
     before = text.encode() if isinstance(text, str) else text
     path.write_bytes(before)
     with pytest.raises(SessionError) as error:
         write_into_urdf(path, [make()], rles, NOW)
-    assert what in error.value.what and str(path) in error.value.what
+    assert str(path) in error.value.what
     assert path.read_bytes() == before
     assert len(list(tmp_path.iterdir())) == 1
 

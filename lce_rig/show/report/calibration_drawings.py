@@ -24,7 +24,7 @@ _DISTANCES_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0,
 # Causes of less than this, in percent, are in the table only.
 _LEAST_SHARE = 0.5
 _CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 73)), np.sin(np.linspace(0, 2 * np.pi, 73))])
-# From behind, from above, from the side: what a view shows to the right and vertically, axes of the camera.
+# From behind, from above, from the side: the camera's axes to the right and vertically in each view.
 _VIEWS = ((0, 1), (0, 2), (2, 1))
 _AXES = ("x right", "y down", "z forward")
 
@@ -285,7 +285,7 @@ def _draw_reach(axes: Any, centre: Sequence[float], corner: Sequence[float], tit
 
 
 def draw_causes(calibration: Calibration) -> Markup:
-    """Draw what share of the variance each cause has, in rotation and in translation."""
+    """Draw each cause's share of the variance, in rotation and in translation."""
     causes = calibration.contributions
     squares = np.array([[c.sigma_rotation_deg, c.sigma_translation_m] for c in causes]) ** 2
     shares = 100 * squares / np.maximum(squares.sum(axis=0), 1e-30)

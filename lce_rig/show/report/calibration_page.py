@@ -84,7 +84,7 @@ def calibration_page(
     Args:
         rig: the profile.
         calibrations: one for each camera and LiDAR.
-        facts: name and value of what identifies the result, for the end of the page.
+        facts: names and values that identify the result, for the end of the page.
         overlays: gives the images of a capture; the page shows them once they are drawn.
     """
     pairs = []
@@ -215,7 +215,7 @@ def _others(c: Calibration, severity: str = "warning") -> str:
 
 
 def _next_steps(c: Calibration) -> list[str]:
-    """List what to do next, the most urgent first: what findings ask for, then how to put it to use."""
+    """List the next steps, the most urgent first: the findings' actions, then the checks before use."""
     asked = [finding.advice for finding in sorted(c.findings, key=lambda f: f.severity != "error")]
     steps = [as_line(text) for text in dict.fromkeys(asked) if text]
     if c.verdict == "fail":

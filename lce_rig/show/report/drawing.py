@@ -16,7 +16,7 @@ _VARIABLES = {
 WIDTH_IN = 4.4
 """Drawings of this width stay legible on a phone; a wide screen shows several side by side."""
 _FONT_PT = 8.5
-# Ticks are what takes time.
+# Most of the drawing time goes into ticks.
 _MOST_TICKS = 5
 _PAGE_HAS = [
     (re.compile(pattern, re.DOTALL), replacement)
@@ -104,7 +104,7 @@ def drawing(figure: Any, label: str) -> Markup:
 
     Args:
         figure: of Matplotlib, in the colours of this module; call it within `style`.
-        label: what it shows, for readers who do not see it; of one part of a page, each has another.
+        label: its content, for screen readers; labels within one part of a page differ.
     """
     from matplotlib import rc_context, rcParams
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -121,7 +121,7 @@ def drawing(figure: Any, label: str) -> Markup:
 
 
 def _as_part_of_a_page(svg: str, label: str) -> Markup:
-    """Leave of an SVG file what a page needs: no names of parts, no fonts and no colours of its own."""
+    """Strip an SVG file for a page: no names of parts, no fonts and no colours of its own."""
     box = re.search(r'viewBox="[^"]*"', svg)
     assert box is not None
     text = svg[svg.index(">", box.end()) + 1 :]

@@ -1,4 +1,4 @@
-"""What the boards of a result show, point by point."""
+"""Residuals of a result's boards, point by point."""
 
 from dataclasses import dataclass
 

@@ -36,7 +36,7 @@ def render(template: str, **values: object) -> str:
 
     Args:
         template: file of `templates/`; it extends frame.html.
-        values: what the template names. Text is escaped; `drawing` returns markup, which is not;
-            the filter `words` sets what `words/` writes.
+        values: by the template's names. Text is escaped; `drawing` returns markup, which is not;
+            the filter `words` sets the texts of findings.
     """
     return environment().get_template(template).render(**values) + "\n"
