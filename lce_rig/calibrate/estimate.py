@@ -65,7 +65,7 @@ def estimate_extrinsics(
         ((name, of_channel),) = matched.items()
         estimate = estimate_observations(of_channel, board, settings, progress)
         scatter_m = depth_scatter_m(estimate.T_cam_lidar, list(estimate.observations.values()))
-        alone = ChannelResult(
+        channel = ChannelResult(
             name,
             len(of_channel),
             noise_px[name],
@@ -74,7 +74,7 @@ def estimate_extrinsics(
             scatter_m,
             scatter_m,
         )
-        return _with_consensus(replace(estimate, channels=(alone,)), list(agreed.values()))
+        return _with_consensus(replace(estimate, channels=(channel,)), list(agreed.values()))
 
     still = {name: solve(observations, board) for name, observations in matched.items()}
     motion = estimate_motion(scans, samples, board, next(iter(still.values())), clocks)
@@ -85,14 +85,14 @@ def estimate_extrinsics(
     by_channel = {name: motion.observations(name if len(agreed) > 1 else None) for name in sorted(agreed)}
     channels = []
     for name, observations in by_channel.items():
-        own = estimate_observations(observations, board, fast)
+        alone = estimate_observations(observations, board, fast)
         result = ChannelResult(
             name,
             len(matched[name]),
             noise_px[name],
-            own.T_cam_lidar,
-            motion.widened(own.cov),
-            depth_scatter_m(own.T_cam_lidar, list(own.observations.values())),
+            alone.T_cam_lidar,
+            motion.widened(alone.cov),
+            depth_scatter_m(alone.T_cam_lidar, list(alone.observations.values())),
             depth_scatter_m(still[name].T_cam_lidar, still[name].observations),
         )
         if motion.offsets is not None:

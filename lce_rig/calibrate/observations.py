@@ -126,8 +126,8 @@ def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
     session = np.array([observation.session for observation in observations])
     numbers = np.zeros(len(observations), dtype=np.intp)
     firsts: list[int] = []
-    for k, own in enumerate(T):
-        apart = np.linalg.norm(T[firsts] - own, axis=1)
+    for k, T_cam_board in enumerate(T):
+        apart = np.linalg.norm(T[firsts] - T_cam_board, axis=1)
         is_same = (apart[:, 3] < SAME_PLACE_M) & (apart[:, 2] < SAME_TURN_RAD)
         is_same &= session[firsts] == session[k]
         if is_same.any():
@@ -156,10 +156,10 @@ def group_shared_placements(
     from scipy.sparse.csgraph import connected_components
 
     n_captures, links = len(order), []
-    for k, own in enumerate(cameras):
+    for k, camera in enumerate(cameras):
         # Each placement of a camera is a node beside those of the captures.
-        placement = group_placements(own) + n_captures * (k + 1)
-        links += [(order[o.capture], number) for o, number in zip(own, placement, strict=True)]
+        placement = group_placements(camera) + n_captures * (k + 1)
+        links += [(order[o.capture], number) for o, number in zip(camera, placement, strict=True)]
     n_nodes = n_captures * (len(cameras) + 1)
     graph = coo_array((np.ones(len(links)), np.array(links).T), shape=(n_nodes, n_nodes))
     _, component = connected_components(graph, directed=False)

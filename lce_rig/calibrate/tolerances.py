@@ -66,12 +66,12 @@ class Tolerances:
     @classmethod
     def of(cls, camera: CameraSettings, board: BoardSettings) -> "Tolerances":
         """Read a profile's camera and board; defaults take the place of what it leaves out."""
-        given, focal_px = camera.intrinsics, camera.intrinsics.fx_px
+        lens, focal_px = camera.intrinsics, camera.intrinsics.fx_px
         return cls(
             lens=camera.to_intrinsics(),
-            focal_length=_FOCAL if given.focal_sigma_px is None else given.focal_sigma_px / focal_px,
-            principal_point_px=_or(given.principal_point_sigma_px, _PRINCIPAL_POINT * focal_px),
-            distortion_px=_or(given.distortion_sigma_px, _DISTORTION * focal_px),
+            focal_length=_FOCAL if lens.focal_sigma_px is None else lens.focal_sigma_px / focal_px,
+            principal_point_px=_or(lens.principal_point_sigma_px, _PRINCIPAL_POINT * focal_px),
+            distortion_px=_or(lens.distortion_sigma_px, _DISTORTION * focal_px),
             square_size=_or(board.square_sigma_m, _SQUARE * board.square_m) / board.square_m,
             pattern_offset_m=board.pattern_offset_sigma_m,
             plate_m=board.plate_sigma_m,
@@ -96,8 +96,8 @@ class Tolerances:
         }[source]
 
 
-def _or(given: float | None, usual: float) -> float:
-    return usual if given is None else given
+def _or(sigma: float | None, usual: float) -> float:
+    return usual if sigma is None else sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,15 +138,12 @@ class Variant(NamedTuple):
 
 def sensitivities_of(variants: Sequence[Variant], moves: Array, known: Tolerances) -> tuple[Sensitivity, ...]:
     """Collect the moves (V, 6) of a method's result under each variant by source."""
-    found = []
-    for source in dict.fromkeys(variant.source for variant in variants):
-        mine = [
-            move / variant.step
-            for variant, move in zip(variants, moves, strict=True)
-            if variant.source == source
-        ]
-        found.append(Sensitivity(source, known.sigma(source), np.array(mine)))
-    return tuple(found)
+    by_source: dict[Source, list[Array]] = {}
+    for variant, move in zip(variants, moves, strict=True):
+        by_source.setdefault(variant.source, []).append(move / variant.step)
+    return tuple(
+        Sensitivity(source, known.sigma(source), np.array(rows)) for source, rows in by_source.items()
+    )
 
 
 def vary(observations: Sequence[Observation], board: Board, known: Tolerances) -> list[Variant]:
@@ -159,22 +156,20 @@ def vary(observations: Sequence[Observation], board: Board, known: Tolerances) -
             give them another.
     """
     poses = np.array([observation.image.T_cam_board for observation in observations])
-    found = []
+    variants = []
     for source, axis, step, shifts_px, shifts_m in _image_errors(poses, board, known.lens):
         moved = perturb(poses, _pose_moves(poses, board, known.lens, shifts_px, shifts_m))
-        seen = [
+        changed = [
             replace(o, image=replace(o.image, T_cam_board=T))
             for o, T in zip(observations, moved, strict=True)
         ]
         if source == "board_bow":
-            seen = [replace(o, lidar=bend(o.lidar, axis, step, board)) for o in seen]
-        found.append(Variant(source, step, seen, board))
-    wider, higher = (
-        replace(board, width_m=board.width_m + _STEP),
-        replace(board, height_m=board.height_m + _STEP),
-    )
-    found += [Variant("plate_size", _STEP, list(observations), assumed) for assumed in (wider, higher)]
-    return found
+            changed = [replace(o, lidar=bend(o.lidar, axis, step, board)) for o in changed]
+        variants.append(Variant(source, step, changed, board))
+    for side in ("width_m", "height_m"):
+        assumed = replace(board, **{side: getattr(board, side) + _STEP})
+        variants.append(Variant("plate_size", _STEP, list(observations), assumed))
+    return variants
 
 
 def _image_errors(

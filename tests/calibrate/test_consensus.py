@@ -99,9 +99,3 @@ def test_captures_that_agree_with_nothing_have_no_consensus():
     with pytest.raises(NotEnoughDataError) as caught:
         find_consensus(captures, BOARD)
     assert caught.value.finding.code == "shortage.few_agree"
-
-
-def test_the_order_of_captures_does_not_matter():
-    captures = simulate(8, seed=7)
-    forward, backward = find_consensus(captures, BOARD), find_consensus(captures[::-1], BOARD)
-    np.testing.assert_array_equal(forward.T_cam_lidar, backward.T_cam_lidar)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lce_rig.calibrate.quadratics import jackknife_scatter, without_prior
+from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse, without_prior
 
 
 def sample_regressions(n_groups, n_trials, seed=0):
@@ -52,3 +52,9 @@ def test_moves_are_those_of_estimates_made_anew_without_each_group():
     np.testing.assert_allclose(estimate + moves, anew, atol=1e-12)
     expected = 3 / 4 * (anew - estimate).T @ (anew - estimate)
     np.testing.assert_allclose(jackknife_scatter(moves), expected, atol=1e-12)
+
+
+def test_a_direction_without_information_gets_a_large_finite_variance():
+    inverse = symmetric_inverse(np.diag([4.0, 1.0, 0.0]))
+    np.testing.assert_allclose(np.diag(inverse)[:2], [0.25, 1.0])
+    assert 1e6 < inverse[2, 2] < np.inf

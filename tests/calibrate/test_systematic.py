@@ -8,8 +8,8 @@ import pytest
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.features import extract_features
-from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings
-from lce_rig.core.geometry import difference, fit_plane, perturb
+from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings, systematic_covariances
+from lce_rig.core.geometry import difference, fit_plane
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
 NO_DRAWS = EstimateSettings("paper", n_draws=0)
@@ -120,11 +120,11 @@ def test_systematic_errors_add_to_the_scatter_and_change_nothing_else():
         assert np.hypot(scatter, added) == pytest.approx(trace(wider.cov))
 
 
-def test_rays_start_from_the_lidar_wherever_it_sits():
-    options = replace(NO_DRAWS, laser_bias_sigma_m=0.008)
-    T = perturb(T_FORWARD, np.array([0.3, -0.1, 0.1, 0.0, 0.2, 0.0]))
-    estimate = fit_extrinsic(
-        simulate(20, 3, Scenario(laser_bias_sigma_m=0.008), T_cam_lidar=T), BOARD, options
-    )
-    error = difference(estimate.T_cam_lidar, T)
-    assert error @ np.linalg.solve(estimate.cov, error) < 16.8
+def test_shared_errors_scatter_the_estimate_as_their_covariance_says():
+    rng = np.random.default_rng(3)
+    sensitivities = rng.normal(size=(3, 5))
+    own = 0.2 * rng.normal(size=(100_000, 5))
+    sources = own - own.mean(axis=1, keepdims=True) + 0.3 * rng.normal(size=(100_000, 1))
+    sampled = np.cov(sources @ sensitivities.T, rowvar=False)
+    expected = sum(systematic_covariances(sensitivities, 0.2, 0.3))
+    np.testing.assert_allclose(sampled, expected, atol=0.02 * np.trace(expected))

@@ -98,10 +98,10 @@ def edge_system(
         J = edges.rows[:, :-1]
         weighted = np.concatenate([J * weight[:, None], score[:, None]], axis=1)
         bounds = np.flatnonzero(np.diff(edges.group, prepend=-1, append=-1))
-        seen = edges.group[bounds[:-1]]
-        system[seen, :-1] = [J[a:b].T @ weighted[a:b] for a, b in pairwise(bounds.tolist())]
-        system[seen, -1, :-1] = system[seen, :-1, -1]
-        system[seen, -1, -1] = np.add.reduceat(value, bounds[:-1])
+        groups = edges.group[bounds[:-1]]
+        system[groups, :-1] = [J[a:b].T @ weighted[a:b] for a, b in pairwise(bounds.tolist())]
+        system[groups, -1, :-1] = system[groups, :-1, -1]
+        system[groups, -1, -1] = np.add.reduceat(value, bounds[:-1])
     return system.reshape(n_captures, edges.n_rings, size, size)
 
 

@@ -110,13 +110,13 @@ def maximise_likelihood(
     """
     priors, usual = priors or Priors(), usual or Levels()
     usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
-    seen = {o.capture: (o, T) for own, T in zip(cameras, T_cam_lidar, strict=True) for o in own}
-    order = {name: k for k, name in enumerate(sorted(seen))}
-    scans = stack_scans([interior(seen[name][0].lidar, board) for name in order], board)
-    images = tuple(stack_camera(own, order, board) for own in cameras)
+    by_name = {o.capture: (o, T) for camera, T in zip(cameras, T_cam_lidar, strict=True) for o in camera}
+    order = {name: k for k, name in enumerate(sorted(by_name))}
+    scans = stack_scans([interior(by_name[name][0].lidar, board) for name in order], board)
+    images = tuple(stack_camera(camera, order, board) for camera in cameras)
     if pose_ratios is not None:
         images = tuple(p.with_larger_errors(r) for p, r in zip(images, pose_ratios, strict=True))
-    T_lidar_board = np.array([invert(T) @ o.image.T_cam_board for o, T in (seen[name] for name in order)])
+    T_lidar_board = np.array([invert(T) @ o.image.T_cam_board for o, T in (by_name[name] for name in order)])
     state = State.without_errors(np.array(T_cam_lidar), T_lidar_board, len(scans.rings))
     search = _Search(scans, images, board, priors)
     placement = group_shared_placements(cameras, order)
@@ -272,8 +272,8 @@ def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDAr
     once = _once(placement, terms.images)
     cost = replace(assemble(replace(terms, trust=once), levels, priors).cost, placement=placement)
     J = np.concatenate(_to_extrinsics(terms.state))
-    H, own = cost.information, np.tensordot(cost.groups, cost.hessians, axes=1)
-    without = symmetric_inverse(H - own)
+    H, of_placement = cost.information, np.tensordot(cost.groups, cost.hessians, axes=1)
+    without = symmetric_inverse(H - of_placement)
     moves = (without @ (cost.groups @ cost.gradients)[..., None])[..., 0] @ J.T
     spread = J @ (without - symmetric_inverse(H)) @ J.T
     precision = symmetric_inverse(J @ symmetric_inverse(H) @ J.T)
@@ -289,9 +289,9 @@ def _once(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array
     Where cameras saw a placement in different numbers of captures, those that few of them saw count more.
     """
     fewest = np.full(len(placement), np.inf)
-    for own in images:
-        seen = placement[own.capture]
-        fewest[own.capture] = np.minimum(fewest[own.capture], np.bincount(seen)[seen])
+    for camera in images:
+        numbers = placement[camera.capture]
+        fewest[camera.capture] = np.minimum(fewest[camera.capture], np.bincount(numbers)[numbers])
     return 1 / fewest
 
 

@@ -65,9 +65,9 @@ def estimate_lidar(
     priors, usual = what_is_known(replace(options, known=None))
     joint = maximise_likelihood(apart, board, T_cam_lidar, priors, usual)
     known, prior = lidar_of(joint), _prior_sigma(joint)
-    rings = np.concatenate([o.lidar.ring for own in sessions for o in own])
+    rings = np.concatenate([o.lidar.ring for session in sessions for o in session])
     n_points = np.array([np.count_nonzero(rings == ring) for ring in joint.terms.rings])
-    return LidarErrors(known, prior, tuple(len(own) for own in sessions), n_points)
+    return LidarErrors(known, prior, tuple(len(session) for session in sessions), n_points)
 
 
 def lidar_of(joint: JointEstimate) -> KnownLidar:

@@ -276,9 +276,9 @@ def _edge_block(terms: Terms, edge_rad: float, backed_rad: float, lost_share: fl
     by_ring = edge_system(terms.edges, edge_rad, backed_rad, lost_share, len(terms.trust))
     block = _spread_rings(by_ring, END, terms.state.layout)
     # A capture's own shift acts as that of all captures does.
-    own, common = row["own_shift"].start, row["shifts"].start
-    block[:, own] = block[:, common]
-    block[:, :, own] = block[:, :, common]
+    own_shift, common = row["own_shift"].start, row["shifts"].start
+    block[:, own_shift] = block[:, common]
+    block[:, :, own_shift] = block[:, :, common]
     return block
 
 
@@ -343,7 +343,7 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, 
     if known is not None:
         mean[layout.z["lens"]], sigmas["lens"] = known.lens, known.lens_sigma
         # Rings that are known: their indices among those seen, and among those known.
-        _, seen, which = np.intersect1d(terms.rings, known.rings, return_indices=True)
+        _, measured, which = np.intersect1d(terms.rings, known.rings, return_indices=True)
     for name, sigma in sigmas.items():
         at = layout.z.of([name])
         prior[at, at] = sigma**-2.0
@@ -352,8 +352,8 @@ def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, 
         cov = each**2 * (np.eye(L) - 1 / L)
         if known is not None:
             cov = each**2 * np.eye(L)
-            cov[seen, seen] = known.lasers_sigma[k, which] ** 2
-            mean[at[seen]] = known.lasers[k, which]
+            cov[measured, measured] = known.lasers_sigma[k, which] ** 2
+            mean[at[measured]] = known.lasers[k, which]
         cov = cov + common**2 + _MEAN_FLOOR**2 * np.eye(L)
         prior[at[:, None], at] = np.linalg.inv(cov)
         log_volume += float(np.linalg.slogdet(cov)[1])

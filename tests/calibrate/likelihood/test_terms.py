@@ -1,6 +1,5 @@
 """Residuals of the joint likelihood: derivatives, sums and evidence against the same computed plainly."""
 
-import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -287,14 +286,3 @@ def test_the_evidence_changes_with_each_level_as_its_derivative_says(scans, imag
             for by in (-step, step)
         )
         assert slope == pytest.approx((above - below) / (2 * step), rel=2e-3, abs=0.05)
-
-
-def test_what_a_search_for_levels_keeps_is_right_at_each_step_and_gone_with_it(scans, images, T_lidar_board):
-    terms = linearise(scans, (images,), BOARD, without_errors(scans, T_lidar_board))
-    assembly, base = Assembly(terms, Priors()), Levels()
-    for changed in (base, replace(base, range_m=0.02), replace(base, lost_share=0.3), base):
-        plainly = assemble(terms, changed, Priors()).minus_2_log_evidence
-        assert assembly.at(changed).minus_2_log_evidence == plainly
-    kept = weakref.ref(terms)
-    del terms, assembly
-    assert kept() is None

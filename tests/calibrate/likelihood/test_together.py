@@ -100,19 +100,6 @@ def test_the_order_of_cameras_does_not_matter(runs):
         assert first.diagnostics.figures() == second.diagnostics.figures()
 
 
-def test_the_same_cameras_under_other_names_give_the_same(runs):
-    """Names decide the order inside: that it does not matter there either holds to the search's tolerance."""
-    own, together = runs[0]
-    names = {LEFT: "z", RIGHT: "a"}
-    other = {names[name]: estimate for name, estimate in own.items()}
-    renamed = calibrate_together(other, BOARD, every(other))
-    for name in (LEFT, RIGHT):
-        first, second = together.estimates[name], renamed.estimates[names[name]]
-        apart = difference(first.T_cam_lidar, second.T_cam_lidar)
-        assert np.sqrt(apart @ np.linalg.solve(first.cov, apart)) < 0.05
-        assert np.allclose(np.diag(first.cov), np.diag(second.cov), rtol=0.05)
-
-
 def test_each_cameras_scale_has_the_prior_of_its_own_lens(runs):
     own, _ = runs[0]
     exact = replace(ML, tolerances=replace(KNOWN, focal_length=0.0, square_size=0.0))

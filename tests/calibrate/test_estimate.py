@@ -11,6 +11,7 @@ from lce_rig.calibrate import (
     error_to_reference,
     fit_extrinsic,
 )
+from lce_rig.calibrate.result import summarise
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, exp_so3, pose
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
@@ -168,3 +169,48 @@ def test_progress_reaches_the_end():
     fit_extrinsic(simulate(6, 0), BOARD, FAST, lambda done, total: seen.append((done, total)))
     assert seen[-1] == (9, 9)
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+@pytest.mark.parametrize("method", ["ml", "paper"])
+def test_the_same_placements_captured_again_claim_no_smaller_sigma(method):
+    once = simulate(14, seed=4)
+    again = [replace(item, capture=f"1{item.capture[1:]}") for item in once]
+    options = EstimateSettings(method, n_draws=1)
+    single, double = (
+        fit_extrinsic(once, BOARD, options),
+        fit_extrinsic([*once, *again], BOARD, options),
+    )
+    assert double.diagnostics.n_placements == single.diagnostics.n_placements == 14
+    ratio = np.sqrt(np.diag(double.cov) / np.diag(single.cov))
+    assert np.all(ratio > 0.85)
+
+
+def test_the_error_to_a_reference_is_the_angle_and_the_distance():
+    T = pose(exp_so3(np.radians([0.0, 0.3, 0.0])) @ T_FORWARD[:3, :3], T_FORWARD[:3, 3] + [0.003, 0, 0.004])
+    np.testing.assert_allclose(error_to_reference(T, T_FORWARD), (0.3, 0.005), rtol=1e-9)
+
+
+def test_noise_of_the_range_is_what_the_plane_residual_shows():
+    captures = simulate(6, 0, Scenario(range_sigma_m=0.02, corner_sigma_px=0.0))
+    residuals = [capture_residual(T_FORWARD, item, BOARD) for item in captures]
+    rms_m = np.sqrt(np.mean([r.plane_rms_m**2 for r in residuals]))
+    # Tilted boards see the noise of the range shortened by the cosine of incidence.
+    assert 0.014 < rms_m < 0.0205
+
+
+def test_a_capture_without_ring_ends_does_not_spoil_the_mean():
+    item = simulate(1, 0)[0]
+    bare = replace(
+        item,
+        lidar=replace(
+            item.lidar,
+            edge_points=np.zeros((0, 3)),
+            edge_ring=np.zeros(0, dtype=np.int16),
+            edge_side=np.zeros(0, dtype=np.int8),
+            edge_behind_m=np.zeros(0),
+            edge_echo=np.zeros(0),
+        ),
+    )
+    residuals = [capture_residual(T_FORWARD, observation, BOARD) for observation in (item, bare)]
+    assert np.isnan(residuals[1].edge_mean_m)
+    assert summarise(residuals).mee_m == residuals[0].edge_mean_m
