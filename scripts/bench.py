@@ -52,7 +52,7 @@ PARTS: dict[str, tuple[str, Part]] = {
         lambda bench, a: bench(a.captures or 20, a.output, a.only),
     ),
     "growth": ("calibrate as sessions grow: time and memory", lambda bench, a: bench(a.output)),
-    "fleet": ("sessions of many robots, lost workers", lambda bench, a: bench(a.output, a.only)),
+    "fleet": ("sessions of many robots", lambda bench, a: bench(a.output, a.only)),
     "speed": ("detection, estimate, the command line", lambda bench, _: bench()),
 }
 

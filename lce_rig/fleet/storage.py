@@ -9,7 +9,7 @@ from typing import Any
 
 from fsspec.core import url_to_fs
 
-from lce_rig.core.errors import LceRigError, SourceError, reason_of
+from lce_rig.core.errors import LceRigError, SessionError, SourceError, reason_of
 from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import copy_over
 
@@ -86,9 +86,14 @@ class Storage:
             return None
 
     def write(self, content: bytes) -> None:
-        """Write it as a file, in one step; raises SessionError on a full disk, too."""
+        """Write it as a file, in one step; raises SessionError, too: a full disk, no permission."""
         if self.local is not None:
-            self.local.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                self.local.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise SessionError(
+                    f"{self.local.parent} cannot be made: {error.strerror or error}"
+                ) from error
             write_atomically(self.local, content)
             return
         with self.reached() as (fs, path):

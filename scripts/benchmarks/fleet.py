@@ -1,11 +1,9 @@
-"""Fleets: hundreds of simulated sessions, lost workers and clients, broken sessions, large tables."""
+"""Fleets: hundreds of simulated sessions, broken sessions, large tables."""
 
-import contextlib
 import json
 import os
 import resource
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -22,7 +20,6 @@ from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import SCHEMA, TABLE, as_table, merged, table_bytes
 
-_KILL_EVERY_S, _CLIENT_LIVES_S = 20.0, 45.0
 _FEW_ROBOTS, _FEW_SESSIONS = 10, 30
 _TABLE_ROWS = 1_000_000
 
@@ -32,12 +29,11 @@ def bench_fleet(folder: Path, only: str = "") -> None:
 
     Args:
         folder: where simulated captures, sessions and registries are kept.
-        only: one of the parts: sessions, kills, broken, table.
+        only: one of the parts: sessions, broken, table.
     """
     folder = folder.resolve()
     parts = {
         "sessions": bench_sessions,
-        "kills": bench_kills,
         "broken": bench_broken,
         "table": bench_table,
     }
@@ -114,60 +110,6 @@ def compare_with_truth(root: Path, registry: Path) -> None:
     print_row(
         len(truth), len(nudged), len(named & nudged), len(right), len(unchanged), len(named & unchanged)
     )
-
-
-def bench_kills(folder: Path) -> None:
-    """A worker is killed every 20 s, and the client after 45 s, until all is done."""
-    root, registry = few_sessions(folder), folder / "registry-kills"
-    shutil.rmtree(registry, ignore_errors=True)
-    n_workers = n_clients = 0
-    while True:
-        # A group of its own, so that workers are found, and none of anybody else.
-        client = subprocess.Popen(
-            _command(root, registry, "--workers", "2"), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-        )
-        start_s = time.monotonic()
-        next_s = start_s + _KILL_EVERY_S
-        while client.poll() is None:
-            time.sleep(0.2)
-            if time.monotonic() > next_s:
-                next_s += _KILL_EVERY_S
-                workers = workers_of(client.pid)
-                if workers:
-                    n_workers += _kill(workers[n_workers % len(workers)])
-            if n_clients < 3 and time.monotonic() > start_s + _CLIENT_LIVES_S:
-                n_clients += _kill(client.pid)
-        output = client.communicate()[0]
-        if client.returncode == 0:
-            break
-    rows = rows_of(registry)
-    sources = [row["source"] for row in rows]
-    wanted = {str(path.parent) for path in root.glob("*/*/session.json")}
-    folders = Registry(Storage.at(registry)).folders()
-    print_head(
-        "workers killed", "clients killed", "sessions", "lost", "twice", "folders", "status of the last run"
-    )
-    print_row(
-        n_workers, n_clients, len(wanted), len(wanted - set(sources)), len(sources) - len(set(sources)),
-        len(folders), json.loads(output)["statuses"],
-    )  # fmt: skip
-
-
-def _kill(pid: int) -> int:
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
-        return 1
-    return 0
-
-
-def workers_of(pid: int) -> list[int]:
-    """List the worker processes of Dask that a client started."""
-    import psutil
-
-    with contextlib.suppress(psutil.Error):
-        children = psutil.Process(pid).children()
-        return sorted(child.pid for child in children if "spawn_main" in " ".join(child.cmdline()))
-    return []
 
 
 def bench_broken(folder: Path) -> None:

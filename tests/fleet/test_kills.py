@@ -9,8 +9,8 @@ import subprocess
 import sys
 import time
 
+import psutil
 import pytest
-from benchmarks.fleet import workers_of
 
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.storage import Storage
@@ -40,6 +40,14 @@ def test_a_lost_worker_and_a_client_that_ends_lose_nothing(simulated, tmp_path, 
     sources = registry.read_table(["source"])["source"].to_pylist()
     assert sorted(sources) == sorted(f"{root}/r{k}/s" for k in range(5))
     assert not [path for path in (tmp_path / "registry").iterdir() if path.name.startswith(".new-")]
+
+
+def workers_of(pid: int) -> list[int]:
+    """List the worker processes of Dask that a client started."""
+    with contextlib.suppress(psutil.Error):
+        children = psutil.Process(pid).children()
+        return sorted(child.pid for child in children if "spawn_main" in " ".join(child.cmdline()))
+    return []
 
 
 def _wait_for(is_so) -> None:

@@ -241,3 +241,19 @@ def test_a_mistake_is_an_error_before_anything_is_deployed(registry, targets, ta
         targets.write_text(text)
     with pytest.raises(error):
         FleetDeployment(registry, target, targets, check)
+
+
+def test_a_registry_that_is_no_folder_is_one_error(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "deploy.yaml").write_text("targets: {nav: {to: /tmp/x}}")
+    words = [
+        "--registry",
+        str(tmp_path / "file"),
+        "--targets",
+        str(tmp_path / "deploy.yaml"),
+        "--target",
+        "nav",
+    ]
+    assert run(["fleet", "deploy", *words]) in (4, 5)
+    assert run(["fleet", "deploy", *words, "--rollback"]) == 0
+    assert "Traceback" not in capsys.readouterr().err
