@@ -44,8 +44,8 @@ def kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return library
 
 
-def read(kernel: Path, form: str, n_planes: int) -> subprocess.CompletedProcess[str]:
-    told = {"LD_PRELOAD": str(kernel), "VIDEO_FORMAT": form, "VIDEO_PLANES": str(n_planes)}
+def read(kernel: Path, form: str, is_planar: bool = False) -> subprocess.CompletedProcess[str]:
+    told = {"LD_PRELOAD": str(kernel), "VIDEO_FORMAT": form, "VIDEO_PLANES": str(int(is_planar))}
     return subprocess.run(
         [sys.executable, "-c", READ], env={**os.environ, **told}, capture_output=True, text=True, timeout=60
     )
@@ -53,7 +53,7 @@ def read(kernel: Path, form: str, n_planes: int) -> subprocess.CompletedProcess[
 
 @pytest.mark.parametrize("form", ["NV12", "UYVY"])
 def test_images_come_whole_counted_and_stamped(kernel: Path, form: str) -> None:
-    ran = read(kernel, form, 0)
+    ran = read(kernel, form)
     assert ran.returncode == 0, ran.stderr
     said: dict[str, Any] = json.loads(ran.stdout)
     assert (
@@ -72,5 +72,5 @@ def test_images_come_whole_counted_and_stamped(kernel: Path, form: str) -> None:
 
 
 def test_a_camera_that_delivers_planes_only_is_refused_with_the_way_to_read_it(kernel: Path) -> None:
-    ran = read(kernel, "NM12", 2)
+    ran = read(kernel, "NM12", is_planar=True)
     assert ran.returncode != 0 and "SourceError" in ran.stderr and "gst-launch" in ran.stderr

@@ -1,6 +1,6 @@
 /* The kernel's side of the video interface, for a camera that is not there: preloaded into the program under
  * test, it answers the ioctls of /dev/null by the kernel's own header and hands memory out for its buffers.
- * What it is comes from the environment: VIDEO_FORMAT, VIDEO_PLANES (0: the single-planar interface).
+ * What it is comes from the environment: VIDEO_FORMAT, VIDEO_PLANES (1: it delivers images in planes only).
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -13,47 +13,33 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { N_BUFFERS = 8, BEGIN = 1 << 20, STEP = 1 << 22, WIDTH = 64, HEIGHT = 48, STRIDE = 96, OFFSET = 16, TAIL = 40 };
-static unsigned char *memory[N_BUFFERS][3];
+enum { N_BUFFERS = 8, BEGIN = 1 << 20, STEP = 1 << 22, WIDTH = 64, HEIGHT = 48, STRIDE = 96, TAIL = 40 };
+static unsigned char *memory[N_BUFFERS];
 static int queued[N_BUFFERS], n_queued, is_streaming;
 static unsigned sequence;
 
-static int planes(void) { return atoi(getenv("VIDEO_PLANES")); }
 static unsigned code(void) { unsigned c; memcpy(&c, getenv("VIDEO_FORMAT"), 4); return c; }
 static int is_two_bytes(void) { return code() == V4L2_PIX_FMT_UYVY; }
-static unsigned stride(int plane) { return is_two_bytes() ? 2 * STRIDE : planes() == 3 && plane ? STRIDE / 2 : STRIDE; }
-static unsigned used(int plane) {
-    if (is_two_bytes()) return stride(0) * HEIGHT;
-    if (planes() < 2) return STRIDE * HEIGHT * 3 / 2;
-    return stride(plane) * (plane ? HEIGHT / 2 : HEIGHT);
-}
-static unsigned offset(void) { return planes() ? OFFSET : 0; }
-static unsigned length(int plane) { return used(plane) + offset() + TAIL; }
-static long place(int buffer, int plane) { return BEGIN + (long)(buffer * 4 + plane) * STEP; }
+static unsigned stride(void) { return is_two_bytes() ? 2 * STRIDE : STRIDE; }
+static unsigned used(void) { return is_two_bytes() ? stride() * HEIGHT : STRIDE * HEIGHT * 3 / 2; }
 
-static void paint(int buffer) {
-    int n = planes() ? planes() : 1;
-    for (int p = 0; p < n; p++) {
-        unsigned char *at = memory[buffer][p];
-        memset(at, 255, length(p)); /* what must not be seen */
-        for (unsigned k = 0; k < used(p); k++) {
-            unsigned column = k % stride(p), luma = 20 + column / 2 + sequence;
-            int is_chroma = is_two_bytes() ? column % 2 == 0 : p || k >= STRIDE * HEIGHT;
-            if (is_two_bytes()) luma = 20 + column / 4 + sequence;
-            at[offset() + k] = is_chroma ? 128 : luma;
-        }
+static void paint(unsigned char *at) {
+    memset(at, 255, used() + TAIL); /* what must not be seen */
+    for (unsigned k = 0; k < used(); k++) {
+        unsigned column = k % stride(), luma = 20 + column / (is_two_bytes() ? 4 : 2) + sequence;
+        int is_chroma = is_two_bytes() ? column % 2 == 0 : k >= STRIDE * HEIGHT;
+        at[k] = is_chroma ? 128 : luma;
     }
 }
 
 static int answer(unsigned long request, void *arg) {
-    int n = planes() ? planes() : 1;
-    unsigned type = planes() ? V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE : V4L2_BUF_TYPE_VIDEO_CAPTURE;
+    unsigned type = V4L2_BUF_TYPE_VIDEO_CAPTURE, is_planar = atoi(getenv("VIDEO_PLANES"));
     switch (request) {
     case VIDIOC_QUERYCAP: {
         struct v4l2_capability *c = arg;
         strcpy((char *)c->driver, "stand-in"), strcpy((char *)c->card, "Stand-in");
         c->capabilities = V4L2_CAP_DEVICE_CAPS;
-        c->device_caps = V4L2_CAP_STREAMING | (planes() ? V4L2_CAP_VIDEO_CAPTURE_MPLANE : V4L2_CAP_VIDEO_CAPTURE);
+        c->device_caps = V4L2_CAP_STREAMING | (is_planar ? V4L2_CAP_VIDEO_CAPTURE_MPLANE : V4L2_CAP_VIDEO_CAPTURE);
         return 0; }
     case VIDIOC_ENUM_FMT: {
         struct v4l2_fmtdesc *f = arg;
@@ -63,14 +49,8 @@ static int answer(unsigned long request, void *arg) {
     case VIDIOC_S_FMT: {
         struct v4l2_format *f = arg;
         if (f->type != type) return EINVAL;
-        if (planes()) {
-            struct v4l2_pix_format_mplane *m = &f->fmt.pix_mp;
-            m->width = WIDTH, m->height = HEIGHT, m->pixelformat = code(), m->num_planes = n;
-            for (int p = 0; p < n; p++) m->plane_fmt[p].bytesperline = stride(p), m->plane_fmt[p].sizeimage = length(p);
-        } else {
-            struct v4l2_pix_format *s = &f->fmt.pix;
-            s->width = WIDTH, s->height = HEIGHT, s->pixelformat = code(), s->bytesperline = stride(0);
-        }
+        struct v4l2_pix_format *p = &f->fmt.pix;
+        p->width = WIDTH, p->height = HEIGHT, p->pixelformat = code(), p->bytesperline = stride();
         return 0; }
     case VIDIOC_REQBUFS: {
         struct v4l2_requestbuffers *r = arg;
@@ -79,7 +59,7 @@ static int answer(unsigned long request, void *arg) {
         return 0; }
     case VIDIOC_QUERYBUF: case VIDIOC_QBUF: case VIDIOC_DQBUF: {
         struct v4l2_buffer *b = arg;
-        if (b->type != type || (planes() && (!b->m.planes || b->length < (unsigned)n))) return EINVAL;
+        if (b->type != type) return EINVAL;
         if (request == VIDIOC_QBUF) { queued[n_queued++] = b->index; return 0; }
         if (request == VIDIOC_DQBUF) {
             static struct timespec last;
@@ -90,18 +70,12 @@ static int answer(unsigned long request, void *arg) {
             last = now;
             b->index = queued[0];
             memmove(queued, queued + 1, --n_queued * sizeof *queued);
-            paint(b->index);
+            paint(memory[b->index]);
             b->sequence = sequence++;
             b->flags = V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC;
             b->timestamp.tv_sec = now.tv_sec, b->timestamp.tv_usec = now.tv_nsec / 1000;
         }
-        if (!planes()) { b->length = length(0), b->bytesused = used(0), b->m.offset = place(b->index, 0); return 0; }
-        for (int p = 0; p < n; p++) {
-            struct v4l2_plane *q = &b->m.planes[p];
-            q->length = length(p), q->bytesused = used(p) + OFFSET, q->data_offset = OFFSET;
-            q->m.mem_offset = place(b->index, p);
-        }
-        b->length = n;
+        b->length = used() + TAIL, b->bytesused = used(), b->m.offset = BEGIN + (long)b->index * STEP;
         return 0; }
     case VIDIOC_STREAMON: is_streaming = 1; return 0;
     case VIDIOC_STREAMOFF: is_streaming = 0, n_queued = 0; return 0;
@@ -123,11 +97,11 @@ int ioctl(int fd, unsigned long request, ...) {
 void *mmap64(void *where, size_t size, int protection, int flags, int fd, off64_t at) {
     int is_ours = fd >= 0 && (flags & MAP_SHARED) && at >= BEGIN && (at - BEGIN) % STEP == 0;
     int number = is_ours ? (at - BEGIN) / STEP : 0;
-    if (!is_ours || number >= 4 * N_BUFFERS)
+    if (!is_ours || number >= N_BUFFERS)
         return ((void *(*)(void *, size_t, int, int, int, off64_t))dlsym(RTLD_NEXT, "mmap64"))(where, size, protection, flags, fd, at);
-    if (size != length(number % 4)) { errno = EINVAL; return MAP_FAILED; }
+    if (size != used() + TAIL) { errno = EINVAL; return MAP_FAILED; }
     void *given = ((void *(*)(void *, size_t, int, int, int, off64_t))dlsym(RTLD_NEXT, "mmap64"))(0, size, protection, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
-    memory[number / 4][number % 4] = given;
+    memory[number] = given;
     return given;
 }
 void *mmap(void *where, size_t size, int protection, int flags, int fd, off_t at) { return mmap64(where, size, protection, flags, fd, at); }
