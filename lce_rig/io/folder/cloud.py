@@ -11,8 +11,6 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import Array
 from lce_rig.rig import LidarSettings
 
-# The laser of each point of a spinning LiDAR, inferred from the points alone.
-
 BIN_RAD = np.radians(0.02)
 MAX_RINGS = 256
 MAX_OFFSET_M = 0.015
@@ -160,7 +158,7 @@ class CloudReading:
     notes: tuple[str, ...]
 
 
-# What is not a number, or beyond a type's range, is looked for where it matters.
+# NaN and values beyond a type's range are checked where they matter.
 @np.errstate(over="ignore", invalid="ignore")
 def to_scan(
     cloud: NDArray[Any],
@@ -189,8 +187,13 @@ def to_scan(
     }
     missing = [axis for axis in "xyz" if axis not in fields]
     if missing:
-        have = ", ".join(_shown(cloud.dtype, name) for name in cloud.dtype.names or ()) or "none"
-        raise SourceError(f"{where}: the point cloud has no field {missing[0]!r}; its fields are {have}")
+        have = ", ".join(
+            name if _is_scalar(cloud.dtype[name]) else f"{name} (not one number per point)"
+            for name in cloud.dtype.names or ()
+        )
+        raise SourceError(
+            f"{where}: the point cloud has no field {missing[0]!r}; its fields are {have or 'none'}"
+        )
     points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
     x, y, z = points.T.astype(np.float64)
     flat_m = np.hypot(x, y)
@@ -200,7 +203,12 @@ def to_scan(
     n_finite, n_kept = int(is_finite.sum()), int(is_kept.sum())
     if n_kept == 0:
         raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
-    _check_unit(float(np.median(np.hypot(flat_m, z)[is_kept])), settings, where)
+    median_m = float(np.median(np.hypot(flat_m, z)[is_kept]))
+    if median_m > _FARTHEST_MEDIAN * settings.max_range_m:
+        raise SourceError(
+            f"{where}: median range {round(median_m):.9g} m, the LiDAR reaches "
+            f"{settings.max_range_m:g} m: points in millimetres must be converted to metres"
+        )
     notes: list[str] = []
     if n_kept < len(points):
         points, cloud = points[is_kept], cloud[is_kept]
@@ -214,20 +222,8 @@ def to_scan(
 
 
 def _is_scalar(field: np.dtype[Any]) -> bool:
-    """Return a figure of each point from several, and from text."""
+    """Return whether a field is one number per point."""
     return field.shape == () and field.kind in "biuf"
-
-
-def _shown(kind: np.dtype[Any], name: str) -> str:
-    return name if _is_scalar(kind[name]) else f"{name} (not one number per point)"
-
-
-def _check_unit(median_m: float, settings: LidarSettings, where: str) -> None:
-    if median_m > _FARTHEST_MEDIAN * settings.max_range_m:
-        raise SourceError(
-            f"{where}: median range {round(median_m):.9g} m, the LiDAR reaches "
-            f"{settings.max_range_m:g} m: points in millimetres must be converted to metres"
-        )
 
 
 def _find(fields: dict[str, str], candidates: tuple[str, ...]) -> str | None:
@@ -261,7 +257,12 @@ def _ring(
     mean = np.bincount(ring_of_point, elevation) / np.bincount(ring_of_point)
     rank = np.argsort(np.argsort(mean, kind="stable"), kind="stable")
     is_whole = ids[0] >= 0 and ids[-1] < 2**15 and bool((ids == np.rint(ids)).all())
-    if is_whole and _counts_upwards(rank):
+    # Some drivers count lasers from the top (Ouster) or by firing order. Neighbouring rings with few near
+    # points may swap their mean elevations, which is no reason to renumber: Spearman's correlation decides.
+    rises = bool((np.diff(rank) > 0).all())
+    if len(rank) >= 3:
+        rises = bool(np.corrcoef(np.arange(len(rank)), rank)[0, 1] > 0.98)
+    if is_whole and rises:
         return values.astype(np.int16)
     notes.append(f"field {name!r} does not count rings from the lowest: renumbered by elevation")
     return rank[ring_of_point].astype(np.int16)
@@ -306,17 +307,6 @@ def _distinct(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
     place = np.zeros(256, dtype=np.intp)
     place[ids] = np.arange(len(ids))
     return ids.astype(np.float64), place[numbers]
-
-
-def _counts_upwards(rank: NDArray[np.intp]) -> bool:
-    """Return whether ring numbers rise with elevation, by Spearman's correlation.
-
-    Some drivers count lasers from the top (Ouster) or by firing order. Neighbouring rings with few near
-    points may swap their mean elevations, which is no reason to renumber.
-    """
-    if len(rank) < 3:
-        return bool((np.diff(rank) > 0).all())
-    return bool(np.corrcoef(np.arange(len(rank)), rank)[0, 1] > 0.98)
 
 
 def _times(

@@ -16,8 +16,6 @@ from lce_rig.io.protocol import PairMethod, RecordedPair, SourceOptions
 from lce_rig.io.sensor_choice import choose_camera, choose_lidar
 from lce_rig.rig import LidarSettings, Rig
 
-# The layout of a folder: its images and point clouds, and the camera of each image folder.
-
 IMAGE_FOLDERS = ("img", "imgs", "image", "images", "camera", "cam", "rgb", "color", "frames")
 CLOUD_FOLDERS = (
     "pcd",
@@ -187,7 +185,8 @@ class FolderRecording:
         with_image = {j for j, _ in together}
         lone += [cloud.name for j, cloud in enumerate(clouds) if j not in with_image]
         if lone:
-            self.notes.append(f"{path.name}: without a partner: {_shorten(lone)}")
+            more = f" and {len(lone) - 6} more" if len(lone) > 6 else ""
+            self.notes.append(f"{path.name}: without a partner: {', '.join(lone[:6])}{more}")
         self.pairs = [
             PairOnDisk(
                 tuple(held),
@@ -255,8 +254,3 @@ class FolderRecording:
         except SourceError as error:
             whose = f" (camera {first.camera})" if len(self._rig.cameras) > 1 else ""
             raise SourceError(f"{self.path}{whose}: {error.what}", error.hint) from None
-
-
-def _shorten(names: Sequence[str], n_shown: int = 6) -> str:
-    shown = ", ".join(names[:n_shown])
-    return shown if len(names) <= n_shown else f"{shown} and {len(names) - n_shown} more"

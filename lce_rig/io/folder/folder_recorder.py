@@ -52,7 +52,8 @@ class FolderRecorder:
         """
         self._recorder.write(sample)
         if isinstance(sample, Events):
-            path = self._aedat4_path(sample.sensor)
+            is_only = self._event_cameras == [sample.sensor]
+            path = self.folder / ("events.aedat4" if is_only else f"{sample.sensor}.aedat4")
             try:
                 if sample.sensor not in self._aedat4:
                     writer = Aedat4Writer(path, (sample.width_px, sample.height_px), sample.sensor)
@@ -79,6 +80,3 @@ class FolderRecorder:
             self._open.__exit__(kind, error, trace)
         except OSError as failure:
             raise not_writable(self.folder, failure) from failure
-
-    def _aedat4_path(self, camera: str) -> Path:
-        return self.folder / ("events.aedat4" if self._event_cameras == [camera] else f"{camera}.aedat4")

@@ -39,6 +39,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     return to_8_bit(decode_pixels(data, flags))
 
 
+@np.errstate(invalid="ignore")  # of signalling NaN
 def to_8_bit(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     """Bring pixels to 8 bits; deeper ones are stretched by their darkest and brightest percent.
 
@@ -51,11 +52,6 @@ def to_8_bit(pixels: NDArray[Any]) -> NDArray[np.uint8]:
         return np.ascontiguousarray(pixels)
     if pixels.dtype not in (np.uint16, np.float32):
         raise ValueError(f"its pixels are {pixels.dtype}, not 8 or 16 bit")
-    with np.errstate(invalid="ignore"):  # of NaN that signals
-        return _stretched(pixels)
-
-
-def _stretched(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     # Every k-th pixel has the same shares, and no copies of a large image are made.
     sample = pixels.ravel()[:: 1 + pixels.size // _MAX_SAMPLED].astype(np.float64)
     sample = sample[np.isfinite(sample)]

@@ -29,7 +29,7 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
     entries = sorted(entry for entry in path.iterdir() if entry.name[0] != ".")
     kinds = {suffix: [e for e in entries if e.is_file() and e.suffix.lower() in suffix] for suffix in _KINDS}
     folders = [entry for entry in entries if entry.is_dir()]
-    if not all(_is_bag(folder) for folder in folders):
+    if not all(any(file.suffix.lower() in _BAGS for file in folder.iterdir()) for folder in folders):
         return [(path, options)]  # Of images and point clouds, whatever lies beside them.
     # A bag in several pieces lies in one folder, and is read as one.
     bags = ([path] if kinds[_BAGS] else []) + folders
@@ -41,10 +41,6 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
     for file in kinds[_EVENTS]:
         parts.append((file, replace(options, camera=_named(file, rig.cameras) or options.camera)))
     return parts or [(path, options)]
-
-
-def _is_bag(folder: Path) -> bool:
-    return any(file.suffix.lower() in _BAGS for file in folder.iterdir())
 
 
 def _named(file: Path, sensors: Collection[str]) -> str | None:
