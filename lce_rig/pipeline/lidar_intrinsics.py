@@ -9,7 +9,7 @@ from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, EstimateSet
 from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors, estimate_lidar
 from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
-from lce_rig.detect.detection import Detections, Pair
+from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import Progress, detect, silent
 from lce_rig.pipeline.intrinsics_files import profile_text
@@ -60,7 +60,8 @@ def measure_lidar(
     for k, session in enumerate(sessions):
         detections = detect(session, progress=progress) if found is None else found[k]
         for pair in detections.pairs:
-            if pair.lidar != name or not _has_frames(session, pair):
+            channel = session.rig.cameras[pair.camera].channels[pair.channel]
+            if pair.lidar != name or channel.kind != "frames":
                 continue
             candidates, _ = candidates_of(detections, pair)
             clocks = clocks_of(session.rig, pair.camera, pair.lidar)
@@ -83,10 +84,6 @@ def measure_lidar(
             "Collect more captures, with the board at several heights, so that each laser meets it in many.",
         )
     return errors
-
-
-def _has_frames(session: Session, pair: Pair) -> bool:
-    return session.rig.cameras[pair.camera].channels[pair.channel].kind == "frames"
 
 
 def _require_still(session: Session, estimate: CalibrationEstimate) -> None:
@@ -113,14 +110,13 @@ def save_lidar(session: Session, lidar: str | None, errors: LidarErrors, path: P
     if path.exists():
         raise UsageError(f"{path} exists already", "Choose another file; existing files are kept.")
     name, known = lidar or next(iter(session.rig.lidars)), errors.found
+    # Range m, azimuth deg and elevation deg of each laser, and their standard deviations.
+    in_degrees = np.array([1.0, np.degrees(1.0), np.degrees(1.0)])
+    rows = np.hstack([known.lasers.T * in_degrees, known.lasers_sigma.T * in_degrees]).tolist()
     lasers = ", ".join(
-        "{"
-        f"ring: {ring}, range_m: {r:.5f}, range_sigma_m: {rs:.5f}, azimuth_deg: {a:.4f}, "
-        f"azimuth_sigma_deg: {as_:.4f}, elevation_deg: {e:.4f}, elevation_sigma_deg: {es:.4f}"
-        "}"
-        for ring, (r, a, e), (rs, as_, es) in zip(
-            known.rings.tolist(), _in_degrees(known.lasers), _in_degrees(known.lasers_sigma), strict=True
-        )
+        f"{{ring: {ring}, range_m: {r:.5f}, range_sigma_m: {r_sigma:.5f}, azimuth_deg: {a:.4f}, "
+        f"azimuth_sigma_deg: {a_sigma:.4f}, elevation_deg: {e:.4f}, elevation_sigma_deg: {e_sigma:.4f}}}"
+        for ring, (r, a, e, r_sigma, a_sigma, e_sigma) in zip(known.rings.tolist(), rows, strict=True)
     )
     block = f"lidars.{name}.intrinsics"
     values = (
@@ -133,9 +129,3 @@ def save_lidar(session: Session, lidar: str | None, errors: LidarErrors, path: P
     text = f"# intrinsics of LiDAR {name}, measured by {MADE_BY} from {n} captures\n" + text
     parse_rig(text, str(path))
     write_atomically(path, text)
-
-
-def _in_degrees(errors: np.ndarray) -> list[list[float]]:
-    """List range m, azimuth deg and elevation deg by laser from (3, K) in m and rad."""
-    scale = np.array([1.0, np.degrees(1.0), np.degrees(1.0)])
-    return [list(map(float, row)) for row in (errors.T * scale)]
