@@ -35,6 +35,7 @@ _PACKAGES = {
     "onnxruntime": "onnxruntime",
     "serial": "pyserial",
     "velodyne_decoder": "velodyne-decoder",
+    "dpkt": "dpkt",
 }
 # What Open3D is linked with and its package does not bring, and Debian's packages of them.
 _OPEN3D_LIBRARIES = {
