@@ -48,6 +48,10 @@ class Columns:
     def __getitem__(self, name: str) -> slice:
         return self._slices[name]
 
+    def span(self, first: str, last: str) -> slice:
+        """Return the columns from one name to another."""
+        return slice(self._slices[first].start, self._slices[last].stop)
+
     def of(self, names: Iterable[str]) -> Indices:
         """List the columns of several names, in their order."""
         slices = [self._slices[name] for name in names]

@@ -195,9 +195,10 @@ class Assembly:
         information, gradient = summed.information, gradients.sum(axis=0) + summed.prior_gradient
         least = costs.sum() + off @ summed.prior_gradient
         least -= gradient @ np.linalg.solve(information, gradient)
-        log_volumes = range_volume + image_volume + own_volume + np.linalg.slogdet(of_own)[1]
-        log_volume = terms.trust @ log_volumes + np.linalg.slogdet(information)[1] + prior_volume
-        return Reduced(summed, np.asarray(steps), of_own, terms.trust, float(least + log_volume))
+        log_volume = float(terms.trust @ (range_volume + image_volume + own_volume))
+        log_volume += float(terms.trust @ np.linalg.slogdet(of_own)[1] + np.linalg.slogdet(information)[1])
+        evidence = float(least + log_volume + prior_volume)
+        return Reduced(summed, np.asarray(steps), of_own, terms.trust, evidence)
 
     def evidence(self, levels: Levels, names: Sequence[str]) -> tuple[float, Array]:
         """Compute -2 ln p(data | levels) and its derivative by the logarithms of some levels.

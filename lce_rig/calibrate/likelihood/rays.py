@@ -55,7 +55,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.features import turn_about_z
-from lce_rig.calibrate.likelihood.layout import END, LASER, RETURN, RING, Indices, State
+from lce_rig.calibrate.likelihood.layout import END, RETURN, RING, Indices, State
 from lce_rig.calibrate.plane_and_ends import (
     BLENDS,
     describe_background,
@@ -233,11 +233,11 @@ def sum_ranges(scans: StackedScans, state: State) -> RangeSums:
     freedoms = np.column_stack([np.ones_like(r), r * x - middle[k, 0], r * y - middle[k, 1]])
     v[:, RETURN["plane"]] = freedoms / cosine[:, None]
     v[:, RETURN["range"]] = 1
-    v[:, RETURN.of(["azimuth", "elevation"])] = r[:, None] * np.einsum("ni,nij->nj", across, scans.turned)
-    v[:, RETURN.of(["lens", "bow"])] = np.einsum("ni,nij->nj", across, scans.fields)
-    by_laser, by_fields = v[:, RETURN.of(LASER)], v[:, RETURN.of(["lens", "bow"])]
-    off = np.einsum("ni,ni->n", by_laser, state.lasers.T[scans.ring]) + by_fields @ state.fields
-    v[:, -1] = r + off - scans.range_m
+    v[:, RETURN.span("azimuth", "elevation")] = r[:, None] * np.einsum("ni,nij->nj", across, scans.turned)
+    v[:, RETURN.span("lens", "bow")] = np.einsum("ni,nij->nj", across, scans.fields)
+    by_laser, by_fields = v[:, RETURN.span("range", "elevation")], v[:, RETURN.span("lens", "bow")]
+    of_laser = np.einsum("ni,ni->n", by_laser, state.lasers.T[scans.ring])
+    v[:, -1] = r + of_laser + by_fields @ state.fields - scans.range_m
     sums = np.zeros((scans.n_captures * len(scans.rings), RETURN.size, RETURN.size))
     bounds = np.flatnonzero(np.diff(scans.group, prepend=-1, append=-1))
     # A product of matrices for each ring: several times faster than sums of products of columns.
@@ -336,8 +336,8 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     rows = np.zeros((len(M), END.size))
     rows[:, END["pose"]] = -differentiate(sideways, here)
     by_angle = -range_m[:, None] * np.einsum("mi,mij->mj", sideways, turned)
-    rows[:, END.of(["azimuth", "elevation"])] = by_angle
-    rows[:, END.of(["lens", "bow"])] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
+    rows[:, END.span("azimuth", "elevation")] = by_angle
+    rows[:, END.span("lens", "bow")] = -np.einsum("mi,mij->mj", sideways, scans.end_fields)
     # By the shifts of (3), the shape of the plate, and the displacement along azimuth and upwards.
     across = np.linalg.norm(sideways, axis=1, keepdims=True)
     of_width = np.column_stack([np.ones(len(range_m)), range_m, scans.end_background])
@@ -345,7 +345,7 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     by_azimuth = np.sum(sideways * scans.end_fields[:, :, 0], axis=1)
     by_shifts = np.column_stack([across * of_width, of_plate, -by_azimuth, -sideways[:, 2]])
     rows[:, END["shifts"]] = by_shifts
-    own_shift_m = by_shifts[:, 0] * state.own_shift_m[scans.end_capture]
-    rows[:, -1] = inside_m + by_shifts @ state.shifts - step_m / 2 + own_shift_m
+    rows[:, -1] = inside_m + rows[:, END.of(["shifts"])] @ state.shifts - step_m / 2
+    rows[:, -1] += by_shifts[:, 0] * state.own_shift_m[scans.end_capture]
     is_backed = scans.end_background[:, BLENDS] > 0
     return EdgeRows(scans.end_capture, scans.end_ring, rows, step_m, range_m, is_backed, len(scans.rings))
