@@ -116,7 +116,6 @@ def _reconstruction_table(rig: "Rig") -> Any:
 
 
 def _board_table(rig: "Rig") -> Any:
-
     board = rig.board
     (cols, rows), (x, y) = board.inner_corners, board.pattern_offset_m
     table = show.plain_table("", "board", "")
@@ -191,7 +190,6 @@ def check_profile(file: str, as_json: bool) -> None:
 
 
 def _print_warnings(rig: "Rig") -> None:
-
     for warning in rig.warnings():
         show.warn(warning.sentence)
 

@@ -184,7 +184,7 @@ def test_another_result_moves_the_earlier_one_and_its_overlays_to_previous(lce_r
     again = lce_rig("calibrate", calibrated)
     assert "earlier result" not in again.err
     assert (folder / "overlays" / "contact_sheet.png").exists()
-    outcome = lce_rig("calibrate", calibrated, "--seed", "5")
+    outcome = lce_rig("calibrate", calibrated, "--use-scene")
     assert "earlier result" in outcome.err and str(folder / "previous") in outcome.err.replace("\n", "")
     kept = folder / "previous"
     assert {path.relative_to(kept): path.read_bytes() for path in kept.rglob("*") if path.is_file()} == before
