@@ -9,7 +9,7 @@ from lce_rig.calibrate.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
 from lce_rig.collect.findings import IMAGE_NONE, LIDAR_ELSEWHERE, LIDAR_NONE
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, invert
+from lce_rig.core.geometry import invert
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder, ImageSearch
@@ -186,7 +186,7 @@ class BoardTracker:
 
     def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageSearch | None:
         last = self._seen.pop(key, None)
-        if last is None and not self._is_search_due(key, time_ns):
+        if last is None and not _is_due(self._searched_ns, key, time_ns, self.search_interval_s):
             return None
         is_thorough = self._is_thorough_due(key, time_ns, was_seen=last is not None)
         found = self.finder.search_image(image, last, is_thorough=is_thorough)
@@ -212,9 +212,6 @@ class BoardTracker:
         if isinstance(search.boards, list) and isinstance(search.usable, Refusal):
             self.refusals.add(search.usable)
         return search.usable
-
-    def _is_search_due(self, key: ImageKey | str, time_ns: int) -> bool:
-        return _is_due(self._searched_ns, key, time_ns, self.search_interval_s)
 
     def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
         """Check whether it is time for a thorough search; a board just lost is soon seen again without."""
@@ -243,9 +240,11 @@ def _compare(
     """
     T_lidar_cam = invert(nominal.to_matrix())
     poses = [pose for pose in (board.T_cam_board, board.T_cam_board_alternative) if pose is not None]
-    distance, angle = np.array(
-        [_apart(T_lidar_cam @ pose, each.T_lidar_board) for pose in poses for each in candidates]
-    ).T
+    expected = np.repeat([T_lidar_cam @ pose for pose in poses], len(candidates), axis=0)
+    measured = np.array([candidate.T_lidar_board for candidate in candidates] * len(poses))
+    # The distance of the boards' centres, and the angle of their planes.
+    distance = np.linalg.norm(expected[:, :3, 3] - measured[:, :3, 3], axis=1)
+    angle = np.arccos(np.minimum(np.abs(np.sum(expected[:, :3, 2] * measured[:, :3, 2], axis=1)), 1.0))
     turn_rad = _NOMINAL_MARGIN * np.radians(nominal.tolerance_deg)
     range_m = float(np.linalg.norm(board.T_cam_board[:3, 3]))
     max_m = CENTRE_TOLERANCE_M + _NOMINAL_MARGIN * nominal.tolerance_m + range_m * turn_rad
@@ -259,12 +258,6 @@ def _compare(
     return float(misfit[best]), LIDAR_ELSEWHERE.refusal(**figures)
 
 
-def _apart(T_1: Array, T_2: Array) -> tuple[float, float]:
-    """Measure how far two boards' centres are apart in m, and the angle of their planes in rad."""
-    cosine = min(abs(float(T_1[:3, 2] @ T_2[:3, 2])), 1.0)
-    return float(np.linalg.norm(T_1[:3, 3] - T_2[:3, 3])), float(np.arccos(cosine))
-
-
 def without_samples(detection: BoardDetection) -> BoardDetection:
-    """Leave out the images and scans that were searched, which take long to send to another process."""
+    """Drop the images and scans that were searched, which take long to send to another process."""
     return replace(detection, frame=replace(detection.frame, images=(), scans=()))

@@ -8,13 +8,12 @@ Events need motion, LiDAR wants stillness. A detection will do where, in a camer
   Light that flickers does not count.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
 from lce_rig.collect.findings import IMAGE_MADE_FEW_EVENTS, IMAGE_STOOD_STILL, READ_NO_EVENTS_AT_SCAN
-from lce_rig.core.data import Events
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.detect.events.event_limits import explain_missing_board, look_for_flicker, too_fast
@@ -39,7 +38,7 @@ def judge_detection(
     """Check whether a detection is worth a capture.
 
     Args:
-        detection: what the sensors saw.
+        detection: the board in its frame.
         around: all detections shortly before and after, itself among them.
         rig: the profile.
 
@@ -51,11 +50,17 @@ def judge_detection(
         return READ_NO_EVENTS_AT_SCAN.refusal()
     watched = [key for key in sorted(detection.images) if key[0] in cuts]
     if not watched:
-        return _explain_unseen(detection, cuts, rig)
+        # The events explain why their images do not show the board.
+        for (camera, channel), refusal in sorted(detection.unseen.items()):
+            if rig.cameras[camera].channels[channel].kind == "events" and camera in cuts:
+                stamp_ns = detection.frame.time_ns - cuts[camera].offset_ns
+                recent = cuts[camera].events.between(stamp_ns - MEMORY_NS, stamp_ns)
+                return explain_missing_board(recent, stamp_ns, refusal, rig.quality)
+        return None
     if not detection.lidars:
         return None
     judged = [_judge_camera(key, detection, around, cuts[key[0]], rig) for key in watched]
-    return next((found for found in judged if isinstance(found, CaptureMoment)), judged[0])
+    return next((verdict for verdict in judged if isinstance(verdict, CaptureMoment)), judged[0])
 
 
 def _judge_camera(
@@ -70,8 +75,12 @@ def _judge_camera(
     motion = _follow(key, around)
     if motion is None:
         return None
-    recent, stamp_ns = _events_before(key, detection, cut, rig)
-    # Count the events a pixel of the board in the second before its image.
+    image = next(i for i in detection.frame.images if (i.sensor, i.channel) == key)
+    # Frames and events of one camera may have clocks, or delays, of their own.
+    time_ns = rig_time_ns(image, rig)
+    stamp_ns = (detection.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
+    # Count the events per pixel of the board in the second before its image.
+    recent = cut.events.between(stamp_ns - MEMORY_NS, stamp_ns)
     camera, board = rig.cameras[key[0]], detection.images[key]
     outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
     (speed_mps, unsteady_m), events_px = motion, event_quality(recent, stamp_ns, outline).events_px
@@ -88,12 +97,8 @@ def _judge_camera(
         lamps = look_for_flicker(recent)
         if lamps is not None:
             return lamps
-    slow = {
-        "speed_mps": round(speed_mps, 5),
-        "unsteady_m": round(unsteady_m, 5),
-        "events_px": round(events_px, 5),
-    }
-    return CaptureMoment(detection, slow)
+    figures = {"speed_mps": speed_mps, "unsteady_m": unsteady_m, "events_px": events_px}
+    return CaptureMoment(detection, {name: round(figure, 5) for name, figure in figures.items()})
 
 
 def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, float] | None:
@@ -110,22 +115,3 @@ def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, flo
     velocity = time_s @ way / (time_s @ time_s)
     rest = way - time_s[:, None] * velocity
     return float(np.linalg.norm(velocity)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
-
-
-def _events_before(key: ImageKey, detection: BoardDetection, cut: EventCut, rig: Rig) -> tuple[Events, int]:
-    """Cut out the second of events before the board's image; also give its time on their clock."""
-    image = next(i for i in detection.frame.images if (i.sensor, i.channel) == key)
-    # Frames and events of one camera may have clocks, or delays, of their own.
-    time_ns = rig_time_ns(image, rig)
-    stamp_ns = (detection.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
-    return cut.events.between(stamp_ns - MEMORY_NS, stamp_ns), stamp_ns
-
-
-def _explain_unseen(detection: BoardDetection, cuts: Mapping[str, EventCut], rig: Rig) -> Refusal | None:
-    """Say what keeps the board from being seen in images that were made of events."""
-    for (camera, channel), refusal in sorted(detection.unseen.items()):
-        if rig.cameras[camera].channels[channel].kind == "events" and camera in cuts:
-            stamp_ns = detection.frame.time_ns - cuts[camera].offset_ns
-            recent = cuts[camera].events.between(stamp_ns - MEMORY_NS, stamp_ns)
-            return explain_missing_board(recent, stamp_ns, refusal, rig.quality)
-    return None

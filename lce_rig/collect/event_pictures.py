@@ -79,27 +79,25 @@ class _Darkroom:
 
     def _develop(self) -> Iterator[Image]:
         # Scans come late in bags: events wait for them before the network goes on.
-        while self._wanted and self._can_feed(self._wanted[0]):
-            stamp_ns = self._wanted.popleft() - self._offset_ns
-            picture = self._picture_at(stamp_ns)
-            if isinstance(picture, Refusal):
-                self._tally.add(picture)
+        while self._wanted:
+            stamp_ns = self._wanted[0] - self._offset_ns
+            has_passed = bool(self._packets) and self._packets[-1].t_ns[-1] >= stamp_ns
+            if not has_passed and self._newest_ns <= self._wanted[0] + PATIENCE_NS:
+                break
+            self._wanted.popleft()
+            if self._fed_ns is not None and stamp_ns < self._fed_ns:
+                self._tally.add(_GONE_BY)
+                continue
+            self._feed(stamp_ns)
+            image: Image | Refusal = _NOT_BEGUN
+            if self._fed_ns is not None:
+                image = self._reconstructor.picture_at(stamp_ns, is_step=self._is_live)
+            if isinstance(image, Refusal):
+                self._tally.add(image)
             else:
-                yield picture
+                yield image
         if self._packets:
             self._feed(min([self._newest_ns - PATIENCE_NS, *self._wanted]) - self._offset_ns)
-
-    def _picture_at(self, stamp_ns: int) -> Image | Refusal:
-        if self._fed_ns is not None and stamp_ns < self._fed_ns:
-            return _GONE_BY
-        self._feed(stamp_ns)
-        if self._fed_ns is None:
-            return _NOT_BEGUN
-        return self._reconstructor.picture_at(stamp_ns, is_step=self._is_live)
-
-    def _can_feed(self, time_ns: int) -> bool:
-        has_passed = bool(self._packets) and self._packets[-1].t_ns[-1] + self._offset_ns >= time_ns
-        return has_passed or self._newest_ns > time_ns + PATIENCE_NS
 
     def _feed(self, until_ns: int) -> None:
         """Give the network all events before a timestamp of their clock."""

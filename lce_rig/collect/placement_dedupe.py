@@ -1,6 +1,6 @@
 """Whether the board stands differently from every capture before."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -10,7 +10,6 @@ from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, parse_pose, rotation_angle
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session, check_capture
 
 ImageKey = tuple[str, str]
@@ -91,20 +90,18 @@ def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
     """
     check_capture(session.rig, capture)
     stored = capture.meta.get("T_cam_board")
+    poses: dict[ImageKey, Array] = {}
     if isinstance(stored, dict):
-        return dict(_stored_poses(stored, session.rig))
-    found, finder = {}, BoardFinder(session.rig)
+        cameras = session.rig.cameras
+        for name, value in stored.items():
+            camera, _, channel = name.partition(".")
+            if camera in cameras and channel in cameras[camera].channels:
+                with suppress(ValueError):
+                    poses[camera, channel] = parse_pose(value)
+        return poses
+    finder = BoardFinder(session.rig)
     for camera, channel in capture.image_keys:
         board = finder.search_image(capture.image(camera, channel)).board
         if isinstance(board, ImageBoard):
-            found[camera, channel] = board.T_cam_board
-    return found
-
-
-def _stored_poses(stored: Mapping[str, Any], rig: Rig) -> Iterator[tuple[ImageKey, Array]]:
-    """Read the poses of a capture's meta data; what is no pose of a camera of the rig is skipped."""
-    for name, value in stored.items():
-        camera, _, channel = name.partition(".")
-        if camera in rig.cameras and channel in rig.cameras[camera].channels:
-            with suppress(ValueError):
-                yield (camera, channel), parse_pose(value)
+            poses[camera, channel] = board.T_cam_board
+    return poses

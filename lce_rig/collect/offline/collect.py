@@ -30,15 +30,13 @@ from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time
 
-# The moments of a recording that are worth a capture.
-
 # How often a whole image is searched while no board is in sight.
 _SEARCH_S = 0.3
 # How often an image without a board is searched thoroughly, which takes most of a second.
 _THOROUGH_S = 1.0
 # A process of its own for images takes a second to start.
 _LONG_SAMPLES = 200
-# Of boards that may move by more while they count as still, no quick look tells that they move.
+# Comparing small images misses motions below this: looser limits on stillness need full searches.
 _GLANCED_M = 0.01
 
 
@@ -186,7 +184,7 @@ def collect(
         SourceError: nothing could be read at all; it names the first file and the cause.
         SessionError: the session cannot be written; what was captured before is safe.
     """
-    collector = _Collector(session, options or CollectOptions(), progress or _silent)
+    collector = _Collector(session, options or CollectOptions(), progress or (lambda *_: None))
     for recording in join_recordings(recordings, session.rig):
         collector.note(recording.notes)
         try:
@@ -201,10 +199,6 @@ def collect(
     return collector.finish()
 
 
-def _silent(_done: int, _total: int, _message: str) -> None:
-    return
-
-
 class _Collector:
     def __init__(self, session: Session, options: CollectOptions, progress: Progress) -> None:
         self.report = CollectReport()
@@ -213,7 +207,13 @@ class _Collector:
         self._progress = progress
         self._stored = StoredEvents()
         self._rejected = {capture.name: capture for capture in session.rejected}
-        self._names_by_key = _known_keys(session)
+        # Captures, rejected ones included, by the key of their data.
+        self._names_by_key: dict[str, str] = {}
+        for capture in session.captures + session.rejected:
+            with suppress(SessionError):  # A damaged capture is named when it is used.
+                source = capture.meta.get("source", {})
+                if isinstance(source, dict) and isinstance(source.get("key"), str):
+                    self._names_by_key[source["key"]] = capture.name
         self._n_captures = len(session.captures)
 
     def take_pairs(self, recording: PairedRecording) -> None:
@@ -268,8 +268,7 @@ class _Collector:
         )
         self.report.has_events |= search.has_events
         torn: list[SourceError] = []
-        samples = self._counted(_until_torn(recording.samples(), torn), recording.n_samples)
-        for moment in search.moments(samples):
+        for moment in search.moments(self._read(recording, torn)):
             if self._is_enough():
                 self.note(["stopped early: the session has as many captures as wanted"])
                 break
@@ -370,46 +369,25 @@ class _Collector:
         self.report.n_resumed += 1
         return f"{label} is capture {name} already"
 
-    def _is_full(self) -> bool:
-        limit = self._options.max_captures
-        return limit is not None and self._n_captures >= limit
-
     def _is_enough(self) -> bool:
-        target = self._options.target
-        return self._is_full() or (target is not None and self._n_captures >= target)
+        limits = self._options.max_captures, self._options.target
+        return any(limit is not None and self._n_captures >= limit for limit in limits)
 
-    def _counted(self, samples: Iterable[Sample], n_samples: int) -> Iterator[Sample]:
+    def _read(self, recording: ContinuousRecording, torn: list[SourceError]) -> Iterator[Sample]:
+        """Yield samples up to a tear, whose error goes to `torn`: moments before it are still captured."""
         done = 0
-        for sample in samples:
-            yield sample
-            if not isinstance(sample, Events):
-                done += 1
-                self._progress(done, n_samples, f"{len(self.report.captured)} captured")
+        try:
+            for sample in recording.samples():
+                yield sample
+                if not isinstance(sample, Events):
+                    done += 1
+                    self._progress(done, recording.n_samples, f"{len(self.report.captured)} captured")
+        except SourceError as error:
+            torn.append(error)
 
     def _note_sizes(self, images: Iterable[Image]) -> None:
         for image in images:
-            found = compare_size(image, self._session.rig.cameras[image.sensor].to_intrinsics())
-            if found is not None:
+            finding = compare_size(image, self._session.rig.cameras[image.sensor].to_intrinsics())
+            if finding is not None:
                 size = f"{image.pixels.shape[1]}x{image.pixels.shape[0]}"
-                self.report.sizes.setdefault(f"{found.subject} {size}", []).append(found)
-
-
-def _until_torn(samples: Iterable[Sample], torn: list[SourceError]) -> Iterator[Sample]:
-    """Pass samples on, and end where the recording is torn: moments found so far must still be captured."""
-    try:
-        yield from samples
-    except SourceError as error:
-        torn.append(error)
-
-
-def _known_keys(session: Session) -> dict[str, str]:
-    """Name the captures, rejected ones included, by the key of what they were made from."""
-    keys = {}
-    for capture in session.captures + session.rejected:
-        try:
-            source = capture.meta.get("source", {})
-        except SessionError:
-            continue  # A damaged capture is named when it is used.
-        if isinstance(source, dict) and isinstance(source.get("key"), str):
-            keys[source["key"]] = capture.name
-    return keys
+                self.report.sizes.setdefault(f"{finding.subject} {size}", []).append(finding)

@@ -1,7 +1,7 @@
 """The board searched for in a recording's images by another process, and only where it may be at rest.
 
-At an eighth of its size an image tells in half a millisecond what is at rest in it. A board is searched for
-where something has come to rest since the last search, and followed where it is at rest itself.
+Comparing images at an eighth of their size takes half a millisecond. A board is searched for where something
+has come to rest since the last search, and followed where it is at rest itself.
 """
 
 from collections import deque
@@ -47,7 +47,7 @@ class Glance:
     others: list[NDArray[np.float32]]
 
     def rests_within(self, corners: Array) -> bool:
-        """Tell whether a board may be at rest, in whose corners (N, 2) the last search found it."""
+        """Check whether a board may be at rest where the last search found its corners (N, 2)."""
         (u0, v0), (u1, v1) = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0)) + 1
         part = slice(max(int(v0), 0), max(int(v1), 1)), slice(max(int(u0), 0), max(int(u1), 1))
         spread = float(np.std(self.small[part]))
@@ -107,7 +107,7 @@ def glance_at(frames: Iterable[Frame]) -> Iterator[tuple[Frame, Glances]]:
 
 
 class RestingTracker(BoardTracker):
-    """Finds boards in images frame by frame, and leaves out those in which none can be at rest."""
+    """Finds boards in images frame by frame, and skips images in which none can be at rest."""
 
     def __init__(self, rig: Rig, search_interval_s: float, thorough_interval_s: float) -> None:
         super().__init__(rig, search_interval_s, thorough_interval_s=thorough_interval_s)
@@ -123,10 +123,12 @@ class RestingTracker(BoardTracker):
             key = (image.sensor, image.channel)
             if key not in glances or self._is_worthwhile(key, frame.time_ns):
                 worth.append(image)
-            else:
-                are_moving.append(self._moves(key))
-        found = self.sight_in_images(replace(frame, images=tuple(worth)))
-        return replace(without_samples(found), is_moving=not worth and any(are_moving))
+                continue
+            # An image may be skipped because something moves in it, or because nothing is new.
+            is_same = _is_same(glances[key].small, self._searched[key][1].small)
+            are_moving.append(key in self._seen or int(np.sum(~is_same)) >= _BOARD_PX)
+        detection = self.sight_in_images(replace(frame, images=tuple(worth)))
+        return replace(without_samples(detection), is_moving=not worth and any(are_moving))
 
     def _is_worthwhile(self, key: ImageKey, time_ns: int) -> bool:
         glance, seen = self._glances[key], self._seen.get(key)
@@ -138,12 +140,6 @@ class RestingTracker(BoardTracker):
         if is_worthwhile:
             self._searched[key] = time_ns, glance
         return is_worthwhile
-
-    def _moves(self, key: ImageKey) -> bool:
-        """Tell whether an image was left out because something moves in it, not because nothing is new."""
-        _, searched = self._searched[key]
-        is_same = _is_same(self._glances[key].small, searched.small)
-        return key in self._seen or int(np.sum(~is_same)) >= _BOARD_PX
 
     def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
         if not super()._is_thorough_due(key, time_ns, was_seen=was_seen):
@@ -164,7 +160,7 @@ def _in_scans(tracker: BoardTracker, frame: Frame, images: Future[BoardDetection
 def _has_come_to_rest(
     glance: Glance, searched: tuple[int, Glance] | None, time_ns: int, blind_s: float
 ) -> bool:
-    """Tell whether anything of a board's size has come to rest since a search, or that was long ago."""
+    """Check whether anything of a board's size has come to rest since a search, or that was long ago."""
     if searched is None or not 0 <= time_ns - searched[0] < blind_s * 1e9:
         return True
     is_new = glance.resting() & ~_is_same(glance.small, searched[1].small)

@@ -90,7 +90,8 @@ class _Chooser:
 
     def take(self, now_ns: int, moment: CaptureMoment | None) -> Iterator[CaptureMoment]:
         """Take the moment at a time, where there is one, and yield those that nothing better came after."""
-        while self._pending and not self._is_young(self._pending[0], now_ns):
+        patience_ns = self._patience_s * 1e9
+        while self._pending and not 0 <= now_ns - self._pending[0].detection.frame.time_ns < patience_ns:
             yield from self._decide_oldest()
         if moment is not None and self._taken.find_like(moment.detection.images) is None:
             self._pending.append(moment)
@@ -105,8 +106,14 @@ class _Chooser:
         oldest = self._pending.popleft()
         if self._taken.find_like(oldest.detection.images) is not None:
             return
+
+        def badness(moment: CaptureMoment) -> tuple[bool, float]:
+            is_short = any(cut.missing_ns > 0 for cut in moment.detection.frame.events)
+            speed_ratio = max(moment.figures["speed_mps"], 1e-3) / BEST_SPEED_MPS
+            return is_short, abs(float(np.log(speed_ratio))) + moment.figures["unsteady_m"] / _UNSTEADY_M
+
         kept: list[CaptureMoment] = []
-        for moment in sorted((oldest, *self._pending), key=self._badness):
+        for moment in sorted((oldest, *self._pending), key=badness):
             boards = moment.detection.images
             if any(self._taken.are_alike(boards, other.detection.images) for other in kept):
                 continue
@@ -115,14 +122,6 @@ class _Chooser:
                 yield oldest
                 return
             kept.append(moment)
-
-    def _is_young(self, moment: CaptureMoment, now_ns: int) -> bool:
-        return 0 <= now_ns - moment.detection.frame.time_ns < self._patience_s * 1e9
-
-    def _badness(self, moment: CaptureMoment) -> tuple[bool, float]:
-        is_short = any(cut.missing_ns > 0 for cut in moment.detection.frame.events)
-        speed_ratio = max(moment.figures["speed_mps"], 1e-3) / BEST_SPEED_MPS
-        return is_short, abs(float(np.log(speed_ratio))) + moment.figures["unsteady_m"] / _UNSTEADY_M
 
 
 class _Neighbours:

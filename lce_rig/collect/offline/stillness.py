@@ -20,11 +20,9 @@ def find_still_moments(
     """Yield the stillest moment of every stretch in which the board moves no more than that."""
     gate = StillnessGate(board, max_motion_m)
     for detection in detections:
-        moment = gate.take(detection)
-        if moment is not None:
+        if (moment := gate.take(detection)) is not None:
             yield moment
-    moment = gate.finish()
-    if moment is not None:
+    if (moment := gate.finish()) is not None:
         yield moment
 
 
@@ -78,53 +76,42 @@ class StillnessGate:
     def _measure(self, detection: BoardDetection) -> float:
         """Put a detection into the window and measure how far the board moved in it."""
         window = self._window
-        is_seen = detection.is_usable
-        if not is_seen or _is_gap(window, detection):
+        now_ns, window_ns = detection.frame.time_ns, _WINDOW_S * 1e9
+        # Start again after a gap, or where the clock was set back.
+        if not detection.is_usable or (window and not 0 < now_ns - window[-1].frame.time_ns < window_ns):
             window.clear()
-        if is_seen:
+        if detection.is_usable:
             window.append(detection)
-        while (
-            len(window) > 2
-            and _span_s(window) - ((window[1].frame.time_ns - window[0].frame.time_ns) * 1e-9) >= _WINDOW_S
-        ):
+        while len(window) > 2 and now_ns - window[1].frame.time_ns >= window_ns:
             window.popleft()
-        is_full = len(window) > 2 and _span_s(window) >= _WINDOW_S * 0.999
+        is_full = len(window) > 2 and now_ns - window[0].frame.time_ns >= 0.999 * window_ns
         return _motion_m(window, self._board, self._max_motion_m) if is_full else np.inf
-
-
-def _is_gap(window: deque[BoardDetection], detection: BoardDetection) -> bool:
-    return bool(window) and not 0 < detection.frame.time_ns - window[-1].frame.time_ns < _WINDOW_S * 1e9
-
-
-def _span_s(window: deque[BoardDetection]) -> float:
-    return (window[-1].frame.time_ns - window[0].frame.time_ns) * 1e-9
 
 
 def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) -> float:
     """Measure how far the board moved within a window.
 
-    Corners tell of motion across the line of sight much better than poses do; planes tell of motion along it.
+    Corners show motion across the line of sight much better than poses do; planes show motion along it.
     """
     middle = window[len(window) // 2]
     motions: list[float] = []
     for key, reference in middle.images.items():
         others = [s.images[key].corners_px for s in window if key in s.images]
-        motions.append(max(_corner_motion_m(corners, reference.corners_px, board) for corners in others))
+        grid = reference.corners_px.reshape(board.rows, board.cols, 2)
+        square_px = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
+        # The order may start at the other end of the pattern where it has no unique top.
+        shift_px = max(
+            min(_rms(corners - reference.corners_px), _rms(corners[::-1] - reference.corners_px))
+            for corners in others
+        )
+        motions.append(shift_px * board.square_m / max(square_px, 1e-6))
     lidar_motions = [
         max(_plane_motion_m(candidate, detection.lidars.get(lidar, []), max_motion_m) for detection in window)
         for lidar, candidates in middle.lidars.items()
         for candidate in candidates
     ]
-    # Walls and tables always stand still: the cameras, which know the board by its print, must agree.
+    # Walls and tables always stand still: the cameras, which identify the board by its pattern, must agree.
     return max(max(motions), min(lidar_motions))
-
-
-def _corner_motion_m(corners_px: Array, reference_px: Array, board: Board) -> float:
-    grid = reference_px.reshape(board.rows, board.cols, 2)
-    square_px = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
-    # The order may start at the other end of the print where the pattern does not say which is up.
-    shift_px = min(_rms(corners_px - reference_px), _rms(corners_px[::-1] - reference_px))
-    return shift_px * board.square_m / max(square_px, 1e-6)
 
 
 def _rms(difference: Array) -> float:
