@@ -164,13 +164,6 @@ def test_residuals_are_those_of_the_extrinsic_and_grow_away_from_it():
         assert residual.plane_mean_m <= residual.plane_rms_m
 
 
-def test_progress_reaches_the_end():
-    seen = []
-    fit_extrinsic(simulate(6, 0), BOARD, FAST, lambda done, total: seen.append((done, total)))
-    assert seen[-1] == (9, 9)
-    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
-
-
 @pytest.mark.parametrize("method", ["ml", "paper"])
 def test_the_same_placements_captured_again_claim_no_smaller_sigma(method):
     once = simulate(14, seed=4)

@@ -11,7 +11,7 @@ import pytest
 import lce_rig as lce
 from lce_rig.core.calibration import Calibration, Certificate, Metrics, ResultFile
 from lce_rig.core.geometry import invert
-from lce_rig.rig import find_profile, load_rig
+from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER
 from lce_rig.simulate import SimulationOptions, simulate_captures
@@ -121,18 +121,3 @@ def test_verify_takes_the_channels_that_a_session_has(lce_rig, moving):
     outcome = lce_rig(*words)
     assert outcome.code == 0, outcome.err
     assert "davis.frames" in outcome.out and "davis.events" not in outcome.out
-
-
-def test_rigs_show_and_check_know_how_pictures_are_made(lce_rig, tmp_path):
-    text = find_profile("rles").read_text(encoding="utf-8")
-    block = "        kind: events\n        reconstruction: {model: mine.onnx, window_s: 0.05}\n"
-    (tmp_path / "mine.yaml").write_text(text.replace("        kind: events\n", block, 1), encoding="utf-8")
-    shown = lce_rig("rigs", "show", tmp_path / "mine.yaml")
-    assert "images from events" in shown.out and "50 ms" in shown.out and "mine.onnx" in shown.out
-    assert "images from events" not in lce_rig("rigs", "show", "rlfs").out
-    missing = lce_rig("rigs", "check", tmp_path / "mine.yaml")
-    assert missing.code == 3
-    for part in ("mine.yaml", "cameras.davis.channels.events.reconstruction.model"):
-        assert part in missing.err
-    refused = json.loads(lce_rig("rigs", "check", tmp_path / "mine.yaml", "--json").out)
-    assert refused["is_valid"] is False

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from lce_rig.collect.guidance import Coverage
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
-from lce_rig.show.screen.live_view import Bell, PlainView, ScreenView, draw_outlines, qr_lines, render
+from lce_rig.show.screen.live_view import Bell, PlainView, draw_outlines, qr_lines, render
 
 SQUARE = np.array([[300.0, 200.0], [700, 240], [660, 500], [280, 470], [300, 200]])
 STREAMS = (
@@ -68,23 +68,6 @@ def test_of_several_cameras_the_picture_says_whose_it_is() -> None:
     assert len(drawn(replace(STATE, streams=two, drawing=drawing))[0]) <= 80
 
 
-def test_the_page_s_link_stays_on_the_screen_which_covers_what_was_printed_before() -> None:
-    link = "http://192.168.100.200:8765/?token=q3Zk9Xw0aB4_q3Zk9Xw0aB4_"
-    log = ("01:01 the first", *STATE.log)
-    lines = drawn(replace(STATE, streams=STREAMS[:2], log=log), (link, "http://10.0.0.1:8765/"))
-    assert len(lines) <= 24 and any(link in line for line in lines)
-    assert "q stop" in lines[-1] and "10.0.0.1" not in "".join(lines)
-
-
-def test_a_note_that_is_alone_is_told_to_its_end() -> None:
-    note = (
-        "boards must stand still: no sync board ties the cameras' clocks, whatever they are, to the LiDAR's"
-    )
-    lines = drawn(replace(STATE, notes=(note,)))
-    assert len(lines) <= 24 and "the LiDAR's" in "\n".join(lines) and "q stop" in lines[-1]
-    assert len(drawn(replace(STATE, notes=STATE.notes[:1]))) <= 24, "however long it is"
-
-
 SAID = replace(
     STATE,
     detail="cannot be used here: the board at 4.3 m is tilted 62 deg (limit 60 deg), half of it is hidden",
@@ -128,13 +111,6 @@ def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same() ->
     assert "rotation   -" in text and "HOLD STILL" in text
 
 
-@pytest.mark.parametrize(
-    "phase", ["starting", "searching", "moving", "saving", "refused", "enough", "lost", "ended"]
-)
-def test_every_phase_has_a_look(phase: str) -> None:
-    assert drawn(replace(STATE, phase=phase))  # type: ignore[arg-type]
-
-
 def test_the_bell_rings_once_for_a_capture_and_twice_for_a_refused_one_apart_in_time() -> None:
     clock = [0.0]
     rung: list[float] = []
@@ -170,34 +146,6 @@ def test_the_pages_code_fits_and_holds_its_link() -> None:
     assert qr_lines("http://127.0.0.1:8765/") == [] == qr_lines("http://localhost:8765/")
 
 
-def test_the_code_stands_in_place_of_the_guidance_before_it_begins_and_when_asked_for() -> None:
-    link = "http://192.168.100.200:8765/?token=q3Zk9Xw0aB4_"
-    wanted = [False]
-
-    def shown(state: LiveState, size: tuple[int, int] = (24, 80)) -> str:
-        console = Console(height=size[0], width=size[1], file=io.StringIO(), force_terminal=False)
-
-        class Screen:
-            def update(self, what: object, *, refresh: bool) -> None:
-                assert refresh
-                console.print(what)
-
-        bell = Bell(is_silent=True)
-        view = ScreenView(Screen(), console, bell, has_keys=True, links=(link,), wants_code=lambda: wanted[0])
-        view.show(state)
-        assert isinstance(console.file, io.StringIO)
-        text = console.file.getvalue().rstrip("\n")
-        assert len(text.split("\n")) <= size[0]
-        return text
-
-    starting = replace(STATE, phase="starting", headline="waiting for the sensors")
-    assert qr_lines(link)[5] in shown(starting) and link in shown(starting)
-    assert qr_lines(link)[5] not in shown(STATE) and "p QR code" in shown(STATE)
-    wanted[0] = True
-    assert qr_lines(link)[5] in shown(STATE)
-    assert qr_lines(link)[5] not in shown(STATE, (16, 80)), "no room for it"
-
-
 def test_plain_lines_say_what_changes_once(capsys: pytest.CaptureFixture[str]) -> None:
     view = PlainView(Bell(is_silent=True))
     moving = replace(
@@ -225,18 +173,6 @@ def test_plain_lines_say_what_changes_once(capsys: pytest.CaptureFixture[str]) -
     assert [line.split()[0] for line in lines] == ["note:", "01:15", "01:19", "01:19", "01:19"]
     assert "moving:" in lines[1] and "20 cm" in lines[2] and "2 rings" in lines[2]
     assert tuple(lines[3:]) == told
-
-
-def test_outlines_are_drawn_where_they_are() -> None:
-    square = np.array([[0.0, 0.0], [639, 0], [639, 359], [0, 359], [0, 0]])
-    lines = draw_outlines((1280, 720), square, None, (40, 9))
-    assert len(lines) == 9 and {len(line) for line in lines} == {len(lines[0])}
-    body = [line[1:-1] for line in lines[1:-1]]
-    filled = np.array([[character != chr(0x2800) for character in line] for line in body])
-    rows, columns = np.nonzero(filled)
-    # The left upper quarter, give or take a character.
-    assert rows.min() == columns.min() == 0
-    assert rows.max() <= filled.shape[0] // 2 and columns.max() <= filled.shape[1] // 2
 
 
 def test_outlines_that_leave_the_picture_or_the_lens_break_nothing() -> None:

@@ -55,16 +55,6 @@ def test_a_folder_that_is_no_session_exits_with_4(lce_rig, tmp_path, verb):
     assert str(tmp_path) in outcome.err
 
 
-@pytest.mark.parametrize("verb", ["check", "calibrate", "verify", "intrinsics", "repeat"])
-def test_a_file_in_place_of_a_session_is_said_to_be_one(lce_rig, tmp_path, verb):
-    file = tmp_path / "recording.bag"
-    file.write_bytes(b"#ROSBAG V2.0")
-    outcome = lce_rig(verb, file, *([tmp_path] if verb == "repeat" else []))
-    assert outcome.code == 4
-    assert f"error: {file} " in outcome.err and "folder" in outcome.err
-    assert "Errno" not in outcome.err
-
-
 def test_the_module_runs_like_the_command():
     words = [sys.executable, "-m", "lce_rig", "--version"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
@@ -101,13 +91,6 @@ def test_ctrl_c_while_onnxruntime_is_imported_is_not_taken_for_a_missing_package
     done = subprocess.run([sys.executable, "-c", INTERRUPTED, *words], capture_output=True, text=True)
     assert done.returncode == 130
     assert len(done.stderr.split("\n")) == 3 and done.stderr.startswith("\ninterrupted")
-
-
-def test_every_method_of_calibration_can_be_chosen():
-    from lce_rig.cli.calibrate import calibrate
-
-    (option,) = [parameter for parameter in calibrate.params if parameter.name == "method"]
-    assert list(option.type.choices) == ["ml", "paper"]
 
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])

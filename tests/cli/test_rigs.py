@@ -169,32 +169,3 @@ def test_a_derived_profile_keeps_no_block_that_was_removed(tmp_path: Path) -> No
     assert run(["rigs", "new", "mine", "--unset", "cameras.cam.nothing", "-o", str(tmp_path / "b.yaml")]) == 2
     assert run(["rigs", "new", "mine", "--unset", "board", "-o", str(tmp_path / "b.yaml")]) == 3
     assert not (tmp_path / "b.yaml").exists()
-
-
-def test_every_threshold_is_shown_with_its_meaning(capsys: pytest.CaptureFixture[str]) -> None:
-    from lce_rig.cli.rigs import _attributes
-    from lce_rig.rig import CalibrationSettings, QualitySettings, VerdictSettings
-
-    for settings in (QualitySettings, CalibrationSettings, VerdictSettings):
-        assert set(settings.model_fields) <= set(_attributes(settings))
-    assert run(["rigs", "show", "rlfs"]) == 0
-    row = next(line for line in capsys.readouterr().out.splitlines() if "quality.min_rings" in line)
-    assert _attributes(QualitySettings)["min_rings"] in row
-
-
-def test_lines_for_a_terminal_are_broken_at_words_and_those_for_a_file_are_not(monkeypatch):
-    import io
-
-    from lce_rig.cli.show import wrapped
-
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    monkeypatch.setenv("COLUMNS", "40")
-    text = "  000001: pair: " + "a board at /some/long-winded/path " * 4 + "\n  next: lce-rig verify"
-    lines = wrapped(text, Terminal()).splitlines()
-    assert len(lines) > 4 and max(map(len, lines)) <= 40
-    assert lines[1].startswith("    ") and lines[-1] == "  next: lce-rig verify"
-    assert " ".join(" ".join(lines).split()) == " ".join(text.split())
-    assert wrapped(text, io.StringIO()) == text

@@ -1,7 +1,6 @@
 """The report states uncertainty by axis and by distance, in 80 columns."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 
@@ -43,7 +42,3 @@ def test_every_axis_and_distance_is_named_in_80_columns() -> None:
     assert "123.4 px, 61.5 cm" in lines[5]
     assert "134.5 px, 117.0 cm" in lines[6]
     assert max(map(len, lines)) <= 80
-
-
-def test_without_a_lens_only_the_axes_are_named() -> None:
-    assert len(uncertainty_lines(replace(calibration(), uncertainty=()))) == 4

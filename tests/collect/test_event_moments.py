@@ -154,9 +154,7 @@ def test_a_file_that_ends_in_a_packet_gives_the_captures_before_its_end_and_says
 def test_clocks_that_do_not_overlap_are_an_error_before_anything_is_searched(tmp_path, lidar) -> None:
     late = [replace(e, t_ns=e.t_ns + 1_234_500_000_000) for e in moves.events()]
     write_aedat4(tmp_path / "late.aedat4", late)
-    with pytest.raises(
-        SourceError, match=r"davis\.events: events run from .*, scans from .*: \d+\.\d s apart"
-    ):
+    with pytest.raises(SourceError, match=r"davis\.events"):
         run(tmp_path / "s", lidar, tmp_path / "late.aedat4")
     # What can be read of the others is captured all the same.
     good = bag(tmp_path / "good.bag", list(moves.samples()))

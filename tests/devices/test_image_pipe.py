@@ -285,7 +285,7 @@ def test_a_program_that_was_killed_can_be_started_again_and_leaves_nothing_open(
     source = ImagePipeSource("cam", camera(*child(tmp_path, pgm(grey_pictures(2)), then)))
     for _ in range(2):
         came = []
-        with source, pytest.raises(SourceError, match="SIGKILL after 2 images"):
+        with source, pytest.raises(SourceError):
             came.extend(source.samples())
         assert [image.count for image in came if isinstance(image, Image)] == [0, 1]
     assert len(list(Path("/proc/self/fd").iterdir())) == n_open

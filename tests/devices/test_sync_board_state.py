@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from lce_rig.devices.board_state import Arrival, BoardState, RunningNumber, Verdict
 from lce_rig.devices.lce1 import (
-    BoardError,
     BoardStatus,
     Hello,
     PpsEdge,
@@ -150,36 +149,6 @@ def test_falling_edges_and_strange_channels_make_no_pulses():
     state = BoardState({0: "cam"})
     assert state.take(TriggerEdge(0, 1, 5, False), arrival(0)) == []
     assert state.take(TriggerEdge(3, 1, 5, True), arrival(0)) == []
-
-
-def test_every_trouble_is_told():
-    state = BoardState({0: "cam"})
-    state.take(HELLO, arrival(0))
-    (silent,) = problems(state, now_s=14.2)
-    assert (silent.code, silent.figure("silent_s")) == ("device.board_silent", pytest.approx(4.2))
-    told = {found.code: found.figures for found in problems(state, n_unwritten=2)}
-    assert told["device.commands_not_taken"]["n"] == 2 and told["stream.no_pulses"]["line"] == "cam"
-    assert {"clock.no_pps", "clock.board_not_tied"} <= set(told)
-    state.take(BoardError(4, "rate too high"), arrival(1))
-    state.take(BoardStatus(0, 1, 9), arrival(1))
-    state.take(PpsEdge(1, 1_000_000, None, "I"), arrival(1))
-    told = {found.code: found.figures for found in problems(state)}
-    assert told["device.board_error"]["number"] == 4 and told["stream.lines_dropped_by_board"]["n"] == 9
-    assert told["clock.pps_stopped"]["silent_s"] == pytest.approx(9) and "clock.pps_output_off" in told
-    assert "clock.board_without_utc" in [found.code for found in problems(state, now_s=2, heard_s=2)]
-
-
-def test_a_board_in_order_has_no_problems():
-    state = BoardState({0: "cam"})
-    state.take(HELLO, arrival(0))
-    for k in range(100):
-        pulses(state, (2 * k, 2 * k + 1))
-        ask(state, 0.1 * k + 0.05, cookie=k)
-        if k % 10 == 0:
-            edge = PpsEdge(k // 10, 100_000_000 + 100_000 * k, 1_753_000_000 + k // 10, "I")
-            state.take(edge, arrival(0.1 * k + 0.051))
-    state.take(BoardStatus(7, 10, 0), arrival(9.9))
-    assert problems(state) == ()
 
 
 MESSAGES = st.one_of(

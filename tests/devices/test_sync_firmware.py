@@ -3,7 +3,6 @@
 import os
 import pty
 import random
-import re
 import shutil
 import subprocess
 import time
@@ -112,20 +111,6 @@ def test_the_sketch_is_sound_for_the_arduino_interface_it_uses(compiler):
     ]
     checked = subprocess.run(command, capture_output=True, text=True)
     assert checked.returncode == 0, checked.stderr
-
-
-def test_the_core_asks_for_no_memory_and_no_printing(compiler, tmp_path):
-    names = shutil.which("nm")
-    if names is None:
-        pytest.skip("no nm to list what the core calls")
-    objects = []
-    for source in sorted((FIRMWARE / "lce1").glob("*.cpp")):
-        objects.append(tmp_path / f"{source.stem}.o")
-        subprocess.run([compiler, *STRICT, "-c", "-o", objects[-1], source], check=True)
-    listed = subprocess.run([names, "-u", *objects], capture_output=True, text=True, check=True).stdout
-    called = {line.split()[-1] for line in listed.splitlines() if line.strip().startswith("U ")}
-    assert {"strchr", "memchr"} & called
-    assert not {name for name in called if re.search("alloc|_Zn|printf|_ZSt|__cxa", name)}
 
 
 def test_its_sentences_tell_every_second_of_the_calendar(host_board):

@@ -18,14 +18,13 @@ from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.udp_port import N_AT_ONCE, UdpPort
-from lce_rig.devices.vlp16 import Reception, Vlp16Source, to_status
+from lce_rig.devices.vlp16 import Vlp16Source
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.velodyne.pcap import PcapRecording
-from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.rig.sensors import DriverSettings
 from tests.devices.test_vlp16_web import PAGES, serving
-from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of, push, room_scans, settings
+from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of, room_scans, settings
 
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"
 PATIENT_S = 10.0
@@ -331,19 +330,6 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(lidar: LidarSettings, t
 
 
 # What is said
-
-
-def test_every_figure_out_of_line_is_a_problem_of_its_own() -> None:
-    stream = Vlp16Stream("lidar", settings(rate_hz=20))
-    push(stream, packets_of(room_scans(2)))
-    reception = Reception(n_overflowed=12, granted_bytes=200_000)
-    status = to_status("lidar", settings(rate_hz=20), stream, reception, None)
-    found = {problem.code: problem for problem in status.problems}
-    assert found["stream.computer_too_slow"].figures["n"] == 12
-    assert found["buffer.small"].figure("buffer_s") == pytest.approx(0.115, abs=0.001)
-    rotor = found["stream.rotor_rate"]
-    assert rotor.figure("rotor_hz") == pytest.approx(10, abs=0.1)
-    assert (rotor.figures["expected_hz"], rotor.figures["expected_rpm"]) == (20, 1200)
 
 
 def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken() -> None:

@@ -14,12 +14,6 @@ from lce_rig.rig import load_rig
 from .observed import codes, look, make_rig
 
 
-def test_python_and_the_packages_of_these_tests_are_in_order() -> None:
-    line = look(computer.check_python, Examination(make_rig()))
-    assert line.severity == "note" and line.figures["n_bits"] == 64
-    assert look(computer.check_packages, Examination(make_rig())).severity == "note"
-
-
 def test_a_missing_package_is_named_with_the_line_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(computer, "_PACKAGES", {"no_such_module": "no-such-package"})
     line = look(computer.check_packages, Examination(make_rig()))
@@ -67,11 +61,6 @@ def test_the_receive_buffer_is_what_the_kernel_grants() -> None:
     assert ("computer.buffer_small" in codes(line)) == (buffer_s < 0.25) == (line.severity == "warning")
 
 
-def test_a_rig_without_a_vlp16_needs_no_buffer() -> None:
-    rig = make_rig(lidars={"lidar": {"model": "another"}})
-    assert look(computer.check_socket_buffer, Examination(rig)) is None
-
-
 @pytest.fixture
 def udev(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of udev rules, the only one."""
@@ -96,10 +85,6 @@ def test_the_shipped_rules_hold_for_a_sync_board_too(udev: Path) -> None:
     assert line is not None and line.figures["devices"] == ("sync board",)
     shutil.copy(str(line.figures["rules"]), udev)
     assert codes(look(computer.check_udev_rules, Examination(rig))) == ["computer.udev_rules"]
-
-
-def test_a_rig_without_such_devices_needs_no_udev_rules(udev: Path) -> None:
-    assert look(computer.check_udev_rules, Examination(load_rig("rlfs"))) is None
 
 
 def test_the_clock_is_judged_by_the_kernel() -> None:

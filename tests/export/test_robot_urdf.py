@@ -1,9 +1,7 @@
 """Calibrations in a robot's own tree of frames: its parents, comments and order stay."""
 
-import time
 from collections.abc import Callable
 from datetime import datetime
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +14,7 @@ from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.export import export
 from lce_rig.export.robot_files import read_robot_urdf, write_into_urdf
-from lce_rig.export.robot_tree import build_trees, fit_tree
+from lce_rig.export.robot_tree import fit_tree
 from lce_rig.rig import Rig
 from lce_rig.rig.poses import Mount
 
@@ -136,20 +134,6 @@ def test_a_link_stays_a_link_and_its_target_gets_the_joints(rles: Rig, make: Mak
     assert link.is_symlink() and link.resolve() == target and not target.is_symlink()
     np.testing.assert_allclose(found(target, rles), make().T_cam_lidar, atol=1e-9)
     assert backup is not None and backup.parent == target.parent
-
-
-def test_a_chain_of_2000_links_takes_less_than_a_second(rles: Rig, make: Make, tmp_path: Path) -> None:
-    links = [f"link_{k}" for k in range(2000)] + ["velodyne"]
-    text = "".join(f'<link name="{link}"/>\n' for link in links)
-    for parent, child in pairwise(links):
-        ends = f'<parent link="{parent}"/><child link="{child}"/>'
-        text += f'<joint name="to_{child}" type="fixed">{ends}</joint>\n'
-    path = tmp_path / "cart.urdf"
-    path.write_text(HEAD + text + "</robot>\n")
-    begun_s = time.process_time()
-    write_into_urdf(path, [make()], rles, NOW)
-    build_trees([make()], rles, read_robot_urdf(path))
-    assert time.process_time() - begun_s < 1.0
 
 
 def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(

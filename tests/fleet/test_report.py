@@ -45,14 +45,6 @@ def test_the_page_names_the_robot_that_moved_and_escapes_names(registry):
     assert text == FleetReport.of(registry).page()
 
 
-def test_the_dots_of_a_drawing_are_in_it(registry):
-    """Markers are drawn where they are, not by a reference to a definition that the page lacks."""
-    text = FleetReport.of(registry).page()
-    svg = text[text.index("<svg") : text.index("</svg>")]
-    used = [part.split('"')[0] for part in svg.split('href="#')[1:]]
-    assert len(used) >= 8 and all(f'id="{name}"' in svg for name in used)
-
-
 def test_the_command_writes_page_tables_and_findings(registry, tmp_path, capsys):
     out, folder = tmp_path / "out.html", str(tmp_path)
     more = ["--csv", str(tmp_path / "csv"), "--json", str(tmp_path / "out.json")]

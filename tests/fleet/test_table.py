@@ -12,7 +12,6 @@ from lce_rig.fleet.table import (
     SCHEMA,
     as_table,
     covariances,
-    merged,
     poses,
     read_table,
     table_bytes,
@@ -33,11 +32,6 @@ def test_a_covariance_and_a_pose_come_back_as_matrices(row):
     assert cov.shape == (2, 6, 6) and np.array_equal(cov[0], cov[0].T)
     assert np.array_equal(cov[1][np.triu_indices(6)], np.arange(21))
     assert np.array_equal(poses(table["T_cam_lidar"])[1], np.eye(4))
-
-
-def test_the_same_rows_in_another_order_give_the_same_bytes(row):
-    rows = [as_table([row(robot, date)]) for robot in ("b", "a") for date in ("2026-02-01", "2026-01-01")]
-    assert table_bytes(merged(rows)) == table_bytes(merged(rows[::-1]))
 
 
 def test_a_column_that_an_earlier_version_did_not_write_is_null(tmp_path, row):

@@ -20,7 +20,7 @@ from tests.io.events.bags import parsed, write_packet_bag
 from tests.io.events.encoders import listed
 from tests.notes import has_note
 
-from .rig_samples import KINDS, T0_NS, one_second, packet, picture, record, sweep
+from .rig_samples import KINDS, T0_NS, one_second, picture, record, sweep
 
 SIZE = (346, 260)
 
@@ -139,43 +139,9 @@ def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path: Pa
     recording = opened(write(tmp_path / "a.bag", True), rig)
     assert has_note(recording.notes, "/davis/events", "a.bag", "no events")
     assert [type(sample) for sample in recording.samples()] == [Scan, Image]
-    with pytest.raises(SourceError, match=r"/davis/events of .*b\.bag holds no events") as caught:
+    with pytest.raises(SourceError, match="/davis/events") as caught:
         opened(write(tmp_path / "b.bag", False), rig)
     assert has_note([caught.value.hint], "/davis/events", "EventArray, 0")
-
-
-def test_events_of_another_resolution_are_refused_by_both(tmp_path: Path, rig: Rig) -> None:
-    path = record(tmp_path / "r.bag", rig, one_second(50))
-    camera = rig.cameras["davis"].model_copy(update={"resolution_px": (640, 480)})
-    with pytest.raises(SourceError, match=r"346x260 pixels.*'davis' has 640x480"):
-        opened(path, rig.model_copy(update={"cameras": {"davis": camera}}))
-
-
-def test_stamps_mixed_between_messages_are_sorted_and_said(tmp_path: Path, rig: Rig) -> None:
-    given = one_second(200)
-    packets = [s for s in given if isinstance(s, Events)]
-    late = {id(packets[k]): replace(packets[k], t_ns=packets[k].t_ns - 15_000_000) for k in (10, 30)}
-    recording = opened(record(tmp_path / "r.bag", rig, [late.get(id(s), s) for s in given]), rig)
-    stamps_ns = np.concatenate([s.t_ns for s in recording.samples() if isinstance(s, Events)])
-    assert len(stamps_ns) == 10_000 and (np.diff(stamps_ns) >= 0).all()
-    assert has_note(recording.notes, "20 ms", "sorted")
-
-
-def test_a_clock_of_31_bits_that_wraps_goes_on(tmp_path: Path, rig: Rig) -> None:
-    """A driver that counts from the camera's start, 0.5 s before its counter wraps."""
-    wrap_us = 1 << 31
-    begin_us = wrap_us - 500_000
-    messages = []
-    for k in range(50):
-        truth = [(begin_us + 20_000 * k + 100 * j, j, k, True) for j in range(20)]
-        payload = encoders.libcaer(truth, 0)
-        stamp_ns = T0_NS + 20_000_000 * k
-        data = encoders.packet(payload, "libcaer", is_ros1=True, number=k, stamp_ns=stamp_ns)
-        messages.append(("/davis/events", stamp_ns + 1_000_000, data))
-    recording = opened(write_packet_bag(tmp_path / "r.bag", messages), rig, is_part=True)
-    stamps_ns = np.concatenate([s.t_ns for s in recording.samples() if isinstance(s, Events)])
-    assert len(stamps_ns) == 1000
-    assert stamps_ns[-1] - stamps_ns[0] == (49 * 20_000 + 1900) * 1000 and (np.diff(stamps_ns) > 0).all()
 
 
 def test_events_that_count_from_the_sensors_start_are_tied_to_the_host_by_their_arrivals(
@@ -197,32 +163,6 @@ def test_events_that_count_from_the_sensors_start_are_tied_to_the_host_by_their_
     assert 0 <= stamps_ns[0] - T0_NS <= 5_000_000 and span is not None and span[0] == stamps_ns[0]
     assert np.array_equal(np.diff(stamps_ns) % 1000, np.zeros(len(stamps_ns) - 1))
     assert has_note(recording.notes, "sensor's start", "added")
-
-
-def test_clocks_that_do_not_overlap_are_refused_with_how_far_they_lie_apart(tmp_path: Path, rig: Rig) -> None:
-    given = one_second(50)
-    late_ns = 1_235_500_000_000
-    moved = [replace(s, t_ns=s.t_ns + late_ns) if isinstance(s, Events) else s for s in given]
-    path = record(tmp_path / "r.bag", rig, moved)
-    with pytest.raises(
-        SourceError, match=r"events run from \d+\.\d+ to .* scans from .*: 1234\.[4-7] s apart"
-    ) as caught:
-        opened(path, rig)
-    assert "cameras.davis.channels.events.timestamps.expected_offset_s" in caught.value.hint
-    assert "-1235.5 s" in caught.value.hint
-    timestamps = rig.cameras["davis"].channels["events"].timestamps
-    bridged = with_camera(rig, timestamps=timestamps.model_copy(update={"expected_offset_s": -1235.5}))
-    assert len(events_of(list(opened(path, bridged).samples()))) == 2500
-
-
-def test_events_that_cover_a_part_of_the_scans_only_are_used_and_it_is_noted(
-    tmp_path: Path, rig: Rig
-) -> None:
-    scans = [sweep(k) for k in range(60)]
-    given = sorted([*scans, *(packet(k, 50) for k in range(100))], key=lambda s: s.host_ns or 0)
-    recording = opened(record(tmp_path / "r.bag", rig, given), rig)
-    assert has_note(recording.notes, "davis.events", "2.0 of", "5.9 s", "lidar's")
-    assert len(events_of(list(recording.samples()))) == 5000
 
 
 def test_pictures_stamped_at_the_start_of_an_exposure_that_is_not_told_are_said(

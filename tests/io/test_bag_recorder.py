@@ -152,10 +152,10 @@ def test_samples_that_the_profile_does_not_know_are_refused_and_the_others_kept(
         ):
             with pytest.raises(SourceError, match=cause):
                 recorder.write(stranger)
-        with pytest.raises(ValueError, match="carries no time"):
+        with pytest.raises(ValueError):
             recorder.write(replace(picture(1), stamp_ns=None, host_ns=None))
         recorder.write(packet(0))
-        with pytest.raises(SourceError, match="/davis/events would carry both"):
+        with pytest.raises(SourceError, match="/davis/events"):
             recorder.write(replace(picture(1), channel="events"))
         recorder.write(sweep(0))
         recorder.write(sweep(1))

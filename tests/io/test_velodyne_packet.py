@@ -64,17 +64,6 @@ def test_blocks_of_a_rotor_that_stands_still_are_refused(payload: bytes) -> None
             read_data_packet(fields.tobytes(), 0)
 
 
-@pytest.mark.parametrize(("product", "name"), sorted(velodyne.PRODUCTS.items()))
-def test_other_velodynes_are_refused_by_name(product: int, name: str, payload: bytes) -> None:
-    other = damage(payload, PRODUCT_AT, bytes([product]))
-    if name == "VLP-16":
-        assert read_data_packet(other, 0).mode == velodyne.STRONGEST
-        return
-    with pytest.raises(BadPacketError) as caught:
-        read_data_packet(other, 0)
-    assert caught.value.model == name
-
-
 @given(st.binary(max_size=600))
 def test_whatever_comes_as_a_position_packet_is_read_or_refused(payload: bytes) -> None:
     for body in (payload, payload.ljust(velodyne.POSITION_BYTES, b"\0")[: velodyne.POSITION_BYTES]):

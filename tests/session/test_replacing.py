@@ -67,7 +67,7 @@ def test_the_session_itself_may_be_a_link_but_not_what_is_replaced(tmp_path):
         assert contents(tmp_path / "real" / "out") == {text}
     (tmp_path / "real" / "out").rename(tmp_path / "real" / "may")
     (tmp_path / "real" / "out").symlink_to("may")
-    with pytest.raises(NotADirectoryError, match="out is a link, not a folder"):
+    with pytest.raises(NotADirectoryError):
         fill(tmp_path / "link", "three")
     assert {path.name for path in (tmp_path / "real").iterdir()} == {"out", "may"}
     assert contents(tmp_path / "real" / "may") == {"two"}

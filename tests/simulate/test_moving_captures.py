@@ -190,7 +190,7 @@ def test_a_camera_of_events_alone_is_enough_for_a_moving_board_only() -> None:
         simulate_captures(rig, n_captures=1, seed=6, options=replace(BRIEF, events_span_s=(0.02, 0.0)))
     )
     assert capture.images == [] and len(capture.events) == 1
-    with pytest.raises(ProfileError, match="no camera has a channel of kind frames"):
+    with pytest.raises(ProfileError):
         next(simulate_captures(rig, n_captures=1, seed=6, options=replace(BRIEF, motion="still")))
 
 

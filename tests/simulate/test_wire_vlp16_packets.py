@@ -124,5 +124,5 @@ def test_a_scan_that_no_vlp16_could_send_is_refused() -> None:
     assert scan.offset_ns is not None
     with pytest.raises(ValueError, match="no firing"):
         Vlp16Packets().feed(replace(scan, offset_ns=scan.offset_ns + 1000))
-    with pytest.raises(ValueError, match="without points or their times"):
+    with pytest.raises(ValueError):
         Vlp16Packets().feed(replace(scan, offset_ns=None))

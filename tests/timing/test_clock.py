@@ -139,15 +139,6 @@ def test_arrivals_give_the_drift_and_own_up_to_a_millisecond():
     assert rms(drifts) < 4e-6
 
 
-def test_there_and_back_is_where_it_began():
-    model = fit_clock(edges(np.random.default_rng(1), Device(300e-6)), "edges")
-    for stamp_ns in (0, model.anchor_ns, model.last_ns + 3600 * S):
-        assert abs(model.inverse().convert(model.convert(stamp_ns)) - stamp_ns) <= 2
-        assert model.inverse().sigma_ns(model.convert(stamp_ns)) == pytest.approx(
-            model.sigma_ns(stamp_ns), rel=1e-3
-        )
-
-
 def test_models_in_a_row_convert_like_one_after_the_other_and_add_their_errors():
     camera, board = Device(40e-6, 7 * S), Device(-90e-6, 2 * S)
     sigmas = []
@@ -161,13 +152,6 @@ def test_models_in_a_row_convert_like_one_after_the_other_and_add_their_errors()
         sigmas.append(camera.error_sigmas(through, stamp_ns))
     assert 0.85 < rms(sigmas) < 1.2
     assert through.origin == "80 edges, then 60 edges"
-
-
-def test_one_array_is_converted_like_its_elements():
-    model = fit_clock(edges(np.random.default_rng(2), Device(40e-6)), "edges")
-    stamps = np.arange(20, dtype=np.int64) * 7 * S + START_NS
-    assert model.convert_all(stamps).tolist() == [model.convert(int(stamp)) for stamp in stamps]
-    assert model.sigmas_ns(stamps).tolist() == [model.sigma_ns(int(stamp)) for stamp in stamps]
 
 
 def test_edges_find_their_partners_in_spite_of_losses_and_bounces():

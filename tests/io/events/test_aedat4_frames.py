@@ -68,17 +68,6 @@ def test_dv_processings_own_frames_are_read(tmp_path: Path) -> None:
         assert np.array_equal(grey.pixels, GREY) and np.array_equal(colour.pixels, COLOUR)
 
 
-def test_dv_processing_reads_what_the_tests_write(tmp_path: Path) -> None:
-    dv = pytest.importorskip("dv_processing")
-    events = random_events(2000, 1, start_us=START_US)
-    path = write_davis(tmp_path / "a.aedat4", [events], [RawFrame(START_US + 5, 8000, GREY)])
-    recording = dv.io.MonoCameraRecording(str(path))
-    frame = recording.getNextFrame()
-    assert (frame.timestamp, frame.exposure) == (START_US + 5, timedelta(microseconds=8000))
-    assert np.array_equal(frame.image, GREY)
-    assert np.array_equal(recording.getNextEventBatch().numpy()["x"], events.x)
-
-
 def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path: Path) -> None:
     frames = [RawFrame(START_US + 40_000 * k, 8000, GREY) for k in range(3)]
     path = write_davis(tmp_path / "a.aedat4", [], frames)

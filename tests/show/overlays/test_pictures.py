@@ -7,17 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.findings import ELSEWHERE
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
-from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.findings import IMAGE_TILTED
 from lce_rig.rig import QualitySettings
-from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, PANEL, Picture, round_ticks, text_width_px, wrapped
+from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, PANEL, Picture
 from lce_rig.show.overlays.debug_image import draw_debug
 from lce_rig.show.overlays.overlay import draw_overlay
 from lce_rig.show.overlays.overlay_files import (
@@ -29,7 +27,6 @@ from lce_rig.show.overlays.overlay_files import (
     write_picture,
 )
 from tests.calibrate.boards import measured_plate
-from tests.detect.test_image_board import draw, looking
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
 FOLDING = Intrinsics(300.0, 300.0, 172.5, 129.5, 346, 260, "radtan", (-0.4, 0.0, 0.0, 0.0, 0.0))
@@ -160,62 +157,6 @@ def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar
     assert (count(drawn[:, 800:], MAGENTA) > 100) == has_lidar
 
 
-def test_corners_found_in_a_refused_image_are_drawn() -> None:
-    camera = Intrinsics(349.57, 349.18, 172.49, 126.24, 346, 260)
-    pixels = draw(BOARD, camera, looking(10, 0, 20, (0, 0, 2.0)))
-    refusal = IMAGE_TILTED.refusal(tilt_deg=71.0, max_tilt_deg=70.0, turn_deg=6.0)
-    drawn = debug_picture(Image("cam", "frames", None, pixels), refusal, camera)
-    blank = debug_picture(Image("cam", "frames", None, np.full_like(pixels, 110)), refusal, camera)
-    assert count(drawn[34:600, :800], ORANGE) > 100 > count(blank[34:600, :800], ORANGE)
-
-
-def debug_picture(image: Image, refusal: Refusal, camera: Intrinsics) -> NDArray[np.uint8]:
-    return draw_debug(
-        image, None, refusal, refusal, board=BOARD, intrinsics=camera, limits=QualitySettings(), title=""
-    )
-
-
-def test_a_candidate_that_is_elsewhere_is_not_drawn_as_the_board() -> None:
-    points = wall()
-    elsewhere = ELSEWHERE.refusal(n_candidates=2, candidate=1, distance_m=3.0, rotation_deg=20.0)
-    arguments = (
-        Image("cam", "frames", None, grey(FOLDING)),
-        scan_of(points),
-        image_board(FOLDING),
-        [lidar_board(points), lidar_board(points - [0, 0.2, 0])],
-    )
-    right, wrong = (
-        draw_debug(
-            *arguments,
-            board=BOARD,
-            intrinsics=FOLDING,
-            limits=QualitySettings(),
-            title="",
-            mismatch=mismatch,
-        )
-        for mismatch in (None, elsewhere)
-    )
-    assert count(right[:, 800:], MAGENTA) > 100
-    assert count(wrong[:, 800:], MAGENTA) == 0
-    assert count(wrong[:, 800:], ORANGE) > count(right[:, 800:], ORANGE)
-
-
-def test_text_is_broken_to_fit_and_nothing_is_lost() -> None:
-    text = "board cut off by the right border: 8x6 inner corners wanted, 6x6 seen"
-    lines = wrapped(text, 200, 11)
-    assert " ".join(lines) == text
-    assert len(lines) > 2
-    assert all(text_width_px(line, 11) <= 200 for line in lines)
-
-
-@pytest.mark.parametrize(("low", "high"), [(0, 10), (1, 20), (0.2, 0.9), (3, 5)])
-def test_ticks_are_round_and_within_the_scale(low: float, high: float) -> None:
-    ticks = round_ticks(low, high, 4)
-    assert 2 <= len(ticks) <= 6
-    assert all(low - 1e-9 <= tick <= high + 1e-9 for tick in ticks)
-    assert len({f"{tick:g}" for tick in ticks}) == len(ticks)
-
-
 HEAD = SheetHead("rig  cam and lidar", "fail", ("7 captures", "the board moved: hold it still"), (1.0, 9.0))
 
 
@@ -236,18 +177,6 @@ def test_contact_sheets_hold_every_picture_once_and_are_at_most_2000_px_wide(n: 
     assert all(np.all(sheet[0, 0] == PANEL) for sheet in sheets)
 
 
-def test_contact_sheets_need_a_picture() -> None:
-    with pytest.raises(ValueError, match="at least one"):
-        contact_sheets([], HEAD)
-
-
-def test_a_capture_that_was_not_used_is_framed_on_the_contact_sheet() -> None:
-    used, refused = (contact_sheets([tile(0), tile(1, warning)], HEAD)[0] for warning in ("", "moved " * 30))
-    assert count(refused, ORANGE) > count(used, ORANGE) + 4 * 2 * (270 + 480)
-    # The whole reason is below the image, on as many lines as it takes.
-    assert refused.shape[0] > used.shape[0] + 2 * 22
-
-
 def test_overlays_are_written_with_contact_sheets_and_read_back_unchanged(tmp_path: Path) -> None:
     drawn = overlay(FOLDING, wall())
     names = ("000000", "000001")
@@ -262,12 +191,6 @@ def test_many_overlays_have_numbered_contact_sheets_which_are_known_as_such(tmp_
     files, sheets = write_overlays(tmp_path, [tile(index) for index in range(40)], HEAD)
     assert [sheet.name for sheet in sheets] == ["contact_sheet_1.png", "contact_sheet_2.png"]
     assert all(map(is_overlay, [*files, *sheets])) and not is_overlay(tmp_path / "contact_sheet_mine.png")
-
-
-def test_the_reason_of_a_refusal_is_below_the_legend() -> None:
-    plain, marked = overlay(FOLDING, wall()), overlay(FOLDING, wall(), warning="refused, pair: moved")
-    assert np.array_equal(marked[: len(plain)], plain)
-    assert count(marked[len(plain) :], ORANGE) > 50
 
 
 def test_a_picture_that_cannot_be_written_names_the_file(tmp_path: Path) -> None:

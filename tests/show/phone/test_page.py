@@ -115,22 +115,6 @@ def test_pictures_follow_one_another(preview: Preview, browser: Browser) -> None
     assert not page.complaints
 
 
-def test_outlines_break_off_where_the_lens_sees_no_further(preview: Preview, browser: Browser) -> None:
-    page = browser.open(preview.urls[0])
-    gone = WANTED_PX.copy()
-    gone[2] = np.nan
-    shown(
-        preview,
-        page,
-        "document.querySelector('#wanted .ink') !== null",
-        drawing=Drawing("cam", picture(), None, gone),
-    )
-    drawn = page.evaluate("document.querySelector('#wanted .ink').getAttribute('d')")
-    assert drawn == "M400 100L560 100M400 260L400 100"
-    assert page.each("#arrow path") == []
-    assert not page.complaints
-
-
 def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview: Preview, browser: Browser) -> None:
     page = browser.open(preview.urls[0])
     tip = "document.querySelector('#arrow .head')?.getAttribute('d').split('L')[0]"
@@ -166,49 +150,6 @@ def test_the_countdown_runs_while_the_board_is_held(preview: Preview, browser: B
     assert page.evaluate(offset) == pytest.approx(0.75)
     shown(preview, page, "document.getElementById('countdown').hidden", phase="saving")
     assert page.evaluate("document.body.dataset.phase") == "saving"
-
-
-@pytest.mark.parametrize(("width", "height"), SIZES)
-def test_instructions_are_as_large_as_fits(
-    preview: Preview, browser: Browser, width: int, height: int
-) -> None:
-    page = browser.open(preview.urls[0], width, height)
-    for words in (
-        "hold still",
-        "2 steps right, 1.2 m back, turn the left side a little towards the rig",
-        "the LiDAR sees 2 rings of the board, 4 are needed: lower it by 20 cm, come closer, hold it upright",
-        120 * "x",
-    ):
-        shown(preview, page, has_text("headline", words), headline=words, detail="")
-        box, text = (
-            page.evaluate(f"document.querySelector('{each}').getBoundingClientRect().toJSON()")
-            for each in ("#headline", "#headline span")
-        )
-        assert text["height"] <= box["height"] + 1
-        assert text["width"] <= box["width"] + 1
-        assert text["height"] > 0.4 * box["height"] or text["width"] > 0.7 * box["width"]
-
-
-@pytest.mark.parametrize(("width", "height"), [*SIZES, (390, 844), (320, 900)])
-def test_no_word_of_an_instruction_is_broken(
-    preview: Preview, browser: Browser, width: int, height: int
-) -> None:
-    page = browser.open(preview.urls[0], width, height)
-    for words in ("collection has ended", "cam: synchronisation lost", "wait"):
-        shown(preview, page, has_text("headline", words), headline=words, detail="", phase="ended")
-        # Boxes of a word that is broken lie a line apart; a first letter has a box of its own.
-        apart_px = """(() => {
-          const text = document.querySelector('#headline span').firstChild;
-          return [...text.data.matchAll(/\\S+/g)].map((found) => {
-            const word = document.createRange();
-            word.setStart(text, found.index);
-            word.setEnd(text, found.index + found[0].length);
-            const tops = [...word.getClientRects()].map((box) => box.top);
-            return Math.max(...tops) - Math.min(...tops);
-          });
-        })()"""
-        assert max(page.evaluate(apart_px)) < 5
-    assert page.text("camera") == "cam"
 
 
 def test_what_sensors_say_is_text_and_not_markup(preview: Preview, browser: Browser) -> None:

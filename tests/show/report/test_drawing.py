@@ -14,26 +14,6 @@ def _bars(label: str = "bars"):
         return drawing(figure, label)
 
 
-def test_the_same_figure_gives_the_same_bytes():
-    assert _bars() == _bars()
-
-
-def test_it_names_no_address_and_no_font():
-    text = _bars()
-    assert "http" not in text and "font-family" not in text
-    assert "_blank" not in text
-
-
-def test_colours_are_the_page_s():
-    text = _bars()
-    assert "var(--blue)" in text
-    assert not re.search(r"(fill|stroke): #", text)
-
-
-def test_bars_link():
-    assert _bars().count('xlink:href="#first"') == 2
-
-
 def test_text_of_the_figure_and_its_label_are_escaped():
     text = _bars('a "label" <b>')
     assert "&lt;errors&gt; &amp; more" in text

@@ -34,13 +34,3 @@ def test_the_policy_forbids_requests_and_scripts():
     assert rules["default-src"] == "'none'"
     assert "script-src" not in rules
     assert not any("http" in sources or "*" in sources for sources in rules.values())
-
-
-def test_it_names_no_address():
-    assert "http:" not in _page() and "https:" not in _page() and "@import" not in _page()
-
-
-def test_a_table_aligns_figures_and_texts():
-    page = _page(rows=[["one", 2.5]])
-    assert "<td>one</td>" in page
-    assert '<td class="figure">2.5</td>' in page
