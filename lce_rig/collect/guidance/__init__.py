@@ -2,8 +2,6 @@
 
 from lce_rig.collect.guidance.candidates import SensorPlace, is_reachable, spread_candidates
 from lce_rig.collect.guidance.evidence import (
-    Evidence,
-    Precision,
     combine,
     sigmas,
     weigh_placements,
@@ -18,20 +16,16 @@ from lce_rig.collect.guidance.instructions import (
     is_there,
     say,
 )
-from lce_rig.collect.guidance.planner import Coverage, Guidance, Novelty, Planner, measure_coverage
-from lce_rig.collect.guidance.sensor_noise import ErrorModel, SensorModel, model_sensors, outline_px
+from lce_rig.collect.guidance.planner import Coverage, Guidance, Planner, measure_coverage
+from lce_rig.collect.guidance.sensor_noise import SensorModel, model_sensors, outline_px
 
 __all__ = [
     "Coverage",
-    "ErrorModel",
-    "Evidence",
     "Guidance",
     "HeldPose",
     "Instruction",
-    "Novelty",
     "Person",
     "Planner",
-    "Precision",
     "SensorModel",
     "SensorPlace",
     "build_pose",

@@ -12,6 +12,7 @@ from lce_rig.detect.image.quality import LEAST_SQUARE_PX
 NEAREST_M = 1.2
 TILTS_DEG = (0.0, 22.0, 42.0)
 N_TILT_DIRECTIONS = 8
+_N_TILTS = 8
 #: As a diamond each ring crosses two slanted edges.
 DIAMOND_DEG = 45.0
 ROLLS_DEG = (-12.0, 0.0, 12.0)
@@ -46,13 +47,12 @@ class SensorPlace:
         return cls(model, T_cam_lidar, np.asarray(T_cam_lidar[:3, 2]))
 
 
-def spread_candidates(view: SensorPlace, n_places: int = 60, n_tilts: int = 8) -> Array:
+def spread_candidates(view: SensorPlace, n_places: int) -> Array:
     """Lay out poses T_cam_board (N, 4, 4) that both sensors see, evenly over everything that is reachable.
 
     Args:
         view: the sensors.
         n_places: places of the board's centre, over the image and the distances, that are tried.
-        n_tilts: tilts, of `TILTS_DEG` in eight directions, that are tried at each; the next ones at the next.
     """
     lens = view.model.lens
     even = np.mod(0.5 + np.arange(1, n_places + 1)[:, None] * _SPREAD, 1.0)
@@ -65,11 +65,12 @@ def spread_candidates(view: SensorPlace, n_places: int = 60, n_tilts: int = 8) -
     straight, *tilted = np.radians(TILTS_DEG)
     direction = 2 * np.pi * np.arange(N_TILT_DIRECTIONS) / N_TILT_DIRECTIONS
     circle = np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    tilts = np.concatenate([[[straight, straight]], *(each * circle for each in tilted)])
-    which = np.arange(n_places * n_tilts)
+    tilts = np.concatenate([[[straight, straight]], *(tilt_rad * circle for tilt_rad in tilted)])
+    # Try some of the tilts at each place, the next ones at the next.
+    which = np.arange(n_places * _N_TILTS)
     tilt = tilts[(which * 5) % len(tilts)]
     roll = np.radians(DIAMOND_DEG + np.array(ROLLS_DEG)[(which // len(tilts)) % len(ROLLS_DEG)])
-    place = which // n_tilts
+    place = which // _N_TILTS
     is_known = np.isfinite(rays[place]).all(axis=1)
     place, tilt, roll = place[is_known], tilt[is_known], roll[is_known]
     poses = face_camera(view, rays[place], distance_m[place], tilt, roll)

@@ -1,4 +1,4 @@
-"""What a board placement tells about the extrinsic, before it is captured; sums over placements just add.
+"""The information of a board placement on the extrinsics, before it is captured; placements just add.
 
 The estimate minimises sum_k f_k (residuals/moments.py). With half Hessians H_k, half gradients whose noise
 has covariance B_k, and half gradients that move by D_k b when the L lasers measure b too long, the estimate
@@ -21,11 +21,18 @@ from lce_rig.calibrate.systematic import systematic_covariances
 from lce_rig.collect.guidance.sensor_noise import ErrorModel, SensorModel
 from lce_rig.core.geometry import Array, invert, skew
 
-# Which rings of a LiDAR cross a board, and where they enter and leave it.
-
 # The detector does not use shorter rings as lines.
 FEWEST_POINTS = 6
 _SAMPLES = 48
+#: Extrinsic tangent (translation m, rotation rad, axes of the camera) and the edge shift.
+N_UNKNOWNS = 7
+# Ring ends of a usual capture: what weighs edges against planes.
+_USUAL_ENDS = 14
+# A ring is represented by its ends and its middle, with Simpson's weights: exact for second moments.
+_NODES = np.array([0.0, 0.5, 1.0])
+_SHARES = np.array([1.0, 4.0, 1.0]) / 6
+# The prior of a rough extrinsic, so that no direction is ever infinitely uncertain.
+_PRIOR_SIGMA_M, _PRIOR_SIGMA_RAD = 1.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,18 +110,9 @@ def _azimuths(model: SensorModel, T_lidar_board: Array) -> tuple[Array, Array]:
     return (middle + low)[:, None] + span[:, None] * share, span
 
 
-#: Extrinsic tangent (translation m, rotation rad, axes of the camera) and the edge shift.
-N_UNKNOWNS = 7
-# Ring ends of a usual capture: what weighs edges against planes.
-_USUAL_ENDS = 14
-# A ring is represented by its ends and its middle, with Simpson's weights: exact for second moments.
-_NODES = np.array([0.0, 0.5, 1.0])
-_SHARES = np.array([1.0, 4.0, 1.0]) / 6
-
-
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What each of N placements adds to (1).
+    """The terms of (1) by each of N placements.
 
     Attributes:
         hessian: (N, 7, 7) H_k.
@@ -142,7 +140,7 @@ class Evidence:
 
 
 def weigh_placements(model: SensorModel, T_cam_board: Array, T_cam_lidar: Array) -> Evidence:
-    """Work out what boards at given places would tell.
+    """Compute the terms of (1) for boards at these poses.
 
     Args:
         model: the sensors.
@@ -156,7 +154,13 @@ def weigh_placements(model: SensorModel, T_cam_board: Array, T_cam_lidar: Array)
     of_pose = hessian[:, :, :6]
     noise = edge_noise + of_pose @ pose_cov @ np.swapaxes(of_pose, 1, 2)
     noise += by_plane @ fit @ np.swapaxes(by_plane, 1, 2)
-    A = _to_board_tangent(T_cam_board, T_cam_lidar)
+    # A (N, 7, 7) maps the extrinsic's tangent to motions of the LiDAR's points on the board. A point x moves
+    # by tau + phi x (x - t): by R^T (tau + phi x (c - t)) at the board's centre c, and turns by R^T phi.
+    R_T = np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
+    A = np.zeros((len(R_T), N_UNKNOWNS, N_UNKNOWNS))
+    A[:, :3, :3] = A[:, 3:6, 3:6] = R_T
+    A[:, :3, 3:6] = -R_T @ skew(T_cam_board[:, :3, 3] - T_cam_lidar[:3, 3])
+    A[:, 6, 6] = 1.0
     A_T = np.swapaxes(A, 1, 2)
     return Evidence(
         hessian=A_T @ hessian @ A,
@@ -268,30 +272,10 @@ def _pose_covariance(model: SensorModel, T_cam_board: Array) -> Array:
     return np.asarray(cov + np.diag(common**2))
 
 
-def _to_board_tangent(T_cam_board: Array, T_cam_lidar: Array) -> Array:
-    """Build A (N, 7, 7), from the extrinsic's tangent to motions of the LiDAR's points on the board.
-
-    A point x moves by tau + phi x (x - t): by R^T (tau + phi x (c - t)) at the board's centre c, seen from
-    the board, and turns about it by R^T phi.
-    """
-    R_T = np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
-    A = np.zeros((len(R_T), N_UNKNOWNS, N_UNKNOWNS))
-    A[:, :3, :3] = A[:, 3:6, 3:6] = R_T
-    A[:, :3, 3:6] = -R_T @ skew(T_cam_board[:, :3, 3] - T_cam_lidar[:3, 3])
-    A[:, 6, 6] = 1.0
-    return A
-
-
 def _lidar_in_board(T_cam_board: Array, T_cam_lidar: Array) -> Array:
     """Find the LiDAR's origin (N, 3) in the frame of each board."""
     to_lidar = T_cam_lidar[:3, 3] - T_cam_board[:, :3, 3]
     return np.asarray(np.einsum("nji,nj->ni", T_cam_board[:, :3, :3], to_lidar))
-
-
-# How well captures determine the extrinsics.
-
-# What is known a priori (a rough extrinsic), so that no direction is ever infinitely uncertain.
-PRIOR_SIGMA_M, PRIOR_SIGMA_RAD = 1.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,7 +356,7 @@ def shortfall(model: SensorModel, cov: Array) -> Array:
 
 
 def _precision(hessian: Array, noise: Array, drift: Array, errors: ErrorModel) -> Precision:
-    prior = np.diag(np.repeat([PRIOR_SIGMA_M, PRIOR_SIGMA_RAD, errors.edge_shift_m], [3, 3, 1]) ** -2.0)
+    prior = np.diag(np.repeat([_PRIOR_SIGMA_M, _PRIOR_SIGMA_RAD, errors.edge_shift_m], [3, 3, 1]) ** -2.0)
     inverse = symmetric_inverse(hessian + prior)
     # The prior's own error counts where captures leave a direction open.
     scatter = inverse @ (noise + prior) @ inverse

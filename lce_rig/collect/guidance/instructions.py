@@ -16,11 +16,10 @@ Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
 
 STEP_M = 0.6
 MOST_AT_ONCE = 3
-#: What people cannot follow, or need not: smaller differences are not mentioned.
+#: Smaller differences are not mentioned: people cannot follow them, or need not.
 DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
 #: Within so many dead bands of every wanted figure the board is there.
 THERE = 1.5
-#: Where no reachable placement is known that was not captured.
 
 
 @dataclass(frozen=True)
@@ -37,11 +36,6 @@ class Instruction:
     kind: Kind
     amount: float
     text: str
-
-    @property
-    def size(self) -> float:
-        """The amount in dead bands, which makes ways and angles comparable."""
-        return abs(self.amount) / DEAD_BANDS[self.kind]
 
 
 @dataclass(frozen=True)
@@ -112,9 +106,14 @@ def instruct(view: SensorPlace, present: Array, wanted: Array) -> list[Instructi
         present: (4, 4) T_cam_board now.
         wanted: (4, 4) T_cam_board to reach.
     """
-    every = [_instruction(kind, amount) for kind, amount in _changes(view, present, wanted).items()]
-    needed = sorted((each for each in every if each.size > 1), key=lambda each: -each.size)
-    return needed[:MOST_AT_ONCE]
+    instructions = [
+        _instruction(kind, amount)
+        for kind, amount in _changes(view, present, wanted).items()
+        if abs(amount) > DEAD_BANDS[kind]
+    ]
+    # Dead bands make ways and angles comparable.
+    instructions.sort(key=lambda instruction: -abs(instruction.amount) / DEAD_BANDS[instruction.kind])
+    return instructions[:MOST_AT_ONCE]
 
 
 def say(instructions: Sequence[Instruction]) -> str:
@@ -149,7 +148,10 @@ def _changes(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, flo
 def _instruction(kind: Kind, amount: float) -> Instruction:
     size = abs(amount)
     if kind == "sideways":
-        text = f"{_way(size)} {'left' if amount > 0 else 'right'}"
+        steps = round(size / STEP_M)
+        way = "one step" if steps == 1 else f"{steps} steps"
+        way = f"{10 * round(10 * size)} cm" if size < 0.75 * STEP_M else way
+        text = f"{way} {'left' if amount > 0 else 'right'}"
     elif kind == "nearer":
         text = f"{size:.1f} m {'closer' if amount > 0 else 'back'}"
     elif kind == "height":
@@ -163,13 +165,6 @@ def _instruction(kind: Kind, amount: float) -> Instruction:
     return Instruction(kind, amount, text)
 
 
-def _way(size_m: float) -> str:
-    if size_m < 0.75 * STEP_M:
-        return f"{10 * round(10 * size_m)} cm"
-    steps = round(size_m / STEP_M)
-    return "one step" if steps == 1 else f"{steps} steps"
-
-
 def _angle(size_deg: float) -> str:
     return "a little " if size_deg < 15 else "far " if size_deg > 45 else ""
 
@@ -180,8 +175,6 @@ def _level_axes(view: SensorPlace) -> tuple[Array, Array]:
     right /= max(float(np.linalg.norm(right)), 1e-9)
     return right, np.asarray(np.cross(view.up, right))
 
-
-# A simulated person who follows instructions, more or less: how guidance is put to the test.
 
 _FIGURE = {
     "sideways": "right_m",
@@ -195,7 +188,7 @@ _FIGURE = {
 
 @dataclass(frozen=True)
 class Person:
-    """How somebody follows instructions.
+    """A simulated person who follows instructions, more or less.
 
     Attributes:
         place_sigma_m: error along each axis.

@@ -93,23 +93,17 @@ ENOUGH_SHARE = 0.9
 LEAST_SHARE = 0.1
 #: Where even the best placement brings less than this share, any new one is welcome.
 LEAST_GAIN = 0.02
-#: How far apart placements are, in units of `Novelty`: nearer ones are asked for when no others are left.
-SPACINGS = (1.0, 0.5)
+#: Placements moved and turned by less than this count as the same.
+MIN_MOVE_M, MIN_TURN_DEG = 0.15, 10.0
+# Spacings of placements in these units: nearer ones are asked for when no others are left.
+_SPACINGS = (1.0, 0.5)
 #: Around a place that cannot be reached.
 AVOIDED_M = 0.4
 # A metre of way, or a turn by a radian, costs as much as an answer that is so much worse.
 _EFFORT = 0.01
-# Nobody is told of more captures to come than this.
+# Upper bound of the "captures left" shown to the user.
 _MOST_MORE = 60
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-
-
-@dataclass(frozen=True)
-class Novelty:
-    """Which placements count as the same: moved and turned by less than this."""
-
-    min_move_m: float = 0.15
-    min_turn_deg: float = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,28 +113,25 @@ class Guidance:
     Attributes:
         n_captures: placements held.
         sigma_rotation_deg, sigma_translation_m: predicted error now.
-        next_rotation_deg, next_translation_m: the same after the wanted placement.
         is_enough: whether the calibration is predicted to meet the profile's target, with a margin.
         n_least: captures that it takes at least.
         stated_rotation_deg, stated_translation_m: predicted standard deviations that the calibration will
             state, which makes up for few captures; they have to be at most `ENOUGH_SHARE` of the target.
         n_more: about how many more captures it takes; 0 where there are enough, None where not known.
         T_cam_board: (4, 4) wanted; None where no reachable placement is new.
-        spacing: of `SPACINGS`, how far a board must be from every capture to count as new.
+        spacing: the share of the smallest move and turn by which a board must differ from every capture.
     """
 
     n_captures: int
     sigma_rotation_deg: float
     sigma_translation_m: float
-    next_rotation_deg: float
-    next_translation_m: float
     is_enough: bool
     n_least: int
     stated_rotation_deg: float
     stated_translation_m: float
     n_more: int | None
     T_cam_board: Array | None
-    spacing: float = SPACINGS[0]
+    spacing: float
 
 
 class Planner:
@@ -148,13 +139,19 @@ class Planner:
 
     Args:
         view: the sensors, and the extrinsics as far as known.
-        novelty: which placements count as the same.
+        min_move_m, min_turn_deg: placements moved and turned by less than this count as the same.
         n_places: how many places of the board's centre are considered, with eight tilts each.
     """
 
-    def __init__(self, view: SensorPlace, novelty: Novelty | None = None, n_places: int = 400) -> None:
+    def __init__(
+        self,
+        view: SensorPlace,
+        min_move_m: float = MIN_MOVE_M,
+        min_turn_deg: float = MIN_TURN_DEG,
+        n_places: int = 400,
+    ) -> None:
         self.view = view
-        self.novelty = novelty or Novelty()
+        self._min_move_m, self._min_turn_rad = min_move_m, np.radians(min_turn_deg)
         poses = spread_candidates(view, n_places)
         evidence = weigh_placements(view.model, poses, view.T_cam_lidar)
         # One ring more than needed, as people do not hold the board to the centimetre.
@@ -162,15 +159,6 @@ class Planner:
             evidence.n_points >= view.model.limits.min_points
         )
         self.candidates, self._evidence = poses[is_seen], evidence.of(is_seen)
-
-    @property
-    def reach_m(self) -> tuple[float, float]:
-        """Nearest and farthest distance at which a placement may be asked for.
-
-        They follow from `NEAREST_M`, the profile's limits on distance and squares, and rings on the board.
-        """
-        distance_m = np.linalg.norm(self.candidates[:, :3, 3], axis=1)
-        return float(distance_m.min()), float(distance_m.max())
 
     def guide(self, held: Array, present: Array | None = None, avoid: Array | None = None) -> Guidance:
         """Say how well the extrinsic is known, and where the board should go.
@@ -187,7 +175,7 @@ class Planner:
         after = combine_with_each(evidence, self._evidence, model.errors)
         cost = shortfall(model, after.improvable)
         if present is not None:
-            # Measure the way and the turn from one pose (4, 4) to others (N, 4, 4), m and rad together.
+            # Add the way in m and the turn in rad.
             way_m = np.linalg.norm(self.candidates[:, :3, 3] - present[:3, 3], axis=1)
             turn = np.arccos(np.clip(self.candidates[:, :3, 2] @ present[:3, 2], -1.0, 1.0))
             cost = cost * (1 + _EFFORT * np.asarray(way_m + turn))
@@ -196,20 +184,20 @@ class Planner:
         best, spacing = self._choose(cost, held, present)
         wanted = None if best is None else self.candidates[best]
         rotation, translation = sigmas(now.cov)
-        then = now.cov if best is None else after.cov[best]
-        next_rotation, next_translation = sigmas(then)
         stated_rotation, stated_translation = sigmas(now.claimed(len(held)))
+        n_least = max(FEWEST_FOR_ENOUGH, model.limits.min_captures)
+        worse = max(stated_rotation / model.target_sigma_rad, stated_translation / model.target_sigma_m)
         return Guidance(
             n_captures=len(held),
             sigma_rotation_deg=float(np.degrees(rotation)),
             sigma_translation_m=float(translation),
-            next_rotation_deg=float(np.degrees(next_rotation)),
-            next_translation_m=float(next_translation),
-            is_enough=self._is_enough(now, len(held)),
-            n_least=self._n_least,
+            is_enough=bool(len(held) >= n_least and worse <= ENOUGH_SHARE),
+            n_least=n_least,
             stated_rotation_deg=float(np.degrees(stated_rotation)),
             stated_translation_m=float(stated_translation),
-            n_more=self._count_more(now, now.scatter if best is None else after.scatter[best], len(held)),
+            n_more=self._count_more(
+                now, now.scatter if best is None else after.scatter[best], len(held), n_least
+            ),
             T_cam_board=wanted,
             spacing=spacing,
         )
@@ -249,46 +237,35 @@ class Planner:
         is_asked = asked is not None and is_there(self.view, present, asked)
         if wanted is None or guidance.is_enough or is_asked:
             return None
-        # Compute by which share each of some placements (N, 4, 4) shrinks what can be shrunk, (N,).
+        # Compute by which share the present and the wanted placement shrink the improvable covariance.
         placements = np.stack([present, wanted])
         model, evidence = self.view.model, self._weigh(held)
         now = shortfall(model, combine(evidence, model.errors).improvable)
         after = combine_with_each(evidence, self._weigh(placements), model.errors)
-        own, best = np.asarray(1 - shortfall(model, after.improvable) / now)
-        if best < LEAST_GAIN or own >= LEAST_SHARE * best:
+        gain, best = np.asarray(1 - shortfall(model, after.improvable) / now)
+        if best < LEAST_GAIN or gain >= LEAST_SHARE * best:
             return None
-        figures = {"gain": max(float(own), 0.0), "best_gain": float(best), "instruction": instruction}
+        figures = {"gain": max(float(gain), 0.0), "best_gain": float(best), "instruction": instruction}
         return CALIBRATE_LITTLE_GAIN.refusal(**figures)
 
     def _weigh(self, poses: Array) -> Evidence:
         return weigh_placements(self.view.model, poses, self.view.T_cam_lidar)
 
-    def _is_enough(self, now: Precision, n_captures: int) -> bool:
-        if n_captures < self._n_least:
-            return False
-        rotation, translation = sigmas(now.claimed(n_captures))
-        model = self.view.model
-        worse = max(rotation / model.target_sigma_rad, translation / model.target_sigma_m)
-        return bool(worse <= ENOUGH_SHARE)
-
-    @property
-    def _n_least(self) -> int:
-        return max(FEWEST_FOR_ENOUGH, self.view.model.limits.min_captures)
-
-    def _count_more(self, now: Precision, scatter_then: Array, n_captures: int) -> int | None:
+    def _count_more(self, now: Precision, scatter_then: Array, n_captures: int, n_least: int) -> int | None:
         """Estimate how many more captures it takes, if each brings as much information as the next one.
 
         Args:
             now: of the captures.
             scatter_then: (6, 6) `Precision.scatter` after the next capture.
             n_captures: so far.
+            n_least: captures needed at least.
         """
         model = self.view.model
         targets = np.square(ENOUGH_SHARE * np.array([model.target_sigma_rad, model.target_sigma_m]))
         # More captures change nothing of what all share.
         constant = np.square(sigmas(now.lasers + now.offset))
         before, after = (1 / np.maximum(np.square(sigmas(s)), 1e-18) for s in (now.scatter, scatter_then))
-        for n_more in range(max(self._n_least - n_captures, 0), _MOST_MORE):
+        for n_more in range(max(n_least - n_captures, 0), _MOST_MORE):
             scatter = 1 / (before + n_more * np.maximum(after - before, 0.0))
             if np.all(few_captures_factor(n_captures + n_more) * scatter + constant <= targets):
                 return n_more
@@ -300,25 +277,25 @@ class Planner:
         Returns:
             Its index, None where there is none; and the spacing at which it is new.
         """
-        for spacing in SPACINGS:
+        for spacing in _SPACINGS:
             is_taken = self._is_like(held, self.candidates, spacing).any(axis=0)
             new = np.flatnonzero(~is_taken & np.isfinite(cost))
             if len(new):
                 ranked = new[np.argsort(cost[new], kind="stable")]
                 if present is None or not self._is_like(held, present[None], spacing).any():
                     return int(ranked[0]), spacing
-                # Who stands at a capture has to be moved on: not to where "hold still" would be said.
+                # Move a board that stands at a capture on, not to where the instruction is "hold still".
                 away = (k for k in ranked if not is_there(self.view, present, self.candidates[k]))
                 return int(next(away, ranked[0])), spacing
-        return None, SPACINGS[-1]
+        return None, _SPACINGS[-1]
 
     def _is_like(self, held: Array, others: Array, spacing: float) -> NDArray[np.bool_]:
         """Find which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
         # The pattern may be read from either end.
         R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
         turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ _HALF_TURN, R_others))
-        is_turned = turn >= np.radians(spacing * self.novelty.min_turn_deg)
-        return np.asarray((_way_m(held, others) < spacing * self.novelty.min_move_m) & ~is_turned)
+        is_turned = turn >= spacing * self._min_turn_rad
+        return np.asarray((_way_m(held, others) < spacing * self._min_move_m) & ~is_turned)
 
 
 def _way_m(held: Array, others: Array) -> Array:

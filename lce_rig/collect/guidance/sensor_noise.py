@@ -15,22 +15,22 @@ from lce_rig.rig import QualitySettings, Rig
 PRIOR_CAPTURES = 5
 #: Rms distance of a board's points from its middle line: what a tilt moves them by.
 BOARD_LEVER_M = 0.2
+_POINTS_PER_EDGE = 12
 
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """Standard deviations of what is measured.
+    """Standard deviations of the measurements.
 
-    The errors of a capture are those of its corners, ranges and ring ends, which average out over many
-    points, and those common to all its points, which do not: an imperfect lens model, a bowed board, a hand
-    that is never quite still, an arm behind one edge. Those of the pose are given as if they were the
-    camera's.
+    Errors of corners, ranges and ring ends average out over the many points of a capture. Errors common to
+    all its points do not: an imperfect lens model, a bowed board, an unsteady hand, an arm behind one edge.
+    Pose errors are stated as if they were the camera's.
 
     Attributes:
         corner_px: of a corner, per coordinate.
         range_m: of a range, from shot to shot.
         ring_end_m: of a ring's end across the board's edge, beyond the spacing of its points.
-        side_m: of all ring ends on one edge of the plate in one capture: what stands behind it draws them.
+        side_m: of all ring ends on one edge of the plate in one capture, drawn by things behind it.
         tilt_rad: of the board's pose about its three axes, common to a capture.
         depth_m: of the board's place along its normal, common to a capture.
         laser_bias_m: of the lasers' constant range errors about their mean.
@@ -100,10 +100,6 @@ class SensorModel:
     target_sigma_m: float
     errors: ErrorModel = field(default_factory=ErrorModel)
 
-    def with_errors(self, errors: ErrorModel) -> "SensorModel":
-        """Exchange how both sensors measure."""
-        return replace(self, errors=errors)
-
 
 def model_sensors(rig: Rig, camera: str, lidar: str) -> SensorModel:
     """Build the model of a pair of sensors from a profile.
@@ -135,19 +131,14 @@ def model_sensors(rig: Rig, camera: str, lidar: str) -> SensorModel:
     )
 
 
-def outline_px(model: SensorModel, T_cam_board: Array, points_per_edge: int = 12) -> Array:
-    """Project the plate's border as a closed polygon; lenses bend its edges.
-
-    Args:
-        model: the camera and the board.
-        T_cam_board: (4, 4).
-        points_per_edge: of the polygon.
+def outline_px(model: SensorModel, T_cam_board: Array) -> Array:
+    """Project the plate's border at T_cam_board (4, 4) as a closed polygon; distortion bends its edges.
 
     Returns:
-        (4 points_per_edge + 1, 2) px, the last point the first; NaN where a point is out of the lens's sight.
+        (N, 2) px, the last point the first; NaN where a point is out of the lens's sight.
     """
     corners = model.board.outline()
-    share = np.arange(points_per_edge)[:, None] / points_per_edge
+    share = np.arange(_POINTS_PER_EDGE)[:, None] / _POINTS_PER_EDGE
     edges = [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     border = np.concatenate([*edges, corners[:1]])
     pixels, _ = model.lens.project(transform(T_cam_board, border))

@@ -1,7 +1,7 @@
-"""What the captures have shown of one camera and one LiDAR, and where the board goes next."""
+"""The captures of one camera and one LiDAR, and the next placement of the board."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,22 +37,6 @@ from lce_rig.session import Capture, Session
 
 #: Another placement is proposed after a board was wanted at one for so long.
 GIVE_UP_S = 30.0
-
-
-@dataclass(frozen=True, eq=False)
-class Learned:
-    """What a first calibration of the captures says.
-
-    Attributes:
-        T_cam_lidar: (4, 4).
-        plane_rms_m, edge_rms_m: residuals.
-        n_captures: behind it.
-    """
-
-    T_cam_lidar: Array
-    plane_rms_m: float
-    edge_rms_m: float
-    n_captures: int
 
 
 class Guide:
@@ -139,16 +123,24 @@ class Guide:
 
     def remove(self, name: str) -> None:
         """Forget a capture that was taken back; its placement is new again."""
-        left = [k for k, each in enumerate(self._names) if each != name]
+        left = [k for k in range(len(self._names)) if self._names[k] != name]
         self._names, self._held = [self._names[k] for k in left], [self._held[k] for k in left]
         self.guidance = self._coverage = None
 
-    def prepare(self, learned: Learned) -> Planner | None:
-        """Build a planner that knows what the captures have shown; takes a second and changes nothing."""
+    def prepare(
+        self, T_cam_lidar: Array, plane_rms_m: float, edge_rms_m: float, n_captures: int
+    ) -> Planner | None:
+        """Build a planner from a calibration of the captures; takes a second and changes nothing.
+
+        Args:
+            T_cam_lidar: (4, 4).
+            plane_rms_m, edge_rms_m: residuals.
+            n_captures: used by the calibration.
+        """
         if self._model is None:
             return None
-        errors = self._model.errors.learned(learned.plane_rms_m, learned.edge_rms_m, learned.n_captures)
-        return Planner(SensorPlace.upright(self._model.with_errors(errors), learned.T_cam_lidar))
+        errors = self._model.errors.learned(plane_rms_m, edge_rms_m, n_captures)
+        return Planner(SensorPlace.upright(replace(self._model, errors=errors), T_cam_lidar))
 
     def adopt(self, planner: Planner | None) -> None:
         """Take a planner from `prepare`; None to go back to the one before any capture."""
@@ -173,7 +165,7 @@ class Guide:
             self.give_up()
         guidance = self._planner.guide(self._held_poses(), present, self._avoided())
         if guidance.T_cam_board is None and self._avoid:
-            # What was in the way may be gone: better to ask again than to ask for nothing.
+            # Obstacles may be gone: ask again rather than for nothing.
             del self._avoid[:-1]
             guidance = self._planner.guide(self._held_poses(), present, self._avoided())
         self.guidance = guidance
@@ -259,7 +251,7 @@ class Guide:
 
 
 def count_in(capture: Capture, session: Session, guides: Sequence[Guide]) -> None:
-    """Let guides know a capture of a session."""
+    """Add a capture of a session to the guides."""
     try:
         poses, lidars = capture_poses(capture, session), capture.lidars
     except LceRigError:
@@ -274,11 +266,11 @@ def predict(session: Session) -> list[Finding]:
 
     Captures without stored poses of the board, such as those of a folder, are not searched for it.
     """
-    with_poses = [each for each in session.captures if isinstance(each.meta.get("T_cam_board"), dict)]
+    with_poses = [c for c in session.captures if isinstance(c.meta.get("T_cam_board"), dict)]
     guides = make_guides(session.rig) if with_poses else []
     for capture in with_poses:
         count_in(capture, session, guides)
-    return [found for guide in guides if (found := guide.predict()) is not None]
+    return [finding for guide in guides if (finding := guide.predict()) is not None]
 
 
 def make_guides(rig: Rig) -> list[Guide]:

@@ -1,4 +1,4 @@
-"""What captures teach: calibrations of them in a process of its own, from which guidance learns."""
+"""Calibrations of the captures in a process of its own, from which guidance learns."""
 
 import threading
 from collections import deque
@@ -10,7 +10,7 @@ import numpy as np
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.guidance import Planner
-from lce_rig.collect.live.guide import Guide, Learned, make_guides
+from lce_rig.collect.live.guide import Guide, make_guides
 from lce_rig.collect.worker import Worker
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import Observation
@@ -51,7 +51,7 @@ class Learning:
         self._thread.join()
 
     def show(self, name: str, detection: BoardDetection) -> None:
-        """Take what a capture shows; returns at once."""
+        """Take a capture's detection; returns at once."""
         with self._changed:
             for k, guide in enumerate(self._guides):
                 if guide.sees(detection):
@@ -62,10 +62,10 @@ class Learning:
             self._changed.notify()
 
     def forget(self, name: str) -> None:
-        """Take back what a capture has shown; returns at once, and what is left is calibrated again."""
+        """Forget a capture; returns at once, and the remaining ones are calibrated again."""
         with self._changed:
             for k, candidates in self._candidates.items():
-                left = [each for each in candidates if each.capture != name]
+                left = [candidate for candidate in candidates if candidate.capture != name]
                 if len(left) < len(candidates):
                     self._candidates[k] = left
                     self._unlearned.add(k)
@@ -74,7 +74,7 @@ class Learning:
             self._changed.notify()
 
     def teach(self) -> None:
-        """Let the guides know what was learned since the last call."""
+        """Pass the planners learned since the last call to their guides."""
         with self._changed:
             taught = list(self._taught)
             self._taught.clear()
@@ -104,30 +104,26 @@ class Learning:
             with self._changed:
                 if any(all(each is not left for left in self._candidates[k]) for each in candidates):
                     continue  # One was taken back meanwhile: it is due again.
-                # What was learned from a capture that was taken back holds no longer.
+                # A planner learned from a capture that was taken back holds no longer.
                 if planner is not None or k in self._unlearned:
                     self._taught.append((self._guides[k], planner))
                     self._unlearned.discard(k)
 
 
 class _Teacher:
-    """What runs there."""
+    """The object in the worker's process."""
 
     def __init__(self, rig: Rig) -> None:
         self._board = rig.board.to_board()
         self._guides = make_guides(rig)
 
     def learn(self, k: int, candidates: Sequence[Observation]) -> Planner | None:
-        """Calibrate what one guide's sensors have shown; None where more captures are needed."""
+        """Calibrate one guide's sensors; None where more captures are needed."""
         try:
             estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings("paper", n_draws=0))
         except (NotEnoughDataError, np.linalg.LinAlgError):
             return None
         figures = estimate.diagnostics
-        learned = Learned(
-            estimate.T_cam_lidar,
-            figures.fit_plane_rms_m,
-            figures.fit_edge_rms_m,
-            len(estimate.used),
+        return self._guides[k].prepare(
+            estimate.T_cam_lidar, figures.fit_plane_rms_m, figures.fit_edge_rms_m, len(estimate.used)
         )
-        return self._guides[k].prepare(learned)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.guidance import (
-    Novelty,
     Planner,
     SensorPlace,
     is_reachable,
@@ -36,9 +35,9 @@ def planner():
 def test_the_guide_names_the_distances_that_are_asked_for(profile, camera):
     rig = load_rig(profile)
     nominal = rig.nominal(camera, "lidar" if "lidar" in rig.lidars else next(iter(rig.lidars)))
-    near_m, far_m = Planner(
-        SensorPlace.upright(model_sensors(rig, camera, nominal.lidar), nominal.to_matrix())
-    ).reach_m
+    view = SensorPlace.upright(model_sensors(rig, camera, nominal.lidar), nominal.to_matrix())
+    distance_m = np.linalg.norm(Planner(view).candidates[:, :3, 3], axis=1)
+    near_m, far_m = distance_m.min(), distance_m.max()
     limits = rig.quality
     assert max(NEAREST_M, limits.min_distance_m) <= near_m < 1.3
     assert near_m < far_m <= limits.max_distance_m
@@ -73,13 +72,12 @@ def test_guided_placements_tell_more_than_random_ones(guided):
     assert translation < 0.9 * np.median([each[1] for each in random])
 
 
-def test_the_wanted_placement_keeps_what_it_promises(planner, guided):
-    guidance = planner.guide(guided[:5])
-    after = np.concatenate([guided[:5], guidance.T_cam_board[None]])
-    rotation, translation = sigmas(predict_covariance(planner.view.model, after, T_FORWARD))
-    assert guidance.next_rotation_deg == pytest.approx(np.degrees(rotation))
-    assert guidance.next_translation_m == pytest.approx(translation)
-    assert guidance.next_rotation_deg < guidance.sigma_rotation_deg
+def test_the_wanted_placement_lowers_the_prediction(planner, guided):
+    before, after = planner.guide(guided[:5]), planner.guide(guided[:6])
+    rotation, translation = sigmas(predict_covariance(planner.view.model, guided[:6], T_FORWARD))
+    assert after.sigma_rotation_deg == pytest.approx(np.degrees(rotation))
+    assert after.sigma_translation_m == pytest.approx(translation)
+    assert after.sigma_rotation_deg < before.sigma_rotation_deg
 
 
 def test_no_placement_is_asked_for_twice(guided):
@@ -123,7 +121,7 @@ def test_a_capture_of_what_is_held_is_refused_and_says_where_to_go(planner, guid
 
 
 def test_a_placement_that_tells_little_is_refused_with_its_figure():
-    bold = Planner(view(), Novelty(0.001, 0.05), n_places=100)
+    bold = Planner(view(), 0.001, 0.05, n_places=100)
     near = bold.guide(NONE).T_cam_board
     crowd = np.array([perturb(near, np.r_[0.02 * k, 0, 0, 0, 0, 0.01 * k]) for k in range(-4, 5)])
     refusal = bold.adds_nothing(crowd, perturb(near, np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.015])))
@@ -168,7 +166,7 @@ def test_where_nothing_is_left_a_refusal_says_so(planner):
 
 def crowded():
     """Captures that crowd about one place, and a board among them that tells little."""
-    bold = Planner(view(), Novelty(0.001, 0.05), n_places=100)
+    bold = Planner(view(), 0.001, 0.05, n_places=100)
     near = bold.guide(NONE).T_cam_board
     crowd = np.array([perturb(near, np.r_[0.02 * k, 0, 0, 0, 0, 0.01 * k]) for k in range(-6, 7)])
     return bold, crowd, perturb(near, np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.015]))
@@ -178,7 +176,7 @@ def test_beyond_the_target_only_what_was_captured_is_refused():
     bold, crowd, present = crowded()
     assert bold.adds_nothing(crowd, present).code == "calibrate.little_gain"
     modest = replace(model(), target_sigma_rad=np.radians(20.0), target_sigma_m=1.0)
-    met = Planner(SensorPlace.upright(modest, T_FORWARD), Novelty(0.001, 0.05), n_places=100)
+    met = Planner(SensorPlace.upright(modest, T_FORWARD), 0.001, 0.05, n_places=100)
     assert met.guide(crowd).is_enough
     assert met.adds_nothing(crowd, present) is None
     assert met.adds_nothing(crowd, crowd[2]).figures["capture"] == "3"

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lce_rig.collect.guidance import HeldPose, Novelty, Person, SensorPlace, build_pose, model_sensors
+from lce_rig.collect.guidance import HeldPose, Person, SensorPlace, build_pose, model_sensors
+from lce_rig.collect.guidance.planner import MIN_MOVE_M, MIN_TURN_DEG
 from lce_rig.collect.live.guide import Guide, make_guides
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.rig import Rig
@@ -13,7 +14,7 @@ from lce_rig.rig import Rig
 # The simulated person tries again after so long; longer than that a walk seldom takes.
 _TRY_S = 7.0
 # A placement nearer than both to a capture is not new.
-NEW_M, NEW_DEG = Novelty().min_move_m, Novelty().min_turn_deg
+NEW_M, NEW_DEG = MIN_MOVE_M, MIN_TURN_DEG
 
 
 @dataclass

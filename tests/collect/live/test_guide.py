@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.guidance import Person
-from lce_rig.collect.live.guide import GIVE_UP_S, Guide, Learned, make_guides
+from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig
 from tests.collect.live.follow import NEW_DEG, NEW_M, follow_guide
@@ -108,7 +108,7 @@ def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(
     assert blind.coverage() is None and blind.adds_nothing(np.eye(4)) is None
     nominal = rig().nominal("davis", "lidar")
     assert nominal is not None
-    planner = blind.prepare(Learned(nominal.to_matrix(), 0.004, 0.006, 6))
+    planner = blind.prepare(nominal.to_matrix(), 0.004, 0.006, 6)
     assert planner is not None
     blind.adopt(planner)
     blind.plan(None, 1.0)
@@ -127,7 +127,7 @@ def test_what_captures_leave_over_raises_the_prediction(guide: Guide) -> None:
     before = guide.guidance.sigma_rotation_deg
     nominal = rig().nominal("davis", "lidar")
     assert nominal is not None
-    planner = guide.prepare(Learned(nominal.to_matrix(), 0.02, 0.02, 6))
+    planner = guide.prepare(nominal.to_matrix(), 0.02, 0.02, 6)
     assert planner is not None
     guide.adopt(planner)
     guide.plan(None, 11.0)
