@@ -22,7 +22,7 @@ _NS_PER_US = 1000
 _LEAST_THRESHOLD = 0.05
 # A pixel in the dark keeps this share of the bandwidth that full white gives it: the photoreceptor's bias.
 _DARK_BANDWIDTH = 0.1
-_HOT_ON_SHARE = 0.95
+_HOT_HZ, _HOT_ON_SHARE = (10.0, 300.0), 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ def draw_pixels(intrinsics: Intrinsics, noise: EventNoise, rng: np.random.Genera
     on, off = np.maximum(means + spread, np.minimum(means, _LEAST_THRESHOLD))
     hot_hz = np.zeros(n)
     hot = rng.choice(n, round(noise.hot_share * n), replace=False)
-    hot_hz[hot] = noise.hot_hz[0] * (noise.hot_hz[1] / noise.hot_hz[0]) ** rng.random(len(hot))
+    hot_hz[hot] = _HOT_HZ[0] * (_HOT_HZ[1] / _HOT_HZ[0]) ** rng.random(len(hot))
     return EventPixels(intrinsics.width_px, intrinsics.height_px, on, off, hot_hz)
 
 
@@ -112,7 +112,16 @@ class EventCamera:
         """Let ln(intensity) run in a straight line from what was seen last to `radiance` (H, W) at t_ns."""
         now_s, start_s = 1e-9 * (t_ns - self._start_ns), self._now_s
         seen = self._log(radiance)
-        output = self._filter(seen, radiance.ravel(), now_s - start_s)
+        # A ramp passes each pixel's low-pass exactly: y' = (x - y) / tau with x = x0 + k t has the solution
+        # x - k tau + (y0 - x0 + k tau) exp(-t / tau).
+        output = seen
+        if np.isfinite(self._noise.cutoff_hz):
+            intensity = np.clip(radiance.ravel(), 0.0, 1.0)
+            bandwidth = _DARK_BANDWIDTH + (1 - _DARK_BANDWIDTH) * intensity
+            tau_s = 1.0 / (2 * np.pi * self._noise.cutoff_hz * bandwidth)
+            lag = (seen - self._input) * (tau_s / (now_s - start_s))
+            decay = np.exp(-(now_s - start_s) / tau_s)
+            output = np.asarray(seen - lag + (self._output - self._input + lag) * decay)
         leak_per_s = self._noise.leak_hz * self._pixels.threshold_on
         # What the pixel compares, at the start of the step, and how fast it grows: e(t) = excess + slope t.
         excess = self._output - self._reference
@@ -128,18 +137,6 @@ class EventCamera:
         pixel = np.flatnonzero(fires & ~is_blind)
         self._fire(pixel, excess[pixel], slope[pixel], end_excess[pixel] > 0, start_s, now_s, output)
         self._input, self._output, self._now_s = seen, output, now_s
-
-    def _filter(self, seen: Array, intensity: NDArray[np.float32], step_s: float) -> Array:
-        """Pass a ramp from the last input to `seen` (P,) through each pixel's low-pass, exactly.
-
-        y' = (x - y) / tau with x = x0 + k t has the solution x - k tau + (y0 - x0 + k tau) exp(-t / tau).
-        """
-        if not np.isfinite(self._noise.cutoff_hz):
-            return seen
-        bandwidth = _DARK_BANDWIDTH + (1 - _DARK_BANDWIDTH) * np.clip(intensity, 0.0, 1.0)
-        tau_s = 1.0 / (2 * np.pi * self._noise.cutoff_hz * bandwidth)
-        lag = (seen - self._input) * (tau_s / step_s)
-        return np.asarray(seen - lag + (self._output - self._input + lag) * np.exp(-step_s / tau_s))
 
     def _fire(
         self,
@@ -177,12 +174,28 @@ class EventCamera:
 
     def take(self) -> Events:
         """Return the events since the last call, in order of time, noise included."""
-        raw = [*self._raw, self._noise_events(self._taken_s, self._now_s)]
+        # Events without a cause: shot noise, more of it in the dark, and hot pixels'.
+        hot_hz, start_s, end_s = self._pixels.hot_hz, self._taken_s, self._now_s
+        summed_hz = np.cumsum(self._noise.noise_hz * 2 * self._darkness + hot_hz)
+        n = self._rng.poisson(summed_hz[-1] * (end_s - start_s))
+        t_s = self._rng.uniform(start_s, end_s, n)
+        pixel = np.searchsorted(summed_hz, self._rng.uniform(0.0, summed_hz[-1], n), side="right")
+        pixel = np.minimum(pixel, len(summed_hz) - 1)
+        on_share = np.where(hot_hz[pixel] > 0, _HOT_ON_SHARE, 0.5)
+        noise = _Raw(t_s, pixel, self._rng.random(n) < on_share)
+        together = join_rows([*self._raw, noise])
         self._raw, self._taken_s = [], self._now_s
-        together = join_rows(raw)
         order = np.lexsort((together.polarity, together.pixel, together.t_s))
         t_s, pixel, polarity = together.t_s[order], together.pixel[order], together.polarity[order]
-        keep = self._outlasts_refractory(t_s, pixel)
+        # Events within their pixel's refractory period are dropped.
+        order = np.argsort(pixel, kind="stable")
+        by_pixel, by_time = pixel[order], t_s[order]
+        is_first = np.diff(by_pixel, prepend=-1) != 0
+        before_s = np.append(-np.inf, by_time[:-1])[: len(order)]
+        before_s = np.where(is_first, self._last_s[by_pixel], before_s)
+        keep = np.empty(len(order), dtype=np.bool_)
+        keep[order] = by_time - before_s >= self._noise.refractory_s * (1 - 1e-9)
+        self._last_s[by_pixel] = by_time  # the last of each pixel stands at its end
         t_ns = self._start_ns + self._offset_ns + np.rint(1e9 * t_s[keep]).astype(np.int64)
         row, column = np.divmod(pixel[keep], self._pixels.width_px)
         return Events(
@@ -195,27 +208,3 @@ class EventCamera:
             self._pixels.height_px,
             int(t_ns[0]) if len(t_ns) else None,
         )
-
-    def _noise_events(self, start_s: float, end_s: float) -> _Raw:
-        """Draw events without a cause: shot noise, more of it in the dark, and hot pixels'."""
-        shot_hz = self._noise.noise_hz * 2 * self._darkness
-        summed_hz = np.cumsum(shot_hz + self._pixels.hot_hz)
-        n = self._rng.poisson(summed_hz[-1] * (end_s - start_s))
-        t_s = self._rng.uniform(start_s, end_s, n)
-        pixel = np.searchsorted(summed_hz, self._rng.uniform(0.0, summed_hz[-1], n), side="right")
-        pixel = np.minimum(pixel, len(summed_hz) - 1)
-        on_share = np.where(self._pixels.hot_hz[pixel] > 0, _HOT_ON_SHARE, 0.5)
-        return _Raw(t_s, pixel, self._rng.random(n) < on_share)
-
-    def _outlasts_refractory(self, t_s: Array, pixel: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Find which events (N,), in order of time, fall outside their pixel's refractory period."""
-        order = np.argsort(pixel, kind="stable")
-        by_pixel, by_time = pixel[order], t_s[order]
-        is_first = np.ones(len(order), dtype=np.bool_)
-        is_first[1:] = by_pixel[1:] != by_pixel[:-1]
-        before_s = np.append(-np.inf, by_time[:-1])[: len(order)]
-        before_s = np.where(is_first, self._last_s[by_pixel], before_s)
-        keep = np.empty(len(order), dtype=np.bool_)
-        keep[order] = by_time - before_s >= self._noise.refractory_s * (1 - 1e-9)
-        self._last_s[by_pixel] = by_time  # the last of each pixel stands at its end
-        return keep

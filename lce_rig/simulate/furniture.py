@@ -1,7 +1,7 @@
 """Furniture drawn by seed: outlines of many kinds, near and far, upright and slanted, before the walls."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,24 +17,14 @@ _RIG_REACH_M = 1.5  # nothing stands so near the rig
 _CLEAR_M, _CLEAR_RAD = 4.2, np.radians(24.0)
 _PAINT_M = 0.004
 
+_Part = tuple[str, Mesh, Material, Array]
 _Piece = list[tuple[str, Mesh, Material]]
 """What a piece of furniture consists of: about the origin of the floor, before it is turned and moved."""
 
 
-@dataclass(frozen=True, eq=False)
-class Furnishing:
-    """Pieces in the room's frame.
-
-    Attributes:
-        parts: name, mesh, material and T_room_piece (4, 4) of each part.
-        obstacles: (low, high) of each piece that stands on the floor or hangs, m.
-    """
-
-    parts: list[tuple[str, Mesh, Material, Array]]
-    obstacles: list[tuple[Array, Array]]
-
-
-def draw_furniture(low: Array, high: Array, rng: np.random.Generator) -> Furnishing:
+def draw_furniture(
+    low: Array, high: Array, rng: np.random.Generator
+) -> tuple[list[_Part], list[tuple[Array, Array]]]:
     """Furnish a room: pieces that stand apart from each other, most in front of the rig, and paint on walls.
 
     The paint has no depth: edges in images that no LiDAR sees.
@@ -42,8 +32,11 @@ def draw_furniture(low: Array, high: Array, rng: np.random.Generator) -> Furnish
     Args:
         low, high: (3,) corners of the room, m; the rig is at the origin and looks along x.
         rng: source of everything.
+
+    Returns:
+        Name, mesh, material and T_room_piece (4, 4) of each part; (low, high) of each piece, m, frame room.
     """
-    parts: list[tuple[str, Mesh, Material, Array]] = []
+    parts: list[_Part] = []
     obstacles: list[tuple[Array, Array]] = []
     kinds, weights = list(_KINDS), np.array(list(_KINDS.values()))
     for _ in range(int(rng.integers(*_N_PIECES))):
@@ -55,7 +48,7 @@ def draw_furniture(low: Array, high: Array, rng: np.random.Generator) -> Furnish
             obstacles.append(bounds)
             parts += [(name, mesh.moved(T), material, T) for name, mesh, material in piece]
     parts += [_paint(low, high, rng) for _ in range(int(rng.integers(4, 10)))]
-    return Furnishing(parts, obstacles)
+    return parts, obstacles
 
 
 def _find_place(
@@ -94,8 +87,8 @@ def _material(rng: np.random.Generator, pattern: Pattern | None = None) -> Mater
     grey = rng.uniform(0.03, 0.85)
     tint = np.clip(grey * rng.uniform(0.7, 1.3, 3), 0.02, 0.9)
     patterns: tuple[Pattern, ...] = ("plain", "plain", "wood", "cloth")
-    chosen = pattern or patterns[int(rng.integers(len(patterns)))]
-    return Material((tint[0], tint[1], tint[2]), float(rng.uniform(0.15, 0.9)), chosen)
+    pattern = pattern or patterns[int(rng.integers(len(patterns)))]
+    return Material((tint[0], tint[1], tint[2]), float(rng.uniform(0.15, 0.9)), pattern)
 
 
 def _shelf(rng: np.random.Generator, _: float) -> _Piece:
@@ -228,7 +221,7 @@ def _plant(rng: np.random.Generator, _: float) -> _Piece:
     ]
 
 
-def _paint(low: Array, high: Array, rng: np.random.Generator) -> tuple[str, Mesh, Material, Array]:
+def _paint(low: Array, high: Array, rng: np.random.Generator) -> _Part:
     """A coloured rectangle on a wall or the floor, at any angle."""
     size = rng.uniform([0.1, 0.3], [0.8, 1.6])
     kind = int(rng.integers(4))

@@ -1,6 +1,6 @@
 """A spinning LiDAR: beam table, firing times, finite beams with mixed pixels, and the errors of real ones."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +11,6 @@ from lce_rig.core.data_sheets import DataSheet
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.options import LidarNoise
 from lce_rig.simulate.scene import Hits, Scene, join_rows, put_rows
-
-# Beams of finite width: the surfaces that a beam hits, and the single range that it reports.
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +43,7 @@ def receive(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) 
     returns = _echoes(scene, hits, origins, directions)
     if max(*noise.divergence_rad, *noise.exit_size_m, noise.edge_growth_m) == 0.0:
         return returns
-    is_split = _touches_several(scene, hits, origins, directions, noise)
-    split = np.flatnonzero(is_split)
+    split = np.flatnonzero(_touches_several(scene, hits, origins, directions, noise))
     return put_rows(returns, split, _mix(scene, origins[split], directions[split], noise))
 
 
@@ -58,17 +55,13 @@ def _echoes(scene: Scene, hits: Hits, origins: Array, directions: Array) -> Retu
     return Returns(hits.range_m, reflectivity * cosine, reflectivity, hits.surface)
 
 
-def _footprint(n_across: int, n_up: int) -> Array:
-    """Lay cells of equal energy over a beam: positions (K, 2) in half-widths, an ellipse of radius 1."""
-    across = (np.arange(n_across) + 0.5) / n_across * 2 - 1
-    up = (np.arange(n_up) + 0.5) / n_up * 2 - 1
-    cells = np.stack(np.meshgrid(across, up, indexing="ij"), axis=-1).reshape(-1, 2)
-    return np.asarray(cells[np.hypot(cells[:, 0], cells[:, 1]) <= 1.0])
-
-
 #: Where a beam is probed for a second surface, in half-widths.
 _PROBES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-_CELLS = _footprint(16, 8)
+# Cells of equal energy over a beam: positions (K, 2) in half-widths, within an ellipse of radius 1.
+_GRID = np.stack(np.meshgrid((np.arange(16) - 7.5) / 8, (np.arange(8) - 3.5) / 4, indexing="ij"), axis=-1)
+_CELLS = _GRID[np.hypot(_GRID[..., 0], _GRID[..., 1]) <= 1.0]
+#: Surfaces of one footprint nearer to each other than this blend into one return.
+_PULSE_M = 0.5
 
 
 def _sub_rays(origins: Array, directions: Array, cells: Array, noise: LidarNoise) -> tuple[Array, Array]:
@@ -115,7 +108,7 @@ def _mix(scene: Scene, origins: Array, directions: Array, noise: LidarNoise) -> 
     safe_range = np.where(is_hit, range_m, 0.0)
     energy = np.where(is_hit, energy / k, 0.0)
     with np.errstate(invalid="ignore"):
-        is_gap = np.diff(range_m, axis=1, prepend=range_m[:, :1]) > noise.pulse_m
+        is_gap = np.diff(range_m, axis=1, prepend=range_m[:, :1]) > _PULSE_M
     group = np.cumsum(is_gap, axis=1) + k * np.arange(n)[:, None]
 
     def total(values: Array) -> Array:
@@ -164,7 +157,6 @@ class LidarModel:
         starts_ns: (L,) when each laser fires after the first of its sequence.
         sequence_ns: time between two sequences.
         period_ns: of one revolution.
-        cut_azimuth_rad: where a scan begins; the rotor turns clockwise as seen from above.
     """
 
     name: str
@@ -175,7 +167,6 @@ class LidarModel:
     starts_ns: NDArray[np.int64]
     sequence_ns: int
     period_ns: int
-    cut_azimuth_rad: float = np.pi
 
     @classmethod
     def of(cls, sheet: DataSheet, rate_hz: float) -> "LidarModel":
@@ -252,8 +243,16 @@ def sweep_scene(
         returns = receive(scene, origins_world, directions_world, noise)
         is_rim = _near_border(scene, origins_world, directions_world, returns, noise)
     else:
-        instants = _instants(scene, board_at, stamp_ns + offset_ns)
-        returns, is_rim = _receive_moving(instants, origins_world, directions_world, noise)
+        # Stretches of firings during which the board hardly moves are traced in a scene of their own.
+        edges = np.append(np.arange(0, len(laser), _FIRINGS_PER_INSTANT), len(laser))
+        middles_ns = stamp_ns + (offset_ns[edges[:-1]] + offset_ns[edges[1:] - 1]) // 2
+        parts, rims = [], []
+        for first, last, T_world_board in zip(edges[:-1], edges[1:], board_at(middles_ns), strict=True):
+            moved = scene.with_board_at(T_world_board)
+            origins, directions = origins_world[first:last], directions_world[first:last]
+            parts.append(receive(moved, origins, directions, noise))
+            rims.append(_near_border(moved, origins, directions, parts[-1], noise))
+        returns, is_rim = join_rows(parts), np.concatenate(rims)
     return Sweep(laser, offset_ns, azimuth_rad, returns, is_rim)
 
 
@@ -269,26 +268,22 @@ def sweep_again(
         scene: the same room with them.
         T_world_lidar, model, noise: as for the scan.
     """
-    near = np.flatnonzero(_may_meet(scene, T_world_lidar, empty.azimuth_rad))
+    bodies = [surface.mesh.vertices for surface in scene.moving.surfaces]
+    bodies.append(transform(scene.T_world_board, scene.board.outline()))
+    points = transform(invert(T_world_lidar), np.concatenate(bodies))
+    if np.hypot(points[:, 0], points[:, 1]).min() < _NEAREST_M:
+        near = np.arange(len(empty.laser))
+    else:
+        x, y = points[:, :2].mean(axis=0)
+        middle_rad = np.arctan2(y, x)
+        spread = np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - middle_rad)))
+        around = np.angle(np.exp(1j * (empty.azimuth_rad - middle_rad)))
+        near = np.flatnonzero((around > spread.min() - _MARGIN_RAD) & (around < spread.max() + _MARGIN_RAD))
     origins, directions = _beams(model, T_world_lidar, empty.laser[near], empty.azimuth_rad[near])
     part = receive(scene, origins, directions, noise)
     is_rim = empty.is_rim.copy()
     is_rim[near] = _near_border(scene, origins, directions, part, noise)
     return replace(empty, returns=put_rows(empty.returns, near, part), is_rim=is_rim)
-
-
-def _may_meet(scene: Scene, T_world_lidar: Array, azimuth_rad: Array) -> NDArray[np.bool_]:
-    """Find which beams at azimuths (N,) may meet the board or its carrier."""
-    bodies = [surface.mesh.vertices for surface in scene.moving.surfaces]
-    bodies.append(transform(scene.T_world_board, scene.board.outline()))
-    points = transform(invert(T_world_lidar), np.concatenate(bodies))
-    if np.hypot(points[:, 0], points[:, 1]).min() < _NEAREST_M:
-        return np.ones(len(azimuth_rad), dtype=np.bool_)
-    x, y = points[:, :2].mean(axis=0)
-    middle_rad = np.arctan2(y, x)
-    spread = np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - middle_rad)))
-    around = np.angle(np.exp(1j * (azimuth_rad - middle_rad)))
-    return np.asarray((around > spread.min() - _MARGIN_RAD) & (around < spread.max() + _MARGIN_RAD))
 
 
 def measure_sweep(
@@ -316,7 +311,14 @@ def measure_sweep(
     """
     laser, returns = sweep.laser, sweep.returns
     bias_m = np.zeros(len(model.elevations_rad)) if laser_bias_m is None else laser_bias_m
-    range_m, intensity = _measure(returns, bias_m[laser], noise, rng)
+    # 100 is the intensity of a white diffuse surface.
+    intensity = np.clip(100.0 * returns.energy, 0.0, 255.0)
+    range_m = returns.range_m + bias_m[laser] + noise.range_offset_m
+    range_m += noise.dark_bias_m * (1.0 - returns.reflectivity)
+    range_m += noise.weak_bias_m * np.clip(1.0 - intensity / 30.0, 0.0, 1.0)
+    range_m += noise.range_sigma_m * rng.standard_normal(len(range_m))
+    if noise.is_quantised:
+        range_m, intensity = np.rint(range_m / noise.range_step_m) * noise.range_step_m, np.rint(intensity)
     spread_rad = noise.rim_spread_rad * rng.uniform(-1.0, 1.0, len(range_m))
     azimuth_rad = sweep.azimuth_rad + np.where(sweep.is_rim, spread_rad, 0.0)
     if noise.is_quantised:
@@ -335,41 +337,6 @@ def measure_sweep(
         offset_ns=sweep.offset_ns[keep],
         host_ns=stamp_ns + model.period_ns,
     )
-
-
-def _instants(
-    scene: Scene, board_at: Callable[[NDArray[np.int64]], Array], t_ns: NDArray[np.int64]
-) -> Iterator[tuple[slice, Scene]]:
-    """Cut firings at times (N,) into stretches during which the board hardly moves, each with its scene."""
-    edges = np.append(np.arange(0, len(t_ns), _FIRINGS_PER_INSTANT), len(t_ns))
-    middles_ns = (t_ns[edges[:-1]] + t_ns[edges[1:] - 1]) // 2
-    for first, last, T_world_board in zip(edges[:-1], edges[1:], board_at(middles_ns), strict=True):
-        yield slice(int(first), int(last)), scene.with_board_at(T_world_board)
-
-
-def _receive_moving(
-    instants: Iterable[tuple[slice, Scene]], origins: Array, directions: Array, noise: LidarNoise
-) -> tuple[Returns, NDArray[np.bool_]]:
-    """Trace each stretch of beams (N, 3) in its own scene; also return which hit the board's border."""
-    parts, rims = [], []
-    for beams, scene in instants:
-        parts.append(receive(scene, origins[beams], directions[beams], noise))
-        rims.append(_near_border(scene, origins[beams], directions[beams], parts[-1], noise))
-    return join_rows(parts), np.concatenate(rims)
-
-
-def _measure(
-    returns: Returns, bias_m: Array, noise: LidarNoise, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Turn returns into measured ranges (N,) and intensities (N,), 100 for a white diffuse surface."""
-    intensity = np.clip(100.0 * returns.energy, 0.0, 255.0)
-    range_m = returns.range_m + bias_m + noise.range_offset_m
-    range_m += noise.dark_bias_m * (1.0 - returns.reflectivity)
-    range_m += noise.weak_bias_m * np.clip(1.0 - intensity / 30.0, 0.0, 1.0)
-    range_m += noise.range_sigma_m * rng.standard_normal(len(range_m))
-    if noise.is_quantised:
-        return np.rint(range_m / noise.range_step_m) * noise.range_step_m, np.rint(intensity)
-    return range_m, intensity
 
 
 def _beams(
@@ -401,7 +368,8 @@ def _firings(
     sequence = np.repeat(np.arange(n_sequences), n_lasers)
     offset_ns = (sequence * model.sequence_ns + model.starts_ns[laser]).astype(np.int64)
     # The rotor is not synchronised with the firings: each scan begins anywhere within one step.
-    start_rad = model.cut_azimuth_rad - model.step_rad * rng.uniform()
+    # It turns clockwise as seen from above, from straight behind.
+    start_rad = np.pi - model.step_rad * rng.uniform()
     azimuth_rad = start_rad - 2 * np.pi * offset_ns / model.period_ns
     if model.azimuths_rad.any():
         azimuth_rad = azimuth_rad + model.azimuths_rad[laser]

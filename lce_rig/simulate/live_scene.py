@@ -1,7 +1,6 @@
 """A board in front of the simulated sensors, still or moving, at any time."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,19 +26,6 @@ _SPARE_PX = 128
 _PHASES = 5
 
 
-@dataclass(frozen=True, eq=False)
-class _Light:
-    """The light on a sensor, and its noise.
-
-    Attributes:
-        linear: (H, W, 3), white is 1.
-        sigma: (H, W, 3) standard deviation of the noise; None without.
-    """
-
-    linear: NDArray[np.float32]
-    sigma: NDArray[np.float32] | None
-
-
 class LiveScene:
     """Renders images and scans of a moving board.
 
@@ -63,7 +49,7 @@ class LiveScene:
         self._noise = self.stage.rng(OF_SESSION, _NOISE_STREAM)
         self._is_held = True
         self._scene: Scene | None = None
-        self._light: dict[str, _Light] = {}
+        self._light: dict[str, NDArray[np.float32]] = {}
         self._sweeps: dict[str, Sweep] = {}
         self._rooms: dict[str, list[Sweep]] = {}
         self._phase = 0
@@ -95,13 +81,35 @@ class LiveScene:
 
     def take_images(self, stamp_ns: int) -> Iterator[Image]:
         """Take an image of each camera."""
-        for camera in self.stage.framed:
-            yield self._take_image(camera, stamp_ns)
+        stage, noise = self.stage, self.stage.options.camera
+        for camera in stage.framed:
+            backdrop = stage.backdrops[camera]
+            if self._is_held:
+                if camera not in self._light:
+                    self._light[camera] = focus(render_radiance(self._render(), backdrop), noise)
+                pixels = develop(self._with_noise(camera, self._light[camera]))
+            else:
+                if camera not in self._empty:
+                    self._empty[camera] = develop(self._with_noise(camera, focus(backdrop.radiance, noise)))
+                pixels = np.array(self._empty[camera])
+                part, linear = glance(self._render(), backdrop, noise)
+                pixels[part] = develop(self._with_noise(camera, linear))
+            channel = stage.rig.cameras[camera].first_channel("frames") or "frames"
+            yield Image(camera, channel, stamp_ns, pixels, stamp_ns)
 
     def take_scans(self, stamp_ns: int) -> Iterator[Scan]:
         """Take a scan of each LiDAR that begins at a time."""
-        for lidar in self.stage.models:
-            yield self._take_scan(lidar, stamp_ns)
+        stage = self.stage
+        for lidar, model in stage.models.items():
+            noise, T_world_lidar = stage.noise[lidar], stage.T_world_sensor[lidar]
+            if lidar not in self._sweeps:
+                rooms = self._rooms.setdefault(lidar, [])
+                if len(rooms) <= self._phase:
+                    empty = Scene(stage.room.raycaster, (), stage.board, _NOWHERE)
+                    rooms.append(sweep_scene(empty, T_world_lidar, model, noise, self._noise))
+                room = rooms[min(self._phase, len(rooms) - 1)]
+                self._sweeps[lidar] = sweep_again(room, self._render(), T_world_lidar, model, noise)
+            yield stage.measure(lidar, self._sweeps[lidar], self._noise, stamp_ns)
 
     def _show(self, T_world_board: Array, *, is_held: bool) -> None:
         self.T_world_board, self._is_held = T_world_board, is_held
@@ -109,61 +117,19 @@ class LiveScene:
         self._light.clear()
         self._sweeps.clear()
 
-    def _take_image(self, camera: str, stamp_ns: int) -> Image:
-        stage = self.stage
-        if self._is_held and camera not in self._light:
-            self._light[camera] = self._expose(
-                focus(render_radiance(self._render(), self.stage.backdrops[camera]), stage.options.camera)
-            )
-        is_held = self._is_held
-        pixels = develop(self._with_noise(camera, self._light[camera])) if is_held else self._glance(camera)
-        channel = stage.rig.cameras[camera].first_channel("frames") or "frames"
-        return Image(camera, channel, stamp_ns, pixels, stamp_ns)
-
-    def _glance(self, camera: str) -> NDArray[np.uint8]:
-        """Take an image of a board on its way."""
-        noise, backdrop = self.stage.options.camera, self.stage.backdrops[camera]
-        if camera not in self._empty:
-            light = self._expose(focus(backdrop.radiance, noise))
-            self._empty[camera] = develop(self._with_noise(camera, light))
-        pixels = np.array(self._empty[camera])
-        part, linear = glance(self._render(), backdrop, noise)
-        pixels[part] = develop(self._with_noise(camera, self._expose(linear)))
-        return pixels
-
-    def _expose(self, linear: NDArray[np.float32]) -> _Light:
-        """Find the noise of the light (h, w, 3) on a sensor."""
+    def _with_noise(self, camera: str, linear: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Add noise to light (h, w, 3): a piece of a field that is drawn once, cut out at a random place."""
         noise = self.stage.options.camera
         if not np.isfinite(noise.full_well_e):
-            return _Light(linear, None)
-        return _Light(linear, np.asarray(shot_noise_e(linear, noise) / np.float32(noise.full_well_e)))
-
-    def _with_noise(self, camera: str, light: _Light) -> NDArray[np.float32]:
-        """Add noise: a piece of a field that is drawn once, cut out at a random place."""
-        if light.sigma is None:
-            return light.linear
+            return linear
         if camera not in self._normals:
             height, width = self.stage.backdrops[camera].range_m.shape
             shape = height + _SPARE_PX, width + _SPARE_PX, 3
             self._normals[camera] = self._noise.standard_normal(shape, dtype=np.float32)
-        height, width = light.linear.shape[:2]
+        height, width = linear.shape[:2]
         v, u = self._noise.integers(_SPARE_PX, size=2)
-        noisy = self._normals[camera][v : v + height, u : u + width] * light.sigma
-        noisy += light.linear
-        return noisy
-
-    def _take_scan(self, lidar: str, stamp_ns: int) -> Scan:
-        stage = self.stage
-        model, noise = stage.models[lidar], stage.noise[lidar]
-        if lidar not in self._sweeps:
-            T_world_lidar = stage.T_world_sensor[lidar]
-            rooms = self._rooms.setdefault(lidar, [])
-            if len(rooms) <= self._phase:
-                empty = Scene(stage.room.raycaster, (), stage.board, _NOWHERE)
-                rooms.append(sweep_scene(empty, T_world_lidar, model, noise, self._noise))
-            room = rooms[min(self._phase, len(rooms) - 1)]
-            self._sweeps[lidar] = sweep_again(room, self._render(), T_world_lidar, model, noise)
-        return stage.measure(lidar, self._sweeps[lidar], self._noise, stamp_ns)
+        sigma = shot_noise_e(linear, noise) / np.float32(noise.full_well_e)
+        return np.asarray(self._normals[camera][v : v + height, u : u + width] * sigma + linear)
 
     def _render(self) -> Scene:
         if self._scene is None:

@@ -27,7 +27,6 @@ class LidarNoise:
             reach 9-10 mm beyond a board's border, as they do on real recordings.
         divergence_rad: full opening of the beam, horizontal and vertical.
         exit_size_m: size of the beam where it leaves the sensor, horizontal and vertical.
-        pulse_m: surfaces nearer to each other than this blend into one return.
         dropout: probability that a return is lost.
         range_step_m: resolution of ranges.
         is_quantised: whether ranges come in such steps and azimuths in steps of 0.01 deg.
@@ -42,7 +41,6 @@ class LidarNoise:
     edge_growth_m: float = VLP_16.rim_m
     divergence_rad: tuple[float, float] = VLP_16.divergence_rad
     exit_size_m: tuple[float, float] = VLP_16.exit_m
-    pulse_m: float = 0.5
     dropout: float = 0.002
     range_step_m: float = VLP_16.range_step_m
     is_quantised: bool = True
@@ -111,8 +109,7 @@ class EventNoise:
         refractory_s: how long a pixel is blind after each event.
         leak_hz: ON events of a pixel that sees nothing change.
         noise_hz: further events of each pixel, of either polarity, twice as many in the dark.
-        hot_share: share of the pixels that fire all the time ...
-        hot_hz: ... at rates between these.
+        hot_share: share of the pixels that fire all the time, at 10 to 300 Hz.
         dark_radiance: apparent radiance of a black pixel: stray light in the lens, and dark current.
     """
 
@@ -125,7 +122,6 @@ class EventNoise:
     leak_hz: float = 0.05
     noise_hz: float = 0.06
     hot_share: float = 2e-4
-    hot_hz: tuple[float, float] = (10.0, 300.0)
     dark_radiance: float = 0.03
 
     @classmethod
@@ -187,7 +183,6 @@ class SimulationOptions:
             ones at most; never more than 0.8 of the tolerances that the profile gives.
         mounting_seed: of the true extrinsics and of the sensors' own errors; None for the session's seed.
             Sessions of one mounting seed are of one rig, with other placements, room and noise.
-        lidar_height_m: height of the LiDAR above the floor.
         print_reflectivity: of the dark squares at 905 nm (the ink of the paper's boards is bright there).
         motion: whether the board is held still or moved by hand; only a moving one makes events.
         hand: how it moves.
@@ -195,7 +190,7 @@ class SimulationOptions:
         events_span_s: how long before and after a scan's timestamp a capture's events begin and end.
         exposure_s: of a moving board's images.
         frame_every_s: between the images of a camera that runs freely while the board moves.
-        flicker_depth, flicker_hz: how much the lamps' light swings, to event cameras, and how often a second.
+        flicker_depth: how much the lamps' light swings, to event cameras, at 100 Hz.
         frame_offset_s, event_offset_s: how far the timestamps of images and of events are ahead of the
             LiDAR's clock, which is the rig's.
     """
@@ -214,7 +209,6 @@ class SimulationOptions:
     truth_rotation_deg: float = 2.0
     truth_translation_m: float = 0.02
     mounting_seed: int | None = None
-    lidar_height_m: float = 1.0
     print_reflectivity: float = 0.85
     motion: Motion = "still"
     hand: HandMotion = field(default_factory=HandMotion)
@@ -223,7 +217,6 @@ class SimulationOptions:
     exposure_s: float = 0.008
     frame_every_s: float = 0.05
     flicker_depth: float = 0.0
-    flicker_hz: float = 100.0
     frame_offset_s: float = 0.0
     event_offset_s: float = 0.0
 
@@ -232,6 +225,10 @@ class SimulationOptions:
             raise ValueError(f"noise_level is 1..{len(PAPER_RANGE_SIGMA_M)}, not {self.noise_level}")
         if not 0 < self.distance_m[0] <= self.distance_m[1]:
             raise ValueError(f"distance_m must be (near, far) with 0 < near <= far, not {self.distance_m}")
+
+    def mounting_of(self, seed: int) -> int:
+        """Return the seed of the mounting in the session of a seed."""
+        return seed if self.mounting_seed is None else self.mounting_seed
 
     def noise_of(self, sheet: DataSheet) -> LidarNoise:
         """Give the errors of a LiDAR, with the options that change them applied."""

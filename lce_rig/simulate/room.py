@@ -25,6 +25,7 @@ _POSTER = Material((0.9, 0.9, 0.9), 0.8, "poster")
 _LAMP = Material((1.0, 1.0, 1.0), 0.7, emission=1.6)
 _WINDOW = Material((0.95, 0.90, 0.86), 0.0, "window", emission=1.0)
 
+LIDAR_HEIGHT_M = 1.0
 # Room frame: x along the first camera's sight, y left, z up, origin on the floor below the LiDAR.
 _LOW = np.array([-4.6, -3.1, 0.0])
 _HIGH = np.array([9.0, 3.4, 3.1])
@@ -74,7 +75,6 @@ def build_room(
     heading_rad: float,
     rng: np.random.Generator,
     decoy: Board | None = None,
-    lidar_height_m: float = 1.0,
     *,
     is_furnished: bool = False,
 ) -> Room:
@@ -84,24 +84,21 @@ def build_room(
         heading_rad: azimuth that the first camera looks along, world.
         rng: source of the room's turn against the rig, of the decoy's place and of drawn furniture.
         decoy: a blank plate of this board's size stands at the side; None for none.
-        lidar_height_m: height of the LiDAR, about which the decoy hangs.
         is_furnished: whether the room's size and furniture are drawn, instead of one room for all.
     """
     turn_rad = heading_rad + np.radians(rng.uniform(-6.0, 6.0))
     T_world_room = pose(_turn_z(turn_rad), np.zeros(3))
     low, high, obstacles = _LOW, _HIGH, _OBSTACLES
-    T_room_decoy = None
-    if decoy is not None:
-        T_room_decoy = _decoy_pose(rng, lidar_height_m)
+    T_room_decoy = None if decoy is None else _decoy_pose(rng)
     if is_furnished:
         low, high = (
             low + rng.uniform([-1, -1, 0], [1, 0.6, 0]),
             high + rng.uniform([-1, -0.6, -0.5], [3, 1, 0.6]),
         )
-        furnishing = draw_furniture(low, high, rng)
-        parts, obstacles = [*_shell(low, high), *furnishing.parts], tuple(furnishing.obstacles)
+        pieces, bounds = draw_furniture(low, high, rng)
+        parts, obstacles = [*_shell(low, high), *pieces], tuple(bounds)
     else:
-        parts = [*_shell(low, high), *_furniture(), *_posters()]
+        parts = [*_shell(low, high), *_furniture()]
     if decoy is not None and T_room_decoy is not None:
         parts += _decoy(decoy, T_room_decoy)
     surfaces = [
@@ -158,6 +155,9 @@ def _furniture() -> list[_Part]:
     pillar = box((0.6, 0.6, 3.1), (5.2, 1.5, 1.55))
     legs = [cone((x, y, 0), (x, y, 0.72), 0.025) for x in (4.7, 6.2) for y in (-2.95, -2.1)]
     screen = box((0.05, 0.55, 0.34), (5.3, -2.55, 1.1))
+    left, right, front, back = (
+        np.array(v, dtype=np.float64) for v in ([0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0])
+    )
     return [
         _part("pillar", pillar, _WALL),
         _part("skirting", box((0.64, 0.64, 0.12), (5.2, 1.5, 0.06)), _SKIRTING),
@@ -170,14 +170,6 @@ def _furniture() -> list[_Part]:
         _part("shelf", box((0.6, 0.8, 1.9), (2.25, 2.98, 0.95)), _WOOD),
         _part("door", box((1.0, 0.06, 2.1), (2.6, -3.08, 1.05)), _WOOD),
         _part("window frame", box((0.08, 3.7, 2.0), (8.98, 0.6, 1.7)), _DARK),
-    ]
-
-
-def _posters() -> list[_Part]:
-    left, right, front, back = (
-        np.array(v, dtype=np.float64) for v in ([0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0])
-    )
-    return [
         _on_wall("window", (3.6, 1.9), np.array([8.93, 0.6, 1.7]), front, _WINDOW),
         _on_wall("poster", (0.9, 1.2), np.array([4.9, 3.39, 1.55]), left, _POSTER),
         _on_wall("poster", (0.9, 1.2), np.array([7.4, -3.09, 1.6]), right, _POSTER),
@@ -187,11 +179,11 @@ def _posters() -> list[_Part]:
     ]
 
 
-def _decoy_pose(rng: np.random.Generator, height_m: float) -> Array:
-    """Choose where the decoy hangs, about facing the rig, in the room frame."""
+def _decoy_pose(rng: np.random.Generator) -> Array:
+    """Choose where the decoy hangs at the LiDAR's height, about facing the rig, in the room frame."""
     azimuth_rad = rng.choice([-1.0, 1.0]) * np.radians(rng.uniform(50.0, 75.0))
     distance_m = rng.uniform(1.9, 2.3)
-    at = np.array([distance_m * np.cos(azimuth_rad), distance_m * np.sin(azimuth_rad), height_m])
+    at = np.array([distance_m * np.cos(azimuth_rad), distance_m * np.sin(azimuth_rad), LIDAR_HEIGHT_M])
     facing = _turn_z(azimuth_rad + np.radians(rng.uniform(-15.0, 15.0))) @ np.array([-1.0, 0.0, 0.0])
     upright = np.stack([np.cross([0.0, 0.0, 1.0], facing), [0.0, 0.0, 1.0], facing], axis=1)
     return pose(upright @ _turn_z(np.radians(rng.uniform(35.0, 55.0))), at)

@@ -17,7 +17,7 @@ from lce_rig.simulate.event_camera import EventPixels, draw_pixels
 from lce_rig.simulate.lidar import LidarModel, Sweep, measure_sweep
 from lce_rig.simulate.options import LidarNoise, SimulationOptions
 from lce_rig.simulate.poses import CameraView, place_board
-from lce_rig.simulate.room import Room, build_room
+from lce_rig.simulate.room import LIDAR_HEIGHT_M, Room, build_room
 
 # Independent streams of random numbers, so that more captures or another camera change nothing else.
 # Streams of a session are [seed, OF_SESSION, stream, ...], those of a capture [seed, index, stream, ...].
@@ -131,26 +131,39 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
         ProfileError: a LiDAR's model is unknown, or no camera has a channel that can be simulated.
     """
     options = options or SimulationOptions.for_rig(rig.name)
-    T_world_base = pose(np.eye(3), np.array([0.0, 0.0, options.lidar_height_m]))
+    T_world_base = pose(np.eye(3), np.array([0.0, 0.0, LIDAR_HEIGHT_M]))
     T_world_sensor = {name: T_world_base @ T for name, T in _sensor_poses(rig, seed, options).items()}
-    cameras = _simulated_cameras(rig, options)
+    kinds: tuple[Literal["frames", "events"], ...] = ("frames",)
+    if options.motion == "moving":
+        kinds = ("frames", "events")
+    cameras = [name for name, camera in rig.cameras.items() if any(map(camera.first_channel, kinds))]
+    if not cameras:
+        hint = "Of a board held still, only frames can be simulated: events need motion."
+        raise ProfileError(f"rig {rig.name}: no camera has a channel of kind {' or '.join(kinds)}", hint)
     sight = T_world_sensor[cameras[0]][:3, 2]
     room = build_room(
         float(np.arctan2(sight[1], sight[0])),
         np.random.default_rng([seed, OF_SESSION, ROOM]),
         rig.board.to_board() if options.has_decoy_plate else None,
-        options.lidar_height_m,
         is_furnished=options.is_furnished,
     )
     lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
-    sheets = {name: _data_sheet(rig, name) for name in rig.lidars}
+    sheets: dict[str, DataSheet] = {}
+    for name, settings in rig.lidars.items():
+        sheet = settings.data_sheet()
+        if sheet is None:
+            hint = f"Known: {', '.join(s.name for s in DATA_SHEETS)}. For others, set elevations_deg."
+            raise ProfileError(f"lidars.{name}.model: {settings.model} cannot be simulated", hint)
+        sheets[name] = sheet
     models = {name: LidarModel.of(sheet, rig.lidars[name].rate_hz) for name, sheet in sheets.items()}
     noise = {name: options.noise_of(sheet) for name, sheet in sheets.items()}
-    mounted = _mounting_seed(seed, options)
-    bias = {
-        name: _laser_bias(models[name], np.random.default_rng([mounted, OF_SESSION, LASERS, k]), noise[name])
-        for k, name in enumerate(rig.lidars)
-    }
+    mounted = options.mounting_of(seed)
+    bias = {}
+    for k, (name, model) in enumerate(models.items()):
+        drawn = np.random.default_rng([mounted, OF_SESSION, LASERS, k]).standard_normal(len(model.starts_ns))
+        bias_m = noise[name].laser_sigma_m * drawn
+        # The mean of all lasers is `LidarNoise.range_offset_m` and nothing else.
+        bias[name] = np.asarray(bias_m - bias_m.mean())
     pixels = {
         name: draw_pixels(
             lenses[name], options.events, np.random.default_rng([mounted, OF_SESSION, PIXELS, k])
@@ -172,28 +185,11 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     )
 
 
-def _mounting_seed(seed: int, options: SimulationOptions) -> int:
-    return seed if options.mounting_seed is None else options.mounting_seed
-
-
-def _simulated_cameras(rig: Rig, options: SimulationOptions) -> list[str]:
-    kinds: tuple[Literal["frames", "events"], ...] = ("frames",)
-    if options.motion == "moving":
-        kinds = ("frames", "events")
-    cameras = [
-        name for name, camera in rig.cameras.items() if any(camera.first_channel(kind) for kind in kinds)
-    ]
-    if not cameras:
-        hint = "Of a board held still, only frames can be simulated: events need motion."
-        raise ProfileError(f"rig {rig.name}: no camera has a channel of kind {' or '.join(kinds)}", hint)
-    return cameras
-
-
 def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Array]:
     """Chain the perturbed nominal extrinsics into T_base_sensor, the base being the first LiDAR."""
     links: list[tuple[str, str, Array]] = []
     for index, entry in enumerate(rig.nominal_extrinsics):
-        rng = np.random.default_rng([_mounting_seed(seed, options), OF_SESSION, TRUTH, index])
+        rng = np.random.default_rng([options.mounting_of(seed), OF_SESSION, TRUTH, index])
         angle_deg = min(options.truth_rotation_deg, 0.8 * entry.tolerance_deg) * rng.uniform(0.4, 1.0)
         shift_m = min(options.truth_translation_m, 0.8 * entry.tolerance_m) * rng.uniform(0.4, 1.0)
         axes = rng.standard_normal((2, 3))
@@ -213,17 +209,3 @@ def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, 
     for name in rig.lidars:
         T_base.setdefault(name, np.eye(4))
     return T_base
-
-
-def _data_sheet(rig: Rig, lidar: str) -> DataSheet:
-    sheet = rig.lidars[lidar].data_sheet()
-    if sheet is None:
-        hint = f"Known: {', '.join(each.name for each in DATA_SHEETS)}. For others, set elevations_deg."
-        raise ProfileError(f"lidars.{lidar}.model: {rig.lidars[lidar].model} cannot be simulated", hint)
-    return sheet
-
-
-def _laser_bias(model: LidarModel, rng: np.random.Generator, noise: LidarNoise) -> Array:
-    """Draw each laser's offset; their mean is `LidarNoise.range_offset_m` and nothing else."""
-    bias = noise.laser_sigma_m * rng.standard_normal(len(model.elevations_rad))
-    return np.asarray(bias - bias.mean())

@@ -18,10 +18,8 @@ from lce_rig.simulate.event_camera import EventCamera
 from lce_rig.simulate.image_rendering import sensor_gain
 from lce_rig.simulate.light import irradiance, reached
 from lce_rig.simulate.options import CameraNoise
-from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO, Hits, Raycaster, Scene
+from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO, Hits, Scene
 from lce_rig.simulate.trajectory import Trajectory
-
-# The board's carrier for event cameras: rendered at intervals, shifted and blended in between.
 
 GREY = np.array([0.114, 0.587, 0.299])
 #: Assumed place of the carrier's middle, m behind the board: decides how its image shifts.
@@ -83,8 +81,11 @@ def render_carrier(scene: Scene, backdrop: Backdrop, blur_px: float) -> CarrierL
     import cv2
 
     middle = carrier_middle(backdrop, scene.T_world_board)
-    window = _window(scene.moving, backdrop)
-    if middle is None or window is None:
+    if middle is None or not scene.moving.surfaces:
+        return None
+    vertices = np.concatenate([surface.mesh.vertices for surface in scene.moving.surfaces])
+    window = _pixel_window(vertices, backdrop, _MARGIN_PX, _MARGIN_PX)
+    if window is None:
         return None
     rows, cols = window
     corners = backdrop.corner_rays[rows.start : rows.stop + 1, cols.start : cols.stop + 1]
@@ -107,15 +108,12 @@ def render_carrier(scene: Scene, backdrop: Backdrop, blur_px: float) -> CarrierL
     )
 
 
-def _window(moving: Raycaster, backdrop: Backdrop) -> Window | None:
-    """Bound the pixels that the carrier covers."""
-    if not moving.surfaces:
-        return None
-    vertices = np.concatenate([surface.mesh.vertices for surface in moving.surfaces])
-    pixels, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), vertices))
+def _pixel_window(points: Array, backdrop: Backdrop, before_px: int, after_px: int) -> Window | None:
+    """Bound the pixels of points (N, 3), world, with margins; None where the image shows none."""
+    pixels, is_valid = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam), points))
     if not is_valid.any():
         return None
-    low, high = pixels[is_valid].min(axis=0) - _MARGIN_PX, pixels[is_valid].max(axis=0) + _MARGIN_PX
+    low, high = pixels[is_valid].min(axis=0) - before_px, pixels[is_valid].max(axis=0) + after_px
     return clip_window(np.stack([low, high]), backdrop)
 
 
@@ -129,24 +127,11 @@ def clip_window(bounds_px: Array, backdrop: Backdrop) -> Window | None:
 Float = NDArray[np.float32]
 _KEY_NS = 250_000_000
 _STEP_PX = 0.4
-_STEPS_PER_FLICKER = 16
+_FLICKER_HZ, _STEPS_PER_FLICKER = 100.0, 16
 _STEP_NS = (500_000, 5_000_000)
 _ALONG = np.linspace(0, 1, 17)[:, None, None]
 # Mean square distance of a pixel's area from its middle, px^2, along one axis.
 _PIXEL_AREA_PX2 = 1 / 12
-
-
-@dataclass(frozen=True, eq=False)
-class _Key:
-    """The parts computed at intervals: the carrier's image, and the light on the board.
-
-    Attributes:
-        carrier: None where there is none to be seen.
-        light: (4,) of light = a + b x + c y + d x y over the board, on its printed side.
-    """
-
-    carrier: CarrierLayer | None
-    light: Array
 
 
 @dataclass(eq=False)
@@ -159,7 +144,7 @@ class MovingView:
         trajectory: where it is.
         scene_at: the scene at a time of the rig's clock, ns: for the carrier.
         lens: the camera's errors; blur, exposure and vignetting count.
-        flicker_depth, flicker_hz: the lamps' light is 1 + depth sin(2 pi f t).
+        flicker_depth: the lamps' light is 1 + depth sin(2 pi f t) at 100 Hz.
     """
 
     backdrop: Backdrop
@@ -168,8 +153,7 @@ class MovingView:
     scene_at: Callable[[int], Scene]
     lens: CameraNoise
     flicker_depth: float = 0.0
-    flicker_hz: float = 100.0
-    _keys: dict[int, _Key] = field(default_factory=dict)
+    _keys: dict[int, tuple[CarrierLayer | None, Array]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         import cv2
@@ -192,10 +176,12 @@ class MovingView:
         if layers is not None:
             window, both = layers
             seen[window] += both[..., 0] - both[..., 1] * seen[window]
-        board_window = self._board_window(T_world_board)
+        outline = transform(T_world_board, self.board.outline())
+        edges = ((1 - _ALONG) * outline + _ALONG * np.roll(outline, -1, axis=0)).reshape(-1, 3)
+        board_window = _pixel_window(edges, self.backdrop, 4, 5)
         if board_window is not None:
             k, weight = divmod(t_ns, _KEY_NS)
-            before, after = self._key(k).light, self._key(k + 1).light
+            before, after = self._key(k)[1], self._key(k + 1)[1]
             radiance, cover = self._board(
                 board_window,
                 T_world_board,
@@ -206,7 +192,7 @@ class MovingView:
             seen[window] += both[..., 2] - both[..., 3] * seen[window]
         seen *= self._gain
         if self.flicker_depth > 0:
-            cycle = (1e-9 * (t_ns % 1_000_000_000)) * self.flicker_hz
+            cycle = (1e-9 * (t_ns % 1_000_000_000)) * _FLICKER_HZ
             seen *= np.float32(1 + self.flicker_depth * np.sin(2 * np.pi * cycle))
         return np.asarray(seen)
 
@@ -215,19 +201,8 @@ class MovingView:
         speed = speed_px_s(self.trajectory, self.board, self.backdrop, t_ns)
         step_ns = 1e9 * _STEP_PX / max(speed, 1e-3)
         if self.flicker_depth > 0:
-            step_ns = min(step_ns, 1e9 / (_STEPS_PER_FLICKER * self.flicker_hz))
+            step_ns = min(step_ns, 1e9 / (_STEPS_PER_FLICKER * _FLICKER_HZ))
         return int(np.clip(step_ns, *_STEP_NS))
-
-    def _board_window(self, T_world_board: Array) -> Window | None:
-        outline = transform(T_world_board, self.board.outline())
-        edges = ((1 - _ALONG) * outline + _ALONG * np.roll(outline, -1, axis=0)).reshape(-1, 3)
-        pixels, is_valid = self.backdrop.intrinsics.project(
-            transform(invert(self.backdrop.T_world_cam), edges)
-        )
-        if not is_valid.any():
-            return None
-        bounds = np.stack([pixels[is_valid].min(axis=0) - 4, pixels[is_valid].max(axis=0) + 5])
-        return clip_window(bounds, self.backdrop)
 
     def _board(self, window: Window, T_world_board: Array, light: Array) -> tuple[Float, Float]:
         """Compute the board's radiance and its cover (h, w) of each pixel, 0..1."""
@@ -274,7 +249,7 @@ class MovingView:
         """Draw the carrier (h, w, 4) as blended from the images before and after this time."""
         middle = carrier_middle(self.backdrop, T_world_board)
         k, weight = divmod(t_ns, _KEY_NS)
-        first, second = self._key(k).carrier, self._key(k + 1).carrier
+        first, second = self._key(k)[0], self._key(k + 1)[0]
         if middle is None or first is None or second is None:
             return None
         bounds = np.stack([first.bounds_px(*middle), second.bounds_px(*middle)])
@@ -285,13 +260,14 @@ class MovingView:
         share = np.float32(weight / _KEY_NS)
         return window, before + share * (after - before)
 
-    def _key(self, k: int) -> _Key:
+    def _key(self, k: int) -> tuple[CarrierLayer | None, Array]:
+        """Render the carrier, None where it is not visible, and the light (4,) on the board."""
         if k not in self._keys:
             for old in [j for j in self._keys if j < k - 1]:
                 del self._keys[old]
             scene = self.scene_at(k * _KEY_NS)
             carrier = render_carrier(scene, self.backdrop, self.lens.blur_px)
-            self._keys[k] = _Key(carrier, _light_on_board(scene, self.backdrop))
+            self._keys[k] = carrier, _light_on_board(scene, self.backdrop)
         return self._keys[k]
 
 
@@ -316,7 +292,7 @@ def speed_px_s(trajectory: Trajectory, board: Board, backdrop: Backdrop, t_ns: i
 
 
 def _light_on_board(scene: Scene, backdrop: Backdrop) -> Array:
-    """Fit the light (4,) on the side of the board that the camera sees, unshadowed."""
+    """Fit light = a + b x + c y + d x y over the side of the board that the camera sees, unshadowed."""
     x, y = (
         grid.ravel()
         for grid in np.meshgrid(

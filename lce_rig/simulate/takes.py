@@ -76,7 +76,7 @@ class MovingBoard:
         moments_ns = exposed_ns + np.rint(1e9 * options.exposure_s * middles).astype(np.int64)
         scene = self.scene_at(exposed_ns)
         scenes = [scene.with_board_at(T_world_board) for T_world_board in self.trajectory.at(moments_ns)]
-        radiance = np.mean([render_radiance(each, backdrop) for each in scenes], axis=0)
+        radiance = np.mean([render_radiance(moment, backdrop) for moment in scenes], axis=0)
         return _develop(self.stage, camera, radiance, exposed_ns, stream)
 
     def take_scan(self, lidar: str, stamp_ns: int, stream: Stream) -> Scan:
@@ -97,7 +97,6 @@ class MovingBoard:
             self.scene_at,
             options.camera,
             options.flicker_depth,
-            options.flicker_hz,
         )
 
     def event_camera(self, camera: str, view: MovingView, start_ns: int, stream: Stream) -> EventCamera:

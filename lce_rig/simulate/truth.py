@@ -30,7 +30,7 @@ def rig_truth(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Any]
     ]
     return {
         "seed": seed,
-        "mounting_seed": seed if options.mounting_seed is None else options.mounting_seed,
+        "mounting_seed": options.mounting_of(seed),
         "T_cam_lidar": pairs[0]["T_cam_lidar"],
         "pairs": pairs,
         "motion": options.motion,

@@ -134,7 +134,7 @@ def test_two_cameras_take_turns_as_the_one_the_board_is_placed_for() -> None:
 
 
 def test_a_decoy_plate_of_the_boards_size_stands_still_in_all_captures(rig: Rig) -> None:
-    decoy = build_room(0.0, np.random.default_rng(5), rig.board.to_board(), 1.0)
+    decoy = build_room(0.0, np.random.default_rng(5), rig.board.to_board())
     plain = build_room(0.0, np.random.default_rng(5))
     assert decoy.T_world_decoy is not None and plain.T_world_decoy is None
     extra = {surface.name for surface in decoy.raycaster.surfaces} - {

@@ -15,13 +15,13 @@ LOW, HIGH = np.array([-4.0, -3.0, 0.0]), np.array([9.0, 3.2, 3.0])
 
 @pytest.mark.parametrize("seed", range(5))
 def test_pieces_stand_in_the_room_apart_from_each_other_and_from_the_rig(seed: int) -> None:
-    furnishing = draw_furniture(LOW, HIGH, np.random.default_rng(seed))
-    assert 5 <= len(furnishing.obstacles) <= 15
-    for low, high in furnishing.obstacles:
+    _, obstacles = draw_furniture(LOW, HIGH, np.random.default_rng(seed))
+    assert 5 <= len(obstacles) <= 15
+    for low, high in obstacles:
         assert np.all(low[:2] >= LOW[:2]) and np.all(high[:2] <= HIGH[:2]) and low[2] > -0.02
         nearest = np.clip([0.0, 0.0], low[:2], high[:2])
         assert np.hypot(*nearest) > 1.0
-    for one, other in combinations(furnishing.obstacles, 2):
+    for one, other in combinations(obstacles, 2):
         assert np.any(one[0][:2] > other[1][:2]) or np.any(one[1][:2] < other[0][:2])
 
 
