@@ -1,19 +1,18 @@
-"""What a live collection writes to disk: captures and, where wanted, the raw streams beside them."""
+"""Writes captures of a live collection and, on request, the raw streams beside them."""
 
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import CaptureMoment, ImageKey
+from lce_rig.collect.board_tracker import CaptureMoment
 from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.offline.stored_events import StoredEvents
 from lce_rig.collect.placement_dedupe import board_figures
-from lce_rig.core.data import Image, Sample
-from lce_rig.core.results import ImageBoard
+from lce_rig.core.data import Sample
 from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.reading import LiveSource
 from lce_rig.io.folder.folder_recorder import FolderRecorder
@@ -22,45 +21,20 @@ from lce_rig.session import Session
 from lce_rig.timing.event_buffer import EventCut
 
 
-@dataclass(frozen=True, eq=False)
-class Task:
+class Task(NamedTuple):
     """One capture to be written.
 
     Attributes:
-        moment: what the sensors saw.
-        images: its images that are stored.
+        moment: the board in its frame, whose images are stored.
         events: stretches of events that are stored.
-        meta: how it came about.
+        meta: the origin of the capture.
         asked_s: time.monotonic() of the decision.
     """
 
     moment: CaptureMoment
-    images: Sequence[Image]
     events: Sequence[EventCut]
     meta: Mapping[str, object]
     asked_s: float
-
-
-@dataclass(frozen=True, eq=False)
-class Kept:
-    """One capture that is safe on the disk.
-
-    Attributes:
-        name: of the capture.
-        boards: where each camera saw the board.
-        latency_s: from the decision until it was safe.
-    """
-
-    name: str
-    boards: Mapping[ImageKey, ImageBoard]
-    latency_s: float
-
-
-@dataclass(frozen=True)
-class TakenBack:
-    """One capture that was taken back, by its name: it has moved to the rejected ones."""
-
-    name: str
 
 
 class CaptureWriter:
@@ -77,8 +51,8 @@ class CaptureWriter:
         self._session = session
         self._learning = learning
         self._stored = StoredEvents()
-        self._done: deque[Kept | TakenBack] = deque()
-        self._sink: Sink[Task | TakenBack] = disk.add(session.path, self._write, is_vital=True)
+        self._done: deque[tuple[str, float | None]] = deque()
+        self._sink: Sink[Task | str] = disk.add(session.path, self._write, is_vital=True)
 
     @property
     def is_busy(self) -> bool:
@@ -90,11 +64,13 @@ class CaptureWriter:
         self._sink.put(task)
 
     def take_back(self, name: str) -> None:
-        """Have a capture, which may still wait to be written, put aside; returns at once."""
-        self._sink.put(TakenBack(name))
+        """Reject a capture, which may still wait to be written; returns at once."""
+        self._sink.put(name)
 
-    def take(self) -> list[Kept | TakenBack]:
-        """Give the captures that have become safe, or were taken back, since the last call.
+    def take(self) -> list[tuple[str, float | None]]:
+        """Return the captures saved or taken back since the last call, by name.
+
+        Each comes with the time in s from the decision until it was safe; None where it was taken back.
 
         Raises:
             SessionError: one cannot be written: the disk is full, or gone.
@@ -106,25 +82,22 @@ class CaptureWriter:
         return done
 
     def notes(self) -> list[str]:
-        """Say what was odd about the events that were stored."""
+        """Describe problems of the stored events."""
         return self._stored.notes()
 
-    def _write(self, item: Task | TakenBack) -> None:
-        """Do what is asked, in its order: a capture is stored before it can be taken back."""
-        if isinstance(item, TakenBack):
-            self._session.reject(item.name, "taken back while collecting")
-            self._learning.forget(item.name)
-            self._done.append(item)
-        else:
-            self._store(item)
-
-    def _store(self, task: Task) -> None:
-        detection = task.moment.detection
+    def _write(self, task: Task | str) -> None:
+        """Store or reject, in the order of the requests: a capture is stored before it is taken back."""
+        if isinstance(task, str):
+            self._session.reject(task, "taken back while collecting")
+            self._learning.forget(task)
+            self._done.append((task, None))
+            return
+        detection, frame = task.moment.detection, task.moment.detection.frame
         meta = {**task.meta, **task.moment.figures, **board_figures(detection.images)}
         events = [cut.events for cut in task.events]
-        name = self._session.add_capture(task.images, detection.frame.scans, meta, events)
-        self._done.append(Kept(name, detection.images, time.monotonic() - task.asked_s))
-        # The capture is safe: what follows delays nothing.
+        name = self._session.add_capture(frame.images, frame.scans, meta, events)
+        self._done.append((name, time.monotonic() - task.asked_s))
+        # The capture is safe: the rest delays nothing.
         self._stored.note(task.events)
         self._learning.show(name, detection)
 
@@ -141,7 +114,7 @@ def record_streams(
         disk: writes.
 
     Returns:
-        What takes each sample, never blocking; and the sink of samples.
+        A function that takes each sample without blocking; and the sink of samples.
 
     Raises:
         SourceError: the folder exists already, or cannot be made.
@@ -152,7 +125,7 @@ def record_streams(
 
     def record(sample: Sample) -> None:
         if sample.sensor not in by_packets:
-            arrays = [each for each in vars(sample).values() if isinstance(each, np.ndarray)]
-            sink.put(sample, sum(each.nbytes for each in arrays))
+            arrays = [value for value in vars(sample).values() if isinstance(value, np.ndarray)]
+            sink.put(sample, sum(array.nbytes for array in arrays))
 
     return record, sink

@@ -9,8 +9,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from lce_rig.collect.board_tracker import (
     BoardDetection,
@@ -20,7 +21,7 @@ from lce_rig.collect.board_tracker import (
     without_samples,
 )
 from lce_rig.collect.live.capture_triggers import SlowBoards, StillBoards
-from lce_rig.collect.live.capture_writer import CaptureWriter, Kept, Task, record_streams
+from lce_rig.collect.live.capture_writer import CaptureWriter, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, count_in, make_guides
 from lce_rig.collect.live.learning import Learning
@@ -40,12 +41,12 @@ from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock, pair_times
 from lce_rig.timing.scan_pairing import Frame
 
-# The board searched for in a process of its own, while this one reads sensors.
-
-#: How often an image without a board is searched thoroughly, during which nothing is said.
-THOROUGH_S = 3.0
-#: How often a scan is searched for other things of the board's size while all that are known are followed.
-RESCAN_S = 1.0
+# Interval of searches of a whole image while no board is in sight, which hold guidance up.
+_SEARCH_S = 0.3
+# Interval of thorough searches of an image without a board, which hold guidance up even longer.
+_THOROUGH_S = 3.0
+# Interval of searches of a scan for other things of the board's size while all known ones are followed.
+_RESCAN_S = 1.0
 # Such searches are as many times rarer than the longest of the last frames took, forgotten by this a frame.
 _RARE, _FORGET = 6.0, 0.95
 
@@ -53,9 +54,9 @@ _RARE, _FORGET = 6.0, 0.95
 class BoardSearch(Worker):
     """A `BoardTracker` in its process; frames' events, which it has no use for, stay here."""
 
-    def __init__(self, rig: Rig, search_interval_s: float) -> None:
+    def __init__(self, rig: Rig) -> None:
         """Prepare; see `BoardTracker`."""
-        super().__init__("search for the board", _Search, rig, search_interval_s)
+        super().__init__("search for the board", _Search, rig)
 
     def sight(self, frame: Frame) -> BoardDetection:
         """Find the board in every image and scan of a frame.
@@ -70,36 +71,36 @@ class BoardSearch(Worker):
         """Search the frame of a moment as `check` does; see `BoardTracker.confirm`."""
         frame = moment.detection.frame
         bare = replace(moment.detection, frame=replace(frame, events=()))
-        found: CaptureMoment | Refusal = self.call("confirm", replace(moment, detection=bare))
-        if isinstance(found, Refusal):
-            return found
-        return replace(found, detection=replace(found.detection, frame=frame))
+        confirmed: CaptureMoment | Refusal = self.call("confirm", replace(moment, detection=bare))
+        if isinstance(confirmed, Refusal):
+            return confirmed
+        return replace(confirmed, detection=replace(confirmed.detection, frame=frame))
 
 
 class _Search:
-    """What runs there: what was searched is not sent back."""
+    """The object in that process: it does not send the searched samples back."""
 
-    def __init__(self, rig: Rig, search_interval_s: float) -> None:
+    def __init__(self, rig: Rig) -> None:
         self._tracker = BoardTracker(
-            rig, search_interval_s, thorough_interval_s=THOROUGH_S, rescan_interval_s=RESCAN_S
+            rig, _SEARCH_S, thorough_interval_s=_THOROUGH_S, rescan_interval_s=_RESCAN_S
         )
         self._longest_s = 0.0
 
     def sight(self, frame: Frame) -> BoardDetection:
         began_s = time.monotonic()
-        found = self._tracker.sight(frame)
+        detection = self._tracker.sight(frame)
         # On a busy computer a thorough search may take longer than the time to the next one: rare searches
         # must stay rare, or every frame waits for one.
         self._longest_s = max(time.monotonic() - began_s, _FORGET * self._longest_s)
-        self._tracker.thorough_interval_s = max(THOROUGH_S, _RARE * self._longest_s)
-        self._tracker.rescan_interval_s = max(RESCAN_S, _RARE * self._longest_s)
-        return without_samples(found)
+        self._tracker.thorough_interval_s = max(_THOROUGH_S, _RARE * self._longest_s)
+        self._tracker.rescan_interval_s = max(_RESCAN_S, _RARE * self._longest_s)
+        return without_samples(detection)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
-        found = self._tracker.confirm(moment)
-        if isinstance(found, CaptureMoment):
-            return replace(found, detection=without_samples(found.detection))
-        return found
+        confirmed = self._tracker.confirm(moment)
+        if isinstance(confirmed, CaptureMoment):
+            return replace(confirmed, detection=without_samples(confirmed.detection))
+        return confirmed
 
 
 _WAIT_S = 0.1
@@ -143,7 +144,7 @@ def collect_live(
         record, recorded = None, None
         if record_to is not None:
             record, recorded = record_streams(record_to, rig, sources, disk)
-        search = BoardSearch(rig, options.search_interval_s)
+        search = BoardSearch(rig)
         with _swift_turns(), search, Learning(rig, guides) as learning:
             keeper = CaptureWriter(session, learning, disk)
             clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
@@ -155,7 +156,7 @@ def collect_live(
             report = loop.close_books()
     if recorded is not None:
         report.n_recorded, report.recording_error = recorded.n_written, recorded.failure
-        report.notes += [each.sentence for each in recorded.findings()]
+        report.notes += [finding.sentence for finding in recorded.findings()]
     return report
 
 
@@ -175,13 +176,12 @@ def _swift_turns() -> Iterator[None]:
 
 
 def _time_s(detection: BoardDetection) -> float:
-    """Tell the sensors' time: patience is measured by what they have seen, however slow this computer is."""
+    """Return the sensors' time in s: patience counts sensor time, however slow this computer is."""
     return detection.frame.time_ns * 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class _Asked:
-    """A capture of this run: its name, the time of its detection, and where each camera saw the board."""
+class _Asked(NamedTuple):
+    """A capture of this run: its name, the time of its detection, and each camera's board."""
 
     name: str
     time_ns: int
@@ -242,31 +242,32 @@ class _Loop:
                 return
 
     def take_kept(self) -> None:
-        """Count the captures that have become safe or were taken back, and take what they taught."""
+        """Count the captures that were saved or taken back, and adopt new planners."""
         self._learning.teach()
-        for done in self._keeper.take():
-            if not isinstance(done, Kept):
-                self.report.taken_back.append(done.name)
-                restore = f"lce-rig captures {self._session.path} --restore {done.name}"
-                self._monitor.cue("taken_back", f"{done.name} taken back ({restore})")
+        for name, latency_s in self._keeper.take():
+            if latency_s is None:
+                self.report.taken_back.append(name)
+                restore = f"lce-rig captures {self._session.path} --restore {name}"
+                self._monitor.cue("taken_back", f"{name} taken back ({restore})")
                 continue
-            self.report.latencies_s.append(done.latency_s)
-            self._kept.add(done.name)
-            if any(done.name == each.name for each in self._asked):
-                self._monitor.cue("captured", f"captured {done.name} ({done.latency_s:.2f} s)")
-        self.report.captured = [each.name for each in self._asked if each.name in self._kept]
+            self.report.latencies_s.append(latency_s)
+            self._kept.add(name)
+            if any(name == asked.name for asked in self._asked):
+                self._monitor.cue("captured", f"captured {name} ({latency_s:.2f} s)")
+        self.report.captured = [asked.name for asked in self._asked if asked.name in self._kept]
 
     def close_books(self) -> LiveReport:
-        """Gather what is to be reported, and write it into the session's journal."""
+        """Complete the report, and write it into the session's journal."""
         report = self.report
         report.n_skipped = self._feed.n_skipped
         if report.ending == "exhausted":
             waited_s = time.monotonic() - self._captured_s
             report.notes.append(f"no capture in the last {waited_s:.0f} s, {self._monitor.last_words()}")
-        report.predicted = [found for guide in self._guides if (found := guide.predict()) is not None]
+        predictions = [guide.predict() for guide in self._guides]
+        report.predicted = [finding for finding in predictions if finding is not None]
         ties = self._clock.problems() + self._clock.account()
         report.notes += self._keeper.notes() + self._learning.notes()
-        report.notes += [f"{each.subject}: {each.sentence}" for each in ties]
+        report.notes += [f"{finding.subject}: {finding.sentence}" for finding in ties]
         self._session.journal(
             "collected live",
             ending=report.ending,
@@ -278,14 +279,14 @@ class _Loop:
         return report
 
     def _see(self, detection: BoardDetection) -> None:
-        """Look for a moment in a detection, and put into words what goes on."""
+        """Capture the moments of a detection, and choose the instruction to show."""
         self._last = detection
         self._monitor.see(detection)
         gate = self._find_gate()
         moments = gate.take(detection)
         guide = self._active_guide(detection)
-        for each in self._guides:
-            each.plan(each.locate(detection), _time_s(detection), is_asked=each is guide)
+        for planned in self._guides:
+            planned.plan(planned.locate(detection), _time_s(detection), is_asked=planned is guide)
         present = guide.locate(detection)
         if present is not None and guide.sees(detection):
             narration = gate.narrate(guide, present)
@@ -330,7 +331,7 @@ class _Loop:
         statuses = self._sensors.statuses()
         serials = {name: status.serial for name, status in statuses.items() if status.serial}
         meta |= {SERIALS: serials} if serials else {}
-        self._keeper.keep(Task(moment, frame.images, gate.events_of(moment), meta, time.monotonic()))
+        self._keeper.keep(Task(moment, gate.events_of(moment), meta, time.monotonic()))
         name = f"{self._number:06d}"
         self._number += 1
         self._asked.append(_Asked(name, frame.time_ns, detection.images))
@@ -371,25 +372,23 @@ class _Loop:
             self._capture_by_hand(self._last)
 
     def _capture_by_hand(self, detection: BoardDetection) -> None:
-        """Capture what is seen now, however it moves, unless it was captured a moment ago."""
+        """Capture the board as it is now, even while it moves, unless it was captured a moment ago."""
         if self._seeing_guide(detection) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        if self._asked and self._is_repeated(detection):
-            name = self._asked[-1].name
-            self._monitor.cue("refused", f"not captured: {name} shows the board here; move it first")
-            return
+        if self._asked:
+            # The board stands at the last capture, or was there within the hold.
+            last = self._asked[-1]
+            is_recent = time.monotonic() - self._captured_s < self._options.hold_s
+            places = Placements(_NOVEL_M, _NOVEL_DEG) if is_recent else Placements(_SAME_M, _SAME_DEG)
+            if self._find_gate().is_captured or places.are_alike(last.boards, detection.images):
+                self._monitor.cue("refused", f"not captured: {last.name} shows the board here; move it first")
+                return
         confirmed = self._search.confirm(CaptureMoment(detection, {"by_hand": 1.0}))
         if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
         else:
             self._monitor.cue("refused", f"not captured: {confirmed.sentence}")
-
-    def _is_repeated(self, detection: BoardDetection) -> bool:
-        """Check whether a board stands where the last capture has it, or was there within the hold."""
-        is_recent = time.monotonic() - self._captured_s < self._options.hold_s
-        places = Placements(_NOVEL_M, _NOVEL_DEG) if is_recent else Placements(_SAME_M, _SAME_DEG)
-        return self._find_gate().is_captured or places.are_alike(self._asked[-1].boards, detection.images)
 
     def _find_ending(self, key: Key | TakeBack | None) -> Ending | None:
         options, elapsed_s = self._options, time.monotonic() - self._began_s
@@ -409,19 +408,15 @@ class _Loop:
             return None
         if self._is_enough() and not options.is_open:
             return "enough"
-        return "exhausted" if self._is_exhausted() else None
+        if options.idle_s is None:
+            return None
+        # Nothing new was shown for long, or no new placement is left.
+        has_nothing_left = all(guide.is_exhausted for guide in self._guides)
+        patience_s = min(options.idle_s, GIVE_UP_S) if has_nothing_left else options.idle_s
+        return "exhausted" if time.monotonic() - self._captured_s > patience_s else None
 
     def _is_enough(self) -> bool:
         return all(guide.is_enough for guide in self._guides)
-
-    def _is_exhausted(self) -> bool:
-        """Check whether nothing new was shown for long, or nothing new is left to show."""
-        idle_s = self._options.idle_s
-        if idle_s is None:
-            return False
-        has_nothing_left = all(guide.is_exhausted for guide in self._guides)
-        patience_s = min(idle_s, GIVE_UP_S) if has_nothing_left else idle_s
-        return time.monotonic() - self._captured_s > patience_s
 
     def _tell(self, *, has_frame: bool, ending: Ending | None) -> None:
         if has_frame or ending is not None or self._monitor.is_due():
@@ -446,7 +441,7 @@ class _Loop:
         return (f"{most.subject}: " if len(self._guides) > 1 else "") + most.sentence
 
     def _active_guide(self, detection: BoardDetection) -> Guide:
-        """Choose whose words are said: of the guides whose camera sees the board that of fewest captures.
+        """Pick the guide to show: among cameras that see the board, the one with fewest captures.
 
         Where they all have enough, the board goes before a camera whose guide has not.
         """
@@ -457,11 +452,11 @@ class _Loop:
         return min(seeing or self._guides, key=lambda guide: guide.n_held)
 
     def _seeing_guide(self, detection: BoardDetection) -> Guide | None:
-        """Choose who judges a placement: of the guides whose sensors see it that of fewest captures."""
+        """Pick the judge of a placement: among guides that see it, the one with fewest captures."""
         return min((g for g in self._guides if g.sees(detection)), key=lambda g: g.n_held, default=None)
 
     def _find_gate(self) -> StillBoards | SlowBoards:
-        """Choose how boards are captured: moving where events come and clocks are tied, else still."""
+        """Choose the gate: moving boards where events come and clocks are synchronised, else still ones."""
         has_events = self._last is not None and bool(self._last.frame.events)
         may_move = has_events and not self._clock.verdict().requires_still_boards
         if self._gate is None or may_move != isinstance(self._gate, SlowBoards):

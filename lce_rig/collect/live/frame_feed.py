@@ -24,7 +24,7 @@ _REFRESH_S = 0.5
 
 @runtime_checkable
 class SyncTimes(Protocol):
-    """What the rig's clock needs of a sync board."""
+    """The clocks and triggers of a sync board."""
 
     sensor: str
 
@@ -113,7 +113,15 @@ class FrameFeed:
 
     def _run(self) -> None:
         try:
-            samples = self._samples() if self._are_events_enough else self._with_pictures()
+            samples = self._samples()
+            # Cameras whose board is visible in images made of their events only.
+            cameras = {
+                name
+                for name, camera in self._rig.cameras.items()
+                if event_channel(self._rig, name) and not camera.first_channel("frames")
+            }
+            if cameras and not self._are_events_enough:
+                samples = with_event_pictures(samples, self._rig, cameras, self.losses, is_live=True)
             for frame in pair_by_time(
                 samples, self._rig, self.losses, LIVE_NS, are_events_enough=self._are_events_enough
             ):
@@ -124,19 +132,8 @@ class FrameFeed:
             if not isinstance(error, LceRigError):
                 raise
 
-    def _with_pictures(self) -> Iterator[Sample]:
-        """Add images made of events for cameras that have nothing else to watch the board by."""
-        cameras = {
-            name
-            for name, camera in self._rig.cameras.items()
-            if event_channel(self._rig, name) and all(c.kind == "events" for c in camera.channels.values())
-        }
-        if not cameras:
-            return self._samples()
-        return with_event_pictures(self._samples(), self._rig, cameras, self.losses, is_live=True)
-
     def _refresh_clock(self) -> None:
-        """Let the clock take what sensors and board know, and the board's lines run as it needs them."""
+        """Update the clock from the sensors and the sync board, and set the board's trigger rates."""
         if time.monotonic() - self._refreshed_s < _REFRESH_S:
             return
         self._refreshed_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""Gathers what the loop knows into the states that views show."""
+"""Gathers the states that views show."""
 
 import time
 from collections import deque
@@ -22,7 +22,7 @@ _TICK_S = 0.5
 _ENOUGH = "enough: you may stop"
 _MET = "the target is predicted to be met"
 _WAIT = "waiting for the sensors"
-# Without a frame for so long, what was seen before says nothing about the board any more.
+# Without a frame for so long, the last detection is out of date.
 _STALE_S = 2.0
 
 
@@ -71,9 +71,13 @@ class Monitor:
             self.reasons.pop(lidar, None)
 
     def narrate(self, narration: Narration, guide: Guide, present: Array | None) -> None:
-        """Take what is said of the last detection."""
+        """Take the narration of the last detection."""
         self._narration, self._guide = narration, guide
-        self._tick(narration)
+        # Tick every half second while the board is held.
+        ticks_left = None if narration.hold_s is None else int(narration.hold_s / _TICK_S)
+        if ticks_left not in (None, self._ticks_left):
+            self.cue("tick")
+        self._ticks_left = ticks_left
         assert self._detection is not None
         picture = next(
             (each for each in self._detection.frame.images if (each.sensor, each.channel) == guide.key), None
@@ -118,7 +122,9 @@ class Monitor:
         self._told_s = now_s = time.monotonic()
         self._watch_sensors()
         if is_enough and not self._was_enough:
-            self.cue("enough", f"{_MET}: {self._what_now()}")
+            n_wanted = self._options.n_wanted
+            what_now = "you may stop" if n_wanted is None else f"going on to {n_wanted} captures"
+            self.cue("enough", f"{_MET}: {what_now}")
             self._was_enough = True
         phase, headline, detail = self._phase(is_enough=is_enough, has_ended=has_ended)
         rig, guidance = self._session.rig, self._guide.guidance if self._guide else None
@@ -165,20 +171,6 @@ class Monitor:
             return "searching", _WAIT, f"no image with a scan of its time for {waited_s:.0f} s"
         return said.phase, said.headline, said.detail or (_MET if is_enough else "")
 
-    def _what_now(self) -> str:
-        n_wanted = self._options.n_wanted
-        return "you may stop" if n_wanted is None else f"going on to {n_wanted} captures"
-
-    def _tick(self, narration: Narration) -> None:
-        """Tick every half second while a board is held."""
-        if narration.hold_s is None:
-            self._ticks_left = None
-            return
-        ticks_left = int(narration.hold_s / _TICK_S)
-        if ticks_left != self._ticks_left:
-            self.cue("tick")
-        self._ticks_left = ticks_left
-
     def _watch_sensors(self) -> None:
         """Ask how sensors do, and log those that go and come back."""
         if not self._statuses or time.monotonic() - self._asked_s > _EVERY_S:
@@ -192,7 +184,7 @@ class Monitor:
         self._lost = frozenset(lost)
 
     def _is_stale(self) -> bool:
-        """Check whether what was seen last is no longer what is there."""
+        """Check whether the last detection is out of date."""
         return self._detection is not None and time.monotonic() - self._seen_s > _STALE_S
 
     def _streams(self) -> tuple[StreamState, ...]:
@@ -200,16 +192,15 @@ class Monitor:
         rig, streams = self._session.rig, []
         for name, camera in rig.cameras.items():
             status = self._statuses.get(name, SourceStatus(name))
-            for channel, given in camera.channels.items():
-                # Of two kinds of one camera only its source can tell the rates apart.
-                otherwise_hz = status.rate_hz if given.kind == "frames" else 0.0
-                kind_hz = status.rates_hz.get(given.kind, otherwise_hz)
-                streams.append(self._camera_stream(name, channel, given.kind == "frames", kind_hz, status))
+            for channel, settings in camera.channels.items():
+                # Only its source knows the rates of frames and events of one camera.
+                is_framed = settings.kind == "frames"
+                kind_hz = status.rates_hz.get(settings.kind, status.rate_hz if is_framed else 0.0)
+                streams.append(self._camera_stream(name, channel, is_framed, kind_hz, status))
         for name in rig.lidars:
             streams.append(self._lidar_stream(name, self._statuses.get(name, SourceStatus(name))))
-        known = {*rig.cameras, *rig.lidars}
         for name, status in self._statuses.items():
-            if name not in known:
+            if name not in {*rig.cameras, *rig.lidars}:
                 streams.append(StreamState(name, status.rate_hz, status.n_lost, None, self._trouble(name)))
         return tuple(streams)
 
@@ -250,12 +241,12 @@ class Monitor:
         if verdict.requires_still_boards:
             reasons = "; ".join(reason.sentence for reason in verdict.reasons)
             notes.append(f"{verdict.finding.text}: {reasons}")
-        notes += [f"{each.subject}: {each.sentence}" for each in self._clock.problems()]
+        notes += [f"{problem.subject}: {problem.sentence}" for problem in self._clock.problems()]
         named: dict[str, list[str]] = {}
         for name, status in self._statuses.items():
             for problem in status.problems:
                 named.setdefault(problem.sentence, []).append(name)
-        notes += [f"{', '.join(names)}: {problem}" for problem, names in named.items()]
+        notes += [f"{', '.join(names)}: {sentence}" for sentence, names in named.items()]
         if self._guide is not None and self._guide.problem:
             notes.append(self._guide.problem.sentence)
         return tuple(notes)

@@ -1,4 +1,4 @@
-"""How a live collection is to go, what it knows at one moment for its views, and how it went."""
+"""Options of a live collection, its state at one moment for the views, and its report."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -24,7 +24,7 @@ class TakeBack:
     """A request to take the last capture of this run back.
 
     Attributes:
-        name: of the capture that whoever asks means: another one stays; "" for the last, whichever it is.
+        name: of the capture shown to the user: another one stays; "" for the last one.
     """
 
     name: str = ""
@@ -45,7 +45,6 @@ class LiveOptions:
         lost_s: how long a lost sensor is waited for.
         goes_on: whether to go on when the target is met, until asked to stop.
         idle_s: ends after so long without a capture, for unattended runs; None never.
-        search_interval_s: how often a whole image is searched while no board is in sight.
     """
 
     n_wanted: int | None = None
@@ -54,7 +53,6 @@ class LiveOptions:
     lost_s: float = 60.0
     goes_on: bool = False
     idle_s: float | None = None
-    search_interval_s: float = 0.3
 
     @property
     def is_open(self) -> bool:
