@@ -47,7 +47,6 @@ def test_the_event_map_needs_no_warm_up(lce_rig, tmp_path):
 def test_a_recording_too_short_to_settle_is_refused_and_nothing_is_written(lce_rig, tmp_path):
     outcome = lce_rig("reconstruct", recording(tmp_path / "short.npz", 0.1), "-o", tmp_path / "out")
     assert outcome.code == 5
-    assert "no image reconstructed" in outcome.err
     assert not (tmp_path / "out").exists()
 
 

@@ -15,10 +15,8 @@ def test_without_a_display_it_exits_with_5_and_names_the_option(lce_rig, calibra
     assert "--output" in outcome.err
 
 
-def test_without_a_result_it_says_which_verb_makes_one(lce_rig, session):
-    outcome = lce_rig("view", session)
-    assert outcome.code == 4
-    assert "lce-rig calibrate" in outcome.err
+def test_without_a_result_it_exits_with_4(lce_rig, session):
+    assert lce_rig("view", session).code == 4
 
 
 def test_a_capture_that_is_not_there_is_refused(lce_rig, calibrated):

@@ -89,7 +89,7 @@ def test_the_beams_of_an_unknown_model_are_measured_in_a_recording(tmp_path):
     settings = parse_rig(text).lidars["lidar"]
     assert np.array(settings.elevations_deg) == pytest.approx(elevations_deg, abs=0.05)
     assert settings.columns == 900
-    assert settings.data_sheet() is not None and found == ["lidar: 26 rings, 900 columns in the recording"]
+    assert settings.data_sheet() is not None and "26 rings" in found[0]
     # Of a known model, its data sheet counts.
     text, _ = new_profile("a", parse_board(BOARD), recording=tmp_path, lidar_model="XT32", intrinsics=[lens])
     assert parse_rig(text).lidars["lidar"].elevations_deg is None

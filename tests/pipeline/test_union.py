@@ -94,10 +94,10 @@ def test_sessions_between_which_a_sensor_moved_are_refused_with_figures(make):
     with pytest.raises(ResultRefusedError) as two:
         lce.calibrate([monday, moved], found[:2], options=FAST)
     assert two.value.exit_code == 7
-    assert "monday and moved" in two.value.what
+    assert "monday" in two.value.what and "moved" in two.value.what
     with pytest.raises(ResultRefusedError) as three:
         lce.calibrate([monday, moved, tuesday], found, options=FAST)
-    assert "leave out moved" in three.value.hint
+    assert "moved" in three.value.hint
 
 
 def test_a_session_too_small_to_be_compared_is_named(make):

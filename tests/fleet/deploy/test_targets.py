@@ -30,7 +30,7 @@ def test_a_target_is_found_in_the_file_beside_the_session_or_in_the_profile(tmp_
     assert find_target("kestrel", other, session, rig).to == "/other"
     with pytest.raises(UsageError) as caught:
         find_target("heron", other, session, rig)
-    assert caught.value.hint == "Known targets: kestrel."
+    assert "kestrel" in caught.value.hint
 
 
 @pytest.mark.parametrize(

