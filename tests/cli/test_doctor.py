@@ -67,22 +67,6 @@ def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
     assert "warn" in done.out.splitlines()[-1]
 
 
-BUSY = {("computer", "disk"), *((name, "stream") for name in ("lidar", "cam")), ("cam", "pulses")}
-BUSY |= {("sync", "pulses"), ("sync", "clock"), ("rig", "clocks"), ("rig", "sync")}
-"""Lines that depend on how busy the computer is, and on what the board has been told before."""
-
-
-def test_a_rig_without_driver_lines_says_what_to_add(lce_rig, tmp_path):
-    document = make_rig(sync=None).model_dump()
-    document["cameras"]["cam"]["driver"] = {}
-    document["lidars"]["lidar"]["driver"]["address"] = "127.0.0.1"
-    path = tmp_path / "rig.yaml"
-    path.write_text(dump_rig(type(make_rig()).model_validate(document)))
-    done = lce_rig("doctor", "--rig", path, "--duration", "1")
-    assert done.code == 5
-    assert "/dev/video0}" in done.out
-
-
 def test_an_unknown_rig_is_an_error_of_the_profile(lce_rig):
     assert lce_rig("doctor", "--rig", "no-such-rig").code == 3
 

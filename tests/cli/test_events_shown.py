@@ -51,17 +51,6 @@ def coloured(picture, colour) -> int:
     return int(np.all(np.abs(picture.astype(int) - colour) < 20, axis=-1).sum())
 
 
-def test_check_shows_event_rate_and_speed_in_80_columns(lce_rig, moving):
-    outcome = lce_rig("check", moving)
-    assert outcome.code == 0, outcome.err
-    events, frames = outcome.out.split("davis.frames and lidar")
-    assert max(len(line.rstrip()) for line in outcome.out.splitlines()) <= 80
-    for heading in ("events", "px/s", "speed", "cm/s"):
-        assert heading in events and heading not in frames
-    (row,) = [line.split() for line in events.splitlines() if line.startswith("000000")]
-    assert row[-1] == "ok" and float(row[5]) > 1
-
-
 def test_check_as_json_has_every_figure_of_events_and_motion(lce_rig, moving):
     document = json.loads(lce_rig("check", moving, "--json").out)
     (pair,) = [pair for pair in document["pairs"] if pair["channel"] == "events"]

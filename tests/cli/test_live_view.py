@@ -96,13 +96,6 @@ def test_no_sentence_is_cut_and_a_wide_terminal_has_a_larger_drawing(width: int,
     assert drawing.index("┐") - drawing.index("┌") >= (20 if height == 24 else 0.45 * width)
 
 
-def test_a_small_terminal_shows_the_keys_and_the_last_message_too() -> None:
-    lines = drawn(replace(STATE, streams=STREAMS[:3]), width=60, height=20)
-    assert len(lines) <= 20 and "q stop" in lines[-1]
-    assert any("not captured" in line for line in lines)
-    assert max(len(line) for line in lines) <= 60
-
-
 def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same() -> None:
     bare = replace(
         STATE, drawing=None, coverage=None, sigma_deg=np.nan, sigma_mm=np.nan, hold_s=None, streams=()

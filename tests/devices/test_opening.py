@@ -5,9 +5,8 @@ from typing import Any
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.opening import LIVE, driver_type, open_live
+from lce_rig.devices.opening import driver_type, open_live
 from lce_rig.rig import DriverSettings, Rig, load_rig
-from lce_rig.rig.sensors import CAMERA_DRIVERS, LIDAR_DRIVERS
 
 
 def with_driver(rig: Rig, camera: str, **driver: Any) -> Rig:
@@ -55,7 +54,3 @@ def test_a_lidar_of_an_unknown_model_is_not_guessed() -> None:
     with pytest.raises(SourceError, match="XY-32"):
         driver_type("lidar", "lidar", "XY-32", DriverSettings())
     assert driver_type("lidar", "lidar", "Puck LITE", DriverSettings()) == "vlp16"
-
-
-def test_the_types_of_both_kinds_are_in_the_table() -> None:
-    assert {*LIDAR_DRIVERS, *CAMERA_DRIVERS, "sync_board"} == set(LIVE)

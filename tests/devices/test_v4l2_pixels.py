@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
+from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder
 
 WIDTH, HEIGHT = 22, 12
 
@@ -115,18 +115,3 @@ def test_exactly_the_declared_bytes_make_a_picture(code: str, width: int, paddin
         assert pixels.dtype == np.uint8
     with pytest.raises(ValueError):
         decoder.decode(bytes(decoder.n_bytes - 1))
-
-
-@pytest.mark.parametrize(
-    ("name", "code"),
-    [
-        ("uyvy", "UYVY"),
-        ("YUY2", "YUYV"),
-        ("Y16", "Y16 "),
-        ("GRAY", None),
-        ("I420", "YU12"),
-        ("mjpeg", "MJPG"),
-    ],
-)
-def test_formats_go_by_several_names(name: str, code: str | None) -> None:
-    assert find_format(name) == code

@@ -134,15 +134,6 @@ def test_absent_sensors_are_left_out_of_the_verdict() -> None:
     assert look(check_sync, examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
 
 
-def test_how_old_pictures_are_and_how_long_the_board_takes_to_answer_is_said() -> None:
-    seen = Finding("clock.davis", "note", figures={"delay_ms": 12.4})
-    own = Finding("clock.board", "note", figures={"round_trip_ms": 0.24})
-    exam = examination(camera(clock=ClockState(seen)), sync_board(clock=ClockState(own)))
-    of_camera, of_board = look(check_clock, exam, "cam"), look(check_clock, exam, "sync")
-    assert of_camera is not None and of_board is not None
-    assert of_camera.figures["delay_ms"] == 12.4 and of_board.figures["round_trip_ms"] == 0.24
-
-
 def test_doubts_of_a_driver_about_its_clock_stand_in_its_line() -> None:
     problem = Finding("clock.missing", "warning", figures={"clock": "tsc"})
     arrival = ClockState(Finding("clock.arrival", "note"))

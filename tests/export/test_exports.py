@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lce_rig.core.calibration import Calibration
-from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError, UsageError
+from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.export import EXPORTS, export, export_formats
 from lce_rig.export.camera_info import load_camera_info
@@ -262,11 +262,6 @@ def test_a_result_of_another_rig_is_refused(rles: Rig, make: Make, tmp_path: Pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unknown_format_lists_the_known_ones(rles: Rig, make: Make, tmp_path: Path) -> None:
-    with pytest.raises(UsageError):
-        export([make()], rles, tmp_path, formats=["sdf"])
-
-
 def test_kalibrs_chain_leads_from_each_camera_to_the_next(
     three_sensor_rig: Rig, make: Make, tmp_path: Path
 ) -> None:
@@ -303,15 +298,6 @@ def test_a_lens_with_fewer_coefficients_is_as_near_as_is_said(
         np.sqrt(np.mean(np.sum((kept.project(true.unproject(pixels))[0] - pixels) ** 2, axis=1)))
         > lens.rms_px
     )
-
-
-def test_a_lens_that_fits_is_left_as_it_is(three_sensor_rig: Rig) -> None:
-    for name in ("davis", "fish"):
-        true = three_sensor_rig.cameras[name].to_intrinsics()
-        lens = fit_coefficients(true, 4)
-        assert lens.max_px == 0
-        points = np.array([[0.1, 0.2, 1.0], [-0.2, 0.1, 2.0]])
-        np.testing.assert_array_equal(lens.intrinsics.project(points)[0], true.project(points)[0])
 
 
 def test_autowares_file_gives_bodies_in_the_kits_frame(rles: Rig, make: Make, tmp_path: Path) -> None:

@@ -74,30 +74,6 @@ def test_a_bag_without_sensors_is_refused_with_what_it_holds(tmp_path, write_bag
     assert "/front/camera_info" in caught.value.hint
 
 
-def test_a_bag_names_topics_rates_rings_and_lenses(
-    tmp_path,
-    write_bag,
-    room,
-    cloud_message,
-    image_message,
-):
-    info = {"D": np.zeros(5), "K": np.array([50.0, 0, 32, 0, 50, 24, 0, 0, 1])}
-    both = [
-        (topic, kind, t, {**fields, **info} if kind == "CameraInfo" else fields)
-        for topic, kind, t, fields in messages(room, cloud_message, image_message)
-        if not topic.startswith("/rear")
-    ]
-    path = write_bag(tmp_path / "bag", "ros1", both)
-    text, found = new_profile(
-        "truck", parse_board("5x7,0.095,0.61x0.85"), recording=path, lidar_model="VLP-16", cameras=["front"]
-    )
-    rig = parse_rig(text)
-    assert (rig.lidars["lidar"].topic, rig.lidars["lidar"].rate_hz) == ("/points", 10)
-    assert rig.cameras["front"].channels["frames"].topic == "/front/image_raw"
-    assert rig.cameras["front"].resolution_px == (64, 48)
-    assert "16 rings" in text and len(found) == 2
-
-
 def test_a_camera_of_a_bag_without_a_lens_is_named(
     tmp_path,
     write_bag,

@@ -6,7 +6,6 @@ import pytest
 
 from lce_rig.core.errors import ProfileError
 from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig
-from lce_rig.rig.loading import all_keys, valid_keys
 
 RLES = find_profile("rles").read_text(encoding="utf-8")
 KIND = "        kind: events\n"
@@ -47,10 +46,6 @@ def test_an_absolute_path_stays_as_it_is(tmp_path: Path) -> None:
     assert model_of(load_rig(tmp_path / "mine.yaml")) == str(path)
 
 
-def test_a_profile_without_the_block_dumps_without_it() -> None:
-    assert "reconstruction" not in dump_rig(load_rig("rles"))
-
-
 @pytest.mark.parametrize(
     ("block", "key"),
     [
@@ -72,9 +67,3 @@ def test_what_cannot_be_meant_is_named_with_its_line(block: str, key: str) -> No
 def test_frames_are_not_reconstructed() -> None:
     message = refusal(with_block("{method: network}", "        kind: frames\n"))
     assert "channels.frames.reconstruction:" in message
-
-
-def test_an_optional_block_is_one_block_to_the_explainer() -> None:
-    path = ("cameras", "davis", "channels", "events", "reconstruction")
-    assert valid_keys(path) == ["method", "model", "window_s", "window_events"]
-    assert ("cameras.*.channels.*.reconstruction", "model") in list(all_keys())

@@ -22,31 +22,6 @@ def _picture():
     return pixels
 
 
-def test_colours_come_from_the_pixel_as_rgb():
-    points = np.array([[-0.5, 0, 2], [0.5, 0, 2]], np.float32)
-    colours, is_seen = colour_points(_scan(points), _picture(), np.eye(4), LENS)
-    assert is_seen.all()
-    assert colours.tolist() == [[*LEFT[::-1]], [*RIGHT[::-1]]]
-
-
-def test_points_behind_the_camera_or_beside_the_image_have_none():
-    points = np.array([[0, 0, -2], [5, 0, 2]], np.float32)
-    colours, is_seen = colour_points(_scan(points), _picture(), np.eye(4), LENS)
-    assert not is_seen.any() and not colours.any()
-
-
-def test_a_wall_behind_a_board_has_none_and_the_wall_beside_it_does():
-    y, x = np.meshgrid(np.linspace(-0.2, 0.2, 21), np.linspace(-0.3, 0.3, 31))
-    board = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], axis=1)
-    behind, beside = np.array([[0.1, 0.05, 4.0]]), np.array([[1.5, 0.0, 4.0]])
-    # The LiDAR stands half a metre to the left of the camera and looks past the board.
-    T = np.eye(4)
-    T[0, 3] = -0.5
-    points = np.concatenate([board, behind, beside]) - T[:3, 3]
-    _, is_seen = colour_points(_scan(points), _picture(), T, LENS)
-    assert is_seen[:-2].all() and not is_seen[-2] and is_seen[-1]
-
-
 def test_a_floor_seen_at_a_grazing_angle_does_not_hide_itself():
     z, x = np.meshgrid(np.linspace(4, 8, 200), np.linspace(-0.5, 0.5, 30))
     floor = np.stack([x.ravel(), np.full(x.size, 1.2), z.ravel()], axis=1)

@@ -29,8 +29,3 @@ def test_every_flipped_bit_is_noticed(entry):
 def test_an_entry_of_another_place_is_not_there(entry):
     shutil.copy(entry, entry.with_name("000001.cam.npz"))
     assert cache.load(entry.with_name("000001.cam.npz")) is None
-
-
-def test_numpy_reads_an_entry_as_it_is(entry):
-    with np.load(entry) as plain:
-        assert np.array_equal(plain["b"], np.eye(3))

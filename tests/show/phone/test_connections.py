@@ -98,13 +98,3 @@ def test_a_page_that_fails_altogether_ends_alone(
     (note,) = preview.notes()
     assert "has ended" in note and "RuntimeError('broken')" in note
     assert len(caplog.records) == 1
-
-
-def test_a_failure_that_repeats_is_logged_once(preview: Preview, caplog: pytest.LogCaptureFixture) -> None:
-    preview.publish(state(notes=object()))
-    for _ in range(5):
-        with Watcher(preview.urls[0]) as watcher:
-            watcher.watch()
-            assert isinstance(watcher.receive(), int)
-    assert len(caplog.records) == 1
-    assert preview.notes()[0].endswith("(5 times)")

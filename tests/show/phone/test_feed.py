@@ -85,18 +85,6 @@ def test_pictures_are_compressed_while_somebody_looks_and_once_for_all(preview: 
         assert preview.n_pictures == 2
 
 
-def test_the_same_picture_is_not_sent_twice(preview: Preview) -> None:
-    drawing = Drawing("cam", picture(), PRESENT_PX)
-    with Watcher(preview.urls[0]) as watcher:
-        watcher.watch()
-        preview.publish(state(drawing=drawing))
-        assert watcher.next_state()[1] is not None
-        preview.publish(state(drawing=Drawing("cam", drawing.pixels, PRESENT_PX + 5)))
-        got, jpeg = watcher.next_state()
-        assert jpeg is None
-        assert got["drawing"]["present_px"][0] == [105.0, 85.0]
-
-
 def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pages(preview: Preview) -> None:
     big = [np.random.default_rng(k).integers(0, 255, (720, 1280, 3), np.uint8) for k in range(5)]
     with Watcher(preview.urls[0]) as stuck, Watcher(preview.urls[0]) as quick:
@@ -232,14 +220,3 @@ def test_closing_does_not_wait_for_pages_whose_line_is_full() -> None:
         preview.close()
         # Its thread has ended too, and left no connection behind.
         assert not [thread for thread in threading.enumerate() if thread.name.startswith("preview")]
-
-
-def test_silence_of_the_collection_is_told(preview: Preview) -> None:
-    with Watcher(preview.urls[0]) as watcher:
-        watcher.watch()
-        assert watcher.receive() == {"beat": True, "age_s": None}
-        preview.publish(state())
-        watcher.next_state()
-        beat = watcher.receive()
-        assert beat["beat"]
-        assert 0.8 < beat["age_s"] < 5

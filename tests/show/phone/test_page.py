@@ -163,12 +163,6 @@ def test_what_sensors_say_is_text_and_not_markup(preview: Preview, browser: Brow
     assert not page.complaints
 
 
-def test_before_the_first_state_it_waits(preview: Preview, browser: Browser) -> None:
-    page = browser.open(preview.urls[0])
-    page.wait_until(has_text("headline", "waiting for the collection"))
-    assert page.text("phase") == "connected"
-
-
 def test_phones_that_may_switch_their_screen_off_are_warned_of(preview: Preview, browser: Browser) -> None:
     page = browser.open(preview.urls[0], 360, 640)
     page.wait_until(OPEN)
@@ -180,17 +174,6 @@ def test_phones_that_may_switch_their_screen_off_are_warned_of(preview: Preview,
     page.call("Page.reload")
     page.wait_until(f"!window.isOld && {OPEN} && !document.getElementById('hint').hidden")
     assert not page.complaints
-
-
-def test_what_was_chosen_stays_chosen(preview: Preview, browser: Browser) -> None:
-    page = browser.open(preview.urls[0])
-    page.wait_until(OPEN)
-    assert page.each("#scene.mirrored") == ["scene"]
-    page.tap("mirror")
-    page.evaluate("window.isOld = true")
-    page.call("Page.reload")
-    page.wait_until(f"!window.isOld && {OPEN} && document.querySelector('#scene.mirrored') === null")
-    assert page.evaluate("document.getElementById('mirror').getAttribute('aria-pressed')") == "false"
 
 
 def test_a_page_in_the_background_is_sent_no_pictures(preview: Preview, browser: Browser) -> None:

@@ -9,8 +9,6 @@ import pytest
 
 from tests.show.phone.browser import Browser
 
-pytestmark = pytest.mark.long
-
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
@@ -56,10 +54,3 @@ def test_a_bar_opens_the_capture_s_overlay(browser, files):
     assert page.evaluate(shown) == ["pair-0-capture-1"]
     page.wait_until("document.querySelector('#pair-0-capture-1 img').naturalWidth === 1000")
     assert page.evaluate("document.documentElement.scrollWidth") == 390
-
-
-def test_it_prints_on_a4_within_the_paper_s_width(browser, files):
-    page = browser.open((files / "one.html").as_uri(), 690, 1000)
-    page.call("Emulation.setEmulatedMedia", media="print")
-    assert page.evaluate("document.documentElement.scrollWidth") == 690
-    assert page.call("Page.printToPDF", preferCSSPageSize=True)["data"]
