@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,11 +37,14 @@ def to_arrays(detection: ImageDetection | LidarDetection | Image) -> Arrays:
     heads = []
     for index, item in enumerate(items):
         head: dict[str, Any] = {"kind": type(item).__name__}
-        for name, value in _fields(item):
+        for entry in dataclasses.fields(item):
+            name, value = entry.name, getattr(item, entry.name)
             if isinstance(value, np.ndarray):
                 arrays[f"{index}.{name}"] = value
+            elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+                head[name] = dataclasses.asdict(value)
             else:
-                head[name] = _plain(value)
+                head[name] = dict(value) if isinstance(value, Mapping) else value
         heads.append(head)
     text = json.dumps({"is_list": isinstance(detection, list), "items": heads}, default=float)
     arrays["head"] = np.frombuffer(text.encode(), dtype=np.uint8)
@@ -56,29 +59,16 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDet
     """
     try:
         document = parse_json(arrays["head"].tobytes(), is_finite=False)
-        items = [_rebuild(index, head, arrays) for index, head in enumerate(document["items"])]
+        items = []
+        for index, head in enumerate(document["items"]):
+            kind, prefix = _KINDS[head.pop("kind")], f"{index}."
+            for name, record in _RECORDS.get(kind, {}).items():
+                head[name] = None if head[name] is None else record(**head[name])
+            parts = {key.removeprefix(prefix): part for key, part in arrays.items() if key.startswith(prefix)}
+            items.append(kind(**head, **parts))
         return items if document["is_list"] else items[0]
     except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
         raise ValueError(f"not a detection: {error!r}") from error
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return dataclasses.asdict(value)
-    return dict(value) if isinstance(value, Mapping) else value
-
-
-def _fields(item: Any) -> Sequence[tuple[str, Any]]:
-    return [(field.name, getattr(item, field.name)) for field in dataclasses.fields(item)]
-
-
-def _rebuild(index: int, head: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Any:
-    kind = _KINDS[head.pop("kind")]
-    for name, record in _RECORDS.get(kind, {}).items():
-        head[name] = None if head[name] is None else record(**head[name])
-    prefix = f"{index}."
-    own = {key[len(prefix) :]: value for key, value in arrays.items() if key.startswith(prefix)}
-    return kind(**head, **own)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.search import find_in_reconstruction
 from lce_rig.detect.image.search import find_image_board, region_around
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import find_lidar_boards, look_for_board, track_lidar_board
+from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board, track_lidar_board
 from lce_rig.detect.limits_met import gate_image_board, gate_lidar_boards
 from lce_rig.rig import Rig
 
@@ -131,63 +131,39 @@ class BoardFinder:
 
     def search_scan(self, scan: Scan) -> ScanSearch:
         """Find the surfaces of the board's size in a whole scan."""
-        lidar, limits = self.rig.lidars[scan.sensor], self.rig.quality
-        found = find_lidar_boards(
-            scan,
-            self.board,
-            min_range_m=lidar.min_range_m,
-            max_range_m=min(lidar.max_range_m, limits.max_distance_m),
-            min_rings=limits.min_rings,
-            max_rms_m=limits.max_thickness_m,
-            beam=self._beam(scan.sensor),
-        )
-        return self._compared(found, scan)
+        return self._compared(find_lidar_boards(scan, self.board, self._limits(scan.sensor)), scan)
 
-    def follow_scan(self, scan: Scan, known: Sequence[LidarBoard]) -> ScanSearch:
+    def follow_scan(self, scan: Scan, last: Sequence[LidarBoard]) -> ScanSearch:
         """Find surfaces near where they were in the scan before; lost ones are omitted.
 
         Args:
             scan: the next one of the same LiDAR.
-            known: `boards` of the search before, at least one.
+            last: `boards` of the search before, at least one.
         """
-        lidar, limits = self.rig.lidars[scan.sensor], self.rig.quality
-        tracked = [
-            track_lidar_board(
-                scan,
-                self.board,
-                each,
-                min_range_m=lidar.min_range_m,
-                min_rings=limits.min_rings,
-                max_rms_m=limits.max_thickness_m,
-                beam=self._beam(scan.sensor),
-            )
-            for each in known
-        ]
-        found = [each for each in tracked if isinstance(each, LidarBoard)]
-        lost = [each for each in tracked if isinstance(each, Refusal)]
-        return self._compared(found or lost[0], scan)
+        limits = self._limits(scan.sensor)
+        tracked = [track_lidar_board(scan, self.board, previous, limits) for previous in last]
+        boards = [result for result in tracked if isinstance(result, LidarBoard)]
+        lost = [result for result in tracked if isinstance(result, Refusal)]
+        return self._compared(boards or lost[0], scan)
 
     def look_for(self, scan: Scan, T_lidar_board: Array) -> LidarBoard | Refusal:
         """Find the board in a scan about a predicted pose (4, 4)."""
-        lidar, limits = self.rig.lidars[scan.sensor], self.rig.quality
-        found = look_for_board(
-            scan,
-            self.board,
-            T_lidar_board,
-            min_range_m=lidar.min_range_m,
-            min_rings=limits.min_rings,
-            max_rms_m=limits.max_thickness_m,
-            beam=self._beam(scan.sensor),
-        )
+        found = look_for_board(scan, self.board, T_lidar_board, self._limits(scan.sensor))
         usable = self._compared(found if isinstance(found, Refusal) else [found], scan).usable
         return usable if isinstance(usable, Refusal) else usable[0]
 
-    def _beam(self, lidar: str) -> Beam:
-        settings = self.rig.lidars[lidar]
-        return Beam(settings.beam_aperture_m, settings.beam_divergence_rad)
+    def _limits(self, sensor: str) -> Limits:
+        lidar, quality = self.rig.lidars[sensor], self.rig.quality
+        return Limits(
+            rms_m=quality.max_thickness_m,
+            min_rings=quality.min_rings,
+            min_range_m=lidar.min_range_m,
+            max_range_m=min(lidar.max_range_m, quality.max_distance_m),
+            beam=Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad),
+        )
 
     def _compared(self, found: list[LidarBoard] | Refusal, scan: Scan) -> ScanSearch:
         if isinstance(found, Refusal):
             return ScanSearch(found, found)
-        boards = [replace(each, stamp_ns=scan.stamp_ns) for each in found]
+        boards = [replace(board, stamp_ns=scan.stamp_ns) for board in found]
         return ScanSearch(boards, gate_lidar_boards(boards, self.board, self.rig.quality))

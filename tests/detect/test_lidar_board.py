@@ -22,14 +22,14 @@ from lce_rig.core.data import Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import exp_so3, invert, pose, transform
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import find_lidar_boards
+from lce_rig.detect.lidar.search import Limits, find_lidar_boards
 
 POINT_BEAM = Beam(0.0, 0.0)
 ROOM = room(13.0)
 
 
-def find(scan, **options):
-    return find_lidar_boards(scan, BOARD, beam=POINT_BEAM, **options)
+def find(scan, **limits):
+    return find_lidar_boards(scan, BOARD, Limits(beam=POINT_BEAM, **limits))
 
 
 def assert_is_board(found, T_lidar_board, within_m=0.02, within_deg=1.5, normal_deg=0.6):

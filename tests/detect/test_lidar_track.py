@@ -7,9 +7,9 @@ from scans import BOARD, board_plate, cast, person, place, room
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import find_lidar_boards, look_for_board, track_lidar_board
+from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board, track_lidar_board
 
-BEAM = Beam(0.0, 0.0)
+LIMITS = Limits(beam=Beam(0.0, 0.0))
 
 
 def view(T, seed=0):
@@ -17,26 +17,26 @@ def view(T, seed=0):
 
 
 def test_board_in_motion_is_followed_through_every_scan():
-    board = find_lidar_boards(view(place(2.5, 170)), BOARD, beam=BEAM)[0]
+    board = find_lidar_boards(view(place(2.5, 170)), BOARD, LIMITS)[0]
     for k in range(1, 12):
         T = place(2.5 - 0.04 * k, 170 + 1.5 * k, 45 + 2 * k, 3 * k)
-        board = track_lidar_board(view(T, seed=k), BOARD, board, beam=BEAM)
+        board = track_lidar_board(view(T, seed=k), BOARD, board, LIMITS)
         assert isinstance(board, LidarBoard)
         assert np.linalg.norm(board.T_lidar_board[:3, 3] - T[:3, 3]) < 0.03
 
 
 def test_tracking_finds_what_the_full_search_finds():
     scan = view(place(2.2, 40, 30, 20))
-    full = find_lidar_boards(scan, BOARD, beam=BEAM)[0]
-    tracked = track_lidar_board(scan, BOARD, full, beam=BEAM)
+    full = find_lidar_boards(scan, BOARD, LIMITS)[0]
+    tracked = track_lidar_board(scan, BOARD, full, LIMITS)
     np.testing.assert_allclose(tracked.T_lidar_board, full.T_lidar_board, atol=5e-3)
     np.testing.assert_allclose(tracked.plane, full.plane, atol=5e-3)
     assert len(tracked.points) > 0.97 * len(full.points)
 
 
 def test_board_that_left_is_reported_lost():
-    board = find_lidar_boards(view(place(2.5, 40)), BOARD, beam=BEAM)[0]
-    refusal = track_lidar_board(view(place(2.5, 200)), BOARD, board, beam=BEAM)
+    board = find_lidar_boards(view(place(2.5, 40)), BOARD, LIMITS)[0]
+    refusal = track_lidar_board(view(place(2.5, 200)), BOARD, board, LIMITS)
     assert isinstance(refusal, Refusal)
     assert (refusal.code, refusal.figures["cause"]) == ("lidar.lost", "lidar.no_returns")
 
@@ -45,9 +45,9 @@ def test_board_held_still_is_measured_as_well_as_by_the_full_search():
     found_deg, tracked_deg = [], []
     for seed in range(8):
         T = place(2.0 + 0.1 * seed, 40 - 10 * seed, 35, 25, 15)
-        previous = find_lidar_boards(view(T, seed=100 + seed), BOARD, beam=BEAM)[0]
-        full = find_lidar_boards(view(T, seed=seed), BOARD, beam=BEAM)[0]
-        tracked = track_lidar_board(view(T, seed=seed), BOARD, previous, beam=BEAM)
+        previous = find_lidar_boards(view(T, seed=100 + seed), BOARD, LIMITS)[0]
+        full = find_lidar_boards(view(T, seed=seed), BOARD, LIMITS)[0]
+        tracked = track_lidar_board(view(T, seed=seed), BOARD, previous, LIMITS)
         for errors, board in ((found_deg, full), (tracked_deg, tracked)):
             errors.append(np.degrees(np.linalg.norm(np.cross(board.plane[:3], T[:3, 2]))))
     assert np.sqrt(np.mean(np.square(tracked_deg))) < 1.1 * np.sqrt(np.mean(np.square(found_deg)))
@@ -58,7 +58,7 @@ def test_a_board_is_found_about_the_pose_that_an_image_predicts(off_m):
     T = place(2.6, 60, 20, 15)
     T_predicted = T.copy()
     T_predicted[:3, 3] += off_m * T[:3, 0]
-    found = look_for_board(view(T), BOARD, T_predicted, beam=BEAM)
+    found = look_for_board(view(T), BOARD, T_predicted, LIMITS)
     assert isinstance(found, LidarBoard)
     assert np.linalg.norm(found.T_lidar_board[:3, 3] - T[:3, 3]) < 0.02
 
@@ -67,15 +67,15 @@ def test_what_is_no_board_is_none_where_one_is_predicted_either():
     T = place(2.6, 60, 20, 15)
     # On a wall, in the air, and where a plate of another size stands.
     for shapes in (room(5.4), room(13.0), [board_plate(T, scale=1.4), *room(13.0)]):
-        refusal = look_for_board(cast(shapes, sigma_m=0.008), BOARD, T, beam=BEAM)
+        refusal = look_for_board(cast(shapes, sigma_m=0.008), BOARD, T, LIMITS)
         assert isinstance(refusal, Refusal)
         assert refusal.code in ("lidar.not_where_expected", "lidar.nothing_where_expected")
     # A board elsewhere is not taken for the one predicted.
-    refusal = look_for_board(view(place(2.6, 66, 20, 15)), BOARD, T, beam=BEAM)
+    refusal = look_for_board(view(place(2.6, 66, 20, 15)), BOARD, T, LIMITS)
     assert isinstance(refusal, Refusal)
 
 
 def test_a_prediction_of_a_scan_without_returns_is_refused():
     empty = view(place(2.6, 60)).select(np.zeros(0, dtype=np.intp))
-    refusal = look_for_board(empty, BOARD, place(2.6, 60), beam=BEAM)
+    refusal = look_for_board(empty, BOARD, place(2.6, 60), LIMITS)
     assert isinstance(refusal, Refusal) and refusal.code == "lidar.no_returns"

@@ -110,7 +110,7 @@ def explain_absence(
     if seen is not None:
         return explain_other_grid(grey, board, seen, is_from_events, min_square_px)
     wanted = {"n_cols": board.cols, "n_rows": board.rows}
-    action = _action(is_from_events)
+    action = "events" if is_from_events else ""
     if bright - low < 50:
         return IMAGE_FLAT.refusal(action=action, **wanted, grey_1=low, grey_99=bright)
     width_px = strongest_edge_px(grey, bright - low)
@@ -135,17 +135,25 @@ def explain_other_grid(
         is_from_events: whether the image was reconstructed from events.
         min_square_px: the profile's minimum side of a square.
     """
-    wanted, seen = _sizes(board, seen_px)
+    rows, cols = seen_px.shape[:2]
+    wanted = board.cols, board.rows
+    # The grid turned the way that is nearer to the board.
+    turned = ((cols, rows), (rows, cols))
+    seen = min(turned, key=lambda size: abs(size[0] - wanted[0]) + abs(size[1] - wanted[1]))
     figures = {"n_cols": wanted[0], "n_rows": wanted[1], "n_cols_seen": seen[0], "n_rows_seen": seen[1]}
-    action = _action(is_from_events)
+    action = "events" if is_from_events else ""
     if seen == wanted:
         return IMAGE_UNCLEAR.refusal(action=action, **figures)
     is_part = seen[0] <= wanted[0] and seen[1] <= wanted[1]
-    side = _side_beyond(grey, seen_px)
-    if is_part and side:
+    height, width = grey.shape
+    low, high = seen_px.min(axis=(0, 1)), seen_px.max(axis=(0, 1))
+    to_border = {"left": low[0], "upper": low[1], "right": width - 1 - high[0], "lower": height - 1 - high[1]}
+    side = min(to_border, key=lambda name: float(to_border[name]))
+    square = max(float(np.linalg.norm(np.diff(seen_px, axis=axis), axis=-1).max()) for axis in (0, 1))
+    if is_part and to_border[side] < 1.5 * square:
         return IMAGE_CUT_OFF.refusal(**figures, side=side)
     if is_part:
-        least_px = max(LEAST_SQUARE_PX * max(1.0, grey.shape[1] / _SEARCHED_PX), min_square_px)
+        least_px = max(LEAST_SQUARE_PX * max(1.0, width / _SEARCHED_PX), min_square_px)
         square_px = square_size_px(grey, board.cols * board.rows)
         if square_px < least_px:
             closer_share = 1 - square_px / least_px
@@ -161,7 +169,7 @@ def quality_problem(
     quality: ImageQuality, min_contrast: float, min_sharpness: float, is_from_events: bool = False
 ) -> Refusal | None:
     """Judge the figures of a detected grid; None if they are sufficient."""
-    action = _action(is_from_events)
+    action = "events" if is_from_events else ""
     if quality.contrast < min_contrast:
         figures = {"contrast": quality.contrast, "min_contrast": min_contrast}
         return IMAGE_LOW_CONTRAST.refusal(action=action, **figures)
@@ -174,35 +182,6 @@ def quality_problem(
         }
         return IMAGE_NOT_SHARP.refusal(action=action, **figures)
     return None
-
-
-def _action(is_from_events: bool) -> str:
-    """Name the kind of action: events need motion, a camera needs a still board."""
-    return "events" if is_from_events else ""
-
-
-def _sizes(board: Board, seen_px: Array) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Name wanted and seen size (cols, rows), the seen one turned the way that is nearer to the wanted."""
-    rows, cols = seen_px.shape[:2]
-    wanted = (board.cols, board.rows)
-    either = ((cols, rows), (rows, cols))
-    seen = min(either, key=lambda size: abs(size[0] - wanted[0]) + abs(size[1] - wanted[1]))
-    return wanted, seen
-
-
-def _side_beyond(grey: NDArray[np.uint8], grid_px: Array) -> str:
-    """Name the border within 1.5 squares of the grid; empty if there is none."""
-    height, width = grey.shape
-    square = max(float(np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1).max()) for axis in (0, 1))
-    low, high = grid_px.min(axis=(0, 1)), grid_px.max(axis=(0, 1))
-    room = {
-        "left": low[0],
-        "upper": low[1],
-        "right": width - 1 - high[0],
-        "lower": height - 1 - high[1],
-    }
-    side = min(room, key=lambda name: float(room[name]))
-    return side if room[side] < 1.5 * square else ""
 
 
 def strongest_edge_px(grey: NDArray[np.uint8], spread: float) -> float:

@@ -147,7 +147,11 @@ def _fit(
 
     `start` holds parameters of patches that were fitted before, and have been centred on their corners since.
     """
-    p, lowest = _start(values, a, b, height_px), np.log(least_sigma_px / height_px)
+    # Without a start the corners are in the middles of their patches.
+    mean = values.mean(axis=1)
+    p, lowest = np.zeros((len(values), 8)), np.log(least_sigma_px / height_px)
+    p[:, 4], p[:, 5] = mean, ((values - mean[:, None]) * np.sign(a * b)).mean(axis=1)
+    p[:, 6:8] = np.log(np.clip(0.8 / height_px, 1e-3, 0.3))
     if start is not None:
         p[:, 2:] = start[:, 2:]
         p[:, 6:8] = np.clip(p[:, 6:8], lowest, 0.0)
@@ -189,15 +193,6 @@ def _fit(
         if not len(k):
             break
     return p, residuals
-
-
-def _start(values: Array, a: Array, b: Array, height_px: Array) -> Array:
-    """Guess the parameters (K, 8) of corners in the middles of their patches."""
-    mean = values.mean(axis=1)
-    p = np.zeros((len(values), 8))
-    p[:, 4], p[:, 5] = mean, ((values - mean[:, None]) * np.sign(a * b)).mean(axis=1)
-    p[:, 6:8] = np.log(np.clip(0.8 / height_px, 1e-3, 0.3))
-    return p
 
 
 def _model(p: Array, values: Array, a: Array, b: Array) -> tuple[Array, Array]:

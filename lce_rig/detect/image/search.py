@@ -1,4 +1,4 @@
-"""The board in a picture: corners, both poses and figures, or why there is none."""
+"""The board in an image: corners, both poses and figures, or why there is none."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -80,7 +80,7 @@ def find_image_board(
         intrinsics: of the camera, at the image's resolution.
         region: (u0, v0, u1, v1) px to search first, from `region_around` the board in the last live image;
             the whole image follows where it is not there.
-        last: the board in the last live picture: where it is there still, or within a third of a square,
+        last: the board in the last live image: where it is there still, or within a third of a square,
             nothing is searched.
         max_reprojection_px: refuse where the corners' rms distance from the board's image is larger.
         min_contrast: refuse where black and white differ by fewer grey values.
@@ -114,11 +114,16 @@ def find_image_board(
     if problem is not None:
         return problem
 
-    solved, crossings = _solve(
-        grey, crossings, board, intrinsics, _starts(None if followed is None else last)
-    )
-    if solved is None or solved.reprojection_px > max_reprojection_px:
-        return _misfit(solved, intrinsics, max_reprojection_px)
+    # The poses of a board that was followed are near its last ones.
+    poses = [] if followed is None or last is None else [last.T_cam_board, last.T_cam_board_alternative]
+    near = [T_cam_board for T_cam_board in poses if T_cam_board is not None]
+    solved, crossings = _solve(grey, crossings, board, intrinsics, near)
+    lens = {"model": intrinsics.model, "width_px": intrinsics.width_px, "height_px": intrinsics.height_px}
+    if solved is None:
+        return IMAGE_NO_POSE.refusal(**lens)
+    if solved.reprojection_px > max_reprojection_px:
+        errors = {"rms_px": solved.reprojection_px, "max_rms_px": max_reprojection_px}
+        return IMAGE_MISFIT.refusal(**lens, **errors)
     quality = replace(quality, n_corners=int(crossings.is_fitted.sum()))
     return board_from_pose(crossings.grid_px.reshape(-1, 2), solved, quality)
 
@@ -181,8 +186,15 @@ def compare_size(image: Image, intrinsics: Intrinsics) -> Finding | None:
     if 0 <= missing_u <= _CUT_FRACTION and 0 <= missing_v <= _CUT_FRACTION:
         return IMAGE_SIZE_CUT(subject, **figures)
     is_canvas = -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0
-    if is_canvas and _is_blank_beyond(image.grey, wanted_width, wanted_height):
-        return IMAGE_SIZE_CANVAS(subject, **figures)
+    if is_canvas:
+        # Right of and below the sensor's size there is only a smooth background; the columns next to the
+        # sensor's are not judged.
+        steps = np.abs(np.diff(image.grey.astype(np.int16), axis=1))
+        inside = np.percentile(steps[:wanted_height, : wanted_width - 1], 99)
+        beyond = (steps[wanted_height:].ravel(), steps[:wanted_height, wanted_width + 8 :].ravel())
+        outside = np.concatenate(beyond)
+        if len(outside) and np.percentile(outside, 99) <= max(0.3 * inside, 2.0):
+            return IMAGE_SIZE_CANVAS(subject, **figures)
     is_scaled = abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width
     return IMAGE_SIZE_OTHER(subject, action="scaled" if is_scaled else "", **figures)
 
@@ -197,16 +209,6 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
     if found is not None and found.severity == "error":
         raise ProfileError(f"{found.subject}: {found.text}", found.advice)
     return image.grey[: intrinsics.height_px, : intrinsics.width_px]
-
-
-def _is_blank_beyond(grey: NDArray[np.uint8], width_px: int, height_px: int) -> bool:
-    """Return whether nothing but a smooth background lies right of and below the sensor's size."""
-    steps = np.abs(np.diff(grey.astype(np.int16), axis=1))
-    inside = np.percentile(steps[:height_px, : width_px - 1], 99)
-    beyond = np.concatenate([steps[height_px:].ravel(), steps[:height_px, width_px + 8 :].ravel()])
-    if not len(beyond):
-        return False  # Columns next to the sensor's are not judged, and there are no others.
-    return bool(np.percentile(beyond, 99) <= max(0.3 * inside, 2.0))
 
 
 def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> Crossings | None:
@@ -244,20 +246,14 @@ def _find_in_region(
     part = grey[max(v0, 0) : v1, max(u0, 0) : u1]
     if min(part.shape) < 16:
         return None
-    square_px = None if is_thorough or last is None else _square_px(last, board)
-    found = find_grid(np.ascontiguousarray(part), board, is_thorough=is_thorough, square_px=square_px)
-    return None if found is None else replace(found, grid_px=found.grid_px + [max(u0, 0), max(v0, 0)])
-
-
-def _starts(last: ImageBoard | None) -> list[Array]:
-    """List where a board that was followed has its poses, about: they jump no farther than it did."""
-    poses = [] if last is None else [last.T_cam_board, last.T_cam_board_alternative]
-    return [T_cam_board for T_cam_board in poses if T_cam_board is not None]
-
-
-def _square_px(found: ImageBoard, board: Board) -> float:
-    grid_px = found.corners_px.reshape(board.rows, board.cols, 2)
-    return float(np.median(np.linalg.norm(np.diff(grid_px, axis=1), axis=-1)))
+    square_px = None
+    if not is_thorough and last is not None:
+        grid_px = last.corners_px.reshape(board.rows, board.cols, 2)
+        square_px = float(np.median(np.linalg.norm(np.diff(grid_px, axis=1), axis=-1)))
+    crossings = find_grid(np.ascontiguousarray(part), board, is_thorough=is_thorough, square_px=square_px)
+    if crossings is None:
+        return None
+    return replace(crossings, grid_px=crossings.grid_px + [max(u0, 0), max(v0, 0)])
 
 
 def _solve(
@@ -304,11 +300,3 @@ def _solve(
 def _errors(T_cam_board: Array, crossings: Crossings, corners_board: Array, intrinsics: Intrinsics) -> Array:
     predicted, _ = intrinsics.project(transform(T_cam_board, corners_board))
     return np.asarray(np.linalg.norm(predicted - crossings.grid_px.reshape(-1, 2), axis=1))
-
-
-def _misfit(solved: PlanarPose | None, intrinsics: Intrinsics, max_reprojection_px: float) -> Refusal:
-    lens = {"model": intrinsics.model, "width_px": intrinsics.width_px, "height_px": intrinsics.height_px}
-    if solved is None:
-        return IMAGE_NO_POSE.refusal(**lens)
-    errors = {"rms_px": solved.reprojection_px, "max_rms_px": max_reprojection_px}
-    return IMAGE_MISFIT.refusal(**lens, **errors)

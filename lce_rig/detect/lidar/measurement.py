@@ -308,12 +308,13 @@ def build_board(
     incidence = np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0))
     # The effective size of the light spot is unknown.
     size_m, sigma_m = 2 * np.asarray(fitted.half_m), np.hypot(size_sigma_m, beyond_m)
+    weight = 1.0 / sigma_m**2
     quality = LidarQuality(
         width_m=float(size_m[0]),
         height_m=float(size_m[1]),
         width_sigma_m=float(sigma_m[0]),
         height_sigma_m=float(sigma_m[1]),
-        size_ratio=_size_ratio(size_m, sigma_m, board),
+        size_ratio=float((weight * size_m / [board.width_m, board.height_m]).sum() / weight.sum()),
         n_rings=1 + int(np.count_nonzero(np.diff(scan.ring[kept]))),
         n_points=len(kept),
         n_ring_ends=len(edge),
@@ -326,6 +327,19 @@ def build_board(
         incidence_deg=float(np.degrees(incidence)),
         range_noise_m=scan.sigma_m,
     )
+    # The share of the power that comes from behind where a beam meets it and the board alike. Intensities
+    # are those of surfaces; the power received falls with the square of the range.
+    intensity = source.intensity[scan.index].astype(np.float64)
+    of_board = float(np.median(intensity[border])) if len(border) else 0.0
+    end = view.member[ends.beam]
+    brightness = intensity[ends.beyond] / of_board if of_board > 0 else np.ones(len(end))
+    echo = brightness * (scan.range_m[end] / scan.range_m[ends.beyond]) ** 2
+    echo = np.where(np.isfinite(ends.behind_m), echo / (1 + echo), 0.0)
+    # y points upwards where the rectangle leaves the choice.
+    direction = np.array([np.cos(fitted.angle_rad), np.sin(fitted.angle_rad)])
+    x = view.axes @ (-direction if direction[0] < 0 else direction)
+    normal = view.plane[:3]
+    R = np.stack([x, np.cross(normal, x), normal], axis=1)
     return LidarBoard(
         points=points,
         ring=scan.ring[kept],
@@ -333,48 +347,11 @@ def build_board(
         edge_ring=scan.ring[edge],
         edge_side=ends.side[order],
         edge_behind_m=ends.behind_m[order],
-        edge_echo=_echo_shares(scan, source, ends, view, border)[order],
+        edge_echo=echo[order],
         azimuth_step_rad=scan.step_rad,
         plane=view.plane,
         sigma_m=rms_m,
-        T_lidar_board=_pose_of(view, fitted),
+        T_lidar_board=pose(R, view.origin + view.axes @ [fitted.u_m, fitted.v_m]),
         offset_ns=None if source.offset_ns is None else source.offset_ns[scan.index[kept]],
         quality=quality,
     )
-
-
-def _size_ratio(size_m: Array, sigma_m: Array, board: Board) -> float:
-    """Compare width and height (2,), with their sigmas (2,), with the nominal ones."""
-    weight = 1.0 / sigma_m**2
-    return float((weight * size_m / [board.width_m, board.height_m]).sum() / weight.sum())
-
-
-def _echo_shares(scan: OrderedScan, source: Scan, ends: RingEnds, view: PlaneView, border: Indices) -> Array:
-    """Compute the share (E,) of the power that comes from behind where a beam meets it and the board alike.
-
-    Intensities are those of surfaces; what is received from them falls with the square of the range.
-
-    Args:
-        scan: all returns.
-        source: the scan they come from; where it has no intensities all surfaces count as alike.
-        ends: ring ends.
-        view: beams about the board.
-        border: returns from near the board's outline.
-    """
-    intensity = source.intensity[scan.index].astype(np.float64)
-    end = view.member[ends.beam]
-    of_board = float(np.median(intensity[border])) if len(border) else 0.0
-    brightness = intensity[ends.beyond] / of_board if of_board > 0 else np.ones(len(end))
-    echo = brightness * (scan.range_m[end] / scan.range_m[ends.beyond]) ** 2
-    return np.where(np.isfinite(ends.behind_m), echo / (1 + echo), 0.0)
-
-
-def _pose_of(view: PlaneView, placement: Placement) -> Array:
-    """Compute T_lidar_board of a placement, y upwards where the rectangle leaves the choice."""
-    direction = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
-    if direction[0] < 0:
-        direction = -direction
-    x = view.axes @ direction
-    normal = view.plane[:3]
-    R = np.stack([x, np.cross(normal, x), normal], axis=1)
-    return pose(R, view.origin + view.axes @ [placement.u_m, placement.v_m])

@@ -61,7 +61,11 @@ def propose_plates(
     tolerance_m = 2.0 * scan.sigma_m + 0.01
     segments = segments.select(segments.lateral_m < tolerance_m)
     first, second = _neighbours(segments, diagonal_m, is_any_size)
-    sums = _sums(segments)
+    # Count, sum of p and sum of p p^T of each segment.
+    outer = segments.centre[:, :, None] * segments.centre[:, None, :]
+    second_moments = (segments.scatter + segments.count[:, None, None] * outer).reshape(-1, 9)
+    count = segments.count[:, None]
+    sums = np.concatenate([count, count * segments.centre, second_moments], axis=1)
     plates = _fit(np.repeat(np.arange(len(first)), 2), np.stack([first, second], 1).ravel(), segments, sums)
     is_kept = (plates.thickness_m < tolerance_m) & _faces_lidar(plates)
     facing, is_blurred = _facing_planes(plates, segments, first, second, 3.0 * scan.sigma_m)
@@ -83,7 +87,14 @@ def propose_plates(
             (ratio[:, 0] > 0.5) & (ratio[:, 0] < 1.5) & (ratio[:, 1] > 0.25) & (ratio[:, 1] < 1.5)
         )
     best = _different(plates, np.flatnonzero(is_kept), board, n_plates)
-    ends = [_ring_ends(scan, segments, column[row == k]) for k in best]
+    ends = []
+    for k in best:
+        members = column[row == k]
+        start, end = segments.start[members], segments.end[members]
+        # Segments a few returns apart count as one.
+        is_joint = (start[1:] - end[:-1] <= MAX_JOINT) & (np.diff(segments.ring[members]) == 0)
+        firsts, lasts = start[np.append(True, ~is_joint)], end[np.append(~is_joint, True)] - 1
+        ends.append(scan.points[np.concatenate([firsts, lasts])].astype(np.float64))
     padded = np.full((len(best), max((len(e) for e in ends), default=1), 3), np.nan)
     for k, e in enumerate(ends):
         padded[k, : len(e)] = e
@@ -107,15 +118,6 @@ def _facing_planes(
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
     d = -np.einsum("ij,ij->i", normal, plates.centre)
     return np.concatenate([normal, d[:, None]], axis=1), is_blurred
-
-
-def _ring_ends(scan: OrderedScan, segments: Segments, members: Indices) -> Array:
-    """List the ends (M, 3) of a plate's segments in m; segments a few returns apart count as one."""
-    start, end = segments.start[members], segments.end[members]
-    is_joint = (start[1:] - end[:-1] <= MAX_JOINT) & (np.diff(segments.ring[members]) == 0)
-    first = start[np.append(True, ~is_joint)]
-    last = end[np.append(~is_joint, True)] - 1
-    return np.asarray(scan.points[np.concatenate([first, last])], dtype=np.float64)
 
 
 def _neighbours(segments: Segments, diagonal_m: float, is_any_size: bool) -> tuple[Indices, Indices]:
@@ -155,15 +157,6 @@ def _spread_out(centres: Array, cell_m: float) -> Indices:
     rank = np.empty(len(cell), dtype=np.intp)
     rank[order] = np.arange(len(cell)) - np.repeat(starts, np.diff(np.append(starts, len(cell))))
     return np.sort(np.argsort(rank, kind="stable")[:MAX_PAIRS])
-
-
-def _sums(segments: Segments) -> Array:
-    """Stack count, sum of p and sum of p p^T of each segment (S, 13)."""
-    outer = segments.centre[:, :, None] * segments.centre[:, None, :]
-    second = (segments.scatter + segments.count[:, None, None] * outer).reshape(-1, 9)
-    return np.concatenate(
-        [segments.count[:, None], segments.count[:, None] * segments.centre, second], axis=1
-    )
 
 
 def _fit(row: Indices, column: Indices, segments: Segments, sums: Array) -> Plates:

@@ -1,6 +1,6 @@
 """Find the board in a full LiDAR scan, without a prior."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,29 +27,41 @@ from lce_rig.detect.lidar.plates import propose_plates, screen_plates
 from lce_rig.detect.lidar.segments import Indices, OrderedScan, cut_segments, order_scan
 from lce_rig.detect.lidar.template import Placement, PlaneView, beams_about, plane_axes, view_plane
 
-# Refusals of a scan: the nearest candidate, with its figures.
-
 # Share of returns beyond the outline, in the board's plane, from which something touches the board.
 TOUCHING_SHARE = 0.10
 SCATTER_M = 0.02  # by how much more than the LiDAR's noise a moving board's returns may scatter to be named
-MAX_SIZE_MISFIT = (
-    0.75  # sum of |log| of the ratios of long and short side up to which a plate is worth naming
-)
+# Sum of |log| of the ratios of long and short side up to which a plate is worth naming.
+MAX_SIZE_MISFIT = 0.75
 LAYER_M = 0.06  # half the depth in which returns may belong to one warped or moving sheet
 
 
-def no_returns(n_points: int, min_range_m: float) -> Refusal:
-    """Refuse a scan without usable returns."""
-    return LIDAR_NO_RETURNS.refusal(n_points=n_points, min_range_m=min_range_m)
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the search, and for accepting a plate as the board.
+
+    Attributes:
+        template_m: largest mean distance of the outline from where the rings end.
+        rms_m: largest rms distance of the returns from the plane.
+        min_rings: fewest rings on the board.
+        min_range_m: nearer returns are ignored.
+        max_range_m: plates farther away are ignored.
+        beam: light spot of the LiDAR, a VLP-16's by default.
+    """
+
+    template_m: float = 0.025
+    rms_m: float = 0.012
+    min_rings: int = 4
+    min_range_m: float = 0.4
+    max_range_m: float = 6.0
+    beam: Beam = field(default_factory=Beam)
+
+    def widened(self, sigma_m: float) -> "Limits":
+        """Allow for the noise that a scan shows."""
+        template_m = min(self.template_m + 1.5 * sigma_m, 0.06)
+        return replace(self, template_m=template_m, rms_m=plane_limit_m(self.rms_m, sigma_m))
 
 
-def too_few_rings(found: LidarBoard, min_rings: int) -> Refusal:
-    """Refuse a board on which too few rings lie; their number goes with 1 / distance."""
-    n_rings, distance_m = found.quality.n_rings, found.quality.distance_m
-    closer_m = max(0.1, distance_m * (1.0 - n_rings / min_rings))
-    return LIDAR_TOO_FEW_RINGS.refusal(
-        n_rings=n_rings, min_rings=min_rings, distance_m=distance_m, closer_m=closer_m
-    )
+STANDARD = Limits()
 
 
 def too_thick(heights_m: Array, limit_m: float) -> Refusal:
@@ -88,9 +100,7 @@ def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_li
     )
 
 
-def no_plate(
-    scan: OrderedScan, board: Board, limit_m: float, min_range_m: float, max_range_m: float
-) -> Refusal:
+def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
     """Refuse a scan in which no plate is the board, naming what comes nearest to it.
 
     The search is repeated for plates of any size and of returns that scatter more than the LiDAR's do.
@@ -98,13 +108,11 @@ def no_plate(
     Args:
         scan: all returns.
         board: the board searched for.
-        limit_m: largest error of an outline.
-        min_range_m: minimum distance of the search.
-        max_range_m: maximum distance of the search.
+        limits: with the scan's noise.
     """
     coarse = replace(scan, sigma_m=scan.sigma_m + SCATTER_M)
-    plates, ends = propose_plates(coarse, cut_segments(coarse, max_range_m), board, is_any_size=True)
-    for plane, centre, placement in screen_plates(plates, ends, board, limit_m):
+    plates, ends = propose_plates(coarse, cut_segments(coarse, limits.max_range_m), board, is_any_size=True)
+    for plane, centre, placement in screen_plates(plates, ends, board, limits.template_m):
         radius_m = float(np.hypot(*placement.half_m))
         view = view_plane(scan, beams_about(scan, centre, radius_m), plane, centre, radius_m, LAYER_M)
         distance = placement.distance_m(view.uv)
@@ -123,7 +131,7 @@ def no_plate(
             distance_m=float(np.linalg.norm(plates.centre[best])),
             **wanted,
         )
-    return LIDAR_NO_PLATE.refusal(**wanted, min_range_m=min_range_m, max_range_m=max_range_m)
+    return LIDAR_NO_PLATE.refusal(**wanted, min_range_m=limits.min_range_m, max_range_m=limits.max_range_m)
 
 
 MAX_CANDIDATES = 4
@@ -134,44 +142,15 @@ CLEAR_SHARE = 0.05
 PATCH_SHARE = 0.20
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Limits for accepting a plate as the board.
-
-    Attributes:
-        template_m: largest mean distance of the outline from where the rings end.
-        rms_m: largest rms distance of the returns from the plane.
-        min_rings: fewest rings on the board.
-    """
-
-    template_m: float
-    rms_m: float
-    min_rings: int
-
-    def widened(self, sigma_m: float) -> "Limits":
-        """Allow for the noise that a scan shows."""
-        template_m = min(self.template_m + 1.5 * sigma_m, 0.06)
-        return Limits(template_m, plane_limit_m(self.rms_m, sigma_m), self.min_rings)
-
-
 def plane_limit_m(rms_m: float, sigma_m: float) -> float:
     """Return the largest rms distance of returns from a plane: a limit without noise, and the noise."""
     return rms_m + 1.5 * sigma_m
 
 
-STANDARD = Limits(template_m=0.025, rms_m=0.012, min_rings=4)
-
-
 def find_lidar_boards(
     scan: Scan,
     board: Board,
-    *,
-    min_range_m: float = 0.4,
-    max_range_m: float = 6.0,
-    min_rings: int = STANDARD.min_rings,
-    max_template_m: float = STANDARD.template_m,
-    max_rms_m: float = STANDARD.rms_m,
-    beam: Beam | None = None,
+    limits: Limits = STANDARD,
 ) -> list[LidarBoard] | Refusal:
     """Find the plates of the board's size in a scan, best first.
 
@@ -182,12 +161,7 @@ def find_lidar_boards(
     Args:
         scan: one revolution, or part of one.
         board: the outer size is what is looked for.
-        min_range_m: nearer returns are ignored.
-        max_range_m: plates farther away are ignored.
-        min_rings: fewest rings on the board.
-        max_template_m: largest mean distance of the outline from where the rings end, without noise.
-        max_rms_m: largest rms distance of the board's returns from its plane, without noise.
-        beam: light spot of the LiDAR; that of a VLP-16 if None.
+        limits: without noise.
 
     Returns:
         At most 4 boards that do not overlap, or why there is none.
@@ -195,39 +169,35 @@ def find_lidar_boards(
     References:
         LCE-Calib, "Automatic Feature Extraction From LiDARs": selection and features.
     """
-    ordered = order_scan(scan, min_range_m)
+    ordered = order_scan(scan, limits.min_range_m)
     if len(ordered.index) == 0:
-        return no_returns(len(scan.points), min_range_m)
-    segments = cut_segments(ordered, max_range_m, 2.0 * float(np.hypot(board.width_m, board.height_m)))
+        return LIDAR_NO_RETURNS.refusal(n_points=len(scan.points), min_range_m=limits.min_range_m)
+    diagonal_m = float(np.hypot(board.width_m, board.height_m))
+    segments = cut_segments(ordered, limits.max_range_m, 2.0 * diagonal_m)
     plates, ends = propose_plates(ordered, segments, board)
-    limits = Limits(max_template_m, max_rms_m, min_rings).widened(ordered.sigma_m)
-    found: list[LidarBoard] = []
+    limits = limits.widened(ordered.sigma_m)
+    boards: list[LidarBoard] = []
     misses: list[Refusal] = []
     max_beyond = np.inf
-    for plane, origin, start in screen_plates(plates, ends, board, limits.template_m):
-        measured = measure_plate(ordered, scan, board, plane, origin, start, limits, beam, max_beyond)
+    for start in screen_plates(plates, ends, board, limits.template_m):
+        measured = measure_plate(ordered, scan, board, start, limits, max_beyond)
         if isinstance(measured, Refusal):
             misses.append(measured)
         elif measured is not None:
-            found.append(measured)
-            if _is_clear(measured):
+            boards.append(measured)
+            if measured.quality.n_rings >= CLEAR_RINGS and measured.quality.beyond_share < CLEAR_SHARE:
                 max_beyond = PATCH_SHARE
-    if found:
-        return _distinct(found, board)
-    if misses:
-        return misses[0]
-    return no_plate(ordered, board, limits.template_m, min_range_m, max_range_m)
+    if boards:
+        return _distinct(boards, board)
+    return misses[0] if misses else no_plate(ordered, board, limits)
 
 
 def measure_plate(
     ordered: OrderedScan,
     scan: Scan,
     board: Board,
-    plane: Array,
-    origin: Array,
-    start: Placement,
+    start: tuple[Array, Array, Placement],
     limits: Limits,
-    beam: Beam | None = None,
     max_beyond: float = np.inf,
 ) -> LidarBoard | Refusal | None:
     """Register the board's outline from a first guess, measure the board and check it against the limits.
@@ -236,36 +206,34 @@ def measure_plate(
         ordered: the returns of the scan.
         scan: where they come from.
         board: nominal size.
-        plane: (4,) first guess, as (n, d).
-        origin: (3,) m, the point of the plane the first guess is counted from.
-        start: first guess of the outline.
+        start: first guess of the plane (4,) as (n, d), its point (3,) in m that the outline is counted from,
+            and the outline.
         limits: with the scan's noise.
-        beam: light spot of the LiDAR; that of a VLP-16 if None.
         max_beyond: largest share of returns in the plane beyond the outline, as it is guessed.
 
     Returns:
         The board, why it is refused, None if there is no plate.
     """
-    refined = refine(ordered, plane, origin, start, limits.template_m, max_beyond)
+    refined = refine(ordered, *start, limits.template_m, max_beyond)
     if refined is None:
         return None
     view, placement = refined
     if placement.error_m > limits.template_m:
         return outline_misfit(view, placement, limits.template_m, limits.rms_m)
-    measured = build_board(ordered, scan, board, view, placement, beam or Beam())
+    measured = build_board(ordered, scan, board, view, placement, limits.beam)
     if measured is None:
         return None
-    if measured.quality.n_rings < limits.min_rings:
-        return too_few_rings(measured, limits.min_rings)
+    n_rings, distance_m = measured.quality.n_rings, measured.quality.distance_m
+    if n_rings < limits.min_rings:
+        # The number of rings goes with 1 / distance.
+        closer_m = max(0.1, distance_m * (1.0 - n_rings / limits.min_rings))
+        return LIDAR_TOO_FEW_RINGS.refusal(
+            n_rings=n_rings, min_rings=limits.min_rings, distance_m=distance_m, closer_m=closer_m
+        )
     if measured.sigma_m > limits.rms_m:
         heights_m = measured.points @ measured.plane[:3] + measured.plane[3]
         return too_thick(heights_m, limits.rms_m)
     return measured
-
-
-def _is_clear(found: LidarBoard) -> bool:
-    """Return whether a candidate has many rings and its plane almost to itself."""
-    return found.quality.n_rings >= CLEAR_RINGS and found.quality.beyond_share < CLEAR_SHARE
 
 
 def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
@@ -292,25 +260,19 @@ def _penalty(found: LidarBoard, board: Board) -> float:
     return penalty
 
 
-# Follow the board from one scan to the next.
-
 WORSE_M = 0.003  # by how much the outline of a board held still may fit worse than before
 # Farther from its last pose a board did not stand still: the search is the safer start.
 STILL_M, STILL_TURN = 0.02, np.cos(np.radians(1.5))
 STILL_SHARE = 0.9  # of the board's returns must lie where it was for a closer look
 MAX_TURN = np.cos(np.radians(45.0))
+MARGIN_M = 0.25  # by how much the box that is searched reaches beyond the board on every side
 
 
 def track_lidar_board(
     scan: Scan,
     board: Board,
     previous: LidarBoard,
-    *,
-    margin_m: float = 0.25,
-    min_range_m: float = 0.4,
-    min_rings: int = STANDARD.min_rings,
-    max_rms_m: float = STANDARD.rms_m,
-    beam: Beam | None = None,
+    limits: Limits = STANDARD,
 ) -> LidarBoard | Refusal:
     """Find the board near its previous pose: only returns in a box about it are looked at.
 
@@ -320,11 +282,7 @@ def track_lidar_board(
         scan: one revolution.
         board: the outer size is what is looked for.
         previous: the board in an earlier scan.
-        margin_m: by how much the box reaches beyond the board on every side.
-        min_range_m: nearer returns are ignored.
-        min_rings: fewest rings on the board.
-        max_rms_m: largest rms distance of the board's returns from its plane, without noise.
-        beam: light spot of the LiDAR; that of a VLP-16 if None.
+        limits: without noise; the search has no maximum range.
 
     Returns:
         The best candidate in the box, or why there is none.
@@ -332,20 +290,11 @@ def track_lidar_board(
     References:
         LCE-Calib, "Checkerboard Tracking".
     """
-    nearby = scan.select(_near(scan, board, previous.T_lidar_board, margin_m))
-    limits = Limits(STANDARD.template_m, max_rms_m, min_rings)
-    still = _measure_again(nearby, board, previous, min_range_m, limits, beam)
+    nearby = scan.select(_near(scan, board, previous.T_lidar_board))
+    still = _measure_again(nearby, board, previous, limits)
     if still is not None:
         return still
-    found = find_lidar_boards(
-        nearby,
-        board,
-        min_range_m=min_range_m,
-        max_range_m=np.inf,
-        min_rings=min_rings,
-        max_rms_m=max_rms_m,
-        beam=beam,
-    )
+    found = find_lidar_boards(nearby, board, replace(limits, max_range_m=np.inf))
     if isinstance(found, Refusal):
         return LIDAR_LOST.refusal(**found.figures, cause=found.code)
     for candidate in found:
@@ -354,20 +303,14 @@ def track_lidar_board(
     return LIDAR_TURNED_AWAY.refusal(max_turn_deg=float(np.degrees(np.arccos(MAX_TURN))))
 
 
-# Look where the board must be.
-
-LOOK_MARGIN_M, LOOK_TURN = 0.25, np.cos(np.radians(15.0))
+LOOK_TURN = np.cos(np.radians(15.0))
 
 
 def look_for_board(
     scan: Scan,
     board: Board,
     T_lidar_board: Array,
-    *,
-    min_range_m: float = 0.4,
-    min_rings: int = STANDARD.min_rings,
-    max_rms_m: float = STANDARD.rms_m,
-    beam: Beam | None = None,
+    limits: Limits = STANDARD,
 ) -> LidarBoard | Refusal:
     """Find the board about a predicted pose, such as an image and extrinsics give.
 
@@ -377,38 +320,25 @@ def look_for_board(
         scan: one revolution.
         board: the outer size is what is looked for.
         T_lidar_board: (4, 4) predicted.
-        min_range_m: nearer returns are ignored.
-        min_rings: fewest rings on the board.
-        max_rms_m: largest rms distance of the board's returns from its plane, without noise.
-        beam: light spot of the LiDAR; that of a VLP-16 if None.
+        limits: without noise; the search has no maximum range.
 
     Returns:
         The board, or why none is there.
     """
-    ordered = order_scan(scan, min_range_m)
+    ordered = order_scan(scan, limits.min_range_m)
     if len(ordered.index) == 0:
-        return no_returns(len(scan.points), min_range_m)
-    limits = Limits(STANDARD.template_m, max_rms_m, min_rings).widened(ordered.sigma_m)
+        return LIDAR_NO_RETURNS.refusal(n_points=len(scan.points), min_range_m=limits.min_range_m)
     normal, centre = T_lidar_board[:3, 2], T_lidar_board[:3, 3]
     plane = np.append(normal, -normal @ centre) * (-1.0 if normal @ centre > 0 else 1.0)
-    at_once = measure_plate(
-        ordered, scan, board, plane, centre, _placed(board, plane, T_lidar_board), limits, beam
-    )
+    start = plane, centre, _placed(board, plane, T_lidar_board)
+    at_once = measure_plate(ordered, scan, board, start, limits.widened(ordered.sigma_m))
     if isinstance(at_once, LidarBoard) and _is_at(at_once, plane, centre):
         return at_once
-    nearby = scan.select(_near(scan, board, T_lidar_board, LOOK_MARGIN_M))
-    found = find_lidar_boards(
-        nearby,
-        board,
-        min_range_m=min_range_m,
-        max_range_m=np.inf,
-        min_rings=min_rings,
-        max_rms_m=max_rms_m,
-        beam=beam,
-    )
+    nearby = scan.select(_near(scan, board, T_lidar_board))
+    found = find_lidar_boards(nearby, board, replace(limits, max_range_m=np.inf))
     if not isinstance(found, Refusal):
         return next(
-            (each for each in found if _is_at(each, plane, centre)),
+            (candidate for candidate in found if _is_at(candidate, plane, centre)),
             LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=float(np.linalg.norm(centre))),
         )
     cause = at_once if isinstance(at_once, Refusal) else found
@@ -418,7 +348,7 @@ def look_for_board(
 def _is_at(found: LidarBoard, plane: Array, centre: Array) -> bool:
     """Return whether a board lies where it was predicted."""
     away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - centre))
-    return away_m < LOOK_MARGIN_M and float(found.plane[:3] @ plane[:3]) > LOOK_TURN
+    return away_m < MARGIN_M and float(found.plane[:3] @ plane[:3]) > LOOK_TURN
 
 
 def _placed(board: Board, plane: Array, T_lidar_board: Array) -> Placement:
@@ -428,10 +358,10 @@ def _placed(board: Board, plane: Array, T_lidar_board: Array) -> Placement:
     return Placement(0.0, 0.0, float(np.arctan2(width_axis[1], width_axis[0])), half_m)
 
 
-def _near(scan: Scan, board: Board, T_lidar_board: Array, margin_m: float) -> Indices:
+def _near(scan: Scan, board: Board, T_lidar_board: Array) -> Indices:
     """List the returns in a box about the board's place."""
     T = T_lidar_board
-    half = np.array([board.width_m / 2, board.height_m / 2, 0.0]) + margin_m
+    half = np.array([board.width_m / 2, board.height_m / 2, 0.0]) + MARGIN_M
     rotation, centre = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
     # A sphere first: it is the cheaper test, and few returns pass it.
     away = np.ascontiguousarray(scan.points.T) - centre[:, None]
@@ -441,23 +371,19 @@ def _near(scan: Scan, board: Board, T_lidar_board: Array, margin_m: float) -> In
     return np.asarray(near[is_inside])
 
 
-def _measure_again(
-    nearby: Scan, board: Board, previous: LidarBoard, min_range_m: float, limits: Limits, beam: Beam | None
-) -> LidarBoard | None:
+def _measure_again(nearby: Scan, board: Board, previous: LidarBoard, limits: Limits) -> LidarBoard | None:
     """Start from the last pose, valid for a still board; None unless it fits as well again."""
     T = previous.T_lidar_board
     half = np.array([board.width_m / 2, board.height_m / 2, 3.0 * previous.sigma_m])
     is_on = (np.abs((nearby.points - T[:3, 3]) @ T[:3, :3]) <= half).all(axis=1)
     if np.count_nonzero(is_on) < max(STILL_SHARE * len(previous.points), 1):
         return None
-    ordered = order_scan(nearby, min_range_m)
+    ordered = order_scan(nearby, limits.min_range_m)
     if len(ordered.index) == 0:
         return None
-    start = _placed(board, previous.plane, T)
+    start = previous.plane, T[:3, 3], _placed(board, previous.plane, T)
     limits = replace(limits, template_m=min(limits.template_m, previous.quality.template_m + WORSE_M))
-    measured = measure_plate(
-        ordered, nearby, board, previous.plane, T[:3, 3], start, limits.widened(ordered.sigma_m), beam
-    )
+    measured = measure_plate(ordered, nearby, board, start, limits.widened(ordered.sigma_m))
     if not isinstance(measured, LidarBoard):
         return None
     is_still = np.linalg.norm(measured.T_lidar_board[:3, 3] - T[:3, 3]) < STILL_M
