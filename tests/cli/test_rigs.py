@@ -97,29 +97,6 @@ def test_a_full_disk_leaves_no_part_of_a_profile(capsys: pytest.CaptureFixture[s
     assert run(["rigs", "new", "mine", "-o", str(path)]) == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "says"),
-    [
-        (["--set", "board.square_m=70"], 3, "board.square_m: 70 looks like millimetres"),
-        (["--set", "board.square_m"], 2, "KEY=VALUE"),
-        (["--from", "rlsf"], 3, "The nearest is rlfs"),
-        (["--from", "missing.yaml"], 3, "there is no such file"),
-    ],
-)
-def test_new_writes_nothing_where_something_is_wrong(
-    arguments: list[str],
-    code: int,
-    says: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run(["rigs", "new", "mine", *arguments]) == code
-    assert says in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_profile_of_ones_own_sensors_takes_one_command(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -144,6 +121,10 @@ def test_a_profile_of_ones_own_sensors_takes_one_command(
 @pytest.mark.parametrize(
     ("words", "code"),
     [
+        (["mine", "--set", "board.square_m=70"], 3),
+        (["mine", "--set", "board.square_m"], 2),
+        (["mine", "--from", "rlsf"], 3),
+        (["mine", "--from", "missing.yaml"], 3),
         (["x.yaml"], 2),
         (["x", "--from", "there/is/none.bag", "--board", "8x6,0.07,0.767x0.626"], 5),
         (["x", "--lidar", "OS1-64", "--board", "8x6,0.07,0.767x0.626"], 2),

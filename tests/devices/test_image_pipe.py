@@ -21,7 +21,6 @@ from lce_rig.devices.image_streams import (
     PnmImages,
     RawImages,
     Y4mImages,
-    find_stream,
 )
 from lce_rig.devices.pipe import ImagePipeSource
 from lce_rig.rig import CameraSettings, load_rig
@@ -101,12 +100,6 @@ def test_grey_values_are_kept(kind: str) -> None:
 def test_y4m_luma_is_of_video_range(colour: str) -> None:
     came = levels(list(Y4mImages().feed(y4m(grey_pictures(3), colour))))
     assert came == pytest.approx([(level - 16) * 255 / 219 for level in (30, 40, 50)], abs=1)
-
-
-@pytest.mark.parametrize("kind", [kind for kind in STREAMS if kind != "raw"])
-def test_streams_are_told_by_their_first_bytes(kind: str) -> None:
-    write, make = STREAMS[kind]
-    assert type(find_stream(write(grey_pictures(1))[:10])) is type(make())
 
 
 def test_a_small_picture_inside_a_jpegs_head_does_not_end_it() -> None:
