@@ -454,9 +454,11 @@ def _run(place: Place, target: TargetSettings, release: str) -> str | None:
     except TargetError as error:
         what = f"{release} is in place, but its command has no outcome: {error.what}"
         raise CommandError(what, f"{error.hint}\n{again}".strip()) from error
-    output, _, code = ran.out.rpartition(f"{SAYS}exit ")
-    if code.strip() != "0":
+    output, _, ending = ran.out.rpartition(f"{SAYS}exit ")
+    # A command that was ended by the time limit may still have written behind its exit code.
+    code = ending.partition("\n")[0].strip()
+    if code != "0":
         said = (output + ran.err).strip()
-        what = f"{release} is in place, but its command ended with {code.strip() or ran.code}: {target.run}"
+        what = f"{release} is in place, but its command ended with {code or ran.code}: {target.run}"
         raise CommandError(what, f"{said[-4000:]}\n{again}".strip())
     return output

@@ -22,6 +22,7 @@ _TOKEN_BYTES = 9
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{8,128}")
 _STOP_S, _SHUTDOWN_S, _KEEP_ALIVE_S = 1.5, 0.5, 5.0
 # For the rest of a request that was answered before its end.
+_CLOSING_S = 0.05
 _LINGERING_S = 1.0
 _LOG = logging.getLogger("lce_rig.preview")
 
@@ -160,3 +161,5 @@ class Preview:
             if handler.transport is not None:
                 handler.transport.abort()
         await runner.cleanup()
+        # Connections that were cut close in the next turns of the loop.
+        await asyncio.sleep(_CLOSING_S)
