@@ -97,7 +97,7 @@ class Worker:
         self._shared = memoryview(shared).cast("B")
         arguments = theirs, shared, self._nice, *self._made
         process = context.Process(target=_serve, args=arguments, name=self._name, daemon=True)
-        with _one_thread(), _without_main():
+        with _plain_surroundings():
             start_without_interrupts(process)
         theirs.close()
         self._connection, self._process = ours, process
@@ -115,30 +115,24 @@ def start_without_interrupts(process: BaseProcess) -> None:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let processes that start now compute in one thread: libraries read this when they are loaded."""
+def _plain_surroundings() -> Iterator[None]:
+    """Let a process that starts now compute in one thread, and hide the program from it.
+
+    Libraries read the number of threads when they are loaded. A script without a guard would run once more.
+    """
     with _starting:
-        before = {name: os.environ.get(name) for name in _ONE_THREAD}
+        before, main = {name: os.environ.get(name) for name in _ONE_THREAD}, sys.modules["__main__"]
         os.environ.update(_ONE_THREAD)
+        sys.modules["__main__"] = ModuleType("__main__")
         try:
             yield
         finally:
+            sys.modules["__main__"] = main
             for name, value in before.items():
                 if value is None:
                     del os.environ[name]
                 else:
                     os.environ[name] = value
-
-
-@contextmanager
-def _without_main() -> Iterator[None]:
-    """Hide the program from a process that starts now: a script without a guard would run there once more."""
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
 
 
 def _pack(request: object, shared: memoryview) -> tuple[bytes, _Spans]:
@@ -172,10 +166,11 @@ def _serve(
         subject = make(*arguments)
         while True:
             data, spans = connection.recv()
-            method, given = pickle.loads(data, buffers=[bytearray(shared[start:end]) for start, end in spans])
+            buffers = [bytearray(shared[start:end]) for start, end in spans]
+            method, values = pickle.loads(data, buffers=buffers)
             answer: object
             try:
-                answer = getattr(subject, method)(*given)
+                answer = getattr(subject, method)(*values)
             except LceRigError as error:
                 answer = error
             except Exception as error:  # The caller learns of bugs as well.

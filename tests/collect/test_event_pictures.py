@@ -48,7 +48,7 @@ def pictures(samples: Iterable[Sample], rig: Rig, tally: Losses | None = None) -
     return [sample for sample in found if isinstance(sample, Image)]
 
 
-def test_pictures_are_those_of_the_whole_stream_at_the_middle_of_each_sweep() -> None:
+def test_images_are_those_of_the_whole_stream_at_the_middle_of_each_scan() -> None:
     rig = rig_with()
     found = pictures(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig), rig)
     stamps_ns = [T0_NS + t * MS for t in MIDDLES_MS]

@@ -136,27 +136,25 @@ class SimulatedSource(LiveSource):
 
 
 class SimulatedRig:
-    """A simulated rig and whoever holds the board before it; open while its `with` block lasts.
+    """A simulated rig and the person with the board before it; open while its `with` block lasts.
 
     Attributes:
         sources: of its sensors: frames and scans. Events cannot be simulated in real time.
         pace: how much slower than real time it runs.
     """
 
-    def __init__(self, rig: Rig, seed: int, person: Person | None = None) -> None:
+    def __init__(self, rig: Rig, seed: int) -> None:
         """Prepare.
 
         Args:
             rig: the profile.
             seed: of truth, room, noise and the person.
-            person: how instructions are followed.
 
         Raises:
             ProfileError: the rig has no camera with frames, or its LiDAR is not known.
         """
         self._rig = rig
         self._seed = seed
-        self._person = person or Person()
         framed = [name for name, camera in rig.cameras.items() if camera.first_channel("frames")]
         if not framed:
             raise ProfileError(
@@ -185,7 +183,7 @@ class SimulatedRig:
         # A forked process would share locks of this one's threads.
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        arguments = theirs, self._rig, self._seed, self._person, dict(self._views)
+        arguments = theirs, self._rig, self._seed, dict(self._views)
         self._process = context.Process(target=_simulate, args=arguments, name="simulated rig", daemon=True)
         start_without_interrupts(self._process)
         theirs.close()
@@ -254,9 +252,7 @@ def _view(rig: Rig, camera: str) -> SensorPlace:
     return SensorPlace.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
 
 
-def _simulate(
-    connection: Connection, rig: Rig, seed: int, person: Person, views: Mapping[str, SensorPlace]
-) -> None:
+def _simulate(connection: Connection, rig: Rig, seed: int, views: Mapping[str, SensorPlace]) -> None:
     """Run the simulation until the other end is gone."""
     try:
         scene = LiveScene(rig, seed, SimulationOptions.for_rig(rig.name))
@@ -271,7 +267,7 @@ def _simulate(
         return  # The parent has ended.
     if isinstance(answer, LceRigError):
         return
-    walker = Walker(scene, person, views)
+    walker = Walker(scene, Person(), views)
     period_ns = max(model.period_ns for model in scene.stage.models.values())
     stamp_ns, due_s = time.time_ns(), time.monotonic()
     try:

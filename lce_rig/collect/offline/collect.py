@@ -1,10 +1,10 @@
 """Build a session from recordings, unattended: what is new becomes a capture, the rest is counted."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment, ImageKey
+from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.findings import CALIBRATE_SAME_PLACEMENT
 from lce_rig.collect.offline.search_ahead import sight_ahead
@@ -12,7 +12,7 @@ from lce_rig.collect.offline.slow_motion import find_moving_moments
 from lce_rig.collect.offline.stillness import find_still_moments
 from lce_rig.collect.offline.stored_events import StoredEvents
 from lce_rig.collect.placement_dedupe import Placements, board_figures, capture_poses, known_placements
-from lce_rig.core.data import Events, Image, Sample, Scan, Stream
+from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.losses import Losses
@@ -25,7 +25,6 @@ from lce_rig.io.protocol import (
     Recording,
     serials_of,
 )
-from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time
@@ -38,79 +37,6 @@ _THOROUGH_S = 1.0
 _LONG_SAMPLES = 200
 # Comparing small images misses motions below this: looser limits on stillness need full searches.
 _GLANCED_M = 0.01
-
-
-@dataclass
-class MomentSearch:
-    """Finds moments in a stream of samples: by stillness or, where there are events, by motion.
-
-    A camera that sends events and no pictures is watched in pictures reconstructed as the stream runs.
-
-    Attributes:
-        rig: the profile.
-        streams: what the recording holds.
-        max_motion_m: how far a board that stands still may move in half a second.
-        min_move_m, min_turn_deg: how far placements of a moving board must be apart.
-        losses: what became no moment so far.
-        n_samples: images and scans to come, about.
-    """
-
-    rig: Rig
-    streams: Collection[Stream]
-    max_motion_m: float
-    min_move_m: float
-    min_turn_deg: float
-    n_samples: int = 0
-    losses: Losses = field(default_factory=Losses)
-
-    @property
-    def has_events(self) -> bool:
-        """Whether events are kept with captures, so that the board has to move."""
-        return any(stream.kind == "events" for stream in self.streams)
-
-    @property
-    def reconstructed(self) -> frozenset[ImageKey]:
-        """(camera, channel) of the pictures that are made of events to watch the board."""
-        with_pictures = {stream.sensor for stream in self.streams if stream.kind == "images"}
-        return frozenset(
-            (stream.sensor, stream.channel)
-            for stream in self.streams
-            if stream.kind == "events" and stream.sensor not in with_pictures
-        )
-
-    def moments(self, samples: Iterable[Sample]) -> Iterator[CaptureMoment]:
-        """Yield the moments of a stream, as `find_still_moments` or `find_moving_moments` define them.
-
-        Raises:
-            ProfileError: the profile's network cannot be used.
-            SourceError: as the samples do.
-        """
-        cameras = {camera for camera, _ in self.reconstructed}
-        if cameras:
-            samples = with_event_pictures(samples, self.rig, cameras, self.losses)
-        watcher = BoardTracker(self.rig, _SEARCH_S, self.losses, _THOROUGH_S)
-        # Why a scan got no image made of events is counted where it was not made.
-        frames = pair_by_time(samples, self.rig, Losses() if cameras else self.losses)
-        is_long = self.n_samples >= _LONG_SAMPLES
-        are_still = not self.has_events and self.max_motion_m <= _GLANCED_M
-        ahead = sight_ahead(watcher, frames, is_still_wanted=are_still)
-        detections = ahead if is_long else map(watcher.sight, frames)
-        if self.has_events:
-            taken = Placements(self.min_move_m, self.min_turn_deg)
-            moments = find_moving_moments(detections, self.rig, taken, self.losses)
-        else:
-            moments = find_still_moments(detections, self.rig.board.to_board(), self.max_motion_m)
-        for moment in moments:
-            confirmed = watcher.confirm(moment)
-            if isinstance(confirmed, Refusal):
-                self.losses.add(confirmed)
-            else:
-                yield confirmed
-
-    def kept_images(self, moment: CaptureMoment) -> list[Image]:
-        """List the pictures of a moment that its capture keeps: all but those that its events give again."""
-        images = moment.detection.frame.images
-        return [image for image in images if (image.sensor, image.channel) not in self.reconstructed]
 
 
 Progress = Callable[[int, int, str], None]
@@ -251,31 +177,65 @@ class _Collector:
                 came before has been captured.
         """
         require_sensors(recording)
-        rig, options = self._session.rig, self._options
+        options = self._options
         known = known_placements(self._session, options.min_move_m, options.min_turn_deg)
         # Where a capture of this recording was rejected, another moment of that placement is not wanted.
         for key, name in self._names_by_key.items():
             if name in self._rejected and key.startswith(f"{recording.key}:"):
                 with suppress(LceRigError):
                     known.add_poses(name, capture_poses(self._rejected[name], self._session))
-        search = MomentSearch(
-            rig,
-            frozenset(recording.streams),
-            rig.quality.max_motion_m if options.max_motion_m is None else options.max_motion_m,
-            options.min_move_m,
-            options.min_turn_deg,
-            recording.n_samples,
-        )
-        self.report.has_events |= search.has_events
+        # A camera that sends events and no images is watched in images reconstructed as the stream runs.
+        with_images = {stream.sensor for stream in recording.streams if stream.kind == "images"}
+        events = [stream for stream in recording.streams if stream.kind == "events"]
+        reconstructed = {(s.sensor, s.channel) for s in events if s.sensor not in with_images}
+        self.report.has_events |= bool(events)
         torn: list[SourceError] = []
-        for moment in search.moments(self._read(recording, torn)):
+        cameras = {camera for camera, _ in reconstructed}
+        for moment in self._moments(recording, torn, cameras, has_events=bool(events)):
             if self._is_enough():
                 self.note(["stopped early: the session has as many captures as wanted"])
                 break
-            self._take_moment(recording, moment, search.kept_images(moment), known)
-        self.report.counts.update(search.losses)
+            # The capture keeps the events instead of the images reconstructed from them.
+            images = moment.detection.frame.images
+            stored = [image for image in images if (image.sensor, image.channel) not in reconstructed]
+            self._take_moment(recording, moment, stored, known)
         if torn:
             raise torn[0]
+
+    def _moments(
+        self, recording: ContinuousRecording, torn: list[SourceError], cameras: set[str], *, has_events: bool
+    ) -> Iterator[CaptureMoment]:
+        """Yield confirmed moments: by motion where there are events, else by stillness.
+
+        Args:
+            recording: is read once.
+            torn: receives the error where the recording is torn.
+            cameras: cameras with events and without images.
+            has_events: whether events are kept with captures, so that the board has to move.
+        """
+        rig, options, losses = self._session.rig, self._options, self.report.counts
+        max_motion_m = rig.quality.max_motion_m if options.max_motion_m is None else options.max_motion_m
+        samples = self._read(recording, torn)
+        if cameras:
+            samples = with_event_pictures(samples, rig, cameras, losses)
+        tracker = BoardTracker(rig, _SEARCH_S, losses, _THOROUGH_S)
+        # Scans without an image made of events are counted by `with_event_pictures`.
+        frames = pair_by_time(samples, rig, Losses() if cameras else losses)
+        detections: Iterable[BoardDetection] = map(tracker.sight, frames)
+        if recording.n_samples >= _LONG_SAMPLES:
+            are_still = not has_events and max_motion_m <= _GLANCED_M
+            detections = sight_ahead(tracker, frames, is_still_wanted=are_still)
+        if has_events:
+            taken = Placements(options.min_move_m, options.min_turn_deg)
+            moments = find_moving_moments(detections, rig, taken, losses)
+        else:
+            moments = find_still_moments(detections, rig.board.to_board(), max_motion_m)
+        for moment in moments:
+            confirmed = tracker.confirm(moment)
+            if isinstance(confirmed, Refusal):
+                losses.add(confirmed)
+            else:
+                yield confirmed
 
     def note(self, notes: Iterable[str]) -> None:
         """Keep notes, each once."""

@@ -232,11 +232,6 @@ def test_a_session_that_cannot_be_written_ends_with_its_error_and_keeps_the_rest
     assert (path / "gone/000000/meta.json").exists()
 
 
-def test_every_camera_with_every_lidar_gets_a_guide() -> None:
-    (guide,) = make_guides(rig())
-    assert guide.key == ("davis", "frames") and guide.lidar == "lidar"
-
-
 @pytest.mark.long
 def test_a_run_that_nobody_looks_after_ends_when_nothing_new_is_shown(tmp_path: Path) -> None:
     show = Show(placements()[:1], each_s=100.0)
