@@ -13,6 +13,7 @@ from lce_rig.simulate.scene import Hits, join_rows
 
 SHADOW_STEP_PX = 4
 _KNOT_STEP_PX = 4
+_EDGE_TONE, _EDGE_SAMPLES = 0.05, 2
 _CHUNK = 1 << 18
 
 
@@ -56,7 +57,13 @@ def build_backdrop(room: Room, T_world_cam: Array, intrinsics: Intrinsics) -> Ba
     rays = pixel_rays(corners).reshape(-1, 3)
     flat, hits, mirrors = _render(room, origin, rays)
     radiance = flat.reshape(*shape, 3)
-    _smooth_edges(radiance, corners, room, origin)
+    # Resample the pixels that differ much from a neighbour.
+    tone = np.sqrt(np.clip(radiance.mean(axis=2), 0.0, 1.0))
+    down, across = (np.abs(np.diff(tone, axis=axis)) > _EDGE_TONE for axis in (0, 1))
+    rows, cols = np.nonzero(beside_changes(down, across))
+    spread = sub_rays(corners, rows, cols, _EDGE_SAMPLES)
+    sampled, _, _ = _render(room, origin, spread.reshape(-1, 3))
+    radiance[rows, cols] = sampled.reshape(spread.shape).mean(axis=1)
 
     coarse = (slice(None, None, SHADOW_STEP_PX), slice(None, None, SHADOW_STEP_PX))
     points = reached(origin, rays, hits).reshape(*shape, 3)[coarse]
@@ -165,15 +172,3 @@ def _render(room: Room, origin: Array, rays: Array) -> tuple[Array, Hits, Mirror
         pieces.append((radiance, hits, replace(mirrors, index=mirrors.index + start)))
     radiances, hits_of, mirrors_of = zip(*pieces, strict=True)
     return np.concatenate(radiances), join_rows(hits_of), join_rows(mirrors_of)
-
-
-def _smooth_edges(radiance: Array, corners: Array, room: Room, origin: Array) -> None:
-    """Resample the pixels (H, W, 3) that differ much from a neighbour, in place."""
-    tone = np.sqrt(np.clip(radiance.mean(axis=2), 0.0, 1.0))
-    threshold, n = 0.05, 2
-    rows, cols = np.nonzero(
-        beside_changes(np.abs(np.diff(tone, axis=0)) > threshold, np.abs(np.diff(tone, axis=1)) > threshold)
-    )
-    rays = sub_rays(corners, rows, cols, n).reshape(-1, 3)
-    seen, _, _ = _render(room, origin, rays)
-    radiance[rows, cols] = seen.reshape(len(rows), n * n, 3).mean(axis=1)

@@ -1,13 +1,14 @@
-"""A simulated session: captures of the board among decoys, still or hand-held."""
+"""A simulated session with its truth: captures of the board among decoys, still or hand-held."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, Scan
-from lce_rig.core.geometry import Array, invert
+from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.rig import Rig
 from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.options import SimulationOptions
@@ -19,6 +20,8 @@ from lce_rig.simulate.trajectory import Trajectory, hold_board, sway_board
 
 _FIRST_STAMP_NS = 1_700_000_000_000_000_000
 _CAPTURE_EVERY_NS = 4_000_000_000
+# Range noise, and mixed returns at the border, do not count as the board's.
+_ON_BOARD_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +75,12 @@ def simulate_captures(
         LceRigError: no place for the board is seen by the camera and the LiDAR.
     """
     stage = set_stage(rig, seed, options)
-    capture = _still_capture if stage.options.motion == "still" else _moving_capture
     for index in range(n_captures):
-        yield capture(stage, index)
-
-
-def _still_capture(stage: Stage, index: int) -> SimulatedCapture:
-    rng = stage.rng(index, PLACEMENT)
-    return capture_at(stage, index, stage.place(index, rng), rng)
+        if stage.options.motion == "moving":
+            yield _moving_capture(stage, index)
+        else:
+            rng = stage.rng(index, PLACEMENT)
+            yield capture_at(stage, index, stage.place(index, rng), rng)
 
 
 def capture_at(
@@ -117,20 +118,16 @@ def _moving_capture(stage: Stage, index: int) -> SimulatedCapture:
     exposed_ns = middle_ns + round(1e9 * (phase_s - options.frame_offset_s))
     images = [board.take_image(camera, exposed_ns, (index,)) for camera in stage.framed]
     scans = [board.take_scan(lidar, stamp_ns, (index,)) for lidar in stage.models]
-    events = [_film_capture(board, camera, stamp_ns, index) for camera in stage.pixels]
-    times_ns = dict.fromkeys(stage.T_world_sensor, stamp_ns) | dict.fromkeys(stage.framed, exposed_ns)
-    return _capture(stage, index, images, scans, events, trajectory, times_ns)
-
-
-def _film_capture(board: MovingBoard, camera: str, stamp_ns: int, index: int) -> Events:
-    """Record the events whose timestamps lie about a scan's."""
-    options = board.stage.options
     before_s, after_s = options.events_span_s
     start_ns, end_ns = (stamp_ns + round(1e9 * (s - options.event_offset_s)) for s in (-before_s, after_s))
-    view = board.view(camera)
-    sensor = board.event_camera(camera, view, start_ns, (index,))
-    film(view, sensor, start_ns, end_ns)
-    return sensor.take()
+    events = []
+    for camera in stage.pixels:
+        view = board.view(camera)
+        sensor = board.event_camera(camera, view, start_ns, (index,))
+        film(view, sensor, start_ns, end_ns)
+        events.append(sensor.take())
+    times_ns = dict.fromkeys(stage.T_world_sensor, stamp_ns) | dict.fromkeys(stage.framed, exposed_ns)
+    return _capture(stage, index, images, scans, events, trajectory, times_ns)
 
 
 def _half_turn_ns(stage: Stage, index: int) -> int:
@@ -165,3 +162,46 @@ def _capture(
         trajectory,
         stage.T_world_sensor,
     )
+
+
+def capture_truth(rig: Rig, capture: SimulatedCapture, options: SimulationOptions) -> dict[str, Any]:
+    """Return where the board was when each sensor saw it.
+
+    Returns:
+        `boards`: by sensor `t_ns`, on the rig's clock, and `T_sensor_board` then; `speed_mps` of the board's
+        middle when the LiDAR that it was placed for met it. A LiDAR's time is the mean firing time of its
+        returns from the board, a camera's the middle of its image's exposure, or that of the LiDAR where it
+        takes none.
+    """
+    times_ns = {scan.sensor: board_time_ns(rig, capture, scan) for scan in capture.scans}
+    middle_ns = times_ns[capture.target[1]]
+    times_ns |= dict.fromkeys(rig.cameras, middle_ns)
+    for image in capture.images:
+        times_ns[image.sensor] = (image.stamp_ns or 0) - round(1e9 * options.frame_offset_s)
+    return {
+        "speed_mps": round(float(capture.trajectory.speed_mps(middle_ns)), 6),
+        "boards": {
+            sensor: {"t_ns": t_ns, "T_sensor_board": capture.T_sensor_board(sensor, t_ns).tolist()}
+            for sensor, t_ns in times_ns.items()
+        },
+    }
+
+
+def board_time_ns(rig: Rig, capture: SimulatedCapture, scan: Scan) -> int:
+    """Find the mean firing time of a scan's board returns; half a scan after its timestamp without any.
+
+    Each return is compared with the board where it was at that return's own time.
+    """
+    first_ns = scan.stamp_ns or 0
+    middle_ns = first_ns + round(0.5e9 / rig.lidars[scan.sensor].rate_hz)
+    if scan.offset_ns is None:
+        return middle_ns
+    board = rig.board.to_board()
+    T_lidar_board = capture.T_sensor_board(scan.sensor, middle_ns)
+    reach_m = 0.3 + 0.5 * np.hypot(board.width_m, board.height_m)
+    near = np.linalg.norm(scan.points - T_lidar_board[:3, 3], axis=1) < reach_m
+    offset_ns = scan.offset_ns[near]
+    T_board_lidar = invert(capture.T_sensor_board(scan.sensor, first_ns + offset_ns))
+    points = transform(T_board_lidar, scan.points[near, None].astype(np.float64))[:, 0]
+    is_on = np.all(np.abs(points) < [board.width_m / 2, board.height_m / 2, _ON_BOARD_M], axis=1)
+    return first_ns + round(offset_ns[is_on].mean()) if is_on.any() else middle_ns

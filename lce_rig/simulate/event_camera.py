@@ -8,6 +8,7 @@ References:
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,7 @@ _DARK_BANDWIDTH = 0.1
 _HOT_HZ, _HOT_ON_SHARE = (10.0, 300.0), 0.95
 
 
-@dataclass(frozen=True, eq=False)
-class EventPixels:
+class EventPixels(NamedTuple):
     """The differences between pixels, fixed for a sensor.
 
     Attributes:

@@ -1,7 +1,7 @@
 """A camera of any lens model: board and carrier in front of the room, anti-aliased, blurred and noisy."""
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,15 +113,8 @@ def _paint_mirror_images(radiance: Array, scene: Scene, backdrop: Backdrop) -> N
     radiance[v[chosen], u[chosen]] += mirrors.weight[chosen] * (image - mirrors.image[chosen])
 
 
-@dataclass(frozen=True, eq=False)
-class _ImageWindow:
-    """The part of an image that board and carrier can cover, h by w pixels.
-
-    Attributes:
-        corner_rays: (h + 1, w + 1, 3) unit, world.
-        backdrop: (h, w, 3) linear radiance without them.
-        backdrop_range_m: (h, w) of what stands behind them.
-    """
+class _ImageWindow(NamedTuple):
+    """The rays (h + 1, w + 1, 3), the room's radiance (h, w, 3) and range (h, w) in a part of an image."""
 
     corner_rays: Array
     backdrop: Array

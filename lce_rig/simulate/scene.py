@@ -54,7 +54,7 @@ class Hits:
 
 def put_rows(record: _Rows, rows: NDArray[Any], part: _Rows) -> _Rows:
     """Replace rows of a record of arrays of equal length by those of another."""
-    values = {each.name: getattr(record, each.name).copy() for each in fields(record)}
+    values = {field.name: getattr(record, field.name).copy() for field in fields(record)}
     for name, value in values.items():
         value[rows] = getattr(part, name)
     return replace(record, **values)
@@ -62,7 +62,7 @@ def put_rows(record: _Rows, rows: NDArray[Any], part: _Rows) -> _Rows:
 
 def join_rows(parts: Sequence[_Rows]) -> _Rows:
     """Join records of arrays, at least one, one behind the other."""
-    names = [each.name for each in fields(parts[0])]
+    names = [field.name for field in fields(parts[0])]
     return replace(parts[0], **{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 
@@ -121,7 +121,10 @@ class Raycaster:
         u, v = (column[:, None] for column in answer["primitive_uvs"].numpy()[hit].astype(np.float64).T)
         first, second, third = (self._normals[corner] for corner in self._triangles[triangle].T)
         normals = np.zeros((len(directions), 3))
-        normals[hit] = _unit_towards((1 - u - v) * first + u * second + v * third, directions[hit])
+        mixed = (1 - u - v) * first + u * second + v * third
+        length = np.sqrt(np.einsum("nc,nc->n", mixed, mixed))
+        side = np.where(np.einsum("nc,nc->n", mixed, directions[hit]) > 0, -1.0, 1.0)
+        normals[hit] = mixed * (side / np.maximum(length, 1e-12))[:, None]
         return Hits(range_m, surface, normals)
 
     def is_blocked(self, origins: Array, targets: Array) -> NDArray[np.bool_]:
@@ -131,12 +134,6 @@ class Raycaster:
         rays = self._rays(origins, targets - origins)
         blocked = self._engine.test_occlusions(rays, tnear=1e-3, tfar=0.999, nthreads=1)
         return np.asarray(blocked.numpy(), dtype=np.bool_)
-
-
-def _unit_towards(normals: Array, directions: Array) -> Array:
-    length = np.sqrt(np.einsum("nc,nc->n", normals, normals))
-    side = np.where(np.einsum("nc,nc->n", normals, directions) > 0, -1.0, 1.0)
-    return np.asarray(normals * (side / np.maximum(length, 1e-12))[:, None])
 
 
 class Scene:
@@ -249,15 +246,11 @@ class Scene:
         for index in np.unique(hits.surface):
             rows = np.flatnonzero(hits.surface == index)
             if index == self.board_index:
-                out[rows] = self._board_colour(hits.normals[rows], points_world[rows])
+                is_print = self.is_dark(points_world[rows])
+                out[rows] = np.where(is_print[:, None], PRINT_ALBEDO, np.array(PLATE.colour))
+                out[rows[~self.is_front(hits.normals[rows])]] = PLATE_BACK.colour
             elif index >= 0:
                 out[rows] = surface_colour(self.surfaces[index], points_world[rows], hits.normals[rows])
-        return out
-
-    def _board_colour(self, normals: Array, points_world: Array) -> Array:
-        out = np.tile(np.array(PLATE.colour), (len(normals), 1))
-        out[self.is_dark(points_world)] = PRINT_ALBEDO
-        out[~self.is_front(normals)] = PLATE_BACK.colour
         return out
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from heapq import merge
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from lce_rig.simulate.trajectory import Trajectory, carry_board
 
 _START_NS = 1_700_000_000_000_000_000
 _PACKET_NS = 20_000_000
+_TRACK_EVERY_NS = 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,3 +104,15 @@ def simulate_recording(
         trajectory = carry_board(placements, _START_NS, options.hand, stage.rng(OF_SESSION, HAND))
         if trajectory.departure_ns[-1] >= end_ns:
             return SimulatedRecording(stage, trajectory, _START_NS, end_ns)
+
+
+def recording_truth(recording: SimulatedRecording) -> dict[str, Any]:
+    """Return where the board is before the first LiDAR, 100 times per second.
+
+    Returns:
+        `boards`: by LiDAR `t_ns` (K), on the rig's clock, and `T_sensor_board` (K, 4, 4).
+    """
+    lidar = next(iter(recording.stage.rig.lidars))
+    t_ns = np.arange(recording.start_ns, recording.end_ns + _TRACK_EVERY_NS, _TRACK_EVERY_NS)
+    track = {"t_ns": t_ns.tolist(), "T_sensor_board": recording.T_sensor_board(lidar, t_ns).tolist()}
+    return {"boards": {lidar: track}}

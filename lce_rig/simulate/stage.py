@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -209,3 +209,25 @@ def _sensor_poses(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, 
     for name in rig.lidars:
         T_base.setdefault(name, np.eye(4))
     return T_base
+
+
+def rig_truth(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Any]:
+    """Return the extrinsics and clocks of a simulated rig.
+
+    Returns:
+        `pairs` of camera and lidar with T_cam_lidar (p_cam = T p_lidar), the first pair's alone, and how much
+        more the timestamps of images and events read than the rig's clock, which is the LiDAR's.
+    """
+    pairs = [
+        {"camera": camera, "lidar": lidar, "T_cam_lidar": T.tolist()}
+        for (camera, lidar), T in sorted(truth_extrinsics(rig, seed, options).items())
+    ]
+    return {
+        "seed": seed,
+        "mounting_seed": options.mounting_of(seed),
+        "T_cam_lidar": pairs[0]["T_cam_lidar"],
+        "pairs": pairs,
+        "motion": options.motion,
+        "frame_offset_s": options.frame_offset_s,
+        "event_offset_s": options.event_offset_s,
+    }

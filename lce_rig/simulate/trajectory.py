@@ -44,9 +44,23 @@ class Trajectory:
     centre: Array
 
     def at(self, t_ns: int | NDArray[np.int64]) -> Array:
-        """Compute T_world_board (..., 4, 4) at times (...) of the rig's clock."""
+        """Compute T_world_board (..., 4, 4) at times (...) of the rig's clock.
+
+        Between placements s = 10 u^3 - 15 u^4 + 6 u^5, minimum jerk from rest to rest.
+
+        References:
+            T. Flash and N. Hogan, The coordination of arm movements, J. Neuroscience 5(7), 1985.
+        """
         t_ns = np.asarray(t_ns, dtype=np.int64)
-        T_world_board = self._carried(t_ns)
+        if len(self.arrival_ns) == 1:
+            T_world_board = np.broadcast_to(self.T_world_placement[0], (*t_ns.shape, 4, 4))
+        else:
+            last = len(self.arrival_ns) - 2
+            k = np.clip(np.searchsorted(self.arrival_ns, t_ns, side="right") - 1, 0, last)
+            since_ns = t_ns - self.departure_ns[k]
+            u = np.clip(since_ns / (self.arrival_ns[k + 1] - self.departure_ns[k]), 0.0, 1.0)
+            s = u**3 * (10 + u * (6 * u - 15))
+            T_world_board = between(self.T_world_placement[k], self.T_world_placement[k + 1], s)
         if not len(self.frequency_hz):
             return T_world_board
         t_s = 1e-9 * (t_ns - self.arrival_ns[0])
@@ -60,20 +74,6 @@ class Trajectory:
         t_ns = np.asarray(t_ns, dtype=np.int64)
         way = self.at(t_ns + _PROBE_NS)[..., :3, 3] - self.at(t_ns - _PROBE_NS)[..., :3, 3]
         return np.asarray(np.linalg.norm(way, axis=-1) / (2e-9 * _PROBE_NS))
-
-    def _carried(self, t_ns: NDArray[np.int64]) -> Array:
-        """Interpolate the placements: s = 10 u^3 - 15 u^4 + 6 u^5, minimum jerk from rest to rest.
-
-        References:
-            T. Flash and N. Hogan, The coordination of arm movements, J. Neuroscience 5(7), 1985.
-        """
-        if len(self.arrival_ns) == 1:
-            return np.broadcast_to(self.T_world_placement[0], (*t_ns.shape, 4, 4))
-        k = np.clip(np.searchsorted(self.arrival_ns, t_ns, side="right") - 1, 0, len(self.arrival_ns) - 2)
-        since_ns = t_ns - self.departure_ns[k]
-        u = np.clip(since_ns / (self.arrival_ns[k + 1] - self.departure_ns[k]), 0.0, 1.0)
-        s = u**3 * (10 + u * (6 * u - 15))
-        return between(self.T_world_placement[k], self.T_world_placement[k + 1], s)
 
 
 def between(start: Array, end: Array, share: float | Array) -> Array:
