@@ -9,7 +9,7 @@ import pytest
 
 from lce_rig.doctor import computer
 from lce_rig.doctor.examination import Examination
-from lce_rig.rig import load_rig
+from lce_rig.rig import Rig, load_rig
 
 from .observed import codes, look, make_rig
 
@@ -69,20 +69,14 @@ def udev(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_davis_wants_udev_rules_and_the_shipped_ones_do(udev: Path) -> None:
-    rig = load_rig("rles")
+@pytest.mark.parametrize(
+    ("rig", "device"),
+    [(load_rig("rles"), "DAVIS"), (make_rig(sync={"device": "/dev/ttyACM0"}), "sync board")],
+)
+def test_devices_want_udev_rules_and_the_shipped_ones_do(udev: Path, rig: Rig, device: str) -> None:
     line = look(computer.check_udev_rules, Examination(rig))
     assert line is not None and codes(line) == ["computer.udev_rules_missing"]
-    assert line.severity == "warning" and line.figures["devices"] == ("DAVIS",)
-    shutil.copy(str(line.figures["rules"]), udev)
-    line = look(computer.check_udev_rules, Examination(rig))
-    assert line is not None and codes(line) == ["computer.udev_rules"]
-
-
-def test_the_shipped_rules_hold_for_a_sync_board_too(udev: Path) -> None:
-    rig = make_rig(sync={"device": "/dev/ttyACM0"})
-    line = look(computer.check_udev_rules, Examination(rig))
-    assert line is not None and line.figures["devices"] == ("sync board",)
+    assert line.severity == "warning" and line.figures["devices"] == (device,)
     shutil.copy(str(line.figures["rules"]), udev)
     assert codes(look(computer.check_udev_rules, Examination(rig))) == ["computer.udev_rules"]
 

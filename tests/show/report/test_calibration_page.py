@@ -1,4 +1,4 @@
-"""The report of a calibration: complete, the same each time, without requests, and its sums add up."""
+"""The report of a calibration: without requests, its links lead somewhere, and its sums add up."""
 
 import re
 from dataclasses import replace

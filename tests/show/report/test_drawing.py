@@ -1,4 +1,4 @@
-"""Drawings are small, link, take the page's colours, and are the same each time."""
+"""Text in drawings is escaped, and drawings of one page do not share names."""
 
 import re
 
