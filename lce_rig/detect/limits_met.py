@@ -18,45 +18,45 @@ from lce_rig.detect.findings import (
 from lce_rig.rig import QualitySettings
 
 
-def gate_image_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
-    """Compare a board found in an image with the profile's limits.
+def gate_image_board(sighting: ImageBoard, limits: QualitySettings) -> ImageBoard | Refusal:
+    """Compare a board detected in an image with the profile's limits.
 
     Args:
-        found: one without quality is judged by its pose alone.
+        sighting: one without quality is judged by its pose alone.
         limits: `quality` of the rig profile.
     """
-    q = found.quality
+    q = sighting.quality
     if q is not None and q.square_px < limits.min_square_px:
-        closer_m = found.distance_m * (1 - q.square_px / limits.min_square_px)
+        closer_m = sighting.distance_m * (1 - q.square_px / limits.min_square_px)
         figures = {"square_px": q.square_px, "min_square_px": limits.min_square_px, "closer_m": closer_m}
         return IMAGE_SMALL_SQUARES.refusal(**figures)
     if q is not None and q.border_px < limits.min_border_px:
         figures = {"border_px": q.border_px, "min_border_px": limits.min_border_px}
         return IMAGE_NEAR_BORDER.refusal(**figures)
-    if found.tilt_deg > limits.max_tilt_deg:
-        turn_deg = found.tilt_deg - limits.max_tilt_deg + 5
-        figures = {"tilt_deg": found.tilt_deg, "max_tilt_deg": limits.max_tilt_deg, "turn_deg": turn_deg}
+    if sighting.tilt_deg > limits.max_tilt_deg:
+        turn_deg = sighting.tilt_deg - limits.max_tilt_deg + 5
+        figures = {"tilt_deg": sighting.tilt_deg, "max_tilt_deg": limits.max_tilt_deg, "turn_deg": turn_deg}
         return IMAGE_TILTED.refusal(**figures)
-    return _gate_distance("image", found.distance_m, limits) or found
+    return _gate_distance("image", sighting.distance_m, limits) or sighting
 
 
 def gate_lidar_boards(
-    found: Sequence[LidarBoard], board: Board, limits: QualitySettings
+    candidates: Sequence[LidarBoard], board: Board, limits: QualitySettings
 ) -> list[LidarBoard] | Refusal:
     """Keep the candidates within the profile's limits; refuse with the likeliest one's cause where none is.
 
     Args:
-        found: candidates, likeliest first, at least one.
+        candidates: boards of the scan, likeliest first, at least one.
         board: the size wanted.
         limits: `quality` of the rig profile.
     """
-    refusals = [_lidar_problem(candidate, board, limits) for candidate in found]
-    kept = [candidate for candidate, refusal in zip(found, refusals, strict=True) if refusal is None]
+    refusals = [_lidar_problem(candidate, board, limits) for candidate in candidates]
+    kept = [candidate for candidate, refusal in zip(candidates, refusals, strict=True) if refusal is None]
     return kept or refusals[0] or []
 
 
-def _lidar_problem(found: LidarBoard, board: Board, limits: QualitySettings) -> Refusal | None:
-    q = found.quality
+def _lidar_problem(candidate: LidarBoard, board: Board, limits: QualitySettings) -> Refusal | None:
+    q = candidate.quality
     if q.n_points < limits.min_points:
         closer_m = max(0.1, q.distance_m * (1 - (q.n_points / limits.min_points) ** 0.5))
         return LIDAR_TOO_FEW_POINTS.refusal(

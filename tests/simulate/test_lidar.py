@@ -171,15 +171,6 @@ def test_dark_squares_and_weak_returns_read_long(board: Board, T_world_lidar: Ar
     assert np.median(depth[is_dark]) == pytest.approx(0.008 + 0.03 * (1 - 20 / 30), abs=1e-3)
 
 
-def test_dropouts_come_as_often_as_claimed(board: Board, room: Room, T_world_lidar: Array) -> None:
-    scene = Scene(room.raycaster, [], board, board_before_lidar(2.0))
-    whole = scan_of(scene, T_world_lidar, EXACT)
-    thinned = scan_of(scene, T_world_lidar, replace(EXACT, dropout=0.1))
-    assert len(thinned.points) / len(whole.points) == pytest.approx(
-        0.9, abs=4 * np.sqrt(0.09 / len(whole.points))
-    )
-
-
 def test_only_returns_between_the_range_limits_are_reported(scene: Scene, T_world_lidar: Array) -> None:
     scan = scan_of(scene, T_world_lidar, LidarNoise(), min_range_m=2.5, max_range_m=4.0)
     range_m = np.linalg.norm(scan.points, axis=1)

@@ -1,7 +1,8 @@
 """Figures from events and a board tracked through their images: event rate, speed, smear in the LiDAR."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,8 +25,7 @@ _MIN_TRACK_S = 0.03
 _ALONG = np.linspace(0, 1, 24)[:, None]
 
 
-@dataclass(frozen=True, eq=False)
-class BoardMotion:
+class BoardMotion(NamedTuple):
     """How the board moves about the time of its main image.
 
     Attributes:

@@ -1,7 +1,7 @@
 """Measure a registered board for the calibration: plane, points, ring ends and size."""
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ SIZE_PRIOR_M = 0.10
 SLACK_M = 0.05  # by how much a board's border may lie off the nominal one to be measured
 
 
-@dataclass(frozen=True, eq=False)
-class RingEnds:
+class RingEnds(NamedTuple):
     """First and last return of each ring on the board, E of them.
 
     Attributes:
