@@ -108,15 +108,15 @@ class BoardTracker:
         unfit: dict[ImageKey, Refusal] = {}
         for image in frame.images:
             key = (image.sensor, image.channel)
-            found = self._find_in_image(image, key, frame.time_ns)
-            if found is None:
+            search = self._find_in_image(image, key, frame.time_ns)
+            if search is None:
                 continue
-            if isinstance(found.board, Refusal):
-                unseen[key] = found.board
+            if isinstance(search.board, Refusal):
+                unseen[key] = search.board
                 continue
-            images[key] = found.board
-            if isinstance(found.usable, Refusal):
-                unfit[key] = found.usable
+            images[key] = search.board
+            if isinstance(search.usable, Refusal):
+                unfit[key] = search.usable
         return BoardDetection(frame, images, {}, unseen, {}, unfit)
 
     def sight_in_scans(self, detection: BoardDetection) -> BoardDetection:
@@ -189,12 +189,12 @@ class BoardTracker:
         if last is None and not _is_due(self._searched_ns, key, time_ns, self.search_interval_s):
             return None
         is_thorough = self._is_thorough_due(key, time_ns, was_seen=last is not None)
-        found = self.finder.search_image(image, last, is_thorough=is_thorough)
-        if found.board is NOT_SEEN_AT_ONCE:
+        search = self.finder.search_image(image, last, is_thorough=is_thorough)
+        if search.board is NOT_SEEN_AT_ONCE:
             return None
-        if isinstance(found.board, ImageBoard):
-            self._seen[key] = found.board
-        return found
+        if isinstance(search.board, ImageBoard):
+            self._seen[key] = search.board
+        return search
 
     def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard] | Refusal:
         known = self._candidates.get(scan.sensor, [])

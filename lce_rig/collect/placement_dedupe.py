@@ -38,7 +38,7 @@ class Placements:
 
     def remove(self, name: str) -> None:
         """Forget a capture: where it was made is new again."""
-        self._poses = [each for each in self._poses if each[0] != name]
+        self._poses = [pose for pose in self._poses if pose[0] != name]
 
     def find_like(self, boards: Mapping[ImageKey, ImageBoard]) -> str | None:
         """Name a capture in which every camera saw the board where it is now; None where it is new."""

@@ -118,7 +118,7 @@ def instruct(view: SensorPlace, present: Array, wanted: Array) -> list[Instructi
 
 def say(instructions: Sequence[Instruction]) -> str:
     """Join instructions to one sentence; "hold still" where there are none."""
-    return ", ".join(each.text for each in instructions) or "hold still"
+    return ", ".join(instruction.text for instruction in instructions) or "hold still"
 
 
 def is_there(view: SensorPlace, present: Array, wanted: Array) -> bool:
@@ -205,7 +205,7 @@ class Person:
         aim = describe_pose(view, wanted)
         instructions = instruct(view, present, wanted)
         if instructions and rng.random() < self.ignored_share:
-            ignored = rng.choice([each.kind for each in instructions])
+            ignored = rng.choice([instruction.kind for instruction in instructions])
             aim = replace(aim, **{_FIGURE[ignored]: getattr(describe_pose(view, present), _FIGURE[ignored])})
         aimed = build_pose(view, aim)
         turn = exp_so3(np.radians(self.turn_sigma_deg) * rng.standard_normal(3))

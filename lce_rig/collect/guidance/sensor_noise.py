@@ -110,10 +110,10 @@ def model_sensors(rig: Rig, camera: str, lidar: str) -> SensorModel:
     settings = rig.lidars[lidar]
     sheet = settings.data_sheet()
     if sheet is None:
-        known = ", ".join(each.name for each in DATA_SHEETS)
+        names = ", ".join(sheet.name for sheet in DATA_SHEETS)
         raise ProfileError(
             f"lidars.{lidar}.model: no guidance for {settings.model}, its beams are not known",
-            f"set elevations_deg, collect without guidance, or use one of {known}",
+            f"set elevations_deg, collect without guidance, or use one of {names}",
         )
     return SensorModel(
         board=rig.board.to_board(),
@@ -135,7 +135,7 @@ def outline_px(model: SensorModel, T_cam_board: Array) -> Array:
     """Project the plate's border at T_cam_board (4, 4) as a closed polygon; distortion bends its edges.
 
     Returns:
-        (N, 2) px, the last point the first; NaN where a point is out of the lens's sight.
+        (N, 2) px, the last point the first; NaN where a point is outside the lens's field of view.
     """
     corners = model.board.outline()
     share = np.arange(_POINTS_PER_EDGE)[:, None] / _POINTS_PER_EDGE

@@ -259,7 +259,6 @@ class _Loop:
     def close_books(self) -> LiveReport:
         """Complete the report, and write it into the session's journal."""
         report = self.report
-        report.n_skipped = self._feed.n_skipped
         if report.ending == "exhausted":
             waited_s = time.monotonic() - self._captured_s
             report.notes.append(f"no capture in the last {waited_s:.0f} s, {self._monitor.last_words()}")

@@ -48,7 +48,6 @@ class FrameFeed:
 
     Attributes:
         losses: scans without an image of their time, and without events to make one of.
-        n_skipped: frames skipped because the next one came first.
     """
 
     def __init__(
@@ -94,11 +93,6 @@ class FrameFeed:
     ) -> None:
         self._stop.set()
         self._thread.join()
-
-    @property
-    def n_skipped(self) -> int:
-        """Frames skipped because the next one came first."""
-        return self._frames.n_dropped
 
     def take(self, timeout_s: float) -> Frame | None:
         """Take the newest frame; None where none came in time.

@@ -71,7 +71,6 @@ class LiveReport:
         taken_back: names of the captures that were taken back, in order.
         latencies_s: from each decision until its capture was safe on the disk.
         n_frames: frames looked at.
-        n_skipped: frames that came while one before was looked at.
         n_lost: samples lost or dropped, by sensor.
         lost: sensors that were lost when it ended, and why, by name.
         error: the sensor that is lost for good; None where none is.
@@ -87,7 +86,6 @@ class LiveReport:
     taken_back: list[str] = field(default_factory=list)
     latencies_s: list[float] = field(default_factory=list)
     n_frames: int = 0
-    n_skipped: int = 0
     n_lost: dict[str, int] = field(default_factory=dict)
     lost: dict[str, SourceError] = field(default_factory=dict)
     error: SourceError | None = None
@@ -148,7 +146,7 @@ class Drawing:
         pixels: (H, W) or (H, W, 3) BGR uint8.
         present_px: (K, 2) closed outline of the board; None where it is not seen.
         wanted_px: (K, 2) closed outline of the placement wanted next; None where there is none. Points out of
-            the lens's sight are NaN.
+            the lens's field of view are NaN.
         is_there: whether the board is where it should be.
         present, wanted: (4, 4) T_cam_board of both; None like their outlines.
     """
