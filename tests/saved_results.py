@@ -1,10 +1,29 @@
-"""result.json of calibrations that a test made."""
+"""Calibrations that a test made up, and their result.json."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from lce_rig.core.calibration import Calibration, Provenance, ResultFile
+from lce_rig.core.calibration import Calibration, Certificate, Metrics, Provenance, ResultFile
+from lce_rig.core.geometry import Array
 from lce_rig.session.durable import write_atomically
+
+
+def made_calibration(T_cam_lidar: Array, cov: Array, **fields: Any) -> Calibration:
+    """Make up a calibration that passes, of camera "cam" and LiDAR "lidar"; `fields` replace these."""
+    usual = {
+        "camera": "cam",
+        "channels": ("frames",),
+        "lidar": "lidar",
+        "certificate": Certificate(True, 1e-9),
+        "metrics": Metrics(0.008, 0.006, 0.1),
+        "n_captures": 20,
+        "n_detected": 20,
+        "captures_used": ("000000",),
+        "captures_refused": {},
+        "verdict": "pass",
+    }
+    return Calibration(T_cam_lidar=T_cam_lidar, cov=cov, **{**usual, **fields})
 
 
 def result_file(

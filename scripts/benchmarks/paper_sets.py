@@ -76,7 +76,7 @@ def paper_set(folder: Path, seed: int, n_captures: int = N_CAPTURES) -> PaperSet
         placement = _read(path)
         if placement is None:
             placement = maker.place(index)
-            store(path, *_flatten(placement))
+            store(path, _flatten(placement), {})
         placements.append(placement)
     return PaperSet(placements, maker.T_cam_lidar)
 
@@ -110,10 +110,9 @@ class _Maker:
         return Placement(BoardFinder(self.rig).image(image), scans)
 
 
-def _flatten(placement: Placement) -> tuple[dict[str, Array], dict[str, list[float]]]:
+def _flatten(placement: Placement) -> dict[str, Array]:
     parts = {"image": placement.image} | {f"scan{level}": scan for level, scan in placement.scans.items()}
-    arrays = {f"{name}/{key}": a for name, part in parts.items() for key, a in to_arrays(part).items()}
-    return arrays, {}
+    return {f"{name}/{key}": a for name, part in parts.items() for key, a in to_arrays(part).items()}
 
 
 def _read(path: Path) -> Placement | None:

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 import lce_rig as lce
-from lce_rig.core.calibration import Calibration, Certificate, Metrics, ResultFile
+from lce_rig.core.calibration import Certificate, Metrics
 from lce_rig.core.geometry import invert
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER
 from lce_rig.simulate import SimulationOptions, simulate_captures
+from tests.saved_results import made_calibration, write_result
 
 
 @pytest.fixture(scope="module")
@@ -28,22 +29,17 @@ def moving(tmp_path_factory) -> Path:
             session.add_capture(capture.images, capture.scans, {}, capture.events)
             frames.add_capture(capture.images, capture.scans, {})
             T_cam_lidar = invert(capture.T_world_sensor["davis"]) @ capture.T_world_sensor["lidar"]
-    truth = Calibration(
+    truth = made_calibration(
+        T_cam_lidar,
+        np.eye(6) * 1e-6,
         camera="davis",
         channels=("events", "frames"),
-        lidar="lidar",
-        T_cam_lidar=T_cam_lidar,
-        cov=np.eye(6) * 1e-6,
         certificate=Certificate(True, 0.0),
         metrics=Metrics(0.01, 0.01, 0.1),
         n_captures=1,
         n_detected=1,
-        captures_used=("000000",),
-        captures_refused={},
-        verdict="pass",
     )
-    (path / "calibration").mkdir()
-    (path / "calibration" / "result.json").write_text(ResultFile(rig=rig.name, pairs=(truth,)).text())
+    write_result(path / "calibration" / "result.json", rig.name, [truth])
     return path
 
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import Calibration, Certificate, Metrics, read_result
+from lce_rig.core.calibration import read_result
 from lce_rig.core.data import Image
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import perturb
 from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
-from tests.saved_results import write_result
+from tests.saved_results import made_calibration, write_result
 
 RLES = find_profile("rles").read_text(encoding="utf-8")
 BENT = Finding("verdict.few_used", figures={"n_used": 3, "n_captures": 20})
@@ -32,18 +32,11 @@ def made(tmp_path):
         with Session.create(tmp_path / name, rig) as session:
             session.add_capture([Image("davis", "frames", None, noise)], [], {})
         T = load_rig("rles").nominal_extrinsics[0].to_matrix()
-        calibration = Calibration(
+        calibration = made_calibration(
+            perturb(T, np.array(tangent, dtype=float)),
+            COV,
             camera="davis",
-            channels=("frames",),
             lidar=lidar,
-            T_cam_lidar=perturb(T, np.array(tangent, dtype=float)),
-            cov=COV,
-            certificate=Certificate(True, 1e-9),
-            metrics=Metrics(0.008, 0.006, 0.1),
-            n_captures=20,
-            n_detected=20,
-            captures_used=("000000",),
-            captures_refused={},
             verdict=verdict,
             findings=() if verdict == "pass" else (BENT,),
         )

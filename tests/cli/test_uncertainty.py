@@ -6,25 +6,19 @@ import numpy as np
 
 from lce_rig.cli.calibrate import uncertainty_lines
 from lce_rig.core.calibration import Calibration, Certificate, Metrics, PointUncertainty, WeakestMotion
+from tests.saved_results import made_calibration
 
 WEAK = "translation along the camera's z axis (line of sight), sigma 104.9 mm"
 
 
 def calibration() -> Calibration:
     cov = np.diag(np.square([0.003, 0.004, 0.012, *np.radians([0.05, 0.12, 0.01])]))
-    return Calibration(
-        camera="cam",
-        channels=("frames",),
-        lidar="lidar",
-        T_cam_lidar=np.eye(4),
-        cov=cov,
+    return made_calibration(
+        np.eye(4),
+        cov,
         certificate=Certificate(True, 0.0),
         metrics=Metrics(0.005, 0.005, 0.1),
-        n_captures=20,
-        n_detected=20,
         captures_used=(),
-        captures_refused={},
-        verdict="pass",
         weakest=WeakestMotion("translation_z", 0.1049),
         uncertainty=tuple(PointUncertainty(d, 123.4, 0.123 * d, 134.5, 0.234 * d) for d in (5.0, 10.0, 20.0)),
     )

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from lce_rig.core.calibration import Calibration, Certificate, Metrics
+from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.export import EXPORTS, export_formats
@@ -26,6 +26,7 @@ from lce_rig.export.lens import fit_coefficients
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.poses import Mount
 from lce_rig.session import Session
+from tests.saved_results import made_calibration
 
 Lens = tuple[str, Array, Array]
 """Model ("fisheye" or another), camera matrix (3, 3), coefficients."""
@@ -380,19 +381,15 @@ def outputs_case(rig_name: str, folder: Path, *, model: str = "radtan", seed: in
     T_cam_lidar = pose(
         exp_so3(np.array([1.2, -1.2, 1.2]) + 0.1 * rng.normal(size=3)), 0.1 * rng.normal(size=3)
     )
-    calibration = Calibration(
+    calibration = made_calibration(
+        T_cam_lidar,
+        1e-6 * np.eye(6),
         camera=camera,
         channels=(next(iter(settings.channels)),),
         lidar=lidar,
-        T_cam_lidar=T_cam_lidar,
-        cov=1e-6 * np.eye(6),
-        certificate=Certificate(True, 1e-9),
         metrics=Metrics(0.01, 0.01, 0.2),
         n_captures=1,
         n_detected=1,
-        captures_used=("000000",),
-        captures_refused={},
-        verdict="pass",
     )
     intrinsics = cameras[camera].to_intrinsics()
     lens = "fisheye" if model == "fisheye" else model, intrinsics.matrix, np.array(intrinsics.distortion)

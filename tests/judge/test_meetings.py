@@ -11,25 +11,22 @@ from lce_rig.core.results import Observation
 from lce_rig.judge.session_check import bring_together, match_candidates
 from tests.calibrate.boards import BOARD, T_FORWARD
 from tests.calibrate.moving_boards import Moving, simulate_moving
+from tests.saved_results import made_calibration
 
 CLOCKS = Clocks(tolerance_s={"frames": 0.1, "events": 0.1})
 MOVING = Moving(speed_mps=0.3, tracked=("events",))
 
 
 def calibration_of(results: tuple[ChannelResult, ...]) -> Calibration:
-    return Calibration(
-        camera="cam",
+    return made_calibration(
+        T_FORWARD,
+        np.eye(6) * 1e-6,
         channels=tuple(result.channel for result in results),
-        lidar="lidar",
-        T_cam_lidar=T_FORWARD,
-        cov=np.eye(6) * 1e-6,
         certificate=Certificate(True, 0.0),
         metrics=Metrics(0.0, 0.0, 0.0),
         n_captures=12,
         n_detected=12,
         captures_used=(),
-        captures_refused={},
-        verdict="pass",
         channel_results=results,
     )
 

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import Calibration, Certificate, Metrics
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import exp_so3, perturb, pose
 from lce_rig.judge.repeatability import compare_calibrations
+from tests.saved_results import made_calibration
 
 TRUTH = pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.1, -0.06, -0.08]))
 # Translation and rotation are correlated, as they are behind a rotation about far boards.
@@ -17,21 +18,7 @@ COV = ROOT @ ROOT.T
 
 
 def calibration(T, cov=COV, **diagnostics) -> Calibration:
-    return Calibration(
-        camera="cam",
-        channels=("frames",),
-        lidar="lidar",
-        T_cam_lidar=T,
-        cov=cov,
-        certificate=Certificate(True, 1e-9),
-        metrics=Metrics(0.008, 0.006, 0.1),
-        n_captures=20,
-        n_detected=20,
-        captures_used=("000000",),
-        captures_refused={},
-        verdict="pass",
-        diagnostics=Diagnostics(**diagnostics),
-    )
+    return made_calibration(T, cov, diagnostics=Diagnostics(**diagnostics))
 
 
 def sessions(n, seed, factor=1.0, cov=COV):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lce_rig.core.calibration import Calibration, Certificate, Metrics
+from lce_rig.core.calibration import Calibration
 from lce_rig.rig import Rig, find_profile, parse_rig, set_value
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import build_view
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, simulate_captures, truth_extrinsics
-from tests.saved_results import write_result
+from tests.saved_results import made_calibration, write_result
 
 COV = np.diag([0.003] * 3 + [0.0015] * 3) ** 2
 SEED = 2
@@ -45,20 +45,7 @@ def small_rig() -> Rig:
 
 def deployed(T_cam_lidar: NDArray[np.float64]) -> Calibration:
     """Make a result with given extrinsics."""
-    return Calibration(
-        camera="cam",
-        channels=("frames",),
-        lidar="lidar",
-        T_cam_lidar=T_cam_lidar,
-        cov=COV,
-        certificate=Certificate(True, 1e-9),
-        metrics=Metrics(0.008, 0.006, 0.1),
-        n_captures=4,
-        n_detected=4,
-        captures_used=("000000",),
-        captures_refused={},
-        verdict="pass",
-    )
+    return made_calibration(T_cam_lidar, COV, n_captures=4, n_detected=4)
 
 
 @pytest.fixture(scope="session")
