@@ -119,7 +119,8 @@ class Finding:
     @property
     def sentence(self) -> str:
         """Fact and action in one line."""
-        return f"{self.text}: {self.advice}" if self.advice else self.text
+        advice = self.advice
+        return f"{self.text}: {advice}" if advice else self.text
 
     def as_json(self) -> dict[str, object]:
         """Return the finding for programs; all but the texts is stable."""
