@@ -439,7 +439,7 @@ def _with_state(opinion: SceneOpinion, write: Callable[[SceneOpinion], Any]) -> 
 class Calibration:
     """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
 
-    result.json keeps all of it but the last eight attributes, which are empty if it is read back.
+    result.json keeps all of it but the last four attributes, which are empty if it is read back.
 
     Attributes:
         channels: of the camera, names.
@@ -465,12 +465,6 @@ class Calibration:
         held_out_m: rms residual of captures where they were not fitted; NaN if the method has none.
         residuals: of each capture used.
         observations: capture -> the boards that were paired, as measured, for each capture used.
-        lens_error, lens_error_sigma: errors of the profile's intrinsics, profile less boards: focal length
-            (relative), principal point x and y (px), distortion (px in the image's corner); their standard
-            deviations.
-        laser_range_m, laser_range_sigma_m: range offset of each of the LiDAR's lasers, by ring; its standard
-            deviation about their mean. Empty where the method has none, the boards moved, or the profile
-            states them.
     """
 
     _: KW_ONLY
@@ -510,10 +504,6 @@ class Calibration:
     held_out_m: Annotated[float, _ANY, _IN_MEMORY] = math.nan
     residuals: Annotated[tuple[CaptureResidual, ...], _ANY, _IN_MEMORY] = ()
     observations: Annotated[Mapping[str, Observation], _ANY, _IN_MEMORY] = field(default_factory=dict)
-    lens_error: Annotated[tuple[float, ...], _ANY, _IN_MEMORY] = ()
-    lens_error_sigma: Annotated[tuple[float, ...], _ANY, _IN_MEMORY] = ()
-    laser_range_m: Annotated[tuple[float, ...], _ANY, _IN_MEMORY] = ()
-    laser_range_sigma_m: Annotated[tuple[float, ...], _ANY, _IN_MEMORY] = ()
 
     @property
     def is_start_certified(self) -> bool:

@@ -167,7 +167,12 @@ def _pose_from_homography(corners_board: Array, rays: Array) -> Array | None:
     """
     if not np.all(np.isfinite(rays)):
         return None
-    R_view = _rotation_to_axis(rays.mean(axis=0))
+    # Build a rotation (3, 3) that takes `direction` to the z axis.
+    direction = rays.mean(axis=0)
+    z = direction / np.linalg.norm(direction)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    R_view = np.stack([x, np.cross(z, x), z])
     view = rays @ R_view.T
     if np.any(view[:, 2] < 1e-3):
         return None
@@ -190,14 +195,6 @@ def _pose_from_homography(corners_board: Array, rays: Array) -> Array | None:
     R = project_to_so3(np.stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])], axis=1))
     t = H[:, 2] * size
     return invert(pose(R_view, np.zeros(3))) @ pose(R, t - R @ centre)
-
-
-def _rotation_to_axis(direction: Array) -> Array:
-    """Build a rotation (3, 3) that takes `direction` to the z axis."""
-    z = direction / np.linalg.norm(direction)
-    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])
 
 
 def _residuals_and_jacobian(

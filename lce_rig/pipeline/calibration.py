@@ -7,7 +7,6 @@ the scene's opinion
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -34,15 +33,13 @@ from lce_rig.judge.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.judge.reach import point_uncertainties
 from lce_rig.judge.relative_pose import relative_pose
 from lce_rig.judge.validate import Validation, validate
-from lce_rig.judge.verdict import judge, share_findings, with_opinion
+from lce_rig.judge.verdict import judge, share_findings
 from lce_rig.lens.lens_estimate import BoardView
-from lce_rig.pipeline.detect_session import Progress, detect, silent
+from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE
 from lce_rig.pipeline.matching import candidates_of
-from lce_rig.pipeline.result_files import Result
-from lce_rig.pipeline.witness import Sharpen, by_boards, fuse, hear_scene, sharpen
+from lce_rig.pipeline.witness import Sharpen, fuse
 from lce_rig.rig import Rig
-from lce_rig.session import Session
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,33 +94,6 @@ _Link = tuple[int, int, CameraPair, list[Finding]]
 """Two cameras that saw the same boards, by their indices among those with an estimate, and contradictions."""
 
 
-def calibrate(
-    session: Session,
-    detections: Detections | None = None,
-    *,
-    options: CalibrateOptions | None = None,
-    cameras: Sequence[str] | None = None,
-    channels: Sequence[str] | None = None,
-    reference: Reference | None = None,
-    use_scene: bool = False,
-    progress: Progress = silent,
-) -> Result:
-    """Estimate and judge the extrinsics of one session, as `union.calibrate` does of one or several."""
-    detections = detect(session) if detections is None else detections
-    pairs, shortages = calibrate_detections(
-        session.rig,
-        detections,
-        options,
-        cameras=cameras,
-        channels=channels,
-        reference=reference,
-        scene=partial(sharpen, [session], [detections]) if use_scene else None,
-        progress=progress,
-    )
-    heard = [with_opinion(pair, hear_scene(session, detections, by_boards(pair))) for pair in pairs]
-    return Result(session, tuple(heard), tuple(shortages))
-
-
 def calibrate_detections(
     rig: Rig,
     detections: Detections,
@@ -143,7 +113,7 @@ def calibrate_detections(
     Args:
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
-        options, cameras, channels, reference, progress: as of `calibrate`.
+        options, cameras, channels, reference, progress: as of `union.calibrate`.
         scene: asks the scene about the boards' extrinsics; None for the boards alone.
 
     Returns:
@@ -175,8 +145,11 @@ def calibrate_detections(
     if scene is not None:
         solved = [_with_scene(rig, each, scene(each)) for each in solved]
     calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
-    if reference is not None:
-        calibrations = [_compared(calibration, reference) for calibration in calibrations]
+    for k, c in enumerate(calibrations):
+        truth = None if reference is None else reference.of(c.camera, c.lidar)
+        if truth is not None:
+            rotation_deg, translation_m = error_to_reference(c.T_cam_lidar, truth)
+            calibrations[k] = replace(c, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
     return calibrations, shortages
 
 
@@ -343,12 +316,6 @@ def _judged(
     refused = dict(own.refused)
     for name, why in estimate.refused.items():
         refused |= dict.fromkeys(estimate.captures_of([name]), why)
-    lens_error: tuple[float, ...] = ()
-    lens_error_sigma: tuple[float, ...] = ()
-    if validation.intrinsics is not None and validation.intrinsics.errors is not None:
-        lens_error = validation.intrinsics.errors
-        lens_error_sigma = tuple(np.sqrt(np.diag(np.array(validation.intrinsics.errors_cov))).tolist())
-    laser_range_m, laser_range_sigma_m = _laser_ranges(rig, own)
     lens = rig.cameras[own.camera].to_intrinsics()
     return Calibration(
         camera=own.camera,
@@ -378,10 +345,6 @@ def _judged(
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,
         observations=estimate.observations,
-        lens_error=lens_error,
-        lens_error_sigma=lens_error_sigma,
-        laser_range_m=laser_range_m,
-        laser_range_sigma_m=laser_range_sigma_m,
     )
 
 
@@ -407,33 +370,6 @@ def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera
         apart_translation_m=apart_m,
         board_rms_m=pair.board_rms_m,
     )
-
-
-def _laser_ranges(rig: Rig, solved: _Solved) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Give the range offset of each laser, by ring, and its standard deviation about their mean.
-
-    Nothing where boards moved, which would make them up, or where the profile states them already.
-    """
-    estimate, settings = solved.estimate, rig.lidars[solved.lidar]
-    found, sheet = estimate.lidar, settings.data_sheet()
-    is_known = settings.intrinsics is not None or settings.laser_bias_sigma_m == 0
-    has_moved = not solved.is_still or estimate.diagnostics.fit_plane_rms_m > rig.verdict.max_plane_misfit_m
-    if found is None or sheet is None or found.rings.max() >= sheet.n_rings or is_known or has_moved:
-        return (), ()
-    # Lasers that met no board are known as well as before.
-    range_m = np.full(sheet.n_rings, found.lasers[0].mean())
-    sigma_m = np.full(sheet.n_rings, settings.laser_bias_sigma_m)
-    range_m[found.rings], sigma_m[found.rings] = found.lasers[0], found.lasers_sigma[0]
-    return tuple(range_m.tolist()), tuple(sigma_m.tolist())
-
-
-def _compared(calibration: Calibration, reference: Reference) -> Calibration:
-    """Report the error from a reference T_cam_lidar, if it states these sensors'."""
-    truth = reference.of(calibration.camera, calibration.lidar)
-    if truth is None:
-        return calibration
-    rotation_deg, translation_m = error_to_reference(calibration.T_cam_lidar, truth)
-    return replace(calibration, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
 
 
 def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:

@@ -11,13 +11,18 @@ import numpy as np
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
-from lce_rig.judge.repeatability import Repeatability, compare_calibrations
-from lce_rig.pipeline.calibration import calibrate
+from lce_rig.judge.repeatability import Repeatability
 from lce_rig.pipeline.detect_session import Progress, silent
-from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, ONLY_ONE, OTHER_BOARD, OUTDATED
+from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, OTHER_BOARD, OUTDATED
 from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
+from lce_rig.pipeline.union import (
+    calibrate,
+    compare_sensors,
+    require_independent,
+    require_same,
+    session_names,
+)
 from lce_rig.session import Session
-from lce_rig.session.identity import differing_keys
 from lce_rig.session.session import CAPTURES
 
 # Inputs of the extrinsics besides the captures; another lens is another camera.
@@ -99,7 +104,11 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
     if len(paths) < 2:
         raise UsageError("a comparison requires two sessions or more, 1 given", "Give two sessions or more.")
     sessions = dict(zip(session_names(paths), (Session.open(path) for path in paths), strict=True))
-    require_one_rig(sessions)
+    require_same(
+        sessions,
+        lambda key: key.path[0] in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(key.path[1:]),
+        "Put the same intrinsics into both (rig.yaml of the session) and calibrate again.",
+    )
     require_independent(sessions)
     results: dict[str, list[Calibration]] = {}
     captures: dict[str, frozenset[str]] = {}
@@ -170,61 +179,6 @@ def _failures(results: dict[str, list[Calibration]]) -> list[Finding]:
     ]
 
 
-def session_names(paths: Sequence[Path]) -> list[str]:
-    """Name sessions by their folder, or by their path if two folders have the same name.
-
-    Raises:
-        UsageError: one is given twice.
-    """
-    resolved = [path.resolve() for path in paths]
-    for path, where in zip(paths, resolved, strict=True):
-        if resolved.count(where) > 1:
-            raise UsageError(f"{path} is given twice", "Give independent sessions.")
-    short = [path.name for path in resolved]
-    return short if len(set(short)) == len(short) else [str(path) for path in paths]
-
-
-def require_one_rig(sessions: Mapping[str, Session]) -> None:
-    """Refuse sessions of different rigs, or with different lenses; raises SessionError."""
-    (first_name, first), *others = sessions.items()
-    for name, session in others:
-        if session.rig.name != first.rig.name:
-            raise SessionError(
-                f"{first_name} belongs to rig {first.rig.name!r}, {name} to rig {session.rig.name!r}",
-                "Give sessions of one rig.",
-            )
-        # Differences between profiles that move extrinsics.
-        keys = [
-            key
-            for key in differing_keys(first.rig, session.rig)
-            if key.path[0] in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(key.path[1:])
-        ]
-        if keys:
-            raise SessionError(
-                f"{first_name} and {name} were made with different sensors: {'; '.join(map(str, keys[:4]))}",
-                "Put the same intrinsics into both (rig.yaml of the session) and calibrate again.",
-            )
-
-
-def require_independent(sessions: Mapping[str, Session]) -> None:
-    """Refuse sessions that share images or scans: a copy agrees with its original despite any error."""
-    hashes: dict[str, list[frozenset[str]]] = {}
-    for name, session in sessions.items():
-        hashes[name] = []
-        for capture in session.captures:
-            # A damaged capture is reported when it is read.
-            with suppress(SessionError):
-                hashes[name].append(capture.file_hashes)
-    for one, other in combinations(sessions, 2):
-        theirs = frozenset().union(*hashes[other])
-        n_shared = sum(not own.isdisjoint(theirs) for own in hashes[one])
-        if n_shared:
-            raise SessionError(
-                f"{one} and {other} share {n_shared} captures: they are not independent",
-                "Collect each session separately, with the board mounted again.",
-            )
-
-
 def _require_apart(captures: Mapping[str, frozenset[str]]) -> None:
     """Refuse results made from the same captures, as that of several sessions contains each of them."""
     for one, other in combinations(captures, 2):
@@ -252,30 +206,3 @@ def _read(session: Session, folder: Path) -> ResultFile:
                 "Run `lce-rig calibrate` again.",
             )
     return saved
-
-
-def compare_sensors(
-    results: dict[str, list[Calibration]], *, are_independent: bool = True
-) -> tuple[tuple[Repeatability, ...], list[Finding]]:
-    """Compare each camera and LiDAR, and report those that only one session calibrates."""
-    groups: dict[tuple[str, str], dict[str, Calibration]] = {}
-    for name, calibrations in results.items():
-        for calibration in calibrations:
-            group = groups.setdefault((calibration.camera, calibration.lidar), {})
-            if name in group:
-                raise SessionError(
-                    f"{name}: its result holds {calibration.camera} and {calibration.lidar} twice",
-                    "Run `lce-rig calibrate` again.",
-                )
-            group[name] = calibration
-    comparisons = [
-        compare_calibrations(group, are_independent=are_independent)
-        for _, group in sorted(groups.items())
-        if len(group) > 1
-    ]
-    lonely = [
-        ONLY_ONE(next(iter(group)), camera=camera, lidar=lidar)
-        for (camera, lidar), group in sorted(groups.items())
-        if len(group) == 1
-    ]
-    return tuple(comparisons), lonely

@@ -1,4 +1,4 @@
-"""One estimate from several sessions of a rig whose sensors were not moved in between.
+"""Calibrate one session, or several of a rig whose sensors were not moved in between, by one estimate.
 
 same rig, own captures -> each session alone, compared -> captures of all in one estimate
 
@@ -6,29 +6,28 @@ The sensors' constant errors are the same in every session, and more sessions do
 estimate of all captures they are common unknowns, and their part of the covariance stays.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
+from pathlib import Path
 
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
+from lce_rig.core.findings import Finding
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.export.reference import Reference
-from lce_rig.judge.repeatability import Repeatability
+from lce_rig.judge.repeatability import Repeatability, compare_calibrations
 from lce_rig.judge.verdict import with_opinion
-from lce_rig.pipeline.calibration import calibrate as calibrate_one
 from lce_rig.pipeline.calibration import calibrate_detections
-from lce_rig.pipeline.comparison import compare_sensors, require_independent, require_one_rig, session_names
 from lce_rig.pipeline.detect_session import Progress, detect, silent
-from lce_rig.pipeline.findings import MOVED
+from lce_rig.pipeline.findings import MOVED, ONLY_ONE
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.witness import by_boards, hear_scene, sharpen
 from lce_rig.session import Session
-from lce_rig.session.identity import differing_keys
-
-# Captures of all sessions are estimated with one of these; targets and limits are those of the first session.
-_SHARED = frozenset({"board", "cameras", "lidars"})
+from lce_rig.session.identity import DifferingKey, differing_keys
 
 
 def calibrate(
@@ -62,43 +61,36 @@ def calibrate(
         SessionError: sessions are not of one rig, board and intrinsics, or share captures.
         UsageError: no capture holds one of the channels; a session is given twice.
     """
-    if isinstance(session, Session) or len(session) == 1:
-        return calibrate_one(
-            session if isinstance(session, Session) else session[0],
-            detections[0] if isinstance(detections, Sequence) else detections,
-            options=options,
-            cameras=cameras,
-            channels=channels,
-            reference=reference,
-            use_scene=use_scene,
-            progress=progress,
-        )
-    named = require_unit(session)
-    given = [detect(each) for each in session] if detections is None else detections
-    if isinstance(given, Detections) or len(given) != len(named):
+    named = require_unit([session] if isinstance(session, Session) else session)
+    sessions = list(named.values())
+    if detections is None:
+        detections = [detect(each) for each in sessions]
+    elif isinstance(detections, Detections):
+        detections = [detections]
+    if len(detections) != len(named):
         raise UsageError(f"{len(named)} sessions require as many detections", "Give one for each session.")
-    found = dict(zip(named, given, strict=True))
+    by_name, is_union = dict(zip(named, detections, strict=True)), len(named) > 1
     options = options or CalibrateOptions()
-    comparisons = _require_unmoved(named, found, options, cameras, channels)
+    comparisons = _require_unmoved(named, by_name, options, cameras, channels) if is_union else ()
     pairs, shortages = calibrate_detections(
-        session[0].rig,
-        join_detections(found),
+        sessions[0].rig,
+        join_detections(by_name) if is_union else detections[0],
         options,
         cameras=cameras,
         channels=channels,
         reference=reference,
-        scene=partial(sharpen, session, given) if use_scene else None,
+        scene=partial(sharpen, sessions, detections) if use_scene else None,
         progress=progress,
     )
     agreements = {(each.camera, each.lidar): (each.finding,) for each in comparisons}
-    heard = []
+    judged = []
     for c in pairs:
         # The scene of the first session that holds captures of these sensors.
-        name = next(name for name in named if Pair.of(c) in found[name].pairs)
-        opinion = hear_scene(named[name], found[name], by_boards(c))
+        name = next(name for name in named if Pair.of(c) in by_name[name].pairs)
+        opinion = hear_scene(named[name], by_name[name], by_boards(c))
         agreement = agreements.get((c.camera, c.lidar), ())
-        heard.append(with_opinion(replace(c, findings=(*c.findings, *agreement)), opinion))
-    return Result(session[0], tuple(heard), tuple(shortages), named)
+        judged.append(with_opinion(replace(c, findings=(*c.findings, *agreement)), opinion))
+    return Result(sessions[0], tuple(judged), tuple(shortages), named if is_union else {})
 
 
 def require_unit(sessions: Sequence[Session]) -> dict[str, Session]:
@@ -111,30 +103,76 @@ def require_unit(sessions: Sequence[Session]) -> dict[str, Session]:
     if not sessions:
         raise UsageError("no session given", "Give one session, or several of one rig.")
     named = dict(zip(session_names([each.path for each in sessions]), sessions, strict=True))
-    require_one_rig(named)
-    (first_name, first), *others = named.items()
-    for name, session in others:
-        keys = [key for key in differing_keys(first.rig, session.rig) if key.path[0] in _SHARED]
-        if keys:
-            raise SessionError(
-                f"{first_name} and {name} differ in board or sensors: {'; '.join(map(str, keys[:4]))}",
-                "One estimate requires one board and one set of sensors. Correct the wrong rig.yaml, or "
-                "calibrate each session alone and compare them with `lce-rig repeat`.",
-            )
+    # Captures of all sessions are estimated with one of these; targets and limits are those of the first.
+    require_same(
+        named,
+        lambda key: key.path[0] in ("board", "cameras", "lidars"),
+        "One estimate requires one board and one set of sensors. Correct the wrong rig.yaml, or calibrate "
+        "each session alone and compare them with `lce-rig repeat`.",
+    )
     require_independent(named)
     return named
 
 
-def join_detections(found: Mapping[str, Detections]) -> Detections:
-    """Put the detections of several sessions into one, captures named SESSION/CAPTURE.
+def session_names(paths: Sequence[Path]) -> list[str]:
+    """Name sessions by their folder, or by their path if two folders have the same name.
 
-    Args:
-        found: by the session's name.
+    Raises:
+        UsageError: one is given twice.
     """
+    resolved = [path.resolve() for path in paths]
+    for path, where in zip(paths, resolved, strict=True):
+        if resolved.count(where) > 1:
+            raise UsageError(f"{path} is given twice", "Give independent sessions.")
+    short = [path.name for path in resolved]
+    return short if len(set(short)) == len(short) else [str(path) for path in paths]
+
+
+def require_same(
+    sessions: Mapping[str, Session], must_agree: Callable[[DifferingKey], bool], hint: str
+) -> None:
+    """Refuse sessions of different rigs, or whose profiles differ in a key that must agree.
+
+    Raises:
+        SessionError: with the keys.
+    """
+    (first_name, first), *others = sessions.items()
+    for name, session in others:
+        if session.rig.name != first.rig.name:
+            raise SessionError(
+                f"{first_name} belongs to rig {first.rig.name!r}, {name} to rig {session.rig.name!r}",
+                "Give sessions of one rig.",
+            )
+        keys = [str(key) for key in differing_keys(first.rig, session.rig) if must_agree(key)]
+        if keys:
+            raise SessionError(f"the profiles of {first_name} and {name} differ: {'; '.join(keys[:4])}", hint)
+
+
+def require_independent(sessions: Mapping[str, Session]) -> None:
+    """Refuse sessions that share images or scans: a copy agrees with its original despite any error."""
+    hashes: dict[str, list[frozenset[str]]] = {}
+    for name, session in sessions.items():
+        hashes[name] = []
+        for capture in session.captures:
+            # A damaged capture is reported when it is read.
+            with suppress(SessionError):
+                hashes[name].append(capture.file_hashes)
+    for one, other in combinations(sessions, 2):
+        theirs = frozenset().union(*hashes[other])
+        n_shared = sum(not own.isdisjoint(theirs) for own in hashes[one])
+        if n_shared:
+            raise SessionError(
+                f"{one} and {other} share {n_shared} captures: they are not independent",
+                "Collect each session separately, with the board mounted again.",
+            )
+
+
+def join_detections(by_session: Mapping[str, Detections]) -> Detections:
+    """Put the detections of several sessions into one, captures named SESSION/CAPTURE."""
     images: dict[tuple[str, str], dict[str, ImageDetection]] = {}
     lidars: dict[str, dict[str, LidarDetection]] = {}
     session_of: dict[str, str] = {}
-    for name, own in found.items():
+    for name, own in by_session.items():
         for key, by_image in own.images.items():
             images.setdefault(key, {}).update({f"{name}/{k}": image for k, image in by_image.items()})
         for lidar, by_scan in own.lidars.items():
@@ -145,7 +183,7 @@ def join_detections(found: Mapping[str, Detections]) -> Detections:
 
 def _require_unmoved(
     sessions: Mapping[str, Session],
-    found: Mapping[str, Detections],
+    detections: Mapping[str, Detections],
     options: CalibrateOptions,
     cameras: Sequence[str] | None,
     channels: Sequence[str] | None,
@@ -160,7 +198,7 @@ def _require_unmoved(
     for name, session in sessions.items():
         try:
             alone[name], _ = calibrate_detections(
-                session.rig, found[name], replace(options, n_draws=0), cameras=cameras, channels=channels
+                session.rig, detections[name], replace(options, n_draws=0), cameras=cameras, channels=channels
             )
         except NotEnoughDataError as error:
             raise NotEnoughDataError(
@@ -188,3 +226,30 @@ def _require_unmoved(
         )
         raise ResultRefusedError(moved.text, moved.advice)
     return comparisons
+
+
+def compare_sensors(
+    results: dict[str, list[Calibration]], *, are_independent: bool = True
+) -> tuple[tuple[Repeatability, ...], list[Finding]]:
+    """Compare each camera and LiDAR, and report those that only one session calibrates."""
+    groups: dict[tuple[str, str], dict[str, Calibration]] = {}
+    for name, calibrations in results.items():
+        for calibration in calibrations:
+            group = groups.setdefault((calibration.camera, calibration.lidar), {})
+            if name in group:
+                raise SessionError(
+                    f"{name}: its result holds {calibration.camera} and {calibration.lidar} twice",
+                    "Run `lce-rig calibrate` again.",
+                )
+            group[name] = calibration
+    comparisons = [
+        compare_calibrations(group, are_independent=are_independent)
+        for _, group in sorted(groups.items())
+        if len(group) > 1
+    ]
+    lonely = [
+        ONLY_ONE(next(iter(group)), camera=camera, lidar=lidar)
+        for (camera, lidar), group in sorted(groups.items())
+        if len(group) == 1
+    ]
+    return tuple(comparisons), lonely
