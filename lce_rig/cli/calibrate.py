@@ -223,7 +223,7 @@ def calibrate(
     import lce_rig as lce
     from lce_rig.core.errors import UsageError
     from lce_rig.export.reference import read_reference
-    from lce_rig.pipeline.result_files import OVERLAYS, UNION, new_result_parts
+    from lce_rig.pipeline.result_files import UNION, new_result_parts
     from lce_rig.pipeline.union import require_unit
     from lce_rig.session.provenance import provenance_of
 
@@ -270,12 +270,6 @@ def calibrate(
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} has no T_cam_lidar for these sensors")
         written = result.write(name=name, force=force, report=not no_report)
-    if written.had_overlays:
-        with show.progress_bar("drawing") as progress:
-            lce.verify(first, result, detections[0], name=name, event_image=event_image).write(
-                progress=progress
-            )
-        show.note(f"overlays drawn again in {written.files[0].parent / OVERLAYS}")
     if as_json:
         show.print_json(result.document())
     else:
@@ -294,10 +288,8 @@ def calibrate(
     if written.previous is not None:
         if len(written.files) == 1 and written.has_usable_previous:
             show.warn(f"this result is not exported; the last usable result is in {written.previous}")
-        elif not written.is_same:
-            show.note(f"the earlier result is in {written.previous}")
-        if written.only_previous:
-            show.note(f"not calibrated in this run: {', '.join(written.only_previous)}")
+        else:
+            show.note(f"the result before it is in {written.previous}")
     lacking = _lacking(wanted, {pair.camera for each in detections for pair in each.pairs}, result.pairs)
     if lacking is not None and any(c.verdict == "fail" for c in result.pairs):
         show.warn(str(lacking))

@@ -114,10 +114,8 @@ def _head(measured: "MeasuredIntrinsics") -> list[str]:
 
 def _table(measured: "MeasuredIntrinsics") -> Any:
     """List the parameters, with the profile's if model and resolution are the same."""
-    from lce_rig.pipeline.intrinsics_files import final
-
     estimate, lens = measured.estimate, measured.given
-    values = estimate.model.vector(final(measured))
+    values = estimate.model.vector(measured.intrinsics)
     try:
         old = None if measured.check is None else estimate.model.vector(lens)
     except ValueError:

@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, UsageError, refusal_of
 from lce_rig.core.findings import Finding, Refusal
@@ -14,7 +16,7 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import crop_to_intrinsics
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
 from lce_rig.lens.calibrate_lens import MIN_CAPTURES, Choice, choose_model, estimate_intrinsics
-from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of
+from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of, lens_errors
 from lce_rig.lens.lens_coverage import find_weaknesses
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import MODELS, model_of
@@ -61,6 +63,29 @@ class MeasuredIntrinsics:
     misfit: Finding | None
     weaknesses: tuple[str, ...]
     refused: Mapping[str, Refusal]
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The estimate, rounded as in every file."""
+        lens = self.estimate.intrinsics
+        pixels = {key: round(getattr(lens, key), 4) for key in ("fx_px", "fy_px", "cx_px", "cy_px")}
+        return replace(lens, **pixels, distortion=tuple(round(value, 8) for value in lens.distortion))
+
+    def deviations(self) -> dict[str, float]:
+        """Compute the standard deviations of the profile's block `intrinsics`, px, by key.
+
+        Its parameters are correlated: focal length, principal point and distortion share what their
+        covariance lets pixels move where boards were seen.
+        """
+        estimate, lens = self.estimate, self.estimate.intrinsics
+        corners_px = estimate.corners_px.reshape(-1, 2)
+        _, cov = lens_errors(lens, lens, corners_px, estimate.cov, estimate.model)
+        focal, x, y, corner_px = np.sqrt(np.diag(cov)).tolist()
+        return {
+            "focal_sigma_px": float(f"{focal * lens.fx_px:.2g}"),
+            "principal_point_sigma_px": float(f"{np.sqrt((x**2 + y**2) / 2):.2g}"),
+            "distortion_sigma_px": float(f"{corner_px:.2g}"),
+        }
 
 
 def measure_intrinsics(

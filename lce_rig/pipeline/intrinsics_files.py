@@ -1,9 +1,9 @@
 """Write measured intrinsics as files: a block for the profile, a new profile, camera_info, plots."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,8 @@ from lce_rig.core.phrasing import as_line
 from lce_rig.export.camera_info import camera_info_text
 from lce_rig.export.files import number, numbers
 from lce_rig.judge.findings import verdict_of
-from lce_rig.lens.difference import lens_errors
 from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
-from lce_rig.pipeline.result_files import keep_earlier
+from lce_rig.pipeline.result_files import keep_foreign
 from lce_rig.rig import (
     Rig,
     dump_rig,
@@ -32,20 +31,18 @@ from lce_rig.rig import (
 )
 from lce_rig.session import Session
 from lce_rig.session.durable import write_atomically
-from lce_rig.session.replacing import copy_over
 from lce_rig.session.session import INTRINSICS
 
 DOCUMENT = "intrinsics.json"
 FORMAT_VERSION = 1
 _FORCE = "To write them nevertheless, add --force."
-_PIXEL_DIGITS, _COEFFICIENT_DIGITS = 4, 8
 
 
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
-    """Write the session's intrinsics/ in one step; an earlier run's files move to intrinsics/previous/.
+    """Write the session's intrinsics/ in one step.
 
     For each camera a block to paste into the profile, a camera_info file and a page of plots; and
-    intrinsics.json for machines. Cameras that only an earlier run measured are kept.
+    intrinsics.json for machines. Other files there stay, as those of cameras that an earlier run measured.
 
     Returns:
         The files of this run.
@@ -59,68 +56,30 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
     names = [DOCUMENT]
 
     def finish(earlier: Path, draft: Path) -> None:
-        # Entries of cameras that were not measured again; none if damaged.
-        others: dict[str, dict[str, Any]] = {}
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            known = {str(each["camera"]): each for each in read_json(earlier / DOCUMENT)["cameras"]}
-            others = {name: known[name] for name in known if name not in {one.camera for one in measured}}
-        for camera in others:
-            for name in _file_names(camera):
-                if (earlier / name).is_file():
-                    copy_over(earlier / name, draft / name)
-        content = document(session.rig, measured, list(others.values()))
+        content = document(session.rig, measured)
+        with suppress(OSError, ValueError, KeyError, TypeError):  # no entries of an earlier run, or damaged
+            others = read_json(earlier / DOCUMENT)["cameras"]
+            cameras = {one.camera for one in measured}
+            content["cameras"] += [other for other in others if other["camera"] not in cameras]
         write_atomically(draft / DOCUMENT, json.dumps(content, indent=2) + "\n")
-        ours = {DOCUMENT, *(name for camera in session.rig.cameras for name in _file_names(camera))}
-        keep_earlier(earlier, draft, DOCUMENT, lambda path: path.name in ours)
+        keep_foreign(earlier, draft, lambda path: path.name in names)
 
     with session.replacing(INTRINSICS, finish=finish) as draft:
         for one in measured:
-            names += (own := _file_names(one.camera))
-            block, info, page = (draft / name for name in own)
-            write_atomically(block, profile_block(session.rig, one))
-            write_atomically(info, camera_info_text(one.camera, final(one), _head(session.rig, one)))
-            title = f"Intrinsics of camera {one.camera}, rig {session.rig.name}"
-            plot = draw_intrinsics(
-                one.estimate, one.certainty, one.difference, title=title, weaknesses=one.weaknesses
-            )
-            write_picture(page, plot)
+            block, info, page = f"{one.camera}.yaml", f"camera_info_{one.camera}.yaml", f"{one.camera}.png"
+            write_atomically(draft / block, profile_block(session.rig, one))
+            head = _head(session.rig, one)
+            write_atomically(draft / info, camera_info_text(one.camera, one.intrinsics, head))
+            title, notes = f"Intrinsics of camera {one.camera}, rig {session.rig.name}", one.weaknesses
+            plot = draw_intrinsics(one.estimate, one.certainty, one.difference, title=title, weaknesses=notes)
+            write_picture(draft / page, plot)
+            names += [block, info, page]
     return [session.path / INTRINSICS / name for name in names]
-
-
-def _file_names(camera: str) -> tuple[str, str, str]:
-    return f"{camera}.yaml", f"camera_info_{camera}.yaml", f"{camera}.png"
-
-
-def final(measured: MeasuredIntrinsics) -> Intrinsics:
-    """Return the intrinsics rounded as in every file."""
-    lens = measured.estimate.intrinsics
-    fx, fy, cx, cy = (
-        round(value, _PIXEL_DIGITS) for value in (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
-    )
-    distortion = tuple(round(value, _COEFFICIENT_DIGITS) for value in lens.distortion)
-    return replace(lens, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=distortion)
-
-
-def deviations(measured: MeasuredIntrinsics) -> dict[str, float]:
-    """Compute the standard deviations of the profile's block `intrinsics`, px, by key.
-
-    Its parameters are correlated: focal length, principal point and distortion share what their covariance
-    lets pixels move where boards were seen.
-    """
-    estimate, lens = measured.estimate, measured.estimate.intrinsics
-    corners_px = estimate.corners_px.reshape(-1, 2)
-    _, cov = lens_errors(lens, lens, corners_px, estimate.cov, estimate.model)
-    focal, x, y, corner_px = np.sqrt(np.diag(cov)).tolist()
-    return {
-        "focal_sigma_px": float(f"{focal * lens.fx_px:.2g}"),
-        "principal_point_sigma_px": float(f"{np.sqrt((x**2 + y**2) / 2):.2g}"),
-        "distortion_sigma_px": float(f"{corner_px:.2g}"),
-    }
 
 
 def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
     """Write the camera's block `intrinsics:`, indented for pasting into a profile."""
-    lens, sigma = final(measured), measured.estimate.sigma
+    lens, sigma = measured.intrinsics, measured.estimate.sigma
     lines = [f"# {line}" for line in _head(rig, measured)]
     lines += [
         f"# In the profile this block belongs to cameras.{measured.camera}, whose images have",
@@ -133,7 +92,7 @@ def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
     names = " ".join(measured.estimate.model.coefficients)
     spread = " ".join(f"{value:.1g}" for value in sigma[4:])
     lines.append(f"      distortion: {numbers(lens.distortion)}   # {names}, +- {spread}")
-    lines += [f"      {key}: {value:g}" for key, value in deviations(measured).items()]
+    lines += [f"      {key}: {value:g}" for key, value in measured.deviations().items()]
     return "\n".join(lines) + "\n"
 
 
@@ -168,12 +127,12 @@ def save_profile(
         raise ResultRefusedError(f"{path} not written. {why}", " ".join([*actions, _FORCE]))
     text = profile_text(session.rig)
     for one in measured:
-        lens, block = final(one), f"cameras.{one.camera}"
+        lens, block = one.intrinsics, f"cameras.{one.camera}"
         if (lens.width_px, lens.height_px) != session.rig.cameras[one.camera].resolution_px:
             text = set_value(text, f"{block}.resolution_px", f"[{lens.width_px}, {lens.height_px}]")
         for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
             text = set_value(text, f"{block}.intrinsics.{key}", number(getattr(lens, key)))
-        for key, value in deviations(one).items():
+        for key, value in one.deviations().items():
             text = set_value(text, f"{block}.intrinsics.{key}", f"{value:g}")
         text = set_value(text, f"{block}.intrinsics.model", lens.model)
         text = set_value(text, f"{block}.intrinsics.distortion", numbers(lens.distortion))
@@ -201,27 +160,19 @@ def _head(rig: Rig, measured: MeasuredIntrinsics) -> list[str]:
     ]
 
 
-def document(
-    rig: Rig, measured: Sequence[MeasuredIntrinsics], others: Sequence[Mapping[str, Any]] = ()
-) -> dict[str, Any]:
-    """Build the content of intrinsics.json from plain types; figures that could not be computed are null.
-
-    Args:
-        rig: the profile.
-        measured: in this run.
-        others: entries of an earlier run for other cameras.
-    """
+def document(rig: Rig, measured: Sequence[MeasuredIntrinsics]) -> dict[str, Any]:
+    """Build the content of intrinsics.json from plain types; figures that could not be computed are null."""
     return {
         "format_version": FORMAT_VERSION,
         "rig": rig.name,
         "made_by": MADE_BY,
-        "cameras": [*map(_camera, measured), *others],
+        "cameras": [*map(_camera, measured)],
     }
 
 
 def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
     """List one camera's intrinsics; its profile's are null if they are for another resolution."""
-    estimate, lens = measured.estimate, final(measured)
+    estimate, lens = measured.estimate, measured.intrinsics
     choice, check, difference = measured.choice, measured.check, measured.difference
     profile = None
     if check is not None and difference is not None:

@@ -37,9 +37,6 @@ class WrittenResult(NamedTuple):
         report: the page; None if it was not asked for.
         previous: the folder with the earlier run's files; None if there was none.
         has_usable_previous: whether that run had a usable result.
-        only_previous: cameras and LiDARs with a usable result there and no result in this run.
-        is_same: whether this result is identical byte for byte to the earlier one.
-        had_overlays: whether overlays of the earlier result moved to `previous`, and this one has none.
     """
 
     files: tuple[Path, ...]
@@ -47,9 +44,6 @@ class WrittenResult(NamedTuple):
     report: Path | None
     previous: Path | None = None
     has_usable_previous: bool = False
-    only_previous: tuple[str, ...] = ()
-    is_same: bool = False
-    had_overlays: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,31 +140,14 @@ class Result:
         parts = new_result_parts(UNION if self.sessions and name is None else name)
         place = self.session.path.joinpath(*parts)
         previous = place / PREVIOUS
-        is_same = had_overlays = False
-
-        def finish(earlier: Path, draft: Path) -> None:
-            nonlocal is_same, had_overlays
-            usable, kept = _usable(earlier), _usable(earlier / PREVIOUS)
-            deserves = (bool(usable) or not kept) and kept <= usable | _usable(draft)
-            is_same = keep_earlier(earlier, draft, RESULT, _is_of_a_result, deserves=deserves)
-            if is_same and (earlier / OVERLAYS).is_dir():
-                copy_over(earlier / OVERLAYS, draft / OVERLAYS)
-            # Also those of the result before: a run that was killed had no time to draw them.
-            has_drawn = any((folder / OVERLAYS).is_dir() for folder in (earlier, earlier / PREVIOUS))
-            had_overlays = has_drawn and not (draft / OVERLAYS).is_dir()
-
-        with self.session.replacing(*parts, finish=finish) as draft:
+        with self.session.replacing(*parts, finish=_keep_earlier) as draft:
             names, findings = self._write_into(draft, force=force, report=report)
-        usable = _usable(previous)
         return WrittenResult(
             tuple(place / file for file in names),
             findings,
             place / REPORT if report else None,
             previous if (previous / RESULT).exists() else None,
-            bool(usable),
-            tuple(sorted(usable - {f"{c.camera} and {c.lidar}" for c in self.pairs})),
-            is_same,
-            had_overlays,
+            bool(_usable(previous)),
         )
 
     def _write_into(
@@ -262,12 +239,7 @@ def _of_session(name: str, captures: Iterable[str]) -> list[str]:
     return [capture for session, _, capture in split if session == name]
 
 
-def as_named_in(
-    session: Session,
-    calibrations: Sequence[Calibration],
-    sessions: Iterable[str],
-    inputs: Mapping[str, str],
-) -> tuple[Calibration, ...]:
+def as_named_in(session: Session, result: ResultFile) -> tuple[Calibration, ...]:
     """Give the calibrations of several sessions with the captures of one of them, named as in it.
 
     A session is recognised by its captures' manifests, wherever it lies. Of a session that was no part of the
@@ -275,16 +247,14 @@ def as_named_in(
 
     Args:
         session: any session of the rig.
-        calibrations: of several sessions.
-        sessions: their names.
-        inputs: as `inputs_sha256` gives them.
+        result: of several sessions.
     """
     manifests: set[str] = set()
     for capture in session.captures:
         with suppress(SessionError):  # a damaged capture is reported when it is read
             manifests.add(capture.manifest_sha256)
-    shared = [path for path, digest in inputs.items() if digest in manifests]
-    is_part = [name for name in sessions if any(p.startswith(f"{name}/{CAPTURES}/") for p in shared)]
+    shared = [path for path, digest in result.inputs_sha256.items() if digest in manifests]
+    is_part = [name for name in result.sessions if any(p.startswith(f"{name}/{CAPTURES}/") for p in shared)]
     name = is_part[0] if is_part else ""
     return tuple(
         replace(
@@ -296,7 +266,7 @@ def as_named_in(
                 for capture in _of_session(name, [qualified])
             },
         )
-        for c in calibrations
+        for c in result.pairs
     )
 
 
@@ -319,40 +289,36 @@ def _usable(folder: Path) -> set[str]:
     return set()
 
 
-def keep_earlier(
-    earlier: Path, draft: Path, document: str, is_ours: Callable[[Path], bool], *, deserves: bool = True
-) -> bool:
-    """Copy files to keep from a folder into the draft that replaces it.
+def _keep_earlier(earlier: Path, draft: Path) -> None:
+    """Copy the earlier result, or the one before it, and the user's files into the draft that replaces it.
+
+    The earlier result becomes `previous/` unless only the one before it is usable, or has the only usable
+    result of a camera. If the new result is the same byte for byte, overlays and `previous/` stay.
 
     Args:
-        earlier: need not exist.
+        earlier: the folder; need not exist.
         draft: with the new files.
-        document: name of the file to compare both results by.
-        is_ours: returns whether a file belongs to a result; the user's files stay.
-        deserves: whether the earlier files become `previous/`; else the present `previous/` stays.
-
-    Returns:
-        Whether both results are identical byte for byte; then `previous/` stays.
 
     Raises:
         OSError: a full disk, no permission; or `previous` is a file, or a link.
     """
     if not earlier.is_dir():
-        return False
+        return
     check_folder(earlier / PREVIOUS)
-    keep_foreign(earlier, draft, lambda path: path.name == PREVIOUS or is_ours(path))
-    is_same = _content(earlier / document) == _content(draft / document)
-    has_earlier = deserves and (earlier / document).exists()
-    kept = earlier if has_earlier and not is_same else earlier / PREVIOUS
-    if kept == earlier:
+    keep_foreign(earlier, draft, lambda path: path.name == PREVIOUS or _is_of_a_result(path))
+    is_same = _content(earlier / RESULT) == _content(draft / RESULT)
+    if is_same and (earlier / OVERLAYS).is_dir():
+        copy_over(earlier / OVERLAYS, draft / OVERLAYS)
+    usable, before = _usable(earlier), _usable(earlier / PREVIOUS)
+    deserves = (bool(usable) or not before) and before <= usable | _usable(draft)
+    if deserves and not is_same and (earlier / RESULT).exists():
         (draft / PREVIOUS).mkdir()
         for entry in earlier.iterdir():
-            if entry.name != PREVIOUS and is_ours(entry):
+            if entry.name != PREVIOUS and _is_of_a_result(entry):
                 copy_over(entry, draft / PREVIOUS / entry.name)
-        keep_foreign(earlier / PREVIOUS, draft / PREVIOUS, is_ours)
-    elif kept.is_dir():
-        copy_over(kept, draft / PREVIOUS)
-    return is_same
+        keep_foreign(earlier / PREVIOUS, draft / PREVIOUS, _is_of_a_result)
+    elif (earlier / PREVIOUS).is_dir():
+        copy_over(earlier / PREVIOUS, draft / PREVIOUS)
 
 
 def keep_foreign(earlier: Path, draft: Path, is_ours: Callable[[Path], bool]) -> None:
@@ -416,18 +382,13 @@ def stored_results(session: Session) -> list[StoredResult]:
         except LceRigError as error:
             problem = error.what
         else:
-            is_outdated = _is_outdated(session, file)
+            try:
+                sessions = {label: Session.open(session.path / path) for label, path in file.sessions.items()}
+                is_outdated = dict(file.inputs_sha256) != inputs_sha256(session, file.pairs, sessions)
+            except LceRigError:
+                is_outdated = True
         results.append(StoredResult(name, folder, file, problem, written_s, is_outdated))
     return results
-
-
-def _is_outdated(session: Session, file: ResultFile) -> bool:
-    """Return whether a result's inputs in its session have changed."""
-    try:
-        sessions = {name: Session.open(session.path / path) for name, path in file.sessions.items()}
-        return dict(file.inputs_sha256) != inputs_sha256(session, file.pairs, sessions)
-    except LceRigError:
-        return True
 
 
 def result_content(session: Session, name: str | None = None) -> bytes | None:

@@ -1,6 +1,6 @@
 """Compare extrinsics with captures: residuals, overlays, and the sensors' detections."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,6 @@ from lce_rig.pipeline.result_files import (
     RESULT,
     Result,
     as_named_in,
-    inputs_sha256,
     keep_foreign,
     result_content,
     result_parts,
@@ -169,21 +168,18 @@ def _extrinsics(
         names = ", ".join(each.name for each in stored_results(session)) or "none"
         raise SessionError(f"{session.path} has no result {name!r}", f"Its results: {names}.")
     if isinstance(result, Result):
-        rig, calibrations = result.session.rig.name, result.pairs
-        is_own = result.session.path.resolve() == session.path.resolve()
-        content = content if is_own and result.file().text().encode() == content else None
-        sessions: Iterable[str] = result.sessions
-        inputs: Mapping[str, str] = inputs_sha256(result.session, result.pairs, result.sessions)
+        saved, is_own = result.file(), result.session.path.resolve() == session.path.resolve()
+        content = content if is_own and saved.text().encode() == content else None
     else:
+        is_own = result is None
         saved = result or read_result(session.path.joinpath(*result_parts(name), RESULT))
-        rig, calibrations, is_own = saved.rig, saved.pairs, result is None
         content = content if is_own else None
-        sessions, inputs = saved.sessions, saved.inputs_sha256
-    if rig != session.rig.name or not calibrations:
-        what = f"the result belongs to rig {rig!r}" if calibrations else "the result holds no pair of sensors"
+    calibrations = saved.pairs
+    if saved.rig != session.rig.name or not calibrations:
+        what = f"the result belongs to rig {saved.rig!r}" if calibrations else "the result holds no pair"
         raise SessionError(f"{what}; the session {session.path} belongs to rig {session.rig.name!r}")
-    if sessions:
-        calibrations = as_named_in(session, calibrations, sessions, inputs)
+    if saved.sessions:
+        calibrations = as_named_in(session, saved)
     elif not is_own:
         # Names of captures differ between sessions: none of these was fitted.
         calibrations = tuple(replace(c, captures_used=(), captures_refused={}) for c in calibrations)

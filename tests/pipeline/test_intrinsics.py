@@ -12,7 +12,7 @@ from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageErr
 from lce_rig.export.camera_info import load_camera_info
 from lce_rig.judge.intrinsics_check import judge_lens
 from lce_rig.pipeline.intrinsics import measure_intrinsics
-from lce_rig.pipeline.intrinsics_files import final, profile_block, save_profile, write_intrinsics
+from lce_rig.pipeline.intrinsics_files import profile_block, save_profile, write_intrinsics
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
 from tests.detect.test_image_board import draw, looking
@@ -96,7 +96,7 @@ def test_a_profile_of_another_resolution_is_no_obstacle(pictures, tmp_path):
     assert save_profile(session, [measured], tmp_path / "new.yaml") == ("davis",)
     camera = load_rig(tmp_path / "new.yaml").cameras["davis"]
     assert camera.resolution_px == (346, 260)
-    assert camera.to_intrinsics() == final(measured)
+    assert camera.to_intrinsics() == measured.intrinsics
 
 
 def test_channels_share_the_lens_and_bad_pictures_are_named(pictures, tmp_path):
@@ -126,7 +126,7 @@ def test_unknown_channels_and_models_are_usage_errors(session):
 def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     files = write_intrinsics(session, [measured])
     assert {path.name for path in (session.path / "intrinsics").iterdir()} == {path.name for path in files}
-    lens = final(measured)
+    lens = measured.intrinsics
     block = yaml.safe_load((session.path / "intrinsics" / "davis.yaml").read_text())["intrinsics"]
     assert block["fx_px"] == lens.fx_px
     assert tuple(block["distortion"]) == lens.distortion
@@ -139,31 +139,25 @@ def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     assert files[-1].read_bytes().startswith(b"\x89PNG")
 
 
-def test_another_run_keeps_the_earlier_files_what_is_the_users_and_other_cameras(session, measured):
+def test_another_run_keeps_what_is_the_users_and_other_cameras(session, measured):
     folder = session.path / "intrinsics"
     write_intrinsics(session, [measured])
     (folder / "notes.txt").write_text("mine")
-    first = (folder / "intrinsics.json").read_bytes()
-    write_intrinsics(session, [measured])
-    assert not (folder / "previous").exists()
-    write_intrinsics(session, [replace(measured, weaknesses=("another",))])
-    assert (folder / "previous" / "intrinsics.json").read_bytes() == first
-    assert (folder / "previous" / "davis.png").exists()
-    assert (folder / "notes.txt").read_text() == "mine"
-    other = json.loads(first)["cameras"][0] | {"camera": "left"}
-    both = json.loads(first) | {"cameras": [other]}
-    (folder / "intrinsics.json").write_text(json.dumps(both))
+    document = json.loads((folder / "intrinsics.json").read_text())
+    document["cameras"][0]["camera"] = "left"
+    (folder / "intrinsics.json").write_text(json.dumps(document))
     (folder / "left.yaml").write_text("left: block")
     write_intrinsics(session, [measured])
     cameras = json.loads((folder / "intrinsics.json").read_text())["cameras"]
     assert [each["camera"] for each in cameras] == ["davis", "left"]
     assert (folder / "left.yaml").read_text() == "left: block"
+    assert (folder / "notes.txt").read_text() == "mine"
 
 
 def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(session, measured, tmp_path):
     save_profile(session, [measured], tmp_path / "new.yaml", is_forced=True)
     rig = load_rig(tmp_path / "new.yaml")
-    assert rig.cameras["davis"].to_intrinsics() == final(measured)
+    assert rig.cameras["davis"].to_intrinsics() == measured.intrinsics
     assert rig.board == RIG.board
     assert "# measure it;" in (tmp_path / "new.yaml").read_text()
     with pytest.raises(UsageError, match="exists already"):
@@ -185,4 +179,4 @@ def test_the_block_can_be_pasted_into_the_profile(measured):
     first = next(k for k, line in enumerate(lines) if line.startswith("    intrinsics:"))
     end = next(k for k in range(first, len(lines)) if lines[k].startswith("    channels:"))
     pasted = [*lines[:first], *profile_block(RIG, measured).splitlines(), *lines[end:]]
-    assert parse_rig("\n".join(pasted)).cameras["davis"].to_intrinsics() == final(measured)
+    assert parse_rig("\n".join(pasted)).cameras["davis"].to_intrinsics() == measured.intrinsics

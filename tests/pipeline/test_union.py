@@ -7,6 +7,7 @@ import pytest
 
 import lce_rig as lce
 from lce_rig.calibrate.observations import group_placements
+from lce_rig.core.calibration import ResultFile
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.core.results import Observation
@@ -127,7 +128,8 @@ def test_targets_and_texts_of_the_profiles_may_differ(make):
     result = lce.calibrate([make("monday"), other], [seen(12, 0), seen(12, 1)], options=FAST)
     assert list(result.sessions) == ["monday", "tuesday"]
     assert "repeat.agree" in {finding.code for finding in result.pairs[0].findings}
-    assert as_named_in(other, result.pairs, result.sessions, {})[0].captures_used == ()
+    saved = ResultFile(rig="rlfs", pairs=result.pairs, sessions=dict.fromkeys(result.sessions, "."))
+    assert as_named_in(other, saved)[0].captures_used == ()
     with pytest.raises(SessionError, match="000000"):
         inputs_sha256(result.session, result.pairs, result.sessions)
 
