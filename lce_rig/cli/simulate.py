@@ -230,7 +230,7 @@ def _simulate_session(
 def _simulate_recording(
     folder: Path, rig: "Rig", duration_s: float, seed: int, options: "SimulationOptions", ros: int
 ) -> None:
-    from lce_rig.io.folder.folder_recorder import FolderRecorder
+    from lce_rig.io.ros.bag_recorder import FolderRecorder
     from lce_rig.simulate import recording_truth, rig_truth, simulate_recording
     from lce_rig.simulate.simulated_recording import stamp_of
 

@@ -23,7 +23,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 from lce_rig.devices.protocol import ClockState, SourceStatus
 from lce_rig.devices.reading import LiveSource, RateMeter
-from lce_rig.io.events.stream import NS_PER_US
+from lce_rig.io.events.event_recording import NS_PER_US
 from lce_rig.rig import CameraSettings
 
 # A batch of events lasts 10 ms: ten seconds of a taker's absence at three streams.

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, Pixels
-from lce_rig.io.folder.image_file import decode_image
+from lce_rig.io.folder.decoding import decode_image
 from lce_rig.rig.sensors import MAX_PIXELS
 
 _MAX_HEADER = 4096

@@ -1,16 +1,14 @@
 """Recordings of all kinds: `open_recording` finds the reader for a path."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from pkgutil import resolve_name
 
 from lce_rig.core.errors import SourceError
 from lce_rig.io import findings as findings  # Readers may name their kinds by code.
-from lce_rig.io.folder.recorded_folder import list_parts
-from lce_rig.io.protocol import Recording, SourceOptions
+from lce_rig.io.protocol import Recording, SourceOptions, choose_lidar
 from lce_rig.io.ros.bag_file import kind_of
-from lce_rig.io.sensor_choice import choose_lidar
 from lce_rig.rig import Rig
 
 RECORDINGS = {
@@ -24,11 +22,13 @@ RECORDINGS = {
     ".raw": "lce_rig.io.events.camera_file:EventCameraFile",
     ".h5": "lce_rig.io.events.camera_file:EventCameraFile",
     ".hdf5": "lce_rig.io.events.camera_file:EventCameraFile",
-    ".npz": "lce_rig.io.events.camera_file:EventCameraFile",
     ".txt": "lce_rig.io.events.camera_file:EventCameraFile",
-    ".zip": "lce_rig.io.events.camera_file:EventCameraFile",
 }
 """Reader by suffix, or "folder"; imported when wanted."""
+_BAGS = frozenset({".bag", ".db3", ".mcap"})
+_PACKETS = frozenset({".pcap", ".pcapng"})
+_EVENTS = frozenset({".aedat4", ".raw", ".h5", ".hdf5"})
+_KINDS = (_BAGS, _PACKETS, _EVENTS)
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
@@ -85,3 +85,37 @@ def open_recordings(
         opened[0].notes.extend(f"skipped: {error.what}" for error in failures)
         recordings += opened
     return recordings
+
+
+def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path, SourceOptions]]:
+    """List the recordings in a folder, with how each is read; anything else is one recording.
+
+    Bags come first: what several hold is taken from the first. A file named after a LiDAR or a camera of the
+    profile belongs to it.
+
+    Args:
+        path: a folder, such as `lce-rig collect --record` fills, or any recording.
+        rig: the profile.
+        options: how it is read, where names of files do not say.
+    """
+    if not path.is_dir() or (path / "metadata.yaml").is_file():
+        return [(path, options)]
+    entries = sorted(entry for entry in path.iterdir() if entry.name[0] != ".")
+    kinds = {suffix: [e for e in entries if e.is_file() and e.suffix.lower() in suffix] for suffix in _KINDS}
+    folders = [entry for entry in entries if entry.is_dir()]
+    if not all(any(file.suffix.lower() in _BAGS for file in folder.iterdir()) for folder in folders):
+        return [(path, options)]  # Of images and point clouds, whatever lies beside them.
+    # A bag in several pieces lies in one folder, and is read as one.
+    bags = ([path] if kinds[_BAGS] else []) + folders
+    is_one_of_many = len(bags) + len(kinds[_PACKETS]) + len(kinds[_EVENTS]) > 1
+    options = replace(options, is_part=options.is_part or is_one_of_many)
+    parts = [(bag, options) for bag in bags]
+    for file in kinds[_PACKETS]:
+        parts.append((file, replace(options, lidar=_named(file, rig.lidars) or options.lidar)))
+    for file in kinds[_EVENTS]:
+        parts.append((file, replace(options, camera=_named(file, rig.cameras) or options.camera)))
+    return parts or [(path, options)]
+
+
+def _named(file: Path, sensors: Collection[str]) -> str | None:
+    return file.stem if file.stem in sensors else None

@@ -20,10 +20,8 @@ from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.geometry import Array
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.fingerprint import fingerprint
 from lce_rig.io.network import PcapFile
-from lce_rig.io.protocol import SourceOptions, Span
-from lce_rig.io.sensor_choice import choose_lidar
+from lce_rig.io.protocol import SourceOptions, Span, choose_lidar, fingerprint
 from lce_rig.rig import LidarSettings, Rig
 
 _MAX_PIXELS, _MAX_COLUMNS = 512, 4096

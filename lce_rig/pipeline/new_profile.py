@@ -16,8 +16,8 @@ from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.detect.lidar.segments import order_scan
 from lce_rig.export.camera_info import load_camera_info
 from lce_rig.io.folder.cloud import to_scan
-from lce_rig.io.folder.cloud_file import DECODERS, read_cloud
-from lce_rig.io.ros.survey import SensorTopic, survey_bag
+from lce_rig.io.folder.decoding import DECODERS, read_cloud
+from lce_rig.io.ros.topics import SensorTopic, survey_bag
 from lce_rig.rig import LidarSettings
 from lce_rig.rig.draft import CameraDraft, LidarDraft, draft_profile
 

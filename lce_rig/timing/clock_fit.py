@@ -139,14 +139,14 @@ def match_edges(
     if len(reference_ns) > 1 and np.median(np.diff(reference_ns)) < 2 * tolerance_ns:
         return None
     predicted_ns = coarse.convert_all(source_ns)
-    nearest = _nearest(predicted_ns, reference_ns)
-    is_mutual = _nearest(reference_ns, predicted_ns)[nearest] == np.arange(len(source_ns))
-    is_near = np.abs(predicted_ns - reference_ns[nearest]) <= tolerance_ns
+    edge = nearest(predicted_ns, reference_ns)
+    is_mutual = nearest(reference_ns, predicted_ns)[edge] == np.arange(len(source_ns))
+    is_near = np.abs(predicted_ns - reference_ns[edge]) <= tolerance_ns
     keep = is_mutual & is_near
-    return TimePairs.from_edges(source_ns[keep], reference_ns[nearest[keep]])
+    return TimePairs.from_edges(source_ns[keep], reference_ns[edge[keep]])
 
 
-def _nearest(these_ns: Stamps, those_ns: Stamps) -> NDArray[np.intp]:
+def nearest(these_ns: Stamps, those_ns: Stamps) -> NDArray[np.intp]:
     """Find the index (N,) of the nearest of `those_ns` to each of `these_ns`; both rising."""
     right = np.clip(np.searchsorted(those_ns, these_ns), 1, max(len(those_ns) - 1, 1))
     left = right - 1

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.data import Events, Image, Sample
-from lce_rig.io.events.aedat4_writer import Aedat4Writer, write_aedat4
+from lce_rig.io.events.aedat4 import Aedat4Writer, write_aedat4
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.session import Session
 from tests.collect import simulated_moves as moves

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 
 from lce_rig.core.data import Events
-from lce_rig.core.event_file import encode_events
+from lce_rig.io.events.aedat4 import write_aedat4
 
 
 def recording(path, duration_s=1.2):
-    """A vertical edge that sweeps over a small sensor and back, written as npz."""
+    """A vertical edge that sweeps over a small sensor and back, written as AEDAT4."""
     rng = np.random.default_rng(0)
     n = int(200_000 * duration_s)
     t_us = np.sort(rng.integers(0, int(duration_s * 1e6), n))
@@ -23,12 +23,12 @@ def recording(path, duration_s=1.2):
         64,
         48,
     )
-    path.write_bytes(encode_events(events))
+    write_aedat4(path, [events])
     return path
 
 
 def test_images_and_their_timestamps_are_written_and_skipped_ones_are_counted(lce_rig, tmp_path):
-    outcome = lce_rig("reconstruct", recording(tmp_path / "sweep.npz"), "-o", tmp_path / "out")
+    outcome = lce_rig("reconstruct", recording(tmp_path / "sweep.aedat4"), "-o", tmp_path / "out")
     assert outcome.code == 0, outcome.err
     lines = (tmp_path / "out" / "stamps.csv").read_text().splitlines()
     pictures = sorted(path.name for path in (tmp_path / "out").glob("*.png"))
@@ -38,14 +38,14 @@ def test_images_and_their_timestamps_are_written_and_skipped_ones_are_counted(lc
 
 
 def test_the_event_map_needs_no_warm_up(lce_rig, tmp_path):
-    words = ["reconstruct", recording(tmp_path / "sweep.npz"), "-o", tmp_path / "out", "--event-image", "map"]
-    outcome = lce_rig(*words)
+    path = recording(tmp_path / "sweep.aedat4")
+    outcome = lce_rig("reconstruct", path, "-o", tmp_path / "out", "--event-image", "map")
     assert outcome.code == 0, outcome.err
     assert "skipped" not in outcome.err
 
 
 def test_a_recording_too_short_to_settle_is_refused_and_nothing_is_written(lce_rig, tmp_path):
-    outcome = lce_rig("reconstruct", recording(tmp_path / "short.npz", 0.1), "-o", tmp_path / "out")
+    outcome = lce_rig("reconstruct", recording(tmp_path / "short.aedat4", 0.1), "-o", tmp_path / "out")
     assert outcome.code == 5
     assert not (tmp_path / "out").exists()
 
@@ -57,7 +57,7 @@ def test_a_folder_without_events_is_refused_with_the_kinds_that_are_read(lce_rig
 
 
 def test_a_part_of_a_recording_gives_pictures_like_those_of_the_whole_there(lce_rig, tmp_path):
-    path = recording(tmp_path / "sweep.npz", 2.6)
+    path = recording(tmp_path / "sweep.aedat4", 2.6)
     assert lce_rig("reconstruct", path, "-o", tmp_path / "whole").code == 0
     words = ["reconstruct", path, "-o", tmp_path / "part", "--start", 1.6, "--duration", 0.3]
     outcome = lce_rig(*words)
@@ -79,13 +79,13 @@ def stamps(folder):
 
 
 def test_a_start_after_the_end_is_refused_with_the_recordings_length(lce_rig, tmp_path):
-    outcome = lce_rig("reconstruct", recording(tmp_path / "a.npz"), "-o", tmp_path / "out", "--start", 60)
+    outcome = lce_rig("reconstruct", recording(tmp_path / "a.aedat4"), "-o", tmp_path / "out", "--start", 60)
     assert outcome.code == 2
     assert "--start 60" in outcome.err and "1.200 s" in outcome.err
 
 
 def test_an_animation_is_written_and_a_video_of_an_unknown_kind_refused(lce_rig, tmp_path):
-    words = ["reconstruct", recording(tmp_path / "sweep.npz"), "-o"]
+    words = ["reconstruct", recording(tmp_path / "sweep.aedat4"), "-o"]
     outcome = lce_rig(*words, tmp_path / "out", "--gif", tmp_path / "a.gif")
     assert outcome.code == 0, outcome.err
     assert (tmp_path / "a.gif").read_bytes()[:6] == b"GIF89a"
@@ -95,14 +95,7 @@ def test_an_animation_is_written_and_a_video_of_an_unknown_kind_refused(lce_rig,
 
 
 def test_one_wild_stamp_does_not_ask_for_images_of_centuries(lce_rig, tmp_path):
-    np.savez(
-        tmp_path / "a.npz",
-        t_us=[0, 1000, 10**15],
-        x=[1, 2, 3],
-        y=[1, 2, 3],
-        polarity=[0, 1, 1],
-        resolution_px=[346, 260],
-    )
-    outcome = lce_rig("reconstruct", tmp_path / "a.npz", "-o", tmp_path / "out")
+    (tmp_path / "a.txt").write_text("346 260\n0.0 1 1 0\n0.001 2 2 1\n1000000000 3 3 1\n")
+    outcome = lce_rig("reconstruct", tmp_path / "a.txt", "-o", tmp_path / "out")
     assert outcome.code == 2
     assert "maximum 1000000" in outcome.err and "--duration" in outcome.err

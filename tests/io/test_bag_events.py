@@ -9,7 +9,7 @@ import pytest
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.events.word_codec import EVT3, WordDecoder
+from lce_rig.io.events.prophesee import EVT3, WordDecoder
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import open_bag_writer
 from lce_rig.io.ros.event_messages import PacketDecoder

@@ -9,9 +9,8 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.io.folder.folder_recorder import FolderRecorder
 from lce_rig.io.protocol import SourceOptions
-from lce_rig.io.ros.bag_recorder import BagRecorder
+from lce_rig.io.ros.bag_recorder import BagRecorder, FolderRecorder
 from lce_rig.rig import Rig, load_rig
 
 from .rig_samples import KINDS, T0_NS, one_second, packet, picture, read, read_events, record, sweep

@@ -10,8 +10,7 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
-from lce_rig.io.folder.folder_recorder import FolderRecorder
-from lce_rig.io.ros.bag_recorder import BagRecorder
+from lce_rig.io.ros.bag_recorder import BagRecorder, FolderRecorder
 from lce_rig.rig import Rig, load_rig
 
 from .rig_samples import KINDS, packet, picture, record, sweep

@@ -9,9 +9,8 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.core.event_file import encode_events
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.events.aedat4_writer import Aedat4Writer, write_aedat4
+from lce_rig.io.events.aedat4 import Aedat4Writer, write_aedat4
 from lce_rig.io.protocol import ContinuousRecording, serials_of
 from lce_rig.rig import Rig, load_rig
 from tests.io.events import encoders
@@ -107,7 +106,6 @@ def write_raw(path: Path) -> None:
 
 WRITERS: dict[str, Callable[[Path], object]] = {
     "a.aedat4": lambda path: write_aedat4(path, [EVENTS]),
-    "a.npz": lambda path: path.write_bytes(encode_events(EVENTS)),
     "a.h5": write_dsec,
     "a.hdf5": write_dsec,
     "a.raw": write_raw,

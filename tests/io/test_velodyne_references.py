@@ -9,7 +9,7 @@ from wire.vlp16_packets import STREAMED_VLP16
 from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
-from lce_rig.io.folder.cloud_file import read_cloud
+from lce_rig.io.folder.decoding import read_cloud
 from lce_rig.io.network import PcapFile
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.ros.bag_file import BagFile

@@ -8,7 +8,7 @@ import pytest
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import invert, transform
 from lce_rig.io.events import open_events
-from lce_rig.io.events.aedat4_writer import write_aedat4
+from lce_rig.io.events.aedat4 import write_aedat4
 from lce_rig.rig import Rig
 from lce_rig.simulate import HandMotion, SimulatedRecording, SimulationOptions, simulate_recording
 from lce_rig.simulate.simulated_recording import stamp_of

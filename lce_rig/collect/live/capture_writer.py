@@ -15,7 +15,7 @@ from lce_rig.collect.placement_dedupe import board_figures
 from lce_rig.core.data import Sample
 from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.reading import LiveSource
-from lce_rig.io.folder.folder_recorder import FolderRecorder
+from lce_rig.io.ros.bag_recorder import FolderRecorder
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.timing.event_buffer import EventCut

@@ -12,12 +12,10 @@ READERS = {
     ".bag": "lce_rig.io.ros.event_messages:BagEvents",
     ".db3": "lce_rig.io.ros.event_messages:BagEvents",
     ".mcap": "lce_rig.io.ros.event_messages:BagEvents",
-    ".raw": "lce_rig.io.events.prophesee_raw:PropheseeEvents",
+    ".raw": "lce_rig.io.events.prophesee:PropheseeEvents",
     ".h5": "lce_rig.io.events.hdf5:Hdf5Events",
     ".hdf5": "lce_rig.io.events.hdf5:Hdf5Events",
-    ".npz": "lce_rig.io.events.npz:NpzEvents",
     ".txt": "lce_rig.io.events.text:TextEvents",
-    ".zip": "lce_rig.io.events.text:TextEvents",
 }
 """Reader by suffix; a folder is a ROS 2 bag. Imported when wanted."""
 
@@ -34,7 +32,7 @@ def open_events(
     """Open a recording of events.
 
     Args:
-        path: an AEDAT4, Prophesee .raw, HDF5 (DSEC), text, zip or npz file, or a ROS 1 or ROS 2 bag.
+        path: an AEDAT4, Prophesee .raw, HDF5 (DSEC) or text file, or a ROS 1 or ROS 2 bag.
         sensor: name of the camera that its events are taken for.
         resolution: (width, height) px of that camera; None takes the file's, or the extent of its events.
         topic: of a bag; None takes the only one with events.

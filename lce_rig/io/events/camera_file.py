@@ -9,13 +9,10 @@ from lce_rig.core.losses import Losses
 from lce_rig.io import findings
 from lce_rig.io.events import open_events
 from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
-from lce_rig.io.events.event_recording import CameraEvents
-from lce_rig.io.events.prophesee_raw import PropheseeEvents
-from lce_rig.io.events.stream import NoEventsError, worded
-from lce_rig.io.fingerprint import fingerprint
+from lce_rig.io.events.event_recording import CameraEvents, NoEventsError, worded
+from lce_rig.io.events.prophesee import PropheseeEvents
 from lce_rig.io.joining import merge_by_time
-from lce_rig.io.protocol import SourceOptions, Span
-from lce_rig.io.sensor_choice import choose_event_camera
+from lce_rig.io.protocol import SourceOptions, Span, choose_event_camera, fingerprint
 from lce_rig.rig import Rig
 
 

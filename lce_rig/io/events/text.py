@@ -1,30 +1,28 @@
-"""E2VID's text: "width height", then a line "t x y polarity" for every event, t in s; plain or in a zip.
+"""E2VID's text: "width height", then a line "t x y polarity" for every event, t in s.
 
 References:
     https://github.com/uzh-rpg/rpg_e2vid
 """
 
-import zipfile
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import EventColumns
-from lce_rig.core.errors import SourceError, reading, reason_of
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.stream import parse_size, to_ns
+from lce_rig.io.events.event_recording import parse_size, to_ns
 
 _BLOCK_LINES = 1 << 16
 
 
 class TextEvents:
-    """Events of a text file, or of the only one in a zip; see `EventStream`."""
+    """Events of a text file; see `EventStream`."""
 
     def __init__(self, path: Path) -> None:
         """Read the first line.
@@ -34,7 +32,7 @@ class TextEvents:
         """
         self._path = path
         self.notes: list[str] = []
-        with _open(path) as file:
+        with reading(path), path.open("rb") as file:
             line = file.readline()
         words = line.decode(errors="replace").split()
         self._has_size = len(words) == 2
@@ -48,32 +46,14 @@ class TextEvents:
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events of some megabytes of text at a time."""
         n_lines = int(self._has_size)
-        with _open(self._path) as file:
-            lines = list(islice(file, n_lines))
-            try:
-                while lines := list(islice(file, _BLOCK_LINES)):
-                    yield _to_columns(_parse_block(lines, n_lines, losses))
-                    n_lines += len(lines)
-            except Exception as error:  # of zipfile and zlib; the events before it have been yielded
-                if not n_lines > self._has_size:
-                    raise
-                losses.add(findings.TORN_END(where=f"line {n_lines}: {reason_of(error)}"))
-
-
-@contextmanager
-def _open(path: Path) -> Iterator[IO[bytes]]:
-    """Open the text, in a zip or not."""
-    with reading(path), ExitStack() as opened:
-        file = opened.enter_context(path.open("rb"))
-        if not zipfile.is_zipfile(file):
-            file.seek(0)
-            yield file
-            return
-        archive = opened.enter_context(zipfile.ZipFile(file))
-        texts = [name for name in archive.namelist() if name.lower().endswith((".txt", ".csv"))]
-        if len(texts) != 1:
-            raise ValueError(f"it holds {len(texts)} text files, expected 1")
-        yield opened.enter_context(archive.open(texts[0]))
+        with reading(self._path), self._path.open("rb") as file:
+            next(islice(file, n_lines, n_lines), None)
+            while lines := list(islice(file, _BLOCK_LINES)):
+                table = _parse_block(lines, n_lines, losses)
+                n_lines += len(lines)
+                # Doubles hold today's seconds to 0.24 us: rounding gives the microsecond that was written.
+                t_ns, pixels = to_ns(np.rint(table[:, 0] * 1e6)), table[:, 1:3].astype(np.uint16)
+                yield EventColumns(t_ns, pixels[:, 0], pixels[:, 1], table[:, 3] > 0)
 
 
 def _parse_block(lines: Sequence[bytes], first_line: int, losses: Losses) -> NDArray[np.float64]:
@@ -107,9 +87,3 @@ def _are_events(table: NDArray[np.float64]) -> NDArray[np.bool_]:
     t_s, x, y, polarity = table.T
     is_pixel = (x >= 0) & (x < 1 << 15) & (x % 1 == 0) & (y >= 0) & (y < 1 << 15) & (y % 1 == 0)
     return np.asarray(np.isfinite(t_s) & is_pixel & ((polarity == 0) | (np.abs(polarity) == 1)))
-
-
-def _to_columns(table: NDArray[np.float64]) -> EventColumns:
-    # Doubles hold today's seconds to 0.24 us: rounding gives the microsecond that was written.
-    x, y = table[:, 1].astype(np.uint16), table[:, 2].astype(np.uint16)
-    return EventColumns(to_ns(np.rint(table[:, 0] * 1e6)), x, y, table[:, 3] > 0)

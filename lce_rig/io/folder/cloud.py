@@ -1,7 +1,6 @@
 """Conversion of a point cloud with any fields to a `Scan`: names, units and conventions."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +10,28 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import Array
 from lce_rig.rig import LidarSettings
 
+# Of rings that are inferred: bin of elevation, most of them, and how far a laser lies above the origin.
 BIN_RAD = np.radians(0.02)
 MAX_RINGS = 256
 MAX_OFFSET_M = 0.015
+
+INTENSITY_FIELDS = ("intensity", "reflectivity", "intensities", "i", "signal")
+RING_FIELDS = ("ring", "channel", "laser_id", "laserid", "line")
+TIME_FIELDS = ("time", "t", "timestamp", "offset", "offset_time", "time_offset", "timeoffset")
+MIN_RANGE_M = 1e-3
+# Half of a room's or a street's returns come from well within a LiDAR's reach, unless metres are millimetres.
+_FARTHEST_MEDIAN = 3.0
+# A scan lasts 0.02 to 1.5 s for any spinning LiDAR; the same figure in another unit is far outside.
+SWEEP_S = (0.02, 1.5)
+_LATEST = 1e19
+_MOST_RINGS = 1024
+# A spinning laser stays within this, even seen from a frame that is tilted by 10 deg; a rosette does not.
+_MOST_THICKNESS_DEG, _N_DIRECTIONS = 1.0, 36
+_NO_RINGS_HINT = (
+    "Only spinning LiDARs can be calibrated: Livox and others that scan in no rings cannot. Of a spinning "
+    "one, give the point cloud with its ring field, in the LiDAR's own frame."
+)
+NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 
 def rings_from_elevation(points_lidar: NDArray[Any]) -> NDArray[np.int16]:
@@ -123,38 +141,17 @@ def _refine_lines(rho: Array, z: Array, lines: Array, n_rounds: int = 3) -> Arra
     return lines
 
 
-INTENSITY_FIELDS = ("intensity", "reflectivity", "intensities", "i", "signal")
-RING_FIELDS = ("ring", "channel", "laser_id", "laserid", "line")
-TIME_FIELDS = ("time", "t", "timestamp", "offset", "offset_time", "time_offset", "timeoffset")
-MIN_RANGE_M = 1e-3
-# Half of a room's or a street's returns come from well within a LiDAR's reach, unless metres are millimetres.
-_FARTHEST_MEDIAN = 3.0
-# A scan lasts 0.02 to 1.5 s for any spinning LiDAR; the same figure in another unit is far outside.
-SWEEP_S = (0.02, 1.5)
-_LATEST = 1e19
-_MOST_RINGS = 1024
-# A spinning laser stays within this, even seen from a frame that is tilted by 10 deg; a rosette does not.
-_MOST_THICKNESS_DEG, _N_DIRECTIONS = 1.0, 36
-_NO_RINGS_HINT = (
-    "Only spinning LiDARs can be calibrated: Livox and others that scan in no rings cannot. Of a spinning "
-    "one, give the point cloud with its ring field, in the LiDAR's own frame."
-)
-NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-
-
-@dataclass(frozen=True, eq=False)
-class CloudReading:
+class CloudReading(NamedTuple):
     """A scan, and the conversions applied to it.
 
     Attributes:
-        n_not_finite: points dropped because a coordinate is NaN or infinite.
-        n_zero_range: points dropped because they lie at the origin (no return), or above or below it.
+        scan: the points with a return.
+        n_without_return: the others: not finite, or at the origin, above or below it.
         notes: what the point cloud lacks or how it was understood, in words; the same for like point clouds.
     """
 
     scan: Scan
-    n_not_finite: int
-    n_zero_range: int
+    n_without_return: int
     notes: tuple[str, ...]
 
 
@@ -197,11 +194,10 @@ def to_scan(
     points = np.stack([cloud[fields[axis]].astype(np.float32) for axis in "xyz"], axis=1)
     x, y, z = points.T.astype(np.float64)
     flat_m = np.hypot(x, y)
-    is_finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
     # No laser of a spinning LiDAR looks along its axis: such a point has no ring.
-    is_kept = is_finite & (flat_m > MIN_RANGE_M)
-    n_finite, n_kept = int(is_finite.sum()), int(is_kept.sum())
-    if n_kept == 0:
+    is_kept = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & (flat_m > MIN_RANGE_M)
+    n_dropped = int(np.count_nonzero(~is_kept))
+    if n_dropped == len(points):
         raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
     median_m = float(np.median(np.hypot(flat_m, z)[is_kept]))
     if median_m > _FARTHEST_MEDIAN * settings.max_range_m:
@@ -210,15 +206,21 @@ def to_scan(
             f"{settings.max_range_m:g} m: points in millimetres must be converted to metres"
         )
     notes: list[str] = []
-    if n_kept < len(points):
+    if n_dropped:
         points, cloud = points[is_kept], cloud[is_kept]
     ring = _ring(cloud, fields, points, where, notes)
     sheet, n_rings = settings.data_sheet(), len(np.unique(ring))
     if sheet is not None and n_rings > sheet.n_rings:
         notes.append(f"{n_rings} rings, a {sheet.name} has {sheet.n_rings}: check lidars.{lidar}.model")
     offset_ns, stamp_ns = _times(cloud, fields, settings, stamp_ns, notes)
-    scan = Scan(lidar, stamp_ns, points, _intensity(cloud, fields, notes), ring, offset_ns, host_ns)
-    return CloudReading(scan, len(is_finite) - n_finite, n_finite - n_kept, tuple(notes))
+    name = _find(fields, INTENSITY_FIELDS)
+    if name is None:
+        notes.append("no intensity")
+        intensity = np.zeros(len(cloud), dtype=np.float32)
+    else:
+        intensity = np.nan_to_num(cloud[name].astype(np.float32), posinf=0.0, neginf=0.0)
+    scan = Scan(lidar, stamp_ns, points, intensity, ring, offset_ns, host_ns)
+    return CloudReading(scan, n_dropped, tuple(notes))
 
 
 def _is_scalar(field: np.dtype[Any]) -> bool:
@@ -230,22 +232,12 @@ def _find(fields: dict[str, str], candidates: tuple[str, ...]) -> str | None:
     return next((fields[name] for name in candidates if name in fields), None)
 
 
-def _intensity(cloud: NDArray[Any], fields: dict[str, str], notes: list[str]) -> NDArray[np.float32]:
-    name = _find(fields, INTENSITY_FIELDS)
-    if name is None:
-        notes.append("no intensity")
-        return np.zeros(len(cloud), dtype=np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.nan_to_num(cloud[name].astype(np.float32), posinf=0.0, neginf=0.0)
-
-
 def _ring(
     cloud: NDArray[Any], fields: dict[str, str], points: NDArray[np.float32], where: str, notes: list[str]
 ) -> NDArray[np.int16]:
     name = _find(fields, RING_FIELDS)
-    with np.errstate(invalid="ignore"):  # of NaN that signals
-        values = np.zeros(len(cloud)) if name is None else cloud[name].astype(np.float64)
-    ids, ring_of_point = _distinct(values)
+    values = np.zeros(len(cloud)) if name is None else cloud[name].astype(np.float64)
+    ids, ring_of_point = np.unique(values, return_inverse=True)
     is_constant = len(cloud) > 100 and len(ids) == 1
     if name is None or is_constant or not np.isfinite(values).all() or len(ids) > _MOST_RINGS:
         return _inferred(points, where, "no ring field", notes)
@@ -298,17 +290,6 @@ def _ring_thickness_deg(
     return float(np.degrees(np.median(np.sqrt(np.maximum(square - mean * mean, 0.0)))))
 
 
-def _distinct(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Do as np.unique with return_inverse, faster where values are small whole numbers, as rings are."""
-    numbers = values.astype(np.uint8)
-    if not (numbers == values).all():
-        return np.unique(values, return_inverse=True)
-    ids = np.flatnonzero(np.bincount(numbers, minlength=256))
-    place = np.zeros(256, dtype=np.intp)
-    place[ids] = np.arange(len(ids))
-    return ids.astype(np.float64), place[numbers]
-
-
 def _times(
     cloud: NDArray[Any],
     fields: dict[str, str],
@@ -347,8 +328,7 @@ def _ticks(values: NDArray[Any]) -> NDArray[Any] | None:
     if values.dtype.kind in "iu":
         ticks: NDArray[Any] = values.astype(np.int64)
         return ticks if np.ptp(ticks) > 0 else None
-    with np.errstate(invalid="ignore"):  # of NaN that signals
-        ticks = values.astype(np.float64)
+    ticks = values.astype(np.float64)
     # Beyond a century of nanoseconds it is not a time in any unit.
     if not np.isfinite(ticks).all() or np.abs(ticks).max() > _LATEST or np.ptp(ticks) == 0:
         return None

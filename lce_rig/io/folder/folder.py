@@ -1,20 +1,24 @@
 """A folder of images and point clouds: per board placement one point cloud, and one image per camera."""
 
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.io.folder.cloud import to_scan
-from lce_rig.io.folder.cloud_file import DECODERS, read_cloud
-from lce_rig.io.folder.file_pairs import Pairing, natural_order, pair_names, parse_times
-from lce_rig.io.folder.image_file import SUFFIXES, read_image
-from lce_rig.io.protocol import PairMethod, RecordedPair, SourceOptions
-from lce_rig.io.sensor_choice import choose_camera, choose_lidar
+from lce_rig.io.folder.decoding import DECODERS, SUFFIXES, read_cloud, read_image
+from lce_rig.io.protocol import PairMethod, RecordedPair, SourceOptions, choose_camera, choose_lidar
 from lce_rig.rig import LidarSettings, Rig
+from lce_rig.timing.clock_fit import nearest
 
 IMAGE_FOLDERS = ("img", "imgs", "image", "images", "camera", "cam", "rgb", "color", "frames")
 CLOUD_FOLDERS = (
@@ -29,6 +33,105 @@ CLOUD_FOLDERS = (
     "pointcloud",
     "ply",
 )
+MOSTLY = 0.9
+
+
+class Pairing(NamedTuple):
+    """A choice of pairs, as positions in the two lists of names.
+
+    Attributes:
+        method: how the pairs were chosen.
+        pairs: (image, point cloud) positions, in the order of the images.
+        reason: the choice in words.
+    """
+
+    method: Literal["stem", "order", "time"]
+    pairs: list[tuple[int, int]]
+    reason: str
+
+
+def natural_order(name: str) -> list[tuple[int, int, str]]:
+    """Give a sort key that puts "scan2" before "scan10"."""
+    return [
+        (0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
+    ]
+
+
+def parse_times(stems: Sequence[str]) -> NDArray[np.int64] | None:
+    """Read file names as times in ns; None where any is not a time.
+
+    Seconds have a decimal point; 19 digits are ns since 1970, 16 are us and 13 are ms. Counters are not
+    times.
+    """
+    times = []
+    for stem in stems:
+        if re.fullmatch(r"\d{1,10}\.\d{1,9}", stem):
+            times.append(int(Decimal(stem) * 10**9))
+        elif re.fullmatch(r"\d{19}|\d{16}|\d{13}", stem):
+            times.append(int(stem) * 10 ** (19 - len(stem)))
+        else:
+            return None
+    if not times or max(times) > np.iinfo(np.int64).max:
+        return None
+    return np.array(times, dtype=np.int64)
+
+
+def pair_names(
+    images: Sequence[str], clouds: Sequence[str], method: PairMethod = "auto", tolerance_s: float = 0.05
+) -> Pairing:
+    """Match images and point clouds by their names (without suffix).
+
+    `auto` takes equal names where nine in ten match; else the nearest time, where names are times and nine in
+    ten find a partner within the tolerance; else sorted order, where there are as many images as point
+    clouds.
+
+    Args:
+        images, clouds: names in natural order.
+        method: "stem", "order", "time", or "auto".
+        tolerance_s: largest difference in time, for "time".
+
+    Raises:
+        SourceError: the names do not allow the method, or no method.
+    """
+    n, image_ns, cloud_ns = len(images), parse_times(images), parse_times(clouds)
+    candidates: list[Pairing] = []
+    if method in ("auto", "stem"):
+        # An image of the same name in another format makes a pair of its own.
+        place = {name: j for j, name in reversed(list(enumerate(clouds)))}
+        pairs = [(i, place[name]) for i, name in enumerate(images) if name in place]
+        candidates.append(Pairing("stem", pairs, "paired by equal file names"))
+    if method in ("auto", "time") and image_ns is not None and cloud_ns is not None:
+        reason = f"paired by nearest time within {tolerance_s:g} s"
+        candidates.append(Pairing("time", _nearest_pairs(image_ns, cloud_ns, tolerance_s), reason))
+    for pairing in candidates:
+        if len(pairing.pairs) >= MOSTLY * min(n, len(clouds)):
+            return pairing
+    if method in ("auto", "order") and n == len(clouds):
+        reason = "paired in sorted order"
+        if image_ns is not None and cloud_ns is not None:
+            apart_s = np.abs(image_ns - cloud_ns).max() * 1e-9
+            reason += f" (names are times up to {apart_s:.3f} s apart)"
+        return Pairing("order", [(i, i) for i in range(n)], reason)
+    best = max(candidates, key=lambda pairing: len(pairing.pairs), default=None)
+    if best is None or not best.pairs:
+        by = "" if method == "auto" else f" by {method}"
+        raise SourceError(
+            f"{n} images and {len(clouds)} point clouds cannot be paired{by}: names and numbers differ",
+            "Give both files of a pair the same name, or remove files without a partner (--pair order).",
+        )
+    return best
+
+
+def _nearest_pairs(
+    image_ns: NDArray[np.int64], cloud_ns: NDArray[np.int64], tolerance_s: float
+) -> list[tuple[int, int]]:
+    """Pair what is nearest in time to each other, both ways."""
+    by_image, by_cloud = np.argsort(image_ns, kind="stable"), np.argsort(cloud_ns, kind="stable")
+    cloud_of = by_cloud[nearest(image_ns, cloud_ns[by_cloud])]
+    image_of = by_image[nearest(cloud_ns, image_ns[by_image])]
+    is_mutual = image_of[cloud_of] == np.arange(len(image_ns))
+    is_near = np.abs(image_ns - cloud_ns[cloud_of]) <= tolerance_s * 1e9
+    return [(int(i), int(cloud_of[i])) for i in np.flatnonzero(is_mutual & is_near)]
 
 
 def _images_by_camera(folder: Path, cameras: Collection[str]) -> dict[str, list[Path]]:
@@ -145,9 +248,9 @@ class PairOnDisk:
         cloud = read_cloud(self.cloud_path)
         reading = to_scan(cloud, self.lidar, self.settings, str(self.cloud_path), self.cloud_stamp_ns)
         notes = list(reading.notes)
-        if reading.n_not_finite or reading.n_zero_range:
-            n_dropped = reading.n_not_finite + reading.n_zero_range
-            notes.append(f"{self.cloud_path.name}: {n_dropped} points without a return skipped")
+        if reading.n_without_return:
+            n = reading.n_without_return
+            notes.append(f"{self.cloud_path.name}: {n} points without a return skipped")
         return RecordedPair(self.label, self.key(), images, (reading.scan,), tuple(notes))
 
 
@@ -175,13 +278,14 @@ class FolderRecording:
         cloud_ns = parse_times([cloud.stem for cloud in clouds])
         # The second image of one camera that goes with a point cloud makes a pair of its own.
         together: dict[tuple[int, int], list[ImageOnDisk]] = {}
-        lone = []
-        for own, pairing in zip(images, self._pair(images, clouds), strict=True):
+        lone: list[str] = []
+        for of_camera, pairing in zip(images, self._pair(images, clouds), strict=True):
             n_held = Counter[int]()
             for i, j in pairing.pairs:
-                together.setdefault((j, n_held[j]), []).append(own[i])
+                together.setdefault((j, n_held[j]), []).append(of_camera[i])
                 n_held[j] += 1
-            lone += [own[i].label for i in pairing.lone_images]
+            with_cloud = {i for i, _ in pairing.pairs}
+            lone += [image.label for i, image in enumerate(of_camera) if i not in with_cloud]
         with_image = {j for j, _ in together}
         lone += [cloud.name for j, cloud in enumerate(clouds) if j not in with_image]
         if lone:
@@ -231,15 +335,20 @@ class FolderRecording:
 
     def _pair(self, images: Sequence[Sequence[ImageOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
         """Match each camera's images with the point clouds, all cameras' in one way."""
-        pairings = [self._pair_camera(own, clouds, self._options.pair) for own in images]
+        pairings = [self._pair_camera(paths, clouds, self._options.pair) for paths in images]
         methods = {pairing.method for pairing in pairings}
         if len(methods) > 1:
             # A camera whose names match less well must not be counted off against the others' names.
             method: PairMethod = "stem" if "stem" in methods else "time"
-            pairings = [self._pair_camera(own, clouds, method) for own in images]
-        for own, pairing in zip(images, pairings, strict=True):
-            whose = f"{own[0].camera}: " if len(images) > 1 else ""
-            self.notes.append(f"{self.path.name}: {whose}{pairing.explanation}")
+            pairings = [self._pair_camera(paths, clouds, method) for paths in images]
+        for of_camera, pairing in zip(images, pairings, strict=True):
+            whose = f"{of_camera[0].camera}: " if len(images) > 1 else ""
+            note = f"{self.path.name}: {whose}{len(pairing.pairs)} pairs, {pairing.reason}"
+            n_images = len(of_camera) - len(pairing.pairs)
+            n_clouds = len(clouds) - len({j for _, j in pairing.pairs})
+            if n_images or n_clouds:
+                note += f"; {n_images} images and {n_clouds} point clouds have no partner"
+            self.notes.append(note)
         return pairings
 
     def _pair_camera(

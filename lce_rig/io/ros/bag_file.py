@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lce_rig.core.errors import SourceError, reading, reason_of
-from lce_rig.io.fingerprint import fingerprint
+from lce_rig.io.protocol import fingerprint
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _MAX_LISTED = 40

@@ -18,8 +18,8 @@ from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.stream import NS_PER_US, seconds_in
-from lce_rig.io.events.word_codec import EVT3, LIBCAER_CMP, WordDecoder
+from lce_rig.io.events.event_recording import NS_PER_US, seconds_in
+from lce_rig.io.events.prophesee import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.messages import EventHead, decode_event_array, deserialize, header_stamp_ns
 

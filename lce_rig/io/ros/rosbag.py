@@ -12,8 +12,7 @@ from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import CameraEvents, EventRecording
-from lce_rig.io.events.stream import NoEventsError, worded
+from lce_rig.io.events.event_recording import CameraEvents, EventRecording, NoEventsError, worded
 from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.joining import check_overlap, merge_by_time
 from lce_rig.io.protocol import SourceOptions, Span
@@ -114,8 +113,7 @@ class TopicDecoder:
         cloud = decode_pointcloud2(content)
         reading = to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns)
         self.notes.update(reading.notes)
-        n_without_return = reading.n_not_finite + reading.n_zero_range
-        self.losses.add(findings.POINTS_WITHOUT_RETURN(), n_without_return)
+        self.losses.add(findings.POINTS_WITHOUT_RETURN(), reading.n_without_return)
         return reading.scan
 
     def _in_order(self, samples: list[Image | Scan]) -> list[Image | Scan]:

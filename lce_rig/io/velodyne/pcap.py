@@ -8,10 +8,8 @@ from lce_rig.core import velodyne
 from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
-from lce_rig.io.fingerprint import fingerprint
 from lce_rig.io.network import PcapFile
-from lce_rig.io.protocol import SourceOptions, Span
-from lce_rig.io.sensor_choice import choose_lidar
+from lce_rig.io.protocol import SourceOptions, Span, choose_lidar, fingerprint
 from lce_rig.io.velodyne.packet import BadPacketError, read_data_packet
 from lce_rig.io.velodyne.stream import DUAL_NOTE, OFFSETS_NOTE, Vlp16Stream
 from lce_rig.rig import LidarSettings, Rig

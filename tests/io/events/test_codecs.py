@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.data import EventColumns, Events, join_events
-from lce_rig.io.events.word_codec import EVT3, LIBCAER_CMP, Evt2Decoder, WordDecoder
+from lce_rig.io.events.prophesee import EVT3, LIBCAER_CMP, Evt2Decoder, WordDecoder
 from lce_rig.io.ros.event_messages import PacketDecoder
 from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, decode_event_array, encode_event_array, typestore
 from tests.io.events import encoders

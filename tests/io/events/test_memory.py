@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lce_rig.core.data import Events
 from lce_rig.io.events import open_events
-from lce_rig.io.events.aedat4_writer import write_aedat4
+from lce_rig.io.events.aedat4 import write_aedat4
 from tests.io.events.encoders import random_events
 
 
