@@ -35,9 +35,11 @@ fi
 # The stamp holds what was installed from where, so that a second run starts at once.
 wanted="$1 $PWD $(cksum <pyproject.toml)"
 if [ "$(cat "$venv/.lce-rig-installed" 2>/dev/null)" != "$wanted" ]; then
-  echo "installing lce-rig and what it needs into $venv (some minutes the first time)" >&2
-  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e ".$1" ||
-    fail "pip could not install lce-rig" "see the lines above"
+  echo "installing lce-rig and what it needs into $venv (a minute the first time)" >&2
+  pip=("$venv/bin/python" -m pip install --quiet --disable-pip-version-check)
+  # uv downloads in parallel; where it cannot, pip does the same more slowly.
+  { "${pip[@]}" uv && "$venv/bin/uv" pip install --quiet --python "$venv/bin/python" -e ".$1"; } ||
+    "${pip[@]}" -e ".$1" || fail "pip could not install lce-rig" "see the lines above"
   echo "$wanted" >"$venv/.lce-rig-installed"
 fi
 
