@@ -22,6 +22,7 @@ PARTS: dict[str, tuple[str, Part]] = {
         "recordings by others: references, halves, channels",
         lambda bench, a: bench(a.splits, a.only, a.methods),
     ),
+    "sessions": ("recordings of one rig: what moved between them", lambda bench, _: bench()),
     "simulated": ("boards held still: error against exact truth", lambda bench, a: bench(a.seeds or 20)),
     "events": ("boards moved before an event camera, the same", lambda bench, a: bench(a.seeds or 10)),
     "intrinsics": ("stale intrinsics: how often they are found", lambda bench, a: bench(a.seeds or 20)),
