@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.calibrate.algorithm_1.algorithm import Progress, solve
+from lce_rig.calibrate.algorithm_1.algorithm import solve
 from lce_rig.calibrate.consensus import Consensus, find_consensus
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
@@ -32,6 +32,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import ChannelResult
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference
+from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import Observation
 
 _N_SHARES = 7
@@ -42,7 +43,7 @@ def estimate_extrinsics(
     board: Board,
     settings: EstimateSettings,
     clocks: Clocks,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> CalibrationEstimate:
     """Estimate T_cam_lidar from detections of the channels of one camera and a LiDAR.
 
@@ -76,6 +77,7 @@ def estimate_extrinsics(
         )
         return _with_consensus(replace(estimate, channels=(channel,)), list(agreed.values()))
 
+    begin(progress, "motion of the board")
     still = {name: solve(observations, board) for name, observations in matched.items()}
     motion = estimate_motion(scans, samples, board, next(iter(still.values())), clocks)
     estimate = estimate_observations(motion.observations(), board, settings, progress)
@@ -85,6 +87,7 @@ def estimate_extrinsics(
     by_channel = {name: motion.observations(name if len(agreed) > 1 else None) for name in sorted(agreed)}
     channels = []
     for name, observations in by_channel.items():
+        begin(progress, f"{name} alone")
         alone = estimate_observations(observations, board, fast)
         result = ChannelResult(
             name,
@@ -104,6 +107,7 @@ def estimate_extrinsics(
                 time_offset_sigma_s=time_offset_sigma_s,
             )
         channels.append(result)
+    begin(progress, "difference of the channels")
     apart, cov = _difference(motion, tuple(by_channel.values()), board, settings.seed)
     return replace(
         estimate,
@@ -120,7 +124,7 @@ def fit_extrinsic(
     candidates: Sequence[Observation],
     board: Board,
     settings: EstimateSettings | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> CalibrationEstimate:
     """Estimate T_cam_lidar from both sensors' detections of boards that stood still.
 
@@ -144,7 +148,7 @@ def estimate_observations(
     observations: Sequence[Observation],
     board: Board,
     settings: EstimateSettings,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> CalibrationEstimate:
     """Estimate T_cam_lidar by the settings' method from matched boards.
 
@@ -157,7 +161,9 @@ def estimate_observations(
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
+    begin(progress, "Algorithm 1")
     start = solve(observations, board, settings.n_drawn, settings.seed, progress)
+    begin(progress, "uncertainty" if settings.method == "paper" else "maximum likelihood")
     if settings.method == "paper":
         return by_scatter(start, board, settings)
     priors, usual = what_is_known(settings)

@@ -269,7 +269,9 @@ def calibrate(
             show.warn(str(NotEnoughDataError.of(shortage)))
         if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
             show.warn(f"{reference} has no T_cam_lidar for these sensors")
-        written = result.write(name=name, force=force, report=not no_report)
+        written = result.write(name=name, force=force, report=False)
+    # The result is on the disk and on the screen before its report is drawn, which takes about as long.
+    folder = written.files[0].parent
     if as_json:
         show.print_json(result.document())
     else:
@@ -277,11 +279,8 @@ def calibrate(
             show.print_lines(_lines(calibration))
         for calibration in result.pairs:
             show.print_lines(camera_lines(calibration, result.pairs))
-        folder = written.files[0].parent
         names = ", ".join(str(file.relative_to(folder)) for file in written.files)
         show.note(f"written: {names} in {folder}")
-    if written.report is not None:
-        show.note(f"report: {written.report}")
     for finding in written.findings:
         if finding.severity != "note":
             show.warn(finding.sentence)
@@ -293,6 +292,10 @@ def calibrate(
     lacking = _lacking(wanted, {pair.camera for each in detections for pair in each.pairs}, result.pairs)
     if lacking is not None and any(c.verdict == "fail" for c in result.pairs):
         show.warn(str(lacking))
+    if not no_report:
+        with show.progress_bar("drawing the report"):
+            page = result.write_report(name=name)
+        show.note(f"report: {page}")
     exit_by_verdict(result.pairs, are_printed=not as_json)
     if lacking is not None:
         raise lacking

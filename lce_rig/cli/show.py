@@ -4,13 +4,12 @@ import json
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import click
 
-Progress = Callable[[int, int], None]
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
 _MOST_UNBROKEN = 24
@@ -88,16 +87,32 @@ def print_table(table: Any) -> None:
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 
+class ProgressBar:
+    """A bar of rich, as `core.progress` calls it: (done, total), and `begin` at each step."""
+
+    def __init__(self, bar: Any, title: str) -> None:
+        self._bar, self._title = bar, title
+        self._task = bar.add_task(title, total=None, rate="")
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show how many are done."""
+        speed = self._bar.tasks[0].speed
+        self._bar.update(self._task, completed=done, total=total, rate=f"{speed:.2g}/s" if speed else "")
+
+    def begin(self, step: str) -> None:
+        """Name the step; the bar moves to and fro until its (done, total) are known."""
+        # A task's total cannot be unset.
+        self._bar.remove_task(self._task)
+        self._task = self._bar.add_task(f"{self._title}: {step}", total=None, rate="")
+
+
 @contextmanager
-def progress_bar(title: str, *, has_rate: bool = False) -> Iterator[Progress]:
+def progress_bar(title: str, *, has_rate: bool = False) -> Iterator[ProgressBar]:
     """Show a progress bar on stderr; nothing if stderr is not a terminal.
 
     Args:
         title: of the bar.
         has_rate: whether to show how many are done per second, too.
-
-    Yields:
-        A callback (done, total).
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -112,13 +127,7 @@ def progress_bar(title: str, *, has_rate: bool = False) -> Iterator[Progress]:
     ]
     console = Console(stderr=True)
     with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(title, total=None, rate="")
-
-        def report(done: int, total: int) -> None:
-            speed = bar.tasks[0].speed
-            bar.update(task, completed=done, total=total, rate=f"{speed:.2g}/s" if speed else "")
-
-        yield report
+        yield ProgressBar(bar, title)
 
 
 def escape(text: str) -> str:

@@ -18,13 +18,13 @@ from typing import Any, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lce_rig.core.errors import CommandError, LceRigError, NotEnoughDataError, SessionError, UsageError
+from lce_rig.core.progress import Progress, silent
 from lce_rig.fleet.deploy import deployment
 from lce_rig.fleet.deploy.place import run_bounded
 from lce_rig.fleet.deploy.targets import read_targets
 from lce_rig.fleet.jobs import folder_name
 from lce_rig.fleet.query import query
 from lce_rig.fleet.registry import Registry
-from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import load_rig
 from lce_rig.rig.target_settings import TargetSettings

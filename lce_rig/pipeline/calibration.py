@@ -26,6 +26,7 @@ from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
+from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
@@ -35,7 +36,6 @@ from lce_rig.judge.relative_pose import relative_pose
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, share_findings
 from lce_rig.lens.lens_estimate import BoardView
-from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE
 from lce_rig.pipeline.matching import candidates_of
 from lce_rig.pipeline.witness import Sharpen, fuse
@@ -140,9 +140,12 @@ def calibrate_detections(
         )
     if not alone:
         raise join_shortages([NotEnoughDataError.of(shortage) for shortage in shortages])
+    if len(alone) > 1:
+        begin(progress, "comparing and joining cameras")
     links = _links(rig, alone)
     solved = _solve_together(rig, detections, alone, links)
     if scene is not None:
+        begin(progress, "estimating from the scene")
         solved = [_with_scene(rig, each, scene(each)) for each in solved]
     calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
     for k, c in enumerate(calibrations):
@@ -206,6 +209,7 @@ def _solve(
     settings = EstimateSettings.of(options, rig.lidars[lidar], tolerances)
     clocks = clocks_of(rig, camera, lidar)
     estimate = estimate_extrinsics(candidates, rig.board.to_board(), settings, clocks, progress)
+    begin(progress, f"checking {camera} and {lidar}")
     validation = _examine(rig, detections, pairs, estimate)
     return _Solved(tuple(pairs), settings, refused, estimate, validation)
 

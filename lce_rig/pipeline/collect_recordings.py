@@ -7,9 +7,9 @@ from pathlib import Path
 from lce_rig.collect import CollectOptions, CollectReport, collect
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.losses import Losses
+from lce_rig.core.progress import Progress, silent
 from lce_rig.io import open_recordings
 from lce_rig.io.protocol import Recording, SourceOptions
-from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 

@@ -11,8 +11,8 @@ import numpy as np
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
+from lce_rig.core.progress import Progress, silent
 from lce_rig.judge.repeatability import Repeatability
-from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, OTHER_BOARD, OUTDATED
 from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
 from lce_rig.pipeline.union import (

@@ -13,6 +13,7 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError, SessionError, refusal_of
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
+from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.events.search import EventImage, EventSighting, find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
@@ -22,12 +23,6 @@ from lce_rig.session import Capture, Session, check_capture
 
 Key = tuple[str, str]
 _Found = TypeVar("_Found", ImageDetection, LidarDetection, Image | Refusal)
-Progress = Callable[[int, int], None]
-"""Called with (done, total)."""
-
-
-def silent(done: int, total: int) -> None:
-    """Report no progress."""
 
 
 def detect(
@@ -87,8 +82,10 @@ def detect(
             for each in held
             if (poses := expected.get(each.capture.name)) is not None
         ]
+        if again:
+            begin(progress, "searching about predicted places")
         looked = pool.map(lambda job: finder.look(*job), again)
-        for (capture, lidar, _), found in zip(again, looked, strict=True):
+        for (capture, lidar, _), found in _counted(again, looked, progress, 0, len(again)):
             before = lidars[lidar][capture.name]
             if not isinstance(found, Refusal):
                 lidars[lidar][capture.name] = [*found, *(before if isinstance(before, list) else [])]

@@ -13,12 +13,12 @@ from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
+from lce_rig.core.progress import Progress, silent
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.devices.reading import LiveSource
 from lce_rig.judge.board_drift import BoardDrift, watch_boards
 from lce_rig.pipeline.calibration import clocks_of
-from lce_rig.pipeline.detect_session import Progress, silent
 from lce_rig.pipeline.result_files import RESULT, result_parts
 from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, own_offset_ns
 from lce_rig.rig import Rig

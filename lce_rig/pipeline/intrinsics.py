@@ -10,6 +10,7 @@ import numpy as np
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, SessionError, UsageError, refusal_of
 from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.progress import Progress, silent
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
@@ -20,7 +21,7 @@ from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of,
 from lce_rig.lens.lens_coverage import find_weaknesses
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import MODELS, model_of
-from lce_rig.pipeline.detect_session import Progress, detect, silent
+from lce_rig.pipeline.detect_session import detect
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 

@@ -9,9 +9,10 @@ from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, EstimateSet
 from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors, estimate_lidar
 from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
+from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import clocks_of
-from lce_rig.pipeline.detect_session import Progress, detect, silent
+from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.intrinsics_files import profile_text
 from lce_rig.pipeline.matching import candidates_of
 from lce_rig.rig import parse_rig, set_value

@@ -112,19 +112,19 @@ class Result:
         force: bool = False,
         report: bool = True,
     ) -> WrittenResult:
-        """Write result.json, the report and, unless a verdict is fail, all exports in place of earlier ones.
+        """Write result.json and, unless a verdict is fail, exports in place of earlier ones; then a report.
 
-        In the session all files of a run appear together. Those of the earlier run move to
-        calibration/previous/, except that neither a failed run nor one without a camera's only usable result
-        replaces a usable run there. If the result is identical byte for byte, overlays and
-        calibration/previous/ stay. Files that lce-rig did not write stay, too.
+        In the session result.json and exports appear together, before the report is drawn. Files of the
+        earlier run move to calibration/previous/, except that neither a failed run nor one without a camera's
+        only usable result replaces a usable run there. If the result is identical byte for byte, report,
+        overlays and calibration/previous/ stay. Files that lce-rig did not write stay, too.
 
         Args:
             folder: None for the session's calibration/; in any other folder files are replaced one by one.
                 Several sessions' result goes into results/union/ of the first instead.
             name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched.
             force: export failed results too; each file then says so.
-            report: write report.html, too; an earlier one does not stay beside another result.
+            report: write report.html, too, as `write_report` does; that of another result does not stay.
 
         Raises:
             UsageError: the name is not valid.
@@ -132,41 +132,71 @@ class Result:
                 unchanged.
             ResultRefusedError: a pose or covariance is not finite; the same.
         """
-        if folder is not None and Path(folder).resolve() != (self.session.path / CALIBRATION).resolve():
+        if folder is not None and not self._is_in_session(folder):
             folder = Path(folder)
-            names, findings = self._write_into(folder, force=force, report=report)
-            page = folder / REPORT if report else None
+            names, findings = self._write_into(folder, force=force)
+            page = self.write_report(folder) if report else None
             return WrittenResult(tuple(folder / file for file in names), findings, page)
-        parts = new_result_parts(UNION if self.sessions and name is None else name)
+        parts = self._parts(name)
         place = self.session.path.joinpath(*parts)
         previous = place / PREVIOUS
         with self.session.replacing(*parts, finish=_keep_earlier) as draft:
-            names, findings = self._write_into(draft, force=force, report=report)
+            names, findings = self._write_into(draft, force=force)
         return WrittenResult(
             tuple(place / file for file in names),
             findings,
-            place / REPORT if report else None,
+            self.write_report(name=name) if report else None,
             previous if (previous / RESULT).exists() else None,
             bool(_usable(previous)),
         )
 
-    def _write_into(
-        self, folder: Path, *, force: bool, report: bool
-    ) -> tuple[list[str], tuple[Finding, ...]]:
-        """Write result.json, the report and the exports of usable results.
+    def write_report(self, folder: Path | str | None = None, *, name: str | None = None) -> Path:
+        """Draw report.html beside the result.json that `write` has written.
 
-        Returns:
-            The files' names without the report's, and the exports' findings.
+        Args:
+            folder, name: as of `write`.
+
+        Raises:
+            SessionError: another result has replaced this one meanwhile, or the disk is full; the files there
+                are unchanged.
         """
         from lce_rig.show.report.calibration_page import report_text
 
         file = self.file()
         text = file.text()
-        write_atomically(folder / RESULT, text)
+        page = report_text(self.session, self.sessions, file, text, OVERLAYS)
+        if folder is not None and not self._is_in_session(folder):
+            write_atomically(Path(folder) / REPORT, page)
+            return Path(folder) / REPORT
+        parts = self._parts(name)
+        place = self.session.path.joinpath(*parts)
+
+        def finish(earlier: Path, draft: Path) -> None:
+            if _content(earlier / RESULT) != text.encode():
+                raise SessionError(
+                    f"{place} was calibrated again while its report was drawn", "Run the command again."
+                )
+            keep_foreign(earlier, draft, lambda path: path.name == REPORT)
+
+        with self.session.replacing(*parts, finish=finish) as draft:
+            write_atomically(draft / REPORT, page)
+        return place / REPORT
+
+    def _is_in_session(self, folder: Path | str) -> bool:
+        return Path(folder).resolve() == (self.session.path / CALIBRATION).resolve()
+
+    def _parts(self, name: str | None) -> tuple[str, ...]:
+        return new_result_parts(UNION if self.sessions and name is None else name)
+
+    def _write_into(self, folder: Path, *, force: bool) -> tuple[list[str], tuple[Finding, ...]]:
+        """Write result.json and the exports of usable results.
+
+        Returns:
+            The files' names, and the exports' findings.
+        """
+        write_atomically(folder / RESULT, self.file().text())
         # Also in a folder whose files are replaced one by one, no report stays beside another result.
         (folder / REPORT).unlink(missing_ok=True)
-        if report:
-            write_atomically(folder / REPORT, report_text(self.session, self.sessions, file, text, OVERLAYS))
         usable = [c for c in self.pairs if force or c.verdict != "fail"]
         if not usable:
             remove_exports(folder)
@@ -293,7 +323,8 @@ def _keep_earlier(earlier: Path, draft: Path) -> None:
     """Copy the earlier result, or the one before it, and the user's files into the draft that replaces it.
 
     The earlier result becomes `previous/` unless only the one before it is usable, or has the only usable
-    result of a camera. If the new result is the same byte for byte, overlays and `previous/` stay.
+    result of a camera. If the new result is the same byte for byte, report, overlays and `previous/`
+    stay.
 
     Args:
         earlier: the folder; need not exist.
@@ -307,8 +338,9 @@ def _keep_earlier(earlier: Path, draft: Path) -> None:
     check_folder(earlier / PREVIOUS)
     keep_foreign(earlier, draft, lambda path: path.name == PREVIOUS or _is_of_a_result(path))
     is_same = _content(earlier / RESULT) == _content(draft / RESULT)
-    if is_same and (earlier / OVERLAYS).is_dir():
-        copy_over(earlier / OVERLAYS, draft / OVERLAYS)
+    for drawn in (REPORT, OVERLAYS):
+        if is_same and (earlier / drawn).exists():
+            copy_over(earlier / drawn, draft / drawn)
     usable, before = _usable(earlier), _usable(earlier / PREVIOUS)
     deserves = (bool(usable) or not before) and before <= usable | _usable(draft)
     if deserves and not is_same and (earlier / RESULT).exists():

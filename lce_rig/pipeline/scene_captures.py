@@ -14,12 +14,12 @@ from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import transform
 from lce_rig.core.losses import Losses
+from lce_rig.core.progress import Progress
 from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.io import open_recordings
 from lce_rig.io.joining import join_recordings, require_sensors
 from lce_rig.io.protocol import ContinuousRecording, PairedRecording
-from lce_rig.pipeline.detect_session import Progress
 from lce_rig.rig import Rig
 from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.views import MAX_CAPTURES

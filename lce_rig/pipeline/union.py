@@ -17,12 +17,13 @@ from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
 from lce_rig.core.findings import Finding
+from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.repeatability import Repeatability, compare_calibrations
 from lce_rig.judge.verdict import with_opinion
 from lce_rig.pipeline.calibration import calibrate_detections
-from lce_rig.pipeline.detect_session import Progress, detect, silent
+from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.findings import MOVED, ONLY_ONE
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.witness import by_boards, hear_scene, sharpen
@@ -71,6 +72,8 @@ def calibrate(
         raise UsageError(f"{len(named)} sessions require as many detections", "Give one for each session.")
     by_name, is_union = dict(zip(named, detections, strict=True)), len(named) > 1
     options = options or CalibrateOptions()
+    if is_union:
+        begin(progress, "calibrating each session alone")
     comparisons = _require_unmoved(named, by_name, options, cameras, channels) if is_union else ()
     pairs, shortages = calibrate_detections(
         sessions[0].rig,
@@ -83,6 +86,7 @@ def calibrate(
         progress=progress,
     )
     agreements = {(each.camera, each.lidar): (each.finding,) for each in comparisons}
+    begin(progress, "comparing with the scene")
     judged = []
     for c in pairs:
         # The scene of the first session that holds captures of these sensors.

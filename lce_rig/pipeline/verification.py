@@ -8,11 +8,12 @@ from pathlib import Path
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Refusal
+from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.events.search import EventImage
 from lce_rig.judge.session_check import SessionCheck, check_session
 from lce_rig.pipeline.calibration import clocks_of
-from lce_rig.pipeline.detect_session import Progress, detect, event_channels, event_picture, silent
+from lce_rig.pipeline.detect_session import detect, event_channels, event_picture
 from lce_rig.pipeline.matching import match_sensors
 from lce_rig.pipeline.result_files import (
     OVERLAYS,

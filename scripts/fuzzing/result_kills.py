@@ -27,6 +27,7 @@ from lce_rig.rig import load_rig
 
 _N_CAPTURES = 8
 _SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+_REPORT = "report.html"
 _EVERY = 6
 # Ctrl-C ends a verb in words; whatever came too late finds it done.
 _MAX_STOP_S = 2.0
@@ -92,6 +93,13 @@ class _Known:
     seconds: dict[str, float] = field(default_factory=dict)
     swap_s: dict[str, float] = field(default_factory=dict)
 
+    def variant_of(self, content: Content) -> int | None:
+        """Tell of which run a result is; one that was killed later has no report yet."""
+        for variant, result in enumerate(self.results):
+            if content in (result, {name: file for name, file in result.items() if name != _REPORT}):
+                return variant
+        return None
+
 
 def fuzz_result_kills(n: int, seed: int) -> ResultKillReport:
     """Kill the three verbs n times in all, by three signals, at any moment and about the swap.
@@ -130,14 +138,15 @@ def check(session: Path, known: _Known) -> list[str]:
     wrong = []
     folder = session / "calibration"
     found = _own_content(folder)
-    if found not in known.results:
+    variant = known.variant_of(found)
+    if variant is None:
         wrong.append(f"calibration/ is of no run: {_describe(found, known.results)}")
     else:
         shown = content_of(folder / "overlays")
-        if shown and shown != known.overlays[known.results.index(found)]:
+        if shown and shown != known.overlays[variant]:
             wrong.append(f"overlays/ do not belong to the result: {_describe(shown, known.overlays)}")
     earlier = content_of(folder / "previous", without=("overlays",))
-    if earlier and earlier not in known.results:
+    if earlier and known.variant_of(earlier) is None:
         wrong.append(f"calibration/previous/ is of no run: {_describe(earlier, known.results)}")
     lens = content_of(session / "intrinsics", without=("previous",))
     if lens not in known.intrinsics:
@@ -170,7 +179,8 @@ def _misread(session: Path, folder: Path) -> list[str]:
         return [str(error)]
     on_disk = dict(_own_content(folder))
     # No exports; that they belong to the run, `check` has found by their content.
-    del on_disk["result.json"], on_disk["report.html"]
+    del on_disk["result.json"]
+    on_disk.pop(_REPORT, None)
     return (
         []
         if on_disk == exports

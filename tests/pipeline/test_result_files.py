@@ -200,5 +200,21 @@ def test_the_report_stays_with_its_result(session, folder):
     page = first.report.read_bytes()
     write(session, OTHER, report=True)
     assert (folder / "previous" / "report.html").read_bytes() == page != first.report.read_bytes()
-    without = write(session, OTHER)
+    page = first.report.read_bytes()
+    again = write(session, OTHER)
+    assert again.report is None and first.report.read_bytes() == page
+    without = write(session, GOOD)
     assert without.report is None and not first.report.exists()
+
+
+def test_an_interrupted_report_leaves_a_complete_result(session, folder):
+    """The result stands before its report is drawn; a report never comes beside another result."""
+    write(session, GOOD, report=True)
+    result = Result(session, (OTHER,))
+    files = {path.name for path in result.write(report=False).files}
+    assert names(folder) == files | {"previous"}
+    write(session, GOOD)
+    with pytest.raises(SessionError):
+        result.write_report()
+    assert "report.html" not in names(folder)
+    assert result.write().report.exists()

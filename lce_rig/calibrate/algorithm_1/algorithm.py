@@ -6,7 +6,7 @@ References:
     they were not fitted to, draws are seeded, and each solution carries a certificate.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,9 +32,9 @@ from lce_rig.core.calibration import Certificate
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose, project_to_so3
+from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import Observation
 
-Progress = Callable[[int, int], None]
 NOMINAL_SIGMA_M = 0.01
 """Residuals for the first weights of captures; weights are reported in units of it."""
 # Share of the plane terms that are kept, those with the least propagated variance.
@@ -76,7 +76,7 @@ def solve(
     board: Board,
     n_draws: int = 0,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Algorithm1:
     """Solve for T_cam_lidar from matched boards.
 
@@ -251,7 +251,7 @@ def draw_subsets(
     n_draws: int,
     seed: int,
     figures: Diagnostics,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> tuple[Array, Diagnostics]:
     """Judge a solution by `n_draws` random subsets of each size 3..F-1, of many captures of 40 sizes.
 
@@ -279,12 +279,12 @@ def draw_subsets(
     selection = (order < np.repeat(sizes, n_draws)[:, None]).astype(np.float64)
     chunk = max(min(_CHUNK, _CHUNK_ENDS // max(len(problem.edge_capture), 1)), 1)
     parts: list[tuple[Array, ...]] = []
+    begin(progress, "Algorithm 1 on random subsets")
     for start in range(0, len(selection), chunk):
         solutions = problem.solve(selection[start : start + chunk], T_start)
         plane, edge = problem.errors(solutions.x)
         parts.append((solutions.T, plane + edge, solutions.certificates.is_optimal.astype(np.float64)))
-        if progress is not None:
-            progress(min(start + chunk, len(selection)), len(selection))
+        progress(min(start + chunk, len(selection)), len(selection))
     T, errors, is_certified = (np.concatenate(part) for part in zip(*parts, strict=True))
 
     by_size = len(sizes), n_draws
