@@ -255,8 +255,8 @@ def require_kind(session: Path, seed: int | None) -> None:
     Raises:
         SessionError: the session holds captures of another kind.
     """
-    from lce_rig.core.documents import read_json
     from lce_rig.core.errors import SessionError
+    from lce_rig.core.files import read_json
 
     truth = session / TRUTH
     hint = "Collect into another folder."

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image
-from lce_rig.core.documents import parse_json
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import EventQuality, ImageBoard, ImageQuality, LidarBoard, LidarQuality
 
@@ -58,7 +57,7 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDet
         ValueError: the arrays are not a detection.
     """
     try:
-        document = parse_json(arrays["head"].tobytes(), is_finite=False)
+        document = json.loads(arrays["head"].tobytes())
         items = []
         for index, head in enumerate(document["items"]):
             kind, prefix = _KINDS[head.pop("kind")], f"{index}."

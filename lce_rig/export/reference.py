@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lce_rig.core.documents import read_json
 from lce_rig.core.errors import SessionError, reading
+from lce_rig.core.files import read_json
 from lce_rig.core.geometry import Array, parse_pose
 
 # References are often printed with four digits.

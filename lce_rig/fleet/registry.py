@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from lce_rig.core.calibration import read_result
-from lce_rig.core.documents import parse_json
 from lce_rig.core.errors import LceRigError, SessionError, reason_of
+from lce_rig.core.files import parse_json
 from lce_rig.fleet.findings import DAMAGED
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import ROWS, TABLE, Row, as_table, merged, read_table, table_bytes, with_pairs

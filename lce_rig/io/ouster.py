@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Scan, Stream
-from lce_rig.core.documents import read_json
 from lce_rig.core.errors import SourceError, reading
+from lce_rig.core.files import read_json
 from lce_rig.core.geometry import Array
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings

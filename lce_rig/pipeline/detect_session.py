@@ -245,7 +245,7 @@ def detection_digest(rig: Rig) -> str:
     """Hash the inputs of a detection besides the capture, profile and code, to 12 digits."""
     digest = hashlib.sha256(rig.model_dump_json(include={"board", "cameras", "lidars", "quality"}).encode())
     package = Path(__file__).parents[1]
-    sources = [source for folder in ("core", "detect") for source in (package / folder).rglob("*.py")]
+    sources = [source for folder in ("core", "detect") for source in (package / folder).rglob("*.[jp]*[ny]")]
     for source in sorted([*sources, Path(__file__)]):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:12]

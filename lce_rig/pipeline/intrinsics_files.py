@@ -11,8 +11,8 @@ import numpy as np
 
 from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.documents import read_json
 from lce_rig.core.errors import ResultRefusedError, UsageError
+from lce_rig.core.files import read_json
 from lce_rig.core.phrasing import as_line
 from lce_rig.export.camera_info import camera_info_text
 from lce_rig.export.files import number, numbers

@@ -15,9 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SessionError, reading
-from lce_rig.core.event_file import decode_events
-from lce_rig.core.image_codec import decode_pixels
-from lce_rig.core.pcd import decode_pcd
+from lce_rig.core.files import decode_events, decode_pcd, decode_pixels
 from lce_rig.rig import Rig
 from lce_rig.rig.settings import Name
 from lce_rig.session.capture_files import EVENTS_VERSION, MANIFEST

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.data import Events, Image, Scan
-from lce_rig.core.event_file import encode_events
-from lce_rig.core.pcd import encode_pcd
+from lce_rig.core.files import encode_events, encode_pcd
 from lce_rig.session.durable import flush_folder, write_new_file
 
 MANIFEST = "meta.json"

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lce_rig import __version__
-from lce_rig.core.documents import read_json
 from lce_rig.core.errors import SessionError, reading
+from lce_rig.core.files import read_json
 from lce_rig.rig import Rig
 
 FORMAT_VERSION = 1

@@ -9,8 +9,8 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsic
 from lce_rig.core.data import Image, Scan
+from lce_rig.core.files import decode_pcd
 from lce_rig.core.findings import Refusal
-from lce_rig.core.pcd import decode_pcd
 from lce_rig.core.results import Observation
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.search import find_lidar_boards

@@ -12,7 +12,7 @@ import pytest
 
 from lce_rig.collect import CollectOptions, collect
 from lce_rig.core.errors import SourceError
-from lce_rig.core.pcd import encode_pcd
+from lce_rig.core.files import encode_pcd
 from lce_rig.io import open_recording
 from lce_rig.rig import load_rig
 from lce_rig.session import Session

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.core.pcd import encode_pcd
+from lce_rig.core.files import encode_pcd
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.io.protocol import PairedRecording
 from lce_rig.rig import load_rig

@@ -6,9 +6,9 @@ from pathlib import Path
 
 PROGRAM = """
 import sys
-from lce_rig.core import memory
-memory._SHARE = 0.0
-memory.limit_memory()
+from lce_rig.cli import entry
+entry._SHARE_OF_MEMORY = 0.0
+entry.limit_memory()
 from lce_rig.cli.main import run
 sys.exit(run(sys.argv[1:]))
 """

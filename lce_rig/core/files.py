@@ -1,0 +1,200 @@
+"""What files hold, as bytes and back: JSON, images, point clouds (PCD), events (a NumPy archive).
+
+References:
+    https://pointclouds.org/documentation/tutorials/pcd_file_format.html
+"""
+
+import io
+import re
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydantic_core
+from numpy.typing import NDArray
+
+from lce_rig.core.data import MAX_TIME_NS, Events
+
+_EVENTS_VERSION = 1
+_NS_PER_US = 1000
+# The same events, the same bytes: no time of writing goes into the archive.
+_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON document from a file; see `parse_json`.
+
+    Raises:
+        OSError: it is not there, or cannot be read.
+        ValueError: it is not JSON.
+    """
+    return parse_json(path.read_bytes())
+
+
+def parse_json(data: bytes) -> Any:
+    """Parse a JSON document in UTF-8; NaN and Infinity are not JSON.
+
+    Raises:
+        ValueError: it is not such a document.
+    """
+    return pydantic_core.from_json(data.removeprefix(b"\xef\xbb\xbf"), allow_inf_nan=False)
+
+
+def decode_pixels(data: bytes, flags: int) -> NDArray[Any]:
+    """Decode a PNG, JPEG, BMP, TIFF, PNM or WebP image.
+
+    OpenCV refuses images of more than OPENCV_IO_MAX_IMAGE_PIXELS (`lce_rig/__init__.py`).
+
+    Args:
+        data: the file's bytes.
+        flags: OpenCV's, of `imdecode`.
+
+    Returns:
+        (H, W) or (H, W, C), as OpenCV decodes it.
+
+    Raises:
+        ValueError: it is truncated, damaged, or no image.
+    """
+    import cv2
+
+    if not data:
+        raise ValueError("it is empty")
+    # Older OpenCV fills the missing part of a torn JPEG or PNG with grey, without an error.
+    if data.startswith(b"\x89PNG") and b"IEND" not in data[-64:]:
+        raise ValueError("it is a truncated PNG image")
+    if data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-1024:]:
+        raise ValueError("it is a truncated JPEG image")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise ValueError("it is damaged, too large, or no image that lce-rig reads")
+    return np.asarray(pixels)
+
+
+def decode_pcd(data: bytes) -> NDArray[Any]:
+    """Decode a whole PCD file in any of its three encodings.
+
+    Args:
+        data: the file's bytes.
+
+    Returns:
+        Structured (N,) with the fields as named in the header; one of count c > 1 as c fields.
+
+    Raises:
+        ValueError: points are missing.
+        Exception: as pypcd4 raises it about damaged files.
+    """
+    if not data:
+        raise ValueError("it is empty")
+    from pypcd4.pypcd4 import PointCloud  # Commands that read no point cloud need not wait for it.
+
+    # Comments need not be UTF-8; MATLAB's hold a trade mark sign.
+    data = re.sub(rb"\A(?:#[^\n]*\n)+", b"", data)
+    cloud = PointCloud.from_fileobj(io.BufferedReader(io.BytesIO(data)))
+    points = np.atleast_1d(cloud.pc_data)
+    if len(points) != cloud.metadata.points:
+        raise ValueError(f"it is truncated: {len(points)} of {cloud.metadata.points} points are there")
+    return points
+
+
+def encode_pcd(cloud: NDArray[Any], comments: Iterable[str] = ()) -> bytes:
+    """Encode a point cloud as binary PCD, `decode_pcd`'s inverse.
+
+    Args:
+        cloud: structured (N,) of scalar fields.
+        comments: lines for the head of the file.
+    """
+    names = cloud.dtype.names or ()
+    dtypes = [cloud.dtype[name] for name in names]
+    packed = np.empty(
+        len(cloud), dtype=[(n, d.newbyteorder("<")) for n, d in zip(names, dtypes, strict=True)]
+    )
+    for name in names:
+        packed[name] = cloud[name]
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        *(f"# {comment}" for comment in comments),
+        "VERSION 0.7",
+        "FIELDS " + " ".join(names),
+        "SIZE " + " ".join(str(d.itemsize) for d in dtypes),
+        "TYPE " + " ".join(d.kind.upper() for d in dtypes),
+        "COUNT " + " ".join("1" for _ in dtypes),
+        f"WIDTH {len(cloud)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(cloud)}",
+        "DATA binary",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii") + packed.tobytes()
+
+
+def encode_events(events: Events) -> bytes:
+    """Write events as a compressed archive; the same events give the same bytes.
+
+    Timestamps are stored as whole microseconds (t_us) where they are that, else as nanoseconds (t_ns).
+
+    Returns:
+        The bytes of an .npz file, for its owner to put in place in one step.
+    """
+    is_whole = not np.any(events.t_ns % _NS_PER_US)
+    columns: dict[str, NDArray[Any]] = {
+        "format_version": np.array(_EVENTS_VERSION),
+        "resolution_px": np.array([events.width_px, events.height_px]),
+        "t_us" if is_whole else "t_ns": events.t_ns // _NS_PER_US if is_whole else events.t_ns,
+        "x": events.x,
+        "y": events.y,
+        "polarity": events.polarity,
+    }
+    if events.host_ns is not None:
+        columns["host_ns"] = np.array(events.host_ns)
+    buffer = io.BytesIO()
+    # A capture must not wait: NumPy's own compression is seven times slower and 5 % smaller; to compress the
+    # pixels' columns takes most of the time, and they hardly shrink.
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, column in columns.items():
+            plain = io.BytesIO()
+            np.lib.format.write_array(plain, np.asarray(column), allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy", _ZIP_EPOCH)
+            how = zipfile.ZIP_STORED if name in ("x", "y") else zipfile.ZIP_DEFLATED
+            archive.writestr(entry, plain.getvalue(), how, compresslevel=1)
+    return buffer.getvalue()
+
+
+def decode_events(data: bytes, sensor: str) -> Events:
+    """Read an archive as `encode_events` writes it, in any order of time.
+
+    Raises:
+        ValueError: it holds other columns, or values that no sensor sends.
+        Exception: as NumPy and zipfile raise it about damaged archives.
+    """
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        columns = {name: np.asarray(archive[name]) for name in archive.files}
+    time, scale = ("t_us", _NS_PER_US) if "t_us" in columns else ("t_ns", 1)
+    names = (time, "x", "y", "polarity")
+    if missing := [name for name in names if name not in columns]:
+        raise ValueError(f"it has no column {missing[0]}; it has {', '.join(columns) or 'nothing'}")
+    t, x, y, polarity = (columns[name] for name in names)
+    if {column.shape for column in (t, x, y, polarity)} != {(len(t),)}:
+        raise ValueError("its columns are not lists of equal length")
+    if {t.dtype.kind, x.dtype.kind, y.dtype.kind} - {"i", "u"} or polarity.dtype.kind not in "biu":
+        raise ValueError("its columns are not whole numbers")
+    if len(t) and not (min(x.min(), y.min()) >= 0 and max(x.max(), y.max()) < 1 << 16):
+        raise ValueError("its pixels are beyond any sensor")
+    if len(t) and not max(abs(int(t.min())), abs(int(t.max()))) * scale < MAX_TIME_NS:
+        raise ValueError(f"its column {time} holds times beyond any clock")
+    width, height = map(int, columns["resolution_px"])
+    host_ns = int(columns["host_ns"]) if "host_ns" in columns else None
+    return Events(
+        sensor,
+        t.astype(np.int64) * scale,
+        x.astype(np.uint16),
+        y.astype(np.uint16),
+        polarity > 0,
+        width,
+        height,
+        host_ns,
+    )
