@@ -1,7 +1,7 @@
 """What boards in view say about deployed extrinsics: `verify`'s residuals, axis by axis."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
-from lce_rig.detect.detection import Detections
+from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.local_quadratic import SCALE, expand
 from lce_rig.judge.session_check import find_meetings
 from lce_rig.rig import LidarSettings, Rig
@@ -85,12 +85,10 @@ def watch_boards(
     Returns:
         None where both sensors see the board at about the same place in fewer than three placements.
     """
-    deployed = calibration
-    if channel not in calibration.channels:
-        deployed = replace(calibration, channels=(*calibration.channels, channel))
+    T_cam_lidar, pair = calibration.T_cam_lidar, Pair(calibration.camera, channel, calibration.lidar)
     detections = Detections({(calibration.camera, channel): dict(images)}, {calibration.lidar: dict(scans)})
     board = rig.board.to_board()
-    meetings = find_meetings(rig, detections, channel, deployed, clocks)
+    meetings = find_meetings(rig, detections, pair, T_cam_lidar, calibration.channel_results, clocks)
     met = [meeting.at_scan_time for meeting in meetings.values()]
     if not met:
         return None

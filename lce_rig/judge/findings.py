@@ -193,6 +193,22 @@ def _sensors_disagree(finding: Finding) -> str:
     )
 
 
+def _moved(finding: Finding) -> str:
+    """The {place} {n_captures} captures, {captures}, fit a mounting {rotation_deg}, {translation_m} apart.
+
+    {neighbour} lies before or after them; {chance}: to differ as much on one mounting.
+    """
+    names, place = finding.figures["captures"], finding.figures["place"]
+    assert isinstance(names, tuple)
+    shown = ", ".join(map(str, names[:4])) + (" ..." if len(names) > 4 else "")
+    text = fill(
+        f"{{n_captures}} captures ({shown}) fit a mounting changed by {_APART}: a sensor moved ",
+        finding.figures,
+    )
+    when = {"last": "after {neighbour}", "first": "before {neighbour}"}.get(str(place), "to and fro")
+    return f"{f'the {place} ' if place else ''}{text}{fill(when, finding.figures)}"
+
+
 def _agree(finding: Finding) -> str:
     """The {n_sessions} calibrations of {camera} and {lidar} agree: {rotation_deg}, {translation_m} apart.
 
@@ -318,6 +334,13 @@ CHANGED = Kind(
     "verdict.changed",
     "extrinsics change significantly at capture {capture}, by " + _APART,
     "fasten the sensors, one may have moved, and collect again",
+)
+MOVED = Kind("verdict.moved", _moved, "fasten the sensors and collect again")
+LAST_REJECTED = Kind(
+    "verdict.last_rejected",
+    "the last capture, {capture}, is an outlier, and none after it shows whether a sensor moved",
+    "collect two more captures",
+    severity="note",
 )
 TWO_GROUPS = Kind(
     "verdict.two_groups",

@@ -43,6 +43,8 @@ def expand(
     *,
     laser_bias_sigma_m: float,
     range_offset_sigma_m: float,
+    sigmas: "FeatureSigmas | None" = None,
+    rings: NDArray[np.int16] | None = None,
 ) -> Quadratics:
     """Expand the cost of captures about given extrinsics.
 
@@ -55,10 +57,13 @@ def expand(
         T_cam_lidar: (4, 4).
         laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
         range_offset_sigma_m: of that mean.
+        sigmas: of planes and ring ends; None estimates them from these captures.
+        rings: (L,) whose offsets are unknowns; None for those that occur.
     """
     features = [extract_features(seen, board) for seen in observations]
-    sigmas = feature_sigmas(features, board, T_cam_lidar)
-    rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
+    sigmas = sigmas or feature_sigmas(features, board, T_cam_lidar)
+    if rings is None:
+        rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
     p = FIRST_RING + len(rings) + 1
     gradients, hessians = np.zeros((len(features), p)), np.zeros((len(features), p, p))
     for k, (f, seen) in enumerate(zip(features, observations, strict=True)):

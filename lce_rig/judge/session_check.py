@@ -13,7 +13,7 @@ from lce_rig.calibrate.motion.board_motion import compensate, fit_motions, sampl
 from lce_rig.calibrate.observations import SharedScan
 from lce_rig.calibrate.result import capture_residual, summarise
 from lce_rig.core.board import Board
-from lce_rig.core.calibration import Calibration, CaptureResidual, Metrics, SceneOpinion
+from lce_rig.core.calibration import Calibration, CaptureResidual, ChannelResult, Metrics, SceneOpinion
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
@@ -48,26 +48,31 @@ class Meeting:
 
 
 def bring_together(
-    observations: Mapping[str, Sequence[Observation]], channel: str, calibration: Calibration, clocks: Clocks
+    observations: Mapping[str, Sequence[Observation]],
+    channel: str,
+    T_cam_lidar: Array,
+    results: Sequence[ChannelResult],
+    clocks: Clocks,
 ) -> dict[str, Meeting]:
     """Compensate each capture for the board's motion between a channel's image and the scan.
 
     Args:
         observations: by channel of the calibration; other channels show how boards moved.
         channel: the channel of the captures.
-        calibration: with its channels' time offsets; without any, boards are assumed to be still.
+        T_cam_lidar: (4, 4).
+        results: the channels' time offsets; without any, boards are assumed to be still.
         clocks: as in the calibration.
 
     Returns:
         By name of the capture.
     """
-    results = {result.channel: result for result in calibration.channel_results}
-    timed = {name: items for name, items in observations.items() if name in results}
-    if channel not in timed or any(results[name].time_offset_s is None for name in timed):
+    of_channel = {result.channel: result for result in results}
+    timed = {name: items for name, items in observations.items() if name in of_channel}
+    if channel not in timed or any(of_channel[name].time_offset_s is None for name in timed):
         return {o.capture: Meeting(o, o, o.lidar) for o in observations.get(channel, ())}
     # Images of all channels by scan, those of the channel with the least noise first.
     by_scan: dict[bytes, dict[str, ImageBoard]] = {}
-    for name in sorted(timed, key=lambda name: results[name].noise_px):
+    for name in sorted(timed, key=lambda name: of_channel[name].noise_px):
         for o in timed[name]:
             by_scan.setdefault(o.lidar.points.tobytes(), {}).setdefault(name, o.image)
     own = list(timed[channel])
@@ -78,13 +83,13 @@ def bring_together(
         SharedScan((o.capture,), {**by_scan[o.lidar.points.tobytes()], channel: o.image}, o.lidar)
         for o in own
     ]
-    samples = sample_poses(scans, clocks, {name: results[name].noise_px for name in timed})
-    offset_s = np.array([results[name].time_offset_s for name in samples.channels], dtype=np.float64)
+    samples = sample_poses(scans, clocks, {name: of_channel[name].noise_px for name in timed})
+    offset_s = np.array([of_channel[name].time_offset_s for name in samples.channels], dtype=np.float64)
     only = channel if len(samples.channels) > 1 else None
     motions = fit_motions(samples, offset_s, only)
-    swept = compensate(own, motions, calibration.T_cam_lidar, clocks.sweep_s)
+    swept = compensate(own, motions, T_cam_lidar, clocks.sweep_s)
     return {
-        o.capture: Meeting(o, moved, _at_image_time(moved, o.image, calibration.T_cam_lidar))
+        o.capture: Meeting(o, moved, _at_image_time(moved, o.image, T_cam_lidar))
         for o, moved in zip(own, swept, strict=True)
     }
 
@@ -128,7 +133,7 @@ def match_candidates(candidates: Observation, board: Board, T_cam_lidar: Array) 
         itertools.product(range(len(poses)), range(len(candidates.places))), key=misfit
     )
     image = replace(candidates.image, T_cam_board=poses[pose_index])
-    return Observation(candidates.capture, image, candidates.places[lidar_index])
+    return replace(candidates, image=image, lidar=candidates.places[lidar_index], others=())
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +216,9 @@ def check_session(
     """
     pair = Pair(calibration.camera, channel, calibration.lidar)
     board = rig.board.to_board()
-    meetings = find_meetings(rig, detections, channel, calibration, clocks)
+    meetings = find_meetings(
+        rig, detections, pair, calibration.T_cam_lidar, calibration.channel_results, clocks
+    )
     residuals = [
         capture_residual(calibration.T_cam_lidar, meeting.at_scan_time, board)
         for meeting in meetings.values()
@@ -245,15 +252,21 @@ def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: 
 
 
 def find_meetings(
-    rig: Rig, detections: Detections, channel: str, calibration: Calibration, clocks: Clocks
+    rig: Rig,
+    detections: Detections,
+    pair: Pair,
+    T_cam_lidar: Array,
+    results: Sequence[ChannelResult],
+    clocks: Clocks,
 ) -> dict[str, Meeting]:
     """Match both sensors' boards in each capture of a channel in which they agree.
 
     Args:
         rig: the profile.
         detections: of the captures.
-        channel: of the camera.
-        calibration: the extrinsics.
+        pair: the sensors.
+        T_cam_lidar: (4, 4) the extrinsics.
+        results: of the channels of the calibration.
         clocks: the profile's settings of the two sensors' times.
 
     Returns:
@@ -261,17 +274,18 @@ def find_meetings(
     """
     board = rig.board.to_board()
     observations: dict[str, list[Observation]] = {}
-    for name in calibration.channels:
-        pair = Pair(calibration.camera, name, calibration.lidar)
-        if pair not in detections.pairs:
+    for name in sorted({pair.channel, *(result.channel for result in results)}):
+        of_channel = replace(pair, channel=name)
+        if of_channel not in detections.pairs:
             continue
         observations[name] = []
-        for capture in detections.captures(pair):
-            image, lidar = detections.of(pair, capture)
+        for capture in detections.captures(of_channel):
+            image, lidar = detections.of(of_channel, capture)
             if not isinstance(image, ImageBoard) or not isinstance(lidar, list):
                 continue
-            matched = match_candidates(Observation.of(capture, image, lidar), board, calibration.T_cam_lidar)
-            middle = calibration.T_cam_lidar @ matched.lidar.T_lidar_board[:, 3]
+            session = detections.session_of.get(capture, "")
+            matched = match_candidates(Observation.of(capture, image, lidar, session), board, T_cam_lidar)
+            middle = T_cam_lidar @ matched.lidar.T_lidar_board[:, 3]
             if np.linalg.norm(middle[:3] - matched.image.T_cam_board[:3, 3]) < _ELSEWHERE_M:
                 observations[name].append(matched)
-    return bring_together(observations, channel, calibration, clocks)
+    return bring_together(observations, pair.channel, T_cam_lidar, results, clocks)

@@ -7,7 +7,7 @@ looked for: those of a sensor that moved to and fro.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from lce_rig.judge.findings import (
     CAMERA_CHANGED,
     CAMERA_SHARES_DIFFER,
     CHANGED,
+    MOVED,
     SHARES_DIFFER,
     TWO_GROUPS,
     failing,
@@ -30,7 +31,7 @@ _MIN_PLACEMENTS = 6
 _MIN_SHARE = 3
 _N_LOTS = 400
 # Median of the chi-squared distribution with six degrees of freedom.
-_MEDIAN_CHI2 = 5.348
+MEDIAN_CHI2 = 5.348
 # Differences beyond this many limits fail.
 _FAIL = 2.0
 # Groups of captures: of fewer placements none are looked for, and a group has this share of them at least.
@@ -39,6 +40,20 @@ _N_NULL, _N_STARTS, _N_ROUNDS = 100, 10, 8
 _EULER = 0.5772
 # Errors that placements have in common, such as those of a laser, gain a tenth more than random ones.
 _COMMON = 1.1
+
+
+class RejectedGroup(NamedTuple):
+    """Captures, at least half of them rejected, that agree on extrinsics of their own.
+
+    Attributes:
+        captures: their names.
+        place: "last" or "first" in time; "" where others lie between them.
+        neighbour: the capture before the last ones, or after the first ones.
+    """
+
+    captures: tuple[str, ...]
+    place: str
+    neighbour: str
 
 
 @dataclass(frozen=True)
@@ -52,6 +67,7 @@ class Contrast:
         n_first: number of captures in the first subset.
         apart: (6,) tangent (translation m, rotation rad) from the second's extrinsics to the first's.
         group: indices of the first subset's captures, where no order tells them.
+        rejected: the captures of one subset, where they were rejected as outliers.
     """
 
     first: str
@@ -62,6 +78,7 @@ class Contrast:
     n_first: int
     apart: tuple[float, ...] = ()
     group: tuple[int, ...] = ()
+    rejected: RejectedGroup | None = None
 
     @property
     def is_change(self) -> bool:
@@ -93,7 +110,7 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
         return ()
     order = np.argsort(np.random.default_rng(seed).random((_N_LOTS, n_placements)), axis=1)
     by_lot, _ = _chi2(expansion, (order < n_placements // 2) @ expansion.groups)
-    unit = max(float(np.median(by_lot)) / _MEDIAN_CHI2, 1e-12)
+    unit = max(float(np.median(by_lot)) / MEDIAN_CHI2, 1e-12)
     x, y, z = centres.T
     # The capture from which on the results differ most, corrected for the number of captures tried.
     n = len(expansion.gradients)
@@ -101,7 +118,7 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
     chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
     best = int(np.argmax(chi2))
     chance = min(len(cuts) * _tail(chi2[best] / unit), 1.0)
-    found = [_contrast("before", "after", apart[best], chance, int(cuts[best]))]
+    found = [make_contrast("before", "after", apart[best], chance, int(cuts[best]))]
     for first, second, key in (
         ("near", "far", np.linalg.norm(centres, axis=1)),
         ("left", "right", x / z),
@@ -109,7 +126,7 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
     ):
         is_first = (np.argsort(np.argsort(key)) < len(key) // 2)[None].astype(np.float64)
         chi2, apart = _chi2(expansion, is_first)
-        found.append(_contrast(first, second, apart[0], _tail(chi2[0] / unit), int(is_first.sum())))
+        found.append(make_contrast(first, second, apart[0], _tail(chi2[0] / unit), int(is_first.sum())))
     return tuple(found)
 
 
@@ -158,7 +175,7 @@ def find_groups(expansion: Quadratics, seed: int = 0) -> tuple[Contrast, ...]:
     shares = smaller @ expansion.groups
     _, apart = _chi2(expansion, shares[None])
     members = np.flatnonzero(shares)
-    found = _contrast("group", "rest", apart[0], chance, len(members))
+    found = make_contrast("group", "rest", apart[0], chance, len(members))
     return (replace(found, group=tuple(members.tolist())),)
 
 
@@ -221,7 +238,8 @@ def _chi2(expansion: Quadratics, shares: Array) -> tuple[Array, Array]:
     return np.asarray(np.sum(apart * scaled, axis=1)), np.asarray(apart)
 
 
-def _contrast(first: str, second: str, apart: Array, chance: float, n_first: int) -> Contrast:
+def make_contrast(first: str, second: str, apart: Array, chance: float, n_first: int) -> Contrast:
+    """Describe two subsets by the tangent (6,) between their extrinsics."""
     rotation_deg, translation_m = tangent_sizes(apart)
     return Contrast(first, second, rotation_deg, translation_m, chance, n_first, tuple(apart.tolist()))
 
@@ -231,10 +249,14 @@ def objections(
 ) -> list[Contrast]:
     """List the subsets that differ significantly and by more than their limit.
 
-    A change at one capture makes two groups, too: it is told as the former.
+    A change at one capture makes two groups, too, and a change seen in rejected captures is seen in others:
+    each is told once.
     """
     found = [contrast for contrast in contrasts if contrast.excess(target, limits) > 1]
+    moved = [contrast for contrast in found if contrast.rejected is not None]
     has_changed = any(contrast.is_change for contrast in found)
+    if moved:
+        found = [*moved, *(each for each in found if not (each.is_change or each.rejected))]
     return [contrast for contrast in found if not (has_changed and contrast.group)]
 
 
@@ -262,7 +284,11 @@ def split_findings(
             "translation_m": c.translation_m,
             "chance": c.chance,
         }
-        if c.is_change:
+        if c.rejected is not None:
+            # Where the first captures were taken before a sensor moved, the result holds since.
+            severity = "warning" if c.rejected.place == "first" else severity
+            findings.append(MOVED(severity=severity, n_captures=c.n_first, **c.rejected._asdict(), **apart))
+        elif c.is_change:
             kind = CAMERA_CHANGED if of_cameras else CHANGED
             findings.append(kind(of_cameras, severity=severity, capture=captures[c.n_first], **apart))
         elif c.group:

@@ -19,6 +19,7 @@ from lce_rig.core.calibration import Contribution
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
+from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import (
     KnownBetter,
     find_contradictions,
@@ -31,6 +32,7 @@ from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.judge.local_quadratic import SCALE, expand
 from lce_rig.judge.negative_control import NegativeControl, run_control, run_control_with_constants
 from lce_rig.judge.nuisances import Nuisances, estimate_nuisances
+from lce_rig.judge.rejected_captures import find_moved
 from lce_rig.judge.split_consistency import Contrast, contrast_halves, find_groups
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import LidarSettings, Rig, VerdictSettings
@@ -165,6 +167,7 @@ def validate(
     lidar: LidarSettings,
     lens: Intrinsics,
     views: Sequence[BoardView],
+    rejected: Sequence[Observation] = (),
 ) -> Validation:
     """Check a result on its own captures.
 
@@ -174,6 +177,7 @@ def validate(
         lidar: its range error settings.
         lens: of the camera.
         views: its boards in the captures used.
+        rejected: captures in which both sensors see the board, that the estimate does not use.
     """
     board, known = rig.board.to_board(), estimate.sensitivities
     # More views do not improve the check of the intrinsics.
@@ -201,7 +205,8 @@ def validate(
             control = run_control(observations, board, estimate.T_cam_lidar, cov, settled, *moved)
         rings = np.unique(np.concatenate([observation.lidar.ring for observation in observations]))
         centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
-        contrasts = (*contrast_halves(settled, centres), *find_groups(settled))
+        of_rejected = find_moved(observations, rejected, board, estimate.T_cam_lidar, lidar)
+        contrasts = (*of_rejected, *contrast_halves(settled, centres), *find_groups(settled))
         nuisances = estimate_nuisances(expansion, rings)
     contradictions = list(find_contradictions(estimate, intrinsics, nuisances, contrasts, rig))
     cov_shared = profile_covariance(known)

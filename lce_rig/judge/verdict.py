@@ -19,6 +19,7 @@ from lce_rig.judge.findings import (
     FEW_PLACEMENTS,
     FEW_USED,
     HELD_OUT,
+    LAST_REJECTED,
     MAY_BE_OFF,
     NO_CERTIFICATE,
     NOT_CERTIFIED,
@@ -269,6 +270,8 @@ def _captures(estimate: CalibrationEstimate, n_captures: int, limits: QualitySet
         yield SENSORS_DISAGREE(
             severity=severity, n_refused=n_refused, n_captures=n, captures=tuple(disagreeing)
         )
+    if disagreeing and disagreeing[-1] > max(estimate.used) and disagreeing[-2:-1] < list(estimate.used[-1:]):
+        yield LAST_REJECTED(capture=disagreeing[-1])
     if n_used < limits.min_detected_fraction * n_captures:
         yield FEW_USED(n_used=n_used, n_captures=n_captures)
     if n_placements < limits.min_captures:

@@ -33,6 +33,7 @@ from lce_rig.export.reference import Reference
 from lce_rig.judge.camera_pairs import CameraPair, camera_findings, relate
 from lce_rig.judge.reach import point_uncertainties
 from lce_rig.judge.relative_pose import relative_pose
+from lce_rig.judge.session_check import find_meetings
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, share_findings
 from lce_rig.lens.lens_estimate import BoardView
@@ -225,8 +226,16 @@ def _examine(
             image = detections.images[pair.camera, pair.channel].get(name)
             if pair.channel in channels and isinstance(image, ImageBoard):
                 views.append(BoardView(name, pair.channel, image))
-    lens = rig.cameras[pairs[0].camera].to_intrinsics()
-    return validate(estimate, rig, rig.lidars[pairs[0].lidar], lens, views)
+    first, used = pairs[0], estimate.captures_of(estimate.used)
+    lens = rig.cameras[first.camera].to_intrinsics()
+    rejected = []
+    if estimate.refused:
+        # Of several channels, the first shows the boards.
+        pair = next(pair for pair in pairs if pair.channel in channels)
+        clocks = clocks_of(rig, pair.camera, pair.lidar)
+        meetings = find_meetings(rig, detections, pair, estimate.T_cam_lidar, estimate.channels, clocks)
+        rejected = [each.at_scan_time for name, each in meetings.items() if name not in used]
+    return validate(estimate, rig, rig.lidars[first.lidar], lens, views, rejected)
 
 
 def _links(rig: Rig, solved: Sequence[_Solved]) -> list[_Link]:

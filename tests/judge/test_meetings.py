@@ -57,7 +57,7 @@ def planes_m(observations: list[Observation]) -> Array:
 def test_planes_meet_once_the_motion_is_taken_off(
     observations: dict[str, list[Observation]], timed: Calibration, channel: str
 ) -> None:
-    meetings = bring_together(observations, channel, timed, CLOCKS)
+    meetings = bring_together(observations, channel, T_FORWARD, timed.channel_results, CLOCKS)
     assert list(meetings) == [o.capture for o in observations[channel]]
     together = planes_m([meeting.at_scan_time for meeting in meetings.values()])
     apart = planes_m([meeting.measured for meeting in meetings.values()])
@@ -69,7 +69,7 @@ def test_planes_meet_once_the_motion_is_taken_off(
 def test_the_lidars_board_is_drawn_where_the_picture_shows_it(
     observations: dict[str, list[Observation]], timed: Calibration, channel: str
 ) -> None:
-    for meeting in bring_together(observations, channel, timed, CLOCKS).values():
+    for meeting in bring_together(observations, channel, T_FORWARD, timed.channel_results, CLOCKS).values():
         T_cam_board = meeting.measured.image.T_cam_board
         moved = transform(T_FORWARD, meeting.lidar_at_image_time.points)
         distance_m = (moved - T_cam_board[:3, 3]) @ T_cam_board[:3, 2]
@@ -84,11 +84,11 @@ def test_without_time_offsets_boards_are_taken_to_have_stood_still(
     observations: dict[str, list[Observation]],
 ) -> None:
     still = calibration_of((result_of("frames", None),))
-    for meeting in bring_together(observations, "frames", still, CLOCKS).values():
+    for meeting in bring_together(observations, "frames", T_FORWARD, still.channel_results, CLOCKS).values():
         assert meeting.at_scan_time is meeting.measured
         assert meeting.lidar_at_image_time is meeting.measured.lidar
         assert meeting.way_m == 0
 
 
 def test_a_channel_without_observations_gives_none(timed: Calibration) -> None:
-    assert bring_together({"frames": []}, "frames", timed, CLOCKS) == {}
+    assert bring_together({"frames": []}, "frames", T_FORWARD, timed.channel_results, CLOCKS) == {}
