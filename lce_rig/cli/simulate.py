@@ -112,7 +112,6 @@ _CAPTURES, _DURATION_S = 30, 20.0
     "--range-offset", type=FiniteRange(-1, 1), metavar="M", help="Add a constant offset to all ranges."
 )
 @click.option("--decoy", is_flag=True, help="Place a blank plate of the board's size in the room.")
-@click.option("--furniture", is_flag=True, help="Draw the room's size and furniture by the seed.")
 def simulate(
     rig_name: str,
     session: Path | None,
@@ -190,7 +189,6 @@ def _options(rig: "Rig", motion: Any, choices: dict[str, Any]) -> "SimulationOpt
         noise_level=choices["noise_level"],
         mounting_seed=choices["mounting"],
         has_decoy_plate=choices["decoy"],
-        is_furnished=choices["furniture"],
         carrier=choices["carrier"] or options.carrier,
         frame_offset_s=choices["frame_offset"],
         event_offset_s=choices["event_offset"] or 0.0,
@@ -232,7 +230,7 @@ def _simulate_recording(
 ) -> None:
     from lce_rig.io.ros.bag_recorder import FolderRecorder
     from lce_rig.simulate import recording_truth, rig_truth, simulate_recording
-    from lce_rig.simulate.simulated_recording import stamp_of
+    from lce_rig.simulate.captures import stamp_of
 
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
     with FolderRecorder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:

@@ -1,8 +1,15 @@
 """The simulated rig: captures of any profile with exact truth, errors and clutter like real ones."""
 
-from lce_rig.simulate.captures import SimulatedCapture, board_time_ns, capture_truth, simulate_captures
+from lce_rig.simulate.captures import (
+    SimulatedCapture,
+    SimulatedRecording,
+    board_time_ns,
+    capture_truth,
+    recording_truth,
+    simulate_captures,
+    simulate_recording,
+)
 from lce_rig.simulate.options import CameraNoise, EventNoise, HandMotion, LidarNoise, SimulationOptions
-from lce_rig.simulate.simulated_recording import SimulatedRecording, recording_truth, simulate_recording
 from lce_rig.simulate.stage import rig_truth, truth_extrinsics
 
 __all__ = [

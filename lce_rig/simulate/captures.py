@@ -1,7 +1,9 @@
-"""A simulated session with its truth: captures of the board among decoys, still or hand-held."""
+"""Samples of a board that is held still or moved, and simulated sessions of them with their truth."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from heapq import merge
 from typing import Any
 
 import numpy as np
@@ -10,18 +12,123 @@ from numpy.typing import NDArray
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.rig import Rig
-from lce_rig.simulate.carriers import build_carrier
+from lce_rig.simulate.event_camera import EventCamera
+from lce_rig.simulate.image_rendering import expose, render_radiance
+from lce_rig.simulate.lidar import sweep_scene
 from lce_rig.simulate.options import SimulationOptions
+from lce_rig.simulate.poses import Trajectory, carry_board, hold_board, sway_board
+from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import Scene
-from lce_rig.simulate.stage import CARRIER, HAND, PHASE, PLACEMENT, Stage, set_stage
-from lce_rig.simulate.subframes import film
-from lce_rig.simulate.takes import MovingBoard, take_image, take_scan
-from lce_rig.simulate.trajectory import Trajectory, hold_board, sway_board
+from lce_rig.simulate.stage import (
+    CARRIER,
+    EVENTS,
+    HAND,
+    IMAGE,
+    OF_SESSION,
+    PHASE,
+    PLACEMENT,
+    SCAN,
+    Stage,
+    set_stage,
+)
+from lce_rig.simulate.subframes import MovingView, film, speed_px_s
 
-_FIRST_STAMP_NS = 1_700_000_000_000_000_000
+# While the shutter is open the board is drawn at moments that lie this far apart in the image at most.
+_SMEAR_STEP_PX = 0.35
+_MOST_MOMENTS = 15
+
+Stream = tuple[int, ...]
+_START_NS = 1_700_000_000_000_000_000
 _CAPTURE_EVERY_NS = 4_000_000_000
 # Range noise, and mixed returns at the border, do not count as the board's.
 _ON_BOARD_M = 0.05
+_PACKET_NS = 20_000_000
+_TRACK_EVERY_NS = 10_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class StagedBoard:
+    """A board, held still or moved, and its carrier in front of the sensors of a stage.
+
+    Samples are taken at times of the rig's clock. Their noise follows from a stream of random numbers.
+
+    Attributes:
+        stage: the session.
+        trajectory: where the board is.
+        carrier_rng: source of what its carrier looks like; it is copied, so that the carrier stays the same.
+    """
+
+    stage: Stage
+    trajectory: Trajectory
+    carrier_rng: np.random.Generator
+
+    def scene_at(self, t_ns: int) -> Scene:
+        """Build the scene at a time."""
+        T_world_board, stage = self.trajectory.at(t_ns), self.stage
+        carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, deepcopy(self.carrier_rng))
+        return Scene(
+            stage.room.raycaster, carrier, stage.board, T_world_board, stage.options.print_reflectivity
+        )
+
+    def take_image(self, camera: str, exposed_ns: int, stream: Stream) -> Image:
+        """Expose an image about a time: the mean of what is seen while the shutter is open."""
+        stage, options = self.stage, self.stage.options
+        backdrop = stage.backdrops[camera]
+        smear_px = options.exposure_s * speed_px_s(self.trajectory, stage.board, backdrop, exposed_ns)
+        n_moments = int(np.clip(np.ceil(smear_px / _SMEAR_STEP_PX), 1, _MOST_MOMENTS))
+        middles = (np.arange(n_moments) + 0.5) / n_moments - 0.5
+        moments_ns = exposed_ns + np.rint(1e9 * options.exposure_s * middles).astype(np.int64)
+        scene = self.scene_at(exposed_ns)
+        scenes = [scene.with_board_at(T_world_board) for T_world_board in self.trajectory.at(moments_ns)]
+        radiance = np.mean([render_radiance(moment, backdrop) for moment in scenes], axis=0)
+        rng = stage.rng(*_numbered(stream, IMAGE, list(stage.backdrops).index(camera)))
+        stamp_ns = exposed_ns + round(1e9 * options.frame_offset_s)
+        channel = stage.rig.cameras[camera].first_channel("frames") or "frames"
+        return Image(camera, channel, stamp_ns, expose(radiance, options.camera, rng), stamp_ns)
+
+    def take_scan(self, lidar: str, stamp_ns: int, stream: Stream) -> Scan:
+        """Take a scan that begins at a time; every firing meets a moving board where it is by then.
+
+        The carrier stays where it is when the rotor has made half its turn.
+        """
+        stage = self.stage
+        T_world_lidar, model, noise = stage.T_world_sensor[lidar], stage.models[lidar], stage.noise[lidar]
+        scene = self.scene_at(stamp_ns + model.period_ns // 2)
+        rng = stage.rng(*_numbered(stream, SCAN, list(stage.models).index(lidar)))
+        board_at = None if self.trajectory.is_still else self.trajectory.at
+        sweep = sweep_scene(scene, T_world_lidar, model, noise, rng, stamp_ns, board_at)
+        return stage.measure(lidar, sweep, rng, stamp_ns)
+
+    def view(self, camera: str) -> MovingView:
+        """Look at the board through a camera's lens."""
+        options = self.stage.options
+        backdrop = self.stage.backdrops[camera]
+        return MovingView(
+            backdrop, self.stage.board, self.trajectory, self.scene_at, options.camera, options.flicker_depth
+        )
+
+    def take_events(
+        self, camera: str, start_ns: int, end_ns: int, every_ns: int, stream: Stream
+    ) -> Iterator[Events]:
+        """Record an event camera from one time to another, in packets of `every_ns`."""
+        stage, view = self.stage, self.view(camera)
+        sensor = EventCamera(
+            stage.pixels[camera],
+            stage.options.events,
+            view.at(start_ns),
+            start_ns,
+            stage.rng(*_numbered(stream, EVENTS, list(stage.pixels).index(camera))),
+            sensor=camera,
+            offset_ns=round(1e9 * stage.options.event_offset_s),
+        )
+        for t_ns in range(start_ns, end_ns, every_ns):
+            film(view, sensor, t_ns, min(t_ns + every_ns, end_ns))
+            yield sensor.take()
+
+
+def _numbered(stream: Stream, kind: int, sensor: int) -> Stream:
+    """Name the stream of one sensor: (session or capture, kind, sensor, what else there is)."""
+    return (stream[0], kind, sensor, *stream[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +183,12 @@ def simulate_captures(
     """
     stage = set_stage(rig, seed, options)
     for index in range(n_captures):
+        rng = stage.rng(index, PLACEMENT)
+        T_world_board = stage.place(index, rng)
         if stage.options.motion == "moving":
-            yield _moving_capture(stage, index)
+            yield _moving_capture(stage, index, T_world_board)
         else:
-            rng = stage.rng(index, PLACEMENT)
-            yield capture_at(stage, index, stage.place(index, rng), rng)
+            yield capture_at(stage, index, T_world_board, rng)
 
 
 def capture_at(
@@ -94,63 +202,44 @@ def capture_at(
         T_world_board: (4, 4).
         rng: source of what its carrier looks like; follows from the index by default.
     """
-    carrier_rng = stage.rng(index, CARRIER) if rng is None else rng
-    carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, carrier_rng)
-    scene = Scene(stage.room.raycaster, carrier, stage.board, T_world_board, stage.options.print_reflectivity)
-    stamp_ns = _FIRST_STAMP_NS + index * _CAPTURE_EVERY_NS
-    exposed_ns = stamp_ns + _half_turn_ns(stage, index)
-    images = [take_image(stage, camera, scene, exposed_ns, (index,)) for camera in stage.framed]
-    scans = [take_scan(stage, lidar, scene, stamp_ns, (index,)) for lidar in stage.models]
-    times_ns = dict.fromkeys(stage.T_world_sensor, stamp_ns)
-    return _capture(stage, index, images, scans, [], hold_board(T_world_board), times_ns)
+    board = StagedBoard(stage, hold_board(T_world_board), rng or stage.rng(index, CARRIER))
+    return _capture(board, index, _middle_ns(stage, index))
 
 
-def _moving_capture(stage: Stage, index: int) -> SimulatedCapture:
+def _moving_capture(stage: Stage, index: int, T_world_board: Array) -> SimulatedCapture:
     """Take one capture of a board that passes its placement when the LiDAR scans it."""
-    options = stage.options
-    stamp_ns = _FIRST_STAMP_NS + index * _CAPTURE_EVERY_NS
-    middle_ns = stamp_ns + _half_turn_ns(stage, index)
-    T_world_board = stage.place(index, stage.rng(index, PLACEMENT))
+    options, middle_ns = stage.options, _middle_ns(stage, index)
     trajectory = sway_board(T_world_board, middle_ns, options.hand, stage.rng(index, HAND))
-    board = MovingBoard(stage, trajectory, (index, CARRIER))
     # A camera that runs freely: its image nearest to the scan's middle, by its own timestamps.
     phase_s = options.frame_every_s * stage.rng(index, PHASE).uniform(-0.5, 0.5)
     exposed_ns = middle_ns + round(1e9 * (phase_s - options.frame_offset_s))
+    return _capture(StagedBoard(stage, trajectory, stage.rng(index, CARRIER)), index, exposed_ns)
+
+
+def _middle_ns(stage: Stage, index: int) -> int:
+    """Find when the LiDAR of a capture looks straight ahead."""
+    lidar = stage.views[index % len(stage.views)].lidar
+    return _START_NS + index * _CAPTURE_EVERY_NS + stage.models[lidar].period_ns // 2
+
+
+def _capture(board: StagedBoard, index: int, exposed_ns: int) -> SimulatedCapture:
+    """Take samples, with the truth at each sensor's own time."""
+    stage, options = board.stage, board.stage.options
+    stamp_ns = _START_NS + index * _CAPTURE_EVERY_NS
     images = [board.take_image(camera, exposed_ns, (index,)) for camera in stage.framed]
     scans = [board.take_scan(lidar, stamp_ns, (index,)) for lidar in stage.models]
     before_s, after_s = options.events_span_s
     start_ns, end_ns = (stamp_ns + round(1e9 * (s - options.event_offset_s)) for s in (-before_s, after_s))
-    events = []
-    for camera in stage.pixels:
-        view = board.view(camera)
-        sensor = board.event_camera(camera, view, start_ns, (index,))
-        film(view, sensor, start_ns, end_ns)
-        events.append(sensor.take())
+    events = [
+        next(board.take_events(camera, start_ns, end_ns, end_ns - start_ns, (index,)))
+        for camera in stage.pixels
+    ]
     times_ns = dict.fromkeys(stage.T_world_sensor, stamp_ns) | dict.fromkeys(stage.framed, exposed_ns)
-    return _capture(stage, index, images, scans, events, trajectory, times_ns)
-
-
-def _half_turn_ns(stage: Stage, index: int) -> int:
-    """How long after its scan's timestamp the LiDAR of this capture looks straight ahead."""
-    view = stage.views[index % len(stage.views)]
-    return stage.models[view.lidar].period_ns // 2
-
-
-def _capture(
-    stage: Stage,
-    index: int,
-    images: list[Image],
-    scans: list[Scan],
-    events: list[Events],
-    trajectory: Trajectory,
-    times_ns: Mapping[str, int],
-) -> SimulatedCapture:
-    """Put samples together with the truth at each sensor's own time."""
-    view = stage.views[index % len(stage.views)]
     T_sensor_board = {
-        name: invert(T_world_sensor) @ trajectory.at(times_ns[name])
+        name: invert(T_world_sensor) @ board.trajectory.at(times_ns[name])
         for name, T_world_sensor in stage.T_world_sensor.items()
     }
+    view = stage.views[index % len(stage.views)]
     return SimulatedCapture(
         index,
         images,
@@ -159,7 +248,7 @@ def _capture(
         {name: T_sensor_board[name] for name in stage.rig.cameras},
         (view.camera, view.lidar),
         events,
-        trajectory,
+        board.trajectory,
         stage.T_world_sensor,
     )
 
@@ -205,3 +294,93 @@ def board_time_ns(rig: Rig, capture: SimulatedCapture, scan: Scan) -> int:
     points = transform(T_board_lidar, scan.points[near, None].astype(np.float64))[:, 0]
     is_on = np.all(np.abs(points) < [board.width_m / 2, board.height_m / 2, _ON_BOARD_M], axis=1)
     return first_ns + round(offset_ns[is_on].mean()) if is_on.any() else middle_ns
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedRecording:
+    """A recording with its truth; iterating yields its samples in order of their timestamps.
+
+    Attributes:
+        stage: the rig's true geometry and the room.
+        trajectory: where the board is in the world at any time of the rig's clock, the LiDAR's.
+        start_ns, end_ns: on the rig's clock.
+    """
+
+    stage: Stage
+    trajectory: Trajectory
+    start_ns: int
+    end_ns: int
+
+    def __iter__(self) -> Iterator[Image | Scan | Events]:
+        board = StagedBoard(self.stage, self.trajectory, self.stage.rng(OF_SESSION, CARRIER))
+        streams: list[Iterator[Image | Scan | Events]] = [
+            *(self._pictures(board, camera) for camera in self.stage.framed),
+            *(self._scans(board, lidar) for lidar in self.stage.models),
+            *(
+                filter(len, board.take_events(camera, self.start_ns, self.end_ns, _PACKET_NS, (OF_SESSION,)))
+                for camera in self.stage.pixels
+            ),
+        ]
+        return merge(*streams, key=stamp_of)
+
+    def T_sensor_board(self, sensor: str, t_ns: int | NDArray[np.int64]) -> Array:
+        """Compute the board's true pose (..., 4, 4) before a camera or LiDAR at times of the rig's clock.
+
+        Timestamps of images and events read `frame_offset_s` or `event_offset_s` more than that clock.
+        """
+        return np.asarray(invert(self.stage.T_world_sensor[sensor]) @ self.trajectory.at(t_ns))
+
+    def _pictures(self, board: StagedBoard, camera: str) -> Iterator[Image]:
+        every_ns = round(1e9 * self.stage.options.frame_every_s)
+        for k, t_ns in enumerate(range(self.start_ns + every_ns // 2, self.end_ns, every_ns)):
+            yield board.take_image(camera, t_ns, (OF_SESSION, k))
+
+    def _scans(self, board: StagedBoard, lidar: str) -> Iterator[Scan]:
+        period_ns = self.stage.models[lidar].period_ns
+        for k, t_ns in enumerate(range(self.start_ns, self.end_ns - period_ns + 1, period_ns)):
+            yield board.take_scan(lidar, t_ns, (OF_SESSION, k))
+
+
+def stamp_of(sample: Image | Scan | Events) -> int:
+    """Read a sample's timestamp; a packet of events has that of its first one."""
+    return int(sample.t_ns[0]) if isinstance(sample, Events) else int(sample.stamp_ns or 0)
+
+
+def simulate_recording(
+    rig: Rig, *, duration_s: float, seed: int, options: SimulationOptions | None = None
+) -> SimulatedRecording:
+    """Set up a recording; iterating over it simulates it, and gives the same bytes each time.
+
+    The board passes the placements that `simulate_captures` of this seed would show, from one to the next.
+
+    Args:
+        rig: the profile.
+        duration_s: of the recording.
+        seed: of truth, room, placements and noise.
+        options: `SimulationOptions.for_rig` of the rig by default; the board always moves.
+
+    Raises:
+        ProfileError: a LiDAR's model is unknown, or no camera has a channel that can be simulated.
+        LceRigError: no place for the board is seen by the camera and the LiDAR.
+    """
+    options = replace(options or SimulationOptions.for_rig(rig.name), motion="moving")
+    stage = set_stage(rig, seed, options)
+    end_ns = _START_NS + round(1e9 * duration_s)
+    placements: list[Array] = []
+    while True:
+        placements.append(stage.place(len(placements), stage.rng(len(placements), PLACEMENT)))
+        trajectory = carry_board(placements, _START_NS, options.hand, stage.rng(OF_SESSION, HAND))
+        if trajectory.departure_ns[-1] >= end_ns:
+            return SimulatedRecording(stage, trajectory, _START_NS, end_ns)
+
+
+def recording_truth(recording: SimulatedRecording) -> dict[str, Any]:
+    """Return where the board is before the first LiDAR, 100 times per second.
+
+    Returns:
+        `boards`: by LiDAR `t_ns` (K), on the rig's clock, and `T_sensor_board` (K, 4, 4).
+    """
+    lidar = next(iter(recording.stage.rig.lidars))
+    t_ns = np.arange(recording.start_ns, recording.end_ns + _TRACK_EVERY_NS, _TRACK_EVERY_NS)
+    track = {"t_ns": t_ns.tolist(), "T_sensor_board": recording.T_sensor_board(lidar, t_ns).tolist()}
+    return {"boards": {lidar: track}}

@@ -7,8 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.simulate.backdrop import SHADOW_STEP_PX, Backdrop, beside_changes, pixel_rays, sub_rays
-from lce_rig.simulate.light import irradiance, reached
+from lce_rig.simulate.backdrop import (
+    SHADOW_STEP_PX,
+    Backdrop,
+    beside_changes,
+    irradiance,
+    pixel_rays,
+    reached,
+    sub_rays,
+)
 from lce_rig.simulate.options import CameraNoise
 from lce_rig.simulate.scene import Scene
 

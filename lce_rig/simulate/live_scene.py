@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, pose
 from lce_rig.rig import Rig
-from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.image_rendering import develop, focus, glance, render_radiance, shot_noise_e
 from lce_rig.simulate.lidar import Sweep, sweep_again, sweep_scene
 from lce_rig.simulate.options import SimulationOptions
-from lce_rig.simulate.poses import can_be_held, count_rings
+from lce_rig.simulate.poses import between, can_be_held, count_rings
+from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, OF_SESSION, set_stage
-from lce_rig.simulate.trajectory import between
 
 _NOISE_STREAM = 102
 # A place that no beam reaches.

@@ -1,4 +1,4 @@
-"""The room around the rig, with objects that a detector must not mistake for the board."""
+"""The room around the rig, with objects that must not be mistaken for the board, and the board's carrier."""
 
 from dataclasses import dataclass
 
@@ -7,17 +7,16 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, pose, transform
-from lce_rig.simulate.furniture import draw_furniture
-from lce_rig.simulate.materials import Material
+from lce_rig.simulate.options import Carrier, Furnish, Obstacles, Part
 from lce_rig.simulate.scene import PLATE, Raycaster, Surface
-from lce_rig.simulate.shapes import Mesh, box, cone, inside_box, merge, rectangle
+from lce_rig.simulate.surfaces import Material, Mesh, box, cone, ellipsoid, inside_box, limb, merge, rectangle
 
 _WALL = Material((0.66, 0.70, 0.72), 0.75)
 _FLOOR = Material((0.42, 0.47, 0.50), 0.45, "tiles", gloss=0.5)
 _CEILING = Material((0.75, 0.77, 0.78), 0.8, "panels")
 _SKIRTING = Material((0.05, 0.06, 0.08), 0.15)
 _WOOD = Material((0.16, 0.30, 0.48), 0.5, "wood")
-_STEEL = Material((0.28, 0.28, 0.28), 0.35)
+_LEGS = Material((0.28, 0.28, 0.28), 0.35)
 _RED = Material((0.05, 0.05, 0.45), 0.5)
 _DARK = Material((0.03, 0.03, 0.035), 0.1)
 _CARDBOARD = Material((0.22, 0.38, 0.50), 0.6, "cloth")
@@ -30,7 +29,7 @@ LIDAR_HEIGHT_M = 1.0
 _LOW = np.array([-4.6, -3.1, 0.0])
 _HIGH = np.array([9.0, 3.4, 3.1])
 # (low, high) of what stands in the room, to keep the board out of it
-_OBSTACLES: tuple[tuple[Array, Array], ...] = (
+_OBSTACLES: Obstacles = (
     (np.array([4.9, 1.2, 0.0]), np.array([5.5, 1.8, 3.1])),
     (np.array([4.6, -3.1, 0.0]), np.array([6.3, -2.0, 1.3])),
     (np.array([1.9, 2.5, 0.0]), np.array([2.6, 3.4, 2.0])),
@@ -56,7 +55,7 @@ class Room:
     lamps: Array
     low: Array
     high: Array
-    obstacles: tuple[tuple[Array, Array], ...]
+    obstacles: Obstacles
     T_world_decoy: Array | None = None
 
     def is_free(self, points_world: Array, margin_m: float = 0.1) -> NDArray[np.bool_]:
@@ -75,30 +74,23 @@ def build_room(
     heading_rad: float,
     rng: np.random.Generator,
     decoy: Board | None = None,
-    *,
-    is_furnished: bool = False,
+    furnish: Furnish | None = None,
 ) -> Room:
     """Build the room around the rig.
 
     Args:
         heading_rad: azimuth that the first camera looks along, world.
-        rng: source of the room's turn against the rig, of the decoy's place and of drawn furniture.
+        rng: source of the room's turn against the rig, and of what is drawn in it.
         decoy: a blank plate of this board's size stands at the side; None for none.
-        is_furnished: whether the room's size and furniture are drawn, instead of one room for all.
+        furnish: draws corners (3,), parts and obstacles of a room from those of the usual one; None keeps it.
     """
     turn_rad = heading_rad + np.radians(rng.uniform(-6.0, 6.0))
     T_world_room = pose(_turn_z(turn_rad), np.zeros(3))
-    low, high, obstacles = _LOW, _HIGH, _OBSTACLES
+    low, high, obstacles, parts = _LOW, _HIGH, _OBSTACLES, _furniture()
     T_room_decoy = None if decoy is None else _decoy_pose(rng)
-    if is_furnished:
-        low, high = (
-            low + rng.uniform([-1, -1, 0], [1, 0.6, 0]),
-            high + rng.uniform([-1, -0.6, -0.5], [3, 1, 0.6]),
-        )
-        pieces, bounds = draw_furniture(low, high, rng)
-        parts, obstacles = [*_shell(low, high), *pieces], tuple(bounds)
-    else:
-        parts = [*_shell(low, high), *_furniture()]
+    if furnish is not None:
+        low, high, parts, obstacles = furnish(low, high, rng)
+    parts = [*_shell(low, high), *parts]
     if decoy is not None and T_room_decoy is not None:
         parts += _decoy(decoy, T_room_decoy)
     surfaces = [
@@ -110,26 +102,23 @@ def build_room(
     return Room(T_world_room, Raycaster(surfaces), lamps, low, high, obstacles, T_world_decoy)
 
 
-_Part = tuple[str, Mesh, Material, Array]
-
-
 def _turn_z(angle_rad: float) -> Array:
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _part(name: str, mesh: Mesh, material: Material) -> _Part:
+def _part(name: str, mesh: Mesh, material: Material) -> Part:
     return name, mesh, material, np.eye(4)
 
 
-def _on_wall(name: str, size_m: tuple[float, float], at: Array, facing: Array, material: Material) -> _Part:
+def _on_wall(name: str, size_m: tuple[float, float], at: Array, facing: Array, material: Material) -> Part:
     """Place a rectangle upright, its middle at `at`, facing along `facing` (horizontal)."""
     right = np.cross([0.0, 0.0, 1.0], facing)
     T = pose(np.stack([right, [0.0, 0.0, 1.0], facing], axis=1), at)
     return name, rectangle(*size_m).moved(T), material, T
 
 
-def _shell(low: Array, high: Array) -> list[_Part]:
+def _shell(low: Array, high: Array) -> list[Part]:
     size, middle = high - low, (high + low) / 2
     walls = inside_box(size, middle)
     # Faces come in the order -x +x -y +y -z +z, two triangles and four vertices each.
@@ -151,7 +140,7 @@ def _shell(low: Array, high: Array) -> list[_Part]:
     ]
 
 
-def _furniture() -> list[_Part]:
+def _furniture() -> list[Part]:
     pillar = box((0.6, 0.6, 3.1), (5.2, 1.5, 1.55))
     legs = [cone((x, y, 0), (x, y, 0.72), 0.025) for x in (4.7, 6.2) for y in (-2.95, -2.1)]
     screen = box((0.05, 0.55, 0.34), (5.3, -2.55, 1.1))
@@ -162,7 +151,7 @@ def _furniture() -> list[_Part]:
         _part("pillar", pillar, _WALL),
         _part("skirting", box((0.64, 0.64, 0.12), (5.2, 1.5, 0.06)), _SKIRTING),
         _part("table", box((1.6, 0.95, 0.035), (5.45, -2.52, 0.737)), _WOOD),
-        _part("table legs", merge(legs), _STEEL),
+        _part("table legs", merge(legs), _LEGS),
         _part("screen", merge([screen, cone((5.32, -2.55, 0.75), (5.32, -2.55, 1.0), 0.03)]), _DARK),
         _part("carton", box((0.45, 0.4, 0.32), (5.95, -2.5, 0.915)), _CARDBOARD),
         _part("bin", cone((4.35, 2.9, 0.0), (4.35, 2.9, 0.55), 0.17, 0.2), _RED),
@@ -189,12 +178,148 @@ def _decoy_pose(rng: np.random.Generator) -> Array:
     return pose(upright @ _turn_z(np.radians(rng.uniform(35.0, 55.0))), at)
 
 
-def _decoy(board: Board, T_room_decoy: Array) -> list[_Part]:
+def _decoy(board: Board, T_room_decoy: Array) -> list[Part]:
     plate = rectangle(board.width_m, board.height_m).moved(T_room_decoy)
     foot = T_room_decoy[:3, 3] - 0.06 * T_room_decoy[:3, 2]
     pole = cone((foot[0], foot[1], 0.02), foot, 0.015)
     base = box((0.4, 0.4, 0.03), (foot[0], foot[1], 0.015))
     return [
         ("decoy plate", plate, PLATE, T_room_decoy),
-        _part("decoy stand", merge([pole, base]), _STEEL),
+        _part("decoy stand", merge([pole, base]), _LEGS),
     ]
+
+
+_STEEL = Material((0.50, 0.50, 0.50), 0.5)
+_RUBBER = Material((0.03, 0.03, 0.03), 0.08)
+_SKIN = Material((0.30, 0.42, 0.62), 0.6)
+_HAIR = Material((0.02, 0.02, 0.025), 0.12)
+_TROUSERS = Material((0.16, 0.13, 0.11), 0.35, "cloth")
+SHIRTS = (
+    Material((0.20, 0.10, 0.07), 0.55, "cloth"),
+    Material((0.12, 0.12, 0.30), 0.45, "cloth"),
+    Material((0.10, 0.20, 0.09), 0.5, "cloth"),
+    Material((0.07, 0.07, 0.07), 0.3, "cloth"),
+)
+
+
+def build_carrier(
+    carrier: Carrier, board: Board, T_world_board: Array, rng: np.random.Generator
+) -> list[Surface]:
+    """Build what carries the board at T_world_board (4, 4), standing on the floor z = 0 behind it."""
+    if carrier == "stand":
+        return _stand(board, T_world_board)
+    if carrier == "person":
+        return _person(board, T_world_board, rng)
+    return []
+
+
+def _backwards(T_world_board: Array) -> Array:
+    """The horizontal direction (3,) away from the board's back."""
+    normal = T_world_board[:3, 2] * [1.0, 1.0, 0.0]
+    return np.asarray(-normal / max(float(np.linalg.norm(normal)), 1e-6))
+
+
+def _clearance(bodies: Array, board: Board, T_world_board: Array, gap_m: float) -> float:
+    """Find how far bodies must move backwards so that all they have near the plate lies `gap_m` behind it.
+
+    Args:
+        bodies: (N, 3) points all over them, m, world.
+        board: the board.
+        T_world_board: (4, 4).
+        gap_m: distance left.
+    """
+    along = float(T_world_board[:3, 2] @ _backwards(T_world_board))  # negative: backwards leaves the pattern
+    outline = transform(T_world_board, board.outline())
+    low, high = outline[:, 2].min() - 0.1, outline[:, 2].max() + 0.1
+    near = bodies[(bodies[:, 2] > low) & (bodies[:, 2] < high)]
+    ahead = (near - T_world_board[:3, 3]) @ T_world_board[:3, 2]
+    return float(np.max((ahead + gap_m) / -along, initial=0.0))
+
+
+def _stand(board: Board, T_world_board: Array) -> list[Surface]:
+    centre, back = T_world_board[:3, 3], _backwards(T_world_board)
+    side = np.cross([0.0, 0.0, 1.0], back)
+    spots = [0.05 * side, -0.05 * side, 0.05 * side + 0.1 * back, -0.05 * side + 0.1 * back]
+    top_m = float(centre[2])
+    feet = np.stack([centre + spot for spot in spots]) * [1.0, 1.0, 0.0]
+    heights = np.linspace(0.14, top_m, 41)[:, None, None] * np.array([0.0, 0.0, 1.0])
+    away = back * (_clearance((feet + heights).reshape(-1, 3), board, T_world_board, 0.03) + 0.011)
+    poles = merge([cone(foot + away + heights[0, 0], foot + away + heights[-1, 0], 0.011) for foot in feet])
+    arm = cone(centre - 0.008 * T_world_board[:3, 2], centre + away + 0.1 * back, 0.014)
+    hub = centre + away + 0.05 * back
+    deck = box((0.34, 0.26, 0.03))
+    R = np.eye(4)
+    R[:3, :3] = np.stack([back, side, [0.0, 0.0, 1.0]], axis=1)
+    R[:3, 3] = [hub[0], hub[1], 0.13]
+    wheels = [ellipsoid((x, y, 0.06), (0.055, 0.018, 0.06)) for x in (-0.15, 0.15) for y in (-0.11, 0.11)]
+    R_floor = R.copy()
+    R_floor[2, 3] = 0.0
+    return [
+        Surface("stand", merge([poles, arm, deck.moved(R)]), _STEEL, R),
+        Surface("stand wheels", merge(wheels).moved(R_floor), _RUBBER, R),
+    ]
+
+
+def _person(board: Board, T_world_board: Array, rng: np.random.Generator) -> list[Surface]:
+    """Stand a person behind the board, facing it, holding it at two opposite corners."""
+    size = rng.uniform(0.94, 1.05)
+    centre, back = T_world_board[:3, 3], _backwards(T_world_board)
+    side = np.cross([0.0, 0.0, 1.0], back)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([back, side, [0.0, 0.0, 1.0]], axis=1)
+    T[:3, 3] = [centre[0], centre[1], 0.0]
+    T[:3, 3] += rng.uniform(-0.06, 0.06) * side
+    body = build_body(size)
+    vertices = np.concatenate([mesh.moved(T).vertices for mesh, _ in body.values()])
+    T[:3, 3] += _clearance(vertices, board, T_world_board, rng.uniform(0.04, 0.15)) * back
+    shirt = SHIRTS[rng.integers(len(SHIRTS))]
+    shoulders = transform(T, np.array([[0.0, s * 0.19, 1.40] for s in (-1.0, 1.0)]) * size)
+    arms, hands = _arms(board, T_world_board, shoulders, back)
+    surfaces = [Surface(name, mesh.moved(T), material or shirt, T) for name, (mesh, material) in body.items()]
+    return [*surfaces, Surface("sleeves", arms, shirt, T), Surface("hands", hands, _SKIN, T)]
+
+
+def build_body(size: float) -> dict[str, tuple[Mesh, Material | None]]:
+    """Build torso, head and legs, x backwards, standing on the origin; None takes the shirt's material."""
+    s = size
+    torso = [
+        ellipsoid((0, 0, 1.22 * s), (0.115 * s, 0.19 * s, 0.30 * s)),
+        ellipsoid((0, 0, 1.36 * s), (0.10 * s, 0.215 * s, 0.12 * s)),
+        ellipsoid((0, 0, 0.96 * s), (0.12 * s, 0.175 * s, 0.16 * s)),
+    ]
+    head = [
+        ellipsoid((0, 0, 1.63 * s), (0.10 * s, 0.078 * s, 0.12 * s)),
+        cone((0, 0, 1.45 * s), (0, 0, 1.56 * s), 0.055),
+    ]
+    hair = [ellipsoid((0.018 * s, 0, 1.665 * s), (0.10 * s, 0.085 * s, 0.10 * s))]
+    legs = [
+        limb((0, y, 0.90 * s), (0.02, 1.25 * y, 0.09 * s), 0.085 * s, 0.05 * s) for y in (-0.09 * s, 0.09 * s)
+    ]
+    shoes = [ellipsoid((-0.05, 1.3 * y, 0.04), (0.14, 0.05, 0.05)) for y in (-0.09 * s, 0.09 * s)]
+    return {
+        "torso": (merge(torso), None),
+        "head": (merge(head), _SKIN),
+        "hair": (merge(hair), _HAIR),
+        "legs": (merge(legs), _TROUSERS),
+        "shoes": (merge(shoes), _RUBBER),
+    }
+
+
+def _arms(board: Board, T_world_board: Array, shoulders: Array, back: Array) -> tuple[Mesh, Mesh]:
+    """Build arms from the shoulders (2, 3) to hands that reach over the plate's outermost corners."""
+    outline = transform(T_world_board, board.outline())
+    side = shoulders[1] - shoulders[0]
+    reach = (outline - T_world_board[:3, 3]) @ side
+    arms, hands = [], []
+    for shoulder, corner in zip(shoulders, (int(np.argmin(reach)), int(np.argmax(reach))), strict=True):
+        # A hand holds an edge a little below the corner, its fingertips 2 cm over the plate.
+        lower = min((corner + 1) % 4, (corner - 1) % 4, key=lambda k: outline[k, 2])
+        grip = outline[corner] + 0.12 * (outline[lower] - outline[corner])
+        outwards = grip - T_world_board[:3, 3]
+        outwards /= np.linalg.norm(outwards)
+        hand = grip + 0.03 * outwards
+        wrist = hand + 0.07 * back + 0.02 * outwards
+        elbow = (shoulder + wrist) / 2 + 0.10 * back + np.array([0.0, 0.0, -0.12])
+        arms += [limb(shoulder, elbow, 0.055, 0.045), limb(elbow, wrist, 0.045, 0.035)]
+        hands += [ellipsoid(hand, (0.048, 0.048, 0.055)), limb(wrist, hand, 0.032, 0.035)]
+    return merge(arms), merge(hands)

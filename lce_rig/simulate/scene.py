@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.interrupts import without_interrupt
-from lce_rig.simulate.materials import Material, albedo, checker
-from lce_rig.simulate.shapes import Mesh, rectangle
+from lce_rig.simulate.surfaces import Material, Mesh, albedo, checker, rectangle
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

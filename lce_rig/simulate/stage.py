@@ -145,7 +145,7 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
         float(np.arctan2(sight[1], sight[0])),
         np.random.default_rng([seed, OF_SESSION, ROOM]),
         rig.board.to_board() if options.has_decoy_plate else None,
-        is_furnished=options.is_furnished,
+        options.furnish,
     )
     lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
     sheets: dict[str, DataSheet] = {}

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.simulate.backdrop import Backdrop, pixel_rays
+from lce_rig.simulate.backdrop import Backdrop, irradiance, pixel_rays, reached
 from lce_rig.simulate.event_camera import EventCamera
 from lce_rig.simulate.image_rendering import sensor_gain
-from lce_rig.simulate.light import irradiance, reached
 from lce_rig.simulate.options import CameraNoise
+from lce_rig.simulate.poses import Trajectory
 from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO, Hits, Scene
-from lce_rig.simulate.trajectory import Trajectory
 
 GREY = np.array([0.114, 0.587, 0.299])
 #: Assumed place of the carrier's middle, m behind the board: decides how its image shifts.

@@ -16,11 +16,11 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session.cache import Cached, load, store
 from lce_rig.simulate import SimulationOptions
+from lce_rig.simulate.captures import StagedBoard
 from lce_rig.simulate.lidar import measure_sweep, sweep_scene
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
-from lce_rig.simulate.scene import Scene
+from lce_rig.simulate.poses import hold_board
 from lce_rig.simulate.stage import IMAGE, PLACEMENT, SCAN, Stage, set_stage, truth_extrinsics
-from lce_rig.simulate.takes import take_image
 
 LEVELS = range(1, len(PAPER_RANGE_SIGMA_M) + 1)
 N_CAPTURES = 30
@@ -98,10 +98,12 @@ class _Maker:
         """Photograph and sweep a board, and detect it at every level."""
         stage, T_world_lidar = self._stage, self._stage.T_world_sensor[LIDAR]
         T_world_board = stage.place(index, stage.rng(index, PLACEMENT))
-        scene = Scene(stage.room.raycaster, (), stage.board, T_world_board, self._options.print_reflectivity)
-        image = take_image(stage, CAMERA, scene, 0, (index, IMAGE))
+        board = StagedBoard(stage, hold_board(T_world_board), stage.rng(index))
+        image = board.take_image(CAMERA, 0, (index, IMAGE))
         model = stage.models[LIDAR]
-        sweep = sweep_scene(scene, T_world_lidar, model, stage.noise[LIDAR], stage.rng(index, SCAN))
+        sweep = sweep_scene(
+            board.scene_at(0), T_world_lidar, model, stage.noise[LIDAR], stage.rng(index, SCAN)
+        )
         scans = {}
         for level in LEVELS:
             noise = replace(self._options, noise_level=level).noise_of(VLP_16)

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 import lce_rig as lce
+from benchmarks.furniture import Furniture
 from benchmarks.kept import kept_folder
 from benchmarks.recordings import RIGS
 from lce_rig.core.calibration import Calibration
@@ -129,7 +130,7 @@ def furnished_room(
 
 
 def _options(rig_name: str) -> SimulationOptions:
-    options = replace(SimulationOptions.for_rig(rig_name), is_furnished=True)
+    options = replace(SimulationOptions.for_rig(rig_name), furnish=Furniture())
     # Like the recording: far boards, held upright.
     return replace(options, distance_m=(2.6, 3.6), roll_deg=(0.0, 15.0)) if rig_name == "os1_64" else options
 

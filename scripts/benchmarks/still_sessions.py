@@ -21,10 +21,9 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import board_from_pose
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
-from lce_rig.simulate.carriers import build_carrier
-from lce_rig.simulate.scene import Scene
+from lce_rig.simulate.captures import StagedBoard
+from lce_rig.simulate.poses import hold_board
 from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage, truth_extrinsics
-from lce_rig.simulate.takes import take_scan
 
 # The camera's backdrop is not needed: the smaller it is, the sooner it is done.
 _SHRINK = 16
@@ -128,10 +127,8 @@ def _simulate(rig: Rig, seed: int, options: SimulationOptions, n_captures: int) 
 
 def scan_held_board(stage: Stage, T_world_board: Array, rng: np.random.Generator, index: int) -> Scan:
     """Scan a board that is held still at (4, 4); rng decides what its carrier looks like."""
-    carrier = build_carrier(stage.options.carrier, stage.board, T_world_board, rng)
-    reflectivity = stage.options.print_reflectivity
-    scene = Scene(stage.room.raycaster, carrier, stage.board, T_world_board, reflectivity)
-    return take_scan(stage, stage.views[0].lidar, scene, _STAMP_NS + index * 4_000_000_000, (index,))
+    board = StagedBoard(stage, hold_board(T_world_board), rng)
+    return board.take_scan(stage.views[0].lidar, _STAMP_NS + index * 4_000_000_000, (index,))
 
 
 def with_small_pictures(rig: Rig) -> Rig:

@@ -16,10 +16,12 @@ from lce_rig.rig import Rig
 from lce_rig.simulate.backdrop import Backdrop, build_backdrop
 from lce_rig.simulate.image_rendering import expose, render_radiance
 from lce_rig.simulate.lidar import LidarModel, measure_sweep, sweep_scene
-from lce_rig.simulate.options import CameraNoise, LidarNoise
+from lce_rig.simulate.options import CameraNoise, EventNoise, LidarNoise
 from lce_rig.simulate.room import Room, build_room
 from lce_rig.simulate.scene import Scene
 
+PERFECT = CameraNoise(blur_px=0.6, full_well_e=np.inf, read_noise_e=0.0, vignetting=0.0)
+QUIET_EVENTS = EventNoise(0.30, 0.25, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 0.0)
 VLP16 = LidarModel.of(VLP_16, 10.0)
 FACING_LIDAR = np.array(
     [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]

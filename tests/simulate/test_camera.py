@@ -8,14 +8,11 @@ import pytest
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.simulate.backdrop import Backdrop, lens_reach, pixel_corner_rays, pixel_rays
-from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.options import CameraNoise
-from lce_rig.simulate.room import Room
+from lce_rig.simulate.room import Room, build_carrier
 from lce_rig.simulate.scene import Scene
 
-from .conftest import FACING_LIDAR, LENSES, render_image
-
-QUIET = replace(CameraNoise.none(), blur_px=0.6)
+from .conftest import FACING_LIDAR, LENSES, PERFECT, render_image
 
 
 def placed(distance_m: float, left_m: float, up_m: float, tilt_deg: float, roll_deg: float) -> Array:
@@ -38,7 +35,7 @@ def test_corners_lie_where_the_truth_projects_them(
         board,
         T_world_board,
     )
-    picture = render_image(scene, backdrop, QUIET, np.random.default_rng(0)).grey
+    picture = render_image(scene, backdrop, PERFECT, np.random.default_rng(0)).grey
     corners_cam = transform(invert(backdrop.T_world_cam) @ T_world_board, board.corners())
     truth, is_valid = backdrop.intrinsics.project(corners_cam)
     assert is_valid.all()
@@ -80,7 +77,7 @@ def test_rays_through_pixels_project_back_onto_them(model: str) -> None:
 def test_the_outer_square_at_the_top_left_is_dark(room: Room, board: Board, backdrop: Backdrop) -> None:
     T = placed(1.3, 0.0, 0.0, 0.0, 0.0)
     picture = render_image(
-        Scene(room.raycaster, [], board, T), backdrop, QUIET, np.random.default_rng(0)
+        Scene(room.raycaster, [], board, T), backdrop, PERFECT, np.random.default_rng(0)
     ).grey
     square = board.square_m
     columns, rows = np.meshgrid(np.arange(board.cols + 1), np.arange(board.rows + 1))

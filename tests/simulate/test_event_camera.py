@@ -13,9 +13,11 @@ from lce_rig.core.geometry import Array
 from lce_rig.simulate.event_camera import EventCamera, EventPixels, draw_pixels
 from lce_rig.simulate.options import EventNoise
 
+from .conftest import QUIET_EVENTS
+
 LENS = Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48)
 SHAPE = (48, 64)
-QUIET = EventNoise.none()
+
 START_NS = 1_700_000_000_000_000_000
 SECOND_NS = 1_000_000_000
 
@@ -78,7 +80,7 @@ def intervals_ns(events: Events) -> NDArray[np.int64]:
 
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
 def test_quiet_pixels_reproduce_the_change_of_ln_intensity_within_one_threshold(sigma: float) -> None:
-    noise = replace(QUIET, threshold_sigma=sigma)
+    noise = replace(QUIET_EVENTS, threshold_sigma=sigma)
     pixels, scene = draw_pixels(LENS, noise, np.random.default_rng(4)), ripples()
     for duration_s in (0.1, 0.37, 0.5):
         (events,) = record(noise, scene, duration_s=duration_s, pixels=pixels)
@@ -95,7 +97,7 @@ def test_a_ramp_gives_as_many_events_of_its_sign_as_thresholds_fit_into_it() -> 
         down = 0.1 * np.exp(-4.01 * t_s * 0.25)
         return np.where(left, up, down).astype(np.float32) * np.ones(SHAPE, dtype=np.float32)
 
-    noise = replace(QUIET, dark_radiance=0.0)
+    noise = replace(QUIET_EVENTS, dark_radiance=0.0)
     (events,) = record(noise, ramp, duration_s=1.0)
     assert np.all(events.polarity == (events.x < 32))
     assert np.all(counts(events, True) + counts(events, False) == 4)
@@ -106,7 +108,7 @@ def test_a_ramp_gives_as_many_events_of_its_sign_as_thresholds_fit_into_it() -> 
 
 def test_stamps_lie_between_the_subframes_where_the_ramp_crosses() -> None:
     scene = ripples(3)
-    coarse, fine = (record(QUIET, scene, duration_s=0.2, step_s=s)[0] for s in (0.004, 0.0005))
+    coarse, fine = (record(QUIET_EVENTS, scene, duration_s=0.2, step_s=s)[0] for s in (0.004, 0.0005))
     assert len(coarse) == pytest.approx(len(fine), rel=0.01)
     first_s = []
     for events in (coarse, fine):
@@ -147,7 +149,7 @@ def test_slow_pixels_lag_behind_and_dark_ones_more() -> None:
 
     delay_s = []
     for level in (0.7, 0.1):
-        noise = replace(QUIET, cutoff_hz=50.0, threshold_on=0.1, dark_radiance=0.0)
+        noise = replace(QUIET_EVENTS, cutoff_hz=50.0, threshold_on=0.1, dark_radiance=0.0)
         (events,) = record(noise, step(level), duration_s=0.2, step_s=0.001)
         assert np.all(counts(events, True) == 2) and events.polarity.all()
         delay_s.append(1e-9 * (events.t_ns[-1] - START_NS) - 0.01)
@@ -157,7 +159,7 @@ def test_slow_pixels_lag_behind_and_dark_ones_more() -> None:
 
 
 def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark() -> None:
-    noise = replace(QUIET, noise_hz=10.0)
+    noise = replace(QUIET_EVENTS, noise_hz=10.0)
     halves = np.where(np.arange(SHAPE[1]) < 32, 0.0, 1.0).astype(np.float32) * np.ones(SHAPE, np.float32)
     (events,) = record(noise, lambda t_s: halves, duration_s=2.0, step_s=0.05)
     rate_hz = [np.sum((events.x < 32) == dark) / (2.0 * np.prod(SHAPE) / 2) for dark in (True, False)]
@@ -166,7 +168,7 @@ def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark() -> None:
 
 
 def test_thresholds_spread_from_pixel_to_pixel_and_from_event_to_event() -> None:
-    noise = replace(QUIET, threshold_sigma=0.04)
+    noise = replace(QUIET_EVENTS, threshold_sigma=0.04)
     pixels = draw_pixels(LENS, noise, np.random.default_rng(0))
     assert pixels.threshold_on.mean() == pytest.approx(noise.threshold_on, abs=0.004)
     assert pixels.threshold_on.std() == pytest.approx(0.04, rel=0.05)
@@ -176,13 +178,14 @@ def test_thresholds_spread_from_pixel_to_pixel_and_from_event_to_event() -> None
         return 0.01 * np.exp(np.float32(10 * t_s)) * flat(1.0)(0)
 
     steady, shaky = (
-        record(replace(QUIET, dark_radiance=0.0, event_sigma=s), rise, duration_s=0.4)[0] for s in (0.0, 0.03)
+        record(replace(QUIET_EVENTS, dark_radiance=0.0, event_sigma=s), rise, duration_s=0.4)[0]
+        for s in (0.0, 0.03)
     )
     assert intervals_ns(steady).std() < 1e5
     assert intervals_ns(shaky).std() * 10e-9 == pytest.approx(0.03, rel=0.1)
 
 
 def test_stamps_carry_the_offset_of_the_cameras_clock() -> None:
-    plain, shifted = (record(QUIET, ripples(), offset_ns=offset)[0] for offset in (0, -15_000_000))
+    plain, shifted = (record(QUIET_EVENTS, ripples(), offset_ns=offset)[0] for offset in (0, -15_000_000))
     assert np.array_equal(shifted.t_ns, plain.t_ns - 15_000_000)
     assert np.array_equal(shifted.x, plain.x)

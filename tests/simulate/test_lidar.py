@@ -9,11 +9,10 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M, LidarNoise, SimulationOptions
-from lce_rig.simulate.room import Room
+from lce_rig.simulate.room import Room, build_carrier
 from lce_rig.simulate.scene import PLATE, Raycaster, Scene, Surface
-from lce_rig.simulate.shapes import merge, rectangle
+from lce_rig.simulate.surfaces import merge, rectangle
 
 from .conftest import VLP16, board_before_lidar, simulate_scan
 

@@ -6,14 +6,13 @@ import pytest
 from lce_rig.core.board import Board
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, pose, rotation_angle
-from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.image_rendering import expose, render_radiance
 from lce_rig.simulate.lidar import sweep_again, sweep_scene
 from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.options import LidarNoise, SimulationOptions
-from lce_rig.simulate.room import Room
+from lce_rig.simulate.poses import between
+from lce_rig.simulate.room import Room, build_carrier
 from lce_rig.simulate.scene import Scene
-from lce_rig.simulate.trajectory import between
 
 from .conftest import VLP16, board_before_lidar, make_rig
 

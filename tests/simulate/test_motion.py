@@ -7,8 +7,8 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, difference, exp_so3, invert, pose
 from lce_rig.simulate.options import HandMotion, LidarNoise
+from lce_rig.simulate.poses import Trajectory, carry_board, hold_board, sway_board
 from lce_rig.simulate.scene import Raycaster, Scene
-from lce_rig.simulate.trajectory import Trajectory, carry_board, hold_board, sway_board
 
 from .conftest import VLP16, board_before_lidar, simulate_scan
 
@@ -50,12 +50,6 @@ def test_a_carried_board_rests_at_each_placement_and_never_jumps() -> None:
     assert trajectory.speed_mps(times_ns).max() <= hand.carry_mps * 1.001
     step = difference(trajectory.at(times_ns[1:]), trajectory.at(times_ns[:-1]))
     assert np.linalg.norm(step[:, 3:], axis=1).max() / 0.002 < np.radians(61)
-
-
-@pytest.mark.parametrize("speed_mps", [(-0.1, 0.2), (0.3, 0.1)])
-def test_speeds_that_cannot_be_meant_are_refused(speed_mps: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match="speed_mps"):
-        HandMotion(speed_mps=speed_mps)
 
 
 def moving_scan(board: Board, T_world_lidar: Array, trajectory: Trajectory, noise: LidarNoise) -> Scan:

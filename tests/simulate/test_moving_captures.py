@@ -11,8 +11,6 @@ from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, transform
 from lce_rig.rig import Rig
 from lce_rig.simulate import (
-    CameraNoise,
-    EventNoise,
     HandMotion,
     LidarNoise,
     SimulatedCapture,
@@ -20,18 +18,18 @@ from lce_rig.simulate import (
     simulate_captures,
     truth_extrinsics,
 )
+from lce_rig.simulate.captures import StagedBoard
 from lce_rig.simulate.stage import PLACEMENT, set_stage
-from lce_rig.simulate.takes import MovingBoard
 
-from .conftest import make_rig
+from .conftest import PERFECT, QUIET_EVENTS, make_rig
 
 MOVING = SimulationOptions(carrier="person", motion="moving", hand=HandMotion(speed_mps=(0.15, 0.3)))
 QUIET = replace(
     MOVING,
     carrier="none",
     lidar=LidarNoise.none(),
-    camera=replace(CameraNoise.none(), blur_px=0.6),
-    events=EventNoise.none(),
+    camera=PERFECT,
+    events=QUIET_EVENTS,
     hand=HandMotion(speed_mps=(0.3, 0.3)),
     distance_m=(1.4, 2.0),
 )
@@ -128,7 +126,7 @@ def test_event_rates_are_those_of_a_davis346(captures: list[SimulatedCapture]) -
 
 def test_quiet_events_reproduce_what_the_camera_saw(rig: Rig, quiet: SimulatedCapture) -> None:
     stage = set_stage(rig, 6, BRIEF)
-    view = MovingBoard(stage, quiet.trajectory, (0,)).view("cam")
+    view = StagedBoard(stage, quiet.trajectory, stage.rng(0)).view("cam")
     noise, events = BRIEF.events, quiet.events[0]
     scan_ns = quiet.scans[0].stamp_ns or 0
     start, end = (

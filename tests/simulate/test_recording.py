@@ -11,7 +11,7 @@ from lce_rig.io.events import open_events
 from lce_rig.io.events.aedat4 import write_aedat4
 from lce_rig.rig import Rig
 from lce_rig.simulate import HandMotion, SimulatedRecording, SimulationOptions, simulate_recording
-from lce_rig.simulate.simulated_recording import stamp_of
+from lce_rig.simulate.captures import stamp_of
 from tests.io.events.bags import write_event_bag
 
 from .test_moving_captures import found_corners, moving_rig

@@ -6,13 +6,12 @@ import pytest
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.backdrop import Backdrop
-from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.image_rendering import render_radiance
 from lce_rig.simulate.options import Carrier
-from lce_rig.simulate.room import Room
+from lce_rig.simulate.poses import Trajectory, hold_board
+from lce_rig.simulate.room import Room, build_carrier
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.subframes import GREY, MovingView
-from lce_rig.simulate.trajectory import Trajectory, hold_board
 
 from .conftest import render_image
 from .test_camera import PLACEMENTS, QUIET

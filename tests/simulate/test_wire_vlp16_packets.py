@@ -12,9 +12,8 @@ from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array
 from lce_rig.io.velodyne.packet import read_data_packet, read_position_packet
 from lce_rig.io.velodyne.stream import Vlp16Stream
-from lce_rig.simulate.carriers import build_carrier
 from lce_rig.simulate.options import LidarNoise
-from lce_rig.simulate.room import Room
+from lce_rig.simulate.room import Room, build_carrier
 from lce_rig.simulate.scene import Scene
 from tests.io.vlp16_room import (
     T0_NS,

@@ -28,7 +28,7 @@ from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
-from lce_rig.simulate.trajectory import between
+from lce_rig.simulate.poses import between
 
 # Rendering a moving board takes longer than the sensors would: slower than this is reported.
 USUAL = 2.0

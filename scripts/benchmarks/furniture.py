@@ -1,14 +1,14 @@
 """Furniture drawn by seed: outlines of many kinds, near and far, upright and slanted, before the walls."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lce_rig.core.geometry import Array, exp_so3, pose
-from lce_rig.simulate.carriers import SHIRTS, build_body
-from lce_rig.simulate.materials import Material, Pattern
-from lce_rig.simulate.shapes import Mesh, box, cone, ellipsoid, limb, merge
+from lce_rig.simulate.options import Part
+from lce_rig.simulate.room import SHIRTS, build_body
+from lce_rig.simulate.surfaces import Material, Mesh, Pattern, box, cone, ellipsoid, limb, merge
 
 _N_PIECES = (9, 15)
 _ATTEMPTS = 60
@@ -17,14 +17,26 @@ _RIG_REACH_M = 1.5  # nothing stands so near the rig
 _CLEAR_M, _CLEAR_RAD = 4.2, np.radians(24.0)
 _PAINT_M = 0.004
 
-_Part = tuple[str, Mesh, Material, Array]
 _Piece = list[tuple[str, Mesh, Material]]
 """What a piece of furniture consists of: about the origin of the floor, before it is turned and moved."""
 
 
+@dataclass(frozen=True)
+class Furniture:
+    """Draws the size of a room and its furniture, as `SimulationOptions.furnish`."""
+
+    def __call__(
+        self, low: Array, high: Array, rng: np.random.Generator
+    ) -> tuple[Array, Array, list[Part], list[tuple[Array, Array]]]:
+        """Move the corners (3,), and furnish the room between them."""
+        low = low + rng.uniform([-1, -1, 0], [1, 0.6, 0])
+        high = high + rng.uniform([-1, -0.6, -0.5], [3, 1, 0.6])
+        return low, high, *draw_furniture(low, high, rng)
+
+
 def draw_furniture(
     low: Array, high: Array, rng: np.random.Generator
-) -> tuple[list[_Part], list[tuple[Array, Array]]]:
+) -> tuple[list[Part], list[tuple[Array, Array]]]:
     """Furnish a room: pieces that stand apart from each other, most in front of the rig, and paint on walls.
 
     The paint has no depth: edges in images that no LiDAR sees.
@@ -36,7 +48,7 @@ def draw_furniture(
     Returns:
         Name, mesh, material and T_room_piece (4, 4) of each part; (low, high) of each piece, m, frame room.
     """
-    parts: list[_Part] = []
+    parts: list[Part] = []
     obstacles: list[tuple[Array, Array]] = []
     kinds, weights = list(_KINDS), np.array(list(_KINDS.values()))
     for _ in range(int(rng.integers(*_N_PIECES))):
@@ -221,7 +233,7 @@ def _plant(rng: np.random.Generator, _: float) -> _Piece:
     ]
 
 
-def _paint(low: Array, high: Array, rng: np.random.Generator) -> _Part:
+def _paint(low: Array, high: Array, rng: np.random.Generator) -> Part:
     """A coloured rectangle on a wall or the floor, at any angle."""
     size = rng.uniform([0.1, 0.3], [0.8, 1.6])
     kind = int(rng.integers(4))
