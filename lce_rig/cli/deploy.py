@@ -66,7 +66,7 @@ def deploy(
     if reason and not (force or rollback):
         raise UsageError("--reason applies to --force and --rollback only", "Add one of them, or omit it.")
     import lce_rig as lce
-    from lce_rig.fleet.deploy.targets import find_target
+    from lce_rig.fleet.deploy.deployment import find_target
     from lce_rig.pipeline.result_files import result_parts
 
     if status or rollback:
@@ -112,7 +112,6 @@ def _show_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None
                     for change in plan.sensors
                 ],
                 "objections": [each.as_json() for each in plan.objections],
-                "diff": list(plan.text),
             }
         )
         return
@@ -126,8 +125,8 @@ def _show_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None
     _warn_of_changes(plan.changed_there)
     if plan.is_in_place:
         show.say("nothing to change: these very files are in place")
-    for line in plan.text:
-        click.echo(line)
+    for name, how in plan.changed.items():
+        show.say(show.escape(f"  {name}: {how}"))
     for each in plan.objections:
         show.warn(f"would be refused: {each.text}")
 

@@ -169,7 +169,6 @@ def table(
 ) -> None:
     """Print rows of the registry's table."""
     from lce_rig.core.errors import SessionError, UsageError
-    from lce_rig.fleet.query import query
     from lce_rig.fleet.registry import Registry
     from lce_rig.fleet.storage import Storage
 
@@ -180,7 +179,7 @@ def table(
         if not opened.place.exists():
             raise SessionError(f"{opened.place.url} does not exist", "`lce-rig fleet run` writes a registry.")
         opened.consolidate(rebuild=True)
-    chosen = query(opened, where, columns or (None if as_csv or as_json else _SHOWN))
+    chosen = opened.read_table(columns or (None if as_csv or as_json else _SHOWN), where)
     batches = chosen.to_batches(max_chunksize=10_000)
     if as_csv:
         writer = csv.writer(sys.stdout, lineterminator="\n")

@@ -1,4 +1,4 @@
-"""`lce-rig fleet report`: the robots of a registry as one page and as tables."""
+"""`lce-rig fleet report`: the robots of a registry as one page."""
 
 from pathlib import Path
 
@@ -22,20 +22,13 @@ _MOST_SHOWN = 20
     help="Write the page to this file.",
 )
 @click.option(
-    "--csv",
-    "csv_folder",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="DIR",
-    help="Write each table as CSV into this folder.",
-)
-@click.option(
     "--json",
     "json_file",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Write findings and tables to this file; the table of all sessions is in --csv only.",
+    help="Write findings, states and counts to this file.",
 )
-def report(registry: str, output: Path, csv_folder: Path | None, json_file: Path | None) -> None:
+def report(registry: str, output: Path, json_file: Path | None) -> None:
     """Report which robots moved, and why results are missing or failed, as one HTML page.
 
     A robot moved if two successive results of it differ beyond their own independent covariance. The page
@@ -49,8 +42,6 @@ def report(registry: str, output: Path, csv_folder: Path | None, json_file: Path
 
     made = FleetReport.of(Registry(Storage.at(registry)))
     write_atomically(output, made.page())
-    if csv_folder is not None:
-        made.write_csv(csv_folder)
     if json_file is not None:
         made.write_json(json_file)
     for finding in made.findings[:_MOST_SHOWN]:

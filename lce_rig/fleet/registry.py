@@ -15,11 +15,23 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from lce_rig.core.calibration import read_result
-from lce_rig.core.errors import LceRigError, SessionError, reason_of
+from lce_rig.core.errors import LceRigError, SessionError, UsageError, reason_of
 from lce_rig.core.files import parse_json
 from lce_rig.fleet.findings import DAMAGED
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import ROWS, TABLE, Row, as_table, merged, read_table, table_bytes, with_pairs
+from lce_rig.fleet.table import (
+    COLUMNS,
+    ROWS,
+    SCHEMA,
+    TABLE,
+    Row,
+    as_table,
+    chosen_rows,
+    merged,
+    read_table,
+    table_bytes,
+    with_pairs,
+)
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import replacing
@@ -134,17 +146,33 @@ class Registry:
             known = {"source": place.url, "date": date if name[:1].isdigit() else None}
             return [{**own, **known, "status": "failed", "cause": cause.code, "detail": cause.text}]
 
-    def read_table(self, columns: Iterable[str] | None = None) -> Any:
-        """Read the table as a `pyarrow.Table`; raises as `lce_rig.fleet.table.read_table`."""
-        names = None if columns is None else list(columns)
+    def read_table(self, columns: Iterable[str] | None = None, where: str = "") -> Any:
+        """Read the table, or some of its rows, as a `pyarrow.Table`.
+
+        Args:
+            columns: their names; None for all.
+            where: condition in SQL, such as "verdict = 'fail' and date > '2026-01-01'" or
+                "list_contains(findings, 'verdict.control_failed')"; "" for all rows.
+
+        Raises:
+            SessionError: there is no table, or it cannot be read.
+            UsageError: the condition or a column is wrong; the columns are named.
+        """
+        names = list(columns or SCHEMA.names)
+        unknown = sorted(set(names) - set(SCHEMA.names))
+        if unknown:
+            raise UsageError(f"the table has no column {unknown[0]!r}", COLUMNS)
+        source: Path | io.BytesIO
         if self.place.local is not None:
-            return read_table(self.place.local / TABLE, names)
-        content = (self.place / TABLE).read()
-        if content is None:
-            raise SessionError(
-                f"{self.place.url} has no {TABLE}", "`lce-rig fleet run` writes it, `table --rebuild` too."
-            )
-        return read_table(io.BytesIO(content), names)
+            source = self.place.local / TABLE
+        else:
+            content = (self.place / TABLE).read()
+            if content is None:
+                raise SessionError(f"{self.place.url} has no {TABLE}", "`lce-rig fleet run` writes it.")
+            source = io.BytesIO(content)
+        if not where.strip():
+            return read_table(source, names)
+        return chosen_rows(read_table(source), where).select(names)
 
     def write_table(self, table: Any) -> None:
         """Write the table in one step; raises SessionError."""

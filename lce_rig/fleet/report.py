@@ -1,29 +1,159 @@
-"""The report of a fleet: one page, and the tables behind it."""
+"""The report of a fleet: robots that moved, and why results are missing or failed.
+
+Each result of a robot, camera and LiDAR is compared with the one before it. With x the tangent from the
+earlier pose to the later one,
+
+    chi2 = x^T (C_1 + C_2)^-1 x,    C_k = cov - cov_shared
+
+is chi-squared with 6 degrees of freedom if nothing moved. `cov_shared`, of errors that all sessions of one
+profile and method have in common, counts only where profile or method differ. The limit is the quantile that
+any of the fleet's comparisons exceeds with a probability of `FALSE_ALARMS` if no robot moved.
+"""
 
 import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.csv as pc_csv
 from markupsafe import Markup
+from numpy.typing import NDArray
 
-from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import difference
+from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.phrasing import as_line
 from lce_rig.fleet.findings import MOVED
-from lce_rig.fleet.moved import FALSE_ALARMS, MOVED_COLUMNS, STATES, History, history_of
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.table import covariances, poses
 from lce_rig.session.durable import write_atomically
 from lce_rig.show.report.drawing import BLUE, FAINT, RED, drawing, new_axes, style
 from lce_rig.show.report.page import render
 
+State = Literal["moved", "steady", "cannot_tell"]
+STATES: tuple[State, ...] = ("moved", "steady", "cannot_tell")
+"""The worst first. "cannot_tell": no two usable results of the same sensors."""
+FALSE_ALARMS = 0.01
+"""Probability that a fleet in which nothing moved names any robot."""
+_SENSORS = ("robot", "camera", "lidar")
+_SERIALS = ("camera_serial", "lidar_serial")
+MOVED_COLUMNS = (
+    *(*_SENSORS, *_SERIALS, "date", "folder", "session_sha256", "profile_sha256", "method", "status"),
+    *("verdict", "findings", "severities", "T_cam_lidar", "cov", "cov_shared"),
+)
+"""Columns of the table that this module requires."""
+# Sensors that moved far from the CAD model fail by this; other errors say that the result is wrong.
+_FAR = "verdict.far_from_nominal"
+# 0.01 mm and 0.0006 deg, so that a covariance of zeros can be inverted.
+_LEAST = 1e-10 * np.eye(6)
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """The usable results of a fleet, by robot, camera, LiDAR and date.
+
+    Attributes:
+        rows: `pyarrow.Table` of N results.
+        is_compared: (N,) whether a result is compared with the one in the row before it.
+        change: (N, 6) tangent from the pose in the row before, m and rad, axes of the camera; NaN if not
+            compared.
+        sigma: (N, 6) its standard deviations.
+        chi2: (N,) of it.
+        limit: of `chi2`.
+        robots: state of every robot in the registry.
+    """
+
+    rows: Any
+    is_compared: NDArray[np.bool_]
+    change: Array
+    sigma: Array
+    chi2: Array
+    limit: float
+    robots: Mapping[str, State]
+
+    @property
+    def moves(self) -> list[int]:
+        """Rows before which a robot moved."""
+        return [int(k) for k in np.flatnonzero(self.is_compared & (self.chi2 > self.limit))]
+
+    def finding(self, k: int) -> Finding:
+        """State the move before row k."""
+        row, before = self.rows.slice(k, 1).to_pylist()[0], self.rows["date"][k - 1].as_py()
+        rotation_deg, translation_m = tangent_sizes(self.change[k])
+        return MOVED(
+            row["robot"],
+            camera=row["camera"],
+            lidar=row["lidar"],
+            before=before,
+            after=row["date"],
+            rotation_deg=rotation_deg,
+            translation_m=translation_m,
+            chi2=float(self.chi2[k]),
+            limit_chi2=self.limit,
+        )
+
+
+def history_of(table: Any) -> History:
+    """Compare each result in a table with the one before it.
+
+    Args:
+        table: `pyarrow.Table` with at least `MOVED_COLUMNS`.
+    """
+    from scipy.special import chdtri
+
+    order = [(name, "ascending") for name in (*_SENSORS, "date", "folder")]
+    rows = table.take(pa.array(_usable(table))).sort_by(order)
+    n = len(rows)
+    same = {name: _is_repeated(rows[name]) for name in MOVED_COLUMNS[:10]}
+    is_compared = np.logical_and.reduce([same[name] for name in _SENSORS]) if n else np.zeros(0, bool)
+    for name in _SERIALS:
+        is_known = rows[name].is_valid().to_numpy()
+        is_compared[1:] &= same[name][1:] | ~is_known[1:] | ~is_known[:-1]
+    # A copy of a session is not another one.
+    is_compared &= ~(same["session_sha256"] & rows["session_sha256"].is_valid().to_numpy())
+    change, sigma, chi2 = np.full((n, 6), np.nan), np.full((n, 6), np.nan), np.full(n, np.nan)
+    k = np.flatnonzero(is_compared)
+    limit = float(chdtri(6, FALSE_ALARMS / max(len(k), 1)))
+    if len(k):
+        T, cov, shared = poses(rows["T_cam_lidar"]), covariances(rows["cov"]), covariances(rows["cov_shared"])
+        differs = ~(same["profile_sha256"] & same["method"])
+        change[k] = difference(T[k], T[k - 1])
+        both = cov[k] + cov[k - 1] - np.where(differs[k, None, None], 0.0, shared[k] + shared[k - 1]) + _LEAST
+        sigma[k] = np.sqrt(np.einsum("kii->ki", both))
+        chi2[k] = np.einsum("ki,ki->k", change[k], np.linalg.solve(both, change[k][..., None])[..., 0])
+    robots: dict[str, State] = dict.fromkeys(sorted(pc.unique(table["robot"]).to_pylist()), "cannot_tell")
+    names = rows["robot"].to_pylist()
+    robots |= {names[i]: "steady" for i in k.tolist()}
+    robots |= {names[i]: "moved" for i in k[chi2[k] > limit].tolist()}
+    return History(rows, is_compared, change, sigma, chi2, limit, robots)
+
+
+def _usable(table: Any) -> NDArray[np.intp]:
+    """List rows with a dated result that did not fail, or failed only by its distance from the CAD model."""
+    known = pc.and_(pc.equal(table["status"], "ok"), pc.is_valid(table["date"]))
+    for name in ("T_cam_lidar", "cov", "cov_shared"):
+        known = pc.and_(known, pc.is_valid(table[name]))
+    is_usable = known.to_numpy().copy()
+    has_failed = pc.fill_null(pc.equal(table["verdict"], "fail"), True).to_numpy()
+    for k in np.flatnonzero(is_usable & has_failed).tolist():
+        codes, severities = table["findings"][k].as_py() or (), table["severities"][k].as_py() or ()
+        errors = {code for code, severity in zip(codes, severities, strict=False) if severity == "error"}
+        is_usable[k] = errors == {_FAR}
+    return np.flatnonzero(is_usable)
+
+
+def _is_repeated(column: Any) -> NDArray[np.bool_]:
+    """Return whether each value equals the one before it; null equals null."""
+    codes = pc.fill_null(column.combine_chunks().dictionary_encode().indices, -1).to_numpy()
+    repeated = np.zeros(len(codes), bool)
+    repeated[1:] = codes[1:] == codes[:-1]
+    return repeated
+
+
 FORMAT_VERSION = 1
+Count = tuple[Any, int, int]
 _CAUSE_COLUMNS = ("robot", "status", "cause", "verdict", "findings", "severities")
 _AXES = tuple((f"{kind} {axis}", unit) for kind, unit in (("along", "m"), ("about", "deg")) for axis in "xyz")
 _MOST_ROWS, _MOST_DRAWINGS, _MOST_SESSIONS = 60, 12, 400
@@ -36,17 +166,19 @@ class FleetReport:
 
     Attributes:
         registry: its name.
+        n_rows: of its table.
         history: results compared in time.
         findings: robots that moved.
-        tables: by name, for export; units in the names of columns.
-        n_rows: of the registry's table.
+        verdicts: (verdict, or status of what has no result), rows and robots, the most rows first.
+        causes: (severity, code) of missing, failed and marginal results, rows and robots, likewise.
     """
 
     registry: str
+    n_rows: int
     history: History
     findings: tuple[Finding, ...]
-    tables: dict[str, Any]
-    n_rows: int
+    verdicts: list[Count]
+    causes: list[Count]
 
     @classmethod
     def of(cls, registry: Registry) -> "FleetReport":
@@ -56,31 +188,17 @@ class FleetReport:
             SessionError: the registry has no table, or it cannot be read.
         """
         history = history_of(registry.read_table(MOVED_COLUMNS))
-        table = registry.read_table(_CAUSE_COLUMNS)
-        sessions = _sessions(history)
-        tables = {
-            "robots": pa.table({"robot": [*history.robots], "state": [*history.robots.values()]}),
-            "moves": sessions.take(pa.array(history.moves, pa.int64())),
-            "sessions": sessions,
-            "verdicts": _verdicts(table),
-            "causes": _causes(table),
-        }
+        rows = registry.read_table(_CAUSE_COLUMNS).to_pylist()
+        results = [(row["verdict"] if row["status"] == "ok" else row["status"], row["robot"]) for row in rows]
+        causes = [(("no result", row["cause"]), row["robot"]) for row in rows if row["cause"]]
+        for row in rows:
+            reasons = zip(row["severities"] or (), row["findings"] or (), strict=False)
+            causes += [(reason, row["robot"]) for reason in reasons if reason[0] in ("error", "warning")]
         findings = tuple(history.finding(k) for k in history.moves)
-        return cls(registry.place.name, history, findings, tables, len(table))
-
-    def write_csv(self, folder: Path) -> None:
-        """Write each table as a file of comma-separated values into a folder; raises SessionError."""
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            for name, table in self.tables.items():
-                pc_csv.write_csv(table, folder / f"{name}.csv")
-        except OSError as error:
-            raise SessionError(
-                f"{folder} cannot be written: {error.strerror or error}", "Choose another folder."
-            ) from error
+        return cls(registry.place.name, len(rows), history, findings, _counted(results), _counted(causes))
 
     def write_json(self, path: Path) -> None:
-        """Write findings and all tables but that of the sessions, which is long; raises SessionError."""
+        """Write findings, states and counts; raises SessionError."""
         document = {
             "format_version": FORMAT_VERSION,
             "n_rows": self.n_rows,
@@ -88,7 +206,11 @@ class FleetReport:
             "limit_chi2": self.history.limit,
             "findings": [finding.as_json() for finding in self.findings],
             "robots": dict(self.history.robots),
-            "tables": {name: table.to_pylist() for name, table in self.tables.items() if name != "sessions"},
+            "verdicts": [{"result": result, "rows": n, "robots": m} for result, n, m in self.verdicts],
+            "causes": [
+                {"severity": severity, "code": code, "rows": n, "robots": m}
+                for (severity, code), n, m in self.causes
+            ],
         }
         write_atomically(path, json.dumps(document, allow_nan=False) + "\n")
 
@@ -113,65 +235,20 @@ class FleetReport:
             n_moves=len(self.findings),
             action=as_line(str(MOVED.action)),
             drawings=_drawings(history),
-            verdicts=[
-                (row["result"], row["rows"], row["robots"], f"{100 * row['share']:.1f} %")
-                for row in self.tables["verdicts"].to_pylist()
-            ],
-            causes=[
-                (row["code"], row["severity"], row["rows"], row["robots"])
-                for row in self.tables["causes"].slice(0, _MOST_ROWS).to_pylist()
-            ],
+            verdicts=[(*count, f"{100 * count[1] / self.n_rows:.1f} %") for count in self.verdicts],
+            causes=[(code, severity, n, m) for (severity, code), n, m in self.causes[:_MOST_ROWS]],
             limit=f"{history.limit:.1f}",
             false_alarms=f"{100 * FALSE_ALARMS:.0f} %",
         )
 
 
-def _sessions(history: History) -> Any:
-    """List each usable result with its change from the one before; null where there is none."""
-    columns = {name: history.rows[name] for name in ("robot", "camera", "lidar", "date", "folder")}
-    before = pa.array([None, *columns["date"].to_pylist()][: len(history.rows)], pa.string())
-    columns["before"] = pc.if_else(pa.array(history.is_compared), before, None)
-    columns["chi2"] = pa.array(history.chi2, from_pandas=True)
-    for k, (axis, unit) in enumerate(_AXES):
-        factor = float(np.degrees(1.0)) if unit == "deg" else 1.0
-        name = axis.replace(" ", "_")
-        columns[f"change_{name}_{unit}"] = pa.array(factor * history.change[:, k], from_pandas=True)
-        columns[f"sigma_{name}_{unit}"] = pa.array(factor * history.sigma[:, k], from_pandas=True)
-    return pa.table(columns)
-
-
-def _verdicts(table: Any) -> Any:
-    """Count results by verdict, or by the status of those that there are not: result, rows, robots, share."""
-    result = pc.if_else(pc.equal(table["status"], "ok"), table["verdict"], table["status"])
-    counted = _counted(pa.table({"result": result, "robot": table["robot"]}), ["result"])
-    share = pc.divide(pc.cast(counted["rows"], pa.float64()), max(len(table), 1))
-    return counted.append_column("share", share)
-
-
-def _causes(table: Any) -> Any:
-    """Rank the reasons of missing, failed and marginal results: severity, code, rows, robots."""
-    failed = table.filter(pc.is_valid(table["cause"]))
-    severity = pa.array(["no result"] * len(failed), pa.string())
-    missing = pa.table({"severity": severity, "code": failed["cause"], "robot": failed["robot"]})
-    codes, severities = table["findings"].combine_chunks(), table["severities"].combine_chunks()
-    reasons = pa.table(
-        {
-            "severity": pc.list_flatten(severities),
-            "code": pc.list_flatten(codes),
-            "robot": table["robot"].take(pc.list_parent_indices(codes)),
-        }
-    )
-    reasons = reasons.filter(pc.is_in(reasons["severity"], value_set=pa.array(["error", "warning"])))
-    return _counted(pa.concat_tables([missing, reasons]), ["severity", "code"])
-
-
-def _counted(table: Any, keys: list[str]) -> Any:
-    """Count rows and robots by keys, the most rows first."""
-    counts = [("robot", "count"), ("robot", "count_distinct")]
-    grouped = (
-        table.group_by(keys, use_threads=False).aggregate(counts).rename_columns([*keys, "rows", "robots"])
-    )
-    return grouped.sort_by([("rows", "descending"), *((key, "ascending") for key in keys)])
+def _counted(pairs: Iterable[tuple[Any, str]]) -> list[Count]:
+    """Count rows and robots by key, the most rows first."""
+    robots: dict[Any, list[str]] = {}
+    for key, robot in pairs:
+        robots.setdefault(key, []).append(robot)
+    counts = [(key, len(names), len(set(names))) for key, names in robots.items()]
+    return sorted(counts, key=lambda count: (-count[1], count[0]))
 
 
 def _drawings(history: History) -> list[tuple[str, str, Markup]]:

@@ -20,10 +20,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from lce_rig.core.errors import CommandError, LceRigError, NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.progress import Progress, silent
 from lce_rig.fleet.deploy import deployment
+from lce_rig.fleet.deploy.deployment import read_targets
 from lce_rig.fleet.deploy.place import run_bounded
-from lce_rig.fleet.deploy.targets import read_targets
 from lce_rig.fleet.jobs import folder_name
-from lce_rig.fleet.query import query
 from lce_rig.fleet.registry import Registry
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import load_rig
@@ -120,10 +119,10 @@ def newest_results(registry: Registry, where: str = "") -> dict[str, RobotState]
 
     Args:
         registry: of the results.
-        where: condition in SQL on the rows of the table, as in `query`.
+        where: condition in SQL on the rows of the table, as of `Registry.read_table`.
     """
     by_robot: dict[str, list[Mapping[str, Any]]] = {}
-    for row in query(registry, where, _COLUMNS).to_pylist():
+    for row in registry.read_table(_COLUMNS, where).to_pylist():
         by_robot.setdefault(row["robot"], []).append(row)
     return {robot: _newest(robot, by_robot[robot]) for robot in sorted(by_robot)}
 

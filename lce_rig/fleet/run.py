@@ -17,9 +17,8 @@ from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.progress import Progress, silent
 from lce_rig.fleet.findings import BUG, EXITED, OUT_OF_MEMORY, SIGNAL, TIMED_OUT, WORKER_LOST
 from lce_rig.fleet.jobs import Job
-from lce_rig.fleet.process import run_apart
 from lce_rig.fleet.table import Row, Status
-from lce_rig.fleet.work import Settings, Used, first_row, publish, without_result
+from lce_rig.fleet.work import Settings, Used, first_row, publish, run_apart, without_result
 
 # Tasks that wait beside those that run: enough to keep workers busy, few enough for any scheduler.
 _WAITING_PER_THREAD, _FEWEST_TASKS = 4, 16

@@ -6,14 +6,13 @@ does not hold: `SESSION`. `pair_columns` selects the other columns from result.j
 
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.core.errors import SessionError, SourceError, UsageError
 
 try:
     import pyarrow as pa
@@ -55,6 +54,7 @@ PAIR: Mapping[str, Any] = {
 }
 """Columns of a camera and a LiDAR, and their types."""
 SCHEMA = pa.schema([pa.field(name, kind) for name, kind in {**SESSION, **PAIR}.items()])
+COLUMNS = f"Columns: {', '.join(SCHEMA.names)}.\nText stands in single quotes: verdict = 'fail'."
 _UPPER = np.triu_indices(6)
 # Rows that share minima and maxima, by which a query skips them.
 _ROWS_PER_GROUP = 1 << 16
@@ -159,31 +159,6 @@ def table_bytes(table: Any) -> bytes:
     return buffer.getvalue()
 
 
-def column_names(source: Path | io.BytesIO) -> list[str]:
-    """List the columns that a table holds.
-
-    Raises:
-        SessionError: there is no such file, or it is not such a table.
-    """
-    with _reading(source):
-        names: list[str] = pq.read_schema(source).names
-    if "robot" not in names:
-        raise SessionError(f"{source} is not a table of results: it has no column robot")
-    return names
-
-
-@contextmanager
-def _reading(source: Path | io.BytesIO) -> Iterator[None]:
-    try:
-        yield
-    except FileNotFoundError:
-        raise SessionError(f"{source}: there is no such table", "`lce-rig fleet run` writes it.") from None
-    except (OSError, pa.ArrowException) as error:
-        raise SessionError(
-            f"{source} cannot be read as a table: {error}", "`lce-rig fleet table --rebuild` writes it again."
-        ) from error
-
-
 def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) -> Any:
     """Read a table as a `pyarrow.Table`; columns that an earlier version did not write are null.
 
@@ -194,11 +169,39 @@ def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) 
     Raises:
         SessionError: there is no such file, or it is not such a table.
     """
-    held = set(column_names(source))
     names = list(SCHEMA.names if columns is None else columns)
-    with _reading(source), pq.ParquetFile(source) as file:
-        table = file.read(columns=[name for name in names if name in held])
-        for name in names:
-            if name not in held:
-                table = table.append_column(SCHEMA.field(name), pa.nulls(len(table), SCHEMA.field(name).type))
-        return table.select(names).cast(pa.schema([SCHEMA.field(name) for name in names]))
+    try:
+        with pq.ParquetFile(source) as file:
+            held = set(file.schema_arrow.names)
+            table = file.read(columns=[name for name in names if name in held])
+    except FileNotFoundError:
+        raise SessionError(f"{source}: there is no such table", "`lce-rig fleet run` writes it.") from None
+    except (OSError, pa.ArrowException) as error:
+        raise SessionError(
+            f"{source} cannot be read as a table: {error}", "`lce-rig fleet table --rebuild` writes it again."
+        ) from error
+    if "robot" not in held:
+        raise SessionError(f"{source} is not a table of results: it has no column robot")
+    for name in names:
+        if name not in held:
+            table = table.append_column(SCHEMA.field(name), pa.nulls(len(table), SCHEMA.field(name).type))
+    return table.select(names).cast(pa.schema([SCHEMA.field(name) for name in names]))
+
+
+def chosen_rows(table: Any, where: str) -> Any:
+    """Choose rows of a table of `SCHEMA` by a condition in SQL; they keep their order.
+
+    Raises:
+        UsageError: the condition is wrong; the columns are named.
+    """
+    import duckdb
+
+    # A condition reads the table and nothing else.
+    settings: dict[str, Any] = {"enable_external_access": False, "python_enable_replacements": False}
+    with duckdb.connect(config={"memory_limit": "1GB", "threads": 2, **settings}) as connection:
+        try:
+            # `filter` takes one condition and nothing else.
+            return connection.from_arrow(table).filter(where).to_arrow_table().cast(SCHEMA)
+        except duckdb.Error as error:
+            first = str(error).splitlines()[0]
+            raise UsageError(f"--where {where!r}: {first}", COLUMNS) from error

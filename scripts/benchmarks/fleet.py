@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.fleet_sessions import BROKEN, TRUTH, break_sessions, make_fleet
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.geometry import perturb
-from lce_rig.fleet.moved import MOVED_COLUMNS, history_of
 from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.report import MOVED_COLUMNS, history_of
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import SCHEMA, TABLE, as_table, merged, table_bytes
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lce_rig.fleet.process import Ended, run_apart
+from lce_rig.fleet.work import Ended, run_apart
 
 # What a session does, by name; the server imports this module by its path.
 _MODULE = """
@@ -61,9 +61,9 @@ def test_a_session_returns_its_rows_and_what_it_cost():
 
 def test_one_that_hangs_is_ended_at_its_time_limit():
     start_s = time.monotonic()
-    ended = act("hang", limit_s=1.0)
+    ended = act("hang", limit_s=8.0)
     assert (ended.rows, ended.reason, ended.known) == (None, "timed_out", {"robot": "r1"})
-    assert time.monotonic() - start_s < 20
+    assert time.monotonic() - start_s < 30
 
 
 @pytest.mark.parametrize("way", ["eat", "gulp"])
@@ -92,7 +92,7 @@ def test_the_session_ends_with_whoever_started_it(tmp_path):
     )
     pid_file = tmp_path / "pid"
     script = (
-        "from lce_rig.fleet.process import run_apart\n"
+        "from lce_rig.fleet.work import run_apart\n"
         f"run_apart('acts_of_sessions:hang', {{'file': {str(pid_file)!r}}}, 60, 4000)\n"
     )
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])

@@ -3,7 +3,6 @@
 import pytest
 
 from lce_rig.core.errors import SessionError, UsageError
-from lce_rig.fleet.query import query
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import SCHEMA, as_table
@@ -33,10 +32,10 @@ def registry(tmp_path, row):
     ],
 )
 def test_a_condition_chooses_rows(registry, where, found):
-    chosen = query(registry, where)
+    chosen = registry.read_table(where=where)
     assert chosen["folder"].to_pylist() == found
     assert chosen.column_names == SCHEMA.names
-    assert query(registry, where, ["folder", "robot"]).column_names == ["folder", "robot"]
+    assert registry.read_table(["folder", "robot"], where).column_names == ["folder", "robot"]
 
 
 @pytest.mark.parametrize(
@@ -51,17 +50,17 @@ def test_a_condition_chooses_rows(registry, where, found):
 def test_a_wrong_condition_names_the_columns(registry, where, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError) as caught:
-        query(registry, where)
+        registry.read_table(where=where)
     assert "sigma_rotation_deg" in caught.value.hint
     assert not (tmp_path / "x.csv").exists()
 
 
 def test_a_wrong_column_names_those_that_there_are(registry):
     with pytest.raises(UsageError) as caught:
-        query(registry, columns=["wheels"])
+        registry.read_table(["wheels"])
     assert "sigma_rotation_deg" in caught.value.hint
 
 
 def test_a_registry_without_a_table_is_refused(tmp_path):
     with pytest.raises(SessionError):
-        query(Registry(Storage.at(tmp_path)), "true")
+        Registry(Storage.at(tmp_path)).read_table(where="true")

@@ -1,6 +1,5 @@
-"""The report of a fleet: page, CSV and JSON."""
+"""The report of a fleet: page and JSON."""
 
-import csv
 import json
 
 import numpy as np
@@ -45,18 +44,17 @@ def test_the_page_names_the_robot_that_moved_and_escapes_names(registry):
     assert text == FleetReport.of(registry).page()
 
 
-def test_the_command_writes_page_tables_and_findings(registry, tmp_path, capsys):
+def test_the_command_writes_page_and_findings(registry, tmp_path, capsys):
     out, folder = tmp_path / "out.html", str(tmp_path)
-    more = ["--csv", str(tmp_path / "csv"), "--json", str(tmp_path / "out.json")]
+    more = ["--json", str(tmp_path / "out.json")]
     assert run(["fleet", "report", "--registry", folder, "-o", str(out), *more]) == 0
     assert out.read_text().startswith("<!DOCTYPE html>") and "<r1>: " in capsys.readouterr().out
     document = json.loads((tmp_path / "out.json").read_text())
     assert document["robots"]["<r1>"] == "moved" and document["n_sessions"] == 80
-    assert [finding["code"] for finding in document["findings"]] == ["fleet.moved"]
-    assert document["tables"]["moves"][0]["date"] == "2026-01-06T10:00:00Z"
-    rows = list(csv.DictReader((tmp_path / "csv" / "sessions.csv").read_text().splitlines()))
-    assert len(rows) == 80 and rows[0]["chi2"] == "" and float(rows[1]["chi2"]) > 0
-    assert run(["fleet", "report", "--registry", folder, "-o", str(out), "--csv", "/proc/csv"]) == 4
+    (finding,) = document["findings"]
+    assert finding["code"] == "fleet.moved" and finding["facts"]["after"] == "2026-01-06T10:00:00Z"
+    assert document["causes"] == [{"severity": "no result", "code": "fleet.signal", "rows": 1, "robots": 1}]
+    assert run(["fleet", "report", "--registry", folder, "-o", str(out), "--json", "/proc/x/y"]) == 4
     assert run(["fleet", "report", "--registry", str(tmp_path / "none"), "-o", str(out)]) == 4
 
 

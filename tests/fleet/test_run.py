@@ -11,7 +11,6 @@ import pytest
 
 from lce_rig.core.calibration import read_result
 from lce_rig.fleet.jobs import find_jobs
-from lce_rig.fleet.query import query
 from lce_rig.fleet.run import cluster, run_fleet, run_job
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import poses
@@ -52,9 +51,11 @@ def test_each_session_has_a_row_a_folder_and_a_cause_where_there_is_no_result(fl
     assert (done.n_new, done.n_held) == (3, 0)
     assert done.statuses == {"ok": 1, "failed": 2}
     assert done.causes == {"shortage.few_detected": 1, "fleet.session": 1}
-    (good,) = query(registry, "status = 'ok'").to_pylist()
+    (good,) = registry.read_table(where="status = 'ok'").to_pylist()
     saved = read_result(registry.place.local / good["folder"] / "result.json")
-    assert (poses(query(registry, "status = 'ok'")["T_cam_lidar"])[0] == saved.pairs[0].T_cam_lidar).all()
+    assert (
+        poses(registry.read_table(where="status = 'ok'")["T_cam_lidar"])[0] == saved.pairs[0].T_cam_lidar
+    ).all()
     assert good["robot"] == "r1" and good["verdict"] == saved.pairs[0].verdict
     assert good["folder"].endswith(good["session_sha256"][:12])
     assert (registry.place.local / good["folder"] / "overlays" / "contact_sheet.png").exists()

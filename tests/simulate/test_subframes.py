@@ -13,8 +13,8 @@ from lce_rig.simulate.room import Room, build_carrier
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.subframes import GREY, MovingView
 
-from .conftest import render_image
-from .test_camera import PLACEMENTS, QUIET
+from .conftest import PERFECT, render_image
+from .test_camera import PLACEMENTS
 
 T_NS = 1_700_000_000_123_000_000
 
@@ -26,7 +26,7 @@ def make_view(
         T = trajectory.at(t_ns)
         return Scene(room.raycaster, build_carrier(carrier, board, T, np.random.default_rng(0)), board, T)
 
-    return MovingView(backdrop, board, trajectory, scene_at, QUIET)
+    return MovingView(backdrop, board, trajectory, scene_at, PERFECT)
 
 
 def refined(picture: np.ndarray, truth: Array) -> Array:
@@ -43,7 +43,7 @@ def test_corners_lie_where_truth_and_pictures_have_them(
     view = make_view(room, board, backdrop, hold_board(T_world_board))
     seen = view.at(T_NS)
     subframe = np.rint(255 * np.clip(seen, 0, 1) ** (1 / 2.2)).astype(np.uint8)
-    picture = render_image(view.scene_at(T_NS), backdrop, QUIET, np.random.default_rng(0)).grey
+    picture = render_image(view.scene_at(T_NS), backdrop, PERFECT, np.random.default_rng(0)).grey
     corners_cam = transform(invert(backdrop.T_world_cam) @ T_world_board, board.corners())
     truth, _ = backdrop.intrinsics.project(corners_cam)
     in_subframe, in_picture = refined(subframe, truth), refined(picture, truth)
@@ -58,7 +58,7 @@ def test_the_board_and_its_carrier_are_as_bright_as_in_pictures(
 
     view = make_view(room, board, backdrop, hold_board(PLACEMENTS[0]))
     radiance = (render_radiance(view.scene_at(T_NS), backdrop) @ GREY).astype(np.float32)
-    expected = cv2.GaussianBlur(radiance, (0, 0), QUIET.blur_px)
+    expected = cv2.GaussianBlur(radiance, (0, 0), PERFECT.blur_px)
     error = np.abs(view.at(T_NS) - expected)
     # Shadows on the room are left out of sub-frames, and hands cast some on the board.
     assert np.mean(error > 0.1) < 0.03

@@ -4,7 +4,6 @@
 makes an earlier release current again. Each opens its own connections; nothing is kept between calls.
 """
 
-import difflib
 import getpass
 import json
 import shutil
@@ -15,10 +14,19 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+from pydantic import ConfigDict, Field, ValidationError
 
 from lce_rig.core.calibration import MADE_BY, ResultFile, read_result
-from lce_rig.core.errors import CommandError, LceRigError, ResultRefusedError, SessionError, TargetError
+from lce_rig.core.errors import (
+    CommandError,
+    LceRigError,
+    ResultRefusedError,
+    SessionError,
+    TargetError,
+    UsageError,
+)
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.export import export_formats
@@ -45,12 +53,12 @@ from lce_rig.fleet.deploy.releases import (
 from lce_rig.fleet.findings import DEPLOY_FAILED, DEPLOY_OLDER, DEPLOY_OTHER_ROBOT, DEPLOY_OTHER_SERIAL
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
-from lce_rig.rig.target_settings import TargetSettings
+from lce_rig.rig.loading import explain, read_document, read_profile
+from lce_rig.rig.settings import RobotName, Settings
+from lce_rig.rig.target_settings import ROBOT_FIELD, TargetSettings
 from lce_rig.session import Session
 from lce_rig.session.replacing import copy_over
 
-# Files whose lines are compared; others only differ or not.
-_TEXTS = (".json", ".yaml", ".yml", ".urdf", ".xml", ".txt", ".py", ".cfg", ".ini")
 _OTHER = "Another deployment came first: look at `--status`, then run the same command again."
 
 
@@ -79,7 +87,6 @@ class Plan:
         changed: files that differ from the current release's: "changed", "missing", "added".
         changed_there: current files that are not as they were deployed.
         sensors: changes of the extrinsics.
-        text: the lines that differ, as `diff -u` gives them; new and removed files by name.
         objections: a deployment is refused for them unless it is forced.
     """
 
@@ -88,7 +95,6 @@ class Plan:
     changed: Mapping[str, str]
     changed_there: Mapping[str, str]
     sensors: tuple[SensorChange, ...]
-    text: tuple[str, ...]
     objections: tuple[Finding, ...]
 
     @property
@@ -268,7 +274,6 @@ def _plan(
         differences(files, {} if state.current is None else state.current.files),
         changed_there,
         tuple(sensors),
-        tuple(_text_changes(deployed, new, differences(files, content_of(deployed)))),
         tuple(_objections(saved, target, state.current)),
     )
 
@@ -368,19 +373,6 @@ def _extrinsics(folder: Path) -> dict[tuple[str, str], Array]:
     return {}
 
 
-def _text_changes(earlier: Path, new: Path, changed: Mapping[str, str]) -> list[str]:
-    """List the lines in which texts differ, as `diff -u` does; new, removed and other files by name."""
-    lines: list[str] = []
-    for name, how in changed.items():
-        if how == "changed" and name.endswith(_TEXTS):
-            with suppress(OSError, ValueError):
-                before, after = ((folder / name).read_text("utf-8").splitlines() for folder in (earlier, new))
-                lines += difflib.unified_diff(before, after, f"deployed/{name}", f"new/{name}", lineterm="")
-                continue
-        lines.append(f"{name}: {'new' if how == 'added' else 'removed' if how == 'missing' else how}")
-    return lines
-
-
 def _write(place: Place, record: ReleaseRecord, folder: Path) -> None:
     """Copy the new files into a release and read them back."""
     name = f"releases/{record.name}"
@@ -462,3 +454,61 @@ def _run(place: Place, target: TargetSettings, release: str) -> str | None:
         what = f"{release} is in place, but its command ended with {code or ran.code}: {target.run}"
         raise CommandError(what, f"{said[-4000:]}\n{again}".strip())
     return output
+
+
+TARGETS_FILE = "deploy.yaml"
+
+
+class _TargetsFile(Settings):
+    # A rig's profile can be given, too: only its targets are read.
+    model_config = ConfigDict(extra="ignore")
+    targets: Annotated[dict[RobotName, TargetSettings], Field(min_length=1)]
+
+
+def read_targets(path: Path) -> dict[str, TargetSettings]:
+    """Read the block `targets` of a file; paths of this computer become absolute.
+
+    Raises:
+        ProfileError: no such file, or an invalid one; every problem with line and key.
+    """
+    document = read_document(read_profile(path), str(path))
+    try:
+        content = _TargetsFile.model_validate(document.data)
+    except ValidationError as error:
+        raise explain(error, document) from error
+    return {name: target.located(path.parent) for name, target in content.targets.items()}
+
+
+def find_target(name: str, file: Path | None, session: Path | None, rig: Rig | None) -> TargetSettings:
+    """Find a target: in the file if one is given, else beside the session, else in its profile.
+
+    Args:
+        name: of the target.
+        file: that lists targets.
+        session: its folder; deploy.yaml is looked for in its parent.
+        rig: the session's profile.
+
+    Raises:
+        ProfileError: a file is invalid.
+        UsageError: there is no target of this name, or it stands for many robots.
+    """
+    targets: dict[str, TargetSettings] = {}
+    beside = None if session is None else session.resolve().parent / TARGETS_FILE
+    if file is not None:
+        targets = read_targets(file)
+    else:
+        targets |= {} if rig is None else rig.targets
+        if beside is not None and beside.is_file():
+            targets |= read_targets(beside)
+    target = targets.get(name)
+    if target is not None and ROBOT_FIELD in target.to:
+        if not target.robot:
+            raise UsageError(f"target {name!r} stands for many robots", "Use `lce-rig fleet deploy`.")
+        return target.for_robot(target.robot)
+    if target is not None:
+        return target
+    where = file or beside or TARGETS_FILE
+    hint = (
+        f"Known targets: {', '.join(targets)}." if targets else f"List targets in {where}, or in the profile."
+    )
+    raise UsageError(f"no target is called {name!r}", hint)
