@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lce_rig.devices.reading import LiveSource
     from lce_rig.rig import Rig
     from lce_rig.session import Session
-    from lce_rig.show.phone import Preview
+    from lce_rig.show.phone.preview import Preview
 
 #: An unattended run ends after this time without a capture. The simulated person never rests; a person at a
 #: rig without a terminal may be away for a while.
@@ -152,7 +152,7 @@ def _open_rig(
 
 def _open_page(stack: ExitStack, address: str) -> "Preview":
     """Serve the preview page and print its link."""
-    from lce_rig.show.phone import Preview, parse_address
+    from lce_rig.show.phone.preview import Preview, parse_address
     from lce_rig.show.screen.live_view import qr_lines
 
     page = Preview(*parse_address(address))

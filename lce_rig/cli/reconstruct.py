@@ -95,7 +95,7 @@ def reconstruct(
     from lce_rig.detect.events.flicker import measure_flicker
     from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
     from lce_rig.io.events import open_events
-    from lce_rig.show.overlays.animation import write_gif, write_video
+    from lce_rig.show.overlays.overlay_files import write_gif, write_video
 
     if window_s is not None and window_events is not None:
         raise UsageError("--window-s and --window-events exclude each other")

@@ -29,8 +29,7 @@ from lce_rig.fleet.findings import MOVED
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.table import covariances, poses
 from lce_rig.session.durable import write_atomically
-from lce_rig.show.report.drawing import BLUE, FAINT, RED, drawing, new_axes, style
-from lce_rig.show.report.page import render
+from lce_rig.show.report.page import BLUE, FAINT, RED, drawing, new_axes, render, style
 
 State = Literal["moved", "steady", "cannot_tell"]
 STATES: tuple[State, ...] = ("moved", "steady", "cannot_tell")

@@ -28,9 +28,8 @@ from lce_rig.pipeline.result_files import (
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import DEBUG
-from lce_rig.show.overlays.check_pictures import draw_check
-from lce_rig.show.overlays.event_picture import ImageWithEvents
-from lce_rig.show.overlays.overlay_files import is_overlay
+from lce_rig.show.overlays.overlay import ImageWithEvents
+from lce_rig.show.overlays.overlay_files import draw_check, is_overlay
 
 
 @dataclass(frozen=True, eq=False)

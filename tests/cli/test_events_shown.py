@@ -13,7 +13,7 @@ from lce_rig.core.calibration import Certificate, Metrics
 from lce_rig.core.geometry import invert
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
-from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER
+from lce_rig.show.overlays.overlay import BRIGHTER, DARKER
 from lce_rig.simulate import SimulationOptions, simulate_captures
 from tests.saved_results import made_calibration, write_result
 

@@ -52,7 +52,7 @@ def test_the_command_writes_page_and_findings(registry, tmp_path, capsys):
     document = json.loads((tmp_path / "out.json").read_text())
     assert document["robots"]["<r1>"] == "moved" and document["n_sessions"] == 80
     (finding,) = document["findings"]
-    assert finding["code"] == "fleet.moved" and finding["facts"]["after"] == "2026-01-06T10:00:00Z"
+    assert finding["code"] == "fleet.moved" and finding["figures"]["after"] == "2026-01-06T10:00:00Z"
     assert document["causes"] == [{"severity": "no result", "code": "fleet.signal", "rows": 1, "robots": 1}]
     assert run(["fleet", "report", "--registry", folder, "-o", str(out), "--json", "/proc/x/y"]) == 4
     assert run(["fleet", "report", "--registry", str(tmp_path / "none"), "-o", str(out)]) == 4

@@ -16,8 +16,7 @@ from lce_rig.detect.lidar.search import plane_limit_m
 from lce_rig.rig import QualitySettings
 from lce_rig.show.overlays import canvas
 from lce_rig.show.overlays.canvas import BLACK, BLUE, FAINT, INK, MAGENTA, ORANGE, WHITE, Colour, Picture
-from lce_rig.show.overlays.event_picture import draw_event_key, draw_events
-from lce_rig.show.overlays.overlay import draw_image_board, range_limits
+from lce_rig.show.overlays.overlay import draw_event_key, draw_events, draw_image_board, range_limits
 
 _PANE_PX = 800
 _PANORAMA_PX = 190

@@ -19,9 +19,8 @@ from lce_rig.judge.findings import cause_words, weakest_words
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.show.report import calibration_drawings as drawings
-from lce_rig.show.report.drawing import style
-from lce_rig.show.report.evidence import Evidence, gather
-from lce_rig.show.report.page import as_markup, render
+from lce_rig.show.report.calibration_drawings import Evidence, gather
+from lce_rig.show.report.page import as_markup, render, style
 
 Overlays = Callable[[Calibration, str], Sequence[str]]
 """Gives the paths of a capture's overlays, from the folder of the page."""

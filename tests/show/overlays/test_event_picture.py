@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SourceError
-from lce_rig.show.overlays.animation import write_gif, write_video
-from lce_rig.show.overlays.event_picture import BRIGHTER, DARKER, ImageWithEvents, draw_events
+from lce_rig.show.overlays.overlay import BRIGHTER, DARKER, ImageWithEvents, draw_events
+from lce_rig.show.overlays.overlay_files import write_gif, write_video
 from tests.show.overlays.test_pictures import (
     FOLDING,
     count,

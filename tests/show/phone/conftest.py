@@ -10,7 +10,7 @@ import pytest
 
 from lce_rig.collect.guidance import Coverage
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
-from lce_rig.show.phone import Preview
+from lce_rig.show.phone.preview import Preview
 
 from .browser import Browser
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from lce_rig.show.phone import Preview
+from lce_rig.show.phone.preview import Preview
 
 from .browser import Page
 from .conftest import state

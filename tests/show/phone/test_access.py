@@ -4,7 +4,7 @@ import aiohttp
 import pytest
 
 from lce_rig.core.errors import UsageError
-from lce_rig.show.phone import Preview
+from lce_rig.show.phone.preview import Preview
 
 from .conftest import state
 from .watcher import Watcher

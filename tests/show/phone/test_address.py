@@ -4,8 +4,7 @@ import socket
 import pytest
 
 from lce_rig.core.errors import UsageError
-from lce_rig.show.phone import Preview, parse_address
-from lce_rig.show.phone.address import links, listen
+from lce_rig.show.phone.preview import Preview, links, listen, parse_address
 
 from .conftest import port_of
 

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from lce_rig.show.phone import Preview, pages
+from lce_rig.show.phone import pages
 from lce_rig.show.phone.pages import MAX_CONNECTIONS, Pages
+from lce_rig.show.phone.preview import Preview
 
 from .conftest import port_of, state
 from .watcher import Watcher

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.live.state import Drawing
-from lce_rig.show.phone import Preview, pages
-from lce_rig.show.phone.pages import MAX_UNDER_WAY
-from lce_rig.show.phone.state_message import MAX_WIDTH_PX, encode_picture
+from lce_rig.show.phone import pages
+from lce_rig.show.phone.pages import MAX_UNDER_WAY, MAX_WIDTH_PX, encode_picture
+from lce_rig.show.phone.preview import Preview
 
 from .conftest import PRESENT_PX, picture, port_of, state
 from .watcher import Watcher

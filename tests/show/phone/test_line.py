@@ -2,7 +2,7 @@
 
 import pytest
 
-from lce_rig.show.phone import Preview
+from lce_rig.show.phone.preview import Preview
 
 from .browser import Browser
 from .conftest import port_of

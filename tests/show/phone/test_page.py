@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.live.state import Drawing, StreamState
-from lce_rig.show.phone import Preview
+from lce_rig.show.phone.preview import Preview
 
 from .browser import Browser, Page
 from .conftest import HEIGHT_PX, PRESENT_PX, WANTED_PX, WIDTH_PX, picture, state

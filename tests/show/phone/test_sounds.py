@@ -5,7 +5,7 @@ import time
 import pytest
 
 from lce_rig.collect.live.state import Cue
-from lce_rig.show.phone import Preview
+from lce_rig.show.phone.preview import Preview
 
 from .browser import Browser
 from .conftest import state

@@ -9,8 +9,8 @@ import pytest
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import invert
 from lce_rig.rig import load_rig
+from lce_rig.show.report.calibration_drawings import gather
 from lce_rig.show.report.calibration_page import work_point
-from lce_rig.show.report.evidence import gather
 from tests.export.conftest import calibration as without_boards
 
 from .conftest import RLFS, page

@@ -2,7 +2,7 @@
 
 import re
 
-from lce_rig.show.report.drawing import BLUE, drawing, new_axes, style
+from lce_rig.show.report.page import BLUE, drawing, new_axes, style
 
 
 def _bars(label: str = "bars"):
