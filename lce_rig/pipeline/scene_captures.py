@@ -126,7 +126,7 @@ class SceneCaptures:
                     if camera in capture.event_cameras and len(events := capture.events(camera)):
                         offset_ns = rig_offset_ns(stream_of(events, self._rig), self._rig)
                         first_ns, last_ns = int(events.t_ns[0]), int(events.t_ns[-1])
-                        cuts.append(EventCut(events, first_ns, last_ns + 1, offset_ns, 0))
+                        cuts.append(EventCut((events,), first_ns, last_ns + 1, offset_ns, 0))
             self._take(capture.name, images, scans, cuts)
 
     def take_recordings(self, paths: Sequence[Path], progress: Progress) -> None:

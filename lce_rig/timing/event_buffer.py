@@ -1,10 +1,12 @@
 """The last seconds of every event camera's stream, and the stretch of it that belongs to a scan."""
 
+from collections import deque
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from lce_rig.core.data import Events
+from lce_rig.core.data import Events, join_events
 from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import rig_offset_ns, stream_of
 
@@ -13,9 +15,6 @@ BEFORE_NS = 1_200_000_000
 AFTER_NS = 150_000_000
 """... and after its last, for the board to be followed."""
 
-_LEAST_EVENTS = 1 << 16
-# Factor of the buffered events: more room costs memory, less of it copies more often.
-_ROOM = 1.5
 # A clock that is fitted again while events come may move them back by microseconds.
 _MAX_BACK_NS = 1_000_000
 
@@ -25,46 +24,57 @@ class EventCut:
     """A stretch of one camera's stream.
 
     Attributes:
-        events: every event with start_ns <= t < end_ns, at least one; they share the stream's memory.
+        packets: those with its events, at least one event.
         start_ns, end_ns: on the events' own clock.
         offset_ns: what brings their timestamps to the rig's time.
         missing_ns: how much of the stretch's beginning lies before the stream; 0 where it is whole.
     """
 
-    events: Events
+    packets: tuple[Events, ...]
     start_ns: int
     end_ns: int
     offset_ns: int
     missing_ns: int
 
+    @cached_property
+    def events(self) -> Events:
+        """Every event with start_ns <= t < end_ns; joined only when wanted, as most frames show no board."""
+        # Arrival is known of a packet's first event, not of a stretch's.
+        return replace(join_events(self.packets).between(self.start_ns, self.end_ns), host_ns=None)
+
     @property
     def sensor(self) -> str:
         """The camera."""
-        return self.events.sensor
+        return self.packets[0].sensor
 
     def __len__(self) -> int:
         return len(self.events)
 
 
 class EventBuffer:
-    """Holds the events of every camera, and hands out what lies around a scan without copying."""
+    """Holds the packets of every event camera, and hands out those around a scan without copying."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._streams: dict[str, _Stream] = {}
 
     def add(self, events: Events) -> None:
-        """Take a camera's next packet, not empty."""
-        stream = self._streams.get(events.sensor)
-        if stream is None:
+        """Take a camera's next packet, not empty; a clock that was set back begins its stream again."""
+        first_ns, stream = int(events.t_ns[0]), self._streams.get(events.sensor)
+        if stream is None or first_ns < stream.last_ns - _MAX_BACK_NS:
             offset_ns = rig_offset_ns(stream_of(events, self._rig), self._rig)
-            stream = self._streams[events.sensor] = _Stream(events, offset_ns)
-        stream.add(events)
+            stream = self._streams[events.sensor] = _Stream(offset_ns, first_ns)
+        if first_ns < stream.last_ns:
+            events = replace(events, t_ns=np.maximum(events.t_ns, stream.last_ns))
+        stream.packets.append(events)
+        stream.last_ns = int(events.t_ns[-1])
 
     def forget_before(self, time_ns: int) -> None:
-        """Drop the events before a time of the rig's clock, but the last of each stream."""
+        """Drop the packets before a time of the rig's clock, but the last of each stream."""
         for stream in self._streams.values():
-            stream.forget_before(time_ns - stream.offset_ns)
+            packets, until_ns = stream.packets, time_ns - stream.offset_ns
+            while len(packets) > 1 and packets[0].t_ns[-1] < until_ns:
+                packets.popleft()
 
     def clear(self) -> None:
         """Forget everything: the clocks were set."""
@@ -78,71 +88,23 @@ class EventBuffer:
         """Cut start_ns <= t < end_ns, the rig's clock, out of every stream that has events in it."""
         cuts = []
         for _, stream in sorted(self._streams.items()):
-            own_ns = start_ns - stream.offset_ns, end_ns - stream.offset_ns
-            events = stream.between(*own_ns)
-            if len(events):
-                missing_ns = max(0, stream.first_ns - own_ns[0])
-                cuts.append(EventCut(events, *own_ns, stream.offset_ns, missing_ns))
+            first_ns, end = start_ns - stream.offset_ns, end_ns - stream.offset_ns
+            packets = tuple(p for p in stream.packets if p.t_ns[-1] >= first_ns and p.t_ns[0] < end)
+            if any(len(packet.between(first_ns, end)) for packet in packets):
+                missing_ns = max(0, stream.first_ns - first_ns)
+                cuts.append(EventCut(packets, first_ns, end, stream.offset_ns, missing_ns))
         return tuple(cuts)
 
 
 class _Stream:
-    """One camera's events in columns that packets are appended to.
-
-    A full block is left to the cuts that were taken of it, and a new one begun with what is still needed: no
-    event of a cut is ever moved or overwritten.
+    """One camera's packets.
 
     Attributes:
         offset_ns: what brings timestamps to the rig's time.
-        first_ns: stamp of the first event of all.
-        last_ns: of the last.
+        first_ns, last_ns: timestamps of the first event of all and of the last.
     """
 
-    def __init__(self, first: Events, offset_ns: int) -> None:
+    def __init__(self, offset_ns: int, first_ns: int) -> None:
         self.offset_ns = offset_ns
-        self.first_ns = self.last_ns = int(first.t_ns[0])
-        self._block = _block_like(first, 0)
-        self._start = self._end = 0
-
-    def add(self, events: Events) -> None:
-        """Append a packet; a clock that was set back begins the stream again."""
-        t_ns, first_ns = events.t_ns, int(events.t_ns[0])
-        if first_ns < self.last_ns - _MAX_BACK_NS:
-            self.first_ns, self._start = first_ns, self._end
-        elif first_ns < self.last_ns:
-            t_ns = np.maximum(t_ns, self.last_ns)
-        if self._end + len(events) > len(self._block):
-            self._begin_block(len(events))
-        _write(self._block, self._end, replace(events, t_ns=t_ns))
-        self._end += len(events)
-        self.last_ns = int(t_ns[-1])
-
-    def forget_before(self, time_ns: int) -> None:
-        """Drop what comes before a timestamp, but the last event."""
-        t_ns = self._block.t_ns[self._start : self._end]
-        self._start += min(int(np.searchsorted(t_ns, time_ns)), len(t_ns) - 1)
-
-    def between(self, start_ns: int, end_ns: int) -> Events:
-        """Return the events with start_ns <= t < end_ns."""
-        return self._held().between(start_ns, end_ns)
-
-    def _held(self) -> Events:
-        return self._block.select(slice(self._start, self._end))
-
-    def _begin_block(self, n_more: int) -> None:
-        held = self._held()
-        self._block = _block_like(held, max(_LEAST_EVENTS, round(_ROOM * (len(held) + n_more))))
-        _write(self._block, 0, held)
-        self._start, self._end = 0, len(held)
-
-
-def _block_like(events: Events, n: int) -> Events:
-    """Make room for events of the same camera."""
-    blank = (np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.bool_))
-    return Events(events.sensor, *blank, events.width_px, events.height_px)
-
-
-def _write(block: Events, start: int, events: Events) -> None:
-    place = slice(start, start + len(events))
-    block.t_ns[place], block.x[place], block.y[place] = events.t_ns, events.x, events.y
-    block.polarity[place] = events.polarity
+        self.first_ns = self.last_ns = first_ns
+        self.packets: deque[Events] = deque()

@@ -231,7 +231,7 @@ def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen) -> None:
         n = len(t_ns)
         x, y = rng.integers(0, 640, n).astype(np.uint16), rng.integers(0, 360, n).astype(np.uint16)
         noise = Events("cam", t_ns, x, y, np.ones(n, dtype=np.bool_), 640, 360)
-        cut = EventCut(noise, int(t_ns[0]), int(t_ns[-1]) + 1, 0, 0)
+        cut = EventCut((noise,), int(t_ns[0]), int(t_ns[-1]) + 1, 0, 0)
         captures.take_frame(Frame(scan.stamp_ns, (), (scan,), (cut,)))
     (pair,) = judge(seen.rig, result, captures).pairs
     assert pair.state == "unknown" and pair.drift.n_captures == len(seen.captures)
