@@ -141,7 +141,7 @@ def _stamps(
     """
     from lce_rig.core.errors import UsageError
 
-    first_ns, last_ns = events.extent_ns()
+    first_ns, last_ns = events.span_ns
     begin_ns, every_ns = first_ns + round(1e9 * start_s), round(1e9 * every_s)
     end_ns = last_ns if duration_s is None else min(last_ns, begin_ns + round(1e9 * duration_s))
     if begin_ns >= last_ns:

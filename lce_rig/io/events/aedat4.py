@@ -28,7 +28,7 @@ from lce_rig.core.data import MAX_TIME_NS, EventColumns, Events, join_events
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import NS_PER_US, NoEventsError, parse_size, to_ns
+from lce_rig.io.events.event_recording import NS_PER_US, EventStream, NoEventsError, parse_size, to_ns
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 EVENT = np.dtype({"names": ["t", "x", "y", "on"], "formats": ["<i8", "<i2", "<i2", "?"], "itemsize": 16})
@@ -170,7 +170,7 @@ class Aedat4File:
         return ""
 
 
-class Aedat4Events:
+class Aedat4Events(EventStream):
     """Events of an AEDAT4 file; see `EventStream`."""
 
     def __init__(self, path: Path) -> None:

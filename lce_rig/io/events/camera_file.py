@@ -1,7 +1,7 @@
 """A file of an event camera's own recorder: its events and, in AEDAT4, its frames."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from lce_rig.core.data import Image, Sample, Stream
@@ -9,8 +9,7 @@ from lce_rig.core.losses import Losses
 from lce_rig.io import findings
 from lce_rig.io.events import open_events
 from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
-from lce_rig.io.events.event_recording import CameraEvents, NoEventsError, worded
-from lce_rig.io.events.prophesee import PropheseeEvents
+from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
 from lce_rig.io.joining import merge_by_time
 from lce_rig.io.protocol import SourceOptions, Span, choose_event_camera, fingerprint
 from lce_rig.rig import Rig
@@ -37,30 +36,28 @@ class EventCameraFile:
         """
         self.path = path
         self.notes: list[str] = []
+        self.key = fingerprint([path])
+        self.n_samples = 0
+        self.streams: dict[Stream, Span | None] = {}
         self._rig = rig
         self._camera, channel = choose_event_camera(rig, options, self.notes)
-        self.streams: dict[Stream, Span | None] = {}
-        self.n_samples = 0
-        self._has_frames = self._open_frames()
-        size = rig.cameras[self._camera].resolution_px
-        self._events: CameraEvents | None = None
+        aedat4 = Aedat4File(path) if path.suffix.lower() == ".aedat4" else None
+        self._frames = None if aedat4 is None else self._open_frames(aedat4)
+        serial = "" if aedat4 is None else aedat4.serial
+        self._events: EventRecording | None = None
         try:
-            self._events = CameraEvents(open_events(path, sensor=self._camera, resolution=size))
+            size = rig.cameras[self._camera].resolution_px
+            self._events = open_events(path, sensor=self._camera, resolution=size)
+            self._events.tie_to_host()
+            first_ns, last_ns = self._events.span_ns
+            self.streams[Stream(self._camera, channel, "events")] = first_ns, last_ns
+            length_s = (last_ns - first_ns) * 1e-9
+            self.notes.append(f"{path.name}: {length_s:.1f} s of {self._camera}.{channel}")
+            serial = serial or self._events.serial
         except NoEventsError as error:
-            if not self._has_frames:
+            if self._frames is None:
                 raise
             self.notes.append(f"{error.what}; its frames are read")
-        if self._events is not None:
-            self.streams[Stream(self._camera, channel, "events")] = self._events.span_ns
-            length_s = (self._events.span_ns[1] - self._events.span_ns[0]) * 1e-9
-            self.notes.append(f"{path.name}: {length_s:.1f} s of {self._camera}.{channel}")
-        self.key = fingerprint([path])
-        readers: dict[str, type[Aedat4File | PropheseeEvents]] = {
-            ".aedat4": Aedat4File,
-            ".raw": PropheseeEvents,
-        }
-        reader = readers.get(path.suffix.lower())
-        serial = "" if reader is None else reader(path).serial
         self.serials = {self._camera: serial} if re.fullmatch("[A-Za-z0-9]{1,64}", serial) else {}
 
     def samples(self) -> Iterator[Sample]:
@@ -69,12 +66,10 @@ class EventCameraFile:
         Raises:
             SourceError: after all that can be read, where the events' clock was set back.
         """
-        parts: list[Iterator[Sample]] = []
+        parts: list[Iterable[Sample]] = [] if self._events is None else [self._events]
         losses = Losses()
-        if self._events is not None:
-            parts.append(self._events.samples())
-        if self._has_frames:
-            parts.append(self._images(losses))
+        if self._frames is not None:
+            parts.append(self._images(*self._frames, losses))
         try:
             yield from merge_by_time(parts, self._rig)
         finally:
@@ -82,40 +77,34 @@ class EventCameraFile:
             notes += [] if self._events is None else self._events.notes
             self.notes += [note for note in notes if note not in self.notes]
 
-    def _open_frames(self) -> bool:
-        """Find the frames of an AEDAT4 file, and the channel they belong to; False if none are read."""
-        if self.path.suffix.lower() != ".aedat4":
-            return False
-        self._file = Aedat4File(self.path)
-        number = self._file.first_stream("FRME")
+    def _open_frames(self, file: Aedat4File) -> tuple[Aedat4File, int, str] | None:
+        """Find the frames of an AEDAT4 file, the number of their stream and their channel; None without."""
+        number = file.first_stream("FRME")
         if number is None:
-            return False
-        first = next(self._file.packets(number, Losses(), decode_frame), None)
-        last = self._file.last_packet(number, decode_frame)
+            return None
+        first = next(file.packets(number, Losses(), decode_frame), None)
+        last = file.last_packet(number, decode_frame)
         if first is None or last is None:
-            return False
+            return None
         channel = self._rig.cameras[self._camera].first_channel("frames")
         if channel is None:
-            self.notes.append(
-                f"{self.path.name}: frames skipped; {self._camera} has no channel of kind frames"
-            )
-            return False
-        self._channel, self._number = channel, number
+            note = f"frames skipped; {self._camera} has no channel of kind frames"
+            self.notes.append(f"{self.path.name}: {note}")
+            return None
         self.streams[Stream(self._camera, channel, "images")] = first.mid_exposure_ns, last.mid_exposure_ns
-        self.n_samples = len(self._file.places[number])
-        self.notes += self._file.notes
+        self.n_samples = len(file.places[number])
         meaning = "has no exposure time; its timestamps are used as mid exposure"
         if first.exposure_ns:
             exposure_ms = first.exposure_ns * 1e-6
             meaning = f"timestamped at mid exposure; exposure {exposure_ms:.1f} ms in the first frame"
-        self.notes.append(f"{self.path.name}: {self._camera}.{channel} {meaning}")
-        return True
+        self.notes += [*file.notes, f"{self.path.name}: {self._camera}.{channel} {meaning}"]
+        return file, number, channel
 
-    def _images(self, losses: Losses) -> Iterator[Sample]:
+    def _images(self, file: Aedat4File, number: int, channel: str, losses: Losses) -> Iterator[Sample]:
         last_ns: int | None = None
-        for frame in self._file.packets(self._number, losses, decode_frame):
+        for frame in file.packets(number, losses, decode_frame):
             if last_ns is not None and frame.mid_exposure_ns <= last_ns:
                 losses.add(findings.FRAMES_OUT_OF_ORDER())
                 continue
             last_ns = frame.mid_exposure_ns
-            yield Image(self._camera, self._channel, last_ns, frame.pixels)
+            yield Image(self._camera, channel, last_ns, frame.pixels)

@@ -3,9 +3,10 @@
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,16 +54,18 @@ def worded(losses: Losses) -> list[str]:
     return [finding.sentence for finding in losses.findings()]
 
 
-class EventStream(Protocol):
+class EventStream:
     """One file or topic of events.
 
     Attributes:
         resolution_px: (width, height) that the file declares; None where it declares none.
         notes: what was chosen or assumed on opening, in words.
+        serial: the camera's serial number; "" where the file does not name it.
     """
 
     resolution_px: tuple[int, int] | None
     notes: list[str]
+    serial: str = ""
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events from the beginning, as they lie in the file; may be called again and again.
@@ -70,16 +73,11 @@ class EventStream(Protocol):
         Raises:
             SourceError: nothing more can be read for a reason the user can repair.
         """
-        ...
-
-
-@runtime_checkable
-class KnowsItsLength(Protocol):
-    """A stream whose duration is known without reading it."""
+        raise NotImplementedError
 
     def duration_ns(self) -> int | None:
-        """Return the time from the first event to the last, about; None where damage hides it."""
-        ...
+        """Return the time from the first event to the last, about; None where only reading all tells."""
+        return None
 
 
 def seconds_in(t_ns: int, first_ns: int) -> str:
@@ -113,12 +111,13 @@ class EventRecording:
     """Events of one camera from one file or topic.
 
     Iterating yields stretches of `Events` from the beginning, in the order of time, and holds only a few of
-    them in memory; it may be done again and again. `read` cuts out a window.
+    them in memory; it may be done again and again. `read` cuts out a window. Timestamps are the sensor's own.
 
     Attributes:
         path: the file or folder.
         sensor: name of the camera.
         resolution_px: (width, height).
+        serial: the camera's serial number; "" where the file does not name it.
     """
 
     def __init__(
@@ -138,10 +137,11 @@ class EventRecording:
         """
         self.path = path
         self.sensor = sensor
+        self.serial = stream.serial
         self._stream = stream
         self._losses = Losses()
         self._assumed: list[str] = []
-        self._span_ns: Span | None = None
+        self._shift_ns = 0
         if not any(len(stretch) for stretch in stream.stretches(self._losses)):
             raise NoEventsError("; ".join([f"{path} holds no events", *worded(self._losses)]))
         self.resolution_px = self._settle_resolution(resolution_px)
@@ -154,51 +154,38 @@ class EventRecording:
 
     @property
     def start_ns(self) -> int:
-        """First timestamp, device time; only the beginning is read."""
+        """First timestamp; only the beginning is read."""
         first = next(iter(self), None)
         if first is None:
-            raise self._unordered()
+            what = f"{self.path} holds no events that can be sorted by time"
+            raise SourceError("; ".join([what, *worded(self._losses)]))
         return int(first.t_ns[0])
 
-    @property
+    @cached_property
     def span_ns(self) -> Span:
-        """First and last timestamp, device time; the first call reads the whole recording."""
-        if self._span_ns is None:
-            for _ in self:
-                pass
-        if self._span_ns is None:
-            raise self._unordered()
-        return self._span_ns
-
-    def _unordered(self) -> SourceError:
-        what = f"{self.path} holds no events that can be sorted by time"
-        return SourceError("; ".join([what, *worded(self._losses)]))
-
-    def extent_ns(self) -> Span:
-        """First and last timestamp; the last may be off by some ms where that saves reading the recording."""
-        duration_ns = self._stream.duration_ns() if isinstance(self._stream, KnowsItsLength) else None
-        if self._span_ns is not None or duration_ns is None:
-            return self.span_ns
-        start_ns = self.start_ns
+        """First and last timestamp; the last within some ms where that saves reading the recording."""
+        start_ns, duration_ns = self.start_ns, self._stream.duration_ns()
+        if duration_ns is None:
+            duration_ns = max(int(stretch.t_ns[-1]) for stretch in self) - start_ns
         return start_ns, start_ns + duration_ns
 
-    @property
-    def duration_s(self) -> float:
-        """From the first event to the last; the first call reads the whole recording."""
-        first_ns, last_ns = self.span_ns
-        return (last_ns - first_ns) * 1e-9
+    def tie_to_host(self) -> None:
+        """Move timestamps that count from the sensor's start to the host's clock, where arrivals are known.
 
-    def host_offset_ns(self) -> int | None:
-        """Return the host's clock minus the device's; None if arrivals are unknown.
-
-        The least difference among the first packets: the one that waited least.
+        The shift is the least difference among the first packets: the one that waited least.
         """
-        delays = [
+        start_ns = self.start_ns
+        delays_ns = [
             stretch.host_ns - int(stretch.t_ns[0])
             for stretch in islice(self, _HOST_STRETCHES)
             if stretch.host_ns is not None
         ]
-        return min(delays, default=None)
+        if start_ns < _SINCE_1970_NS and delays_ns and start_ns + min(delays_ns) >= _SINCE_1970_NS:
+            self._shift_ns = min(delays_ns) // NS_PER_US * NS_PER_US
+            self._assumed.append(
+                f"{self.sensor}'s events count from the sensor's start; {self._shift_ns * 1e-9:.6f} s added, "
+                "from the arrival of their packets"
+            )
 
     def __iter__(self) -> Iterator[Events]:
         """Yield the events from the beginning, in the order of time.
@@ -207,18 +194,13 @@ class EventRecording:
             SourceError: the timestamps run back for good, or events lie off the sensor.
         """
         losses = Losses()
-        first_ns = last_ns = None
         try:
             for stretch in in_time_order(self.path, self._stream.stretches(losses), losses):
                 on_sensor = self._on_sensor(stretch, losses)
                 if len(on_sensor):
-                    first_ns = int(on_sensor.t_ns[0]) if first_ns is None else first_ns
-                    last_ns = int(on_sensor.t_ns[-1])
-                    yield self.to_events(on_sensor)
+                    yield self._to_events(on_sensor)
         finally:
             self._losses.keep_more(losses)
-        if first_ns is not None and last_ns is not None:
-            self._span_ns = first_ns, last_ns
 
     def read(self, start_ns: int, end_ns: int) -> Events:
         """Read the events with start_ns <= t < end_ns, device time; there may be none.
@@ -226,7 +208,7 @@ class EventRecording:
         Raises:
             SourceError: as iterating does.
         """
-        parts = [self.to_events(NO_EVENTS)]
+        parts = [self._to_events(NO_EVENTS)]
         for stretch in self:
             if stretch.t_ns[-1] >= start_ns:
                 parts.append(stretch.between(start_ns, end_ns))
@@ -235,9 +217,10 @@ class EventRecording:
         # Arrival is known of a stretch's first event, not of a window's.
         return replace(join_events(parts), host_ns=None)
 
-    def to_events(self, columns: EventColumns) -> Events:
+    def _to_events(self, columns: EventColumns) -> Events:
         """Add the camera's name and resolution."""
-        t_ns, x, y, polarity = columns.t_ns, columns.x, columns.y, columns.polarity
+        t_ns = columns.t_ns + self._shift_ns if self._shift_ns else columns.t_ns
+        x, y, polarity = columns.x, columns.y, columns.polarity
         return Events(self.sensor, t_ns, x, y, polarity, *self.resolution_px, columns.host_ns)
 
     def _settle_resolution(self, profile_px: tuple[int, int] | None) -> tuple[int, int]:
@@ -282,48 +265,6 @@ class EventRecording:
 
 def _size(resolution_px: tuple[int, int]) -> str:
     return f"{resolution_px[0]}x{resolution_px[1]}"
-
-
-class CameraEvents:
-    """Events of one camera on the clock that the other sensors share, in the order of time.
-
-    Some sensors count from their own start. If arrivals at the host are known, their timestamps are moved by
-    the least delay, so that they meet the timestamps of other sensors.
-
-    Attributes:
-        recording: the events on the sensor's own clock.
-        shift_ns: added to their timestamps; whole microseconds.
-        span_ns: first and last timestamp after that, the last within some ms.
-    """
-
-    def __init__(self, recording: EventRecording) -> None:
-        self.recording = recording
-        start_ns = recording.start_ns
-        offset_ns = None if start_ns >= _SINCE_1970_NS else recording.host_offset_ns()
-        is_shifted = offset_ns is not None and start_ns + offset_ns >= _SINCE_1970_NS
-        self.shift_ns = offset_ns // NS_PER_US * NS_PER_US if offset_ns is not None and is_shifted else 0
-        first_ns, last_ns = recording.extent_ns()
-        self.span_ns: Span = first_ns + self.shift_ns, last_ns + self.shift_ns
-
-    @property
-    def notes(self) -> list[str]:
-        """Assumptions, repairs and losses so far, in words."""
-        if not self.shift_ns:
-            return self.recording.notes
-        tied = (
-            f"{self.recording.path.name}: {self.recording.sensor}'s events count from the sensor's start; "
-            f"{self.shift_ns * 1e-9:.6f} s added, from the arrival of their packets"
-        )
-        return [*self.recording.notes, tied]
-
-    def samples(self) -> Iterator[Events]:
-        """Yield the events in packets.
-
-        Raises:
-            SourceError: the timestamps run back for good, or events lie off the sensor.
-        """
-        for events in self.recording:
-            yield replace(events, t_ns=events.t_ns + self.shift_ns) if self.shift_ns else events
 
 
 def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses) -> Iterator[EventColumns]:

@@ -16,13 +16,13 @@ from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import to_ns
+from lce_rig.io.events.event_recording import EventStream, to_ns
 
 _BLOCK_EVENTS = 1 << 20
 _COLUMNS = ("events/t", "events/x", "events/y", "events/p")
 
 
-class Hdf5Events:
+class Hdf5Events(EventStream):
     """Events of an HDF5 file; see `EventStream`."""
 
     def __init__(self, path: Path) -> None:

@@ -24,7 +24,7 @@ from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import NS_PER_US, parse_size
+from lce_rig.io.events.event_recording import NS_PER_US, EventStream, parse_size
 
 _BLOCK_BYTES = 1 << 18
 _WORDS = {"2": "<u4", "3": "<u2"}
@@ -233,12 +233,8 @@ def _expand(
     return word, bit
 
 
-class PropheseeEvents:
-    """Events of a .raw file; see `EventStream`.
-
-    Attributes:
-        serial: the camera's serial number, "" if the file does not name it.
-    """
+class PropheseeEvents(EventStream):
+    """Events of a .raw file; see `EventStream`."""
 
     def __init__(self, path: Path) -> None:
         """Read the header.

@@ -16,12 +16,12 @@ from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import parse_size, to_ns
+from lce_rig.io.events.event_recording import EventStream, parse_size, to_ns
 
 _BLOCK_LINES = 1 << 16
 
 
-class TextEvents:
+class TextEvents(EventStream):
     """Events of a text file; see `EventStream`."""
 
     def __init__(self, path: Path) -> None:

@@ -18,7 +18,7 @@ from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import NS_PER_US, seconds_in
+from lce_rig.io.events.event_recording import NS_PER_US, EventStream, seconds_in
 from lce_rig.io.events.prophesee import EVT3, LIBCAER_CMP, WordDecoder
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.messages import EventHead, decode_event_array, deserialize, header_stamp_ns
@@ -173,7 +173,7 @@ def _decode_libcaer(packet: EventPacket) -> EventColumns:
     return EventColumns(t_ns, x, y, (where >> 1 & 1).astype(bool), packet.head.stamp_ns)
 
 
-class BagEvents:
+class BagEvents(EventStream):
     """Events of one topic; see `EventStream`."""
 
     def __init__(self, path: Path, topic: str | None, bag: BagFile | None = None) -> None:

@@ -1,6 +1,6 @@
 """A bag as a stream of images, scans and events, by the timestamps in their headers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -12,7 +12,7 @@ from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import CameraEvents, EventRecording, NoEventsError, worded
+from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
 from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.joining import check_overlap, merge_by_time
 from lce_rig.io.protocol import SourceOptions, Span
@@ -186,7 +186,7 @@ class BagRecording:
             SourceError: no message of a topic could be decoded; or, after all that can be read, the bag is
                 damaged.
         """
-        parts = [self._messages(), *(events.samples() for events in self._events.values())]
+        parts: list[Iterable[Sample]] = [self._messages(), *self._events.values()]
         try:
             yield from merge_by_time(parts, self._rig)
         finally:
@@ -214,13 +214,13 @@ class BagRecording:
                 cause = failed.figures["where"] if failed else "its timestamps do not increase"
                 raise SourceError(f"{self.path}: no message of {topic} could be used: {cause}", decoder.hint)
 
-    def _open_events(self) -> dict[Stream, CameraEvents]:
+    def _open_events(self) -> dict[Stream, EventRecording]:
         """Take the topics of raw events out of the others and open them.
 
         Raises:
             SourceError: events of another resolution; or no events, and no images either.
         """
-        opened: dict[Stream, CameraEvents] = {}
+        opened: dict[Stream, EventRecording] = {}
         for topic, target in list(self._targets.items()):
             stream = target.stream(self._bag.topics[topic][0])
             if stream.kind != "events":
@@ -229,7 +229,8 @@ class BagRecording:
             size = self._rig.cameras[target.sensor].resolution_px
             try:
                 events = BagEvents(self.path, topic, self._bag)
-                opened[stream] = CameraEvents(EventRecording(self.path, events, target.sensor, size))
+                opened[stream] = EventRecording(self.path, events, target.sensor, size)
+                opened[stream].tie_to_host()
             except NoEventsError as error:
                 if all(other.channel is None for other in self._targets.values()):
                     raise SourceError(f"{topic} of {error.what}", list_topics(self._bag.topics)) from None

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
-from lce_rig.io.events.event_recording import REORDER_NS, EventRecording
+from lce_rig.io.events.event_recording import REORDER_NS, EventRecording, EventStream
 from tests.io.events.encoders import random_events
 from tests.notes import has_note
 
 PATH = Path("recording.test")
 
 
-class ListedStream:
+class ListedStream(EventStream):
     """A stream of stretches given in advance."""
 
     def __init__(
@@ -96,7 +96,7 @@ def test_events_before_the_clock_is_set_at_the_start_are_left_out_and_counted() 
     recording = record(columns(before), columns(after[:400]), columns(after[400:]))
     assert stamps_us(recording) == after.tolist()
     assert has_note(recording.notes, "200 events", "before")
-    assert recording.duration_s == pytest.approx(0.999)
+    assert recording.span_ns == (0, 999_000_000)
     assert recording.start_ns == 0
 
 
@@ -158,14 +158,21 @@ def test_windows_hold_what_lies_between_their_ends_in_any_order(
         assert (window.width_px, window.height_px, window.sensor) == (346, 260, "events")
 
 
-def test_the_host_clock_is_taken_from_the_packet_that_waited_least() -> None:
+def test_a_clock_of_its_own_is_tied_by_the_packet_that_waited_least() -> None:
     delays_ms = [7, 3, 5]
-    stretches = [
-        replace(columns([1000 * i]), host_ns=1_000_000 * (i + delay) + 10**18)
-        for i, delay in enumerate(delays_ms)
-    ]
-    assert record(*stretches).host_offset_ns() == 10**18 + 3_000_000
-    assert record(columns([1])).host_offset_ns() is None
+    recording = record(
+        *(
+            replace(columns([1000 * i]), host_ns=1_000_000 * (i + delay) + 17 * 10**17)
+            for i, delay in enumerate(delays_ms)
+        )
+    )
+    recording.tie_to_host()
+    first_us = 17 * 10**14 + 3000
+    assert stamps_us(recording) == [first_us, first_us + 1000, first_us + 2000]
+    assert has_note(recording.notes, "arrival")
+    unknown = record(columns([1]))
+    unknown.tie_to_host()
+    assert stamps_us(unknown) == [1] and not unknown.notes
 
 
 def test_stamps_at_the_ends_of_64_bits_are_left_out_and_the_others_kept() -> None:
