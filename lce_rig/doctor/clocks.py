@@ -118,7 +118,7 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
     middle_ms = float(np.median(delays_ms))
     scatter_ms = _SIGMA_PER_MAD * float(np.median(np.abs(np.array(delays_ms) - middle_ms)))
     yield findings.DELAY(**counts, delay_ms=middle_ms, delay_scatter_ms=scatter_ms)
-    if matcher.losses.n("pulses.slip", "pulses.missed_by_camera"):
+    if matcher.counts["n_slips"] or matcher.counts["n_missed"]:
         yield findings.MISSED(**counts)
 
 

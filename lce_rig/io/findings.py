@@ -32,8 +32,6 @@ SENT_TWICE = _loss("sent_twice", "{n} sent twice (equal timestamps)")
 OUT_OF_ORDER = _loss("out_of_order", "{n} out of order (timestamps decrease)")
 CLOCK_SET_BACK = _loss("clock_set_back", "{n} jumps of the clock back by more than 1 s")
 NOT_DECODED = _loss("not_decoded", "{n} could not be decoded (first: {where})")
-CLOCK_WRAPPED_31 = _loss("clock_wrapped_31", "{n} wraps of a 35.8 min clock undone")
-CLOCK_WRAPPED_32 = _loss("clock_wrapped_32", "{n} wraps of a 71.6 min clock undone")
 
 
 def _flaw(name: str, text: str) -> Kind:

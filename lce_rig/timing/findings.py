@@ -27,13 +27,6 @@ PULSES_NOT_FOLLOWED = Kind(
 )
 BOARD_RESTARTED = Kind("pulses.board_restarted", "the board restarted its count")
 CAMERA_RESTARTED = Kind("pulses.camera_restarted", "the camera restarted its count")
-IMAGE_UNMATCHED = _note("pulses.image_unmatched", "{n} images match no pulse")
-IMAGE_LOST = _note("pulses.image_lost", "{n} images lost, by the camera's numbers")
-MESSAGE_LOST = _note("pulses.message_lost", "messages of {n} pulses lost, whose images came")
-MISSED_BY_CAMERA = _note("pulses.missed_by_camera", "{n} pulses made no image")
-REPEATED = _note("pulses.repeated", "{n} images and pulses came twice")
-SLIP = _note("pulses.slip", "the camera's count slipped {n} times")
-RESTART = _note("pulses.restart", "the camera or the board restarted its count {n} times")
 SLIPPED = _note(
     "pulses.slipped",
     "its count slipped against the pulses {n_slips} times and restarted {n_restarts} times; "

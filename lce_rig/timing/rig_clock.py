@@ -328,7 +328,7 @@ class RigClock:
         return [
             Finding(findings.SLIPPED.code, findings.SLIPPED.severity, name, matcher.figures())
             for name, matcher in self._matchers.items()
-            if matcher.losses.n("pulses.slip", "pulses.restart")
+            if matcher.counts["n_slips"] or matcher.counts["n_restarts"]
         ]
 
     def verdict(self) -> SyncVerdict:

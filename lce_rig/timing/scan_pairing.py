@@ -149,13 +149,10 @@ class _Pairing:
         if images or events:
             yield Frame(time_ns, tuple(images), tuple(scans), events)
         else:
-            self._count_alone(nearest_ns)
-
-    def _count_alone(self, nearest_ns: int | None) -> None:
-        is_best = nearest_ns is not None and nearest_ns < (self._nearest_ns or 2**62)
-        nearest_s = None if nearest_ns is None else nearest_ns * 1e-9
-        self._nearest_ns = nearest_ns if is_best else self._nearest_ns
-        self._losses.add(READ_NO_IMAGE_AT_SCAN.refusal(nearest_s=nearest_s), is_best=is_best)
+            is_best = nearest_ns is not None and nearest_ns < (self._nearest_ns or 2**62)
+            nearest_s = None if nearest_ns is None else nearest_ns * 1e-9
+            self._nearest_ns = nearest_ns if is_best else self._nearest_ns
+            self._losses.add(READ_NO_IMAGE_AT_SCAN.refusal(nearest_s=nearest_s), is_best=is_best)
 
 
 def middle_of_sweep_ns(scan: Scan, rig: Rig) -> int | None:

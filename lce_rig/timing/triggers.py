@@ -7,14 +7,13 @@ missed, or a frame that its driver did not number, shifts every later image by w
 """
 
 from bisect import bisect_left
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 from statistics import median
 from typing import NamedTuple
 
 from lce_rig.core.data import Image, Pulse
 from lce_rig.core.findings import Figure, Finding, Kind
-from lce_rig.core.losses import Losses
 from lce_rig.timing import findings
 from lce_rig.timing.clock import ClockModel
 
@@ -32,15 +31,6 @@ _SLIP_WINDOW = 200
 _N_PULSES = 1024
 _N_RECENT = 8
 _MAX_INTERPOLATED = 8
-_LOSSES = {
-    "n_unmatched": findings.IMAGE_UNMATCHED,
-    "n_lost_frames": findings.IMAGE_LOST,
-    "n_lost_pulses": findings.MESSAGE_LOST,
-    "n_missed": findings.MISSED_BY_CAMERA,
-    "n_repeated": findings.REPEATED,
-    "n_slips": findings.SLIP,
-    "n_restarts": findings.RESTART,
-}
 
 
 class TriggeredImage(NamedTuple):
@@ -49,16 +39,14 @@ class TriggeredImage(NamedTuple):
     Attributes:
         image: as the camera gave it.
         pulse: running number of the pulse.
-        pulse_ns: its rising edge, board time.
+        pulse_ns: its rising edge, board time; between its neighbours' where the pulse's line was lost.
         stamp_ns: the moment the image shows, board time: the pulse and the camera's usual delay.
-        is_interpolated: whether the pulse's line was lost, and its time is between its neighbours'.
     """
 
     image: Image
     pulse: int
     pulse_ns: int
     stamp_ns: int
-    is_interpolated: bool
 
 
 class _Waiting(NamedTuple):
@@ -71,24 +59,22 @@ class TriggerMatcher:
     """Pulses and images of one camera in, matched images out, each stream in its own order.
 
     Attributes:
-        n_matched: images matched.
-        losses: images and pulses lost, sent twice or not matched; corrections of the constant.
+        counts: n_matched images, n_unmatched, n_lost_frames and n_repeated ones; pulses n_missed by the
+            camera; corrections of the constant, n_slips, and n_restarts of either count.
         problem: why images are not matched now; None while they are.
     """
 
-    def __init__(self, camera: str, max_delay_ns: int, min_delay_ns: int = 0) -> None:
+    def __init__(self, camera: str, max_delay_ns: int) -> None:
         """Prepare to find the constant.
 
         Args:
             camera: its name in the profile.
             max_delay_ns: latest timestamp of an image after its pulse, on the board's clock.
-            min_delay_ns: earliest; below 0 where the two clocks are tied loosely.
         """
-        self.n_matched = 0
-        self.losses = Losses()
+        self.counts = Counter[str]()
         self.problem: Finding | None = findings.NOTHING_YET(camera)
         self._camera = camera
-        self._window_ns = (min_delay_ns, max_delay_ns)
+        self._max_delay_ns = max_delay_ns
         self._clock: ClockModel | None = None
         self._pulses = PulseLog()
         self._waiting: deque[_Waiting] = deque()
@@ -108,7 +94,7 @@ class TriggerMatcher:
         """Take a pulse, and give the images that waited for it."""
         if len(self._pulses) and pulse.count <= self._pulses.last_count:
             if pulse.stamp_ns <= self._pulses.last_ns and pulse.stamp_ns in self._pulses:
-                self._lose("n_repeated")
+                self.counts["n_repeated"] += 1
                 return []
             self._restart(findings.BOARD_RESTARTED)
             self._pulses.clear()
@@ -118,22 +104,22 @@ class TriggerMatcher:
     def take_image(self, image: Image) -> list[TriggeredImage]:
         """Take an image, and give those whose pulses are now known."""
         if image.count is None or image.stamp_ns is None or self._clock is None:
-            self._lose("n_unmatched")
+            self.counts["n_unmatched"] += 1
             is_numbered = image.count is not None
             kind = findings.CLOCK_NOT_TIED if is_numbered else findings.IMAGES_NOT_NUMBERED
             self.problem = kind(self._camera)
             return []
         if self._last is not None and image.count <= self._last[0]:
             if image.stamp_ns <= self._last[1]:
-                self._lose("n_repeated")
+                self.counts["n_repeated"] += 1
                 return []
             self._restart(findings.CAMERA_RESTARTED)
         elif self._last is not None:
-            self._lose("n_lost_frames", image.count - self._last[0] - 1)
+            self.counts["n_lost_frames"] += image.count - self._last[0] - 1
         self._last = image.count, image.stamp_ns
         if len(self._waiting) == _N_WAITING:
             self._waiting.popleft()
-            self._lose("n_unmatched")
+            self.counts["n_unmatched"] += 1
             self.problem = findings.NO_PULSES(self._camera)
         self._waiting.append(_Waiting(image, image.count, self._clock.convert(image.stamp_ns)))
         return list(self._proceed())
@@ -143,7 +129,7 @@ class TriggerMatcher:
             frame = self._waiting[0]
             if self._constant is None:
                 # Only when the pulses have come past an image's time are all that could be its own known.
-                if self._pulses.last_ns <= frame.board_ns - self._window_ns[0]:
+                if self._pulses.last_ns <= frame.board_ns:
                     return
                 yield from self._seek(self._waiting.popleft())
             elif frame.number - self._constant > self._pulses.last_count:
@@ -153,20 +139,20 @@ class TriggerMatcher:
 
     def _seek(self, frame: _Waiting) -> Iterator[TriggeredImage]:
         """Look for the constant: the same for several images in a row, each with one possible pulse."""
-        least_ns, most_ns = self._window_ns
-        possible = self._pulses.within(frame.board_ns - most_ns, frame.board_ns - least_ns)
+        window_ns = self._max_delay_ns
+        possible = self._pulses.within(frame.board_ns - window_ns, frame.board_ns)
         # A pulse lost on the way is missing among the possible, and makes another look like the only one.
-        is_ambiguous = len(possible) > 1 or self._pulses.least_period_ns() < most_ns - least_ns
+        is_ambiguous = len(possible) > 1 or self._pulses.least_period_ns() < window_ns
         constant = frame.number - possible[0] if len(possible) == 1 and not is_ambiguous else None
         if is_ambiguous:
-            self.problem = findings.AMBIGUOUS_PULSES(self._camera, window_ms=(most_ns - least_ns) / 1e6)
+            self.problem = findings.AMBIGUOUS_PULSES(self._camera, window_ms=window_ns / 1e6)
         elif not possible:
             self.problem = findings.IMAGES_WITHOUT_PULSES(self._camera)
         if constant is None or constant != self._candidate:
             self._drop(self._agreeing)
             self._candidate = constant
         if constant is None:
-            self._lose("n_unmatched")
+            self.counts["n_unmatched"] += 1
             return
         self._agreeing.append(frame)
         if len(self._agreeing) == N_AGREE:
@@ -175,7 +161,7 @@ class TriggerMatcher:
             for image in agreeing:
                 pulse = self._pulses.time_of(image.number - constant)
                 assert pulse is not None
-                self._delays_ns.append(image.board_ns - pulse[0])
+                self._delays_ns.append(image.board_ns - pulse)
             for image in agreeing:
                 yield from self._emit(image)
 
@@ -183,7 +169,7 @@ class TriggerMatcher:
         """Match by number, and keep an eye on the time."""
         assert self._constant is not None
         if self._pulses.time_of(frame.number - self._constant) is None:
-            self._lose("n_unmatched")
+            self.counts["n_unmatched"] += 1
             return
         shift = self._shift(frame)
         if shift == 0:
@@ -193,7 +179,7 @@ class TriggerMatcher:
                 yield from self._emit(image)
             pulse = self._pulses.time_of(frame.number - self._constant)
             if pulse is not None:
-                self._delays_ns.append(frame.board_ns - pulse[0])
+                self._delays_ns.append(frame.board_ns - pulse)
             return
         self._doubtful.append(frame)
         if len(self._doubtful) < N_AGREE:
@@ -209,8 +195,8 @@ class TriggerMatcher:
             self._restart(findings.PULSES_NOT_FOLLOWED)
             return
         self._constant -= shift
-        self._lose("n_slips")
-        self._lose("n_missed", max(shift, 0))
+        self.counts["n_slips"] += 1
+        self.counts["n_missed"] += max(shift, 0)
         self._slipped_at.append(doubtful[-1].number)
         for image in doubtful:
             yield from self._emit(image)
@@ -223,7 +209,7 @@ class TriggerMatcher:
         pulse = self._pulses.time_of(number)
         if pulse is None:
             return 0
-        off = (made_ns - pulse[0]) / self._pulses.period_ns(number)
+        off = (made_ns - pulse) / self._pulses.period_ns(number)
         return round(off) if abs(off - round(off)) < _NEAR and abs(off) < _MAX_SLIP else None
 
     def _emit(self, frame: _Waiting) -> Iterator[TriggeredImage]:
@@ -231,17 +217,14 @@ class TriggerMatcher:
         number = frame.number - self._constant
         pulse = self._pulses.time_of(number)
         if pulse is None:
-            self._lose("n_unmatched")
+            self.counts["n_unmatched"] += 1
             return
-        time_ns, is_interpolated = pulse
-        self._lose("n_lost_pulses", is_interpolated)
-        self.n_matched += 1
-        stamp_ns = time_ns + round(median(self._delays_ns))
-        yield TriggeredImage(frame.image, number, time_ns, stamp_ns, is_interpolated)
+        self.counts["n_matched"] += 1
+        yield TriggeredImage(frame.image, number, pulse, pulse + round(median(self._delays_ns)))
 
     def _restart(self, reason: Kind) -> None:
         self.problem = reason(self._camera)
-        self._lose("n_restarts")
+        self.counts["n_restarts"] += 1
         for frames in (self._waiting, self._agreeing, self._doubtful):
             self._drop(frames)
         self._constant = self._candidate = self._last = None
@@ -249,17 +232,14 @@ class TriggerMatcher:
         self._slipped_at.clear()
 
     def figures(self) -> dict[str, Figure]:
-        """Return how matching went: n_matched, and what was lost by its name."""
+        """Return the counts for a finding."""
         return {
-            "n_matched": self.n_matched,
-            **{name: self.losses.n(kind.code) for name, kind in _LOSSES.items()},
+            name: self.counts[name]
+            for name in ("n_matched", "n_unmatched", "n_missed", "n_slips", "n_restarts")
         }
 
-    def _lose(self, name: str, n: int = 1) -> None:
-        self.losses.add(_LOSSES[name](self._camera), n)
-
     def _drop(self, frames: list[_Waiting] | deque[_Waiting]) -> None:
-        self._lose("n_unmatched", len(frames))
+        self.counts["n_unmatched"] += len(frames)
         frames.clear()
 
 
@@ -308,22 +288,18 @@ class PulseLog:
             if time_ns <= end_ns
         ]
 
-    def time_of(self, count: int) -> tuple[int, bool] | None:
-        """Find the time of a pulse, and whether it is interpolated between neighbours.
-
-        Returns:
-            None where neither it nor neighbours within 8 numbers of each other are known.
-        """
+    def time_of(self, count: int) -> int | None:
+        """Find the time of a pulse, between its neighbours' where it is lost; None where they are far."""
         after = bisect_left(self._counts, count)
         if after < len(self._counts) and self._counts[after] == count:
-            return self._times_ns[after], False
+            return self._times_ns[after]
         if not 0 < after < len(self._counts):
             return None
         n_apart = self._counts[after] - self._counts[after - 1]
         if n_apart > _MAX_INTERPOLATED:
             return None
         span_ns = self._times_ns[after] - self._times_ns[after - 1]
-        return self._times_ns[after - 1] + span_ns * (count - self._counts[after - 1]) // n_apart, True
+        return self._times_ns[after - 1] + span_ns * (count - self._counts[after - 1]) // n_apart
 
     def period_ns(self, count: int) -> float:
         """Return the time between two pulses about a number; infinite where there is but one pulse."""

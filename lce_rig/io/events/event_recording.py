@@ -22,12 +22,6 @@ MAX_EVENT_PIXELS = 1 << 22
 """Of one event camera: four times the largest on sale; a damaged file may declare more."""
 # Recorders with several threads, and readout that is not in order, mix timestamps by this much at most.
 REORDER_NS = 20_000_000
-# Counters of 31 and 32 bits of microseconds are common; they wrap after 36 and 72 minutes.
-_WRAPS_NS = {
-    findings.CLOCK_WRAPPED_31: (1 << 31) * NS_PER_US,
-    findings.CLOCK_WRAPPED_32: (1 << 32) * NS_PER_US,
-}
-_MAX_GAP_NS = 60_000_000_000
 # Cameras may send a little before their clock is set at the start.
 _MAX_LEAD_NS = 1_000_000_000
 # More stray timestamps than this are not scattered damage but a clock that was set.
@@ -270,7 +264,7 @@ def _size(resolution_px: tuple[int, int]) -> str:
 def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses) -> Iterator[EventColumns]:
     """Yield stretches whose timestamps never decrease, within and from one to the next.
 
-    Timestamps mixed within 20 ms are sorted; counters that wrap are unwrapped; stray timestamps are skipped.
+    Timestamps mixed within 20 ms are sorted; stray ones are skipped.
     Events are held back until the next stretch shows that nothing earlier follows.
 
     Raises:
@@ -279,18 +273,12 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
     held = NO_EVENTS
     first_ns: int | None = None
     delivered_ns: int | None = None
-    raw_ns: int | None = None
-    shift_ns = 0
     for stretch in stretches:
-        if len(stretch) and not -MAX_TIME_NS < stretch.t_ns.min() <= stretch.t_ns.max() < MAX_TIME_NS:
-            is_time = (stretch.t_ns > -MAX_TIME_NS) & (stretch.t_ns < MAX_TIME_NS)
-            losses.add(findings.EVENTS_BEYOND_CLOCKS(), int(np.count_nonzero(~is_time)))
-            stretch = stretch.select(is_time)
-        if not len(stretch):
+        is_time = (stretch.t_ns > -MAX_TIME_NS) & (stretch.t_ns < MAX_TIME_NS)
+        current = stretch if is_time.all() else stretch.select(is_time)
+        losses.add(findings.EVENTS_BEYOND_CLOCKS(), len(stretch) - len(current))
+        if not len(current):
             continue
-        shifts = shift_ns + _wraps_ns(stretch.t_ns, raw_ns, losses)
-        raw_ns, shift_ns = int(stretch.t_ns[-1]), int(shifts[-1])
-        current = replace(stretch, t_ns=stretch.t_ns + shifts) if shifts.any() else stretch
         if first_ns is None:
             first_ns = int(current.t_ns[0])
         if len(held) and int(current.t_ns.min()) >= held.t_ns[-1]:
@@ -326,19 +314,6 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
             held = held.select(slice(cut, None))
     if len(held):
         yield held
-
-
-def _wraps_ns(t_ns: NDArray[np.int64], before_ns: int | None, losses: Losses) -> NDArray[np.int64]:
-    """Sum the wraps of a counter of microseconds up to each timestamp: (N,), or (1,) zero without wraps."""
-    steps = np.diff(t_ns, prepend=t_ns[0] if before_ns is None else before_ns)
-    has_wraps = steps.min() < _MAX_GAP_NS - min(_WRAPS_NS.values())
-    shifts = np.zeros(len(t_ns) if has_wraps else 1, np.int64)
-    if has_wraps:
-        for kind, wrap_ns in _WRAPS_NS.items():
-            is_wrap = (steps < _MAX_GAP_NS - wrap_ns) & (steps >= -wrap_ns)
-            shifts[is_wrap] = wrap_ns
-            losses.add(kind(), int(np.count_nonzero(is_wrap)))
-    return np.cumsum(shifts)
 
 
 def _sorted(events: EventColumns, first_ns: int, delivered_ns: int | None, losses: Losses) -> EventColumns:

@@ -190,10 +190,11 @@ class SensorTopic:
     @property
     def namespace(self) -> str:
         """The topic without its last part, and without that of a transport such as compressed."""
-        parts = [part for part in self.topic.split("/") if part]
-        if parts[-1] in ("compressed", "theora") and len(parts) > 1:
-            parts.pop()
-        return "/".join(parts[:-1])
+        return _namespace(self.topic.removesuffix("/compressed").removesuffix("/theora"))
+
+
+def _namespace(topic: str) -> str:
+    return "/".join([part for part in topic.split("/") if part][:-1])
 
 
 def survey_bag(path: Path) -> list[SensorTopic]:
@@ -233,9 +234,8 @@ def survey_bag(path: Path) -> list[SensorTopic]:
         if n > 1 and last_ns is not None and last_ns > message.log_ns:
             sensor = replace(sensor, rate_hz=(n - 1) / ((last_ns - message.log_ns) * 1e-9))
         if sensor.kind != "scans":
-            beside = (info for info in sorted(infos & first.keys()) if _is_beside(info, sensor))
-            info = next(beside, None)
-            sensor = sensor if info is None else _with_lens(sensor, first[info])
+            beside = [info for info in infos & first.keys() if _namespace(info) == sensor.namespace]
+            sensor = _with_lens(sensor, first[min(beside)]) if beside else sensor
         sensors.append(sensor)
     if not sensors:
         raise SourceError(f"{path}: no images, events or point clouds", list_topics(bag.topics))
@@ -265,10 +265,6 @@ def _probe(message: RawMessage, n: int) -> SensorTopic:
         if name in (cloud.dtype.names or ()) and len(cloud):
             n_rings = len(np.unique(cloud[name]))
     return SensorTopic(message.topic, "scans", n, frame=frame, n_rings=n_rings, cloud=cloud)
-
-
-def _is_beside(info: str, sensor: SensorTopic) -> bool:
-    return "/".join([part for part in info.split("/") if part][:-1]) == sensor.namespace
 
 
 def _with_lens(sensor: SensorTopic, message: RawMessage) -> SensorTopic:

@@ -71,16 +71,6 @@ def test_equal_stamps_keep_their_order() -> None:
     assert events.x.tolist() == [2, 0, 1, 3, 4]
 
 
-@pytest.mark.parametrize("bits", [31, 32])
-@pytest.mark.parametrize("cut", [1, 400, 500, 999])
-def test_a_clock_that_wraps_goes_on_and_is_said(bits: int, cut: int) -> None:
-    truth = (1 << bits) - 500 * 20 + np.arange(1000) * 20
-    wrapped = truth % (1 << bits)
-    recording = record(columns(wrapped[:cut]), columns(wrapped[cut:]))
-    assert stamps_us(recording) == truth.tolist()
-    assert any("1 wraps of a" in note for note in recording.notes)
-
-
 def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound() -> None:
     first, second = np.arange(1000) * 1000, np.arange(1000) * 1000 - 5_000_000
     delivered = []
