@@ -41,7 +41,7 @@ def test_the_guide_names_the_distances_that_are_asked_for(profile, camera):
     limits = rig.quality
     assert max(NEAREST_M, limits.min_distance_m) <= near_m < 1.3
     assert near_m < far_m <= limits.max_distance_m
-    guide = (Path(__file__).parents[3] / "docs" / "how-to-calibrate.md").read_text()
+    guide = (Path(__file__).parents[3] / "docs" / "collect.md").read_text()
     assert f"distance from {NEAREST_M:g} m" in guide
     assert re.search(rf"{far_m:.1f} m with(?: the profile)?\s+`{profile}`", guide)
 
