@@ -32,7 +32,7 @@ from lce_rig.session.identity import DifferingKey, differing_keys
 
 
 def calibrate(
-    session: Session | Sequence[Session],
+    session: Session | str | Path | Sequence[Session | str | Path],
     detections: Detections | Sequence[Detections] | None = None,
     *,
     options: CalibrateOptions | None = None,
@@ -45,8 +45,8 @@ def calibrate(
     """Estimate and judge the extrinsics of every camera with every LiDAR; nothing is written.
 
     Args:
-        session: open for reading is enough. Several sessions of one rig whose sensors were not moved give one
-            estimate; `write` puts it into the first session.
+        session: its folder, or one that is open for reading. Several sessions of one rig whose sensors were
+            not moved give one estimate; `write` puts it into the first session.
         detections: of the session, or of each; None detects the board first, as `detect` does by default.
         options: of the estimate; None for the defaults.
         cameras: the cameras to calibrate, as if the session held no others; None for all.
@@ -62,7 +62,8 @@ def calibrate(
         SessionError: sessions are not of one rig, board and intrinsics, or share captures.
         UsageError: no capture holds one of the channels; a session is given twice.
     """
-    named = require_unit([session] if isinstance(session, Session) else session)
+    chosen = [session] if isinstance(session, Session | str | Path) else session
+    named = require_unit([each if isinstance(each, Session) else Session.open(Path(each)) for each in chosen])
     sessions = list(named.values())
     if detections is None:
         detections = [detect(each) for each in sessions]

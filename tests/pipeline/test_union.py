@@ -69,7 +69,7 @@ def test_what_all_sessions_share_is_not_averaged_out(make):
     sessions = [make(name, profile(0.008, 0.005)) for name in ("monday", "tuesday")]
     found = [seen(12, 0), seen(12, 1)]
     plain = lce.CalibrateOptions("paper", n_draws=0)
-    (alone,) = lce.calibrate(sessions[0], found[0], options=plain).pairs
+    (alone,) = lce.calibrate(str(sessions[0].path), found[0], options=plain).pairs
     (both,) = lce.calibrate(sessions, found, options=plain).pairs
     parts = [c.diagnostics.sigma_systematic_translation_m for c in (alone, both)]
     assert parts[1] > 0.9 * parts[0]
