@@ -96,37 +96,15 @@ def write_bag() -> Callable[[Path, str, Iterable[Message]], Path]:
 
 @pytest.fixture(scope="session")
 def cloud_message() -> Callable[..., dict[str, Any]]:
-    """Lay a structured cloud out as a PointCloud2: point_step, row_step, byte order and height at will."""
+    """Lay a structured cloud out as a PointCloud2."""
     codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
-    def build(
-        cloud: np.ndarray,
-        stamp_ns: int,
-        *,
-        offsets: dict[str, int] | None = None,
-        point_step: int | None = None,
-        height: int = 1,
-        row_padding: int = 0,
-        is_bigendian: bool = False,
-    ) -> dict[str, Any]:
-        names = cloud.dtype.names
-        order = ">" if is_bigendian else "<"
-        formats = [np.dtype(order + cloud.dtype[n].str[1:]) for n in names]
-        packed = np.cumsum([0] + [f.itemsize for f in formats]).tolist()
-        places = [offsets[n] for n in names] if offsets else packed[:-1]
-        step = point_step or packed[-1]
-        out = np.zeros(
-            len(cloud), dtype={"names": names, "formats": formats, "offsets": places, "itemsize": step}
-        )
-        for name in names:
-            out[name] = cloud[name]
-        width = len(cloud) // height
-        rows = np.frombuffer(out.tobytes(), np.uint8).reshape(height, width * step)
-        rows = np.pad(rows, ((0, 0), (0, row_padding)), constant_values=255)
+    def build(cloud: np.ndarray, stamp_ns: int) -> dict[str, Any]:
+        fields = [(name, place, codes[kind.str[1:]], 1) for name, (kind, place) in cloud.dtype.fields.items()]
         return {
-            "stamp_ns": stamp_ns, "height": height, "width": width, "is_bigendian": is_bigendian,
-            "fields": [(n, o, codes[cloud.dtype[n].str[1:]], 1) for n, o in zip(names, places, strict=True)],
-            "point_step": step, "row_step": rows.shape[1], "data": rows.ravel(), "is_dense": False,
+            "stamp_ns": stamp_ns, "height": 1, "width": len(cloud), "is_bigendian": False, "fields": fields,
+            "point_step": cloud.itemsize, "row_step": cloud.nbytes,
+            "data": np.frombuffer(cloud.tobytes(), np.uint8), "is_dense": False,
         }  # fmt: skip
 
     return build

@@ -1,6 +1,5 @@
 """Files of an event camera's own recorder as recordings: events, frames, and what may be wrong with them."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,38 +88,6 @@ def test_frames_out_of_order_are_left_out_and_counted(tmp_path: Path, rig: Rig) 
     recording = opened(path, rig)
     assert len(images_of(recording)) == 2
     assert has_note(recording.notes, "a.aedat4", "frames: 1 out")
-
-
-def write_dsec(path: Path) -> None:
-    import h5py
-
-    with h5py.File(path, "w") as file:
-        file["events/t"], file["t_offset"] = (EVENTS.t_ns // 1000 - T0_US).astype(np.uint32), T0_US
-        file["events/x"], file["events/y"], file["events/p"] = EVENTS.x, EVENTS.y, EVENTS.polarity
-
-
-def write_raw(path: Path) -> None:
-    local = [(t - T0_US, x, y, p) for t, x, y, p in listed(EVENTS)]
-    path.write_bytes(b"% evt 3.0\n% geometry 346x260\n% end\n" + encoders.evt3(local))
-
-
-WRITERS: dict[str, Callable[[Path], object]] = {
-    "a.aedat4": lambda path: write_aedat4(path, [EVENTS]),
-    "a.h5": write_dsec,
-    "a.hdf5": write_dsec,
-    "a.raw": write_raw,
-}
-
-
-@pytest.mark.parametrize("name", sorted(WRITERS))
-def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path: Path, rig: Rig, name: str) -> None:
-    WRITERS[name](tmp_path / name)
-    recording = opened(tmp_path / name, rig)
-    shift_us = T0_US if name == "a.raw" else 0
-    assert [(t + shift_us, x, y, p) for t, x, y, p in events_of(recording)] == listed(EVENTS)
-    span = recording.streams[EVENT_STREAM]
-    assert span is not None
-    assert [stamp + shift_us * 1000 for stamp in span] == [int(EVENTS.t_ns[0]), int(EVENTS.t_ns[-1])]
 
 
 def test_serial_numbers_in_heads_of_files_are_told(tmp_path: Path, rig: Rig) -> None:

@@ -58,38 +58,35 @@ def write_pcap(
     frames: list[tuple[int, bytes]],
     *,
     link: int = 1,
-    order: str = "<",
-    is_ns: bool = False,
     snaplen: int = 65535,
 ) -> Path:
-    magic, per_tick = (0xA1B23C4D, 1) if is_ns else (0xA1B2C3D4, 1000)
-    parts = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, snaplen, link)]
+    parts = [struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, snaplen, link)]
     for host_ns, frame in frames:
         seconds, ns = divmod(host_ns, 10**9)
         kept = frame[:snaplen]
-        parts += [struct.pack(f"{order}IIII", seconds, ns // per_tick, len(kept), len(frame)), kept]
+        parts += [struct.pack("<IIII", seconds, ns // 1000, len(kept), len(frame)), kept]
     path.write_bytes(b"".join(parts))
     return path
 
 
-def block(order: str, kind: int, body: bytes) -> bytes:
+def block(kind: int, body: bytes) -> bytes:
     body += bytes(-len(body) % 4)
     length = 12 + len(body)
-    return struct.pack(f"{order}II", kind, length) + body + struct.pack(f"{order}I", length)
+    return struct.pack("<II", kind, length) + body + struct.pack("<I", length)
 
 
-def write_pcapng(path: Path, frames: list[tuple[int, bytes]], order: str = "<") -> Path:
+def write_pcapng(path: Path, frames: list[tuple[int, bytes]]) -> Path:
     """A card whose stamps are in units of 2**-20 s."""
-    resolution = struct.pack(f"{order}HHB3x", 9, 1, 0x80 | 20) + struct.pack(f"{order}HH", 0, 0)
+    resolution = struct.pack("<HHB3x", 9, 1, 0x80 | 20) + struct.pack("<HH", 0, 0)
     parts = [
-        block(order, 0x0A0D0D0A, struct.pack(f"{order}IHHq", 0x1A2B3C4D, 1, 0, -1)),
-        block(order, 1, struct.pack(f"{order}HHI", 1, 0, 0) + resolution),
-        block(order, 0x0BAD, b"custom"),
+        block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)),
+        block(1, struct.pack("<HHI", 1, 0, 0) + resolution),
+        block(0x0BAD, b"custom"),
     ]
     for host_ns, frame in frames:
         ticks = (host_ns << 20) // 10**9
-        head = struct.pack(f"{order}IIIII", 0, ticks >> 32, ticks & 0xFFFFFFFF, len(frame), len(frame))
-        parts.append(block(order, 6, head + frame))
+        head = struct.pack("<IIIII", 0, ticks >> 32, ticks & 0xFFFFFFFF, len(frame), len(frame))
+        parts.append(block(6, head + frame))
     path.write_bytes(b"".join(parts))
     return path
 
@@ -97,15 +94,11 @@ def write_pcapng(path: Path, frames: list[tuple[int, bytes]], order: str = "<") 
 ETHERNET_TYPE = b"\x08\x00"
 LINKS: dict[str, tuple[int, Callable[[bytes], bytes]]] = {
     "ethernet": (1, lambda f: f),
-    "ethernet with a trailer": (1, lambda f: f + b"\0\0\0\0"),
     "VLAN": (1, lambda f: f[:12] + b"\x81\x00\x00\x07" + f[12:]),
-    "two VLANs": (1, lambda f: f[:12] + b"\x88\xa8\x00\x02\x81\x00\x00\x07" + f[12:]),
     "SLL": (113, lambda f: bytes(14) + ETHERNET_TYPE + f[IP_AT:]),
     "SLL2": (276, lambda f: ETHERNET_TYPE + bytes(18) + f[IP_AT:]),
     "raw": (101, lambda f: f[IP_AT:]),
-    "raw IPv4": (228, lambda f: f[IP_AT:]),
     "BSD loopback": (0, lambda f: struct.pack("<I", 2) + f[IP_AT:]),
-    "OpenBSD loopback": (108, lambda f: struct.pack(">I", 2) + f[IP_AT:]),
 }
 
 
@@ -118,21 +111,8 @@ def test_every_link_type_gives_the_same_scans(
     check_scans(read(path, rig)[0])
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize("is_ns", [False, True])
-def test_byte_orders_and_units_of_time_do_not_matter(
-    order: str, is_ns: bool, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
-) -> None:
-    check_scans(read(write_pcap(tmp_path / "a.pcap", frames, order=order, is_ns=is_ns), rig)[0])
-
-
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_wiresharks_own_format_is_read(
-    order: str, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
-) -> None:
-    scans, notes = read(write_pcapng(tmp_path / "a.pcapng", frames, order), rig)
-    check_scans(scans)
-    assert not any("cut off" in note for note in notes)
+def test_wiresharks_own_format_is_read(frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path) -> None:
+    check_scans(read(write_pcapng(tmp_path / "a.pcapng", frames), rig)[0])
 
 
 def test_what_the_writer_wrote_comes_back_byte_for_byte(
@@ -219,8 +199,8 @@ def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(
         struct.pack("<IHH", 0xA1B2C3D4, 2, 4),
         struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1),
         struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 127),
-        block("<", 0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
-        + block("<", 1, struct.pack("<HHI", 105, 0, 0)),
+        block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+        + block(1, struct.pack("<HHI", 105, 0, 0)),
     ],
     ids=["empty", "text", "packed", "torn header", "no frames", "wireless", "pcapng of a wireless card"],
 )

@@ -82,31 +82,6 @@ def test_a_folder_of_split_bags_is_read_in_order(tmp_path, rig, write_bag, strea
     assert np.diff([i.stamp_ns for i in images]).tolist() == [STEP_NS] * 5
 
 
-@pytest.mark.parametrize(
-    "layout",
-    [
-        {},
-        {"offsets": {"x": 0, "y": 4, "z": 8, "intensity": 16, "ring": 20, "time": 24}, "point_step": 32},
-        {"offsets": {"x": 10, "y": 3, "z": 30, "intensity": 20, "ring": 1, "time": 40}, "point_step": 51},
-        {"height": 16, "row_padding": 7},
-        {"is_bigendian": True, "height": 4},
-    ],
-    ids=["22 bytes", "32 bytes", "unaligned", "padded rows", "big endian"],
-)
-def test_clouds_of_any_layout_are_read_alike(
-    tmp_path, rig, room, picture, write_bag, cloud_message, image_message, layout
-):
-    messages = [
-        (LIDAR, "PointCloud2", T0_NS, cloud_message(room, T0_NS, **layout)),
-        (CAM, "Image", T0_NS + 1, image_message(picture, T0_NS)),
-    ]
-    _, (scan,) = read(open_recording(write_bag(tmp_path / "bag", "ros1", messages), rig))
-    points = np.stack([room["x"], room["y"], room["z"]], axis=1)
-    np.testing.assert_array_equal(scan.points, points)
-    np.testing.assert_array_equal(scan.ring, room["ring"])
-    np.testing.assert_allclose(scan.offset_ns, room["time"] * 1e9, atol=100)
-
-
 def _as_yuv(bgr, order):
     # ITU-R BT.601, studio range, as cameras deliver it.
     b, g, r = np.moveaxis(bgr.astype(float), -1, 0)

@@ -1,4 +1,4 @@
-"""Packets of every Velodyne that is read become scans with its own beams and times."""
+"""Packets of every Velodyne that is read, and those that others recorded, become scans of their own beams."""
 
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,20 @@ from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import find_data_sheet
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
+from lce_rig.io.network import PcapFile
 from lce_rig.io.protocol import SourceOptions
-from lce_rig.io.ros.messages import typestore
+from lce_rig.io.ros.bag_file import BagFile
+from lce_rig.io.ros.messages import deserialize, typestore
 from lce_rig.io.ros.rosbag import BagRecording
 from lce_rig.io.velodyne.pcap import PcapRecording
-from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.io.velodyne.stream import Vlp16Decoder, Vlp16Stream, keep_brighter
 from lce_rig.rig import LidarSettings, Rig, load_rig
+
+from .vlp16_room import (
+    decode_by_manual,
+    stamps,
+    stream_of,
+)
 
 RANGE_M, RATE_HZ, T0_US = 4.0, 10.0, 5_000_000
 
@@ -141,3 +149,79 @@ def test_a_recorded_hdl32e_is_read(recordings: Path) -> None:
     elevation = np.degrees(np.arctan2(scan.points[:, 2], np.hypot(scan.points[:, 0], scan.points[:, 1])))
     top = np.median(elevation[scan.ring == 31])
     assert len(scan.points) > 50_000 and top == pytest.approx(10.67, abs=0.3)
+
+
+def einride(recordings: Path) -> np.ndarray:
+    return np.fromfile(recordings / "vlp16_packets" / "einride" / "recording.bin", velodyne.DATA_PACKET)
+
+
+@pytest.mark.dataset
+def test_the_einride_payloads_make_whole_scans_without_a_loss(recordings: Path) -> None:
+    stream = stream_of()
+    fields = einride(recordings)
+    scans = [scan for packet in fields if (scan := stream.push_data(packet.tobytes(), 0)) is not None]
+    assert (len(scans), stream.losses.n("packet.lost"), stream.flaws()) == (13, 0, [])
+
+
+def nebula_packets(recordings: Path) -> list[tuple[int, bytes]]:
+    bag = BagFile(recordings / "vlp16_packets" / "nebula" / "vlp16" / "1673400471837873222")
+    messages = [deserialize(message) for message in bag.messages({"/velodyne_packets"})]
+    return [
+        (p.stamp.sec * 10**9 + p.stamp.nanosec, bytes(p.data))
+        for message in messages
+        for p in message.packets
+    ]
+
+
+def mrpt_packets(recordings: Path) -> bytes:
+    file = PcapFile(recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_vlp16_gps.pcap")
+    return b"".join(d.payload for d in file.datagrams() if d.port == velodyne.DATA_PORT)
+
+
+@pytest.mark.dataset
+@pytest.mark.parametrize("name", ["einride", "nebula", "mrpt"])
+def test_every_point_of_a_recording_is_that_of_the_manual(recordings: Path, name: str) -> None:
+    payloads = {
+        "einride": lambda: einride(recordings).tobytes(),
+        "nebula": lambda: b"".join(payload for _, payload in nebula_packets(recordings)),
+        "mrpt": lambda: mrpt_packets(recordings),
+    }[name]()
+    fields = np.frombuffer(payloads, velodyne.DATA_PACKET).copy()
+    if name == "nebula":
+        keep_brighter(fields)
+    points, *_ = Vlp16Decoder(0.0, 200.0).decode(fields, [1000 * int(us) for us in fields["us"]])
+    manual = decode_by_manual(fields)
+    order = np.argsort(manual["packet"] * 10**7 + manual["time_ns"], kind="stable")
+    assert len(points) == len(order) == np.count_nonzero(fields["blocks"]["returns"]["range"])
+    off = np.linalg.norm(points - manual["points"][order], axis=1) / manual["range_m"][order]
+    assert off.max() < 4.5e-4  # 0.025 deg
+
+
+@pytest.mark.dataset
+def test_nebulas_recording_was_not_synchronised_and_is_stamped_by_arrival(recordings: Path) -> None:
+    stream = stream_of()
+    sent = nebula_packets(recordings)
+    scans = [scan for host_ns, body in sent if (scan := stream.push_data(body, host_ns)) is not None]
+    assert stream.mode == velodyne.DUAL and len(scans) == 3
+    assert not stream.clock.is_utc
+    ahead_ns = stream.clock.ahead_ns()
+    assert ahead_ns is not None and ahead_ns * 1e-9 == pytest.approx(-1531.18, abs=0.01)
+    assert all(sent[0][0] < int(stamp_ns or 0) < sent[-1][0] for stamp_ns in stamps(scans))
+
+
+@pytest.mark.dataset
+def test_mrpts_recording_gives_its_scans_with_the_clock_in_doubt(recordings: Path, rig: Rig) -> None:
+    path = recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_vlp16_gps.pcap"
+    recording = PcapRecording(path, rig, SourceOptions())
+    scans = list(recording.samples())
+    assert len(scans) == 3
+    assert [len(scan.points) for scan in scans] == pytest.approx([18_550] * 3, abs=50)
+    text = "\n".join(recording.notes)
+    # PPS is locked and the sentences fit, but the recorder's clock was a third of a second off.
+    assert "by arrival" in text and "-0.37 s" in text and "lost" not in text
+
+
+@pytest.mark.dataset
+def test_mrpts_hdl32_is_refused_by_name(recordings: Path, rig: Rig) -> None:
+    with pytest.raises(SourceError, match="500 of HDL-32E"):
+        open_recording(recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_hdl32.pcap", rig)

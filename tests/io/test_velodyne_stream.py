@@ -1,21 +1,30 @@
-"""Packets of a VLP-16 become scans whatever happens to them on the way."""
+"""Packets of a VLP-16 become scans with the manual's points and, where its clock can be trusted, its time."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from wire.vlp16_packets import SensorPacket, Vlp16Clock
+from wire.vlp16_packets import SensorPacket, Vlp16Clock, Vlp16Packets
 
 from lce_rig.core import velodyne
+from lce_rig.core.data import Scan
+from lce_rig.core.errors import SourceError
+from lce_rig.io.velodyne.stream import Vlp16Decoder, Vlp16Stream, keep_brighter, read_controls
+from lce_rig.rig.sensors import DriverSettings, TimestampSettings
 
 from .vlp16_room import (
+    HOUR_NS,
+    NETWORK_NS,
     PERIOD_NS,
     T0_NS,
+    decode_by_manual,
     largest_errors,
     only_data,
     packets_of,
     push,
+    room_scan,
     room_scans,
+    settings,
     stamps,
     stream_of,
 )
@@ -120,3 +129,161 @@ def test_mutated_packets_never_make_a_scan_that_breaks_its_own_rules() -> None:
             assert scan.offset_ns is not None and np.all(np.diff(scan.offset_ns) > -100_000)
             assert scan.offset_ns[0] >= 0 and scan.offset_ns[-1] < 101_000_000
     assert n_scans >= 5 and sum(flaw.figure("n") for flaw in stream.flaws()) > 20
+
+
+@pytest.mark.parametrize(
+    ("controls", "cause"),
+    [
+        ({"rpm": 600}, "no 'rpm'; it has position_port, cut_deg"),
+        ({"position_port": "8308"}, "not a port"),
+        ({"position_port": 0}, "not a port"),
+        ({"cut_deg": True}, "not an angle"),
+        ({"cut_deg": 500.0}, "not an angle"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_its_key(controls: dict[str, object], cause: str) -> None:
+    driver = DriverSettings.model_validate({"controls": controls})
+    with pytest.raises(SourceError, match=cause):
+        read_controls("lidar", settings(driver=driver))
+
+
+@pytest.mark.parametrize("cut_deg", [-90, 0, 37.5])
+def test_the_seam_lies_where_the_profile_wants_it(cut_deg: float) -> None:
+    driver = DriverSettings(controls={"cut_deg": cut_deg})
+    stream = Vlp16Stream("lidar", settings(driver=driver))
+    scans = push(stream, packets_of(room_scans(4)))
+    assert len(scans) == 3 and stream.losses.n("scan.partial") == 2
+    for scan in scans:
+        azimuth_deg = np.degrees(np.unwrap(np.arctan2(scan.points[:, 1], scan.points[:, 0])))
+        off_deg = (azimuth_deg[0] - cut_deg + 180) % 360 - 180
+        assert -0.45 < off_deg <= 0.01
+        assert np.ptp(azimuth_deg) == pytest.approx(359.8, abs=0.4)
+
+
+def test_time_goes_on_over_the_full_hour() -> None:
+    truth = room_scans(6, T0_NS - T0_NS % HOUR_NS + HOUR_NS - 250_000_000)
+    stream = stream_of()
+    scans = push(stream, packets_of(truth))
+    assert stream.clock.is_utc
+    assert np.abs(np.array(stamps(scans), np.int64) - np.array(stamps(truth), np.int64)).max() < 1000
+    assert stream.losses.n("packet.lost") == 0
+
+
+UNSYNCHRONISED = {
+    "absent": (Vlp16Clock("absent", has_nmea=False, error_us=721_000_000), "clock.pps_not_locked"),
+    "synchronising": (Vlp16Clock("synchronising"), "clock.pps_not_locked"),
+    "in error": (Vlp16Clock("error"), "clock.pps_not_locked"),
+    "without sentences": (Vlp16Clock(has_nmea=False), "clock.no_nmea"),
+    "of another second": (Vlp16Clock(error_us=721_000_000), "clock.nmea_of_other_second"),
+    "of another clock": (Vlp16Clock(error_us=-368_000), "clock.lidar_utc_differs"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(UNSYNCHRONISED))
+def test_time_that_cannot_be_trusted_is_said_and_replaced_by_arrival(name: str) -> None:
+    clock, code = UNSYNCHRONISED[name]
+    truth = room_scans(3, T0_NS + 500_000_000)
+    stream = stream_of()
+    scans = push(stream, packets_of(truth, clock=clock))
+    state = stream.clock.state()
+    assert not stream.clock.is_utc and (state.code, state.severity) == (code, "warning")
+    late_ns = np.array(stamps(scans), np.int64) - np.array(stamps(truth), np.int64)
+    # The packet's length is taken off; what is left is the way through the network, and the counter's step.
+    np.testing.assert_allclose(late_ns, NETWORK_NS, atol=1000)
+
+
+def test_arrivals_that_waited_do_not_shift_stamps() -> None:
+    truth = room_scans(10)
+    clock = Vlp16Clock("absent", has_nmea=False, error_us=5)
+    rng = np.random.default_rng(1)
+    arrived = [
+        replace(p, sent_ns=p.sent_ns + int(rng.exponential(3_000_000)))
+        for p in packets_of(truth, clock=clock)
+    ]
+    scans = push(stream_of(), arrived)
+    late_ns = np.array(stamps(scans), np.int64) - np.array(stamps(truth), np.int64) - NETWORK_NS
+    assert late_ns.min() > -1000 and late_ns[1:].max() < 300_000
+
+
+def test_a_board_that_fakes_gps_is_good_enough() -> None:
+    stream = stream_of()
+    push(stream, packets_of(room_scans(2), clock=Vlp16Clock(is_valid=False)))
+    assert stream.clock.is_utc
+
+
+def test_without_position_packets_the_sensors_time_is_not_trusted(packets: list[SensorPacket]) -> None:
+    stream = stream_of()
+    scans = push(stream, only_data(packets))
+    assert len(scans) == 5
+    assert stream.clock.state().code == "clock.no_position_packets"
+
+
+def test_position_packets_that_stop_end_the_trust(packets: list[SensorPacket]) -> None:
+    stream = stream_of()
+    push(stream, packets)
+    assert stream.clock.is_utc
+    push(stream, only_data(packets_of(room_scans(2, T0_NS + 4 * 10**9))))
+    assert stream.clock.state().code == "clock.position_packets_stopped"
+
+
+def test_the_profile_may_want_the_hosts_time(packets: list[SensorPacket]) -> None:
+    stream = stream_of(timestamps=TimestampSettings(reference="first_firing", clock="host"))
+    scans = push(stream, packets)
+    assert stream.clock.state().code == "clock.host_wanted"
+    np.testing.assert_allclose(
+        np.array(stamps(scans), np.int64) - np.array(stamps(room_scans(5)), np.int64), NETWORK_NS, atol=1000
+    )
+
+
+def test_packets_without_any_arrival_give_scans_without_stamps(packets: list[SensorPacket]) -> None:
+    scans = push(stream_of(), packets, delay_ns=None)
+    assert stamps(scans) == [None] * 5
+    assert scans[0].host_ns is None
+
+
+@pytest.mark.parametrize("mode", [velodyne.STRONGEST, velodyne.DUAL])
+def test_points_are_those_of_the_manual(mode: int) -> None:
+    fields = np.frombuffer(
+        b"".join(packet.payload for packet in only_data(packets_of([room_scan(T0_NS)], mode))[:30]),
+        velodyne.DATA_PACKET,
+    ).copy()
+    if mode == velodyne.DUAL:
+        keep_brighter(fields)
+    starts_ns = [1000 * int(us) for us in fields["us"]]
+    points, intensity, ring, offset_ns = Vlp16Decoder(0.1, 200.0).decode(fields, starts_ns)
+    manual = decode_by_manual(fields)
+    ring_of_laser = np.array([0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15])
+    np.testing.assert_array_equal(ring, ring_of_laser[manual["laser"]])
+    np.testing.assert_array_equal(intensity, manual["reflectivity"])
+    time_ns = np.array(starts_ns)[manual["packet"]] + manual["time_ns"] - starts_ns[0]
+    assert np.abs(offset_ns - time_ns).max() <= 50
+    # The library rounds azimuths to 0.01 deg and takes the mean speed over a packet.
+    assert (np.linalg.norm(points - manual["points"], axis=1) / manual["range_m"]).max() < 3e-4
+
+
+def test_ranges_beyond_the_profiles_limits_give_no_points(packets: list[SensorPacket]) -> None:
+    near = push(stream_of(min_range_m=4.0, max_range_m=4.5), packets)[1]
+    reach = np.linalg.norm(near.points, axis=1)
+    assert 3.98 < reach.min() < 4.02 and 4.48 < reach.max() < 4.52
+    assert np.all(np.diff(near.offset_ns) > 0)
+
+
+def test_of_two_returns_the_brighter_one_is_kept() -> None:
+    front = room_scan(T0_NS, dropout=0.0)
+    behind = room_scan(T0_NS, scale=1.5, dropout=0.0)
+    # The last return is brighter in every other firing, and alone in the last hundred.
+    brighter = np.arange(len(front.points)) % 2 == 0
+    behind = replace(behind, intensity=front.intensity + np.where(brighter, 5, -5).astype(np.float32))
+    front = front.select(np.arange(len(front.points)) < len(front.points) - 100)
+    sender_packets = packets_of_dual(front, behind)
+    scan = push(stream_of(), sender_packets)[0]
+    assert len(scan.points) == len(behind.points)
+    expected = np.where(brighter | (np.arange(len(behind.points)) >= len(front.points)), 1.5, 1.0)
+    reach = np.linalg.norm(scan.points, axis=1)
+    reach_behind = np.linalg.norm(behind.points, axis=1)
+    np.testing.assert_allclose(reach, reach_behind * expected / 1.5, atol=0.02)
+
+
+def packets_of_dual(front: Scan, behind: Scan) -> list[SensorPacket]:
+    sender = Vlp16Packets(velodyne.DUAL)
+    return sender.feed(front, behind) + sender.finish()
