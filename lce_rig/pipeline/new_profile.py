@@ -1,7 +1,7 @@
 """A profile for a rig of one's own: from its data sheets, or from a bag that it recorded."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
-from lce_rig.core.data_sheets import find_data_sheet
+from lce_rig.core.data_sheets import TYPICAL, find_data_sheet
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.detect.lidar.segments import order_scan
 from lce_rig.export.camera_info import load_camera_info
 from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.folder.decoding import DECODERS, read_cloud
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
-from lce_rig.rig import LidarSettings
-from lce_rig.rig.draft import CameraDraft, LidarDraft, draft_profile
+from lce_rig.rig import BoardSettings, LidarSettings
+from lce_rig.rig.loading import Document, dump_yaml, rig_from_document
 
 _UNKNOWN_MODEL = "other"
 # A ring that sees one distance only has no height: 0.1 mrad against 15 mm.
@@ -31,6 +31,21 @@ _FAMILIES: dict[str, Literal["radtan", "equidistant"]] = {
     "plumb_bob": "radtan",
     "equidistant": "equidistant",
     "fisheye": "equidistant",
+}
+_BOARD_SIGMAS = ("pattern_offset_sigma_m", "plate_sigma_m", "bow_sigma_m")
+_COMMENTS = {
+    "board": "measure it; do not rely on the CAD model",
+    "inner_corners": "where four squares meet: [along the width, along the height]",
+    "pattern_offset_m": "pattern's centre from the plate's centre: [right, up]",
+    "square_sigma_m": "standard deviation of square_m",
+    "pattern_offset_sigma_m": "of each coordinate of pattern_offset_m",
+    "plate_sigma_m": "of width_m and height_m",
+    "bow_sigma_m": "of the height of the plate's middle over its ends",
+    "elevations_deg": "of the rings, as recorded",
+    "laser_bias_sigma_m": "this and the next three are typical: enter your LiDAR's",
+    "clock": "device, host or utc",
+    "reference": "LiDAR: first_firing or last_firing; camera: mid_exposure or start",
+    "sync": "hardware (shared pulse), ptp or none",
 }
 BOARD_FORM = "COLSxROWS,SQUARE,WIDTHxHEIGHT[,RIGHT,UP], lengths in m, such as 8x6,0.07,0.767x0.626"
 _LENS_FORM = (
@@ -68,19 +83,21 @@ def new_profile(
         SourceError: the bag cannot be read, or holds no camera or no LiDAR.
         ProfileError: the parts do not make a valid profile.
     """
-    clouds = None if recording is None else clouds_in(recording)
+    clouds = [] if recording is None else clouds_in(recording)
     topics = survey_bag(recording) if recording is not None and not clouds else []
-    lidars = list(_lidars([t for t in topics if t.kind == "scans"], lidar_model))
-    if clouds:
-        lidars = [_with_beams(lidars[0], read_cloud(clouds[0]), str(clouds[0]))]
-    groups = _by_camera([t for t in topics if t.kind != "scans"])
+    scans = [topic for topic in topics if topic.kind == "scans"]
+    groups = _by_camera([topic for topic in topics if topic.kind != "scans"])
     if recording is not None and not clouds:
-        for kinds, what in ((("scans",), "point clouds"), (("frames", "events"), "images or events")):
-            if not any(topic.kind in kinds for topic in topics):
+        for seen, what in ((scans, "point clouds"), (groups, "images or events")):
+            if not seen:
                 listed = "; ".join(map(_line, topics))
                 raise SourceError(f"{recording}: no {what}, so that it is no recording of a rig", listed)
-        _require_count(len(cameras), len(groups), "names (--camera)", recording)
-        _require_count(len(intrinsics), len(groups), "--intrinsics", recording)
+        for n, what in ((len(cameras), "names (--camera)"), (len(intrinsics), "--intrinsics")):
+            if n not in (0, len(groups)):
+                raise UsageError(
+                    f"{recording} holds {len(groups)} cameras, {n} {what} given",
+                    "Give one for each camera, in the order of their topics, or none.",
+                )
     else:
         groups = [[] for _ in cameras or ("cam",)]
         if len(intrinsics) != len(groups):
@@ -88,21 +105,97 @@ def new_profile(
                 f"intrinsics of {len(intrinsics)} of {len(groups)} cameras given",
                 f"Give --intrinsics once for each --camera: a camera_info file, or {_LENS_FORM}.",
             )
-    names = list(cameras) or _names(groups)
-    used = {lidar.frame for lidar in lidars}
-    drafts = []
-    for index, (camera, group) in enumerate(zip(names, groups, strict=True)):
-        lens = intrinsics[index] if intrinsics else _lens(camera, group)
+    model = lidar_model or _UNKNOWN_MODEL
+    notes = [_line(topic) for topic in topics]
+    if scans:
+        names = ["lidar"] if len(scans) == 1 else [f"lidar_{k + 1}" for k in range(len(scans))]
+        lidars = {name: _lidar(name, model, topic) for name, topic in zip(names, scans, strict=True)}
+    else:
+        cloud = read_cloud(clouds[0]) if clouds else None
+        lidars = {"lidar": _lidar("lidar", model, None, cloud, str(clouds[0]) if clouds else "")}
+        if rings := lidars["lidar"].get("elevations_deg"):
+            notes.append(f"lidar: {len(rings)} rings, {lidars['lidar'].get('columns', 'unknown')} columns")
+    used = {block["frame"] for block in lidars.values()}
+    blocks = {}
+    for k, (camera, group) in enumerate(zip(list(cameras) or _names(groups), groups, strict=True)):
         frame = next((t.frame for t in group if t.frame and t.frame not in used), None)
         used.add(frame)
-        draft = CameraDraft(camera, lens, frame)
-        if group:
-            draft = draft._replace(
-                channels=[("events" if t.kind == "events" else "frames", t.topic) for t in group]
-            )
-        drafts.append(draft)
-    found = [_line(topic) for topic in topics] + [f"{each.name}: {each.sees}" for each in lidars if clouds]
-    return draft_profile(name, lidars, drafts, board, source), found
+        blocks[camera] = _camera(camera, intrinsics[k] if intrinsics else _lens(camera, group), frame, group)
+    data = {
+        "format_version": 1,
+        "name": name,
+        "board": _board(board),
+        "lidars": lidars,
+        "cameras": blocks,
+    }
+    rig_from_document(Document(source, data, root=None))
+    head = f"# {name}: written by `lce-rig rigs new`; `lce-rig rigs show FILE` shows every setting.\n"
+    return head + "".join(map(_commented, dump_yaml(data).splitlines())), notes
+
+
+def _board(board: Board) -> dict[str, Any]:
+    """List the board's settings, with the usual standard deviations."""
+    return {
+        "inner_corners": [board.cols, board.rows],
+        "square_m": board.square_m,
+        "width_m": board.width_m,
+        "height_m": board.height_m,
+        "pattern_offset_m": list(board.pattern_offset_m),
+        "square_sigma_m": float(f"{board.square_m / 1000:.2g}"),
+        **{key: BoardSettings.model_fields[key].default for key in _BOARD_SIGMAS},
+    }
+
+
+def _lidar(
+    name: str, model: str, topic: SensorTopic | None, cloud: NDArray[Any] | None = None, where: str = ""
+) -> dict[str, Any]:
+    """List the settings of a LiDAR; of an unknown model with the beams that a cloud shows."""
+    block: dict[str, Any] = {"model": model, "frame": f"{name}_link"}
+    if topic is not None:
+        block |= {"frame": topic.frame or block["frame"], "topic": topic.topic}
+        rate_hz = round(topic.rate_hz or 0.0, 1)
+        block |= {"rate_hz": rate_hz} if rate_hz else {}
+        cloud, where = topic.cloud, topic.topic
+    if find_data_sheet(model) is None:
+        if cloud is not None:
+            scan = to_scan(cloud, name, LidarSettings.model_validate({"model": model}), where).scan
+            elevations_deg, columns = measure_beams(scan)
+            block["elevations_deg"] = [round(value, 2) for value in elevations_deg]
+            block |= {} if columns is None else {"columns": columns}
+        block |= {
+            "laser_bias_sigma_m": TYPICAL.laser_bias_sigma_m,
+            "range_offset_sigma_m": TYPICAL.range_offset_sigma_m,
+            "beam_aperture_m": TYPICAL.aperture_m,
+            "beam_divergence_rad": TYPICAL.divergence_rad[0],
+        }
+    return block | {"timestamps": {"clock": "host", "reference": "first_firing", "sync": "none"}}
+
+
+def _camera(
+    name: str, lens: Intrinsics, optical_frame: str | None, topics: Sequence[SensorTopic]
+) -> dict[str, Any]:
+    """List the settings of a camera, with a channel for each of its topics."""
+    timestamps = {"clock": "host", "reference": "mid_exposure", "sync": "none"}
+    channels: dict[str, Any] = {topic.kind: {"kind": topic.kind, "topic": topic.topic} for topic in topics}
+    return {
+        "frame": f"{name}_link",
+        "optical_frame": optical_frame or f"{name}_optical_frame",
+        "resolution_px": [lens.width_px, lens.height_px],
+        "intrinsics": {
+            "model": lens.model,
+            **{key: getattr(lens, key) for key in ("fx_px", "fy_px", "cx_px", "cy_px")},
+            "distortion": list(lens.distortion),
+        },
+        "channels": {
+            kind: {**channel, "timestamps": dict(timestamps)}
+            for kind, channel in (channels or {"frames": {"kind": "frames"}}).items()
+        },
+    }
+
+
+def _commented(line: str) -> str:
+    comment = _COMMENTS.get(line.strip().partition(":")[0])
+    return f"{line:<40} # {comment}\n" if comment else f"{line}\n"
 
 
 def clouds_in(folder: Path) -> list[Path]:
@@ -187,27 +280,6 @@ def parse_intrinsics(text: str) -> Intrinsics:
     return Intrinsics(fx, fy, cx, cy, width, height, _FAMILIES[model], tuple(distortion))
 
 
-def _lidars(topics: Sequence[SensorTopic], model: str | None) -> Iterator[LidarDraft]:
-    for index, topic in enumerate(topics):
-        name = "lidar" if len(topics) == 1 else f"lidar_{index + 1}"
-        sees = "" if topic.n_rings is None else f"{topic.n_rings} rings in the recording"
-        rate_hz = None if topic.rate_hz is None else round(topic.rate_hz, 1) or None
-        draft = LidarDraft(name, model or _UNKNOWN_MODEL, topic.frame or None, topic.topic, rate_hz, sees)
-        yield draft if topic.cloud is None else _with_beams(draft, topic.cloud, topic.topic)
-    if not topics:
-        yield LidarDraft(model=model or _UNKNOWN_MODEL)
-
-
-def _with_beams(lidar: LidarDraft, cloud: NDArray[Any], where: str) -> LidarDraft:
-    """Add the beams that a cloud shows, where the model's are not known."""
-    if find_data_sheet(lidar.model) is not None:
-        return lidar
-    scan = to_scan(cloud, lidar.name, LidarSettings.model_validate({"model": lidar.model}), where).scan
-    elevations_deg, columns = measure_beams(scan)
-    sees = f"{len(elevations_deg)} rings, {columns or 'unknown'} columns in the recording"
-    return lidar._replace(elevations_deg=elevations_deg, columns=columns, sees=sees)
-
-
 def _by_camera(topics: Sequence[SensorTopic]) -> list[list[SensorTopic]]:
     """Group topics by camera: frames and events in one namespace share a lens; two of a kind do not."""
     groups: list[list[SensorTopic]] = []
@@ -243,14 +315,6 @@ def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
         f"no intrinsics of camera {camera} ({topic.topic}): {why}",
         f"Give --intrinsics for every camera: a camera_info file, or {_LENS_FORM}.",
     )
-
-
-def _require_count(n_given: int, n_there: int, what: str, recording: Path) -> None:
-    if n_given not in (0, n_there):
-        raise UsageError(
-            f"{recording} holds {n_there} cameras, {n_given} {what} given",
-            "Give one for each camera, in the order of their topics, or none.",
-        )
 
 
 def _line(topic: SensorTopic) -> str:

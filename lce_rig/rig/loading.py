@@ -2,7 +2,7 @@
 
 import difflib
 import reprlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
@@ -115,7 +115,11 @@ def parse_rig(text: str, source: str = "profile") -> Rig:
 
 def dump_rig(rig: Rig) -> str:
     """Write a rig as YAML, without comments; `parse_rig` returns an equal rig."""
-    data = rig.model_dump(mode="json", exclude_none=True)
+    return dump_yaml(rig.model_dump(mode="json", exclude_none=True))
+
+
+def dump_yaml(data: Mapping[str, Any]) -> str:
+    """Write plain data as YAML, blocks in the order given."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
 
 
