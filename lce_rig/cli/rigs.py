@@ -175,7 +175,7 @@ def check_profile(file: str, as_json: bool) -> None:
             show.print_json({"is_valid": False, "problems": problems, "warnings": [], "findings": []})
         raise
     if as_json:
-        warnings = rig.warnings()
+        warnings = list(rig.warnings())
         show.print_json(
             {
                 "is_valid": True,

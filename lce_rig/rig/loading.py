@@ -11,6 +11,7 @@ from typing import Any, get_args
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
+from yaml.constructor import ConstructorError
 
 from lce_rig.core.errors import ProfileError, reading
 from lce_rig.rig.profile import Rig
@@ -21,8 +22,6 @@ BAD_SCALARS = (ValueError, ArithmeticError, LookupError, AttributeError, TypeErr
 """Errors of PyYAML for a scalar that contradicts its tag: `!!bool x`, `!!int ""`, `!!timestamp x`."""
 # A profile has a page or two. Parsing 100 kB of YAML takes a second.
 _MAX_BYTES = 1 << 18
-# The search for the nearest key takes 1 ms per problem.
-_MOST_SHOWN = 100
 _SUFFIXES = (".yaml", ".yml")
 # The words of pydantic's messages, and those of ours.
 _REWORDED = (
@@ -90,14 +89,10 @@ def read_profile(path: Path) -> str:
     Raises:
         ProfileError: it cannot be read, is not text, or is too large.
     """
-    with reading(path, ProfileError), path.open("rb") as file:
-        content = file.read(_MAX_BYTES + 1)
-        if len(content) > _MAX_BYTES:
-            raise ProfileError(f"{path}: is too large to be a rig profile")
-        try:
-            return content.decode()
-        except UnicodeDecodeError as error:
-            raise ProfileError(f"{path}: is not UTF-8 text (byte {error.start})") from error
+    with reading(path, ProfileError):
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError("it is too large to be a rig profile")
+        return path.read_text(encoding="utf-8")
 
 
 def parse_rig(text: str, source: str = "profile") -> Rig:
@@ -133,28 +128,17 @@ class _Dumper(yaml.SafeDumper):
         return super().represent_sequence(tag, sequence, flow_style=is_flat)
 
 
-class _BadValueError(yaml.MarkedYAMLError):
-    """YAML that no profile has."""
-
-
 class _Loader(yaml.SafeLoader):
-    """Refuse keys given twice, and name the line of a scalar that contradicts its tag."""
+    """Refuse keys given twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         data: dict[Any, Any] = {}
         for key, value in node.value:
             # As written: YAML 1.1 reads the keys `on` and `no` as truth values.
             if key.value in data:
-                raise _BadValueError(problem=f"{key.value} is given twice", problem_mark=key.start_mark)
+                raise ConstructorError(None, None, f"{key.value} is given twice", key.start_mark)
             data[key.value] = self.construct_object(value, deep=True)
         return data
-
-    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        try:
-            return super().construct_object(node, deep)
-        except BAD_SCALARS as error:
-            problem = f"{node.value!r} cannot be read: {error}"
-            raise _BadValueError(problem=problem, problem_mark=node.start_mark) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,22 +180,18 @@ def read_document(text: str, source: str) -> Document:
     try:
         loader = _Loader(text)
         root = loader.get_single_node()
-        if root is None:
-            raise ProfileError(
-                f"{source}: is empty", "Start from a shipped one: `lce-rig rigs new NAME --from rlfs`"
-            )
-        data: Any = loader.construct_document(root)
+        data: Any = None if root is None else loader.construct_document(root)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"{source}:{mark.line + 1}" if mark else source
-        kind = "" if isinstance(error, _BadValueError) else "not YAML: "
-        raise ProfileError(f"{where}: {kind}{error.problem or error.context}") from error
-    except yaml.YAMLError as error:
+        raise ProfileError(f"{where}: not YAML: {error.problem or error.context}") from error
+    except (yaml.YAMLError, RecursionError, *BAD_SCALARS) as error:
         raise ProfileError(f"{source}: not YAML: {str(error).splitlines()[0]}") from error
-    except RecursionError as error:
-        raise ProfileError(f"{source}: is too deeply nested to be a rig profile") from error
     if not isinstance(data, dict):
-        raise ProfileError(f"{source}: is not a rig profile: expected a mapping of keys")
+        raise ProfileError(
+            f"{source}: is not a rig profile: expected a mapping of keys",
+            "Start from a shipped one: `lce-rig rigs new NAME --from rlfs`",
+        )
     return Document(source, data, root)
 
 
@@ -225,9 +205,8 @@ def rig_from_document(document: Document) -> Rig:
 
 def explain(error: ValidationError, document: Document) -> ProfileError:
     """Build the error for the user, with each problem once, in the order of the file's lines."""
-    details = error.errors()
     problems: dict[KeyPath, tuple[str, KeyPath | None]] = {}
-    for detail in details[:_MOST_SHOWN]:
+    for detail in error.errors():
         path, what, meant = _problem(detail)
         problems.setdefault(path, (what, meant))
     # A misspelt key is not reported as missing as well.
@@ -241,9 +220,7 @@ def explain(error: ValidationError, document: Document) -> ProfileError:
     sentences = [f"{source}{f':{line}' if document.root else ''}: {text}" for line, text in lines]
     if len(sentences) == 1:
         return ProfileError(sentences[0])
-    n_more = max(len(details) - _MOST_SHOWN, 0)
-    hint = "\n".join([*sentences, *([f"and {n_more} more"] if n_more else [])])
-    return ProfileError(f"{source}: {len(sentences) + n_more} problems", hint)
+    return ProfileError(f"{source}: {len(sentences)} problems", "\n".join(sentences))
 
 
 def _problem(detail: ErrorDetails) -> tuple[KeyPath, str, KeyPath | None]:
@@ -273,8 +250,13 @@ def _problem(detail: ErrorDetails) -> tuple[KeyPath, str, KeyPath | None]:
 
 
 def _unknown_key(path: KeyPath) -> tuple[str, KeyPath | None]:
-    key = str(path[-1])
-    valid = valid_keys(path[:-1])
+    key, place = str(path[-1]), [str(part) for part in path[:-1]]
+    blocks = [(block.split(".") if block else [], name) for block, name in all_keys()]
+    valid = [
+        name
+        for block, name in blocks
+        if len(block) == len(place) and all(a in ("*", b) for a, b in zip(block, place, strict=True))
+    ]
     # A missing unit is the most likely error: for difflib, fx is as close to fy_px as to fx_px.
     nearest = [name for name in valid if name.startswith(f"{key}_")]
     elsewhere = [block for block, name in all_keys() if name == key]
@@ -284,20 +266,6 @@ def _unknown_key(path: KeyPath) -> tuple[str, KeyPath | None]:
     if nearest:
         return f"unknown key; the nearest is {nearest[0]}", (*path[:-1], nearest[0])
     return f"unknown key; choose one of: {', '.join(valid)}", None
-
-
-def valid_keys(path: KeyPath) -> list[str]:
-    """List the keys that a block may have.
-
-    Args:
-        path: the block's path; () for the whole profile.
-    """
-
-    def is_here(block: str) -> bool:
-        parts = block.split(".") if block else []
-        return len(parts) == len(path) and all(a in ("*", str(b)) for a, b in zip(parts, path, strict=True))
-
-    return [key for block, key in all_keys() if is_here(block)]
 
 
 def all_keys(model: type[BaseModel] = Rig, block: str = "") -> Iterator[tuple[str, str]]:

@@ -156,15 +156,17 @@ class Rig(Settings):
 
     def located(self, folder: Path) -> "Rig":
         """Make the paths in a profile absolute; relative ones start at the folder its file lies in."""
-        cameras = {name: camera.located(folder) for name, camera in self.cameras.items()}
+        cameras = {
+            name: camera.model_copy(
+                update={"channels": {key: each.located(folder) for key, each in camera.channels.items()}}
+            )
+            for name, camera in self.cameras.items()
+        }
         targets = {name: target.located(folder) for name, target in self.targets.items()}
         return self.model_copy(update={"cameras": cameras, "targets": targets})
 
-    def warnings(self) -> tuple[Finding, ...]:
+    def warnings(self) -> Iterator[Finding]:
         """List valid but probably unintended settings; the subject is the key."""
-        return tuple(self._warnings())
-
-    def _warnings(self) -> Iterator[Finding]:
         (cols, rows), width_m, height_m = self.board.inner_corners, self.board.width_m, self.board.height_m
         if (cols - rows) * (width_m - height_m) < 0:
             yield SWAPPED_SIDES("board", n_cols=cols, n_rows=rows, width_m=width_m, height_m=height_m)

@@ -256,13 +256,6 @@ class ReconstructionSettings(Settings):
             raise problem("the event map needs no network", "model")
         return self
 
-    def located(self, folder: Path) -> "ReconstructionSettings":
-        """Make the model's path absolute; a relative one starts at the profile's folder."""
-        if self.model is None:
-            return self
-        path = (folder / Path(self.model).expanduser()).resolve()
-        return self.model_copy(update={"model": str(path)})
-
 
 class ChannelSettings(Settings):
     """One stream of a camera.
@@ -293,9 +286,11 @@ class ChannelSettings(Settings):
 
     def located(self, folder: Path) -> "ChannelSettings":
         """Make paths absolute; relative ones start at the profile's folder."""
-        if self.reconstruction is None:
+        settings = self.reconstruction
+        if settings is None or settings.model is None:
             return self
-        return self.model_copy(update={"reconstruction": self.reconstruction.located(folder)})
+        path = (folder / Path(settings.model).expanduser()).resolve()
+        return self.model_copy(update={"reconstruction": settings.model_copy(update={"model": str(path)})})
 
 
 class CameraSettings(Settings):
@@ -351,11 +346,6 @@ class CameraSettings(Settings):
     def _other_resolution(self) -> str:
         width, height = round(2 * self.intrinsics.cx_px), round(2 * self.intrinsics.cy_px)
         return f"; check whether they belong to another resolution (about {width}x{height} px)"
-
-    def located(self, folder: Path) -> "CameraSettings":
-        """Make paths absolute; relative ones start at the profile's folder."""
-        channels = {name: channel.located(folder) for name, channel in self.channels.items()}
-        return self.model_copy(update={"channels": channels})
 
     def first_channel(self, kind: Literal["frames", "events"]) -> str | None:
         """Name the first channel of a kind; None if there is none."""

@@ -1,8 +1,8 @@
 """Thresholds of a profile; each has a default."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from lce_rig.rig.settings import NotNegative, Positive, Settings
 
@@ -61,9 +61,6 @@ class QualitySettings(Settings):
     max_mee_m: Positive = 0.04
 
 
-_WEIGHTS = ("plane_weight", "edge_weight")
-
-
 class CalibrationSettings(Settings):
     """Target standard deviations.
 
@@ -74,12 +71,6 @@ class CalibrationSettings(Settings):
 
     target_sigma_deg: Positive = 0.2
     target_sigma_m: Positive = 0.01
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_weights(cls, data: Any) -> Any:
-        """Drop the weights of earlier sessions' profiles; they now follow from the captures."""
-        return {k: v for k, v in data.items() if k not in _WEIGHTS} if isinstance(data, dict) else data
 
     def in_targets(self, rotation_deg: float, translation_m: float) -> float:
         """Measure an error or a difference in units of the targets; the larger of the two counts."""
