@@ -20,6 +20,7 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.pipeline.matching import expected_poses
 from lce_rig.rig import ReconstructionSettings, Rig
 from lce_rig.session import Capture, Session, check_capture
+from lce_rig.session.durable import load_arrays, store_arrays
 
 Key = tuple[str, str]
 _Found = TypeVar("_Found", ImageDetection, LidarDetection, Image | Refusal)
@@ -222,10 +223,10 @@ class _Finder:
             check_capture(self._session.rig, capture)
             capture.check()
             key = _cache_key(digest, capture, sensor)
-            cached = self._session.load_cached(key)
-            if cached is not None:
+            arrays = load_arrays(self._session.cached(key))
+            if arrays is not None:
                 with suppress(ValueError):
-                    return cast(_Found, from_arrays(cached.arrays))
+                    return cast(_Found, from_arrays(arrays))
             detection = find()
         except SessionError as error:
             return refusal_of("read", error)
@@ -233,7 +234,7 @@ class _Finder:
         return detection
 
     def _keep(self, key: str, detection: ImageDetection | LidarDetection | Image) -> None:
-        self._session.store_cached(key, to_arrays(detection), {})
+        store_arrays(self._session.cached(key), to_arrays(detection))
 
 
 def _cache_key(digest: str, capture: Capture, sensor: str) -> str:

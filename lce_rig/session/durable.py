@@ -1,8 +1,15 @@
 """Files that survive a power failure, and the lock against a second writer."""
 
 import fcntl
+import io
 import os
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.errors import SessionError
 
@@ -49,6 +56,30 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         raise SessionError(
             f"{path}: cannot be written: {error.strerror or error}", "Free space or choose another folder."
         ) from error
+
+
+def store_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> bool:
+    """Write an entry of a cache: arrays by name, without pickle; the same arrays give the same bytes.
+
+    Returns:
+        Whether it could be written: a full or read-only disk only costs the time saved.
+    """
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **dict(sorted(arrays.items())))
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, buffer.getvalue())
+        return True
+    return False
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
+    """Read what `store_arrays` wrote; None if there is no entry or it is damaged, by its checksums."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except Exception:  # An entry of another version can fail in any way.
+        return None
 
 
 def flush_folder(path: Path) -> None:

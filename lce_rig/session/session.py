@@ -16,13 +16,10 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import LceRigError, SessionError, reading
 from lce_rig.rig import Rig, dump_rig, load_rig
-from lce_rig.session import cache
 from lce_rig.session.capture import Capture, check_samples, event_channel
 from lce_rig.session.capture_files import content_hash, write_capture
 from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file
@@ -333,19 +330,8 @@ class Session:
                     entries += [entry] if isinstance(entry, dict) else []
         return entries
 
-    def store_cached(self, key: str, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> bool:
-        """Store arrays and JSON values under a key such as "3f9a1c/000012" for `load_cached`.
-
-        Returns:
-            Whether it could be written; a full or read-only disk only costs the time saved.
-        """
-        return cache.store(self._cache_path(key), arrays, values)
-
-    def load_cached(self, key: str) -> cache.Cached | None:
-        """Return what `store_cached` stored; None if there is no entry or it is damaged."""
-        return cache.load(self._cache_path(key))
-
-    def _cache_path(self, key: str) -> Path:
+    def cached(self, key: str) -> Path:
+        """Give the file of arrays kept under a key such as "3f9a1c/000012"."""
         return self.path / DETECTIONS / f"{key}.npz"
 
     @contextmanager

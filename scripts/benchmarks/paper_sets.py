@@ -14,7 +14,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.detect.detection import ImageDetection, LidarDetection, from_arrays, to_arrays
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
-from lce_rig.session.cache import Cached, load, store
+from lce_rig.session.durable import load_arrays, store_arrays
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.captures import StagedBoard
 from lce_rig.simulate.lidar import measure_sweep, sweep_scene
@@ -76,7 +76,7 @@ def paper_set(folder: Path, seed: int, n_captures: int = N_CAPTURES) -> PaperSet
         placement = _read(path)
         if placement is None:
             placement = maker.place(index)
-            store(path, _flatten(placement), {})
+            store_arrays(path, _flatten(placement))
         placements.append(placement)
     return PaperSet(placements, maker.T_cam_lidar)
 
@@ -119,17 +119,17 @@ def _flatten(placement: Placement) -> dict[str, Array]:
 
 def _read(path: Path) -> Placement | None:
     """Read a placement; None where it was not kept, or by a detector that found less."""
-    kept = load(path)
+    kept = load_arrays(path)
     try:
         return None if kept is None else _rebuild(kept)
     except ValueError:
         return None
 
 
-def _rebuild(kept: Cached) -> Placement:
+def _rebuild(kept: dict[str, Array]) -> Placement:
     def part(name: str) -> dict[str, Array]:
         prefix = f"{name}/"
-        return {key[len(prefix) :]: a for key, a in kept.arrays.items() if key.startswith(prefix)}
+        return {key[len(prefix) :]: a for key, a in kept.items() if key.startswith(prefix)}
 
     scans = {level: from_arrays(part(f"scan{level}")) for level in LEVELS}
     return Placement(from_arrays(part("image")), scans)
