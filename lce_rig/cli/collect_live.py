@@ -138,7 +138,7 @@ def _open_rig(
 ) -> "tuple[list[LiveSource], SimulatedRig | None]":
     """Open the attached sources, or with a seed simulated ones, whose truth goes into the session."""
     if seed is None:
-        from lce_rig.devices.opening import open_live
+        from lce_rig.devices import open_live
 
         return open_live(rig), None
     from lce_rig.collect.live.simulated import SimulatedRig

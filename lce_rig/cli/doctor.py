@@ -12,7 +12,7 @@ from lce_rig.cli.options import FiniteRange, json_option, rig_option
 
 if TYPE_CHECKING:
     from lce_rig.core.findings import Severity
-    from lce_rig.doctor.examination import Check
+    from lce_rig.doctor.examine import Check
 
 _MARKS = {"note": "[green]ok[/]", "warning": "[yellow]warn[/]", "error": "[bold red]FAIL[/]"}
 _EXIT_ERROR = 5
@@ -51,7 +51,7 @@ def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
     Exits with 5 if a check reports FAIL, else with 0.
     """
     from lce_rig.core.findings import worst
-    from lce_rig.doctor.examination import sensors
+    from lce_rig.devices import sensors
     from lce_rig.doctor.examine import DoctorOptions, examine
     from lce_rig.rig import load_rig
 

@@ -105,7 +105,7 @@ _JUDGING_S = 120.0
 def _watch_live(rig: "Rig", saved: "ResultFile", seconds: float | None) -> "DriftReport":
     """Watch attached sensors until the time is over, or a signal or q asks to stop."""
     from lce_rig.core.interrupts import patience
-    from lce_rig.devices.opening import open_live
+    from lce_rig.devices import open_live
     from lce_rig.pipeline.drift import drift_live
     from lce_rig.show.screen.keys import controls
 

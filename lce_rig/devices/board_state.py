@@ -1,26 +1,24 @@
 """The state of a sync board from its messages: pulses, clocks, problems; no device, no thread."""
 
+import math
 from collections import Counter
 from collections.abc import Mapping
-from enum import Enum
 from typing import Any, NamedTuple
 
 from lce_rig.core.data import Pulse
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 from lce_rig.devices.lce1 import (
-    PPS_IS_ON,
     BoardError,
     BoardStatus,
     Hello,
-    LineFault,
     LineReader,
     Message,
     PpsEdge,
     TimeReply,
     TriggerEdge,
 )
-from lce_rig.devices.protocol import ClockState
+from lce_rig.devices.reading import ClockState
 from lce_rig.rig.sync_settings import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import ClockTracker
@@ -31,8 +29,6 @@ from lce_rig.timing.clock_fit import ClockTracker
 # A line is written within milliseconds of its event, and read whenever the computer gets to it.
 ROOM_NS = 2 * NS_PER_S
 _MOST_BACK_NS = NS_PER_S
-# Answers may overtake what the board had queued before; a board that has just started is not that far.
-_MOST_BACK_GREETED_NS = NS_PER_S // 10
 
 _STALLED_S = 3.0
 _DAMAGED = 0.01
@@ -41,53 +37,40 @@ _PPS_LATE_S = 2.5
 _NO_CLOCK_S = 5.0
 
 
-class Verdict(Enum):
-    """The judgement of a value: believed, skipped, or the first after a restart."""
-
-    SOUND = "sound"
-    ODD = "odd"
-    ANEW = "anew"
-
-
 class BoardTime:
-    """The board's clock against one of the computer's that is never set."""
+    """The board's clock against one of the computer's that is never set.
+
+    Attributes:
+        n_restarts: how often it began anew.
+    """
 
     def __init__(self) -> None:
+        self.n_restarts = 0
         self._latest_ns: int | None = None
         self._least_late_ns = 0
         self._odd_late_ns: int | None = None
-        self._was_greeted = False
 
-    def greeted(self) -> None:
-        """Note that the board said hello: it was asked to, or has just started."""
-        self._was_greeted = True
-
-    def judge(self, board_ns: int, steady_ns: int) -> Verdict:
+    def accepts(self, board_ns: int, steady_ns: int) -> bool:
         """Judge a time on the board's clock by when it came.
 
         Messages may come late, and many at once; never early, and never much out of order.
         """
         late_ns = steady_ns - board_ns
-        if self._latest_ns is None:
-            self._begin(board_ns, late_ns)
-            return Verdict.SOUND
-        most_back_ns = _MOST_BACK_GREETED_NS if self._was_greeted else _MOST_BACK_NS
-        is_back = board_ns < self._latest_ns - most_back_ns
-        if is_back or late_ns < self._least_late_ns - ROOM_NS:
+        if self._latest_ns is not None and (
+            board_ns < self._latest_ns - _MOST_BACK_NS or late_ns < self._least_late_ns - ROOM_NS
+        ):
             is_confirmed = self._odd_late_ns is not None and abs(late_ns - self._odd_late_ns) < ROOM_NS
             self._odd_late_ns = late_ns
-            if not is_confirmed and not (is_back and self._was_greeted):
-                return Verdict.ODD
-            self._begin(board_ns, late_ns)
-            return Verdict.ANEW
-        self._odd_late_ns, self._was_greeted = None, False
+            if not is_confirmed:
+                return False
+            self.n_restarts += 1
+            self._latest_ns = None
+        self._odd_late_ns = None
+        if self._latest_ns is None:
+            self._latest_ns, self._least_late_ns = board_ns, late_ns
         self._latest_ns = max(self._latest_ns, board_ns)
         self._least_late_ns = min(self._least_late_ns, late_ns)
-        return Verdict.SOUND
-
-    def _begin(self, board_ns: int, late_ns: int) -> None:
-        self._latest_ns, self._least_late_ns = board_ns, late_ns
-        self._odd_late_ns, self._was_greeted = None, False
+        return True
 
 
 class RunningNumber:
@@ -99,36 +82,29 @@ class RunningNumber:
 
     def __init__(self) -> None:
         self.n_lost = 0
-        self._last: int | None = None
-        self._last_us = 0
+        self._last: tuple[int, int] | None = None
         self._least_period_us = 0
         self._odd: int | None = None
 
-    def judge(self, number: int, t_us: int) -> Verdict:
+    def accepts(self, number: int, t_us: int) -> bool:
         """Judge a number; one that skips others must have left them the time to happen."""
-        if self._last is None:
-            self._take(number, t_us)
-            return Verdict.SOUND
-        n_steps, elapsed_us = number - self._last, t_us - self._last_us
-        if n_steps < 1 or (n_steps > 1 and elapsed_us < (n_steps - 0.5) * self._least_period_us):
-            is_confirmed = self._odd is not None and number == self._odd + 1
-            self._odd = number
-            if not is_confirmed:
-                return Verdict.ODD
-            self._take(number, t_us)
-            return Verdict.ANEW
-        if n_steps == 1 and elapsed_us > 0:
-            self._least_period_us = min(self._least_period_us or elapsed_us, elapsed_us)
-        self.n_lost += n_steps - 1
-        self._take(number, t_us)
-        return Verdict.SOUND
+        if self._last is not None:
+            n_steps, elapsed_us = number - self._last[0], t_us - self._last[1]
+            if n_steps < 1 or (n_steps > 1 and elapsed_us < (n_steps - 0.5) * self._least_period_us):
+                is_confirmed = self._odd is not None and number == self._odd + 1
+                self._odd = number
+                if not is_confirmed:
+                    return False
+            else:
+                self.n_lost += n_steps - 1
+                if n_steps == 1 and elapsed_us > 0:
+                    self._least_period_us = min(self._least_period_us or elapsed_us, elapsed_us)
+        self._last, self._odd = (number, t_us), None
+        return True
 
-    def begin(self) -> None:
+    def restart(self) -> None:
         """Take the next number for the first of a new row."""
         self._last = self._odd = None
-
-    def _take(self, number: int, t_us: int) -> None:
-        self._last, self._last_us, self._odd = number, t_us, None
 
 
 class Arrival(NamedTuple):
@@ -146,7 +122,7 @@ class BoardState:
         n_pulses: pulses handed on, by line.
         n_lost_by_line: pulses whose messages never came, by line; gaps in the running numbers tell.
         n_implausible: messages whose figures cannot be.
-        n_restarts, restarted_ns: how often the board restarted, and when it last did, by the steady clock.
+        restarted_ns: when the board last restarted, by the steady clock; None where it did not.
         heard_ns: when the last message came, or the port was opened, by the steady clock.
         hello, status, error: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
@@ -163,7 +139,7 @@ class BoardState:
         self.reader = LineReader()
         self.n_pulses: Counter[str] = Counter()
         self.n_lost_by_line: Counter[str] = Counter()
-        self.n_implausible = self.n_restarts = self.heard_ns = 0
+        self.n_implausible = self.heard_ns = 0
         self.restarted_ns: int | None = None
         self.hello: Hello | None = None
         self.status: BoardStatus | None = None
@@ -196,19 +172,14 @@ class BoardState:
 
     def take(self, message: Message, arrival: Arrival) -> list[Pulse]:
         """Take a message, and give the pulses that it tells of."""
-        board_us: int | None = None
         match message:
-            case Hello():
-                self._time.greeted()
             case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | TimeReply(_, _, t_us):
-                board_us = t_us
-        if board_us is not None:
-            verdict = self._time.judge(board_us * 1000, arrival.steady_ns)
-            if verdict is Verdict.ODD:
-                self.n_implausible += 1
-                return []
-            if verdict is Verdict.ANEW:
-                self._restart(arrival)
+                n_restarts = self.n_restarts
+                if not self._time.accepts(t_us * 1000, arrival.steady_ns):
+                    self.n_implausible += 1
+                    return []
+                if self.n_restarts > n_restarts:
+                    self._restart(arrival)
         match message:
             case Hello():
                 self.hello = message
@@ -232,6 +203,11 @@ class BoardState:
             case BoardError():
                 self.error = message
         return []
+
+    @property
+    def n_restarts(self) -> int:
+        """How often the board restarted."""
+        return self._time.n_restarts
 
     @property
     def has_answered(self) -> bool:
@@ -262,44 +238,17 @@ class BoardState:
             figures["round_trip_ms"] = self.round_trip_ns / 1e6
         return ClockState(findings.BOARD_CLOCK(**figures))
 
-    def figures(self, now_ns: int) -> dict[str, float]:
-        """Return the board's figures by name at a moment of the steady clock."""
-        faults, host = self.reader.faults, self.host_clock
-        figures: dict[str, float] = {
-            "n_messages": self.reader.n_messages,
-            "n_bad_checksums": faults[LineFault.CHECKSUM],
-            "n_malformed": faults[LineFault.MALFORMED] + faults[LineFault.TOO_LONG],
-            "n_unknown": faults[LineFault.UNKNOWN],
-            "n_implausible": self.n_implausible,
-            "n_resets": self.n_restarts,
-            "line_age_s": (now_ns - self.heard_ns) / NS_PER_S,
-        }
-        figures |= {f"n_pulses.{line}": n_pulses for line, n_pulses in sorted(self.n_pulses.items())}
-        if host is not None:
-            figures["host_rms_us"] = host.rms_ns / 1000
-        if self.pps is not None:
-            figures["pps_age_s"] = (now_ns - self.pps[1].steady_ns) / NS_PER_S
-        return figures
-
-    def problems(self, now_ns: int, n_unwritten: int = 0) -> tuple[Finding, ...]:
-        """List the problems at a moment of the steady clock.
-
-        Args:
-            now_ns: that moment.
-            n_unwritten: commands that the board did not take.
-        """
+    def problems(self, now_ns: int) -> tuple[Finding, ...]:
+        """List the problems at a moment of the steady clock."""
         silent_s = (now_ns - self.heard_ns) / NS_PER_S
         if silent_s > _STALLED_S:
             return (findings.BOARD_SILENT(silent_s=silent_s),)
         has_waited = now_ns - self._opened_ns > _NO_CLOCK_S * NS_PER_S
         problems: list[Finding] = []
-        faults = self.reader.faults
-        n_damaged = sum(faults.values()) - faults[LineFault.UNKNOWN] + self.n_implausible
+        n_damaged = self.reader.n_damaged + self.n_implausible
         n_lines = n_damaged + self.reader.n_messages
         if n_damaged >= _MIN_DAMAGED and n_damaged > _DAMAGED * n_lines:
             problems.append(findings.DAMAGED_LINES(n=n_damaged, n_lines=n_lines))
-        if n_unwritten:
-            problems.append(findings.COMMANDS_NOT_TAKEN(n=n_unwritten))
         if self.restarted_ns is not None:
             ago_s = (now_ns - self.restarted_ns) / NS_PER_S
             problems.append(findings.BOARD_RESTARTED(n=self.n_restarts, ago_s=ago_s))
@@ -309,7 +258,7 @@ class BoardState:
             if has_waited and not self.n_pulses[line]:
                 problems.append(findings.NO_PULSES(line=line))
         if self.n_lost_by_line:
-            by_line = tuple(sorted(self.n_lost_by_line.items()))
+            by_line = ", ".join(f"{line} {n}" for line, n in sorted(self.n_lost_by_line.items()))
             problems.append(findings.PULSE_LINES_LOST(n=sum(self.n_lost_by_line.values()), by_line=by_line))
         if self.status is not None and self.status.n_lost:
             problems.append(findings.LINES_DROPPED_BY_BOARD(n=self.status.n_lost))
@@ -318,42 +267,27 @@ class BoardState:
         steps = self.host_tracker.steps
         if steps:
             problems.append(findings.COMPUTER_JUMPED(n=len(steps), last_s=steps[-1].size_ns / NS_PER_S))
-        return (*problems, *self._pps_problems(now_ns, has_waited=has_waited))
-
-    def _pps_problems(self, now_ns: int, *, has_waited: bool) -> list[Finding]:
-        if self.hello is None:
-            return []
-        if self.pps is None:
-            return [findings.NO_PPS()] if has_waited else []
-        problems: list[Finding] = []
-        edge, arrival = self.pps
-        late_s = (now_ns - arrival.steady_ns) / NS_PER_S
-        if late_s > _PPS_LATE_S:
-            problems.append(findings.PPS_STOPPED(silent_s=late_s))
-        elif edge.utc_s is None:
+        late_s = math.inf if self.pps is None else (now_ns - self.pps[1].steady_ns) / NS_PER_S
+        if self.hello is not None and has_waited and late_s > _PPS_LATE_S:
+            problems.append(findings.NO_PPS())
+        elif self.pps is not None and self.pps[0].utc_s is None:
             problems.append(findings.BOARD_WITHOUT_UTC())
-        if self.status is not None and not self.status.flags & PPS_IS_ON:
-            problems.append(findings.PPS_OUTPUT_OFF())
-        if self.n_lost_by_line[PPS_LINE]:
-            problems.append(findings.PPS_LINES_LOST(n=self.n_lost_by_line[PPS_LINE]))
-        return problems
+        return tuple(problems)
 
     def _pulse(self, line: str, count: int, t_us: int, arrival: Arrival) -> list[Pulse]:
         number = self._numbers.setdefault(line, RunningNumber())
-        n_lost = number.n_lost
-        if number.judge(count, t_us) is Verdict.ODD:
+        if not number.accepts(count, t_us):
             self.n_implausible += 1
             return []
-        if number.n_lost > n_lost:
-            self.n_lost_by_line[line] += number.n_lost - n_lost
+        if number.n_lost:
+            self.n_lost_by_line[line] = number.n_lost
         self.n_pulses[line] += 1
         return [Pulse(line, t_us * 1000, count, arrival.host_ns)]
 
     def _restart(self, arrival: Arrival) -> None:
-        self.n_restarts += 1
         self.restarted_ns = arrival.steady_ns
         for number in self._numbers.values():
-            number.begin()
+            number.restart()
         self._asked = None
         self.host_tracker.restart()
         self.utc_tracker.restart()

@@ -2,33 +2,13 @@
 
 from functools import partial
 
-from lce_rig.core.findings import Figure, Finding, Kind
+from lce_rig.core.findings import Finding, Kind
 
 _RAISE_LIMIT = (
     "raise the receive buffer limit, now {buffer_kib} KiB: sudo sysctl -w net.core.rmem_max=4194304"
 )
 
 _note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
-
-
-def _mid_exposure(finding: Finding) -> str:
-    """The timestamps are of mid exposure, from {mark} by {clock}; images arrive {delay_ms} old."""
-    mark = str(finding.figures["mark"]).replace("_", " ")
-    moved = f"{mark} by clock {finding.figures['clock']}, as this computer's UTC, corrected to mid exposure"
-    return moved + _delay(finding)
-
-
-def _davis(finding: Finding) -> str:
-    """The timestamps are the camera's own clock, set on opening; events arrive {delay_ms} old."""
-    clock = (
-        "the camera's own clock, set to this computer's UTC on opening; drifts until fitted to trigger edges"
-    )
-    return clock + _delay(finding)
-
-
-def _delay(finding: Finding) -> str:
-    delay_ms = finding.figures.get("delay_ms")
-    return "" if delay_ms is None else f"; {finding.figure('delay_ms'):.0f} ms old on arrival"
 
 
 def _board_clock(finding: Finding) -> str:
@@ -46,41 +26,8 @@ def _board_clock(finding: Finding) -> str:
     return text + (f"; round trip {finding.figure('round_trip_ms'):.1f} ms" if has_asked else "")
 
 
-def _pairs(figure: Figure, unit: str = "") -> str:
-    """List pairs of a name and a number."""
-    assert isinstance(figure, tuple)
-    texts = []
-    for pair in figure:
-        assert isinstance(pair, tuple)
-        name, number = pair
-        texts.append(f"{name} {number:.3g}{unit}" if isinstance(number, float) else f"{name} {number}{unit}")
-    return ", ".join(texts)
-
-
-def _none_fits(finding: Finding) -> str:
-    """No clock of this computer fits the timestamps, {delays_ms} by clock; the arrival is used."""
-    ages = _pairs(finding.figures["delays_ms"], " ms")
-    return f"no clock fits the timestamps (image age by {ages}); arrival times are used"
-
-
-def _ambiguous_clock(finding: Finding) -> str:
-    """Several clocks fit the timestamps, {delays_ms}; they are uncertain by {spread_ms}."""
-    ages, spread_ms = _pairs(finding.figures["delays_ms"], " ms"), finding.figure("spread_ms")
-    return f"the clock of the timestamps is uncertain by {spread_ms:.3g} ms (image age by {ages})"
-
-
-def _pulse_lines_lost(finding: Finding) -> str:
-    """Messages of {n} pulses were lost, {by_line}."""
-    return f"messages of {finding.figures['n']} pulses lost ({_pairs(finding.figures['by_line'])})"
-
-
 CONTROL_DIFFERS = _warning(
     "device.control_differs", "control {control} is {given}, the profile's value is {expected}"
-)
-ROW_PADDING = _warning(
-    "device.row_padding",
-    "rows of {row_bytes} bytes, GStreamer pads them to {padded_bytes}",
-    "if the image is slanted, let the command write JPEG (jpegenc)",
 )
 RECORDING_STOPPED = _warning(
     "device.recording_stopped", "recording to {path} stopped: {cause}", "free some space"
@@ -94,9 +41,6 @@ BOARD_SILENT = _warning(
     "device.board_silent",
     "no message from the board for {silent_s:.0f} s",
     "check its cable and power, press its reset",
-)
-COMMANDS_NOT_TAKEN = _warning(
-    "device.commands_not_taken", "the board did not accept {n} commands", "press its reset"
 )
 BOARD_RESTARTED = _warning(
     "device.board_restarted",
@@ -120,14 +64,6 @@ ROTOR_RATE = _warning(
     "rotor at {rotor_hz:.1f} Hz ({expected_hz:g} expected)",
     "set rate_hz in the profile, or rpm {expected_rpm:.0f} on the web page",
 )
-RATE_REFUSED = _warning(
-    "stream.rate_refused",
-    "the camera sends {rate_hz:.4g} images/s ({expected_hz:g} expected)",
-    "choose a rate that `v4l2-ctl --list-formats-ext` lists",
-)
-FEW_BUFFERS = _warning(
-    "stream.few_buffers", "the driver grants {n} buffers ({expected} expected): images may be lost"
-)
 DAMAGED_IMAGES = _warning(
     "stream.damaged_images",
     "{n} damaged images",
@@ -147,9 +83,8 @@ DAMAGED_LINES = _warning(
 NO_PULSES = _warning(
     "stream.no_pulses", "no pulses for {line}", "check sync.triggers.{line}.channel and that triggers are on"
 )
-PULSE_LINES_LOST = _warning("stream.pulse_lines_lost", _pulse_lines_lost, "use a USB port of its own")
-PPS_LINES_LOST = _warning(
-    "stream.pps_lines_lost", "messages of {n} pulses per second lost; the LiDAR received the pulses"
+PULSE_LINES_LOST = _warning(
+    "stream.pulse_lines_lost", "messages of {n} pulses lost ({by_line})", "use a USB port of its own"
 )
 LINES_DROPPED_BY_BOARD = _warning(
     "stream.lines_dropped_by_board",
@@ -162,24 +97,25 @@ BUFFER_SMALL = _warning(
 
 ARRIVAL = _note("clock.arrival", "arrival at this computer, later than the exposure by an unknown time")
 HEADER = _note("clock.header", "headers of the ROS 2 messages, {delay_ms:.3g} ms before their arrival")
-MID_EXPOSURE = _note("clock.mid_exposure", _mid_exposure)
-DAVIS_CLOCK = _note("clock.davis", _davis)
-CLOCK_MISSING = _warning(
-    "clock.missing",
-    "this computer has no clock {clock}; arrival times are used",
+MID_EXPOSURE = _note(
+    "clock.mid_exposure",
+    "{mark} by clock {clock}, as this computer's UTC, corrected to mid exposure; "
+    "{delay_ms:.0f} ms old on arrival",
+)
+DAVIS_CLOCK = _note(
+    "clock.davis",
+    "the camera's own clock, set to this computer's UTC on opening; drifts until fitted to trigger edges; "
+    "{delay_ms:.0f} ms old on arrival",
+)
+NO_CLOCK_FITS = _warning(
+    "clock.none_fits",
+    "no clock fits the timestamps (image age by {ages}); arrival times are used",
     "set driver.frame_timing.clock",
 )
-CLOCK_DOES_NOT_FIT = _warning(
-    "clock.does_not_fit",
-    "by clock {clock} images are {delay_ms:.3g} ms old",
-    "correct driver.frame_timing.clock",
-)
-NO_CLOCK_FITS = _warning("clock.none_fits", _none_fits, "set driver.frame_timing.clock if you know it")
 CLOCK_AMBIGUOUS = _warning(
-    "clock.ambiguous", _ambiguous_clock, "set driver.frame_timing.clock if you know it"
-)
-CLOCK_CHANGED = _warning(
-    "clock.changed", "the timestamps changed clock {n} times", "check the camera's driver (dmesg)"
+    "clock.ambiguous",
+    "the clock of the timestamps is uncertain by {spread_ms:.3g} ms",
+    "set driver.frame_timing.clock if you know it",
 )
 EXPOSURE_UNKNOWN = _warning(
     "clock.exposure_unknown",
@@ -219,39 +155,12 @@ COMPUTER_JUMPED = _warning(
 NO_PPS = _warning(
     "clock.no_pps", "no pulse per second: the LiDAR cannot be synchronised", "press the board's reset"
 )
-PPS_STOPPED = _warning(
-    "clock.pps_stopped", "no pulse per second for {silent_s:.0f} s", "press the board's reset"
-)
 BOARD_WITHOUT_UTC = _warning(
     "clock.board_without_utc", "the board does not know UTC yet: the LiDAR's hour is unknown"
 )
-PPS_OUTPUT_OFF = _warning(
-    "clock.pps_output_off", "its output of pulses per second is off", "press the board's reset"
-)
 
-OTHER_MODEL = _warning(
-    "settings.other_model",
-    "the LiDAR is a {model}, the profile says {expected}: its packets are not read",
-    "correct the model in the profile",
+SETTING_DIFFERS = _warning(
+    "settings.differs",
+    "{setting} {value} ({expected} expected)",
+    "correct it on the LiDAR's web page, or in the profile",
 )
-MOTOR_OFF = _warning("settings.motor_off", "the motor is off", "switch it on (rpm 600)")
-LASER_OFF = _warning("settings.laser_off", "the laser is off", "switch it on")
-ROTOR_SETTING = _warning(
-    "settings.rotor_rate",
-    "rotor set to {set_hz:.1f} Hz ({expected_hz:g} expected)",
-    "set rpm to {expected_rpm:.0f}, or rate_hz in the profile",
-)
-FOV_CUT = _warning(
-    "settings.fov_cut", "field of view cut to {start_deg:.0f} to {end_deg:.0f} deg", "set it to 0 to 359"
-)
-DATA_PORT = _warning(
-    "settings.data_port",
-    "data sent to port {port} ({expected_port} expected)",
-    "set either of them to the other",
-)
-POSITION_PORT = _warning(
-    "settings.position_port",
-    "telemetry sent to port {port} ({expected_port} expected): PPS is unknown",
-    "set driver.controls.position_port",
-)
-PPS_SETTING = _warning("settings.pps", "PPS is {pps}: the LiDAR's clock is not UTC", "check pulse and NMEA")

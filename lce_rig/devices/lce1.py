@@ -6,9 +6,7 @@ with a strict grammar, and with what the board has said before (`BoardState`).
 """
 
 import re
-from collections import Counter
 from collections.abc import Callable
-from enum import Enum
 from functools import reduce
 from operator import xor
 from typing import Any, NamedTuple, TypeAlias
@@ -19,8 +17,6 @@ MAX_LINE = 512
 MAX_US = (2**63 - 1) // 1000
 MAX_COUNT = 2**32 - 1
 N_CHANNELS = 16
-PPS_IS_ON = 2
-"""Bit of a status: pulses per second run."""
 
 _SENTENCE = re.compile(rb"([!-#%-)+-~ ]+)\*([0-9A-Fa-f]{1,2})\Z")
 _NUMBER = re.compile(rb"(?:0|[1-9][0-9]{0,18})\Z")
@@ -88,15 +84,6 @@ class BoardError(NamedTuple):
 Message: TypeAlias = Hello | PpsEdge | TriggerEdge | TimeReply | BoardStatus | BoardError
 
 
-class LineFault(Enum):
-    """Why a line is no message."""
-
-    CHECKSUM = "wrong checksum"
-    MALFORMED = "malformed"
-    UNKNOWN = "unknown"
-    TOO_LONG = "too long"
-
-
 def _count(field: bytes, largest: int = MAX_COUNT) -> int:
     if not _NUMBER.match(field) or int(field) > largest:
         raise ValueError(field)
@@ -154,64 +141,68 @@ def write_sentence(body: str) -> bytes:
     return b"$%s*%02X\r\n" % (data, checksum(data))
 
 
-def read_sentence(line: bytes) -> bytes | LineFault:
+def read_sentence(line: bytes) -> bytes:
     """Return the body of a sentence, between `$` and `*`.
 
     Anything before the last `$` is skipped: a board that restarts breaks off in the middle of a line.
+
+    Raises:
+        ValueError: the line is damaged.
     """
-    start = line.rfind(b"$")
-    if start < 0:
-        return LineFault.UNKNOWN
-    framed = _SENTENCE.match(line, start + 1)
-    if framed is None:
-        return LineFault.MALFORMED
-    return framed[1] if checksum(framed[1]) == int(framed[2], 16) else LineFault.CHECKSUM
+    framed = _SENTENCE.match(line, line.rfind(b"$") + 1)
+    if framed is None or checksum(framed[1]) != int(framed[2], 16):
+        raise ValueError(line)
+    return framed[1]
 
 
-def read_line(line: bytes) -> Message | LineFault:
-    """Read one line, without its end."""
+def read_line(line: bytes) -> Message | None:
+    """Read one line, without its end; None where it is text or another sentence.
+
+    Raises:
+        ValueError: the line is damaged.
+    """
     if len(line) > MAX_LINE:
-        return LineFault.TOO_LONG
-    body = read_sentence(line)
-    if isinstance(body, LineFault):
-        return body
-    name, _, rest = body.partition(b",")
+        raise ValueError(line)
+    if b"$" not in line:
+        return None
+    name, _, rest = read_sentence(line).partition(b",")
     if name not in SENTENCES:
-        return LineFault.UNKNOWN
+        return None
     kind, readers = SENTENCES[name]
     fields = rest.split(b",", len(readers) - 1)
     try:
         message = kind(*(read(field) for read, field in zip(readers, fields, strict=True)))
-    except (ValueError, KeyError):
-        return LineFault.MALFORMED
-    is_back = isinstance(message, TimeReply) and message.rx_us > message.tx_us
-    return LineFault.MALFORMED if is_back else message
+    except KeyError as error:
+        raise ValueError(line) from error
+    if isinstance(message, TimeReply) and message.rx_us > message.tx_us:
+        raise ValueError(line)
+    return message
 
 
 class LineReader:
     """Bytes of a serial line in, messages out; damaged lines are counted and skipped.
 
     Attributes:
-        n_messages: messages so far.
-        faults: how many lines were none, by reason.
+        n_messages, n_damaged: messages and damaged lines so far.
     """
 
     def __init__(self) -> None:
-        self.n_messages = 0
-        self.faults: Counter[LineFault] = Counter()
+        self.n_messages = self.n_damaged = 0
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Message]:
-        """Take bytes as they come, and give the messages that they complete; empty lines are skipped."""
+        """Take bytes as they come, and give the messages that they complete."""
         *lines, rest = (self._rest + data).split(b"\n")
         # Enough of a line without an end to tell that it is too long.
         self._rest = rest[: MAX_LINE + 1]
         messages: list[Message] = []
-        for line in filter(None, (line.strip() for line in lines)):
-            message = read_line(line)
-            if isinstance(message, LineFault):
-                self.faults[message] += 1
-            else:
+        for line in lines:
+            try:
+                message = read_line(line.strip())
+            except ValueError:
+                self.n_damaged += 1
+                continue
+            if message is not None:
                 messages.append(message)
         self.n_messages += len(messages)
         return messages

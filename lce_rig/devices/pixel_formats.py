@@ -67,15 +67,10 @@ FORMATS = {
 }
 """By four-character code, padded with blanks as the kernel does."""
 
-_OTHER_NAMES = {
-    **{"YUY2": "YUYV", "Y800": "GREY", "Y8": "GREY", "GRAY8": "GREY", "I420": "YU12", "BGGR": "BA81"},
-    **{"BGR": "BGR3", "BGR8": "BGR3", "RGB": "RGB3", "BGRX": "BGR4", "BGRA": "BGR4", "MJPEG": "MJPG"},
-}
-
 
 def find_format(name: str) -> str | None:
-    """Find the code of a pixel format by that or by what GStreamer and others call it; None if unknown."""
-    code = _OTHER_NAMES.get(name.strip().upper(), name.strip().upper()).ljust(4)
+    """Find the code of a pixel format; None if it is not read here."""
+    code = name.strip().upper().ljust(4)
     return code if code in FORMATS else None
 
 

@@ -4,25 +4,140 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.devices.disk_writer import DiskWriter
-from lce_rig.devices.protocol import SourceStatus, Waiting
 
 _TAKE_S = 0.2
 _RATE_WINDOW_S = 3.0
 # Two seconds of images, six of scans: longer than a busy computer lets them wait.
-_N_SHARED_SLOTS = 64
+_N_SLOTS = 64
 REOPEN_EVERY_S = 1.0
 
+T = TypeVar("T")
 AnySource = TypeVar("AnySource", bound="LiveSource")
+
+
+@dataclass(frozen=True)
+class ClockState:
+    """Whose time a sensor's timestamps are.
+
+    Attributes:
+        finding: whose time, and how it is tied to others.
+        is_utc: whether it is the sensor's own time, tied to UTC by pulses and sentences.
+        ahead_s: by how much the sensor's clock is ahead of this computer's; None where unknown.
+    """
+
+    finding: Finding
+    is_utc: bool = False
+    ahead_s: float | None = None
+
+
+@dataclass(frozen=True)
+class SourceStatus:
+    """How an attached sensor does.
+
+    Attributes:
+        sensor: its name in the profile.
+        n_samples: samples handed on since it was opened.
+        n_dropped: samples dropped because they were not taken in time.
+        n_lost: samples or packets that never arrived, by the device's own counters or timestamps.
+        rate_hz: samples a second over the last seconds; 0 before two have come.
+        clock: whose time the timestamps are; None before the first.
+        problems: what is wrong now.
+        device: what answers: its model, serial number and firmware as far as it tells them.
+        serial: its serial number; "" where it tells none, or none yet.
+        rates_hz: what a device of several streams, or with a rotor, measures: by "scans", "frames", "events".
+        n_packets: data packets received; None of a sensor that sends none.
+        n_lost_by_line: of a sync board: pulses lost, by line.
+    """
+
+    sensor: str
+    n_samples: int = 0
+    n_dropped: int = 0
+    n_lost: int = 0
+    rate_hz: float = 0.0
+    clock: ClockState | None = None
+    problems: tuple[Finding, ...] = ()
+    device: str = ""
+    serial: str = ""
+    rates_hz: Mapping[str, float] = field(default_factory=dict)
+    n_packets: int | None = None
+    n_lost_by_line: Mapping[str, int] = field(default_factory=dict)
+
+
+class Inbox(Generic[T]):
+    """A queue from reader threads to one taker; of each sender the newest items wait, older ones are dropped.
+
+    Attributes:
+        n_put, n_dropped: items by sender.
+    """
+
+    def __init__(self) -> None:
+        self.n_put: Counter[str] = Counter()
+        self.n_dropped: Counter[str] = Counter()
+        self._n_waiting: Counter[str] = Counter()
+        self._items: deque[tuple[str, T]] = deque()
+        self._is_closed = False
+        self._error: SourceError | None = None
+        self._changed = threading.Condition()
+
+    def put(self, sender: str, items: Iterable[T], n_slots: int = _N_SLOTS) -> None:
+        """Hand items over; never blocks.
+
+        Args:
+            sender: they come from.
+            items: in order.
+            n_slots: so many of this sender may wait.
+        """
+        with self._changed:
+            for item in items:
+                if self._n_waiting[sender] >= n_slots:
+                    place = next(k for k, (name, _) in enumerate(self._items) if name == sender)
+                    del self._items[place]
+                    self._n_waiting[sender] -= 1
+                    self.n_dropped[sender] += 1
+                self._items.append((sender, item))
+                self._n_waiting[sender] += 1
+                self.n_put[sender] += 1
+            self._changed.notify()
+
+    def close(self, error: SourceError | None = None) -> None:
+        """End the queue: items in it can still be taken, then `error` is raised if there is one."""
+        with self._changed:
+            self._is_closed = True
+            self._error = self._error or error
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> tuple[str, T] | None:
+        """Take the oldest item with its sender; None where nothing came in time, or the queue has ended.
+
+        Raises:
+            SourceError: the reader failed, and all that it read before has been taken.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._items or self._is_closed, timeout_s)
+            if self._items:
+                sender, item = self._items.popleft()
+                self._n_waiting[sender] -= 1
+                return sender, item
+            if self._error is not None:
+                raise self._error
+            return None
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether the queue was closed and everything taken."""
+        with self._changed:
+            return self._is_closed and not self._items
 
 
 class RateMeter:
@@ -58,52 +173,6 @@ class RateMeter:
             return n / max(max(last_s, now_s - typical_s) - first_s, 1e-9)
 
 
-class Inbox(Waiting[tuple[str, LiveSample]]):
-    """The queue that readers feed and one taker empties; of each sensor the newest samples wait.
-
-    Attributes:
-        n_put, n_dropped: samples by sensor.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.n_put: Counter[str] = Counter()
-        self.n_dropped: Counter[str] = Counter()
-        self._n_waiting: Counter[str] = Counter()
-
-    def put(self, sensor: str, samples: Iterable[LiveSample], n_slots: int) -> None:
-        """Hand samples over; never blocks.
-
-        Args:
-            sensor: they come from.
-            samples: in order.
-            n_slots: so many of this sensor may wait.
-        """
-        with self._changed:
-            for sample in samples:
-                if self._n_waiting[sensor] >= n_slots:
-                    place = next(k for k, (name, _) in enumerate(self._items) if name == sensor)
-                    del self._items[place]
-                    self._n_waiting[sensor] -= 1
-                    self.n_dropped[sensor] += 1
-                self._items.append((sensor, sample))
-                self._n_waiting[sensor] += 1
-                self.n_put[sensor] += 1
-            self._changed.notify()
-
-    def take(self, timeout_s: float) -> tuple[str, LiveSample] | None:
-        """Take the oldest sample with its sensor; None where nothing came in time, or the queue has ended.
-
-        Raises:
-            SourceError: the reader failed, and all that it read before has been taken.
-        """
-        with self._changed:
-            came = super().take(timeout_s)
-            if came is not None:
-                self._n_waiting[came[0]] -= 1
-            return came
-
-
 class LiveSource(ABC):
     """An attached sensor, read by a thread of its own while its `with` block lasts.
 
@@ -115,21 +184,21 @@ class LiveSource(ABC):
     """
 
     def __init__(
-        self, sensor: str, who: str, n_slots: int, silence_s: float, what_to_check: str = ""
+        self, sensor: str, who: str, silence_s: float, what_to_check: str = "", n_slots: int = _N_SLOTS
     ) -> None:
         """Prepare; nothing is opened yet.
 
         Args:
             sensor: its name in the profile.
             who: the same for messages: "camera 'cam'".
-            n_slots: samples that may wait to be taken; when more do, the oldest is dropped.
             silence_s: so long without a sample is an error.
             what_to_check: the hint of that error.
+            n_slots: samples that may wait to be taken; when more do, the oldest is dropped.
         """
         self.sensor = sensor
         self._who = who
         self._n_slots, self._silence_s, self._what_to_check = n_slots, silence_s, what_to_check
-        self._inbox, self._is_shared, self._reopen_every_s = Inbox(), False, 0.0
+        self._inbox, self._is_shared, self._reopen_every_s = Inbox[LiveSample](), False, 0.0
         self._stopping = threading.Event()
         self._rate = RateMeter()
         self._heard_s = 0.0
@@ -173,10 +242,9 @@ class LiveSource(ABC):
         what = "fell silent" if has_sent else "sends nothing"
         return SourceError(f"{self._who} {what}: nothing for {self._silence_s:g} s", self._what_to_check)
 
-    def feed(self, inbox: Inbox, reopen_every_s: float) -> None:
+    def feed(self, inbox: Inbox[LiveSample], reopen_every_s: float) -> None:
         """Feed a shared queue, and reopen the device whenever it is lost; call before opening."""
         self._inbox, self._is_shared, self._reopen_every_s = inbox, True, reopen_every_s
-        self._n_slots = max(self._n_slots, _N_SHARED_SLOTS)
 
     def __enter__(self: AnySource) -> AnySource:
         """Open the device and start reading; what an own queue held and counted before is forgotten.
@@ -313,7 +381,7 @@ class AttachedSensors:
     def __init__(self, sources: Sequence[LiveSource], reopen_every_s: float = REOPEN_EVERY_S) -> None:
         """Take the sources; none is opened yet."""
         self.sources = {source.sensor: source for source in sources}
-        self._inbox = Inbox()
+        self._inbox = Inbox[LiveSample]()
         for source in sources:
             source.feed(self._inbox, reopen_every_s)
 

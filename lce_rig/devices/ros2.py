@@ -8,14 +8,12 @@ from typing import Any
 from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import findings
-from lce_rig.devices.protocol import ClockState, SourceStatus
-from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
 from lce_rig.io.ros.bag_file import RawMessage
 from lce_rig.io.ros.rosbag import TopicDecoder
 from lce_rig.io.ros.topics import Target
 from lce_rig.rig import CameraSettings, LidarSettings
 
-_N_SLOTS = 16
 _WAIT_S = 0.25
 # Nodes find each other within a second on one computer, within a few on a network.
 _DISCOVERY_S = 5.0
@@ -44,7 +42,7 @@ class Ros2Source(LiveSource):
             self._target = Target(sensor, None)
         self._topic = f"/{named.lstrip('/')}" if named else ""
         hint = f"Does its driver publish? `ros2 topic hz {self._topic}`."
-        super().__init__(sensor, who, _N_SLOTS, silence_s, hint)
+        super().__init__(sensor, who, silence_s, hint)
         self._settings = settings
         self._stack = ExitStack()
         self._waiting: list[tuple[int, bytes]] = []

@@ -5,15 +5,16 @@ import math
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+
+import serial
 
 from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import lce1
 from lce_rig.devices.board_state import Arrival, BoardState
-from lce_rig.devices.protocol import SourceStatus
-from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.rig.sync_settings import BOARD, SyncSettings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 
@@ -27,9 +28,7 @@ _BY_ID = Path("/dev/serial/by-id")
 _N_SLOTS = 4096
 _GREET_AGAIN_NS = NS_PER_S
 _ANSWER_WITHIN_NS = NS_PER_S // 2
-# Often while little is known, then as often as a changing drift needs.
-_ASK_EVERY_NS = (NS_PER_S // 20, NS_PER_S // 5)
-_ASK_OFTEN_NS = 10 * NS_PER_S
+_ASK_EVERY_NS = NS_PER_S // 10
 _SET_UTC_EVERY_NS = 10 * NS_PER_S
 _UTC_SIGMA_NS = 1_000_000
 _UTC_MIN_ANSWERS = 8
@@ -39,36 +38,24 @@ _N_HEARD_BYTES = 40
 class BoardPort:
     """An open serial port, for this program alone.
 
-    Attributes:
-        n_unwritten: commands that did not go out because the board took nothing.
+    DTR and RTS are low before it opens: on many boards they are wired to the reset. Some kernels raise them
+    for a moment all the same.
+
+    Raises:
+        SourceError: it is absent, busy, not permitted or no serial port.
     """
 
     def __init__(self, who: str, device: str, baud: int) -> None:
-        """Open the port.
-
-        DTR and RTS are low before it opens: on many boards they are wired to the reset. Some kernels raise
-        them for a moment all the same.
-
-        Raises:
-            SourceError: it is absent, busy, not permitted or no serial port, or pyserial is missing.
-        """
-        self.n_unwritten = 0
         self._who, self._device = who, device
-        try:
-            import serial
-        except ImportError:
-            raise SourceError(f"{who} needs the package pyserial", "Run: pip install pyserial") from None
-        self._failures: tuple[type[Exception], ...] = (serial.SerialException, OSError)
-        self._timeouts: type[Exception] = serial.SerialTimeoutException
-        self._port: Any = serial.Serial()
+        self._port = serial.Serial()
         self._port.port, self._port.baudrate = device, baud
         self._port.timeout, self._port.write_timeout = _READ_S, _WRITE_S
         self._port.exclusive = True
         self._port.dtr = self._port.rts = False
         try:
             self._port.open()
-        except (*self._failures, ValueError) as error:
-            raise _explained(who, device, error) from None
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise self._explain(error) from None
 
     def read(self) -> bytes:
         """Wait for bytes, 20 ms at most, and return them.
@@ -78,7 +65,7 @@ class BoardPort:
         """
         try:
             return bytes(self._port.read(max(1, self._port.in_waiting)))
-        except self._failures as error:
+        except (serial.SerialException, OSError) as error:
             raise self._gone(error) from None
 
     def write(self, data: bytes) -> int:
@@ -90,18 +77,16 @@ class BoardPort:
         sent_ns = time.time_ns()
         try:
             self._port.write(data)
-        except self._timeouts:
-            self.n_unwritten += 1
-        except self._failures as error:
+        except serial.SerialTimeoutException:
+            pass  # A board that takes no commands gives no answers either, which is reported.
+        except (serial.SerialException, OSError) as error:
             raise self._gone(error) from None
         return sent_ns
 
     def close(self) -> None:
         """Close the port; never raises."""
-        try:
+        with suppress(serial.SerialException, OSError):
             self._port.close()
-        except self._failures:
-            return
 
     def _gone(self, error: Exception) -> SourceError:
         number = getattr(error, "errno", None)
@@ -112,49 +97,37 @@ class BoardPort:
             "`ls -l /dev/serial/by-id` shows it.",
         )
 
-
-def _explained(who: str, device: str, error: Exception) -> SourceError:
-    """Explain why a port cannot be opened, and what to do about it."""
-    number = getattr(error, "errno", None)
-    if number == errno.ENOENT:
-        ports = sorted(map(str, _BY_ID.iterdir())) if _BY_ID.is_dir() else []
-        listing = f"choose one of: {', '.join(ports)}" if ports else "no port is there"
-        return SourceError(
-            f"{who}: there is no {device}", f"Check plug and cable, and sync.device; {listing}."
-        )
-    if number in (errno.EACCES, errno.EPERM):
-        hint = "Run: sudo usermod -aG dialout $USER, then log in again."
-        return SourceError(f"{who}: {device} may not be opened by this user", hint)
-    if number in (errno.EBUSY, errno.EAGAIN):
-        hint = f"Close it: a serial monitor, ModemManager or another lce-rig. `fuser {device}` shows which."
-        return SourceError(f"{who}: {device} is in use by another program", hint)
-    if number in (errno.ENOTTY, errno.EINVAL) or "configure" in str(error):
-        return SourceError(f"{who}: {device} is not a serial port", "Check sync.device in the profile.")
-    return SourceError(f"{who}: {device} cannot be opened: {error}", "Check sync.device in the profile.")
+    def _explain(self, error: Exception) -> SourceError:
+        """Explain why the port cannot be opened, with an action."""
+        number, what = getattr(error, "errno", None), f"{self._who}: {self._device}"
+        if number == errno.ENOENT:
+            ports = sorted(map(str, _BY_ID.iterdir())) if _BY_ID.is_dir() else []
+            listing = f"choose one of: {', '.join(ports)}" if ports else "no port is there"
+            return SourceError(f"{what} is not there", f"Check plug and cable, and sync.device; {listing}.")
+        if number in (errno.EACCES, errno.EPERM):
+            hint = "Run: sudo usermod -aG dialout $USER, then log in again."
+            return SourceError(f"{what} may not be opened by this user", hint)
+        if number in (errno.EBUSY, errno.EAGAIN):
+            hint = f"Close it: a serial monitor, ModemManager or another lce-rig. `fuser {self._device}`."
+            return SourceError(f"{what} is in use by another program", hint)
+        return SourceError(f"{what} cannot be opened: {error}", "Check sync.device in the profile.")
 
 
 class SyncBoard(LiveSource):
     """An attached sync board; a `LiveSource` of pulses.
 
     A reader thread always drains the port: some boards block, and hold their pulse high, if it is not.
+
+    Args:
+        settings: how the board is reached, and which camera each line triggers.
+        hello_s: how long to wait for its first words.
+        silence_s: so long without a message is an error.
     """
 
     def __init__(
-        self,
-        settings: SyncSettings,
-        sensor: str = BOARD,
-        hello_s: float = HELLO_S,
-        silence_s: float = SILENCE_S,
+        self, settings: SyncSettings, hello_s: float = HELLO_S, silence_s: float = SILENCE_S
     ) -> None:
-        """Prepare; nothing is opened yet.
-
-        Args:
-            settings: how the board is reached, and which camera each line triggers.
-            sensor: its name in messages.
-            hello_s: how long to wait for its first words.
-            silence_s: so long without a message is an error.
-        """
-        super().__init__(sensor, f"sync board '{sensor}'", _N_SLOTS, math.inf)
+        super().__init__(BOARD, f"sync board '{BOARD}'", math.inf, n_slots=_N_SLOTS)
         self._settings = settings
         self._hello_s, self._silence_ns = hello_s, silence_s * NS_PER_S
         self._state = BoardState({trigger.channel: camera for camera, trigger in settings.triggers.items()})
@@ -164,7 +137,7 @@ class SyncBoard(LiveSource):
         self._outbox: deque[bytes] = deque()
         self._rate_hz: float | None = None
         self._n_restarts = self._cookie = 0
-        self._asked_ns = self._told_utc_ns = self._greeted_ns = self._busy_until_ns = 0
+        self._asked_ns = self._told_utc_ns = self._greeted_ns = 0
         self._is_set_up = False
         self._port: BoardPort | None = None
 
@@ -176,10 +149,8 @@ class SyncBoard(LiveSource):
         """
         self._port = BoardPort(self._who, self._settings.device, self._settings.port_baud)
         self._early, self._heard, self._is_set_up = [], b"", False
-        now_ns = time.monotonic_ns()
         with self._lock:
-            self._state.opened(now_ns)
-        self._busy_until_ns = now_ns + _ASK_OFTEN_NS
+            self._state.opened(time.monotonic_ns())
         until_s = time.monotonic() + self._hello_s
         while not self._is_set_up and not self.is_stopping:
             self._early = self.read()
@@ -219,9 +190,7 @@ class SyncBoard(LiveSource):
                 )
             has_restarted = self._state.n_restarts != self._n_restarts
             if has_restarted:
-                self._n_restarts = self._state.n_restarts
-                self._busy_until_ns = arrival.steady_ns + _ASK_OFTEN_NS
-                self._told_utc_ns = 0
+                self._n_restarts, self._told_utc_ns = self._state.n_restarts, 0
             if has_restarted or (not self._is_set_up and self._state.hello is not None):
                 self._set_lines()
                 self._is_set_up = True
@@ -230,15 +199,13 @@ class SyncBoard(LiveSource):
 
     def describe(self) -> SourceStatus:
         """Report the state of the board."""
-        now_ns = time.monotonic_ns()
         with self._lock:
             state, hello = self._state, self._state.hello
             return SourceStatus(
                 self.sensor,
                 n_lost=sum(state.n_lost_by_line.values()),
                 clock=state.clock_state(),
-                problems=state.problems(now_ns, self._port.n_unwritten if self._port else 0),
-                figures=state.figures(now_ns),
+                problems=state.problems(time.monotonic_ns()),
                 device=f"{hello.board}, firmware {hello.firmware}, LCE{hello.version}" if hello else "",
                 n_lost_by_line=dict(state.n_lost_by_line),
             )
@@ -285,9 +252,8 @@ class SyncBoard(LiveSource):
             port.write(self._outbox.popleft())
         if now_ns - self._told_utc_ns > _SET_UTC_EVERY_NS:
             self._tell_utc(port, now_ns)
-        is_busy = now_ns < self._busy_until_ns
         is_free = self._state.has_answered or now_ns - self._asked_ns > _ANSWER_WITHIN_NS
-        if is_free and now_ns - self._asked_ns > _ASK_EVERY_NS[0 if is_busy else 1]:
+        if is_free and now_ns - self._asked_ns > _ASK_EVERY_NS:
             self._asked_ns = now_ns
             self._cookie += 1
             # The answer is read by this same thread: it cannot overtake the note.

@@ -1,17 +1,27 @@
-"""A camera of the kernel's video interface: images with the kernel's timestamps, counted, in UTC."""
+"""A camera of the kernel's video interface: images with the kernel's timestamps, counted, in UTC.
+
+Drivers say CLOCK_MONOTONIC. Jetson's do too, and use a counter that is seconds away from it. So every clock
+is tried on the timestamps: an image is younger than 0.2 s when it arrives, and never of the future.
+
+References:
+    https://docs.kernel.org/userspace-api/media/v4l/buffer.html (V4L2_BUF_FLAG_TIMESTAMP_*)
+    https://github.com/tier4/ros2_v4l2_camera (the offset of Jetson's counter)
+"""
 
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
+from lce_rig.devices import v4l2_abi as abi
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
-from lce_rig.devices.protocol import ClockState, SourceStatus
-from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.stamp_clock import FrameTiming, Mark, StampClock, frame_timing, stamped_moment
+from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
 from lce_rig.devices.video_device import (
     VideoDevice,
     apply_controls,
@@ -20,11 +30,10 @@ from lce_rig.devices.video_device import (
     serial_number,
     video_devices,
 )
-from lce_rig.rig import CameraSettings
+from lce_rig.rig import CameraSettings, DriverSettings
 
 # Two buffers drop images as soon as the computer stalls for one; eight ride out a quarter of a second.
 N_BUFFERS = 8
-_N_SLOTS = 16
 _WAIT_S = 0.25
 _EXPOSURE_EVERY_S = 1.0
 _SILENT_HINT = (
@@ -32,10 +41,178 @@ _SILENT_HINT = (
 )
 
 
+Mark = Literal["start_of_exposure", "start_of_frame", "end_of_frame", "trigger"]
+# Their flags say end of frame; the timestamp is what the video input saw of the first row (devices' forums).
+_JETSON_DRIVERS = ("tegra", "nv_", "vi5", "vi6")
+_MAX_DELAY_NS = 200_000_000
+# A computer that stalls takes images late from the queue: no reason to doubt a clock once it is known.
+_MAX_STALL_NS = 2_000_000_000
+# Two clocks that agree as well as this may stand for each other.
+_HARMLESS_NS = 2_000_000
+_N_BRACKETS = 3
+_CLOCK_IDS = {
+    "monotonic": time.CLOCK_MONOTONIC,
+    "monotonic_raw": time.CLOCK_MONOTONIC_RAW,
+    "boottime": time.CLOCK_BOOTTIME,
+    "realtime": time.CLOCK_REALTIME,
+}
+_TSC_OFFSET = Path("/sys/devices/system/clocksource/clocksource0/offset_ns")
+CLOCKS = ("monotonic", "monotonic_raw", "tsc", "tsc_minus", "boottime", "realtime")
+"""Candidates, in the order in which equally good ones are taken."""
+
+
+@dataclass(frozen=True)
+class FrameTiming:
+    """How the rows of an image are exposed and read.
+
+    A row of a rolling shutter is exposed and then read; the next one follows a line time later. With rows 0
+    to H-1, exposure e and line time l (0 for a global shutter), the middle row m = (H-1)/2 is half exposed at
+
+        t_start of exposure + m l + e/2                                                                    (1)
+        t_start of frame    + m l - e/2          the first row is exposed, its reading begins              (2)
+        t_end of frame      - (H-m) l - e/2      the last row is read                                      (3)
+        t_trigger + delay   + m l + e/2                                                                    (4)
+
+    Attributes:
+        n_rows: of the image.
+        exposure_ns: of a row; None where unknown.
+        line_time_ns: from row to row.
+        trigger_delay_ns: from the trigger's edge to the start of the first row's exposure.
+    """
+
+    n_rows: int
+    exposure_ns: float | None
+    line_time_ns: float = 0.0
+    trigger_delay_ns: float = 0.0
+
+    def to_mid_ns(self, mark: Mark) -> int:
+        """Return the time from a timestamp's moment to the middle of the exposure, (1) to (4).
+
+        An unknown exposure counts as none.
+        """
+        half_ns = 0.5 * (self.exposure_ns or 0.0)
+        rows_ns = 0.5 * (self.n_rows - 1) * self.line_time_ns
+        if mark == "start_of_exposure":
+            return round(rows_ns + half_ns)
+        if mark == "start_of_frame":
+            return round(rows_ns - half_ns)
+        if mark == "end_of_frame":
+            return round(rows_ns - self.n_rows * self.line_time_ns - half_ns)
+        return round(self.trigger_delay_ns + rows_ns + half_ns)
+
+
+def frame_timing(settings: DriverSettings, n_rows: int, exposure_us: float | None = None) -> FrameTiming:
+    """Take the timing from the profile; the exposure from the camera where the profile has none."""
+    timing = settings.frame_timing
+    exposure_us = timing.exposure_us or exposure_us
+    return FrameTiming(
+        n_rows,
+        None if exposure_us is None else 1000 * exposure_us,
+        1000 * timing.line_time_us,
+        1000 * timing.trigger_delay_us,
+    )
+
+
+def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
+    """Find which moment a timestamp marks: as the profile says, else as a buffer's flags do.
+
+    Args:
+        settings: the camera's.
+        flags: the kernel's, of a buffer.
+        driver: its name; Jetson's flags are wrong.
+    """
+    if settings.frame_timing.mark != "auto":
+        return settings.frame_timing.mark
+    if driver.lower().startswith(_JETSON_DRIVERS):
+        return "start_of_frame"
+    is_start = flags & abi.STAMP_SOURCE_MASK == abi.STAMP_SOURCE_SOE
+    return "start_of_exposure" if is_start else "end_of_frame"
+
+
+def read_clocks() -> dict[str, int]:
+    """Read every candidate clock now, ns; Jetson's counter only where the kernel gives its offset."""
+    readings = {name: time.clock_gettime_ns(number) for name, number in _CLOCK_IDS.items()}
+    try:
+        offset_ns = int(_TSC_OFFSET.read_text())
+    except (OSError, ValueError):
+        return readings
+    raw_ns = readings["monotonic_raw"]
+    return readings | {"tsc": raw_ns + offset_ns, "tsc_minus": raw_ns - offset_ns}
+
+
+def choose_clock(stamp_ns: int, now_ns: Mapping[str, int]) -> tuple[str | None, int]:
+    """Choose the clock with 0 <= now - stamp <= 0.2 s; None where none fits.
+
+    Args:
+        stamp_ns: of an image.
+        now_ns: readings of the candidates when it arrived.
+
+    Returns:
+        The clock's name, and by how much the fitting clocks disagree, ns; 0 where one fits.
+    """
+    delays = {name: now_ns[name] - stamp_ns for name in CLOCKS if name in now_ns}
+    fitting = {name: delay_ns for name, delay_ns in delays.items() if 0 <= delay_ns <= _MAX_DELAY_NS}
+    if not fitting:
+        return None, 0
+    return next(iter(fitting)), max(fitting.values()) - min(fitting.values())
+
+
+class StampClock:
+    """Turns a driver's timestamps into UTC, by the clock they fit.
+
+    The computer's UTC clock may be stepped while we run; its distance from the driver's clock is measured
+    again for every image.
+
+    Args:
+        clock: name of the driver's clock; "auto" tries the candidates on the timestamps.
+
+    Attributes:
+        used: name of the clock behind the last timestamp; None where it fitted none.
+        delay_ns: how old the last image was by that clock.
+    """
+
+    def __init__(self, clock: str = "auto") -> None:
+        self.used: str | None = None
+        self.delay_ns = 0
+        self._wanted = clock
+        self._delays_ns: dict[str, int] = {}
+        self._spread_ns = 0
+
+    def to_utc_ns(self, stamp_ns: int) -> int | None:
+        """Convert the timestamp of an image that has just arrived; None where no clock fits."""
+        # Between two readings of UTC; the closest of a few tries, without interruption.
+        brackets = []
+        for _ in range(_N_BRACKETS):
+            before_ns = time.time_ns()
+            readings = read_clocks()
+            brackets.append((time.time_ns() - before_ns, before_ns, readings))
+        # A negative width: UTC was set back meanwhile.
+        width_ns, before_ns, now_ns = min(brackets, key=lambda bracket: (bracket[0] < 0, bracket[0]))
+        self._delays_ns = {name: reading_ns - stamp_ns for name, reading_ns in now_ns.items()}
+        if self._wanted != "auto":
+            self.used = self._wanted
+        if not 0 <= self._delays_ns.get(self.used or "", -1) <= _MAX_STALL_NS:
+            is_free = self._wanted == "auto"
+            self.used, self._spread_ns = choose_clock(stamp_ns, now_ns) if is_free else (None, 0)
+        if self.used is None:
+            return None
+        self.delay_ns = self._delays_ns[self.used]
+        return before_ns + width_ns // 2 - self.delay_ns
+
+    def problems(self) -> list[Finding]:
+        """List the problems of the timestamps."""
+        if self._delays_ns and self.used is None:
+            ages = ", ".join(f"{name} {delay_ns / 1e6:.3g} ms" for name, delay_ns in self._delays_ns.items())
+            return [findings.NO_CLOCK_FITS(ages=ages)]
+        if self._spread_ns > _HARMLESS_NS:
+            return [findings.CLOCK_AMBIGUOUS(spread_ms=self._spread_ns * 1e-6)]
+        return []
+
+
 class V4l2Source(LiveSource):
     """A camera at /dev/video*; see `LiveSource`.
 
-    Timestamps are mid exposure in the computer's UTC: the driver's, moved by the rules of `kernel_clock`
+    Timestamps are mid exposure in the computer's UTC: the driver's, moved by (1) to (4)
     and read by the clock that they fit. Where none fits it is the arrival, and the status says so.
 
     Args:
@@ -45,7 +222,7 @@ class V4l2Source(LiveSource):
     """
 
     def __init__(self, sensor: str, settings: CameraSettings, silence_s: float = 5.0) -> None:
-        super().__init__(sensor, f"camera {sensor!r}", _N_SLOTS, silence_s, _SILENT_HINT)
+        super().__init__(sensor, f"camera {sensor!r}", silence_s, _SILENT_HINT)
         self._settings = settings
         self._channel = settings.first_channel("frames") or "frames"
         self._clock = StampClock(settings.driver.frame_timing.clock)
@@ -84,15 +261,9 @@ class V4l2Source(LiveSource):
             self._known = list_controls(self._device)
             self._notes = apply_controls(self._device, self.sensor, driver.controls)
             if driver.frame_rate_hz is not None:
-                rate_hz = self._device.set_rate(driver.frame_rate_hz)
-                if rate_hz is not None and abs(rate_hz / driver.frame_rate_hz - 1) > 0.01:
-                    self._notes.append(
-                        findings.RATE_REFUSED(rate_hz=rate_hz, expected_hz=driver.frame_rate_hz)
-                    )
+                self._device.set_rate(driver.frame_rate_hz)
             self._read_exposure()
-            n_buffers = self._device.start(N_BUFFERS)
-            if n_buffers < N_BUFFERS:
-                self._notes.append(findings.FEW_BUFFERS(n=n_buffers, expected=N_BUFFERS))
+            self._device.start(N_BUFFERS)
             self._stack = stack.pop_all()
 
     def close(self) -> None:
@@ -101,13 +272,6 @@ class V4l2Source(LiveSource):
 
     def describe(self) -> SourceStatus:
         """Report the state of the camera."""
-        figures = {
-            "n_damaged": float(self._n_damaged),
-            "stamp_to_mid_exposure_ms": self._timing.to_mid_ns(self._mark) * 1e-6,
-            "trigger_to_mid_exposure_ms": self._timing.to_mid_ns("trigger") * 1e-6,
-        }
-        if self._timing.exposure_ns is not None:
-            figures["exposure_ms"] = self._timing.exposure_ns * 1e-6
         problems = self._notes + self._clock.problems()
         if self._n_damaged:
             problems.append(findings.DAMAGED_IMAGES(n=self._n_damaged))
@@ -125,7 +289,6 @@ class V4l2Source(LiveSource):
             n_lost=self._n_lost,
             clock=clock,
             problems=tuple(problems),
-            figures=figures,
             device=self._device_in_words,
             serial=self._serial,
         )

@@ -25,7 +25,6 @@ MEMORY_MMAP = 1
 FIELD_NONE = 1
 
 CAP_VIDEO_CAPTURE = 0x0000_0001
-CAP_VIDEO_CAPTURE_MPLANE = 0x0000_1000
 CAP_STREAMING = 0x0400_0000
 CAP_DEVICE_CAPS = 0x8000_0000
 
@@ -33,8 +32,8 @@ BUFFER_ERROR = 0x40
 STAMP_SOURCE_MASK, STAMP_SOURCE_SOE = 0x7_0000, 0x1_0000
 
 NEXT_CONTROL = 0x8000_0000
-CONTROL_DISABLED, CONTROL_READ_ONLY, CONTROL_INACTIVE = 0x1, 0x4, 0x10
-INTEGER, BOOLEAN, MENU, BUTTON, INTEGER64, BITMASK, INTEGER_MENU = 1, 2, 3, 4, 5, 8, 9
+CONTROL_DISABLED = 0x1
+INTEGER, BOOLEAN, MENU, INTEGER64, BITMASK, INTEGER_MENU = 1, 2, 3, 5, 8, 9
 EXPOSURE_ABSOLUTE_ID = 0x009A_0902
 """V4l2Control of the exposure, in units of 100 us."""
 
@@ -173,20 +172,6 @@ class ControlQuery(Structure):
     )
 
 
-class _MenuItem(Union):
-    _pack_ = 1
-    _layout_ = "ms"
-    _fields_ = (("name", c_char * 32), ("value", c_int64))
-
-
-class MenuQuery(Structure):
-    """One choice of a setting."""
-
-    _pack_ = 1
-    _layout_ = "ms"
-    _fields_ = (("id", c_uint32), ("index", c_uint32), ("item", _MenuItem), ("reserved", c_uint32))
-
-
 class _ControlUnion(Union):
     _pack_ = 1
     _layout_ = "ms"
@@ -229,7 +214,6 @@ DEQUEUE_BUFFER = _code(_BOTH, 17, Buffer)
 STREAM_ON = _code(_WRITE, 18, c_int32)
 STREAM_OFF = _code(_WRITE, 19, c_int32)
 SET_PARAMETERS = _code(_BOTH, 22, CaptureParameters)
-QUERY_MENU = _code(_BOTH, 37, MenuQuery)
 GET_CONTROLS = _code(_BOTH, 71, V4l2Controls)
 SET_CONTROLS = _code(_BOTH, 72, V4l2Controls)
 QUERY_CONTROL = _code(_BOTH, 103, ControlQuery)

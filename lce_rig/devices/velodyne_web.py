@@ -16,7 +16,7 @@ from urllib.request import ProxyHandler, build_opener
 
 from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Finding
+from lce_rig.core.findings import Figure, Finding
 from lce_rig.devices import findings
 from lce_rig.rig import LidarSettings
 
@@ -40,7 +40,6 @@ class WebReport(NamedTuple):
         fov_deg: first and last azimuth that is sent.
         host: address that packets are sent to; 255.255.255.255 is everybody.
         data_port, position_port: UDP ports they are sent to.
-        temperature_c: of the hotter board.
     """
 
     model: str = ""
@@ -56,7 +55,6 @@ class WebReport(NamedTuple):
     host: str = ""
     data_port: int | None = None
     position_port: int | None = None
-    temperature_c: float | None = None
 
 
 class VelodyneWeb:
@@ -73,21 +71,16 @@ class VelodyneWeb:
         self._timeout_s = timeout_s
 
     def read(self) -> WebReport:
-        """Read info, status, settings and diagnostics; nothing is changed.
+        """Read info, status and settings; nothing is changed.
 
         Raises:
             SourceError: nothing answers, or what answers is no Velodyne.
         """
         info, status, settings = self._get("info"), self._get("status"), self._get("settings")
-        try:
-            diagnostics = self._get("diag")
-        except SourceError:  # Not every firmware has them.
-            diagnostics = {}
         start, end = _number(settings, "fov", "start"), _number(settings, "fov", "end")
         rpm, wanted_rpm = _number(status, "motor", "rpm"), _number(settings, "rpm")
         data_port = _number(settings, "host", "dport")
         position_port = _number(settings, "host", "tport")
-        boards = [_number(diagnostics, "volt_temp", board, "lm20_temp") for board in ("top", "bot")]
         # The version of the application, wherever this firmware keeps it.
         version = info.get("version")
         for key in ("application", "firmware", "version", "id"):
@@ -107,7 +100,6 @@ class VelodyneWeb:
             host=_text(settings, "host", "addr"),
             data_port=None if data_port is None else int(data_port),
             position_port=None if position_port is None else int(position_port),
-            temperature_c=max((_celsius(counts) for counts in boards if counts is not None), default=None),
         )
 
     def read_serial(self) -> str:
@@ -142,30 +134,30 @@ class VelodyneWeb:
 
 
 def find_problems(report: WebReport, settings: LidarSettings) -> list[Finding]:
-    """Find what on the web page keeps the profile's scans from coming."""
-    problems = []
-    product = velodyne.product_of(settings.model)
-    reported = velodyne.product_of(report.model.replace(" ", "-")) or velodyne.product_of(report.model)
-    if report.model and reported != product:
-        problems.append(findings.OTHER_MODEL(model=report.model, expected=settings.model))
-    if report.is_motor_on is False:
-        problems.append(findings.MOTOR_OFF())
-    if report.is_laser_on is False:
-        problems.append(findings.LASER_OFF())
-    set_hz, rate_hz = report.wanted_rotor_hz, settings.rate_hz
-    if set_hz is not None and abs(set_hz - rate_hz) > _MAX_OFF_RATE * rate_hz:
-        rotor = findings.ROTOR_SETTING(set_hz=set_hz, expected_hz=rate_hz, expected_rpm=60 * rate_hz)
-        problems.append(rotor)
-    if report.fov_deg is not None and (report.fov_deg[1] - report.fov_deg[0]) % 360 < 359:
-        problems.append(findings.FOV_CUT(start_deg=report.fov_deg[0], end_deg=report.fov_deg[1]))
+    """Find what on the web page keeps the profile's scans from coming; what it lacks is left out."""
+    problems: list[Finding] = []
+
+    def compare(setting: str, value: Figure, expected: Figure, is_wrong: object) -> None:
+        if is_wrong:
+            problems.append(findings.SETTING_DIFFERS(setting=setting, value=value, expected=expected))
+
+    model = velodyne.product_of(report.model.replace(" ", "-")) or velodyne.product_of(report.model)
+    is_other = report.model and model != velodyne.product_of(settings.model)
+    compare("model", report.model, settings.model, is_other)
+    compare("motor", "off", "on", report.is_motor_on is False)
+    compare("laser", "off", "on", report.is_laser_on is False)
+    if report.wanted_rotor_hz is not None:
+        rpm, wanted_rpm = 60 * report.wanted_rotor_hz, 60 * settings.rate_hz
+        compare("rpm", rpm, wanted_rpm, abs(rpm - wanted_rpm) > _MAX_OFF_RATE * wanted_rpm)
+    if report.fov_deg is not None:
+        first_deg, last_deg = report.fov_deg
+        compare("field of view", report.fov_deg, (0, 359), (last_deg - first_deg) % 360 < 359)
     port = settings.driver.port or velodyne.DATA_PORT
-    if report.data_port is not None and report.data_port != port:
-        problems.append(findings.DATA_PORT(port=report.data_port, expected_port=port))
-    position_port = int(settings.driver.controls.get("position_port", velodyne.POSITION_PORT))
-    if report.position_port is not None and report.position_port != position_port:
-        problems.append(findings.POSITION_PORT(port=report.position_port, expected_port=position_port))
-    if settings.timestamps.clock == "utc" and report.pps and report.pps != "locked":
-        problems.append(findings.PPS_SETTING(pps=report.pps))
+    compare("data port", report.data_port, port, report.data_port not in (None, port))
+    port = int(settings.driver.controls.get("position_port", velodyne.POSITION_PORT))
+    compare("telemetry port", report.position_port, port, report.position_port not in (None, port))
+    is_utc = settings.timestamps.clock == "utc"
+    compare("PPS", report.pps, "locked", is_utc and report.pps not in ("", "locked"))
     return problems
 
 
@@ -181,8 +173,3 @@ def _number(content: dict[str, Any], *keys: str) -> float | None:
     except ValueError:
         return None
     return number if math.isfinite(number) and abs(number) < 1e9 else None
-
-
-def _celsius(counts: float) -> float:
-    """Convert a reading of the LM20 on a board; VLP-16 User Manual, appendix on diagnostics."""
-    return -1481.96 + math.sqrt(2.1962e6 + max(-5e5, (1.8639 - 5 * counts / 4096) / 3.88e-6))

@@ -11,7 +11,6 @@ import stat
 from collections.abc import Mapping
 from contextlib import suppress
 from ctypes import Structure, c_int32, pointer
-from difflib import get_close_matches
 from fcntl import ioctl
 from mmap import MAP_SHARED, PROT_READ, PROT_WRITE, mmap
 from pathlib import Path
@@ -26,8 +25,9 @@ _US_NS = 1000
 _S_NS = 1_000_000_000
 Value = bool | int | float | str
 _NUMBERS = (abi.INTEGER, abi.BOOLEAN, abi.MENU, abi.INTEGER64, abi.BITMASK, abi.INTEGER_MENU)
-_MENUS = (abi.MENU, abi.INTEGER_MENU)
 _EXPOSURE_UNIT_US = 100
+_LIST_CONTROLS = "`v4l2-ctl --list-ctrls-menus` lists the settings and their numbers."
+_LOCKED = f"An automatic mode or a running stream may lock it: set that mode, too. {_LIST_CONTROLS}"
 
 
 class Layout(NamedTuple):
@@ -136,15 +136,13 @@ class VideoDevice:
         granted = pix.pixelformat.decode("ascii", "replace").ljust(4)
         return Layout(granted, pix.width, pix.height, pix.bytesperline)
 
-    def set_rate(self, rate_hz: float) -> float | None:
-        """Ask for images a second; gives what they will be, None where the device does not say."""
+    def set_rate(self, rate_hz: float) -> None:
+        """Ask for images a second; the device may choose another rate."""
         ask = abi.CaptureParameters(type=abi.VIDEO_CAPTURE, numerator=1000, denominator=round(1000 * rate_hz))
-        if not self.grants(abi.SET_PARAMETERS, ask) or not ask.numerator:
-            return None
-        return float(ask.denominator / ask.numerator)
+        self.grants(abi.SET_PARAMETERS, ask)
 
-    def start(self, n_buffers: int) -> int:
-        """Map buffers and start; gives how many buffers there are.
+    def start(self, n_buffers: int) -> None:
+        """Map buffers and start; the device may grant fewer of them.
 
         Raises:
             SourceError: another program streams from it, or the device fails.
@@ -162,7 +160,6 @@ class VideoDevice:
             self.ioctl(abi.STREAM_ON, c_int32(abi.VIDEO_CAPTURE))
         except OSError as error:
             raise self._explain(error, "does not start") from None
-        return int(request.count)
 
     def stop(self) -> None:
         """Stop and give the buffers back; never raises."""
@@ -214,16 +211,10 @@ class VideoDevice:
         self.bus = said.bus_info.decode("utf-8", "replace")
         able = said.device_caps if said.capabilities & abi.CAP_DEVICE_CAPS else said.capabilities
         where = f"camera {self._sensor!r}: {self.path} ({self.card})"
-        if (
-            able & abi.CAP_STREAMING
-            and able & abi.CAP_VIDEO_CAPTURE_MPLANE
-            and not able & abi.CAP_VIDEO_CAPTURE
-        ):
-            # Image processors of many boards (Rockchip, Qualcomm, NXP).
-            hint = "Read it through a pipe: driver.type command, with gst-launch-1.0 v4l2src."
-            raise SourceError(f"{where} delivers images in several planes, which are not read here", hint)
         if not able & abi.CAP_VIDEO_CAPTURE or not able & abi.CAP_STREAMING:
-            raise SourceError(f"{where} delivers no images; it is another end of some device", _attached())
+            # Image processors of many boards (Rockchip, Qualcomm, NXP) deliver several planes.
+            hint = f"{_attached()} For several planes: driver.type command, with gst-launch-1.0 v4l2src."
+            raise SourceError(f"{where} delivers no images, or in several planes", hint)
 
     def _explain(self, error: OSError, what: str) -> SourceError:
         """Explain a failure of the device, with an action."""
@@ -282,32 +273,22 @@ def _attached() -> str:
     return f"Set driver.device to one of: {', '.join(devices)}."
 
 
-class ControlInfo(NamedTuple):
-    """One setting of a device: number, kind and flags as in `v4l2_abi`, range, a menu's names by value."""
+class Control(NamedTuple):
+    """One setting of a device: its number, and its kind as in `v4l2_abi`."""
 
     id: int
     type: int
-    minimum: int
-    maximum: int
-    flags: int
-    choices: Mapping[int, str]
 
 
-def list_controls(device: VideoDevice) -> dict[str, ControlInfo]:
-    """List the settings that hold one number, by name."""
+def list_controls(device: VideoDevice) -> dict[str, Control]:
+    """List the settings that hold one number, by the names that v4l2-ctl shows."""
     controls = {}
     ask = abi.ControlQuery(id=abi.NEXT_CONTROL)
     while device.grants(abi.QUERY_CONTROL, ask):
         if ask.type in _NUMBERS and not ask.flags & abi.CONTROL_DISABLED and ask.nr_of_dims == 0:
-            choices = {}
-            for index in range(ask.minimum, ask.maximum + 1) if ask.type in _MENUS else ():
-                menu = abi.MenuQuery(id=ask.id, index=index)
-                if device.grants(abi.QUERY_MENU, menu):
-                    is_name = ask.type == abi.MENU
-                    value = menu.item.name.decode("utf-8", "replace") if is_name else str(menu.item.value)
-                    choices[index] = value
-            name = _plain_name(ask.name.decode("utf-8", "replace"))
-            controls[name] = ControlInfo(ask.id, ask.type, ask.minimum, ask.maximum, ask.flags, choices)
+            # "Exposure Time, Absolute" is exposure_time_absolute.
+            name = re.sub(r"[^a-z0-9]+", "_", ask.name.decode("utf-8", "replace").lower()).strip("_")
+            controls[name] = Control(ask.id, ask.type)
         ask.id |= abi.NEXT_CONTROL
     return controls
 
@@ -316,93 +297,50 @@ def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]
     """Set what the profile wants: choices first, since automatic modes lock other settings.
 
     Returns:
-        What the device set otherwise than asked.
+        What the device set otherwise than asked: it keeps numbers within its range.
 
     Raises:
         SourceError: it has no such setting, or cannot take the value.
     """
     known = list_controls(device)
-    for name in wanted:
+    where = f"camera {sensor!r}: driver.controls"
+    for name, value in wanted.items():
         if name not in known:
-            nearest = get_close_matches(name, known, 1, 0.5)
-            guess = f"Did you mean {nearest[0]}? " if nearest else ""
-            hint = f"{guess}It has: {', '.join(sorted(known)) or 'none'}."
-            raise SourceError(f"{_where(sensor, name)}: {device.card} has no such setting", hint)
+            hint = f"It has: {', '.join(sorted(known)) or 'none'}."
+            raise SourceError(f"{where}.{name}: {device.card} has no such setting", hint)
+        if isinstance(value, str) or value != int(value):
+            raise SourceError(f"{where}.{name}: {value!r} is not a whole number", _LIST_CONTROLS)
     deviations = []
     for name in sorted(wanted, key=lambda name: known[name].type in (abi.INTEGER, abi.INTEGER64)):
-        info = known[name]
-        value = _to_number(sensor, name, info, wanted[name])
-        _set(device, sensor, name, info, value)
-        given = read_control(device, info)
+        kind, value = known[name], int(wanted[name])
+        control = abi.V4l2Control(id=kind.id)
+        setattr(control.value, "value64" if kind.type == abi.INTEGER64 else "value", value)
+        try:
+            device.ioctl(abi.SET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control)))
+        except OSError as error:
+            raise SourceError(f"{where}.{name}: {value} is refused: {error.strerror}", _LOCKED) from None
+        given = read_control(device, kind)
         if given is not None and given != value:
             deviations.append(findings.CONTROL_DIFFERS(control=name, given=given, expected=value))
     return deviations
 
 
-def read_control(device: VideoDevice, info: ControlInfo) -> int | None:
+def read_control(device: VideoDevice, kind: Control) -> int | None:
     """Read one setting; None where the device does not say."""
-    control = abi.V4l2Control(id=info.id)
+    control = abi.V4l2Control(id=kind.id)
     if not device.grants(abi.GET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control))):
         return None
-    return int(control.value.value64 if info.type == abi.INTEGER64 else control.value.value)
+    return int(control.value.value64 if kind.type == abi.INTEGER64 else control.value.value)
 
 
-def read_exposure_us(device: VideoDevice, known: Mapping[str, ControlInfo]) -> float | None:
+def read_exposure_us(device: VideoDevice, known: Mapping[str, Control]) -> float | None:
     """Read how long a row is exposed; None where no setting says so in a known unit.
 
     V4L2_CID_EXPOSURE counts in units of the driver's choice; Jetson's 64-bit setting of that name in us.
     """
-    for name, info in known.items():
-        if info.id == abi.EXPOSURE_ABSOLUTE_ID:
-            value = read_control(device, info)
-            return None if value is None else float(value * _EXPOSURE_UNIT_US)
-        if name == "exposure" and info.type == abi.INTEGER64:
-            value = read_control(device, info)
-            return None if value is None else float(value)
+    for name, kind in known.items():
+        is_jetsons = name == "exposure" and kind.type == abi.INTEGER64
+        if is_jetsons or kind.id == abi.EXPOSURE_ABSOLUTE_ID:
+            value = read_control(device, kind)
+            return None if value is None else float(value * (1 if is_jetsons else _EXPOSURE_UNIT_US))
     return None
-
-
-def _set(device: VideoDevice, sensor: str, name: str, info: ControlInfo, value: int) -> None:
-    control = abi.V4l2Control(id=info.id)
-    if info.type == abi.INTEGER64:
-        control.value.value64 = value
-    else:
-        control.value.value = value
-    try:
-        device.ioctl(abi.SET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control)))
-    except OSError as error:
-        hint = "Remove it from driver.controls, or see `v4l2-ctl --list-ctrls-menus`."
-        if info.flags & abi.CONTROL_READ_ONLY:
-            hint = "It can only be read: remove it from driver.controls."
-        elif info.flags & abi.CONTROL_INACTIVE or error.errno in (errno.EACCES, errno.EBUSY):
-            hint = (
-                "An automatic mode or a running stream locks it: turn the automatic off in driver.controls."
-            )
-        raise SourceError(f"{_where(sensor, name)}: {value} is refused: {error.strerror}", hint) from None
-
-
-def _to_number(sensor: str, name: str, info: ControlInfo, value: Value) -> int:
-    where = _where(sensor, name)
-    choices = ", ".join(f"{number} ({choice})" for number, choice in info.choices.items())
-    if isinstance(value, str):
-        by_name = {_plain_name(choice): number for number, choice in info.choices.items()}
-        if _plain_name(value) not in by_name:
-            raise SourceError(f"{where}: {value!r} is not a choice", f"Choices: {choices or 'numbers'}.")
-        return by_name[_plain_name(value)]
-    if value != int(value):
-        raise SourceError(f"{where}: {value:g} is not a whole number", "The camera takes whole numbers.")
-    if info.type in _MENUS and int(value) not in info.choices:
-        raise SourceError(f"{where}: {int(value)} is not a choice", f"Choices: {choices}.")
-    if info.type != abi.BITMASK and not info.minimum <= value <= info.maximum:
-        hint = f"It takes {info.minimum} to {info.maximum}."
-        raise SourceError(f"{where}: {int(value)} is out of range", hint)
-    return int(value)
-
-
-def _plain_name(name: str) -> str:
-    """Write a name as v4l2-ctl does: "Exposure Time, Absolute" is exposure_time_absolute."""
-    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-
-
-def _where(sensor: str, name: str) -> str:
-    return f"camera {sensor!r}: driver.controls.{name}"

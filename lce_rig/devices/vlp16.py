@@ -1,168 +1,61 @@
-"""A VLP-16 on the network: UDP packets in, scans of one revolution each out."""
+"""A VLP-16 on the network: UDP packets in, scans of one revolution each out.
 
+Many datagrams are taken in one system call: recvmmsg, which Python does not offer. The kernel stamps their
+arrival and counts those that it drops.
+
+References:
+    man 2 recvmmsg, man 3 cmsg
+"""
+
+import contextlib
+import ctypes
+import errno
+import os
 import select
+import socket
+import struct
 import threading
 import time
 from collections import Counter
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import findings
 from lce_rig.devices.disk_writer import DiskWriter, Sink
-from lce_rig.devices.protocol import ClockState, SourceStatus
-from lce_rig.devices.reading import LiveSource
-from lce_rig.devices.udp_port import PACKET_COST_BYTES, UdpPort
+from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
 from lce_rig.devices.velodyne_web import VelodyneWeb, find_problems
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.velodyne.stream import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
 
 SILENCE_S = 2.0
-# Half a second of scans: a slower taker wants the newest.
-N_SLOTS = 5
-
 # A computer that is busy elsewhere for longer than this is too slow anyhow.
 _MIN_BUFFER_S = 0.25
 _MAX_LOST_SHARE = 0.01
 _MAX_OFF_RATE = 0.05
-_N_STRANGERS = 8
 _WAIT_S = 0.1
 _GATHER_S = 0.005
 _WEB_TIMEOUT_S = 1.0
 _EVERYBODY = "255.255.255.255"
-_MAX_SHOWN = 3
 
-
-@dataclass
-class Reception:
-    """Figures of the packets' reception by the host.
-
-    Attributes:
-        address: whose packets are taken; "" before the first.
-        serial: the sensor's serial number, by its web page; "" until that has answered.
-        n_overflowed: datagrams that the kernel dropped because they were not taken in time.
-        granted_bytes: receive buffer of a port.
-        strangers: datagrams of other senders, by IP address; the first few.
-        n_strange: datagrams of other senders.
-    """
-
-    address: str = ""
-    serial: str = ""
-    n_overflowed: int = 0
-    granted_bytes: int = 0
-    strangers: Counter[str] = field(default_factory=Counter)
-    n_strange: int = 0
-
-    def see_stranger(self, address: str) -> None:
-        """Count a datagram of another sender."""
-        self.n_strange += 1
-        if address in self.strangers or len(self.strangers) < _N_STRANGERS:
-            self.strangers[address] += 1
-
-
-def to_status(
-    sensor: str,
-    settings: LidarSettings,
-    stream: Vlp16Stream | None,
-    reception: Reception,
-    recorder: Sink[Datagram] | None,
-) -> SourceStatus:
-    """Gather everything as figures and findings."""
-    if stream is None:
-        return SourceStatus(sensor)
-    losses, state = stream.losses, stream.clock.state()
-    ahead_ns = stream.clock.ahead_ns()
-    figures = {
-        "position_packets": float(stream.n_position),
-        "bad_packets": float(sum(flaw.figure("n") for flaw in stream.flaws())),
-        "late_packets": float(losses.n("packet.late")),
-        "overflowed_packets": float(reception.n_overflowed),
-        "stranger_packets": float(reception.n_strange),
-        "clock_steps": float(losses.n("packet.clock_set")),
-        "receive_buffer_bytes": float(reception.granted_bytes),
-        "is_dual": float(stream.mode == velodyne.DUAL),
-    }
-    problems = [] if state.severity == "note" else [state]
-    buffer_kib = reception.granted_bytes // 2048
-    n_lost_on_way = losses.n("packet.lost") - reception.n_overflowed
-    if n_lost_on_way > _MAX_LOST_SHARE * max(stream.n_data, 1):
-        share = n_lost_on_way / (stream.n_data + n_lost_on_way)
-        problems.append(findings.PACKETS_LOST(share=share))
-    if reception.n_overflowed:
-        problems.append(findings.COMPUTER_TOO_SLOW(n=reception.n_overflowed, buffer_kib=buffer_kib))
-    packet_s = 1e-9 * stream.product.packet_ns(stream.mode == velodyne.DUAL)
-    buffer_s = reception.granted_bytes / PACKET_COST_BYTES * packet_s
-    if 0 < buffer_s < _MIN_BUFFER_S:
-        problems.append(findings.BUFFER_SMALL(buffer_s=buffer_s, buffer_kib=buffer_kib))
-    problems += [flaw for flaw in stream.flaws() if flaw.figure("n") > _MAX_LOST_SHARE * stream.n_data]
-    rotor_hz, rate_hz = stream.rotor_hz, settings.rate_hz
-    if rotor_hz and abs(rotor_hz / rate_hz - 1) > _MAX_OFF_RATE:
-        rotor = findings.ROTOR_RATE(rotor_hz=rotor_hz, expected_hz=rate_hz, expected_rpm=60 * rate_hz)
-        problems.append(rotor)
-    if recorder is not None:
-        figures["recorded_packets"] = float(recorder.n_written)
-        figures["unrecorded_packets"] = float(recorder.n_dropped)
-        problems += recorder.findings()
-    return SourceStatus(
-        sensor,
-        n_lost=losses.n("packet.lost"),
-        clock=ClockState(state, stream.clock.is_utc, None if ahead_ns is None else ahead_ns * 1e-9),
-        problems=tuple(problems),
-        figures=figures,
-        device=f"{stream.product.name} at {reception.address}" if reception.address else "",
-        serial=reception.serial,
-        rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
-        n_packets=stream.n_data,
-    )
-
-
-def explain_silence(
-    sensor: str,
-    settings: LidarSettings,
-    stream: Vlp16Stream,
-    reception: Reception,
-    silence_s: float,
-    web_port: int,
-) -> SourceError:
-    """Find the likeliest reason; the sensor's web page is asked."""
-    port, address = settings.driver.port or velodyne.DATA_PORT, settings.driver.address
-    whose = f" from {address}" if address else ""
-    began = "have stopped" if stream.n_data else "come"
-    none = "" if stream.n_data else "no "
-    what = f"{sensor}: {none}data packets{whose} on UDP port {port} {began} (for {silence_s:g} s)"
-    others = stream.other_models.most_common(1)
-    if others:
-        wanted = stream.product.name
-        return SourceError(
-            f"{sensor}: the packets on UDP port {port} come from a {others[0][0]}, not a {wanted}",
-            f"Set the model of {sensor!r} in the profile, or check driver.address.",
-        )
-    flaws = stream.flaws()
-    if flaws:
-        bad = ", ".join(flaw.text for flaw in flaws[:_MAX_SHOWN])
-        return SourceError(f"{what}: only {bad}", "Check which program sends to this port.")
-    if reception.strangers:
-        there = ", ".join(sorted(reception.strangers))
-        return SourceError(what, f"Packets come from {there}: set driver.address in the profile.")
-    address = address or velodyne.FACTORY_ADDRESS
-    try:
-        report = VelodyneWeb(address, web_port, _WEB_TIMEOUT_S).read()
-    except SourceError:
-        return SourceError(
-            what,
-            f"Its web page http://{address} does not answer either. Check its power and cable; that this "
-            "computer has an address in its network (192.168.1.x, mask 255.255.255.0); and driver.address.",
-        )
-    advice = [as_line(problem.sentence) for problem in find_problems(report, settings)]
-    if report.host and report.host != _EVERYBODY:
-        advice.append(f"Data go to {report.host} only: check that this is this computer.")
-    firewall = f"Open UDP port {port} in this computer's firewall (sudo ufw allow {port}/udp)."
-    return SourceError(what, " ".join([f"Its web page http://{address} answers.", *(advice or [firewall])]))
+# Two seconds of data packets, as the kernel accounts for them.
+_WANTED_BUFFER_BYTES = 4 << 20
+# What a data packet takes of the buffer: its bytes, and the kernel's own about it.
+_PACKET_COST_BYTES = 2304
+#: Datagrams that are taken in one call: 85 ms of data packets.
+N_AT_ONCE = 64
+# asm-generic/socket.h; Python names neither.
+_SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
+_MAX_PAYLOAD_BYTES, _ANCILLARY_BYTES, _ADDRESS_BYTES = 2048, 256, 16
+_NS_PER_S = 1_000_000_000
+_TIMESPEC = struct.Struct("@ll")
+_PORT_AND_ADDRESS = struct.Struct("!2xH4s")
+_CONTROL = struct.Struct("@Nii")
+_ALIGN = ctypes.sizeof(ctypes.c_size_t)
 
 
 class Vlp16Source(LiveSource):
@@ -171,37 +64,27 @@ class Vlp16Source(LiveSource):
     `driver.address` is whose packets are taken, those of the VLP-16 heard first where it is not set;
     `driver.port` is the port of data packets (2368); `driver.controls` as `read_controls` reads them.
 
-    Attributes:
+    Args:
         sensor: its name in the profile.
+        settings: its block of the profile.
+        silence_s: without packets for so long, it is taken to be gone.
+        web_port: of the sensor's web server, which is asked when no packets come.
     """
 
     def __init__(
-        self,
-        sensor: str,
-        settings: LidarSettings,
-        *,
-        silence_s: float = SILENCE_S,
-        n_slots: int = N_SLOTS,
-        web_port: int = 80,
+        self, sensor: str, settings: LidarSettings, silence_s: float = SILENCE_S, web_port: int = 80
     ) -> None:
-        """Take the settings; nothing is opened yet.
-
-        Args:
-            sensor: its name in the profile.
-            settings: its block of the profile.
-            silence_s: without packets for so long, it is taken to be gone.
-            n_slots: scans that wait for a slow taker; the oldest are dropped.
-            web_port: of the sensor's web server, which is asked when no packets come.
-        """
-        super().__init__(sensor, sensor, n_slots, silence_s)
+        super().__init__(sensor, sensor, silence_s)
         self._settings = settings
+        self._port = settings.driver.port or velodyne.DATA_PORT
         self._web_port = web_port
         self._lock = threading.Lock()
-        self._reception = Reception()
         self._stream: Vlp16Stream | None = None
         self._recorder: Sink[Datagram] | None = None
         self._ports: tuple[UdpPort, ...] = ()
         self._early: list[Scan] = []
+        self._address = self._serial = ""
+        self._strangers: Counter[str] = Counter()
         self._n_lost_before = 0
 
     def record_packets(self, folder: Path, disk: DiskWriter) -> bool:
@@ -227,29 +110,22 @@ class Vlp16Source(LiveSource):
             SourceError: no packets come, or those of another model; a port is held by another program;
                 velodyne-decoder is not installed.
         """
-        with self._lock:
-            self._n_lost_before += self._stream.losses.n("packet.lost") if self._stream is not None else 0
-            self._stream, self._reception = Vlp16Stream(self.sensor, self._settings), Reception()
+        stream = Vlp16Stream(self.sensor, self._settings)
         position_port, _ = read_controls(self.sensor, self._settings)
-        data = UdpPort(self._settings.driver.port or velodyne.DATA_PORT, f"{self.sensor}: data packets")
+        data = UdpPort(self._port, f"{self.sensor}: data packets")
         self._ports = (data,)
         self._ports = data, UdpPort(position_port, f"{self.sensor}: position packets")
-        self._early = []
+        with self._lock:
+            self._n_lost_before += self._stream.losses.n("packet.lost") if self._stream is not None else 0
+            self._stream, self._early = stream, []
+            self._address, self._serial, self._strangers = self._settings.driver.address or "", "", Counter()
         until_s = time.monotonic() + self._silence_s
-        while not self._stream.n_data and not self.is_stopping:
+        while not stream.n_data and not self.is_stopping:
             self._early = self.read()
-            if not self._stream.n_data and time.monotonic() > until_s:
+            if not stream.n_data and time.monotonic() > until_s:
                 raise self.explain_silence(has_sent=False)
         # Packets hold no serial number, and must not wait until a web page has answered.
-        reception = self._reception
-        address = self._settings.driver.address or reception.address
-
-        def ask_serial() -> None:
-            with suppress(SourceError):
-                reception.serial = VelodyneWeb(address, self._web_port, _WEB_TIMEOUT_S).read_serial()
-
-        if address:
-            threading.Thread(target=ask_serial, daemon=True).start()
+        threading.Thread(target=self._ask_serial, args=(self._address,), daemon=True).start()
 
     def read(self) -> list[Scan]:
         """Take the packets that came, and give the scans that they complete.
@@ -281,26 +157,70 @@ class Vlp16Source(LiveSource):
             port.close()
         self._ports = ()
 
-    def explain_silence(self, *, has_sent: bool) -> SourceError:
-        """Find the likeliest reason; the sensor's web page is asked."""
-        assert self._stream is not None  # it was open
-        return explain_silence(
-            self.sensor, self._settings, self._stream, self._reception, self._silence_s, self._web_port
-        )
-
     def describe(self) -> SourceStatus:
         """Report the state of the sensor; may be called from any thread."""
         with self._lock:
-            reception, ports = self._reception, self._ports
-            reception.n_overflowed = sum(port.n_overflowed for port in ports)
-            reception.granted_bytes = min((port.granted_bytes for port in ports), default=0)
-            status = to_status(self.sensor, self._settings, self._stream, reception, self._recorder)
-            return replace(status, n_lost=status.n_lost + self._n_lost_before)
+            stream, ports = self._stream, self._ports
+            if stream is None:
+                return SourceStatus(self.sensor)
+            state, ahead_ns = stream.clock.state(), stream.clock.ahead_ns()
+            problems = [] if state.severity == "note" else [state]
+            problems += self._find_losses(stream, ports)
+            if self._recorder is not None:
+                problems += self._recorder.findings()
+            ahead_s = None if ahead_ns is None else ahead_ns * 1e-9
+            return SourceStatus(
+                self.sensor,
+                n_lost=stream.losses.n("packet.lost") + self._n_lost_before,
+                clock=ClockState(state, stream.clock.is_utc, ahead_s),
+                problems=tuple(problems),
+                device=f"{stream.product.name} at {self._address}" if stream.n_data else "",
+                serial=self._serial,
+                rates_hz={"scans": stream.rotor_hz} if stream.rotor_hz else {},
+                n_packets=stream.n_data,
+            )
+
+    def explain_silence(self, *, has_sent: bool) -> SourceError:
+        """Find the likeliest reason; the sensor's web page is asked."""
+        assert self._stream is not None  # it was open
+        sensor, port, address, flaws = self.sensor, self._port, self._address, self._stream.flaws()
+        whose = f" from {address}" if address else ""
+        began = (
+            "data packets{} on UDP port {} have stopped"
+            if has_sent
+            else "no data packets{} on UDP port {} come"
+        )
+        what = f"{sensor}: {began.format(whose, port)} (for {self._silence_s:g} s)"
+        for model, _ in self._stream.other_models.most_common(1):
+            wanted = self._stream.product.name
+            what = f"{sensor}: the packets on UDP port {port} come from a {model}, not a {wanted}"
+            return SourceError(what, f"Set the model of {sensor!r} in the profile, or check driver.address.")
+        if flaws:
+            bad = ", ".join(flaw.text for flaw in flaws)
+            return SourceError(f"{what}: only {bad}", "Check which program sends to this port.")
+        if self._strangers:
+            there = ", ".join(sorted(self._strangers))
+            return SourceError(what, f"Packets come from {there}: set driver.address in the profile.")
+        address = address or velodyne.FACTORY_ADDRESS
+        try:
+            report = VelodyneWeb(address, self._web_port, _WEB_TIMEOUT_S).read()
+        except SourceError:
+            hint = (
+                f"Its web page http://{address} does not answer either. Check its power and cable; that this "
+                "computer has an address in its network (192.168.1.x, mask 255.255.255.0); driver.address."
+            )
+            return SourceError(what, hint)
+        advice = [as_line(problem.sentence) for problem in find_problems(report, self._settings)]
+        if report.host and report.host != _EVERYBODY:
+            advice.append(f"Data go to {report.host} only: check that this is this computer.")
+        firewall = f"Open UDP port {port} in this computer's firewall (sudo ufw allow {port}/udp)."
+        return SourceError(
+            what, " ".join([f"Its web page http://{address} answers.", *(advice or [firewall])])
+        )
 
     def _take(self, datagram: Datagram, stream: Vlp16Stream, *, is_data: bool) -> Scan | None:
-        address = self._settings.driver.address or self._reception.address
-        if address and datagram.source != address:
-            self._reception.see_stranger(datagram.source)
+        if self._address and datagram.source != self._address:
+            self._strangers[datagram.source] += 1
             return None
         if self._recorder is not None:
             self._recorder.put(datagram, len(datagram.payload))
@@ -309,6 +229,151 @@ class Vlp16Source(LiveSource):
                 stream.push_position(datagram.payload)
                 return None
             scan = stream.push_data(datagram.payload, datagram.host_ns)
-            if stream.n_data and not self._reception.address:
-                self._reception.address = datagram.source
+            if stream.n_data and not self._address:
+                self._address = datagram.source
             return scan
+
+    def _find_losses(self, stream: Vlp16Stream, ports: "tuple[UdpPort, ...]") -> list[Finding]:
+        """Find what keeps packets from coming, from being taken or read, and a rotor of another speed."""
+        problems: list[Finding] = []
+        n_overflowed = sum(port.n_overflowed for port in ports)
+        granted_bytes = min((port.granted_bytes for port in ports), default=0)
+        n_lost_on_way = stream.losses.n("packet.lost") - n_overflowed
+        if n_lost_on_way > _MAX_LOST_SHARE * max(stream.n_data, 1):
+            problems.append(findings.PACKETS_LOST(share=n_lost_on_way / (stream.n_data + n_lost_on_way)))
+        if n_overflowed:
+            problems.append(findings.COMPUTER_TOO_SLOW(n=n_overflowed, buffer_kib=granted_bytes // 2048))
+        packet_s = 1e-9 * stream.product.packet_ns(stream.mode == velodyne.DUAL)
+        buffer_s = granted_bytes / _PACKET_COST_BYTES * packet_s
+        if 0 < buffer_s < _MIN_BUFFER_S:
+            problems.append(findings.BUFFER_SMALL(buffer_s=buffer_s, buffer_kib=granted_bytes // 2048))
+        problems += [flaw for flaw in stream.flaws() if flaw.figure("n") > _MAX_LOST_SHARE * stream.n_data]
+        rotor_hz, rate_hz = stream.rotor_hz, self._settings.rate_hz
+        if rotor_hz and abs(rotor_hz / rate_hz - 1) > _MAX_OFF_RATE:
+            rotor = findings.ROTOR_RATE(rotor_hz=rotor_hz, expected_hz=rate_hz, expected_rpm=60 * rate_hz)
+            problems.append(rotor)
+        return problems
+
+    def _ask_serial(self, address: str) -> None:
+        with contextlib.suppress(SourceError):
+            serial = VelodyneWeb(address, self._web_port, _WEB_TIMEOUT_S).read_serial()
+            if address == self._address:
+                self._serial = serial
+
+
+class _Vector(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+class _MessageHeader(ctypes.Structure):
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_length", ctypes.c_uint32),
+        ("vectors", ctypes.POINTER(_Vector)),
+        ("n_vectors", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Message(ctypes.Structure):
+    _fields_ = (("header", _MessageHeader), ("length", ctypes.c_uint32))
+
+
+class UdpPort:
+    """An open UDP port; other programs may listen on the same one.
+
+    Attributes:
+        port: its number.
+        granted_bytes: receive buffer that the kernel granted.
+        n_overflowed: datagrams that the kernel dropped because they were not taken in time.
+    """
+
+    def __init__(self, port: int, what: str) -> None:
+        """Open the port.
+
+        Args:
+            port: its number.
+            what: it is for, for messages: "lidar: data packets".
+
+        Raises:
+            SourceError: another program holds it alone, or it may not be opened.
+        """
+        self.port = port
+        self.n_overflowed = 0
+        self._receive = ctypes.CDLL(None, use_errno=True).recvmmsg
+        self._payloads = [ctypes.create_string_buffer(_MAX_PAYLOAD_BYTES) for _ in range(N_AT_ONCE)]
+        self._controls = [ctypes.create_string_buffer(_ANCILLARY_BYTES) for _ in range(N_AT_ONCE)]
+        self._names = [ctypes.create_string_buffer(_ADDRESS_BYTES) for _ in range(N_AT_ONCE)]
+        self._vectors = [_Vector(ctypes.addressof(each), _MAX_PAYLOAD_BYTES) for each in self._payloads]
+        self._messages = (_Message * N_AT_ONCE)()
+        for k, message in enumerate(self._messages):
+            message.header.name = ctypes.addressof(self._names[k])
+            message.header.vectors, message.header.n_vectors = ctypes.pointer(self._vectors[k]), 1
+            message.header.control = ctypes.addressof(self._controls[k])
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WANTED_BUFFER_BYTES)
+            for option in (_SO_TIMESTAMPNS, _SO_RXQ_OVFL):
+                # Without the one arrivals are stamped a little later; without the other, drops look like
+                # losses in the network.
+                with contextlib.suppress(OSError):
+                    self._socket.setsockopt(socket.SOL_SOCKET, option, 1)
+            self._socket.bind(("", port))
+        except OSError as error:
+            self._socket.close()
+            if error.errno == errno.EADDRINUSE:
+                hint = f"Stop the other program (ROS driver, VeloView): `ss -ulpn sport = :{port}` names it."
+                raise SourceError(f"{what}: UDP port {port} is held by another program", hint) from None
+            is_low = port < 1024
+            hint = "Ports below 1024 need root; set driver.port as on the LiDAR's web page." if is_low else ""
+            raise SourceError(f"{what}: UDP port {port} cannot be opened: {error.strerror}", hint) from None
+        # Linux doubles what was asked for, for its own accounts, and reports the double.
+        self.granted_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+
+    def fileno(self) -> int:
+        """Return the file descriptor, to wait on."""
+        return self._socket.fileno()
+
+    def receive_many(self) -> list[Datagram]:
+        """Take the datagrams that came first, N_AT_ONCE at most, in one call; never waits.
+
+        Every call lets other threads run: a thread that takes a datagram at a time falls behind beside one
+        that computes.
+
+        Raises:
+            OSError: the network failed.
+        """
+        for message in self._messages:
+            message.header.name_length = _ADDRESS_BYTES
+            message.header.control_length = _ANCILLARY_BYTES
+        n_came = self._receive(self._socket.fileno(), self._messages, N_AT_ONCE, socket.MSG_DONTWAIT, None)
+        if n_came < 0:
+            number = ctypes.get_errno()
+            if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR):
+                return []
+            raise OSError(number, os.strerror(number))
+        return [self._to_datagram(k) for k in range(n_came)]
+
+    def close(self) -> None:
+        """Close the port."""
+        self._socket.close()
+
+    def _to_datagram(self, k: int) -> Datagram:
+        message, host_ns, at = self._messages[k], 0, 0
+        port, address = _PORT_AND_ADDRESS.unpack_from(self._names[k])
+        control = ctypes.string_at(message.header.control, message.header.control_length)
+        while at + _CONTROL.size <= len(control):
+            length, level, kind = _CONTROL.unpack_from(control, at)
+            if length < _CONTROL.size:
+                break
+            if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
+                seconds, ns = _TIMESPEC.unpack_from(control, at + _CONTROL.size)
+                host_ns = seconds * _NS_PER_S + ns
+            elif (level, kind) == (socket.SOL_SOCKET, _SO_RXQ_OVFL):
+                (self.n_overflowed,) = struct.unpack_from("@I", control, at + _CONTROL.size)
+            at += -(-length // _ALIGN) * _ALIGN
+        payload = ctypes.string_at(self._vectors[k].base, message.length)
+        return Datagram(host_ns or time.time_ns(), socket.inet_ntoa(address), port, self.port, payload)

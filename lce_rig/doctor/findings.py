@@ -1,49 +1,21 @@
-"""Kinds of findings of the doctor: computer, each sensor's stream, clock, pulses and images, the board."""
+"""Kinds of findings of the doctor: the computer, each sensor's device, stream, clock and pulses."""
 
 from functools import partial
 from textwrap import shorten
 
-from lce_rig.core.findings import Figure, Finding, Kind
+from lce_rig.core.findings import Finding, Kind
 
 _MAX_COMMAND = 50
-_EVERY_PULSE = (
-    "make every pulse trigger one image: set the camera's trigger mode in driver.controls, check the line"
-)
 
 _note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
 
 
-def _packages(finding: Finding) -> str:
-    """All {n} packages are installed; OpenCV {opencv}, for a DAVIS dv-processing {dv_processing}."""
-    opencv = finding.figures["opencv"] or "another build"
-    davis = finding.figures["dv_processing"]
-    more = f", dv-processing {davis}" if davis else ""
-    return f"all {finding.figures['n']} installed; OpenCV {opencv}{more}"
-
-
-def _install_packages(finding: Finding) -> str:
-    """run: pip install {packages}"""
-    return f"run: pip install {_spaced(finding.figures['packages'])}"
-
-
-def _install_libraries(finding: Finding) -> str:
-    """run: sudo apt install {packages}"""
-    return f"run: sudo apt install {_spaced(finding.figures['packages'])}"
-
-
-def _spaced(figure: Figure) -> str:
-    assert isinstance(figure, tuple)
-    return " ".join(map(str, figure))
-
-
 def _answers(finding: Finding) -> str:
-    """The {driver} reads {device}, firmware {firmware}, serial number {serial}, at {temperature_c}."""
+    """The {driver} reads {device}, firmware {firmware}, serial number {serial}."""
     figures = finding.figures
     device = str(figures["device"] or f"answers (driver {figures['driver']})")
     parts = [shorten(device, _MAX_COMMAND, placeholder=" ...") if figures["driver"] == "command" else device]
     parts += [f"{name} {figures[name]}" for name in ("firmware", "serial") if figures.get(name)]
-    if figures.get("temperature_c") is not None:
-        parts.append(f"{finding.figure('temperature_c'):.0f} C")
     return ", ".join(parts)
 
 
@@ -123,30 +95,6 @@ def _offset(finding: Finding) -> str:
     return f"{finding.subject}{offset} {drift}"
 
 
-def _in_scan(finding: Finding) -> str:
-    """The board is {distance_m} away: {n_rings} rings, {n_points} points, {n_candidates} candidates."""
-    n_rings, n_points, n = (finding.figure(name) for name in ("n_rings", "n_points", "n_candidates"))
-    text = f"{finding.figure('distance_m'):.2f} m away, {n_rings:.0f} rings, {n_points:.0f} points"
-    return f"{text}; {n:.0f} objects of its size" if n > 1 else text
-
-
-PYTHON = _note("computer.python", "Python {python}, numpy {numpy}, {system} {machine}, {n_bits} bit")
-NOT_LINUX_64 = Kind(
-    "computer.not_linux_64", "not 64-bit Linux", "read live sensors on 64-bit Linux; recordings work"
-)
-PACKAGES = _note("computer.packages", _packages)
-PACKAGES_MISSING = Kind("computer.packages_missing", "missing: {packages}", _install_packages)
-DV_PROCESSING_MISSING = Kind(
-    "computer.dv_processing_missing",
-    "missing: dv-processing, which reads the DAVIS",
-    "run: pip install 'lce-rig[davis]' (Linux, Python 3.10 to 3.13)",
-)
-LIBRARIES = _note("computer.libraries", "{libraries}")
-LIBRARIES_MISSING = _warning(
-    "computer.libraries_missing",
-    "missing: {libraries}; Open3D, which `lce-rig simulate` uses, does not load",
-    _install_libraries,
-)
 DISK = _note("computer.disk", "{free_mb:.0f} MB free, {write_mbps:.0f} MB/s flushed, in {folder}")
 DISK_FULL = Kind(
     "computer.disk_full", "too little space (minimum 5000 MB)", "make room, or choose another disk with -o"
@@ -160,20 +108,6 @@ DISK_NOT_WRITABLE = Kind(
     "computer.disk_not_writable",
     "{folder} cannot be written: {cause}",
     "choose another folder with -o, or make room there",
-)
-BUFFER = _note("computer.buffer", "{granted_kib} KiB granted: {buffer_s:.2f} s of a VLP-16's packets")
-BUFFER_SMALL = _warning(
-    "computer.buffer_small",
-    "too small (minimum 0.25 s)",
-    "run: sudo sysctl -w net.core.rmem_max={wanted_bytes}\n"
-    "to keep it: echo net.core.rmem_max={wanted_bytes} | sudo tee /etc/sysctl.d/60-lidar.conf",
-)
-UDEV_RULES = _note("computer.udev_rules", "installed for {devices}")
-UDEV_RULES_MISSING = _warning(
-    "computer.udev_rules_missing",
-    "none for {devices}: only root may open it",
-    "run: sudo cp {rules} /etc/udev/rules.d/ && sudo udevadm control --reload\n"
-    "then unplug the device and plug it in again",
 )
 COMPUTER_CLOCK = _note("computer.clock", "synchronised, error at most {max_error_ms:.0f} ms")
 COMPUTER_CLOCK_LOOSE = _warning(
@@ -244,34 +178,9 @@ LINE_NONE = Kind(
 )
 PULSES_LOST = _note("pulses.lost", "{n} lost")
 FRAMES_OF_PULSES = _note("pulses.frames", "{n_frames} images of {n_pulses} pulses")
-COUNTED_ONLY = _note("pulses.counted_only", "counted only, not matched yet")
-UNEQUAL = Kind("pulses.unequal", "image and pulse counts differ", _EVERY_PULSE)
-NOT_MATCHED = Kind("pulses.not_matched", "not matched")
+UNEQUAL = Kind(
+    "pulses.unequal",
+    "image and pulse counts differ",
+    "make every pulse trigger one image: set the camera's trigger mode in driver.controls, check the line",
+)
 DELAY = _note("pulses.delay", "delay {delay_ms:.2f} +- {delay_scatter_ms:.2f} ms")
-MISSED = Kind("pulses.missed", "{n_missed} pulses missed, count slipped {n_slips} times", _EVERY_PULSE)
-
-GREY = _note(
-    "exposure.grey", "grey {grey_1:.0f} to {grey_99:.0f}, {white_share:percent} white, edges {edge_px:.1f} px"
-)
-NOTHING_VISIBLE = Kind(
-    "exposure.nothing_visible",
-    "nothing visible",
-    "take the lens cap off, and check that the cable is in the right port",
-)
-DARK = _warning(
-    "exposure.dark",
-    "underexposed ({black_share:percent} black)",
-    "expose longer, open the lens, or add light",
-)
-BRIGHT = _warning("exposure.bright", "overexposed", "expose shorter, or turn away from the light")
-BLURRED = _warning(
-    "exposure.blurred", "blurred (limit {limit_px:.0f} px)", "focus the lens, clean it, and expose shorter"
-)
-EVENTS_FIT = _note("exposure.events", "moving edges, no flicker, hardly any hot pixels")
-BOARD_IN_SCAN = _note("board.in_scan", _in_scan)
-BOARD_IN_IMAGE = _note(
-    "board.in_image",
-    "{distance_m:.2f} m away, {n_corners:.0f} corners to {corner_rms_px:.2f} px rms, "
-    "sharpness {sharpness:.1f}",
-)
-BOARD_IN_EVENTS = _note("board.in_events", "{distance_m:.2f} m away, detected in its events")

@@ -2,25 +2,27 @@
 
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Events, Image, LiveSample, Pulse, Scan
+from lce_rig.core.data import Events, Image, LiveSample, Pulse
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.protocol import SourceStatus
-from lce_rig.devices.reading import LiveSource
+from lce_rig.core.findings import Finding
+from lce_rig.devices import driver_of
+from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.devices.sync_board import SyncBoard
+from lce_rig.devices.velodyne_web import WebReport
+from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 
-# A sync board that its port's opening resets takes some seconds to speak; the wait ends then.
-PATIENCE_S = 3.0
+# A sync board that its port's opening resets takes some seconds to speak.
+_OPENING_S = 10.0
+_CLOSING_S = 3.0
 _POLL_S = 0.05
-# The network that makes images from events remembers about a second.
-_EVENTS_KEPT_NS = 1_500_000_000
 _NO_PIXELS = np.zeros((1, 1), dtype=np.uint8)
 
 
@@ -34,10 +36,9 @@ class ObservedSensor:
         failure: why it could not be opened, or ended early.
         watched_s: for how long it was open.
         ended_ns: when that ended, by the computer's time of day.
-        timestamps: (timestamp, arrival) ns of each scan, image or batch, by "scans", "frames", "events".
+        stamps: (timestamp, arrival) ns of each scan, image or batch, by "scans", "frames", "events".
         frames: every image, without its pixels.
         pulses: every pulse, of a board or seen by a camera.
-        scan, images, events: the last scan, the last image of each channel, the last 1.5 s of events.
         n_events: how many events came in all.
         host_clock, utc_clock: a sync board's models of the computer's time and of UTC.
     """
@@ -50,17 +51,14 @@ class ObservedSensor:
     stamps: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
     frames: list[Image] = field(default_factory=list)
     pulses: list[Pulse] = field(default_factory=list)
-    scan: Scan | None = None
-    images: dict[str, Image] = field(default_factory=dict)
-    events: deque[Events] = field(default_factory=deque)
     n_events: int = 0
     host_clock: ClockModel | None = None
     utc_clock: ClockModel | None = None
 
     @property
-    def has_opened(self) -> bool:
-        """Whether it opened, and did not end at once."""
-        return self.status is not None
+    def is_utc(self) -> bool:
+        """Whether its timestamps are its own clock's, which is tied to UTC."""
+        return self.status is not None and self.status.clock is not None and self.status.clock.is_utc
 
     def times(self, stream: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the timestamps (N,) and arrivals (N,) of a stream, ns."""
@@ -72,116 +70,112 @@ class ObservedSensor:
         if isinstance(sample, Pulse):
             self.pulses.append(sample)
         elif isinstance(sample, Events):
-            if not len(sample):
-                return
-            self._note("events", int(sample.t_ns[-1]), sample.host_ns)
-            self.n_events += len(sample)
-            self.events.append(sample)
-            while self.events[0].t_ns[-1] < sample.t_ns[-1] - _EVENTS_KEPT_NS:
-                self.events.popleft()
+            if len(sample):
+                self._note("events", int(sample.t_ns[-1]), sample.host_ns)
+                self.n_events += len(sample)
         elif isinstance(sample, Image):
             self._note("frames", sample.stamp_ns, sample.host_ns)
             self.frames.append(replace(sample, pixels=_NO_PIXELS))
-            self.images[sample.channel] = sample
         else:
             self._note("scans", sample.stamp_ns, sample.host_ns)
-            self.scan = sample
 
     def _note(self, stream: str, stamp_ns: int | None, host_ns: int | None) -> None:
         if stamp_ns is not None and host_ns is not None:
             self.stamps.setdefault(stream, []).append((stamp_ns, host_ns))
 
 
-def observe(
-    sources: Mapping[str, Callable[[], LiveSource]],
-    duration_s: float,
-    meanwhile: Sequence[Callable[[], None]] = (),
-) -> dict[str, ObservedSensor]:
-    """Open every sensor and watch it.
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """Observations of a rig.
 
-    Sensors that take their time to open are waited for, 3 s beyond the duration at most, and then watched
-    for half of it. Where none is open, nothing is waited for.
+    Attributes:
+        rig: the profile.
+        folder: where sessions are to be written.
+        seen: what was observed, by the sensor's name.
+        web: what the web page of each VLP-16 says, or why it says nothing, by name.
+    """
+
+    rig: Rig
+    folder: Path = Path()
+    seen: Mapping[str, ObservedSensor] = field(default_factory=dict)
+    web: Mapping[str, WebReport | SourceError] = field(default_factory=dict)
+
+    def problems(self, sensor: str, *families: str) -> list[Finding]:
+        """Return the problems that a sensor's driver names, of some families of codes."""
+        status = self.seen[sensor].status
+        return [] if status is None else [each for each in status.problems if each.family in families]
+
+    def driver(self, sensor: str) -> str:
+        """Name the driver that reads a sensor; "" where there is none."""
+        try:
+            return driver_of(self.rig, sensor)
+        except SourceError:
+            return ""
+
+
+def observe(sources: Mapping[str, Callable[[], LiveSource]], duration_s: float) -> dict[str, ObservedSensor]:
+    """Open every sensor and watch it, for a time that begins when the last one has opened or failed.
+
+    Where none is open, nothing is waited for.
 
     Args:
         sources: makes each sensor's source, by its name; may raise SourceError.
         duration_s: how long to watch.
-        meanwhile: what else is to be done in that time, in this thread.
 
     Returns:
-        What was seen, by the sensor's name.
+        The observations by the sensor's name.
     """
-    start_s = time.monotonic()
-    watches = {sensor: _Watch(sensor, make) for sensor, make in sources.items()}
+    seen = {sensor: ObservedSensor(sensor) for sensor in sources}
+    begun = {sensor: threading.Event() for sensor in sources}
+    stop = threading.Event()
+    threads: dict[str, threading.Thread] = {}
     try:
-        for work in meanwhile:
-            work()
-        while (now_s := time.monotonic()) < start_s + duration_s + PATIENCE_S:
-            open_s = [now_s - watch.opened_s for watch in watches.values() if watch.opened_s is not None]
-            is_any_opening = any(watch.opened_s is None and not watch.is_over for watch in watches.values())
-            has_watched = not is_any_opening and all(each_s >= duration_s / 2 for each_s in open_s)
-            is_due = now_s >= start_s + duration_s and has_watched
-            if is_due or all(watch.is_over for watch in watches.values()):
-                break
+        for sensor, make in sources.items():
+            arguments = seen[sensor], make, begun[sensor], stop
+            threads[sensor] = threading.Thread(target=_watch, args=arguments, daemon=True)
+            threads[sensor].start()
+        until_s = time.monotonic() + _OPENING_S
+        for event in begun.values():
+            event.wait(max(0.0, until_s - time.monotonic()))
+        until_s = time.monotonic() + duration_s
+        while time.monotonic() < until_s and any(thread.is_alive() for thread in threads.values()):
             time.sleep(_POLL_S)
-    except BaseException:  # Ctrl-C too: what a source has started must not outlive the program.
-        for watch in watches.values():
-            watch.stop.set()
-        for watch in watches.values():
-            watch.result(PATIENCE_S)
-        raise
-    for watch in watches.values():
-        watch.stop.set()
-    limit_s = max(duration_s, time.monotonic() - start_s) + PATIENCE_S
-    return {sensor: watch.result(start_s + limit_s - time.monotonic()) for sensor, watch in watches.items()}
-
-
-class _Watch:
-    """One sensor's thread: opens it, takes samples, and closes it.
-
-    Attributes:
-        stop: set to end the watch.
-        opened_s: when it opened, by the steady clock; None before.
-        is_over: whether it has failed or been closed.
-    """
-
-    def __init__(self, sensor: str, make: Callable[[], LiveSource]) -> None:
-        self.stop = threading.Event()
-        self.opened_s: float | None = None
-        self.is_over = False
-        self._seen = ObservedSensor(sensor)
-        self._make = make
-        self._thread = threading.Thread(target=self._run, name=f"watch {sensor}", daemon=True)
-        self._thread.start()
-
-    def result(self, timeout_s: float) -> ObservedSensor:
-        """Wait for the sensor to close, and give what was seen."""
-        self._thread.join(max(timeout_s, _POLL_S))
-        if self._thread.is_alive() and self._seen.failure is None:
+    finally:  # After Ctrl-C, too: no program that a source has started may outlive this one.
+        stop.set()
+        until_s = time.monotonic() + _CLOSING_S
+        for thread in threads.values():
+            thread.join(max(_POLL_S, until_s - time.monotonic()))
+    for sensor, thread in threads.items():
+        if thread.is_alive() and seen[sensor].failure is None:
             hint = "Unplug it, plug it in again and repeat."
-            self._seen.failure = SourceError("it neither opens nor closes in time", hint)
-        return self._seen
+            seen[sensor].failure = SourceError("it neither opens nor closes in time", hint)
+    return seen
 
-    def _run(self) -> None:
-        try:
-            with self._make() as source:
-                self.opened_s = time.monotonic()
-                try:
-                    while not self.stop.is_set():
-                        sample = source.take(_POLL_S)
-                        if sample is not None:
-                            self._seen.take(sample)
-                except SourceError as error:
-                    self._seen.failure = error
-                # Nothing of one that never sent anything.
-                if self._seen.failure is None or self._seen.stamps or self._seen.pulses:
-                    self._seen.status = source.status()
-                    self._seen.watched_s = time.monotonic() - self.opened_s
-                    self._seen.ended_ns = time.time_ns()
-                    if isinstance(source, SyncBoard):
-                        self._seen.host_clock, self._seen.utc_clock = source.host_clock, source.utc_clock
-        except SourceError as error:
-            self._seen.failure = self._seen.failure or error
-        except Exception as error:  # A bug in one driver must not hide what is known of the others.
-            self._seen.failure = SourceError(f"its driver failed: {error!r}", "This is a bug: report it.")
-        finally:
-            self.is_over = True
+
+def _watch(
+    seen: ObservedSensor, make: Callable[[], LiveSource], begun: threading.Event, stop: threading.Event
+) -> None:
+    """Open a sensor, take its samples until asked to stop, and close it."""
+    try:
+        with make() as source:
+            opened_s = time.monotonic()
+            begun.set()
+            try:
+                while not stop.is_set():
+                    sample = source.take(_POLL_S)
+                    if sample is not None:
+                        seen.take(sample)
+            except SourceError as error:
+                seen.failure = error
+            # A sensor that never sent anything has no status.
+            if seen.failure is None or seen.stamps or seen.pulses:
+                seen.status = source.status()
+                seen.watched_s, seen.ended_ns = time.monotonic() - opened_s, time.time_ns()
+                if isinstance(source, SyncBoard):
+                    seen.host_clock, seen.utc_clock = source.host_clock, source.utc_clock
+    except SourceError as error:
+        seen.failure = seen.failure or error
+    except Exception as error:  # A bug in one driver must not hide what is known of the others.
+        seen.failure = SourceError(f"its driver failed: {error!r}", "This is a bug: report it.")
+    finally:
+        begun.set()

@@ -15,7 +15,7 @@ from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import transform
 from lce_rig.core.losses import Losses
 from lce_rig.core.progress import Progress
-from lce_rig.devices.opening import edge_cameras
+from lce_rig.devices import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.io import open_recordings
 from lce_rig.io.joining import join_recordings, require_sensors

@@ -24,10 +24,9 @@ from benchmarks.tables import print_head, print_row
 from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.state import Key, LiveOptions, LiveReport, LiveState
 from lce_rig.core.geometry import Array
+from lce_rig.devices import open_live
 from lce_rig.devices.davis import DavisSource, OpenedCamera
-from lce_rig.devices.opening import open_live
-from lce_rig.devices.protocol import SourceStatus
-from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.sync_settings import SyncSettings
 from lce_rig.session import Session

@@ -97,8 +97,7 @@ class FakeBoard:
         *lines, rest = data.split(b"\n")
         for line in lines:
             rx_us = self.board_us()
-            sentence = read_sentence(line.strip())
-            words = sentence.split(b",") if isinstance(sentence, bytes) else [line.strip()]
+            words = read_sentence(line.strip()).split(b",")
             self.commands.append(b",".join(words).decode())
             with self._lock:
                 if self.is_mute or self.is_stalled:

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.opening import driver_type, open_live
-from lce_rig.rig import DriverSettings, Rig, load_rig
+from lce_rig.devices import driver_of, open_live, sensors, source_of
+from lce_rig.rig import Rig, load_rig
 
 
 def with_driver(rig: Rig, camera: str, **driver: Any) -> Rig:
@@ -42,15 +42,24 @@ def test_the_profile_may_choose_the_driver(
     assert type(open_live(with_driver(load_rig(rig), camera, **driver))[1]).__name__ == source
 
 
-def test_an_unknown_driver_or_one_of_another_kind_is_named() -> None:
-    for wanted in ("v4l", "vlp16", "sync_board"):
-        rig = with_driver(load_rig("rlfs"), "cam", type=wanted)
-        with pytest.raises(SourceError, match=f"'{wanted}'") as caught:
-            open_live(rig)
-        assert "v4l2, command, davis" in caught.value.hint
+@pytest.mark.parametrize("wanted", ["v4l", "vlp16", "sync_board"])
+def test_an_unknown_driver_or_one_of_another_kind_keeps_no_other_sensor_from_opening(wanted: str) -> None:
+    rig = with_driver(load_rig("rlfs"), "cam", type=wanted)
+    with pytest.raises(SourceError) as caught:
+        open_live(rig)
+    assert repr(wanted) in caught.value.what and "v4l2, command, davis" in caught.value.hint
+    assert sensors(rig)[:2] == ["lidar", "cam"] and source_of(rig, "lidar").sensor == "lidar"
 
 
 def test_a_lidar_of_an_unknown_model_is_not_guessed() -> None:
-    with pytest.raises(SourceError, match="XY-32"):
-        driver_type("lidar", "lidar", "XY-32", DriverSettings())
-    assert driver_type("lidar", "lidar", "Puck LITE", DriverSettings()) == "vlp16"
+    rig = load_rig("rlfs")
+    unknown, lite = (
+        rig.model_copy(update={"lidars": {"lidar": rig.lidars["lidar"].model_copy(update=changes)}})
+        for changes in (
+            {"model": "XY-32", "driver": rig.lidars["lidar"].driver.model_copy(update={"type": None})},
+            {"model": "Puck LITE"},
+        )
+    )
+    with pytest.raises(SourceError) as caught:
+        driver_of(unknown, "lidar")
+    assert "XY-32" in caught.value.what and driver_of(lite, "lidar") == "vlp16"

@@ -7,8 +7,7 @@ import pytest
 
 from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.protocol import SourceStatus
-from lce_rig.devices.reading import AttachedSensors, LiveSource, RateMeter
+from lce_rig.devices.reading import AttachedSensors, LiveSource, RateMeter, SourceStatus
 
 HINT = "Check the plug."
 
@@ -23,7 +22,7 @@ class Script(LiveSource):
     def __init__(
         self, *entries: list[Pulse] | Exception, name: str = "s", n_slots: int = 9, silence_s: float = 5.0
     ) -> None:
-        super().__init__(name, f"sensor {name!r}", n_slots, silence_s, HINT)
+        super().__init__(name, f"sensor {name!r}", silence_s, HINT, n_slots)
         self.entries = list(entries)
         self.is_open = False
 
@@ -127,7 +126,7 @@ def test_what_comes_while_others_are_being_opened_is_no_loss() -> None:
             while early.entries:
                 time.sleep(0.005)
 
-    early, late = Script([pulse(k) for k in range(100)], n_slots=1), Slow([pulse(0)], name="t")
+    early, late = Script([pulse(k) for k in range(100)], n_slots=64), Slow([pulse(0)], name="t")
     with AttachedSensors([early, late]) as sensors:
         assert sensors.take(5.0) == ("s", pulse(36))  # the newest 64 of 100
         assert sensors.statuses()["s"].n_dropped == 0

@@ -22,7 +22,7 @@ import pytest
 
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.opening import open_live
+from lce_rig.devices import open_live
 from lce_rig.devices.reading import AttachedSensors
 from lce_rig.devices.ros2 import Ros2Source
 from lce_rig.io.ros.bag_recorder import encode_image, encode_scan

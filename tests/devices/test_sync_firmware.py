@@ -17,7 +17,6 @@ from lce_rig.devices.lce1 import (
     BoardError,
     BoardStatus,
     Hello,
-    LineFault,
     LineReader,
     PpsEdge,
     TimeReply,
@@ -75,7 +74,7 @@ def virtual(host_board):
         )
         lines = [line.strip() for line in done.stdout.splitlines()]
         messages = [rmc_utc_s(line) if b"RMC" in line else read_line(line) for line in lines]
-        assert not [message for message in messages if isinstance(message, LineFault)]
+        assert None not in messages
         return messages
 
     return run
@@ -272,9 +271,9 @@ def test_our_live_source_and_the_firmware_understand_each_other(running):
         # The last pulse per second began a second of this computer's clock.
         off_ns = (model.convert(told[-1].stamp_ns) + 500_000_000) % 1_000_000_000 - 500_000_000
         assert abs(off_ns) < 30_000_000
-    assert status.figures["n_bad_checksums"] == status.figures["n_resets"] == status.n_lost == 0
+    assert status.n_lost == 0
     codes = {problem.code for problem in status.problems}
-    assert not codes & {"stream.damaged_lines", "device.board_error"}
+    assert not codes & {"stream.damaged_lines", "device.board_error", "device.board_restarted"}
 
 
 def test_noise_on_its_input_is_survived_and_a_computer_that_does_not_read_costs_lines_only(running):

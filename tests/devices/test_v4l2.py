@@ -79,7 +79,6 @@ STRUCTURES = {
     "v4l2_requestbuffers": abi.BufferRequest,
     "v4l2_buffer": abi.Buffer,
     "v4l2_query_ext_ctrl": abi.ControlQuery,
-    "v4l2_querymenu": abi.MenuQuery,
     "v4l2_ext_control": abi.V4l2Control,
     "v4l2_ext_controls": abi.V4l2Controls,
 }
@@ -95,20 +94,16 @@ NUMBERS = {
     "VIDIOC_STREAMON": abi.STREAM_ON,
     "VIDIOC_STREAMOFF": abi.STREAM_OFF,
     "VIDIOC_S_PARM": abi.SET_PARAMETERS,
-    "VIDIOC_QUERYMENU": abi.QUERY_MENU,
     "VIDIOC_G_EXT_CTRLS": abi.GET_CONTROLS,
     "VIDIOC_S_EXT_CTRLS": abi.SET_CONTROLS,
     "VIDIOC_QUERY_EXT_CTRL": abi.QUERY_CONTROL,
     "V4L2_CAP_VIDEO_CAPTURE": abi.CAP_VIDEO_CAPTURE,
-    "V4L2_CAP_VIDEO_CAPTURE_MPLANE": abi.CAP_VIDEO_CAPTURE_MPLANE,
     "V4L2_CAP_STREAMING": abi.CAP_STREAMING,
     "V4L2_CAP_DEVICE_CAPS": abi.CAP_DEVICE_CAPS,
     "V4L2_BUF_FLAG_ERROR": abi.BUFFER_ERROR,
     "V4L2_BUF_FLAG_TSTAMP_SRC_MASK": abi.STAMP_SOURCE_MASK,
     "V4L2_BUF_FLAG_TSTAMP_SRC_SOE": abi.STAMP_SOURCE_SOE,
     "V4L2_CTRL_FLAG_NEXT_CTRL": abi.NEXT_CONTROL,
-    "V4L2_CTRL_FLAG_READ_ONLY": abi.CONTROL_READ_ONLY,
-    "V4L2_CTRL_FLAG_INACTIVE": abi.CONTROL_INACTIVE,
     "V4L2_CTRL_TYPE_INTEGER64": abi.INTEGER64,
     "V4L2_CTRL_TYPE_INTEGER_MENU": abi.INTEGER_MENU,
     "V4L2_CID_EXPOSURE_ABSOLUTE": abi.EXPOSURE_ABSOLUTE_ID,
@@ -124,7 +119,6 @@ OFFSETS = {
     "v4l2_query_ext_ctrl, flags": abi.ControlQuery.flags.offset,
     "v4l2_ext_control, value64": abi.V4l2Control.value.offset,
     "v4l2_ext_controls, controls": abi.V4l2Controls.controls.offset,
-    "v4l2_querymenu, name": abi.MenuQuery.item.offset,
 }
 
 

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.hardware
 DEVICE = os.environ.get("LCE_RIG_VIDEO", "/dev/video0")
 SIZE = tuple(int(n) for n in os.environ.get("LCE_RIG_VIDEO_SIZE", "640x360").split("x"))
 # Its stamps of an end of frame lie in the future; those of a start of exposure do not.
-VIVID = {"timestamp_source": "Start of Exposure", "osd_text_mode": "None"}
+VIVID = {"timestamp_source": 1, "osd_text_mode": 2}
 
 
 @pytest.fixture(autouse=True)
@@ -82,12 +82,11 @@ def test_a_size_that_it_does_not_have_is_refused() -> None:
 @pytest.mark.parametrize(
     ("controls", "hint"),
     [
-        ({"brightnes": 1}, "brightness?"),
-        ({"brightness": 300}, "255"),
-        ({"brightness": 1.5}, ""),
-        ({"timestamp_source": "Dawn"}, "End of Frame"),
-        ({"menu": 2}, "Menu Item 4"),
-        ({"read_only_integer_32_bits": 1}, "driver.controls"),
+        ({"brightnes": 1}, "brightness"),
+        ({"brightness": 1.5}, "v4l2-ctl"),
+        ({"timestamp_source": "Dawn"}, "v4l2-ctl"),
+        ({"menu": 2}, "v4l2-ctl"),
+        ({"read_only_integer_32_bits": 1}, "v4l2-ctl"),
     ],
 )
 def test_controls_it_cannot_take_are_refused_by_name(
@@ -101,8 +100,8 @@ def test_controls_it_cannot_take_are_refused_by_name(
     assert hint in caught.value.hint
 
 
-def test_controls_are_set_by_number_and_by_name(vivid: None) -> None:
-    wanted = {"brightness": 77, "integer_64_bits": 1 << 40, "menu": "Menu Item 4", "gain_automatic": False}
+def test_controls_are_set_by_number(vivid: None) -> None:
+    wanted = {"brightness": 77, "integer_64_bits": 1 << 40, "menu": 4, "gain_automatic": False}
     with V4l2Source("cam", camera(wanted)) as source:
         assert source.status().problems == ()
     device = VideoDevice(DEVICE, "cam")
@@ -153,7 +152,7 @@ def test_the_flag_of_a_start_of_exposure_is_believed(vivid: None) -> None:
 
 
 def test_stamps_in_the_future_are_not_trusted(vivid: None) -> None:
-    with V4l2Source("cam", camera({"timestamp_source": "End of Frame"}, frame_rate_hz=5.0)) as source:
+    with V4l2Source("cam", camera({"timestamp_source": 0}, frame_rate_hz=5.0)) as source:
         take(source, 3)
         assert any(problem.family == "clock" for problem in source.status().problems)
 

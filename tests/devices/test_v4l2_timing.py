@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.stamp_clock import FrameTiming, frame_timing, stamped_moment
+from lce_rig.devices.v4l2 import FrameTiming, frame_timing, stamped_moment
 from lce_rig.rig import DriverSettings, FrameTimingSettings
 
 ROWS = st.integers(2, 1080)

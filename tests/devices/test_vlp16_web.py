@@ -11,8 +11,7 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.velodyne_web import VelodyneWeb, find_problems
-from lce_rig.devices.vlp16 import Reception, explain_silence
-from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.devices.vlp16 import Vlp16Source
 from lce_rig.rig.sensors import DriverSettings
 from tests.io.vlp16_room import settings
 
@@ -35,8 +34,7 @@ SETTINGS = {
     "host": {"addr": "255.255.255.255", "dport": 2368, "tport": 8308},
     "phaselock": {"enabled": "Off", "offset": 0},
 }
-DIAGNOSTICS = {"volt_temp": {"top": {"lm20_temp": 1100}, "bot": {"lm20_temp": 1050}}}
-PAGES: dict[str, Any] = {"info": INFO, "status": STATUS, "settings": SETTINGS, "diag": DIAGNOSTICS}
+PAGES: dict[str, Any] = {"info": INFO, "status": STATUS, "settings": SETTINGS}
 
 
 class FakeSensor:
@@ -88,7 +86,6 @@ def test_the_page_of_a_healthy_sensor_is_read_without_a_complaint() -> None:
     assert report.is_motor_on and report.is_laser_on
     assert report.rotor_hz == pytest.approx(9.98, abs=0.01) and report.wanted_rotor_hz == 10
     assert (report.fov_deg, report.data_port, report.position_port) == ((0, 359), 2368, 8308)
-    assert report.temperature_c is not None and 20 < report.temperature_c < 60
     assert find_problems(report, settings()) == []
 
 
@@ -113,7 +110,6 @@ def test_types_that_differ_by_firmware_do_not_matter() -> None:
         True,
     )
     assert (report.rotor_hz, report.returns, report.data_port) == (10, "strongest", 2368)
-    assert report.temperature_c is None
     assert find_problems(report, settings()) == []
 
 
@@ -121,7 +117,7 @@ def test_types_that_differ_by_firmware_do_not_matter() -> None:
     "nonsense", [{}, {"gps": 3, "motor": [], "rpm": None, "host": "x", "fov": {"start": {}}}]
 )
 def test_pages_that_say_nothing_of_use_give_an_empty_report(nonsense: dict[str, Any]) -> None:
-    with serving({"info": nonsense, "status": nonsense, "settings": nonsense, "diag": nonsense}) as (_, web):
+    with serving({"info": nonsense, "status": nonsense, "settings": nonsense}) as (_, web):
         report = web.read()
     assert report.rotor_hz is None and report.data_port is None and report.pps == ""
     assert find_problems(report, settings()) == []
@@ -144,36 +140,26 @@ def test_an_address_where_nothing_answers_is_an_error_with_what_to_check() -> No
         VelodyneWeb("no such host").read()
 
 
-WRONG: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "settings.other_model": (
-        {"info": {"model": "HDL-32E", "expected": "VLP-16"}},
-        {"model": "HDL-32E", "expected": "VLP-16"},
-    ),
-    "settings.motor_off": ({"status": {"motor": {"state": "Off"}}}, {}),
-    "settings.laser_off": ({"status": {"laser": {"state": "Disabled"}}, "settings": {"laser": "Off"}}, {}),
-    "settings.rotor_rate": (
-        {"settings": {"rpm": 1200}},
-        {"set_hz": 20.0, "expected_hz": 10.0, "expected_rpm": 600.0},
-    ),
-    "settings.fov_cut": (
-        {"settings": {"fov": {"start": 270, "end": 90}}},
-        {"start_deg": 270.0, "end_deg": 90.0},
-    ),
-    "settings.data_port": ({"settings": {"host": {"dport": 2369}}}, {"port": 2369, "expected_port": 2368}),
-    "settings.position_port": (
-        {"settings": {"host": {"tport": 8309}}},
-        {"port": 8309, "expected_port": 8308},
-    ),
-    "settings.pps": ({"status": {"gps": {"pps_state": "Absent"}}}, {"pps": "absent"}),
-}
+WRONG: list[tuple[dict[str, Any], tuple[str, Any, Any]]] = [
+    ({"info": {"model": "HDL-32E"}}, ("model", "HDL-32E", "VLP-16")),
+    ({"status": {"motor": {"state": "Off"}}}, ("motor", "off", "on")),
+    ({"status": {"laser": {"state": "Disabled"}}, "settings": {"laser": "Off"}}, ("laser", "off", "on")),
+    ({"settings": {"rpm": 1200}}, ("rpm", 1200.0, 600.0)),
+    ({"settings": {"fov": {"start": 270, "end": 90}}}, ("field of view", (270, 90), (0, 359))),
+    ({"settings": {"host": {"dport": 2369}}}, ("data port", 2369, 2368)),
+    ({"settings": {"host": {"tport": 8309}}}, ("telemetry port", 8309, 8308)),
+    ({"status": {"gps": {"pps_state": "Absent"}}}, ("PPS", "absent", "locked")),
+]
 
 
-@pytest.mark.parametrize("code", sorted(WRONG))
-def test_what_keeps_scans_from_coming_is_found_with_its_figures(code: str) -> None:
-    changes, figures = WRONG[code]
+@pytest.mark.parametrize(("changes", "figures"), WRONG, ids=[figures[0] for _, figures in WRONG])
+def test_what_keeps_scans_from_coming_is_found_with_its_figures(
+    changes: dict[str, Any], figures: tuple[str, Any, Any]
+) -> None:
     with serving({key: {**page, **changes.get(key, {})} for key, page in PAGES.items()}) as (_, web):
-        problems = find_problems(web.read(), settings())
-    assert [(found.code, dict(found.figures)) for found in problems] == [(code, figures)]
+        (problem,) = find_problems(web.read(), settings())
+    assert problem.code == "settings.differs"
+    assert tuple(problem.figures[name] for name in ("setting", "value", "expected")) == figures
 
 
 @pytest.mark.parametrize(
@@ -188,6 +174,8 @@ def test_a_silent_sensor_is_asked_where_it_sends_to(host: dict[str, Any], advice
     lidar = settings(driver=DriverSettings(address="127.0.0.1", port=2368))
     with serving({**PAGES, "settings": {**SETTINGS, "host": host}}) as (_, web):
         port = int(web.url.rpartition(":")[2])
-        error = explain_silence("lidar", lidar, Vlp16Stream("lidar", lidar), Reception(), 2.0, port)
-    assert all(figure in error.what for figure in ("127.0.0.1", "2368", "2 s"))
+        with pytest.raises(SourceError) as caught:
+            Vlp16Source("lidar", lidar, silence_s=0.2, web_port=port).__enter__()
+    error = caught.value
+    assert all(figure in error.what for figure in ("127.0.0.1", "2368", "0.2 s"))
     assert "http://127.0.0.1" in error.hint and advice in error.hint

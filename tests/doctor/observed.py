@@ -7,9 +7,9 @@ import numpy as np
 
 from lce_rig.core.data import Image, Pulse, Scan
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.devices.protocol import ClockState, SourceStatus
-from lce_rig.doctor.examination import Check, Examination
-from lce_rig.doctor.observing import ObservedSensor
+from lce_rig.devices.reading import ClockState, SourceStatus
+from lce_rig.doctor.examine import Check
+from lce_rig.doctor.observing import Examination, ObservedSensor
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 

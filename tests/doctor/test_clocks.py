@@ -10,10 +10,9 @@ from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.core.data import LiveSample, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices.opening import edge_cameras
-from lce_rig.devices.protocol import ClockState, SourceStatus
-from lce_rig.devices.reading import AttachedSensors, LiveSource
-from lce_rig.doctor.clocks import check_clock, check_edges, check_offsets, check_sync, tie
+from lce_rig.devices import edge_cameras
+from lce_rig.devices.reading import AttachedSensors, ClockState, LiveSource, SourceStatus
+from lce_rig.doctor.checks import check_clock, check_edges, check_offsets, check_sync, tie
 from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
@@ -146,7 +145,7 @@ class Replayed(LiveSource):
     """A device that sends what was observed of one."""
 
     def __init__(self, seen: ObservedSensor) -> None:
-        super().__init__(seen.sensor, seen.sensor, 4096, 60.0)
+        super().__init__(seen.sensor, seen.sensor, 60.0, n_slots=4096)
         self.host_clock, self.utc_clock = seen.host_clock, seen.utc_clock
         self._seen = seen
         self.left: list[LiveSample] = []

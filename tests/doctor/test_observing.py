@@ -39,20 +39,7 @@ def test_what_fails_is_said_and_the_others_are_watched_all_the_same() -> None:
 def test_where_nothing_opens_nothing_is_waited_for() -> None:
     start_s = time.monotonic()
     seen = observe({"gone": absent}, 60.0)
-    assert time.monotonic() - start_s < 10 and not seen["gone"].has_opened
-
-
-def test_other_work_is_done_meanwhile_and_its_failure_is_not_hidden() -> None:
-    done = []
-    observe({"gone": absent}, 1.0, [lambda: done.append("work")])
-    assert done == ["work"]
-    with FakeBoard() as fake:
-        settings = SyncSettings.model_validate({"device": fake.path})
-        with pytest.raises(ZeroDivisionError):
-            observe({"sync": lambda: SyncBoard(settings)}, 60.0, [lambda: 1 / 0])  # type: ignore[func-returns-value,list-item]
-        # The port is free again.
-        with SyncBoard(settings):
-            pass
+    assert time.monotonic() - start_s < 10 and seen["gone"].status is None
 
 
 def test_a_davis_over_the_network_has_its_events_counted(tmp_path: Path) -> None:
@@ -66,6 +53,6 @@ def test_a_davis_over_the_network_has_its_events_counted(tmp_path: Path) -> None
             "davis"
         ]
     assert seen.failure is None
-    assert seen.n_events == sum(len(part) for part in seen.events) > 0
+    assert seen.n_events > 0 and seen.n_events % 50 == 0
     stamps, arrivals = seen.times("events")
     assert len(stamps) == len(arrivals) > 1

@@ -6,10 +6,9 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices.protocol import ClockState
+from lce_rig.devices.reading import ClockState
 from lce_rig.devices.velodyne_web import WebReport
-from lce_rig.doctor.clocks import check_pps
-from lce_rig.doctor.streams import check_settings
+from lce_rig.doctor.checks import check_pps, check_settings
 from lce_rig.rig import Rig
 
 from .observed import LOCKED, UNLOCKED, codes, examination, lidar, look, make_rig
@@ -62,8 +61,8 @@ def test_settings_that_differ_from_the_profile_are_named_once() -> None:
     line = look(check_settings, examination(lidar(), web={"lidar": report}), "lidar")
     assert line is not None and line.severity == "warning"
     # The pulse has a line of its own.
-    wrong = ["settings.rotor_rate", "settings.fov_cut", "settings.data_port"]
-    assert codes(line) == ["settings.read", *wrong]
+    wrong = [each.figures["setting"] for each in line.findings[1:]]
+    assert codes(line)[0] == "settings.read" and wrong == ["rpm", "field of view", "data port"]
 
 
 def test_a_web_page_that_does_not_answer_is_no_fault_of_the_packets() -> None:

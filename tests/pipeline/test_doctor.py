@@ -1,18 +1,14 @@
 """The doctor examines a rig over real transports: all of it attached, parts of it, or none."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from wire.vlp16_packets import Vlp16Clock
 
 from lce_rig.core.findings import worst
-from lce_rig.doctor.examination import Check
-from lce_rig.doctor.examine import DoctorOptions, examine, look_for_boards
-from lce_rig.doctor.observing import ObservedSensor
+from lce_rig.doctor.examine import Check, DoctorOptions, examine
 from lce_rig.rig import Rig
-from tests.detect.moving_board import CENTRE_PX, HEIGHT_PX, WIDTH_PX, Motion, board_events
 from tests.doctor.attached import Attached, attach, picture_of, scan_of
 from tests.doctor.observed import codes, make_rig
 
@@ -37,7 +33,7 @@ def doctor_until_scanned(
         start_s = time.monotonic()
         lines = doctor(rig, folder, web_port, watch_s)
         took_s = time.monotonic() - start_s
-        if ("lidar", "board") in lines and "clock.no_position_packets" not in codes(lines["lidar", "PPS"]):
+        if ("lidar", "PPS") in lines and "clock.no_position_packets" not in codes(lines["lidar", "PPS"]):
             break
     return lines, watch_s, took_s
 
@@ -82,16 +78,6 @@ def test_its_lidar_is_locked_and_set_as_the_profile_wants(everything: tuple[Line
     assert settings.figures["fov_deg"] == (0, 359)
 
 
-def test_its_board_is_seen_by_both_sensors(everything: tuple[Lines, float, float]) -> None:
-    lines, *_ = everything
-    assert lines["lidar", "board"].severity == "note"
-    assert lines["lidar", "board"].figures["distance_m"] == pytest.approx(2.2, abs=0.02)
-    assert lines["cam", "board"].severity == "note"
-    # A square of 68 mm is 20 px wide through a lens of 300 px.
-    assert lines["cam", "board"].figures["distance_m"] == pytest.approx(300 * 0.068 / 20, rel=0.01)
-    assert lines["cam", "picture"].severity == "note"
-
-
 def test_its_clocks_are_compared(everything: tuple[Lines, float, float]) -> None:
     lines, *_ = everything
     if lines["lidar", "PPS"].severity == "note":  # a LiDAR that sends too late is not believed
@@ -122,7 +108,7 @@ def test_a_rig_of_which_nothing_is_there_has_a_red_line_a_sensor_and_all_of_the_
     assert all(codes(lines[name, "device"]) == ["sensor.failed"] for name in ("lidar", "cam", "sync"))
     assert all(lines[name, "device"].figures["hint"] for name in ("lidar", "cam", "sync"))
     computer = {name for subject, name in lines if subject == "computer"}
-    assert computer == {"python", "packages", "libraries", "disk", "buffer", "clock"}
+    assert computer == {"disk", "clock"}
 
 
 def test_an_absent_camera_keeps_nothing_else_from_being_looked_at(tmp_path: Path) -> None:
@@ -132,38 +118,9 @@ def test_an_absent_camera_keeps_nothing_else_from_being_looked_at(tmp_path: Path
     with attach(attached, tmp_path) as (reached, web_port):
         lines, *_ = doctor_until_scanned(reached, tmp_path, web_port)
     assert lines["cam", "device"].severity == "error" and ("cam", "stream") not in lines
-    assert lines["lidar", "device"].severity == "note" and lines["lidar", "board"].severity == "note"
+    assert lines["lidar", "device"].severity == "note"
     # The profile promises a clock tied by hardware.
     assert lines["lidar", "PPS"].severity == "error"
     assert "clock.pps_not_locked" in codes(lines["lidar", "PPS"])
     assert lines["sync", "device"].severity == "note"
     assert worst(found for check in lines.values() for found in check.findings) == "error"
-
-
-def test_a_picture_without_a_board_says_what_to_show(tmp_path: Path) -> None:
-    rig = make_rig(sync=None)
-    pixels = picture_of(rig.board.to_board())
-    pixels[:, :200] = 120
-    with attach(Attached(rig, pixels, has_board=False), tmp_path) as (reached, web_port):
-        for watch_s in (1.0, 3.0, 9.0):  # A busy computer may start the camera's program late.
-            lines = doctor(reached, tmp_path, web_port, watch_s)
-            if ("cam", "board") in lines:
-                break
-    (missing,) = lines["cam", "board"].findings
-    assert (missing.severity, missing.family) == ("warning", "image") and missing.advice
-
-
-def test_a_camera_of_events_alone_sees_the_board_while_it_moves() -> None:
-    camera = {
-        "resolution_px": (WIDTH_PX, HEIGHT_PX),
-        "intrinsics": {"fx_px": 200.0, "fy_px": 200.0, "cx_px": CENTRE_PX[0], "cy_px": CENTRE_PX[1]},
-        "channels": {"events": {"kind": "events"}},
-    }
-    board = {"inner_corners": (6, 4), "square_m": 0.07, "width_m": 0.546, "height_m": 0.406}
-    rig = make_rig(sync=None, board=board, cameras={"cam": camera})
-    seen = ObservedSensor("cam")
-    seen.take(replace(board_events(Motion(), 1.4, threshold=0.6), sensor="cam"))
-    sight = look_for_boards(rig, {"cam": seen})["cam", "events"]
-    assert sight.code == "board.in_events"
-    # Squares of 70 mm are 14 px wide through a lens of 200 px.
-    assert sight.figures["distance_m"] == pytest.approx(1.0, rel=0.03)

@@ -61,10 +61,7 @@ class WireSyncBoard:
                 due_ns += _S
 
     def _answer(self, line: bytes, came_ns: int) -> None:
-        sentence = read_sentence(line)
-        if not isinstance(sentence, bytes):
-            return
-        words = sentence.split(b",")
+        words = read_sentence(line).split(b",")
         if words[0] == b"LCEHI?":
             os.write(self._master, write_sentence("LCEHI,1,1.0,wire,1000000"))
         elif words[0] == b"LCETM?":

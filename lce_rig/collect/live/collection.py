@@ -32,8 +32,8 @@ from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.collect.worker import Worker
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard
+from lce_rig.devices import edge_cameras
 from lce_rig.devices.disk_writer import DiskWriter
-from lce_rig.devices.opening import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.rig import Rig
 from lce_rig.session import Session

@@ -10,8 +10,7 @@ from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.core.data import Sample
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.losses import Losses
-from lce_rig.devices.protocol import Mailbox
-from lce_rig.devices.reading import AttachedSensors
+from lce_rig.devices.reading import AttachedSensors, Inbox
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
@@ -79,7 +78,7 @@ class FrameFeed:
         self._are_events_enough = are_events_enough
         self._refreshed_s = -1e9
         self._is_slow = False
-        self._frames: Mailbox[Frame] = Mailbox(1)
+        self._frames = Inbox[Frame]()
         self._stop = threading.Event()
         self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="pair samples", daemon=True)
@@ -100,10 +99,10 @@ class FrameFeed:
         Raises:
             LceRigError: the feed cannot go on, such as a profile's network that cannot be used.
         """
-        frame = self._frames.take(timeout_s)
-        if frame is None and self._failure is not None:
+        came = self._frames.take(timeout_s)
+        if came is None and self._failure is not None:
             raise self._failure
-        return frame
+        return None if came is None else came[1]
 
     def _run(self) -> None:
         try:
@@ -119,7 +118,7 @@ class FrameFeed:
             for frame in pair_by_time(
                 samples, self._rig, self.losses, LIVE_NS, are_events_enough=self._are_events_enough
             ):
-                self._frames.put(frame)
+                self._frames.put("pairs", [frame], n_slots=1)
         except BaseException as error:  # The taker of frames learns of bugs as well.
             self._failure = error
             self._frames.close(error if isinstance(error, SourceError) else None)

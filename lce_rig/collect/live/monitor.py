@@ -11,8 +11,7 @@ from lce_rig.collect.live.narration import Narration, image_figures, scan_figure
 from lce_rig.collect.live.state import Cue, Drawing, LiveOptions, LiveState, Phase, Sound, StreamState
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.devices.protocol import SourceStatus
-from lce_rig.devices.reading import AttachedSensors
+from lce_rig.devices.reading import AttachedSensors, SourceStatus
 from lce_rig.session import Session
 from lce_rig.timing.rig_clock import RigClock
 

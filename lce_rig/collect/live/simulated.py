@@ -23,8 +23,7 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert
-from lce_rig.devices.protocol import ClockState, Mailbox, SourceStatus
-from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.reading import ClockState, Inbox, LiveSource, SourceStatus
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
@@ -90,9 +89,9 @@ class SimulatedSource(LiveSource):
     """One simulated sensor; see `LiveSource`."""
 
     def __init__(self, sensor: str, pace: SimulatedPace | None = None) -> None:
-        super().__init__(sensor, sensor, _N_SLOTS, math.inf)
+        super().__init__(sensor, sensor, math.inf)
         self._pace = pace
-        self._mailbox: Mailbox[Image | Scan] = Mailbox(_N_SLOTS)
+        self._taken = Inbox[Image | Scan]()
         self._failure: SourceError | None = None
 
     def open(self) -> None:
@@ -103,23 +102,23 @@ class SimulatedSource(LiveSource):
         """
         if self._failure is not None:
             raise self._failure
-        self._mailbox = Mailbox(_N_SLOTS)
+        self._taken = Inbox()
 
     def read(self) -> list[Image | Scan]:
         """Give what the simulation has put; see `LiveSource`."""
-        sample = self._mailbox.take(_WAIT_S)
-        return [] if sample is None else [sample]
+        came = self._taken.take(_WAIT_S)
+        return [] if came is None else [came[1]]
 
     def close(self) -> None:
         """End."""
-        self._mailbox.close()
+        self._taken.close()
 
     def describe(self) -> SourceStatus:
         """Say how the sensor does."""
         problem = self._pace.problem() if self._pace else None
         return SourceStatus(
             self.sensor,
-            n_lost=self._mailbox.n_dropped,
+            n_lost=self._taken.n_dropped[self.sensor],
             clock=ClockState(CLOCK_SIMULATED()),
             problems=() if problem is None else (problem,),
             device="simulated",
@@ -127,12 +126,12 @@ class SimulatedSource(LiveSource):
 
     def put(self, sample: Image | Scan) -> None:
         """Take a sample of the simulation."""
-        self._mailbox.put(sample)
+        self._taken.put(self.sensor, [sample], _N_SLOTS)
 
     def fail(self, error: SourceError) -> None:
         """End for good."""
         self._failure = error
-        self._mailbox.close(error)
+        self._taken.close(error)
 
 
 class SimulatedRig:

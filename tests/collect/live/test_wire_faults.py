@@ -14,7 +14,7 @@ from wire.rig import WireRig
 
 from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.state import LiveOptions, LiveState
-from lce_rig.devices.opening import open_live
+from lce_rig.devices import open_live
 from lce_rig.session import Session
 from tests.collect.live.sent import check_sent, check_stamps, check_whole, errors, journal_of, read_sent
 
@@ -23,8 +23,8 @@ Start = Callable[..., WireRig]
 # stamps of arrivals left out, which no process can set.
 SET_CLOCK = """
 import os, time
-from lce_rig.devices import udp_port
-udp_port._SO_TIMESTAMPNS = -1
+from lce_rig.devices import vlp16
+vlp16._SO_TIMESTAMPNS = -1
 real_ns = time.time_ns
 time.time_ns = lambda: real_ns() + ({set_ns} if os.path.exists({file!r}) else 0)
 """

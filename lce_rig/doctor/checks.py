@@ -1,5 +1,14 @@
-"""The streams' clocks: what each is tied to, how they lie apart and drift, and whether boards may move."""
+"""Every check: a function that yields findings, first how it is as a note, then what is wrong.
 
+A check of the computer takes the examination, all others the name of a sensor with it. A fault is a warning
+where collecting works, less well, and an error where it does not or its data are wrong.
+"""
+
+import ctypes
+import os
+import shutil
+import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -7,24 +16,176 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.data import Image, Pulse
+from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding, Severity
 from lce_rig.devices.findings import BOARD_NOT_TIED
-from lce_rig.devices.velodyne_web import WebReport
+from lce_rig.devices.velodyne_web import WebReport, find_problems
 from lce_rig.doctor import findings
-from lce_rig.doctor.examination import Examination, driver_of
-from lce_rig.doctor.observing import ObservedSensor
+from lce_rig.doctor.observing import Examination, ObservedSensor
+from lce_rig.rig import Rig
 from lce_rig.rig.sync_settings import BOARD, PPS_LINE
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import fit_arrivals
 from lce_rig.timing.rig_clock import RigClock, edge_line
 from lce_rig.timing.triggers import TriggerMatcher
 
+_PROBE_BYTES, _PROBE_BLOCK_BYTES, _PROBE_S = 48 << 20, 4 << 20, 0.5
+_MB = 1e6
+# A capture is a few MB; raw images of 1280x720 px at 30 Hz are 55 MB/s.
+_MIN_FREE_MB, _SCARCE_MB = 500.0, 5000.0
+_MIN_WRITE_MBPS, _SLOW_WRITE_MBPS = 2.0, 20.0
+# struct timex is 26 longs on 64-bit Linux; its fourth is the largest error, us.
+_TIMEX_LONGS, _MAX_ERROR_LONG, _TIME_ERROR = 32, 3, 5
+# A rotor holds its speed within some tenths of a percent, cameras theirs within a few percent.
+_MAX_OFF_RATE, _MAX_OFF_PULSES = 0.05, 0.02
+_MAX_LOST_SHARE = 0.01
+_STOPPED_S = 1.0
+_US_PER_S = 1e6
 _SIGMA_PER_MAD = 1.4826
-_MAX_OFF_RATE = 0.02
 # Frames and lines come in bursts: how many are still on their way differs.
 _ROOM, _MAX_UNLIKE = 2, 0.01
 _MAX_DRIFT_PPM = 200.0
-_STREAMS = ("scans", "events", "frames")
+
+
+def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
+    """Measure the free space of a folder's disk, and how fast it takes data that are flushed to it."""
+    folder = exam.folder.absolute()
+    folder = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        free_mb = shutil.disk_usage(folder).free / _MB
+        block = os.urandom(_PROBE_BLOCK_BYTES)  # disks that compress are not fooled
+        n_bytes, start_s = 0, time.monotonic()
+        with tempfile.TemporaryFile(dir=folder) as file:
+            # Half a second at most, each block flushed as a capture's files are.
+            while n_bytes < _PROBE_BYTES and time.monotonic() - start_s < _PROBE_S:
+                file.write(block)
+                file.flush()
+                os.fsync(file.fileno())
+                n_bytes += len(block)
+        write_mbps = n_bytes / _MB / max(time.monotonic() - start_s, 1e-9)
+    except OSError as error:
+        yield findings.DISK_NOT_WRITABLE(folder=str(folder), cause=error.strerror)
+        return
+    yield findings.DISK(free_mb=free_mb, write_mbps=write_mbps, folder=str(folder))
+    if free_mb < _SCARCE_MB:
+        yield findings.DISK_FULL(severity="error" if free_mb < _MIN_FREE_MB else "warning")
+    elif write_mbps < _SLOW_WRITE_MBPS:
+        yield findings.DISK_SLOW(severity="error" if write_mbps < _MIN_WRITE_MBPS else "warning")
+
+
+def check_computer_clock(_exam: Examination, _subject: str = "") -> Iterator[Finding]:
+    """Ask the kernel whether something keeps the computer's clock right; a VLP-16's hour is taken from it."""
+    timex = (ctypes.c_long * _TIMEX_LONGS)()
+    state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
+    if state in (-1, _TIME_ERROR):
+        yield findings.COMPUTER_CLOCK_LOOSE()
+    else:
+        yield findings.COMPUTER_CLOCK(max_error_ms=timex[_MAX_ERROR_LONG] / 1000)
+
+
+def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
+    """Report the device that answers, or the reason of its failure."""
+    seen = exam.seen[sensor]
+    if seen.failure is not None:
+        yield findings.FAILED(what=seen.failure.what, hint=seen.failure.hint)
+        return
+    assert seen.status is not None  # a sensor that neither opened nor failed has a failure of its own
+    figures: dict[str, Any] = {"device": seen.status.device, "driver": exam.driver(sensor)}
+    report = exam.web.get(sensor)
+    if isinstance(report, WebReport):
+        figures |= {name: getattr(report, name) for name in ("firmware", "serial")}
+    yield findings.ANSWERS(**figures)
+    yield from exam.problems(sensor, "device")
+
+
+def check_settings(exam: Examination, sensor: str) -> Iterator[Finding]:
+    """Compare what the web page of a VLP-16 says with the profile."""
+    report = exam.web.get(sensor)
+    if isinstance(report, SourceError):
+        # A sensor that sends nothing has a line already, with all there is to check.
+        if exam.seen[sensor].status is not None:
+            yield findings.SETTINGS_UNKNOWN(what=report.what)
+    elif report is not None:
+        names = ("rotor_hz", "returns", "fov_deg", "host", "data_port")
+        figures: dict[str, Any] = {name: getattr(report, name) for name in names}
+        yield findings.SETTINGS(**figures)
+        problems = find_problems(report, exam.rig.lidars[sensor])
+        # The pulse has a line of its own.
+        yield from (problem for problem in problems if problem.figures["setting"] != "PPS")
+
+
+def check_stream(exam: Examination, sensor: str) -> Iterator[Finding]:
+    """Compare a LiDAR's or camera's rates with the profile, and count what was lost."""
+    seen, rig = exam.seen[sensor], exam.rig
+    status = seen.status
+    if status is None:
+        return
+    stream = "scans" if sensor in rig.lidars else "frames"
+    camera = rig.cameras.get(sensor)
+    kinds = {"scans"} if camera is None else {channel.kind for channel in camera.channels.values()}
+    problems = exam.problems(sensor, "stream", "packet", "buffer")
+    if stream in kinds or seen.frames:
+        rate = _rate(exam, seen, stream)
+        yield rate
+        if rate.code == findings.RATE_OFF.code:
+            problems = [each for each in problems if each.code != "stream.rotor_rate"]  # the same once more
+    if "events" in kinds and not seen.n_events:
+        yield findings.NO_EVENTS()
+    elif "events" in kinds:
+        yield findings.EVENT_RATE(events_per_s=seen.n_events / max(seen.watched_s, 1e-9))
+    counts: dict[str, Any] = {
+        "watched_s": seen.watched_s,
+        "n_packets": status.n_packets,
+        "n_lost": status.n_lost,
+        "n_dropped": status.n_dropped,
+    }
+    n_missing = status.n_lost + status.n_dropped
+    if n_missing:
+        n_came = len(seen.stamps.get(stream, ())) if status.n_packets is None else status.n_packets
+        counts["share"] = share = n_missing / (max(n_came, 1) + status.n_lost)
+        severity: Severity = "error" if share > _MAX_LOST_SHARE else "warning"
+        yield findings.LOSSES(**counts, severity=severity, action="named" if problems else "")
+    else:
+        yield findings.COMPLETE(**counts)
+    yield from problems
+
+
+def wanted_rate_hz(rig: Rig, sensor: str, driver: str) -> float | None:
+    """Return how many scans or images a second the profile wants; None where it does not say."""
+    if sensor in rig.lidars:
+        return rig.lidars[sensor].rate_hz
+    settings = rig.cameras[sensor].driver
+    # Pulses cannot trigger a DAVIS, which keeps an interval of its own.
+    if driver == "davis":
+        interval_us = settings.controls.get("frame_interval_us", 0)
+        return _US_PER_S / interval_us if isinstance(interval_us, int | float) and interval_us > 0 else None
+    if rig.sync is not None and sensor in rig.sync.triggers:
+        return rig.sync.triggers[sensor].rate_hz
+    return settings.frame_rate_hz
+
+
+def _rate(exam: Examination, seen: ObservedSensor, stream: str) -> Finding:
+    """Judge how many scans or images a second came.
+
+    A LiDAR's rate is its rotor's speed, by its own clock: scans arrive late on a busy computer.
+    """
+    rate_hz = 0.0 if seen.status is None else seen.status.rates_hz.get("scans", 0.0)
+    if stream != "scans" or not seen.stamps.get(stream) or rate_hz <= 0:
+        _, arrivals = seen.times(stream)
+        span_ns = int(arrivals[-1] - arrivals[0]) if len(arrivals) > 1 else 0
+        rate_hz = 1e9 * (len(arrivals) - 1) / span_ns if span_ns > 0 else 0.0
+    expected_hz = wanted_rate_hz(exam.rig, seen.sensor, exam.driver(seen.sensor))
+    figures: dict[str, Any] = {"stream": stream, "rate_hz": rate_hz, "expected_hz": expected_hz}
+    if rate_hz == 0:
+        return findings.NO_STREAM(**figures)
+    silent_s = (seen.ended_ns - seen.stamps[stream][-1][1]) * 1e-9
+    if silent_s > max(_STOPPED_S, 3 / rate_hz):
+        return findings.STOPPED(**figures, silent_s=silent_s)
+    if expected_hz is None or abs(rate_hz / expected_hz - 1) <= _MAX_OFF_RATE:
+        return findings.RATE(**figures)
+    is_triggered = exam.rig.sync is not None and seen.sensor in exam.rig.sync.triggers
+    action = "rotor" if stream == "scans" else "trigger" if is_triggered else ""
+    return findings.RATE_OFF(**figures, expected_rpm=60 * expected_hz, action=action)
 
 
 def check_clock(exam: Examination, sensor: str) -> Iterator[Finding]:
@@ -73,7 +234,7 @@ def check_pulses_sent(exam: Examination, sensor: str = BOARD) -> Iterator[Findin
             # The driver says that the pulse per second is missing.
             severity: Severity = "note" if line == PPS_LINE else "error"
             yield findings.LINE_NONE(**figures, severity=severity, action=action)
-        elif abs(rate_hz / expected_hz - 1) > _MAX_OFF_RATE:
+        elif abs(rate_hz / expected_hz - 1) > _MAX_OFF_PULSES:
             yield findings.LINE_OFF(**figures, action=action)
         else:
             yield findings.LINE(**figures)
@@ -82,9 +243,9 @@ def check_pulses_sent(exam: Examination, sensor: str = BOARD) -> Iterator[Findin
 
 
 def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
-    """See whether each pulse made a frame of a triggered camera."""
+    """Check that each pulse made one image of a triggered camera, and measure their delay."""
     sync, board, seen = exam.rig.sync, exam.seen.get(BOARD), exam.seen[sensor]
-    is_triggered = sync is not None and sensor in sync.triggers and driver_of(exam.rig, sensor) != "davis"
+    is_triggered = sync is not None and sensor in sync.triggers and exam.driver(sensor) != "davis"
     if sync is None or board is None or not is_triggered or board.status is None or seen.status is None:
         return
     pulses = [pulse for pulse in board.pulses if pulse.sensor == sensor]
@@ -96,13 +257,11 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
         last_ns = min(frames_ns[-1], pulses[-1].host_ns)
         n_frames, n_pulses = (_count(each, first_ns, last_ns) for each in (seen.frames, pulses))
     yield findings.FRAMES_OF_PULSES(n_frames=n_frames, n_pulses=n_pulses)
+    if abs(n_frames - n_pulses) > _ROOM + _MAX_UNLIKE * n_pulses:
+        yield findings.UNEQUAL()
     trigger, clock = sync.triggers[sensor], board.host_clock
     if clock is None or trigger.rate_hz * trigger.max_delay_s >= 1:
-        # `collect` begins with slow pulses then, to tell which is which.
-        yield findings.COUNTED_ONLY()
-        if abs(n_frames - n_pulses) > _ROOM + _MAX_UNLIKE * n_pulses:
-            yield findings.UNEQUAL()
-        return
+        return  # `collect` begins with slow pulses then, to tell which is which.
     matcher, delays_ms = TriggerMatcher(sensor, round(1e9 * trigger.max_delay_s)), list[float]()
     matcher.set_clock(clock.inverse())
     samples: list[Pulse | Image] = sorted([*pulses, *seen.frames], key=lambda sample: sample.host_ns or 0)
@@ -110,16 +269,12 @@ def check_frames_of_pulses(exam: Examination, sensor: str) -> Iterator[Finding]:
         take = matcher.take_pulse if isinstance(sample, Pulse) else matcher.take_image
         for matched in take(sample):  # type: ignore[arg-type]
             delays_ms.append(((matched.image.stamp_ns or 0) - clock.convert(matched.pulse_ns)) * 1e-6)
-    counts: dict[str, Any] = matcher.figures()
-    if matcher.problem is not None or not delays_ms:
-        yield findings.NOT_MATCHED(**counts)
-        yield from [matcher.problem] if matcher.problem is not None else []
-        return
-    middle_ms = float(np.median(delays_ms))
-    scatter_ms = _SIGMA_PER_MAD * float(np.median(np.abs(np.array(delays_ms) - middle_ms)))
-    yield findings.DELAY(**counts, delay_ms=middle_ms, delay_scatter_ms=scatter_ms)
-    if matcher.counts["n_slips"] or matcher.counts["n_missed"]:
-        yield findings.MISSED(**counts)
+    if delays_ms:
+        middle_ms = float(np.median(delays_ms))
+        scatter_ms = _SIGMA_PER_MAD * float(np.median(np.abs(np.array(delays_ms) - middle_ms)))
+        yield findings.DELAY(delay_ms=middle_ms, delay_scatter_ms=scatter_ms)
+    if matcher.problem is not None:
+        yield matcher.problem
 
 
 def _count(samples: Sequence[Pulse | Image], first_ns: int, last_ns: int) -> int:
@@ -131,7 +286,7 @@ def _count(samples: Sequence[Pulse | Image], first_ns: int, last_ns: int) -> int
 def check_edges(exam: Examination, sensor: str) -> Iterator[Finding]:
     """Fit the clock of a camera that sees the board's pulses to them."""
     board, seen = exam.seen.get(BOARD), exam.seen[sensor]
-    is_davis = driver_of(exam.rig, sensor) == "davis"
+    is_davis = exam.driver(sensor) == "davis"
     if not is_davis or seen.status is None or board is None or board.status is None:
         return
     line = edge_line(exam.rig, sensor)
@@ -177,10 +332,8 @@ def check_offsets(exam: Examination, _subject: str = "") -> Iterator[Finding]:
 
 def _by_arrivals(exam: Examination, seen: ObservedSensor) -> ClockModel | None:
     """Fit this computer's time on a sensor's clock; None of timestamps that are arrivals themselves."""
-    stream = next((name for name in _STREAMS if name in seen.stamps), None)
-    if stream is None or seen.status is None or driver_of(exam.rig, seen.sensor) == "command":
-        return None
-    if stream == "scans" and not _is_utc(seen):
+    stream = next((name for name in ("scans", "events", "frames") if name in seen.stamps), None)
+    if stream is None or exam.driver(seen.sensor) == "command" or (stream == "scans" and not seen.is_utc):
         return None
     stamps, arrivals = seen.times(stream)
     # A LiDAR's first scans may be stamped by arrival yet, until its position packets have come.
@@ -192,7 +345,7 @@ def _by_arrivals(exam: Examination, seen: ObservedSensor) -> ClockModel | None:
 def check_sync(exam: Examination, _subject: str = "") -> Iterator[Finding]:
     """Judge whether boards may move while they are captured; absent sensors do not count."""
     rig, verdict = exam.rig, tie(exam).verdict()
-    absent = [sensor for sensor, seen in exam.seen.items() if not seen.has_opened]
+    absent = [sensor for sensor, seen in exam.seen.items() if seen.status is None]
     if not verdict.requires_still_boards:
         yield from [] if absent else [verdict.finding]
         return
@@ -213,10 +366,10 @@ def tie(exam: Examination) -> RigClock:
     """Put every sensor that can be onto the rig's clock, as `collect` does with the same samples."""
     board = exam.seen.get(BOARD)
     has_board = board is not None and board.status is not None
-    cameras = [name for name in exam.rig.cameras if driver_of(exam.rig, name) == "davis"]
+    cameras = [name for name in exam.rig.cameras if exam.driver(name) == "davis"]
     clock = RigClock(exam.rig, has_board=has_board, edge_cameras=cameras)
     models = (None, None) if board is None else (board.host_clock, board.utc_clock)
-    locked = [name for name, seen in exam.seen.items() if _is_utc(seen)]
+    locked = [name for name, seen in exam.seen.items() if seen.is_utc]
     clock.refresh(*models, locked)
     came: list[tuple[str, Pulse | Image]] = []
     for name, seen in exam.seen.items():
@@ -225,7 +378,3 @@ def tie(exam: Examination) -> RigClock:
         clock.take(name, sample)
     clock.refresh(*models, locked)
     return clock
-
-
-def _is_utc(seen: ObservedSensor) -> bool:
-    return seen.status is not None and seen.status.clock is not None and seen.status.clock.is_utc
