@@ -93,7 +93,7 @@ def export(
     pairs = lce.read_result(opened.path.joinpath(*result_parts(name), RESULT)).pairs
     if output is not None:
         from lce_rig.export import export_formats
-        from lce_rig.export.robot_files import read_robot
+        from lce_rig.export.urdf import read_robot
 
         robot = None if tree is None else read_robot(tree)
         output.mkdir(parents=True, exist_ok=True)
@@ -106,7 +106,7 @@ def export(
             (show.note if finding.severity == "note" else show.warn)(finding.sentence)
         return
     from lce_rig.export import require_usable
-    from lce_rig.export.robot_files import write_into_urdf
+    from lce_rig.export.urdf import write_into_urdf
 
     assert into is not None
     require_usable(pairs, is_forced=force)

@@ -26,7 +26,7 @@ class Format:
     """A form of output.
 
     Attributes:
-        home: module and function, imported when used.
+        home: module of this package and function, imported when used.
         about: its files and their purpose, one line.
         is_usual: whether it is written unless others are named.
     """
@@ -42,46 +42,37 @@ def _usual(home: str, about: str) -> Format:
 
 EXPORTS: dict[str, Format] = {
     "extrinsics": _usual(
-        "lce_rig.export.extrinsics:export_extrinsics",
-        "extrinsics.yaml: pose, inverse, example point, covariance",
+        "extrinsics:export_extrinsics", "extrinsics.yaml: pose, inverse, example point, covariance"
     ),
-    "urdf": _usual("lce_rig.export.urdf:export_urdf", "RIG.urdf: for robot_state_publisher"),
+    "urdf": _usual("urdf:export_urdf", "RIG.urdf: for robot_state_publisher"),
     "camera_info": _usual(
-        "lce_rig.export.camera_info:export_camera_info", "camera_info_CAMERA.yaml: for ROS camera drivers"
+        "camera_info:export_camera_info", "camera_info_CAMERA.yaml: for ROS camera drivers"
     ),
     "static_tf": _usual(
-        "lce_rig.export.static_tf:export_static_tf",
-        "static_transforms.txt: static_transform_publisher lines, ROS 1 and 2",
+        "static_tf:export_static_tf", "static_transforms.txt: static_transform_publisher lines, ROS 1 and 2"
     ),
-    "ros2_launch": Format(
-        "lce_rig.export.static_tf:export_ros2_launch", "RIG.launch.py: a ROS 2 launch file"
-    ),
+    "ros2_launch": Format("static_tf:export_ros2_launch", "RIG.launch.py: a ROS 2 launch file"),
     "tf_static_bag": Format(
-        "lce_rig.export.ros_bag:export_tf_static_bag", "tf_static/: a ROS 2 bag with latched /tf_static"
+        "ros_bag:export_tf_static_bag", "tf_static/: a ROS 2 bag with latched /tf_static"
     ),
-    "kalibr": _usual("lce_rig.export.kalibr:export_kalibr", "camchain_LIDAR.yaml: Kalibr's camera chain"),
+    "kalibr": _usual("other_tools:export_kalibr", "camchain_LIDAR.yaml: Kalibr's camera chain"),
     "autoware": _usual(
-        "lce_rig.export.autoware:export_autoware",
+        "autoware:export_autoware",
         "sensor_kit_calibration.yaml, sensors_calibration.yaml: Autoware's individual_params",
     ),
     "fast_livo2": Format(
-        "lce_rig.export.fast_livo2:export_fast_livo2",
+        "other_tools:export_fast_livo2",
         "fast_livo2_CAMERA.yaml (Rcl, Pcl), fast_livo2_camera_CAMERA.yaml: FAST-LIVO2",
     ),
-    "koide3": Format(
-        "lce_rig.export.koide3:export_koide3", "calib_CAMERA.json: direct_visual_lidar_calibration"
-    ),
-    "opencv": Format("lce_rig.export.opencv:export_opencv", "opencv_CAMERA.yaml: for cv::FileStorage"),
-    "isaac": Format("lce_rig.export.urdf:export_isaac", "isaac_calibration.urdf: Isaac ROS; needs base_link"),
+    "koide3": Format("other_tools:export_koide3", "calib_CAMERA.json: direct_visual_lidar_calibration"),
+    "opencv": Format("other_tools:export_opencv", "opencv_CAMERA.yaml: for cv::FileStorage"),
+    "isaac": Format("urdf:export_isaac", "isaac_calibration.urdf: Isaac ROS; needs base_link"),
     "mcap": Format(
-        "lce_rig.export.ros_bag:export_mcap",
-        "RIG_session/: the session for Foxglove and RViz, with projected clouds",
+        "ros_bag:export_mcap", "RIG_session/: the session for Foxglove and RViz, with projected clouds"
     ),
-    "ply": Format(
-        "lce_rig.export.coloured_cloud:export_ply", "coloured_CAMERA.ply: coloured points of all captures"
-    ),
+    "ply": Format("coloured_cloud:export_ply", "coloured_CAMERA.ply: coloured points of all captures"),
     "ply_captures": Format(
-        "lce_rig.export.coloured_cloud:export_ply_captures", "coloured_CAMERA_CAPTURE.ply: of each capture"
+        "coloured_cloud:export_ply_captures", "coloured_CAMERA_CAPTURE.ply: of each capture"
     ),
 }
 
@@ -94,7 +85,7 @@ def load_exporter(name: str) -> Exporter:
     """
     if name not in EXPORTS:
         raise UsageError(f"no export format is called {name}", f"Choose one of: {', '.join(EXPORTS)}")
-    exporter: Exporter = resolve_name(EXPORTS[name].home)
+    exporter: Exporter = resolve_name(f"lce_rig.export.{EXPORTS[name].home}")
     return exporter
 
 

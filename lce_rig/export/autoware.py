@@ -15,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from lce_rig.core.geometry import Array, invert, pose
-from lce_rig.export.files import number, quoted
 from lce_rig.export.findings import NO_FRAME
 from lce_rig.export.job import ExportJob
 from lce_rig.export.robot_tree import FrameTree, RobotTree
-from lce_rig.export.rotations import rpy
+from lce_rig.export.writing import number, quoted, rpy
 
 KIT, BASE = "sensor_kit_base_link", "base_link"
 KIT_FILE, BASE_FILE = "sensor_kit_calibration.yaml", "sensors_calibration.yaml"

@@ -8,8 +8,8 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError
-from lce_rig.export.files import numbers, quoted
 from lce_rig.export.job import ExportJob
+from lce_rig.export.writing import numbers, quoted
 from lce_rig.session.durable import write_atomically
 
 

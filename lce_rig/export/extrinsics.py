@@ -6,9 +6,8 @@ import numpy as np
 
 from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.export.files import number, numbers, quoted, rows, texts
 from lce_rig.export.job import ExportJob
-from lce_rig.export.rotations import quaternion_wxyz
+from lce_rig.export.writing import number, numbers, quaternion_wxyz, quoted, rows, texts
 from lce_rig.rig import Rig
 
 

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lce_rig.export.files import number
 from lce_rig.export.job import ExportJob
 from lce_rig.export.robot_tree import Joint
-from lce_rig.export.rotations import quaternion_wxyz
+from lce_rig.export.writing import number, quaternion_wxyz
 
 _OPTIONS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 

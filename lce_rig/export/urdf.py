@@ -1,18 +1,38 @@
-"""URDF: LiDAR, camera body and optical frame as links, the calibration as fixed joints.
+"""URDF: calibrated sensors as links and fixed joints, in a file of their own or in the robot's.
+
+The robot's tree of frames is read from its URDF or from a recording. An edited URDF keeps its comments, its
+order and everything else.
 
 References:
     https://nvidia-isaac-ros.github.io/robots/isaac_urdf_requirements (base_link; body and optical frames)
 """
 
+import re
+from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
+from xml.etree import ElementTree
+from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-from lce_rig.export.files import number
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lce_rig.core.calibration import MADE_BY, Calibration
+from lce_rig.core.errors import SessionError, SourceError, reading
+from lce_rig.core.geometry import pose
 from lce_rig.export.findings import NO_FRAME
 from lce_rig.export.job import ExportJob
-from lce_rig.export.robot_tree import FrameTree, Joint
-from lce_rig.export.rotations import RPY_BODY_OPTICAL, rpy
+from lce_rig.export.robot_tree import FrameTree, Joint, JointChange, RobotTree, fit_tree
+from lce_rig.export.writing import RPY_BODY_OPTICAL, number, rpy
+from lce_rig.rig import Rig
+from lce_rig.session.durable import write_atomically
 
+_TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+# Rounding of the float64 that ROS writes is far below; a quaternion that differs more is no rotation.
+_UNIT_TOLERANCE = 1e-3
+_ORIGIN = re.compile(rb"""<origin\b(?:[^>"']|"[^"]*"|'[^']*')*>""")
+_TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _ISAAC_FILE, _ISAAC_BASE = "isaac_calibration.urdf", "base_link"
 
 
@@ -66,3 +86,180 @@ def origin(joint: Joint) -> str:
     xyz = " ".join(number(value) for value in joint.T_parent_child[:3, 3])
     turn = " ".join(number(value) for value in angles)
     return f'<origin xyz="{xyz}" rpy="{turn}"/>'
+
+
+def read_robot(path: Path) -> RobotTree:
+    """Read a robot's tree from its URDF, or from the static transforms of a recording.
+
+    Raises:
+        SessionError: the file cannot be read, or its frames are not a tree.
+        SourceError: the recording cannot be read or has no static transforms.
+    """
+    if path.suffix.lower() in (".urdf", ".xml", ".xacro"):
+        return read_robot_urdf(path)
+    return read_robot_bag(path)
+
+
+def read_robot_bag(path: Path) -> RobotTree:
+    """Read the transforms on /tf_static of a ROS 1 bag, a ROS 2 bag or an mcap file.
+
+    Of several transforms to one frame the last counts, as in tf.
+
+    Raises:
+        SourceError: the bag cannot be read, is damaged, or has no static transforms.
+        SessionError: a frame has two parents, or the frames make a loop; or a transform is not rigid.
+    """
+    from lce_rig.io.ros.bag_file import BagFile, list_topics
+    from lce_rig.io.ros.messages import deserialize
+
+    bag = BagFile(path)
+    topics = [
+        topic for topic, (kind, _) in bag.topics.items() if topic.endswith("tf_static") and kind in _TF_TYPES
+    ]
+    joints: dict[tuple[str, str], Joint] = {}
+    for message in bag.messages(topics):
+        with reading(path):
+            transforms = deserialize(message).transforms
+        for stamped in transforms:
+            # tf began names with a slash, tf2 does not.
+            frames = stamped.header.frame_id.removeprefix("/"), stamped.child_frame_id.removeprefix("/")
+            t, q = stamped.transform.translation, stamped.transform.rotation
+            xyz, xyzw = np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w])
+            if not (np.isfinite(xyz).all() and abs(np.linalg.norm(xyzw) - 1) < _UNIT_TOLERANCE):
+                raise SessionError(f"{path}: the static transform to {frames[1]} is not rigid")
+            joints.pop(frames, None)
+            joints[frames] = Joint(*frames, pose(Rotation.from_quat(xyzw).as_matrix(), xyz))
+    if not joints:
+        raise SourceError(f"{path} has no static transforms (/tf_static)", list_topics(bag.topics))
+    return RobotTree.of_joints(str(path), [*joints.values()], has_one_root=False)
+
+
+def read_robot_urdf(path: Path) -> RobotTree:
+    """Read a robot's tree of frames from its URDF.
+
+    Raises:
+        SessionError: the file cannot be read or is no URDF; xacro has to be expanded first.
+    """
+    return _parse(path, _read(path))
+
+
+def _read(path: Path) -> bytes:
+    with reading(path, SessionError):
+        return path.read_bytes()
+
+
+def _parse(path: Path, text: bytes) -> RobotTree:
+    if b"xacro:" in text or b"${" in text:
+        hint = f"Expand it first: `xacro {path.name} > robot.urdf`. Then copy the figures back by hand."
+        raise SessionError(f"{path} is xacro, not URDF", hint)
+    joints = []
+    with reading(path, SessionError, "Give the robot's URDF."):
+        robot = ElementTree.fromstring(text)
+        if robot.tag != "robot" or b"\0" in text:
+            raise ValueError("it is not a URDF in UTF-8")
+        links = [link.attrib["name"] for link in robot.iterfind("link")]
+        for joint in robot.iterfind("joint"):
+            name = joint.attrib["name"]
+            parent, child = (
+                element.attrib["link"] for end in ("parent", "child") for element in joint.findall(end)
+            )
+            element = joint.find("origin")
+            figures = {} if element is None else element.attrib
+            xyz, angles = (np.array(figures.get(key, "0 0 0").split(), np.float64) for key in ("xyz", "rpy"))
+            if not (xyz.shape == angles.shape == (3,) and np.isfinite([xyz, angles]).all()):
+                raise ValueError(f"the origin of joint {name} is not six finite numbers")
+            T = pose(Rotation.from_euler("xyz", angles).as_matrix(), xyz)
+            joints.append(Joint(parent, child, T, joint.attrib["type"] == "fixed", name))
+    return RobotTree.of_joints(str(path), joints, links)
+
+
+def write_into_urdf(
+    path: Path, calibrations: Sequence[Calibration], rig: Rig, now: datetime
+) -> tuple[Path | None, list[JointChange]]:
+    """Replace or add the joints of calibrated sensors in a robot's URDF; its earlier text stays beside it.
+
+    Args:
+        path: the robot's URDF; of a link, the file that it leads to is replaced in one step.
+        calibrations: of the rig's sensors.
+        rig: the profile, which names the frames.
+        now: names the backup, path.urdf.2026-11-22T101500.bak.
+
+    Returns:
+        The file with the earlier text, None where nothing had to change, and the joints that are new or
+        moved.
+
+    Raises:
+        SessionError: it is not a URDF, does not fit (`fit_tree`), or cannot be written; it is unchanged.
+    """
+    before = _read(path)
+    tree = _parse(path, before)
+    _, changes, _ = fit_tree(tree, calibrations, rig)
+    changes = [change for change in changes if change.is_real]
+    if not changes:
+        return None, []
+    after = _edited(before, changes, tree)
+    path = path.resolve()
+    backup = path.with_name(f"{path.name}.{now:%Y-%m-%dT%H%M%S}.bak")
+    while backup.exists():  # a second one within the same second
+        backup = backup.with_name(f"{backup.name.removesuffix('.bak')}+.bak")
+    write_atomically(backup, before)
+    write_atomically(path, after)
+    return backup, changes
+
+
+def _edited(text: bytes, changes: Sequence[JointChange], tree: RobotTree) -> bytes:
+    """Change the origins of joints, and add new ones before the end of the robot."""
+    places = _find_joints(text)
+    edits = []
+    added = []
+    for change in changes:
+        joint = change.joint
+        if joint.child in tree.above:
+            start, end = places[tree.above[joint.child].name]
+            edits.append(_origin_edit(text, start, end, joint))
+        else:
+            added += [f"  <link name={quoteattr(joint.child)}/>", *joint_lines(joint)]
+    if added:
+        end = text.rindex(b"</robot")
+        lines = [f"  <!-- added by {MADE_BY} -->", *added]
+        # References to characters hold in whatever encoding the file declares.
+        edits.append((end, end, ("\n".join(lines) + "\n").encode("ascii", "xmlcharrefreplace")))
+    for start, end, new in sorted(edits, reverse=True):
+        text = text[:start] + new + text[end:]
+    return text
+
+
+def _find_joints(text: bytes) -> dict[str, tuple[int, int]]:
+    """Find the first and last byte of each joint below the robot, by its name."""
+    parser = expat.ParserCreate()
+    depth, begun, places = 0, ("", 0), {}
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth, begun
+        depth += 1
+        if tag == "joint" and depth == 2:
+            begun = attributes["name"], parser.CurrentByteIndex
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        if tag == "joint" and depth == 2:
+            places[begun[0]] = begun[1], parser.CurrentByteIndex
+        depth -= 1
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(text, True)
+    return places
+
+
+def _origin_edit(text: bytes, start: int, end: int, joint: Joint) -> tuple[int, int, bytes]:
+    """Replace the origin of a joint, or put one behind its opening tag; comments are no origins."""
+    blanked = re.sub(rb"<!--.*?-->", lambda comment: b" " * len(comment.group()), text[start:end], flags=re.S)
+    old = _ORIGIN.search(blanked)
+    if old is None:
+        tag = _TAG.match(blanked)
+        assert tag is not None
+        return start + tag.end(), start + tag.end(), b"\n    " + origin(joint).encode()
+    new = origin(joint).encode()
+    if not old.group().endswith(b"/>"):
+        new = new.removesuffix(b"/>") + b">"
+    return start + old.start(), start + old.end(), new

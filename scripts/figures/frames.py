@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from lce_rig.core.geometry import Array
-from lce_rig.export.robot_files import read_robot_urdf
+from lce_rig.export.urdf import read_robot_urdf
 
 _COLOURS = ("#e5484d", "#2b9a3e", "#2f6fdb")
 _CAMERA_FRAMES = ("camera_link", "camera_optical_frame")

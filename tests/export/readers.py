@@ -22,7 +22,7 @@ from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.export import EXPORTS, export_formats
-from lce_rig.export.lens import fit_coefficients
+from lce_rig.export.other_tools import fit_coefficients
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.poses import Mount
 from lce_rig.session import Session

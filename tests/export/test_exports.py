@@ -19,10 +19,10 @@ from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.export import EXPORTS, export, export_formats
 from lce_rig.export.camera_info import load_camera_info
-from lce_rig.export.lens import fit_coefficients
-from lce_rig.export.robot_files import read_robot_urdf
+from lce_rig.export.other_tools import fit_coefficients
 from lce_rig.export.robot_tree import Joint, RobotTree, build_trees
-from lce_rig.export.rotations import T_BODY_OPTICAL
+from lce_rig.export.urdf import read_robot_urdf
+from lce_rig.export.writing import T_BODY_OPTICAL
 from lce_rig.rig import Rig
 from tests.export.conftest import reason
 from tests.export.readers import probe_points

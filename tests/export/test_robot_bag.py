@@ -15,9 +15,9 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, SessionError, SourceError
 from lce_rig.core.geometry import Array, pose
 from lce_rig.export import export, export_formats
-from lce_rig.export.robot_files import read_robot, read_robot_bag
 from lce_rig.export.robot_tree import build_trees, fit_tree
-from lce_rig.export.rotations import R_BODY_OPTICAL
+from lce_rig.export.urdf import read_robot, read_robot_bag
+from lce_rig.export.writing import R_BODY_OPTICAL
 from lce_rig.rig import Rig
 from lce_rig.rig.poses import Mount
 

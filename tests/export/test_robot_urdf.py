@@ -13,8 +13,8 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.export import export
-from lce_rig.export.robot_files import read_robot_urdf, write_into_urdf
 from lce_rig.export.robot_tree import fit_tree
+from lce_rig.export.urdf import read_robot_urdf, write_into_urdf
 from lce_rig.rig import Rig
 from lce_rig.rig.poses import Mount
 

@@ -14,7 +14,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
 from lce_rig.core.phrasing import as_line
 from lce_rig.detect.detection import Pair
-from lce_rig.export.rotations import T_BODY_OPTICAL, rpy
+from lce_rig.export.writing import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words, weakest_words
 from lce_rig.rig import Rig
 from lce_rig.session import Session
