@@ -168,7 +168,7 @@ def check_profile(file: str, as_json: bool) -> None:
 
     try:
         rig = load_rig(file)
-        check_networks(rig, file)
+        check_networks(rig)
     except ProfileError as error:
         if as_json:
             problems = error.hint.splitlines() if error.hint else [error.what]

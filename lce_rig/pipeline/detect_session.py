@@ -4,8 +4,9 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -54,28 +55,29 @@ def detect(
     scan_jobs = [(each.capture, lidar) for each in held for lidar in each.lidars]
     image_jobs = [(each.capture, camera, channel) for each in held for camera, channel in each.images]
     event_jobs = [(each.capture, camera, channel) for each in held for camera, channel in each.events]
-    total = len(scan_jobs) + len(image_jobs) + len(event_jobs)
+    n_scans, total = len(scan_jobs), len(scan_jobs) + len(image_jobs) + len(event_jobs)
     images: dict[Key, dict[str, ImageDetection]] = {}
     lidars: dict[str, dict[str, LidarDetection]] = {}
 
     def find_in_events(job: tuple[Capture, str, str]) -> ImageDetection:
         name = job[0].name
-        scans = {lidar: found[name] for lidar, found in lidars.items() if name in found}
-        return finder.events(*job, scans=scans)
+        return finder.events(*job, scans={lidar: by[name] for lidar, by in lidars.items() if name in by})
+
+    def counted(results: Iterable[_Found], n_before: int, total: int) -> Iterator[_Found]:
+        for n_done, result in enumerate(results, start=n_before + 1):
+            yield result
+            progress(n_done, total)
 
     with ThreadPoolExecutor(n_threads) as pool:
         scanned = pool.map(lambda job: finder.scan(*job), scan_jobs)
-        for (capture, lidar), scan in _counted(scan_jobs, scanned, progress, 0, total):
+        for (capture, lidar), scan in zip(scan_jobs, counted(scanned, 0, total), strict=True):
             lidars.setdefault(lidar, {})[capture.name] = scan
         # The LiDAR's detection gives the time for the images from events.
         pictured = pool.map(lambda job: finder.image(*job), image_jobs)
         developed = pool.map(find_in_events, event_jobs)
-        for jobs, seen, n_before in (
-            (image_jobs, pictured, len(scan_jobs)),
-            (event_jobs, developed, len(scan_jobs) + len(image_jobs)),
-        ):
-            for (capture, camera, channel), image in _counted(jobs, seen, progress, n_before, total):
-                images.setdefault((camera, channel), {})[capture.name] = image
+        seen = counted(chain(pictured, developed), n_scans, total)
+        for (capture, camera, channel), image in zip([*image_jobs, *event_jobs], seen, strict=True):
+            images.setdefault((camera, channel), {})[capture.name] = image
         detections = Detections(images, lidars)
         again = [
             (each.capture, lidar, poses)
@@ -86,7 +88,7 @@ def detect(
         if again:
             begin(progress, "searching about predicted places")
         looked = pool.map(lambda job: finder.look(*job), again)
-        for (capture, lidar, _), found in _counted(again, looked, progress, 0, len(again)):
+        for (capture, lidar, _), found in zip(again, counted(looked, 0, len(again)), strict=True):
             before = lidars[lidar][capture.name]
             if not isinstance(found, Refusal):
                 lidars[lidar][capture.name] = [*found, *(before if isinstance(before, list) else [])]
@@ -109,14 +111,6 @@ def event_picture(
     finder = _Finder(session, event_image)
     scans = {lidar: finder.scan(capture, lidar) for lidar in capture.lidars}
     return finder.picture(capture, camera, channel, scans=scans)
-
-
-def _counted(
-    jobs: list[Any], results: Iterable[Any], progress: Progress, n_before: int, total: int
-) -> Iterator[tuple[Any, Any]]:
-    for done, job_and_result in enumerate(zip(jobs, results, strict=True), start=n_before + 1):
-        yield job_and_result
-        progress(done, total)
 
 
 class _Held(NamedTuple):
@@ -287,7 +281,7 @@ def see_events(
         event_image: replaces the profile's method.
 
     Raises:
-        ProfileError: the network cannot be used; with file and key.
+        ProfileError: the network cannot be used.
         SessionError: the capture is damaged.
     """
     from lce_rig.detect.events.figures import sweep_time_s
@@ -296,26 +290,16 @@ def see_events(
     stamp_ns = picture_stamp_ns(rig, capture, camera, channel, lidars)
     if stamp_ns is None:
         stamp_ns = int(events.t_ns[-1]) if len(events) else 0
-    settings = rig.cameras[camera].channels[channel].reconstruction
-    try:
-        return find_event_board(
-            events,
-            stamp_ns,
-            reconstructor_for(settings, channel, event_image),
-            rig.board.to_board(),
-            rig.cameras[camera].to_intrinsics(),
-            rig.quality,
-            sweep_s=next(
-                (
-                    sweep_time_s(found[0], 1 / rig.lidars[name].rate_hz)
-                    for name, found in lidars.items()
-                    if isinstance(found, list) and found
-                ),
-                None,
-            ),
-        )
-    except ProfileError as error:
-        raise _in_profile(str(session.path / "rig.yaml"), camera, channel, error) from error
+    boards = [(name, found[0]) for name, found in lidars.items() if isinstance(found, list) and found]
+    return find_event_board(
+        events,
+        stamp_ns,
+        reconstructor_for(rig.cameras[camera].channels[channel].reconstruction, channel, event_image),
+        rig.board.to_board(),
+        rig.cameras[camera].to_intrinsics(),
+        rig.quality,
+        sweep_s=sweep_time_s(boards[0][1], 1 / rig.lidars[boards[0][0]].rate_hz) if boards else None,
+    )
 
 
 def picture_stamp_ns(
@@ -353,7 +337,7 @@ def event_digest(
         base: inputs of all detections.
 
     Raises:
-        ProfileError: the network's file cannot be read; with file and key.
+        ProfileError: the network's file cannot be read.
     """
     from lce_rig.detect.events.reconstruct import model_bytes
 
@@ -361,33 +345,17 @@ def event_digest(
     settings = settings.model_copy(update={"method": event_image or settings.method})
     digest = hashlib.sha256(f"{base} {settings.model_dump_json()}".encode())
     if settings.method == "network":
-        try:
-            digest.update(model_bytes(None if settings.model is None else Path(settings.model)))
-        except ProfileError as error:
-            raise _in_profile(str(session.path / "rig.yaml"), camera, channel, error) from error
+        digest.update(model_bytes(None if settings.model is None else Path(settings.model)))
     return digest.hexdigest()[:12]
 
 
-def check_networks(rig: Rig, source: str) -> None:
+def check_networks(rig: Rig) -> None:
     """Check that every network that a profile names is usable.
 
-    Args:
-        rig: the profile.
-        source: its file, for errors.
-
     Raises:
-        ProfileError: one is not; with file and key.
+        ProfileError: one is not.
     """
-    for camera, settings in rig.cameras.items():
-        for channel, stream in settings.channels.items():
-            if stream.reconstruction is not None and stream.reconstruction.model is not None:
-                try:
-                    reconstructor_for(stream.reconstruction, channel)
-                except ProfileError as error:
-                    raise _in_profile(source, camera, channel, error) from error
-
-
-def _in_profile(source: str, camera: str, channel: str, error: ProfileError) -> ProfileError:
-    """Add the file and the key to an error about a network."""
-    key = f"cameras.{camera}.channels.{channel}.reconstruction.model"
-    return ProfileError(f"{source}: {key}: {error.what}", error.hint)
+    for camera in rig.cameras.values():
+        for name, channel in camera.channels.items():
+            if channel.reconstruction is not None and channel.reconstruction.model is not None:
+                reconstructor_for(channel.reconstruction, name)

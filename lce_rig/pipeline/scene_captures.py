@@ -108,26 +108,16 @@ class SceneCaptures:
         captures = evenly(session.captures, MAX_CAPTURES * len(self._pairs))
         for done, capture in enumerate(captures, start=1):
             progress(done, len(captures))
-            images: list[Image] = []
-            scans: list[Scan] = []
-            cuts: list[EventCut] = []
-            keys: Sequence[tuple[str, str]] = ()
-            # A damaged file costs its own sensor only, a damaged manifest the capture.
-            with suppress(SessionError):
-                keys = [key for key in capture.image_keys if key[0] in cameras]
-            for key in keys:
-                with suppress(SessionError):
-                    images.append(capture.image(*key))
-            for lidar in lidars:
-                with suppress(SessionError):
-                    scans.append(capture.scan(lidar))
-            for camera in cameras:
-                with suppress(SessionError):
-                    if camera in capture.event_cameras and len(events := capture.events(camera)):
+            with suppress(SessionError):  # A damaged one is skipped.
+                images = [capture.image(*key) for key in capture.image_keys if key[0] in cameras]
+                scans = [capture.scan(lidar) for lidar in capture.lidars if lidar in lidars]
+                cuts = []
+                for camera in cameras.intersection(capture.event_cameras):
+                    if len(events := capture.events(camera)):
                         offset_ns = rig_offset_ns(stream_of(events, self._rig), self._rig)
                         first_ns, last_ns = int(events.t_ns[0]), int(events.t_ns[-1])
                         cuts.append(EventCut((events,), first_ns, last_ns + 1, offset_ns, 0))
-            self._take(capture.name, images, scans, cuts)
+                self._take(capture.name, images, scans, cuts)
 
     def take_recordings(self, paths: Sequence[Path], progress: Progress) -> None:
         """Read recordings: pairs of images and point clouds, or streams, whose scans are paired by time.
