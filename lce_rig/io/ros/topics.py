@@ -1,6 +1,6 @@
 """A bag's topics: their assignment to the sensors of a rig, and a survey of them for a new profile."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -74,24 +74,14 @@ def choose_topics(
         SourceError: a topic that was asked for is not there or of another type, or no image or point cloud is
             left; the hint lists the topics that are there.
     """
-    there = list_topics(topics)
-    targets = [
-        (Target(name, channel, settings.kind == "events"), settings.topic)
-        for name, camera in rig.cameras.items()
-        for channel, settings in camera.channels.items()
-    ]
-    targets += [(Target(name, None), lidar.topic) for name, lidar in rig.lidars.items()]
-    # "cam.events", "lidar", and "cam" for the first channel of a camera.
-    by_name = {str(target): target for target, _ in targets}
-    for name, camera in rig.cameras.items():
-        by_name[name] = by_name[f"{name}.{next(iter(camera.channels))}"]
-    unknown = sorted(set(options.topics) - set(by_name))
-    if unknown:
-        sensors = ", ".join(sorted(by_name))
-        raise SourceError(f"rig {rig.name!r} has no sensor {unknown[0]!r}; it has {sensors}")
-    asked = {by_name[name]: topic for name, topic in options.topics.items()}
-    chosen: dict[str, Target] = {}
-    for target, profile_topic in targets:
+    targets, asked = _list_targets(rig, options)
+    there, chosen = list_topics(topics), dict[str, Target]()
+
+    def take(target: Target, topic: str, reason: str) -> None:
+        chosen[topic] = target
+        notes.append(f"{path.name}: {target} from {topic}{reason}")
+
+    for target, profile_topic in targets.items():
         candidates = [asked[target]] if target in asked else [profile_topic] if profile_topic else []
         if target not in asked and profile_topic and target.channel is not None:
             candidates.append(f"{profile_topic}/compressed")  # a recorder may have kept that one only
@@ -101,58 +91,61 @@ def choose_topics(
                 raise SourceError(f"{path}: no topic {asked[target]} for {target}", there)
             continue
         msgtype, count = topics[topic]
-        if msgtype in target.types and topic not in chosen:
-            chosen[topic] = target
-            notes.append(f"{path.name}: {target} from {topic} ({count} messages)")
-        elif topic in chosen:
+        if topic in chosen:
             raise SourceError(f"{path}: {topic} is requested for both {chosen[topic]} and {target}", there)
+        if msgtype in target.types:
+            take(target, topic, f" ({count} messages)")
         elif target in asked or target.channel is None:
             types = " or ".join(sorted(target.types))
             raise SourceError(f"{path}: {topic} for {target} is {msgtype}, not {types}", there)
         else:
             notes.append(f"{path.name}: {topic} is {msgtype} and is not read")
-    for target, profile_topic in targets:
+    # The only topic of its kind is taken where the profile names none.
+    for target, profile_topic in targets.items():
         fitting = [topic for topic in _fitting(topics, EVENT_TYPES) if topic not in chosen]
         is_open = target.has_events and profile_topic is None and target not in chosen.values()
         if is_open and len(fitting) == 1:
-            chosen[fitting[0]] = target
-            notes.append(f"{path.name}: {target} from {fitting[0]}, the only topic with events")
-    failures = [
-        failure
-        for what in ("image", "point cloud")
-        if (failure := _add_only_topic(path, topics, targets, chosen, notes, what)) is not None
-    ]
+            take(target, fitting[0], ", the only topic with events")
+    failures = []
+    for is_lidar, what in enumerate(("images", "point clouds")):
+        of_kind = [target for target in targets if (target.channel is None) == is_lidar]
+        if set(of_kind) & set(chosen.values()):
+            continue
+        target, profile_topic = of_kind[0], targets[of_kind[0]]
+        # Packets are read where a driver's point clouds of them were not recorded.
+        fitting = _fitting(topics, target.types & CLOUD_TYPES) or _fitting(topics, target.types)
+        if profile_topic is None and len(fitting) == 1:
+            take(target, fitting[0], f", the only topic with {what}")
+            continue
+        fault = f"no topic {profile_topic}" if profile_topic else f"no single topic with {what}"
+        hint = f"{there}. Say which with --topic {target}=TOPIC, or set topic in the profile."
+        failures.append(SourceError(f"{path}: {fault} for {target}", hint))
     if failures and not (options.is_part and chosen):
         raise failures[0]
     return chosen
 
 
-def _add_only_topic(
-    path: Path,
-    topics: Topics,
-    targets: Sequence[tuple[Target, str | None]],
-    chosen: dict[str, Target],
-    notes: list[str],
-    what: str,
-) -> SourceError | None:
-    """Give the rig's first camera or LiDAR the only topic of its kind, where the profile names none.
+def _list_targets(rig: Rig, options: SourceOptions) -> tuple[dict[Target, str | None], dict[Target, str]]:
+    """List the rig's sensors with the profile's topic of each, and the topics that were asked for.
 
-    Returns:
-        The error for a rig without one; None where there is one.
+    Raises:
+        SourceError: a topic was asked for a sensor that the rig does not have.
     """
-    of_kind = [pair for pair in targets if (pair[0].channel is not None) == (what == "image")]
-    if any(target in chosen.values() for target, _ in of_kind):
-        return None
-    target, profile_topic = of_kind[0]
-    # Packets are read where a driver's point clouds of them were not recorded.
-    fitting = _fitting(topics, target.types & CLOUD_TYPES) or _fitting(topics, target.types)
-    if profile_topic is None and len(fitting) == 1:
-        chosen[fitting[0]] = target
-        notes.append(f"{path.name}: {target} from {fitting[0]}, the only topic with {what}s")
-        return None
-    fault = f"no topic {profile_topic}" if profile_topic else f"no single topic with {what}s"
-    hint = f"{list_topics(topics)}. Say which with --topic {target}=TOPIC, or set topic in the profile."
-    return SourceError(f"{path}: {fault} for {target}", hint)
+    targets: dict[Target, str | None] = {
+        Target(name, channel, settings.kind == "events"): settings.topic
+        for name, camera in rig.cameras.items()
+        for channel, settings in camera.channels.items()
+    }
+    targets |= {Target(name, None): lidar.topic for name, lidar in rig.lidars.items()}
+    # "cam.events", "lidar", and "cam" for the first channel of a camera.
+    by_name = {str(target): target for target in targets}
+    for name, camera in rig.cameras.items():
+        by_name[name] = by_name[f"{name}.{next(iter(camera.channels))}"]
+    unknown = sorted(set(options.topics) - set(by_name))
+    if unknown:
+        sensors = ", ".join(sorted(by_name))
+        raise SourceError(f"rig {rig.name!r} has no sensor {unknown[0]!r}; it has {sensors}")
+    return targets, {by_name[name]: topic for name, topic in options.topics.items()}
 
 
 def _fitting(topics: Topics, types: frozenset[str]) -> list[str]:

@@ -7,7 +7,6 @@ from pathlib import Path
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.core.losses import Losses
 from lce_rig.io.network import PcapFile
 from lce_rig.io.protocol import SourceOptions, Span, choose_lidar, fingerprint
 from lce_rig.io.velodyne.packet import BadPacketError, read_data_packet
@@ -45,9 +44,11 @@ class PcapRecording:
         self._product = Vlp16Stream(self._lidar, self._settings).product
         self._address, n_packets = self._choose_sender()
         self.key = fingerprint([path])
-        self.streams: Mapping[Stream, Span | None] = {
-            Stream(self._lidar, "", "scans"): self._span_ns() if options.is_part else None
-        }
+        span_ns: Span | None = None
+        if options.is_part:
+            arrivals_ns = [d.host_ns for d in self._file.datagrams() if d.source == self._address]
+            span_ns = (min(arrivals_ns), max(arrivals_ns)) if any(arrivals_ns) else None
+        self.streams: Mapping[Stream, Span | None] = {Stream(self._lidar, "", "scans"): span_ns}
         sweep_s = n_packets * self._product.packet_ns(is_dual=False) * 1e-9
         self.n_samples = max(1, round(sweep_s * self._settings.rate_hz))
 
@@ -80,33 +81,23 @@ class PcapRecording:
             causes = "; ".join(stream.account()) or f"{stream.n_data} packets are less than a revolution"
             raise SourceError(f"{self.path}: no whole revolution in it: {causes}", "Record at least 1 s.")
 
-    def _span_ns(self) -> Span | None:
-        arrivals_ns = [
-            datagram.host_ns
-            for datagram in self._file.datagrams()
-            if datagram.source == self._address and len(datagram.payload) == velodyne.DATA_BYTES
-        ]
-        return (min(arrivals_ns), max(arrivals_ns)) if any(arrivals_ns) else None
-
     def _choose_sender(self) -> tuple[str, float]:
         """Choose the sensor whose packets are taken by the start of the file.
 
         Returns:
             Its IP address, and the number of its data packets in the whole file, about.
+
+        Raises:
+            SourceError: there is none of the profile's model, or several of which none has its address.
         """
         senders, others, ports = Counter[str](), Counter[str](), Counter[int]()
-        refused = Losses()
         for datagram in self._file.datagrams():
             ports[datagram.port] += 1
-            if len(datagram.payload) == velodyne.DATA_BYTES:
-                try:
-                    read_data_packet(datagram.payload, datagram.host_ns, self._product)
-                    senders[datagram.source] += 1
-                except BadPacketError as error:
-                    if error.model:
-                        others[error.model] += 1
-                    else:
-                        refused.add(error.kind(of="data"))
+            try:
+                read_data_packet(datagram.payload, datagram.host_ns, self._product)
+                senders[datagram.source] += 1
+            except BadPacketError as error:
+                others.update([error.model] if error.model else [])
             n_sound = senders.total() + others.total()
             if n_sound >= _SURVEY_PACKETS or (n_sound and ports.total() >= 50 * _SURVEY_PACKETS):
                 break
@@ -122,16 +113,10 @@ class PcapRecording:
             hint = f"Set driver.address of {self._lidar!r} in the profile to one of them."
             what = f"{self.path}: packets of several LiDARs, none of them {wanted}: {addresses}"
             raise SourceError(what, hint)
-        if others:
-            models = ", ".join(f"{n} of {model}" for model, n in others.most_common())
-            read = ", ".join(product.name for product in velodyne.READ)
-            raise SourceError(
-                f"{self.path}: holds packets of another LiDAR ({models}), not of a {name}",
-                f"Set model of {self._lidar!r} in the profile; read are {read}. Record others in a bag.",
-            )
-        causes = [loss.text for loss in refused.findings()] + self._file.account()
-        if not refused.counts():
-            by_port = ", ".join(f"{n} to {port}" for port, n in ports.most_common(_MAX_SHOWN))
-            causes.insert(0, f"UDP packets by port: {by_port}" if ports else "no UDP packets at all")
-        hint = "Record whole packets: tcpdump -s 0." if self._file.losses.n("datagram.cut_short") else ""
-        raise SourceError(f"{self.path}: holds no packets of a {name}: {'; '.join(causes)}", hint)
+        by_port = [f"{n} to port {port}" for port, n in ports.most_common(_MAX_SHOWN)]
+        holds = [f"{n} packets of {model}" for model, n in others.most_common()] or by_port
+        causes = "; ".join([*holds, *self._file.account()]) or "no UDP packets at all"
+        what = f"{self.path}: holds no packets of a {name}: {causes}"
+        read = ", ".join(product.name for product in velodyne.READ)
+        hint = f"Record whole packets (tcpdump -s 0), or set the model of {self._lidar!r}; read are {read}."
+        raise SourceError(what, hint)
