@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.data import Events, Image, Sample
-from lce_rig.io.events.aedat4 import Aedat4Writer, write_aedat4
+from lce_rig.io.events.aedat4 import Aedat4Writer
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.session import Session
 from tests.collect import simulated_moves as moves
-from tests.io.events.aedat4_files import RawFrame, write_davis
+from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 
 
 def bag(path: Path, samples: list[Sample]) -> Path:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from lce_rig.core.data import Events
-from lce_rig.io.events.aedat4 import write_aedat4
+from tests.io.events.aedat4_files import write_aedat4
 
 
 def recording(path, duration_s=1.2):

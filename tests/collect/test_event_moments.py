@@ -13,10 +13,9 @@ from lce_rig.core.geometry import rotation_angle
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.search import find_event_board, reconstructor_for
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.events.aedat4 import write_aedat4
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.session import Session
-from tests.io.events.aedat4_files import RawFrame, write_davis
+from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 
 from . import simulated_moves as moves
 

@@ -1,7 +1,6 @@
 """What a rig delivers is recorded as bags that our readers, and others', give back as it was."""
 
 import resource
-import shutil
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -193,21 +192,6 @@ def test_a_folder_holds_a_bag_and_the_events_as_aedat4(tmp_path: Path, rles: Rig
     assert [len(samples) for samples in read(recorder.bag, rles)] == [20, 10]
     with pytest.raises(SourceError, match="exists already"):
         FolderRecorder(folder, rles)
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_the_bag_of_a_killed_recorder_is_named_with_its_repair(tmp_path: Path, rles: Rig, name: str) -> None:
-    with BagRecorder(tmp_path / name, rles) as recorder:
-        samples = [*map(picture, range(40)), *map(sweep, range(20))]
-        for sample in samples:
-            recorder.write(sample)
-        on_disk = tmp_path / name
-        left = tmp_path / f"left{on_disk.suffix}"
-        # The files as they are at this moment are what a SIGKILL leaves.
-        (shutil.copytree if on_disk.is_dir() else shutil.copy)(on_disk, left)
-    with pytest.raises(SourceError) as caught:
-        open_recording(left, rles)
-    assert ("rosbag reindex" if name.endswith(".bag") else "mcap recover") in caught.value.hint
 
 
 @contextmanager

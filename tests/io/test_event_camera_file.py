@@ -9,11 +9,11 @@ import pytest
 from lce_rig.core.data import Events, Image, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.events.aedat4 import Aedat4Writer, write_aedat4
+from lce_rig.io.events.aedat4 import Aedat4Writer
 from lce_rig.io.protocol import ContinuousRecording, serials_of
 from lce_rig.rig import Rig, load_rig
 from tests.io.events import encoders
-from tests.io.events.aedat4_files import RawFrame, write_davis
+from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 from tests.io.events.encoders import listed, random_events
 from tests.notes import has_note
 

@@ -91,17 +91,6 @@ def test_text_ply_is_read_with_what_stands_before_its_vertices():
     assert all(np.array_equal(read[name], POINTS[name]) for name in POINTS.dtype.names)
 
 
-def test_open3d_and_this_reader_agree(tmp_path):
-    import open3d
-
-    points = np.random.default_rng(1).normal(size=(50, 3))
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-    for is_text in (True, False):
-        open3d.io.write_point_cloud(str(tmp_path / "a.ply"), cloud, write_ascii=is_text)
-        read = read_cloud(tmp_path / "a.ply")
-        np.testing.assert_allclose(np.stack([read[axis] for axis in "xyz"], axis=1), points, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     "data",
     [

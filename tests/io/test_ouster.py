@@ -20,6 +20,7 @@ from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.ouster import PROFILES, OusterMetadata, OusterRecording, read_metadata
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.rig import Rig, load_rig
+from tests.damage import damaged
 
 KEPT = np.load(Path(__file__).parent / "ouster_packets.npz")
 DOCUMENT = json.loads(KEPT["meta"].tobytes())
@@ -140,14 +141,8 @@ def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(
     path = tmp_path / "drive.pcap"
     path.unlink(missing_ok=True)
     write_pcap(path, write_metadata(tmp_path / "drive.json", "LEGACY"), 1.0)
-    damaged = data.draw(st.sampled_from([path, path.with_suffix(".json")]), label="file")
-    content = bytearray(damaged.read_bytes())
-    if data.draw(st.booleans(), label="is cut"):
-        content = content[: data.draw(st.integers(0, len(content)), label="length")]
-    else:
-        place = st.one_of(st.integers(0, 200), st.integers(0, len(content) - 1))
-        content[data.draw(place, label="place")] ^= data.draw(st.integers(1, 255))
-    damaged.write_bytes(bytes(content))
+    file = data.draw(st.sampled_from([path, path.with_suffix(".json")]), label="file")
+    file.write_bytes(data.draw(damaged(file.read_bytes())))
     try:
         assert all(isinstance(scan, Scan) for scan in OusterRecording(path, rig, SourceOptions()).samples())
     except SourceError as error:

@@ -17,6 +17,7 @@ from lce_rig.io.network import Datagram, PcapFile, PcapWriter, build_frame
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
 from lce_rig.io.velodyne.pcap import PcapRecording
 from lce_rig.rig import Rig
+from tests.damage import damaged
 from tests.notes import has_note
 
 from .vlp16_room import NETWORK_NS, T0_NS, packets_of, room_scans
@@ -177,13 +178,8 @@ def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(
     suffix: str, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path, data: st.DataObject
 ) -> None:
     path = tmp_path / f"a.{suffix}"
-    content = bytearray((write_pcap if suffix == "pcap" else write_pcapng)(path, frames[:90]).read_bytes())
-    if data.draw(st.booleans(), label="is cut"):
-        content = content[: data.draw(st.integers(0, len(content)), label="length")]
-    else:
-        place = st.one_of(st.integers(0, 200), st.integers(0, len(content) - 1))
-        content[data.draw(place, label="place")] ^= data.draw(st.integers(1, 255))
-    path.write_bytes(bytes(content))
+    whole = (write_pcap if suffix == "pcap" else write_pcapng)(path, frames[:90]).read_bytes()
+    path.write_bytes(data.draw(damaged(whole)))
     try:
         assert all(isinstance(scan, Scan) for scan in read(path, rig)[0])
     except SourceError as error:
@@ -211,28 +207,6 @@ def test_recordings_of_no_wired_network_are_refused(content: bytes, rig: Rig, tm
         read(path, rig)
 
 
-def test_frames_cut_short_by_the_recorder_are_named(
-    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
-) -> None:
-    path = write_pcap(tmp_path / "a.pcap", frames, snaplen=96)
-    with pytest.raises(SourceError, match="243 datagrams"):
-        read(path, rig)
-
-
-def test_packets_of_something_else_are_named_by_port(rig: Rig, tmp_path: Path) -> None:
-    other = Datagram(T0_NS, "10.0.0.1", 5353, 5353, b"mdns")
-    path = write_pcap(tmp_path / "a.pcap", [(T0_NS, build_frame(other))] * 3)
-    with pytest.raises(SourceError):
-        read(path, rig)
-
-
-def test_less_than_a_revolution_is_an_error(
-    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
-) -> None:
-    with pytest.raises(SourceError):
-        read(write_pcap(tmp_path / "a.pcap", frames[:40]), rig)
-
-
 def test_of_several_sensors_the_profiles_is_taken(
     datagrams: list[Datagram], rig: Rig, tmp_path: Path
 ) -> None:
@@ -248,3 +222,14 @@ def test_of_several_sensors_the_profiles_is_taken(
     other = rig.model_copy(update={"lidars": {"lidar": lidar.model_copy(update={"driver": driver})}})
     with pytest.raises(SourceError, match=r"192\.168\.1\.201, 192\.168\.1\.77"):
         read(path, other)
+
+
+def test_no_packets_whole_ones_or_whole_revolutions_are_errors(
+    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
+) -> None:
+    with pytest.raises(SourceError, match="243 datagrams"):
+        read(write_pcap(tmp_path / "a.pcap", frames, snaplen=96), rig)
+    mdns = build_frame(Datagram(T0_NS, "10.0.0.1", 5353, 5353, b"mdns"))
+    for others in ([(T0_NS, mdns)] * 3, frames[:40]):
+        with pytest.raises(SourceError):
+            read(write_pcap(tmp_path / "a.pcap", others), rig)

@@ -14,6 +14,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.rig import load_rig
+from tests.damage import damaged
 from tests.notes import has_note
 
 KINDS = ["ros1", "sqlite3", "mcap"]
@@ -297,12 +298,7 @@ def test_damage_in_the_middle_of_a_bag_costs_what_comes_behind_it(tmp_path, rig,
 @given(data=st.data())
 def test_any_beginning_and_any_flipped_byte_give_data_or_a_source_error(small_bags, rig, kind, data):
     whole, path = small_bags[kind]
-    content = bytearray(whole)
-    if data.draw(st.booleans(), label="is cut"):
-        content = content[: data.draw(st.integers(0, len(whole)), label="length")]
-    else:
-        content[data.draw(st.integers(0, len(whole) - 1), label="place")] ^= data.draw(st.integers(1, 255))
-    path.write_bytes(bytes(content))
+    path.write_bytes(data.draw(damaged(whole)))
     try:
         for sample in open_recording(path, rig).samples():
             assert isinstance(sample, Image | Scan)

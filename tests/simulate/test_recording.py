@@ -8,10 +8,10 @@ import pytest
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import invert, transform
 from lce_rig.io.events import open_events
-from lce_rig.io.events.aedat4 import write_aedat4
 from lce_rig.rig import Rig
 from lce_rig.simulate import HandMotion, SimulatedRecording, SimulationOptions, simulate_recording
 from lce_rig.simulate.captures import stamp_of
+from tests.io.events.aedat4_files import write_aedat4
 from tests.io.events.bags import write_event_bag
 
 from .test_moving_captures import found_corners, moving_rig

@@ -169,23 +169,6 @@ def test_the_time_of_a_lost_line_lies_between_its_neighbours():
     assert all(abs(m.pulse_ns - whole[m.pulse]) < 2 for m in between)
 
 
-@pytest.mark.parametrize("n_missed", [1, 2, 3])
-def test_pulses_that_the_camera_missed_shift_its_numbers_and_are_noticed(n_missed):
-    rig = Rig(missed=tuple(range(60, 60 + n_missed)))
-    matcher, matched = rig.run()
-    assert rig.wrong(matched) == []
-    assert len(matched) == 200 - n_missed
-    assert (matcher.counts["n_slips"], matcher.counts["n_missed"]) == (1, n_missed)
-
-
-def test_a_number_that_the_driver_skipped_is_noticed():
-    rig = Rig(extra=(80, 150))
-    matcher, matched = rig.run()
-    assert rig.wrong(matched) == []
-    assert len(matched) == 200
-    assert (matcher.counts["n_slips"], matcher.counts["n_missed"]) == (2, 0)
-
-
 @settings(max_examples=25)
 @given(st.integers(0, 10**6), st.integers(30, 180))
 def test_a_slip_amid_losses_costs_pictures_and_never_their_truth(seed, where):
@@ -195,11 +178,25 @@ def test_a_slip_amid_losses_costs_pictures_and_never_their_truth(seed, where):
     assert len(matched) > 100 and matcher.counts["n_slips"] <= 1
 
 
-def test_single_late_stamps_are_no_slips():
-    rig = Rig(seed=5, late=0.05)
+@pytest.mark.parametrize(
+    ("faults", "n_matched", "n_slips", "n_missed"),
+    [
+        ({"missed": (60,)}, 199, 1, 1),
+        ({"missed": (60, 61, 62)}, 197, 1, 3),
+        ({"extra": (80, 150)}, 200, 2, 0),
+        ({"seed": 5, "late": 0.05}, 200, 0, 0),
+    ],
+    ids=["a pulse missed", "three pulses missed", "numbers skipped by the driver", "late timestamps"],
+)
+def test_slips_of_the_count_are_noticed_and_late_timestamps_are_none(faults, n_matched, n_slips, n_missed):
+    rig = Rig(**faults)
     matcher, matched = rig.run()
     assert rig.wrong(matched) == []
-    assert matcher.counts["n_slips"] == 0 and len(matched) == 200
+    assert (len(matched), matcher.counts["n_slips"], matcher.counts["n_missed"]) == (
+        n_matched,
+        n_slips,
+        n_missed,
+    )
 
 
 def test_a_start_that_leaves_a_choice_is_refused_with_what_to_do():

@@ -14,7 +14,7 @@ import re
 import struct
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
@@ -348,23 +348,6 @@ class Aedat4Writer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def write_aedat4(path: Path, stretches: Iterable[Events], camera_name: str = "lce_rig") -> None:
-    """Write a recording of events, at least one stretch, as AEDAT4; timestamps are cut to microseconds.
-
-    Raises:
-        FileExistsError: the file is there already.
-        ValueError: no stretch, or some of different resolutions.
-    """
-    iterator = iter(stretches)
-    first = next(iterator, None)
-    if first is None:
-        raise ValueError("no events to write")
-    with Aedat4Writer(path, (first.width_px, first.height_px), camera_name) as writer:
-        writer.write(first)
-        for stretch in iterator:
-            writer.write(stretch)
 
 
 def _sized(body: bytes) -> bytes:

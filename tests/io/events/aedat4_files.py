@@ -1,13 +1,14 @@
 """AEDAT4 files of a DAVIS, events and frames, laid out independently of the readers."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lce_rig.core.data import Events
+from lce_rig.io.events.aedat4 import Aedat4Writer
 
 Value = tuple[str, int] | bytes
 """A number with its struct code, or the content of a vector of bytes or of structs."""
@@ -116,3 +117,11 @@ def write_davis(
         for _, number, data in sorted(packets, key=lambda packet: packet[:2]):
             file.write(struct.pack("<ii", number, len(data)) + data)
     return path
+
+
+def write_aedat4(path: Path, stretches: Iterable[Events], camera_name: str = "lce_rig") -> None:
+    """Write events as `collect --record` does, at least one stretch."""
+    first, *others = stretches
+    with Aedat4Writer(path, (first.width_px, first.height_px), camera_name) as writer:
+        for events in (first, *others):
+            writer.write(events)

@@ -6,8 +6,6 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.io.events import EventRecording, open_events
-from lce_rig.io.ros.bag_recorder import event_messages
-from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, typestore
 from tests.io.events import encoders
 from tests.io.events.bags import write_event_bag, write_packet_bag
 from tests.io.events.encoders import Event, listed, random_events
@@ -39,19 +37,6 @@ def test_packets_of_a_topic_are_one_recording(tmp_path: Path, name: str, encodin
     assert recording.notes == [f"{name}: events from {TOPIC} (20 messages)"]
 
 
-def test_sqlite_bags_are_read_as_a_folder_and_as_a_file(tmp_path: Path) -> None:
-    from rosbags.rosbag2 import StoragePlugin, Writer
-
-    events = random_events(2000, 11, start_us=1_700_000_000_000_000)
-    with Writer(tmp_path / "ros2", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        connection = writer.add_connection("/dvs/events", EVENT_ARRAY_TYPE, typestore=typestore(False))
-        for received_ns, message in event_messages(events, "cam", is_ros1=False):
-            writer.write(connection, received_ns, message)
-    (file,) = (tmp_path / "ros2").glob("*.db3")
-    for path in (tmp_path / "ros2", file):
-        assert everything(open_events(path)) == listed(events)
-
-
 @pytest.mark.parametrize("name", ["a.bag", "ros2"])
 def test_broken_packets_are_counted_and_the_first_is_named(tmp_path: Path, name: str) -> None:
     sent = messages(name == "a.bag")
@@ -79,16 +64,6 @@ def test_packets_of_another_size_or_encoding_are_broken_ones(tmp_path: Path) -> 
     recording = open_events(write_packet_bag(tmp_path / "a.bag", sent))
     assert everything(recording) == TRUTH
     assert has_note(recording.notes, "2 broken packets", "640x480")
-
-
-@pytest.mark.parametrize("n_kept", [0.5, 0.98])
-def test_a_bag_whose_recorder_was_killed_is_refused(tmp_path: Path, n_kept: float) -> None:
-    path = tmp_path / "a.bag"
-    write_event_bag(path, [random_events(100_000, 3, start_us=1_700_000_000_000_000, step_us=100)])
-    path.write_bytes(path.read_bytes()[: int(n_kept * path.stat().st_size)])
-    with pytest.raises(SourceError) as caught:
-        open_events(path)
-    assert "a.bag" in caught.value.hint
 
 
 def test_a_damaged_record_ends_the_events_and_the_loss_is_said(tmp_path: Path) -> None:

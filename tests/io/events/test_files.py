@@ -1,6 +1,7 @@
 """Files of events: read back exactly, and where they are damaged as far as they go."""
 
 import struct
+import tracemalloc
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -13,9 +14,10 @@ from hypothesis import strategies as st
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError
 from lce_rig.io.events import EventRecording, open_events
-from lce_rig.io.events.aedat4 import Aedat4Writer, write_aedat4
+from lce_rig.io.events.aedat4 import Aedat4Writer
 from tests.damage import damaged
 from tests.io.events import encoders
+from tests.io.events.aedat4_files import write_aedat4
 from tests.io.events.bags import write_event_bag
 from tests.io.events.encoders import listed, random_events
 from tests.notes import has_note
@@ -263,3 +265,19 @@ def test_damaged_events_are_read_or_refused_in_one_line(
     except SourceError as error:
         assert name in error.what
         assert "\n" not in error.what
+
+
+def test_a_long_recording_is_never_in_memory_as_a_whole(tmp_path: Path) -> None:
+    piece = random_events(20_000, 1)
+    span_ns = int(piece.t_ns[-1])
+    pieces = (
+        Events("", piece.t_ns + i * span_ns, piece.x, piece.y, piece.polarity, 346, 260) for i in range(150)
+    )
+    write_aedat4(tmp_path / "a.aedat4", pieces)
+    recording = open_events(tmp_path / "a.aedat4")
+    tracemalloc.start()
+    n_events = sum(map(len, recording))
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert n_events == 3_000_000
+    assert peak_bytes < 0.3 * n_events * 13
