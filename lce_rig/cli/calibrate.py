@@ -1,14 +1,14 @@
 """`lce-rig calibrate`: estimate the extrinsics of a session, judge them and write them as files."""
 
 import math
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
 import click
 import numpy as np
 
+import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import (
     cameras_option,
@@ -24,11 +24,15 @@ from lce_rig.core.calibration import (
     Method,
     SceneOpinion,
 )
-from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
+from lce_rig.export.reference import read_reference
 from lce_rig.judge.findings import weakest_words
+from lce_rig.pipeline.result_files import UNION, Result, WrittenResult, new_result_parts
+from lce_rig.pipeline.union import require_unit
+from lce_rig.session.provenance import provenance_of
 
 _AXES = ("x right", "y down", "z forward")
 _OPINIONS = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
@@ -182,15 +186,6 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
 @click.option("--no-report", is_flag=True, help="Do not write report.html.")
-@click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(0), help="Set the seed of the random subsets."
-)
-@click.option(
-    "--draws",
-    "n_draws",
-    type=click.IntRange(0, 10_000),
-    help="Set the number of random subsets per size, I in the paper [default: 0; with --method paper 100].",
-)
 def calibrate(
     sessions: tuple[Path, ...],
     reference: Path | None,
@@ -204,8 +199,6 @@ def calibrate(
     force: bool,
     no_report: bool,
     method: Any,
-    seed: int,
-    n_draws: int | None,
 ) -> None:
     """Estimate the extrinsics between the LiDAR and each camera of SESSION (default: session/).
 
@@ -220,13 +213,6 @@ def calibrate(
     Exits with 7 if a result has failed; the exports then skip that camera, unless --force is given. Exits
     with 7 if sessions disagree, and with 6 if a camera has no result.
     """
-    import lce_rig as lce
-    from lce_rig.core.errors import UsageError
-    from lce_rig.export.reference import read_reference
-    from lce_rig.pipeline.result_files import UNION, new_result_parts
-    from lce_rig.pipeline.union import require_unit
-    from lce_rig.session.provenance import provenance_of
-
     paths = sessions or (Path("session"),)
     name = UNION if name is None and len(paths) > 1 else name
     new_result_parts(name)
@@ -235,9 +221,8 @@ def calibrate(
     for each in opened:
         each.rig = each.rig.of_robot(robot)
     provenance_of(opened)
-    first, rig = opened[0], opened[0].rig
+    rig = opened[0].rig
     require_sensors("camera", cameras, rig.cameras)
-    options = lce.CalibrateOptions(method, n_draws, seed)
     wanted = [
         name
         for name, camera in rig.cameras.items()
@@ -249,28 +234,42 @@ def calibrate(
             f"{reference}: T_cam_lidar names no sensors, but the rig has several: {', '.join(wanted)}",
             'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or add --camera.',
         )
-    with _earlier_result_named(first.path.joinpath(*new_result_parts(name))):
-        detections = []
-        for each in opened:
-            with show.progress_bar("detecting") as progress:
-                detections.append(lce.detect(each, event_image=event_image, progress=progress))
-        with show.progress_bar("calibrating") as progress:
-            result = lce.calibrate(
-                opened,
-                detections,
-                options=options,
-                cameras=cameras or None,
-                channels=channels,
-                reference=truth,
-                use_scene=use_scene,
-                progress=progress,
-            )
-        for shortage in result.shortages:
-            show.warn(str(NotEnoughDataError.of(shortage)))
-        if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
-            show.warn(f"{reference} has no T_cam_lidar for these sensors")
-        written = result.write(name=name, force=force, report=False)
+    detections = []
+    for each in opened:
+        with show.progress_bar("detecting") as progress:
+            detections.append(lce.detect(each, event_image=event_image, progress=progress))
+    with show.progress_bar("calibrating") as progress:
+        result = lce.calibrate(
+            opened,
+            detections,
+            options=lce.CalibrateOptions(method),
+            cameras=cameras or None,
+            channels=channels,
+            reference=truth,
+            use_scene=use_scene,
+            progress=progress,
+        )
+    for shortage in result.shortages:
+        show.warn(str(NotEnoughDataError.of(shortage)))
+    if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
+        show.warn(f"{reference} has no T_cam_lidar for these sensors")
     # The result is on the disk and on the screen before its report is drawn, which takes about as long.
+    written = result.write(name=name, force=force, report=False)
+    _show(result, written, as_json=as_json)
+    lacking = _lacking(wanted, {pair.camera for each in detections for pair in each.pairs}, result.pairs)
+    if lacking is not None and any(c.verdict == "fail" for c in result.pairs):
+        show.warn(str(lacking))
+    if not no_report:
+        with show.progress_bar("drawing the report"):
+            page = result.write_report(name=name)
+        show.note(f"report: {page}")
+    exit_by_verdict(result.pairs, are_printed=not as_json)
+    if lacking is not None:
+        raise lacking
+
+
+def _show(result: Result, written: WrittenResult, *, as_json: bool) -> None:
+    """Print the extrinsics, and the files with them."""
     folder = written.files[0].parent
     if as_json:
         show.print_json(result.document())
@@ -289,31 +288,6 @@ def calibrate(
             show.warn(f"this result is not exported; the last usable result is in {written.previous}")
         else:
             show.note(f"the result before it is in {written.previous}")
-    lacking = _lacking(wanted, {pair.camera for each in detections for pair in each.pairs}, result.pairs)
-    if lacking is not None and any(c.verdict == "fail" for c in result.pairs):
-        show.warn(str(lacking))
-    if not no_report:
-        with show.progress_bar("drawing the report"):
-            page = result.write_report(name=name)
-        show.note(f"report: {page}")
-    exit_by_verdict(result.pairs, are_printed=not as_json)
-    if lacking is not None:
-        raise lacking
-
-
-@contextmanager
-def _earlier_result_named(folder: Path) -> Iterator[None]:
-    """Say that the files are those of an earlier run if this one ends without a result."""
-    from lce_rig.core.errors import LceRigError
-    from lce_rig.pipeline.result_files import RESULT
-
-    try:
-        yield
-    except LceRigError:
-        with suppress(OSError):
-            if (folder / RESULT).exists():
-                show.note(f"{folder} is unchanged, with the result of an earlier run")
-        raise
 
 
 def _lacking(
@@ -344,8 +318,6 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = 
     Raises:
         ResultRefusedError: the worst verdict is "fail".
     """
-    from lce_rig.core.errors import ResultRefusedError
-
     failed = [c for c in calibrations if c.verdict == "fail"]
     if failed:
         pairs = ", ".join(str(Pair.of(c)) for c in failed)

@@ -2,16 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
-
-if TYPE_CHECKING:
-    from lce_rig.pipeline.result_files import StoredResult
-    from lce_rig.session import Capture, Session
+from lce_rig.core.errors import SessionError, UsageError
+from lce_rig.pipeline.result_files import CURRENT, StoredResult, stored_results
+from lce_rig.session import Capture, Session
 
 
 @click.command()
@@ -28,17 +28,14 @@ def captures(
     A rejected capture moves to SESSION/rejected/ with all its files. No command uses it, and `collect` does
     not take it again from the same recording. Restoring moves it back.
     """
-    import lce_rig as lce
-    from lce_rig.pipeline.result_files import stored_results
-
-    rejecting, restoring = list(map(_full, reject)), list(map(_full, restore))
+    rejecting, restoring = set(map(_full, reject)), set(map(_full, restore))
     with lce.Session.open(session, writable=bool(rejecting or restoring)) as opened:
         _require_there(opened, rejecting, restoring)
-        for name in rejecting:
+        for name in sorted(rejecting):
             opened.reject(name, reason)
-        for name in restoring:
+        for name in sorted(restoring):
             opened.restore(name)
-        changed = {*rejecting, *restoring}
+        changed = rejecting | restoring
         stored = stored_results(opened)
         records = [each for each in _records(opened, stored) if not changed or each["name"] in changed]
         outdated = [each.name for each in stored if changed and each.is_outdated]
@@ -59,36 +56,26 @@ def _full(name: str) -> str:
     return name.zfill(6) if name.isascii() and name.isdigit() else name
 
 
-def _require_there(session: "Session", rejecting: list[str], restoring: list[str]) -> None:
+def _require_there(session: Session, rejecting: set[str], restoring: set[str]) -> None:
     """Check every name before any capture is moved.
 
     Raises:
-        UsageError: a name is given twice, or is not that of a capture to be rejected or restored.
+        UsageError: a name is not that of a capture to be rejected or restored, or is given for both.
     """
-    from lce_rig.core.errors import UsageError
-
-    names = [*rejecting, *restoring]
     kept = {capture.name for capture in session.captures}
     rejected = {capture.name for capture in session.rejected}
-    for name in names:
-        if names.count(name) > 1:
-            raise UsageError(f"capture {name} is given twice")
-        if name in kept and name in rejected:
+    for name, place, state in [
+        *((name, kept - rejected, "kept") for name in rejecting),
+        *((name, rejected - kept, "rejected") for name in restoring),
+    ]:
+        if name not in place or (name in rejecting and name in restoring):
             raise UsageError(
-                f"{session.path}: capture {name} is in captures/ and in rejected/",
-                "Move one of the two out of the session.",
+                f"{session.path} has no {state} capture {name}",
+                f"List them with: lce-rig captures {session.path}",
             )
-        if name not in kept | rejected:
-            raise UsageError(
-                f"{session.path} has no capture {name}", f"List them with: lce-rig captures {session.path}"
-            )
-        if name not in (kept if name in rejecting else rejected):
-            state = "rejected already" if name in rejecting else "not rejected"
-            raise UsageError(f"{session.path}: capture {name} is {state}")
 
 
-def _records(session: "Session", stored: Sequence["StoredResult"]) -> list[dict[str, Any]]:
-    from lce_rig.pipeline.result_files import CURRENT
+def _records(session: Session, stored: Sequence[StoredResult]) -> list[dict[str, Any]]:
 
     # The cameras whose current result used each capture.
     used: dict[str, list[str]] = {}
@@ -101,8 +88,7 @@ def _records(session: "Session", stored: Sequence["StoredResult"]) -> list[dict[
     return [_record(capture, state, used.get(capture.name, [])) for capture, state in states]
 
 
-def _record(capture: "Capture", state: str, used_by: list[str]) -> dict[str, Any]:
-    from lce_rig.core.errors import SessionError
+def _record(capture: Capture, state: str, used_by: list[str]) -> dict[str, Any]:
 
     record = {"name": capture.name, "state": state, "used_by": used_by}
     try:

@@ -8,12 +8,16 @@ from typing import Any
 
 import click
 
+import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, json_option, session_argument
+from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.lidar.search import plane_limit_m
+from lce_rig.pipeline.matching import refusals_of
+from lce_rig.pipeline.verification import write_debug_images
 from lce_rig.rig import Rig
 
 
@@ -27,11 +31,6 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
 
     Exits with 6 if no capture is usable.
     """
-    import lce_rig as lce
-    from lce_rig.core.errors import NotEnoughDataError
-    from lce_rig.pipeline.matching import refusals_of
-    from lce_rig.pipeline.verification import write_debug_images
-
     opened = lce.Session.open(session)
     if not opened.captures:
         raise NotEnoughDataError(

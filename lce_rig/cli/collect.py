@@ -7,7 +7,17 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
+from lce_rig.cli.collect_live import run_live, show_next
 from lce_rig.cli.options import FiniteRange, require_sensors, rig_option, robot_option, session_argument
+from lce_rig.cli.simulate import require_kind
+from lce_rig.collect import CollectOptions
+from lce_rig.collect.live.guide import predict
+from lce_rig.core.errors import NotEnoughDataError, UsageError
+from lce_rig.io import open_recordings
+from lce_rig.io.protocol import PairedRecording, SourceOptions
+from lce_rig.pipeline.collect_recordings import fill_session
+from lce_rig.rig import load_rig
+from lce_rig.session import Session
 
 
 def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
@@ -79,19 +89,12 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     help="Name the LiDAR of a folder's point clouds if the rig has several; once or per --from.",
 )
 @click.option(
-    "--max-captures", type=click.IntRange(1), metavar="N", help="Stop at N captures in the session."
-)
-@click.option(
-    "--target",
+    "--captures",
+    "n_wanted",
     type=click.IntRange(1),
     metavar="N",
-    help="Stop at N captures in the session, and warn if the recordings give fewer.",
-)
-@click.option(
-    "--frames",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Live: stop at N captures in the session instead of at the predicted target.",
+    help="Stop at N captures in the session: live instead of at the predicted target, from recordings with a "
+    "warning if they give fewer.",
 )
 @click.option(
     "--timeout", type=FiniteRange(0, min_open=True), metavar="S", help="Live: stop after S seconds."
@@ -131,8 +134,7 @@ def collect(
     cameras: tuple[str, ...],
     channels: tuple[str, ...],
     lidars: tuple[str, ...],
-    max_captures: int | None,
-    target: int | None,
+    n_wanted: int | None,
     **live: Any,
 ) -> None:
     """Build or continue SESSION (default: session/), live or from recordings.
@@ -149,27 +151,13 @@ def collect(
     recordings, such as --from lidar.bag --from events.aedat4, are joined: each adds a sensor to those before
     it. Run the command again to continue; existing captures are not repeated.
     """
-    from lce_rig.rig import load_rig
-
     rig = load_rig(rig_name).of_robot(robot)
     if not paths:
-        _refuse_options(
-            (*_OF_RECORDINGS, "target"), "applies to recordings only", "Add --from, or omit this option."
-        )
-        from lce_rig.cli.collect_live import run_live
+        _refuse_options(_OF_RECORDINGS, "applies to recordings only", "Add --from, or omit this option.")
 
-        run_live(rig, session, **live)
+        run_live(rig, session, n_wanted, **live)
         return
     _refuse_options(tuple(live), "applies to live collection only", "Omit --from or this option.")
-    from lce_rig.cli.collect_live import show_next
-    from lce_rig.cli.simulate import require_kind
-    from lce_rig.collect import CollectOptions
-    from lce_rig.collect.live.guide import predict
-    from lce_rig.core.errors import NotEnoughDataError
-    from lce_rig.io import open_recordings
-    from lce_rig.io.protocol import PairedRecording, SourceOptions
-    from lce_rig.pipeline.collect_recordings import fill_session
-    from lce_rig.session import Session
 
     require_kind(session, None)
     sensors = zip(
@@ -180,9 +168,8 @@ def collect(
     )
     sources = [SourceOptions(*names, pair, pair_tolerance, topics) for names in sensors]
     recordings = open_recordings(paths, rig, sources)
-    wanted = CollectOptions(max_captures=max_captures, target=target)
     with show.progress_bar("collecting") as progress:
-        report = fill_session(rig, recordings, session, wanted, progress)
+        report = fill_session(rig, recordings, session, CollectOptions(target=n_wanted), progress)
     n_captures = len(Session.open(session).captures)
     if topics and any(isinstance(recording, PairedRecording) for recording in recordings):
         show.warn("--topic is ignored for a folder of images and point clouds")
@@ -195,7 +182,7 @@ def collect(
     show_next(session, rig, predict(Session.open(session)), n_captures)
 
 
-_OF_RECORDINGS = ("pair", "pair_tolerance", "topics", "cameras", "channels", "lidars", "max_captures")
+_OF_RECORDINGS = ("pair", "pair_tolerance", "topics", "cameras", "channels", "lidars")
 
 
 def _one_for_each(
@@ -206,8 +193,6 @@ def _one_for_each(
     Raises:
         UsageError: the number of names is neither one nor that of the recordings, or a name is unknown.
     """
-    from lce_rig.core.errors import UsageError
-
     if sensors_of_rig is not None:
         require_sensors(option.removeprefix("--"), names, sensors_of_rig)
     if len(names) < 2:
@@ -226,8 +211,6 @@ def _refuse_options(names: tuple[str, ...], what: str, hint: str) -> None:
     Raises:
         UsageError: one was given; the message names it.
     """
-    from lce_rig.core.errors import UsageError
-
     context = click.get_current_context()
     for param in context.command.params:
         source = context.get_parameter_source(param.name or "")
@@ -243,11 +226,6 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
     """
     for text in report.notes:
         show.note(text)
-    for first, *others in report.sizes.values():
-        tell = show.warn if first.severity == "error" else show.note
-        tell(f"{first.subject}: {show.counted(1 + len(others), 'image')} of {first.sentence}")
-    for label, capture in report.duplicates.items():
-        show.note(f"{label}: duplicate of {capture}, skipped")
     for label, refusal in report.refused.items():
         show.warn(f"{label}: {refusal.sentence}")
     counts = report.counts.counts()
@@ -255,10 +233,7 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
         show.note("not captured:\n" + "\n".join(f"  {n} x {why.sentence}" for why, n in counts))
     if report.n_missing:
         show.warn(f"{report.n_missing} captures short of the target")
-    new = f"{len(report.captured)} new" + (
-        f", {report.n_resumed} captured before" if report.n_resumed else ""
-    )
-    new += f", {report.n_rejected} rejected earlier" if report.n_rejected else ""
+    new = f"{len(report.captured)} new" + (f", {report.n_known} held already" if report.n_known else "")
     show.note(f"{session}: {show.counted(n_captures, 'capture')} ({new})")
     for error in report.errors[:-1]:
         show.warn(str(error))

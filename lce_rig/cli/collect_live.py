@@ -6,23 +6,24 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from lce_rig.cli import show
 from lce_rig.cli.simulate import TRUTH, require_kind, write_truth
-from lce_rig.core.errors import LceRigError
+from lce_rig.collect.live.collection import collect_live
+from lce_rig.collect.live.simulated import SimulatedRig
+from lce_rig.collect.live.state import HOLD_S, Key, LiveOptions, LiveReport, LiveState, TakeBack
+from lce_rig.core.errors import LceRigError, NotEnoughDataError, UsageError
+from lce_rig.core.findings import Finding
+from lce_rig.devices import open_live
+from lce_rig.devices.reading import LiveSource
+from lce_rig.rig import Rig
+from lce_rig.session import Session, discard_if_empty
+from lce_rig.show.phone.preview import Preview, parse_address
 from lce_rig.show.screen.keys import Controls, controls
-
-if TYPE_CHECKING:
-    from lce_rig.collect.live.simulated import SimulatedRig
-    from lce_rig.collect.live.state import Key, LiveReport, LiveState, TakeBack
-    from lce_rig.core.findings import Finding
-    from lce_rig.devices.reading import LiveSource
-    from lce_rig.rig import Rig
-    from lce_rig.session import Session
-    from lce_rig.show.phone.preview import Preview
+from lce_rig.show.screen.live_view import open_view, qr_lines
+from lce_rig.simulate import SimulationOptions, rig_truth
 
 #: An unattended run ends after this time without a capture. The simulated person never rests; a person at a
 #: rig without a terminal may be away for a while.
@@ -38,10 +39,10 @@ _ENDINGS = {
 
 
 def run_live(
-    rig: "Rig",
+    rig: Rig,
     path: Path,
+    n_wanted: int | None,
     *,
-    frames: int | None,
     timeout: float | None,
     keep_going: bool,
     hold: float | None,
@@ -53,11 +54,6 @@ def run_live(
     seed: int | None,
 ) -> None:
     """Collect live into a session and report the outcome; the options are those of --help."""
-    from lce_rig.collect.live.collection import collect_live
-    from lce_rig.collect.live.state import HOLD_S, LiveOptions
-    from lce_rig.core.errors import UsageError
-    from lce_rig.show.screen.live_view import open_view
-
     if seed is not None and not simulated:
         raise UsageError("--seed applies to --simulated only", "Add --simulated, or omit --seed.")
     require_kind(path, (seed or 0) if simulated else None)
@@ -70,7 +66,7 @@ def run_live(
         asked = stack.enter_context(controls())
         idle_s = SIMULATED_IDLE_S if simulated else None if asked.is_interactive else UNATTENDED_IDLE_S
         hold_s = HOLD_S if hold is None else hold
-        options = LiveOptions(frames, timeout, hold_s, goes_on=keep_going, idle_s=idle_s)
+        options = LiveOptions(n_wanted, timeout, hold_s, goes_on=keep_going, idle_s=idle_s)
         with open_view(
             is_plain=plain,
             has_keys=asked.is_interactive,
@@ -83,12 +79,12 @@ def run_live(
             listeners += [] if person is None else [person.watch]
             is_begun = threading.Event()
 
-            def tell(state: "LiveState") -> None:
+            def tell(state: LiveState) -> None:
                 is_begun.set()
                 for listener in listeners:
                     listener(state)
 
-            def ask() -> "Key | TakeBack | None":
+            def ask() -> Key | TakeBack | None:
                 return asked() or (None if page is None else page.asked())
 
             try:
@@ -100,15 +96,15 @@ def run_live(
                     stack.callback(show.note, saved)
     if report.n_recorded is not None:
         show.note(f"{record}: {report.n_recorded} samples recorded")
-    _tell(report, n_captures, asked, person, frames)
+    _tell(report, n_captures, asked, person, n_wanted)
     show_next(path, rig, report.predicted, n_captures)
 
 
-def _until_gone(show_state: "Callable[[LiveState], None]") -> "Callable[[LiveState], None]":
+def _until_gone(show_state: Callable[[LiveState], None]) -> Callable[[LiveState], None]:
     """Show states until the terminal is gone; its hangup then ends the collection in good order."""
     is_gone = threading.Event()
 
-    def tell(state: "LiveState") -> None:
+    def tell(state: LiveState) -> None:
         if not is_gone.is_set():
             try:
                 show_state(state)
@@ -119,10 +115,8 @@ def _until_gone(show_state: "Callable[[LiveState], None]") -> "Callable[[LiveSta
 
 
 @contextmanager
-def _session(path: Path, rig: "Rig") -> "Iterator[Session]":
+def _session(path: Path, rig: Rig) -> Iterator[Session]:
     """Continue or start a session; delete a new one that stays empty because its rig does not answer."""
-    from lce_rig.session import Session, discard_if_empty
-
     is_new = not path.exists()
     try:
         with Session.resume(path, rig) as session:
@@ -134,15 +128,11 @@ def _session(path: Path, rig: "Rig") -> "Iterator[Session]":
 
 
 def _open_rig(
-    stack: ExitStack, rig: "Rig", path: Path, seed: int | None
-) -> "tuple[list[LiveSource], SimulatedRig | None]":
+    stack: ExitStack, rig: Rig, path: Path, seed: int | None
+) -> tuple[list[LiveSource], SimulatedRig | None]:
     """Open the attached sources, or with a seed simulated ones, whose truth goes into the session."""
     if seed is None:
-        from lce_rig.devices import open_live
-
         return open_live(rig), None
-    from lce_rig.collect.live.simulated import SimulatedRig
-    from lce_rig.simulate import SimulationOptions, rig_truth
 
     show.note("starting the simulated rig ...")
     simulated = stack.enter_context(SimulatedRig(rig, seed))
@@ -150,11 +140,8 @@ def _open_rig(
     return simulated.sources, simulated
 
 
-def _open_page(stack: ExitStack, address: str) -> "Preview":
+def _open_page(stack: ExitStack, address: str) -> Preview:
     """Serve the preview page and print its link."""
-    from lce_rig.show.phone.preview import Preview, parse_address
-    from lce_rig.show.screen.live_view import qr_lines
-
     page = Preview(*parse_address(address))
 
     def tell_troubles() -> None:
@@ -172,10 +159,10 @@ def _open_page(stack: ExitStack, address: str) -> "Preview":
 
 
 def _tell(
-    report: "LiveReport",
+    report: LiveReport,
     n_captures: int,
     asked: Controls,
-    simulated: "SimulatedRig | None",
+    simulated: SimulatedRig | None,
     n_wanted: int | None,
 ) -> None:
     """Report the outcome.
@@ -185,19 +172,14 @@ def _tell(
         LceRigError: the recording ended early, for example on a full disk; the captures are kept.
         NotEnoughDataError: there is no capture, or too few when the new placements are exhausted.
     """
-    from lce_rig.core.errors import NotEnoughDataError
-
     for text in report.notes:
         show.note(text)
     lost = {name: n for name, n in report.n_lost.items() if n}
     if lost:
         show.note("dropped: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
-    slow = None if simulated is None else simulated.pace.problem()
-    if slow is not None:
-        show.warn(slow.sentence)
     ending = _ENDINGS[report.ending]
     if report.ending == "enough":
-        ending += " (--keep-going or --frames N collect more)"
+        ending += " (--keep-going or --captures N collect more)"
     elif report.ending == "exhausted" and n_wanted is not None:
         ending += f"; {n_captures} of {n_wanted} captures"
     show.note(f"ended: {ending}")
@@ -205,17 +187,9 @@ def _tell(
         raise report.error
     if asked.signal == signal.SIGINT:
         raise click.exceptions.Exit(130)
-    remedy = "Give the simulated person more time with a longer --timeout."
-    if report.lost:
-        remedy = "\n".join(
-            f"{name} is lost: {error.what}. {error.hint}" for name, error in report.lost.items()
-        )
-    elif simulated is None:
+    remedy = "Run the same command again to continue."
+    if simulated is None:
         remedy = "Hold the board in view of all sensors at once; run `lce-rig doctor` to find the fault."
-    elif slow is not None:
-        remedy = "This computer is too busy or too slow. End other programs, or use `lce-rig simulate`."
-    elif report.ending == "exhausted":
-        remedy = "Run the same command again to continue."
     if n_captures == 0:
         raise NotEnoughDataError("nothing was captured", remedy)
     if report.recording_error is not None:
@@ -225,7 +199,7 @@ def _tell(
         raise NotEnoughDataError(few, remedy)
 
 
-def show_next(path: Path, rig: "Rig", predicted: "Sequence[Finding]", n_captures: int) -> None:
+def show_next(path: Path, rig: Rig, predicted: Sequence[Finding], n_captures: int) -> None:
     """Print the predicted standard deviations and the next command."""
     for prediction in predicted:
         show.note(prediction.sentence)

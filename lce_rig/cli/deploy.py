@@ -1,17 +1,19 @@
 """`lce-rig deploy`: put a result on a robot, ask what is there, or go back."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
-
-if TYPE_CHECKING:
-    from lce_rig.fleet.deploy.deployment import Deployed, Plan, Standing
-    from lce_rig.fleet.deploy.releases import ReleaseRecord
-    from lce_rig.rig.target_settings import TargetSettings
+from lce_rig.core.errors import UsageError
+from lce_rig.fleet.deploy import deployment
+from lce_rig.fleet.deploy.deployment import Deployed, Plan, Standing, find_target
+from lce_rig.fleet.deploy.releases import ReleaseRecord
+from lce_rig.pipeline.result_files import result_parts
+from lce_rig.rig.target_settings import TargetSettings
 
 
 @click.command()
@@ -54,9 +56,6 @@ def deploy(
     those deployed. Exits with 8 if the target was not reached or written and holds the earlier set, and with
     9 if the command after it failed and the new set is in place.
     """
-    from lce_rig.core.errors import UsageError
-    from lce_rig.fleet.deploy import deployment
-
     if sum((dry_run, status, rollback)) > 1:
         raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
     if release is not None and not rollback:
@@ -65,9 +64,6 @@ def deploy(
         raise UsageError("--force requires a reason", "Add --reason TEXT; it is written down at the target.")
     if reason and not (force or rollback):
         raise UsageError("--reason applies to --force and --rollback only", "Add one of them, or omit it.")
-    import lce_rig as lce
-    from lce_rig.fleet.deploy.deployment import find_target
-    from lce_rig.pipeline.result_files import result_parts
 
     if status or rollback:
         # A session is opened for its profile only.
@@ -91,14 +87,14 @@ def deploy(
     _show_done(done, target, as_json=as_json)
 
 
-def _show_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None:
+def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
     if as_json:
         show.print_json(
             {
                 "format_version": 1,
                 "to": target.to,
                 "current": _release(plan.state.current),
-                "new": plan.record.model_dump(),
+                "new": plan.record,
                 "changed": dict(plan.changed),
                 "changed_there": dict(plan.changed_there),
                 "sensors": [
@@ -111,7 +107,7 @@ def _show_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None
                     }
                     for change in plan.sensors
                 ],
-                "objections": [each.as_json() for each in plan.objections],
+                "objections": plan.objections,
             }
         )
         return
@@ -131,7 +127,7 @@ def _show_plan(plan: "Plan", target: "TargetSettings", *, as_json: bool) -> None
         show.warn(f"would be refused: {each.text}")
 
 
-def _show_standing(standing: "Standing", target: "TargetSettings", *, as_json: bool) -> None:
+def _show_standing(standing: Standing, target: TargetSettings, *, as_json: bool) -> None:
     state = standing.state
     if as_json:
         show.print_json(
@@ -163,24 +159,24 @@ def _show_standing(standing: "Standing", target: "TargetSettings", *, as_json: b
         show.warn("the command after the deployment has not succeeded; the same deployment runs it again")
 
 
-def _warn_of_changes(changed: "Any") -> None:
+def _warn_of_changes(changed: Any) -> None:
     if changed:
         listed = ", ".join(f"{file} {how}" for file, how in changed.items())
         show.warn(f"not as it was deployed: {listed}")
 
 
-def _described(release: "ReleaseRecord") -> str:
+def _described(release: ReleaseRecord) -> str:
     verdicts = ", ".join(f"{pair} {verdict}" for pair, verdict in release.verdicts.items())
     robot = f"robot {release.robot}, " if release.robot else ""
     dated = f"captures of {release.date}, " if release.date else ""
     return f"{release.name} ({robot}{dated}{verdicts})"
 
 
-def _release(release: "ReleaseRecord | None") -> dict[str, Any] | None:
+def _release(release: ReleaseRecord | None) -> dict[str, Any] | None:
     return None if release is None else release.model_dump() | {"set_sha256": release.set_sha256}
 
 
-def _show_done(done: "Deployed", target: "TargetSettings", *, as_json: bool) -> None:
+def _show_done(done: Deployed, target: TargetSettings, *, as_json: bool) -> None:
     if as_json:
         show.print_json(
             {

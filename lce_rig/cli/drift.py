@@ -3,18 +3,23 @@
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, json_option
-
-if TYPE_CHECKING:
-    from lce_rig.core.calibration import ResultFile
-    from lce_rig.pipeline.drift import DriftReport, PairDrift
-    from lce_rig.rig import Rig
-    from lce_rig.scene.drift import AxisDrift
+from lce_rig.core.calibration import ResultFile, read_result
+from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
+from lce_rig.core.interrupts import patience
+from lce_rig.core.phrasing import as_line
+from lce_rig.devices import open_live
+from lce_rig.pipeline.drift import DriftReport, PairDrift, drift_live
+from lce_rig.pipeline.drift import drift as watch_drift
+from lce_rig.rig import Rig, load_rig
+from lce_rig.scene.drift import AxisDrift
+from lce_rig.scene.findings import STATES
+from lce_rig.show.screen.keys import controls
 
 
 @click.command()
@@ -58,12 +63,6 @@ def drift(
     Exits with 0 if no axis has changed, with 7 if one has, and with 6 if neither the scene nor the board can
     tell; of several cameras the worst counts.
     """
-    from lce_rig.core.calibration import read_result
-    from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
-    from lce_rig.core.phrasing import as_line
-    from lce_rig.pipeline.drift import drift as watch_drift
-    from lce_rig.rig import load_rig
-
     is_live = rig_name is not None and not recordings
     if seconds is not None and not is_live:
         raise UsageError("--seconds applies to attached sensors only", "Omit it, or give --rig alone.")
@@ -102,13 +101,8 @@ def drift(
 _JUDGING_S = 120.0
 
 
-def _watch_live(rig: "Rig", saved: "ResultFile", seconds: float | None) -> "DriftReport":
+def _watch_live(rig: Rig, saved: ResultFile, seconds: float | None) -> DriftReport:
     """Watch attached sensors until the time is over, or a signal or q asks to stop."""
-    from lce_rig.core.interrupts import patience
-    from lce_rig.devices import open_live
-    from lce_rig.pipeline.drift import drift_live
-    from lce_rig.show.screen.keys import controls
-
     with show.progress_bar("watching, seconds") as progress, controls() as asked, patience(_JUDGING_S):
         began_s: list[float] = []
 
@@ -129,8 +123,7 @@ _WITHOUT_FIT = ("scene.flat", "scene.no_peak")
 _COLOURS = {"unchanged": "none", "changed": "red", "unknown": "yellow"}
 
 
-def _table(pair: "PairDrift") -> Any:
-    from lce_rig.scene.findings import STATES
+def _table(pair: PairDrift) -> Any:
 
     opinions = [("scene", pair.drift.axes if pair.drift.curves else None)]
     opinions += [] if pair.board is None else [("board", pair.board.axes)]
@@ -148,7 +141,7 @@ def _table(pair: "PairDrift") -> Any:
     return table
 
 
-def _figures(axis: "AxisDrift | None") -> tuple[str, str]:
+def _figures(axis: AxisDrift | None) -> tuple[str, str]:
     if axis is None or not math.isfinite(axis.sigma) or axis.reason in _WITHOUT_FIT:
         return "-", "-"
     scale, digits = (1.0, 2) if axis.is_rotation else (1000.0, 0)
@@ -156,8 +149,7 @@ def _figures(axis: "AxisDrift | None") -> tuple[str, str]:
     return best, f"{scale * axis.smallest:.{digits}f}" if math.isfinite(axis.smallest) else "-"
 
 
-def _summary(pair: "PairDrift") -> list[str]:
-    from lce_rig.core.phrasing import as_line
+def _summary(pair: PairDrift) -> list[str]:
 
     line = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
     if pair.board is not None:

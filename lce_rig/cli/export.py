@@ -1,18 +1,22 @@
 """`lce-rig export`: write a result for other programs, and into a robot's own URDF."""
 
+from datetime import datetime
 from pathlib import Path
 
 import click
 
+import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import session_argument, split_names
+from lce_rig.core.errors import UsageError
+from lce_rig.export import EXPORTS, export_formats, require_usable
+from lce_rig.export.urdf import read_robot, write_into_urdf
+from lce_rig.pipeline.result_files import RESULT, result_parts
 
 
 def _list_formats(context: click.Context, _param: click.Parameter, is_asked: bool) -> None:
     """Print the formats with their files and end."""
     if is_asked and not context.resilient_parsing:
-        from lce_rig.export import EXPORTS
-
         for name, form in EXPORTS.items():
             show.say(f"{name + (' *' if form.is_usual else ''):<16} {form.about}")
         show.note("* unless others are named with --formats or as `exports` in the profile")
@@ -74,12 +78,6 @@ def export(
     sensor that is nearest to the root of the robot's tree stays where it is. Each other one keeps its parent,
     and its pose there changes; one that the robot lacks is added. The rest of a URDF stays as it is.
     """
-    from datetime import datetime
-
-    import lce_rig as lce
-    from lce_rig.core.errors import UsageError
-    from lce_rig.pipeline.result_files import RESULT, result_parts
-
     if (into is None) == (output is None):
         raise UsageError(
             "neither --output nor --into is given"
@@ -92,9 +90,6 @@ def export(
     opened = lce.Session.open(session)
     pairs = lce.read_result(opened.path.joinpath(*result_parts(name), RESULT)).pairs
     if output is not None:
-        from lce_rig.export import export_formats
-        from lce_rig.export.urdf import read_robot
-
         robot = None if tree is None else read_robot(tree)
         output.mkdir(parents=True, exist_ok=True)
         files, findings = export_formats(
@@ -105,8 +100,6 @@ def export(
         for finding in findings:
             (show.note if finding.severity == "note" else show.warn)(finding.sentence)
         return
-    from lce_rig.export import require_usable
-    from lce_rig.export.urdf import write_into_urdf
 
     assert into is not None
     require_usable(pairs, is_forced=force)

@@ -1,19 +1,25 @@
-"""`lce-rig fleet`: run the sessions of many robots, and ask questions of their results."""
+"""`lce-rig fleet`: run the sessions of many robots, ask questions of their results, and deploy them."""
 
 import csv
 import json
 import math
 import os
 import sys
-from typing import Any, get_args
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.fleet_deploy import deploy
-from lce_rig.cli.fleet_report import report
 from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
 from lce_rig.core.calibration import DEFAULT_METHOD, Method
+from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
+from lce_rig.core.interrupts import patience
+from lce_rig.core.phrasing import as_line
+from lce_rig.session.durable import write_atomically
+
+if TYPE_CHECKING:
+    from lce_rig.fleet.rollout import RobotState
 
 # Ctrl-C: sessions end at once, workers and the table take their time.
 _GRACE_S = 20.0
@@ -29,7 +35,7 @@ _SHOWN = (
     "sigma_rotation_deg",
     "sigma_translation_m",
 )
-_MOST_SHOWN = 1000
+_MOST_SHOWN, _MOST_FINDINGS = 1000, 20
 
 
 @click.group()
@@ -38,10 +44,6 @@ def fleet() -> None:
 
     Requires `pip install 'lce-rig[fleet]'`. docs/fleets.md describes the registry and its table.
     """
-
-
-fleet.add_command(report)
-fleet.add_command(deploy)
 
 
 @fleet.command()
@@ -112,7 +114,6 @@ def run(
     continue. A session that fails, takes too long, crashes or needs too much memory is recorded with the
     cause and stops no other. Nothing below ROOT is written.
     """
-    from lce_rig.core.interrupts import patience
     from lce_rig.fleet.jobs import find_jobs
     from lce_rig.fleet.run import cluster, run_fleet
     from lce_rig.fleet.storage import Storage
@@ -168,7 +169,6 @@ def table(
     registry: str, where: str, columns: list[str] | None, as_csv: bool, as_json: bool, rebuild: bool
 ) -> None:
     """Print rows of the registry's table."""
-    from lce_rig.core.errors import SessionError, UsageError
     from lce_rig.fleet.registry import Registry
     from lce_rig.fleet.storage import Storage
 
@@ -215,3 +215,143 @@ def _cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if math.isfinite(value) else "-"
     return show.escape(str(value))
+
+
+@fleet.command()
+@registry_option
+@click.option(
+    "--output",
+    "-o",
+    default=Path("fleet_report.html"),
+    show_default=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write the page to this file.",
+)
+@click.option(
+    "--json",
+    "json_file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write findings, states and counts to this file.",
+)
+def report(registry: str, output: Path, json_file: Path | None) -> None:
+    """Report which robots moved, and why results are missing or failed, as one HTML page.
+
+    A robot moved if two successive results of it differ beyond their own independent covariance. The page
+    loads nothing. docs/fleets.md explains it.
+    """
+    from lce_rig.fleet.registry import Registry
+    from lce_rig.fleet.report import FleetReport
+    from lce_rig.fleet.storage import Storage
+
+    made = FleetReport.of(Registry(Storage.at(registry)))
+    write_atomically(output, made.page())
+    if json_file is not None:
+        made.write_json(json_file)
+    for finding in made.findings[:_MOST_FINDINGS]:
+        show.say(show.escape(f"{finding.subject}: {as_line(finding.sentence)}"))
+    if len(made.findings) > _MOST_FINDINGS:
+        show.note(f"{len(made.findings) - _MOST_FINDINGS} more in the report")
+    states = [*made.history.robots.values()]
+    show.note(f"{states.count('moved')} of {show.counted(len(states), 'robot')} moved; written: {output}")
+
+
+@fleet.command()
+@registry_option
+@click.option("--target", required=True, metavar="NAME", help="Name the target; each robot has its own.")
+@click.option(
+    "--targets",
+    default=Path("deploy.yaml"),
+    show_default=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Read targets from this file; {robot} in `to` stands for the robot's name.",
+)
+@click.option(
+    "--where",
+    default="",
+    metavar="CONDITION",
+    help="Choose robots by a condition in SQL, as `fleet table` does.",
+)
+@click.option(
+    "--check",
+    default="",
+    metavar="COMMAND",
+    help="Run this here after each deployment, without a shell; {robot}, {result} and {to} are filled in. "
+    "Exit code 7, as of `drift`, contradicts the result; 6 cannot tell and passes.",
+)
+@click.option("--dry-run", is_flag=True, help="Print which result would go where; change nothing.")
+@click.option("--status", is_flag=True, help="Print the state of every robot; change nothing.")
+@click.option("--rollback", is_flag=True, help="Restore the earlier files of every robot deployed to.")
+@click.option(
+    "--reason", default="", metavar="TEXT", help="With --rollback: say why; it is written down there."
+)
+@json_option
+def deploy(
+    registry: str,
+    target: str,
+    targets: Path,
+    where: str,
+    check: str,
+    dry_run: bool,
+    status: bool,
+    rollback: bool,
+    reason: str,
+    as_json: bool,
+) -> None:
+    """Put the newest result of each robot in a registry onto the robot, one after the other.
+
+    Stops at the first robot that fails: not reached, not written, result refused, command failed, or --check
+    contradicts. Run it again to continue; robots that hold their result are not written again. To pass over a
+    robot, use --where. Robots whose newest session failed are left out. Exits with 7 if it was stopped.
+    """
+    from lce_rig.fleet.registry import Registry
+    from lce_rig.fleet.rollout import FleetDeployment, newest_results, read_rollout
+    from lce_rig.fleet.storage import Storage
+
+    if sum((dry_run, status, rollback)) > 1:
+        raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
+    opened = Registry(Storage.at(registry))
+    if status:
+        rollout = read_rollout(opened, target)
+    elif dry_run:
+        table = show.plain_table("", "robot", "result", "")
+        for robot, state in newest_results(opened, where).items():
+            table.add_row(*map(show.escape, (robot, state.folder, state.detail)))
+        show.print_table(table)
+        return
+    else:
+        under_way = FleetDeployment(opened, target, targets, check)
+        with show.progress_bar("robots") as progress:
+            if rollback:
+                rollout = under_way.roll_back(reason, progress=progress)
+            else:
+                rollout = under_way.run(newest_results(opened, where), progress=progress)
+    if as_json:
+        show.print_json(rollout.model_dump())
+    else:
+        counts = ", ".join(f"{_words(state)} {n}" for state, n in rollout.counts.most_common())
+        show.say(f"{rollout.target}: {counts or 'nothing deployed yet'}")
+        table = show.plain_table("", "robot", "state", "release", "replaces")
+        for state in rollout.robots.values():
+            cells = (state.robot, _words(state.state), state.release or "-", state.replaces or "-")
+            table.add_row(*map(show.escape, cells))
+        show.print_table(table)
+        for state in rollout.robots.values():
+            if state.detail:
+                show.note(f"{state.robot}: {_line(state)}")
+    if rollout.stopped_by and not (status or rollback):
+        stopped = rollout.robots[rollout.stopped_by]
+        raise ResultRefusedError(
+            f"stopped at {stopped.robot}: {_line(stopped)}",
+            "Remove the cause and run it again, or restore every robot's earlier files with --rollback.",
+        )
+
+
+def _words(state: str) -> str:
+    return state.replace("_", " ")
+
+
+def _line(state: "RobotState") -> str:
+    return " ".join(f"{_words(state.state)}: {state.detail}".split())

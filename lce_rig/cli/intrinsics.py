@@ -1,15 +1,18 @@
 """`lce-rig intrinsics`: estimate the intrinsics from a session's images and compare the profile's."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import cameras_option, require_sensors, session_argument, split_names
-
-if TYPE_CHECKING:
-    from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
+from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
+from lce_rig.judge.intrinsics_check import describe as figures_of
+from lce_rig.pipeline.intrinsics import MeasuredIntrinsics, measure_intrinsics
+from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
+from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
+from lce_rig.session import Session
 
 _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
 
@@ -52,12 +55,6 @@ def intrinsics(
     page of plots per camera. The profile is not changed. Exits with 6 if the captures are insufficient, with
     7 if --save-profile has nothing to write, as the session determines no intrinsics better than the profile.
     """
-    from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-    from lce_rig.pipeline.intrinsics import measure_intrinsics
-    from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
-    from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
-    from lce_rig.session import Session
-
     opened = Session.open(session)
     require_sensors("camera", cameras, opened.rig.cameras)
     if save_profile is not None and save_profile.exists():
@@ -93,7 +90,7 @@ def intrinsics(
         raise join_shortages(troubles)
 
 
-def _head(measured: "MeasuredIntrinsics") -> list[str]:
+def _head(measured: MeasuredIntrinsics) -> list[str]:
     estimate = measured.estimate
     n = len({view.capture for view in estimate.views})
     (along_width, along_height, aspect), sigma = estimate.shape, estimate.shape_sigma
@@ -112,7 +109,7 @@ def _head(measured: "MeasuredIntrinsics") -> list[str]:
     return lines
 
 
-def _table(measured: "MeasuredIntrinsics") -> Any:
+def _table(measured: MeasuredIntrinsics) -> Any:
     """List the parameters, with the profile's if model and resolution are the same."""
     estimate, lens = measured.estimate, measured.given
     values = estimate.model.vector(measured.intrinsics)
@@ -132,8 +129,7 @@ def _table(measured: "MeasuredIntrinsics") -> Any:
     return table
 
 
-def _findings(measured: "MeasuredIntrinsics") -> list[str]:
-    from lce_rig.judge.intrinsics_check import describe as figures_of
+def _findings(measured: MeasuredIntrinsics) -> list[str]:
 
     lines = []
     if measured.check is None:

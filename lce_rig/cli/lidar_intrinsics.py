@@ -1,15 +1,17 @@
 """`lce-rig lidar-intrinsics`: estimate a LiDAR's constant errors from the boards of sessions."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import numpy as np
 
+from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option
-
-if TYPE_CHECKING:
-    from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors
+from lce_rig.core.errors import UsageError
+from lce_rig.pipeline.lidar_intrinsics import measure_lidar, save_lidar
+from lce_rig.session import Session
 
 
 @click.command(name="lidar-intrinsics")
@@ -32,10 +34,6 @@ def lidar_intrinsics(
     profile written by --save-profile, `calibrate` of later sessions starts from these errors.
     Exits with 6 for too few captures, with 7 if boards moved or captures do not determine the lasers' ranges.
     """
-    from lce_rig.core.errors import UsageError
-    from lce_rig.pipeline.lidar_intrinsics import measure_lidar, save_lidar
-    from lce_rig.session import Session
-
     if save_profile is not None and save_profile.exists():
         raise UsageError(f"{save_profile} exists already", "Choose another file; existing files are kept.")
     opened = [Session.open(path) for path in sessions]
@@ -73,8 +71,7 @@ def _print(document: dict[str, Any]) -> None:
     show.print_table(table)
 
 
-def _document(errors: "LidarErrors") -> dict[str, Any]:
-    import numpy as np
+def _document(errors: LidarErrors) -> dict[str, Any]:
 
     estimate = errors.found
     values, sigmas = estimate.lasers.copy(), estimate.lasers_sigma.copy()

@@ -2,16 +2,22 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import cv2
+import numpy as np
 
 from lce_rig.cli import show
 from lce_rig.cli.options import EVENT_IMAGES, FiniteRange
-
-if TYPE_CHECKING:
-    from lce_rig.core.data import Events
-    from lce_rig.io.events.event_recording import EventRecording
+from lce_rig.core.data import Events
+from lce_rig.core.errors import SourceError, UsageError
+from lce_rig.core.findings import Refusal
+from lce_rig.detect.events.flicker import measure_flicker
+from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor
+from lce_rig.io.events import open_events
+from lce_rig.io.events.event_recording import EventRecording
+from lce_rig.show.overlays.overlay_files import write_gif, write_picture, write_video
 
 STAMPS = "stamps.csv"
 # 14 hours at the default period; one wrong timestamp makes a recording centuries long.
@@ -44,13 +50,6 @@ _WARM_UP_NS = 1_500_000_000
 @click.option("--duration", type=FiniteRange(0.001), metavar="S", help="End S seconds after the beginning.")
 @click.option("--topic", metavar="/TOPIC", help="Choose the topic if a bag has several with events.")
 @click.option(
-    "--window-s",
-    type=FiniteRange(0.001, 10),
-    metavar="S",
-    help="Use windows of S seconds (paper: 0.05).",
-)
-@click.option("--window-events", type=click.IntRange(1), metavar="N", help="Use windows of N events.")
-@click.option(
     "--event-image",
     type=EVENT_IMAGES,
     default="network",
@@ -63,10 +62,11 @@ _WARM_UP_NS = 1_500_000_000
     metavar="FILE",
     help="Use this ONNX file instead of the shipped network.",
 )
-@click.option("--no-filter", is_flag=True, help="Keep hot pixels and background activity.")
-@click.option("--gif", type=click.Path(path_type=Path), metavar="FILE", help="Also write an animation.")
 @click.option(
-    "--video", type=click.Path(path_type=Path), metavar="FILE", help="Also write a video: .mp4, .avi or .mkv."
+    "--video",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Also write a video: .mp4, .avi, .mkv or .gif.",
 )
 def reconstruct(
     recording: Path,
@@ -75,12 +75,8 @@ def reconstruct(
     start: float,
     duration: float | None,
     topic: str | None,
-    window_s: float | None,
-    window_events: int | None,
     event_image: Any,
     model: Path | None,
-    no_filter: bool,
-    gif: Path | None,
     video: Path | None,
 ) -> None:
     """Reconstruct grey images from the events of RECORDING into FOLDER, with timestamps in stamps.csv.
@@ -88,24 +84,7 @@ def reconstruct(
     Reads AEDAT4, Prophesee RAW (EVT2, EVT3), ROS 1, ROS 2 and mcap bags, HDF5 in DSEC's layout and E2VID's
     text. Skips the first images, until the network has settled, and prints how many.
     """
-    import cv2
-    import numpy as np
-
-    from lce_rig.core.errors import SourceError, UsageError
-    from lce_rig.detect.events.flicker import measure_flicker
-    from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
-    from lce_rig.io.events import open_events
-    from lce_rig.show.overlays.overlay_files import write_gif, write_video
-
-    if window_s is not None and window_events is not None:
-        raise UsageError("--window-s and --window-events exclude each other")
-    windows = WindowOptions()
-    if window_s is not None:
-        windows = WindowOptions("time", duration_s=window_s)
-    elif window_events is not None:
-        windows = WindowOptions("count", n_events=window_events)
-    options = ReconstructionOptions(method=event_image, windows=windows, is_filtered=not no_filter)
-    reconstructor = Reconstructor(model, options)
+    reconstructor = Reconstructor(model, ReconstructionOptions(method=event_image))
     events = open_events(recording, topic=topic)
     flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
     if flicker.is_storm:
@@ -124,23 +103,21 @@ def reconstruct(
             f"{recording}: no image reconstructed", "Record longer: the network needs time to settle."
         )
     show.note(f"{len(files)} images in {output}, timestamps in {output / STAMPS}")
-    for path, write in ((gif, write_gif), (video, write_video)):
-        if path is not None:
-            pictures = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files)
-            write(path, (np.asarray(picture, dtype=np.uint8) for picture in pictures), every)
-            show.note(f"written: {path}")
+    if video is not None:
+        pictures = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files)
+        write = write_gif if video.suffix.lower() == ".gif" else write_video
+        write(video, (np.asarray(picture, dtype=np.uint8) for picture in pictures), every)
+        show.note(f"written: {video}")
 
 
 def _stamps(
-    recording: Path, events: "EventRecording", start_s: float, duration_s: float | None, every_s: float
+    recording: Path, events: EventRecording, start_s: float, duration_s: float | None, every_s: float
 ) -> range:
     """List the timestamps of the requested images.
 
     Raises:
         UsageError: all are after the recording's end, or there are more than a million.
     """
-    from lce_rig.core.errors import UsageError
-
     first_ns, last_ns = events.span_ns
     begin_ns, every_ns = first_ns + round(1e9 * start_s), round(1e9 * every_s)
     end_ns = last_ns if duration_s is None else min(last_ns, begin_ns + round(1e9 * duration_s))
@@ -159,12 +136,9 @@ def _stamps(
 
 
 def _write(
-    output: Path, reconstructor: Any, events: "EventRecording", stamps_ns: range
+    output: Path, reconstructor: Any, events: EventRecording, stamps_ns: range
 ) -> tuple[list[Path], list[str]]:
     """Write the images and their timestamps; return the files, and the causes of skipped images."""
-    from lce_rig.core.findings import Refusal
-    from lce_rig.show.overlays.overlay_files import write_picture
-
     lines = ["picture,stamp_ns"]
     files: list[Path] = []
     refused: list[str] = []
@@ -182,7 +156,7 @@ def _write(
     return files, refused
 
 
-def _stretches(events: "EventRecording", stamps_ns: range) -> "Iterator[Events]":
+def _stretches(events: EventRecording, stamps_ns: range) -> Iterator[Events]:
     """Read the part of the recording that the images need."""
     from_ns, until_ns = stamps_ns[0] - stamps_ns.step - _WARM_UP_NS, stamps_ns[-1] + 1
     for stretch in events:

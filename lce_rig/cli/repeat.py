@@ -1,16 +1,18 @@
 """`lce-rig repeat`: compare the extrinsics from independent sessions of one rig, or the results of one."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import numpy as np
 
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option
+from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.phrasing import as_line
-
-if TYPE_CHECKING:
-    from lce_rig.judge.repeatability import Repeatability
+from lce_rig.judge.repeatability import Repeatability
+from lce_rig.pipeline.comparison import compare_results
+from lce_rig.pipeline.comparison import repeat as compare
 
 
 @click.command()
@@ -36,10 +38,6 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
     A session without a result is calibrated for the comparison; nothing is written. Exits with 7 if the
     calibrations disagree, or if one of them failed.
     """
-    from lce_rig.core.errors import ResultRefusedError, UsageError
-    from lce_rig.pipeline.comparison import compare_results
-    from lce_rig.pipeline.comparison import repeat as compare
-
     if len(sessions) == 1:
         compared = compare_results(sessions[0], names)
     elif len(names) > 1:
@@ -57,8 +55,8 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
             {
                 "format_version": 2,
                 "rig": compared.rig,
-                "calibrated": list(compared.calibrated),
-                "findings": [finding.as_json() for finding in compared.findings],
+                "calibrated": compared.calibrated,
+                "findings": compared.findings,
                 "pairs": [_pair(comparison) for comparison in compared.comparisons],
             }
         )
@@ -78,8 +76,7 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
         )
 
 
-def _deviations(comparison: "Repeatability") -> Any:
-    import numpy as np
+def _deviations(comparison: Repeatability) -> Any:
 
     headings = (">x mm", ">y mm", ">z mm", ">about x deg", ">about y deg", ">about z deg")
     table = show.plain_table(f"{_sensors(comparison)}: difference from the mean", "session", *headings)
@@ -90,7 +87,7 @@ def _deviations(comparison: "Repeatability") -> Any:
     return table
 
 
-def _differences(comparison: "Repeatability") -> Any:
+def _differences(comparison: Repeatability) -> Any:
     headings = ("first", "second", ">deg", ">mm", ">distance", ">chance")
     table = show.plain_table("pairs of sessions", *headings)
     for pair in comparison.differences:
@@ -99,7 +96,7 @@ def _differences(comparison: "Repeatability") -> Any:
     return table
 
 
-def _summary(comparison: "Repeatability") -> list[str]:
+def _summary(comparison: Repeatability) -> list[str]:
     c = comparison
     scatter = ""
     if c.scatter_rotation_deg is not None and c.scatter_translation_m is not None:
@@ -118,29 +115,10 @@ def _summary(comparison: "Repeatability") -> list[str]:
     return [*lines, f"[{colour}]{show.escape(as_line(c.finding.sentence))}[/]"]
 
 
-def _sensors(comparison: "Repeatability") -> str:
+def _sensors(comparison: Repeatability) -> str:
     return f"{comparison.camera} and {comparison.lidar}"
 
 
-def _pair(c: "Repeatability") -> dict[str, Any]:
-    return {
-        "camera": c.camera,
-        "lidar": c.lidar,
-        "sessions": list(c.names),
-        "agrees": c.agrees,
-        "finding": c.finding.as_json(),
-        "T_cam_lidar": c.T_cam_lidar.tolist(),
-        "deviations": c.deviations.tolist(),
-        "spread_rotation_deg": c.spread_rotation_deg,
-        "spread_translation_m": c.spread_translation_m,
-        "claimed_rotation_deg": c.reported_rotation_deg,
-        "claimed_translation_m": c.reported_translation_m,
-        "scatter_rotation_deg": c.scatter_rotation_deg,
-        "scatter_translation_m": c.scatter_translation_m,
-        "chi2": c.chi2,
-        "dof": c.dof,
-        "p": c.p,
-        "odd_one": c.odd_one,
-        "are_independent": c.are_independent,
-        "differences": [vars(pair) for pair in c.differences],
-    }
+def _pair(c: Repeatability) -> dict[str, Any]:
+    figures = {name.replace("reported_", "claimed_"): value for name, value in vars(c).items()}
+    return figures | {"sessions": figures.pop("names"), "agrees": c.agrees, "finding": c.finding}

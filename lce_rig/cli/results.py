@@ -3,16 +3,15 @@
 import math
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
-
-if TYPE_CHECKING:
-    from lce_rig.core.calibration import Calibration
-    from lce_rig.pipeline.result_files import StoredResult
+from lce_rig.core.calibration import Calibration
+from lce_rig.pipeline.result_files import StoredResult, stored_results
 
 # Short, so that the table fits into 80 columns.
 _SCENE = {"agrees": "agrees", "contradicts": "[red]differs[/]", "unknown": "?"}
@@ -26,9 +25,6 @@ def results(session: Path, as_json: bool) -> None:
 
     `lce-rig calibrate --name NAME` adds a named result, `lce-rig repeat SESSION` compares them.
     """
-    import lce_rig as lce
-    from lce_rig.pipeline.result_files import stored_results
-
     opened = lce.Session.open(session)
     stored = stored_results(opened)
     if as_json:
@@ -56,7 +52,7 @@ def results(session: Path, as_json: bool) -> None:
             show.note(f"{result.name}: the profile or the captures that it used have changed since")
 
 
-def _tables(stored: list["StoredResult"]) -> list[Any]:
+def _tables(stored: list[StoredResult]) -> list[Any]:
     """List results by camera and LiDAR, a table each, and those that cannot be read."""
     tables: dict[str, Any] = {}
     for result in stored:
@@ -89,7 +85,7 @@ def _tables(stored: list["StoredResult"]) -> list[Any]:
     return list(tables.values())
 
 
-def _pair(c: "Calibration") -> dict[str, Any]:
+def _pair(c: Calibration) -> dict[str, Any]:
     px = c.metrics.reprojection_px
     return {
         "camera": c.camera,

@@ -1,16 +1,32 @@
 """`lce-rig rigs`: list, show, check and derive rig profiles."""
 
+import inspect
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from lce_rig.cli import show
-
-if TYPE_CHECKING:
-    from lce_rig.rig import Rig
+from lce_rig.cli.options import require_sensors
+from lce_rig.core.errors import ProfileError, SourceError, UsageError
+from lce_rig.io.ros.bag_file import SUFFIXES, is_bag_file
+from lce_rig.pipeline.detect_session import check_networks
+from lce_rig.pipeline.new_profile import BOARD_FORM, clouds_in, parse_board, parse_intrinsics
+from lce_rig.pipeline.new_profile import new_profile as draft
+from lce_rig.rig import (
+    Rig,
+    derive_text,
+    dump_rig,
+    edit_text,
+    find_profile,
+    load_rig,
+    read_profile,
+    shipped_profiles,
+)
+from lce_rig.session.durable import replace_file
 
 
 @click.group(invoke_without_command=True)
@@ -25,8 +41,6 @@ def rigs(ctx: click.Context) -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def list_profiles(as_json: bool) -> None:
     """List the shipped profiles."""
-    from lce_rig.rig import load_rig, shipped_profiles
-
     profiles = [load_rig(name) for name in shipped_profiles()]
     summaries: list[dict[str, Any]] = [
         {
@@ -56,98 +70,32 @@ def list_profiles(as_json: bool) -> None:
 @rigs.command("show")
 @click.argument("rig_name", metavar="RIG")
 @click.option("--json", "as_json", is_flag=True, help="Print every setting as JSON.")
-@click.option("--yaml", "as_yaml", is_flag=True, help="Print every setting, defaults included, as YAML.")
-def show_profile(rig_name: str, as_json: bool, as_yaml: bool) -> None:
-    """Show the profile RIG, a name or a file."""
-    from lce_rig.rig import dump_rig, load_rig
-
+def show_profile(rig_name: str, as_json: bool) -> None:
+    """Print every setting of the profile RIG, a name or a file, as YAML; thresholds with their meaning."""
     rig = load_rig(rig_name)
     if as_json:
         show.print_json(rig.model_dump(mode="json"))
-    elif as_yaml:
-        click.echo(dump_rig(rig), nl=False)
-    else:
-        for table in (*_sensor_tables(rig), _reconstruction_table(rig), _board_table(rig), _limit_table(rig)):
-            if table.row_count:
-                show.print_table(table)
-        _print_warnings(rig)
+        return
+    block = ""
+    for line in dump_rig(rig).splitlines():
+        key, _, value = line.partition(":")
+        block = block if line.startswith((" ", "-")) else key
+        if block in _THRESHOLDS and value:
+            settings = type(getattr(rig, block))
+            default = settings.model_fields[key.strip()].default
+            changed = (
+                "" if default == getattr(getattr(rig, block), key.strip()) else f" (default: {default:g})"
+            )
+            click.echo(f"  # {_attributes(settings).get(key.strip(), '')}{changed}")
+        click.echo(line)
+    _print_warnings(rig)
 
 
-def _sensor_tables(rig: "Rig") -> tuple[Any, Any]:
-    """List the sensors, then where their data come from; side by side they are wider than a terminal."""
-
-    def stamps(settings: Any) -> str:
-        return f"{settings.reference}, clock {settings.clock}, sync {settings.sync}"
-
-    sensors = show.plain_table(f"{rig.name}: {rig.description}", "sensor", "model", "frame", "optics")
-    sources = show.plain_table("", "sensor", "topic", "timestamps")
-    for name, lidar in rig.lidars.items():
-        sensors.add_row(name, lidar.model, lidar.frame, f"{lidar.min_range_m:g}-{lidar.max_range_m:g} m")
-        sources.add_row(name, lidar.topic or "-", stamps(lidar.timestamps))
-    for name, camera in rig.cameras.items():
-        lens, (width, height) = camera.intrinsics, camera.resolution_px
-        optics = f"{width}x{height}, f {lens.fx_px:.1f} {lens.fy_px:.1f} px, {lens.model}"
-        sensors.add_row(name, camera.model, camera.optical_frame, optics)
-        for channel, settings in camera.channels.items():
-            sources.add_row(f"{name}/{channel}", settings.topic or "-", stamps(settings.timestamps))
-    for column in (*sensors.columns, *sources.columns):
-        # A truncated topic or frame is unusable.
-        column.overflow = "fold"
-    return sensors, sources
-
-
-def _reconstruction_table(rig: "Rig") -> Any:
-    """List how images are reconstructed from events."""
-    from lce_rig.rig import ReconstructionSettings
-
-    table = show.plain_table("", "images from events", "method", "network", "windows")
-    for name, camera in rig.cameras.items():
-        for channel, stream in camera.channels.items():
-            if stream.kind == "events":
-                settings = stream.reconstruction or ReconstructionSettings()
-                windows = "by event rate"
-                if settings.window_s is not None:
-                    windows = f"{1e3 * settings.window_s:g} ms"
-                elif settings.window_events is not None:
-                    windows = f"{settings.window_events} events"
-                network = "-" if settings.method == "map" else settings.model or "shipped"
-                table.add_row(f"{name}/{channel}", settings.method, network, windows)
-    return table
-
-
-def _board_table(rig: "Rig") -> Any:
-    board = rig.board
-    (cols, rows), (x, y) = board.inner_corners, board.pattern_offset_m
-    table = show.plain_table("", "board", "")
-    table.add_row("inner corners", f"{cols} x {rows}")
-    table.add_row("square", f"{1e3 * board.square_m:g} mm")
-    table.add_row("plate", f"{board.width_m:g} x {board.height_m:g} m")
-    table.add_row("pattern's centre from the plate's", f"{1e3 * x:g}, {1e3 * y:g} mm (right, up)")
-    for entry in rig.nominal_extrinsics:
-        limits = f"CAD model, result within {entry.tolerance_deg:g} deg, {1e3 * entry.tolerance_m:g} mm"
-        if entry.source == "typical":
-            limits = "typical, not compared with results"
-        table.add_row(f"nominal extrinsics, {entry.lidar} to {entry.camera}", limits)
-    return table
-
-
-def _limit_table(rig: "Rig") -> Any:
-    table = show.plain_table("", "threshold", "value", "default", "meaning")
-    for block in ("quality", "calibration", "verdict"):
-        settings = getattr(rig, block)
-        meanings = _attributes(type(settings))
-        for key, field in type(settings).model_fields.items():
-            value = getattr(settings, key)
-            default = "" if value == field.default else f"{field.default:g}"
-            table.add_row(f"{block}.{key}", f"{value:g}", default, meanings.get(key, ""))
-    return table
+_THRESHOLDS = ("quality", "calibration", "verdict")
 
 
 def _attributes(documented: type) -> dict[str, str]:
     """Read what a class's docstring says of each attribute."""
-    import inspect
-    import re
-
     _, _, text = (inspect.getdoc(documented) or "").partition("Attributes:\n")
     entries = re.findall(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
     return {
@@ -162,10 +110,6 @@ def _attributes(documented: type) -> dict[str, str]:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def check_profile(file: str, as_json: bool) -> None:
     """Check the profile FILE and list every problem with its line. Exits with 3 if there is one."""
-    from lce_rig.core.errors import ProfileError
-    from lce_rig.pipeline.detect_session import check_networks
-    from lce_rig.rig import find_profile, load_rig
-
     try:
         rig = load_rig(file)
         check_networks(rig)
@@ -189,7 +133,7 @@ def check_profile(file: str, as_json: bool) -> None:
     _print_warnings(rig)
 
 
-def _print_warnings(rig: "Rig") -> None:
+def _print_warnings(rig: Rig) -> None:
     for warning in rig.warnings():
         show.warn(warning.sentence)
 
@@ -250,12 +194,6 @@ def new_profile(
       lce-rig rigs new truck --from drive.bag --lidar OS1-64 --board 8x6,0.07,0.767x0.626
       lce-rig rigs new mine --from rlfs --set board.square_m=0.08 --unset nominal_extrinsics
     """
-    from lce_rig.core.errors import ProfileError, UsageError
-    from lce_rig.pipeline.new_profile import BOARD_FORM, parse_board, parse_intrinsics
-    from lce_rig.pipeline.new_profile import new_profile as draft
-    from lce_rig.rig import derive_text, edit_text, find_profile, load_rig, read_profile, shipped_profiles
-    from lce_rig.session.durable import replace_file
-
     stem = name.removesuffix(".yaml").removesuffix(".yml")
     if stem != name:
         raise UsageError(
@@ -314,10 +252,6 @@ def _is_bag(path: Path) -> bool:
     Raises:
         SourceError: it would be a bag, and is not there; or a folder without one.
     """
-    from lce_rig.core.errors import SourceError
-    from lce_rig.io.ros.bag_file import SUFFIXES, is_bag_file
-    from lce_rig.pipeline.new_profile import clouds_in
-
     if path.is_dir():
         if any(is_bag_file(entry) for entry in path.iterdir()) or clouds_in(path):
             return True
@@ -331,13 +265,9 @@ def _is_bag(path: Path) -> bool:
 
 
 def _sensor_settings(
-    parent: "Rig", lidar: str | None, cameras: Sequence[str], intrinsics: Sequence[str], board: str | None
+    parent: Rig, lidar: str | None, cameras: Sequence[str], intrinsics: Sequence[str], board: str | None
 ) -> list[tuple[str, str]]:
     """Give the keys that --lidar, --intrinsics and --board change in the profile that is derived from."""
-    from lce_rig.cli.options import require_sensors
-    from lce_rig.core.errors import UsageError
-    from lce_rig.pipeline.new_profile import parse_board, parse_intrinsics
-
     require_sensors("camera", cameras, parent.cameras)
     names = cameras or tuple(parent.cameras)[: len(intrinsics)]
     if len(names) != len(intrinsics):

@@ -51,8 +51,16 @@ def warn(text: str) -> None:
 
 
 def print_json(document: Any) -> None:
-    """Print a result for machines."""
-    click.echo(json.dumps(document, indent=2, allow_nan=False))
+    """Print a result for machines: findings, records and arrays as they are, too."""
+
+    def plain(value: Any) -> Any:
+        if hasattr(value, "as_json"):
+            return value.as_json()
+        if hasattr(value, "model_dump"):
+            return value.model_dump()
+        return value.tolist() if hasattr(value, "tolist") else vars(value)
+
+    click.echo(json.dumps(document, indent=2, allow_nan=False, default=plain))
 
 
 def plain_table(title: str, *headings: str) -> Any:

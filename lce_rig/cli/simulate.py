@@ -3,17 +3,28 @@
 import json
 import re
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, rig_option
-
-if TYPE_CHECKING:
-    from lce_rig.rig import Rig
-    from lce_rig.simulate import SimulationOptions
+from lce_rig.core.errors import SessionError, UsageError
+from lce_rig.core.files import read_json
+from lce_rig.io.ros.bag_recorder import FolderRecorder
+from lce_rig.rig import Rig, load_rig
+from lce_rig.session import Session
+from lce_rig.simulate import (
+    SimulationOptions,
+    capture_truth,
+    recording_truth,
+    rig_truth,
+    simulate_captures,
+    simulate_recording,
+)
+from lce_rig.simulate.captures import stamp_of
 
 TRUTH = "truth.json"
 _CAPTURES, _DURATION_S = 30, 20.0
@@ -87,20 +98,9 @@ _CAPTURES, _DURATION_S = 30, 20.0
     help="Add this offset from the LiDAR's clock to the timestamps of events.",
 )
 @click.option(
-    "--flicker",
-    type=FiniteRange(0, 0.9),
-    metavar="DEPTH",
-    help="Let the lamps flicker at 100 Hz with this modulation depth.",
-)
-@click.option(
     "--carrier",
     type=click.Choice(["stand", "person", "none"]),
     help="Choose what holds the board [default: person for rigs rles..., none for sss..., else stand].",
-)
-@click.option(
-    "--noise-level",
-    type=click.IntRange(1, 10),
-    help="Set the range noise of the paper's simulated sets, from level 1 (none) to 10 (10 cm).",
 )
 @click.option(
     "--range-sigma",
@@ -108,10 +108,6 @@ _CAPTURES, _DURATION_S = 30, 20.0
     metavar="M",
     help="Set the standard deviation of the LiDAR's ranges.",
 )
-@click.option(
-    "--range-offset", type=FiniteRange(-1, 1), metavar="M", help="Add a constant offset to all ranges."
-)
-@click.option("--decoy", is_flag=True, help="Place a blank plate of the board's size in the room.")
 def simulate(
     rig_name: str,
     session: Path | None,
@@ -129,9 +125,6 @@ def simulate(
 
     The truth is written to truth.json; pass SESSION/truth.json to `lce-rig calibrate --reference`.
     """
-    from lce_rig.core.errors import UsageError
-    from lce_rig.rig import load_rig
-
     rig = load_rig(rig_name)
     drawn = {entry.camera for entry in rig.nominal_extrinsics}
     for name in rig.cameras:
@@ -159,18 +152,13 @@ def simulate(
     _simulate_recording(recording, rig, duration or _DURATION_S, seed, options, int(ros or 1))
 
 
-def _options(rig: "Rig", motion: Any, choices: dict[str, Any]) -> "SimulationOptions":
+def _options(rig: Rig, motion: Any, choices: dict[str, Any]) -> SimulationOptions:
     """Apply the chosen options to the defaults of the rig.
 
     Raises:
         UsageError: an option of a moving board was chosen for a still one.
     """
-    from dataclasses import replace
-
-    from lce_rig.core.errors import UsageError
-    from lce_rig.simulate import SimulationOptions
-
-    of_motion = [name for name in ("speed", "event_offset", "flicker") if choices[name] is not None]
+    of_motion = [name for name in ("speed", "event_offset") if choices[name] is not None]
     if motion == "still" and of_motion:
         option = of_motion[0].replace("_", "-")
         raise UsageError(f"--{option} applies to a moving board only", "Add --motion moving.")
@@ -185,23 +173,14 @@ def _options(rig: "Rig", motion: Any, choices: dict[str, Any]) -> "SimulationOpt
         options,
         hand=hand,
         range_sigma_m=choices["range_sigma"],
-        range_offset_m=choices["range_offset"],
-        noise_level=choices["noise_level"],
         mounting_seed=choices["mounting"],
-        has_decoy_plate=choices["decoy"],
         carrier=choices["carrier"] or options.carrier,
         frame_offset_s=choices["frame_offset"],
         event_offset_s=choices["event_offset"] or 0.0,
-        flicker_depth=choices["flicker"] or 0.0,
     )
 
 
-def _simulate_session(
-    path: Path, rig: "Rig", n_captures: int, seed: int, options: "SimulationOptions"
-) -> None:
-    from lce_rig.core.errors import SessionError
-    from lce_rig.session import Session
-    from lce_rig.simulate import capture_truth, rig_truth, simulate_captures
+def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options: SimulationOptions) -> None:
 
     if path.exists():
         raise SessionError(
@@ -226,11 +205,8 @@ def _simulate_session(
 
 
 def _simulate_recording(
-    folder: Path, rig: "Rig", duration_s: float, seed: int, options: "SimulationOptions", ros: int
+    folder: Path, rig: Rig, duration_s: float, seed: int, options: SimulationOptions, ros: int
 ) -> None:
-    from lce_rig.io.ros.bag_recorder import FolderRecorder
-    from lce_rig.simulate import recording_truth, rig_truth, simulate_recording
-    from lce_rig.simulate.captures import stamp_of
 
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
     with FolderRecorder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:
@@ -253,9 +229,6 @@ def require_kind(session: Path, seed: int | None) -> None:
     Raises:
         SessionError: the session holds captures of another kind.
     """
-    from lce_rig.core.errors import SessionError
-    from lce_rig.core.files import read_json
-
     truth = session / TRUTH
     hint = "Collect into another folder."
     if not truth.exists():

@@ -5,8 +5,13 @@ from typing import Any
 
 import click
 
+import lce_rig as lce
 from lce_rig.cli import show
+from lce_rig.cli.calibrate import exit_by_verdict, scene_texts
 from lce_rig.cli.options import event_image_option, json_option, session_argument
+from lce_rig.core.errors import ResultRefusedError, UsageError
+from lce_rig.core.findings import worst
+from lce_rig.detect.detection import Pair
 
 
 @click.command()
@@ -41,12 +46,6 @@ def verify(
     SESSION/overlays/, with --name NAME those beside that result. Exits with 7 if the verdict is fail or these
     captures contradict the extrinsics.
     """
-    import lce_rig as lce
-    from lce_rig.cli.calibrate import exit_by_verdict
-    from lce_rig.core.errors import ResultRefusedError, UsageError
-    from lce_rig.core.findings import worst
-    from lce_rig.detect.detection import Pair
-
     if result is not None and name is not None:
         raise UsageError("--result and --name exclude each other", "Name a file or a result of the session.")
     opened = lce.Session.open(session)
@@ -89,7 +88,6 @@ def _table(checked: Any) -> Any:
 
 
 def _summary(checked: Any) -> list[str]:
-    from lce_rig.cli.calibrate import scene_texts
 
     lines = []
     if checked.metrics is not None:

@@ -4,8 +4,11 @@ from pathlib import Path
 
 import click
 
+import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import session_argument
+from lce_rig.pipeline.viewing import capture_in_3d, view_of
+from lce_rig.show.overlays.view_3d import draw_picture, show_window
 
 
 @click.command()
@@ -30,10 +33,6 @@ def view(session: Path, name: str | None, capture: str | None, output: Path | No
 
     Exits with 5 where there is no display, or Open3D cannot open a window.
     """
-    import lce_rig as lce
-    from lce_rig.pipeline.viewing import capture_in_3d, view_of
-    from lce_rig.show.overlays.view_3d import draw_picture, show_window
-
     opened = lce.Session.open(session)
     cameras, calibrations = view_of(opened, name)
     captures = [each for each in opened.captures if calibrations[0].lidar in each.lidars]

@@ -1,5 +1,5 @@
 """From recordings to a session of captures, unattended."""
 
-from lce_rig.collect.offline.collect import CollectOptions, CollectReport, collect
+from lce_rig.collect.offline import CollectOptions, CollectReport, collect
 
 __all__ = ["CollectOptions", "CollectReport", "collect"]

@@ -9,7 +9,7 @@ from lce_rig.calibrate.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
 from lce_rig.collect.findings import IMAGE_NONE, LIDAR_ELSEWHERE, LIDAR_NONE
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import invert
+from lce_rig.core.geometry import Array, invert
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder, ImageSearch
@@ -47,6 +47,11 @@ class BoardDetection:
     unscanned: dict[str, Refusal] = field(default_factory=dict)
     unfit: dict[ImageKey, Refusal] = field(default_factory=dict)
     is_moving: bool = False
+
+    @property
+    def poses(self) -> dict[ImageKey, Array]:
+        """Where each camera sees it, T_cam_board (4, 4)."""
+        return {key: board.T_cam_board for key, board in self.images.items()}
 
     @property
     def is_usable(self) -> bool:
@@ -256,8 +261,3 @@ def _compare(
         "rotation_deg": float(np.degrees(angle[best])),
     }
     return float(misfit[best]), LIDAR_ELSEWHERE.refusal(**figures)
-
-
-def without_samples(detection: BoardDetection) -> BoardDetection:
-    """Drop the images and scans that were searched, which take long to send to another process."""
-    return replace(detection, frame=replace(detection.frame, images=(), scans=()))

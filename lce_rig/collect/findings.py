@@ -1,31 +1,6 @@
 """Why captures are not taken, why guidance is missing, and why a collection continues."""
 
-from lce_rig.core.findings import Finding, Kind
-from lce_rig.core.phrasing import figures_apart
-
-
-def _few_captures(finding: Finding) -> str:
-    """About {n_more} more (minimum {n_least} captures)."""
-    return f"{_more(finding)} (minimum {finding.figures['n_least']} captures)"
-
-
-def _rotation_above(finding: Finding) -> str:
-    """About {n_more} more (held-out {rotation_deg} > {limit_deg})."""
-    stated, limit = figures_apart(finding.figure("rotation_deg"), finding.figure("limit_deg"))
-    return f"{_more(finding)} (held-out {stated} > {limit} deg)"
-
-
-def _position_above(finding: Finding) -> str:
-    """About {n_more} more (held-out {position_m} > {limit_m})."""
-    figures = 1000 * finding.figure("position_m"), 1000 * finding.figure("limit_m")
-    stated, limit = figures_apart(*figures)
-    return f"{_more(finding)} (held-out {stated} > {limit} mm)"
-
-
-def _more(finding: Finding) -> str:
-    n_more = finding.figures["n_more"]
-    return "more captures" if n_more is None else f"about {n_more} more"
-
+from lce_rig.core.findings import Kind
 
 GUIDE_NO_BEAMS = Kind("guide.no_beams", "no guidance: {cause}", severity="warning")
 GUIDE_NO_NOMINAL = Kind(
@@ -34,9 +9,12 @@ GUIDE_NO_NOMINAL = Kind(
     "the profile has no nominal extrinsics of {camera} and {lidar}",
     severity="warning",
 )
-GUIDE_FEW_CAPTURES = Kind("guide.few_captures", _few_captures, severity="note")
-GUIDE_ROTATION_ABOVE = Kind("guide.rotation_above", _rotation_above, severity="note")
-GUIDE_POSITION_ABOVE = Kind("guide.position_above", _position_above, severity="note")
+GUIDE_CONTINUES = Kind(
+    "guide.continues",
+    "captures to go: {n_more} (minimum {n_least}; predicted {rotation_deg:2deg}, {position_mm:.0f} mm, "
+    "limit {limit_deg:g} deg, {limit_mm:g} mm)",
+    severity="note",
+)
 GUIDE_PREDICTED = Kind(
     "guide.predicted",
     "{subject}: predicted standard deviations for {n_captures} captures: rotation {rotation_deg:2deg} "
@@ -90,9 +68,3 @@ CALIBRATE_LITTLE_GAIN = Kind(
     "{instruction}",
 )
 CLOCK_SIMULATED = Kind("clock.simulated", "simulated", severity="note")
-STREAM_SIMULATED_SLOWLY = Kind(
-    "stream.simulated_slowly",
-    "simulated about {factor} times slower than real time",
-    "expect low rates: this computer is too busy or too slow, no sensor is at fault",
-    severity="warning",
-)

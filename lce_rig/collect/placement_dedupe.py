@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, parse_pose, rotation_angle
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.finder import BoardFinder
@@ -28,11 +27,7 @@ class Placements:
         self._min_turn_rad = float(np.radians(min_turn_deg))
         self._poses: list[tuple[str, ImageKey, Array]] = []
 
-    def add(self, name: str, boards: Mapping[ImageKey, ImageBoard]) -> None:
-        """Remember the poses of a capture."""
-        self.add_poses(name, {key: board.T_cam_board for key, board in boards.items()})
-
-    def add_poses(self, name: str, poses: Mapping[ImageKey, Array]) -> None:
+    def add(self, name: str, poses: Mapping[ImageKey, Array]) -> None:
         """Remember poses T_cam_board (4, 4) of a capture."""
         self._poses.extend((name, key, T_cam_board) for key, T_cam_board in poses.items())
 
@@ -40,18 +35,18 @@ class Placements:
         """Forget a capture: where it was made is new again."""
         self._poses = [pose for pose in self._poses if pose[0] != name]
 
-    def find_like(self, boards: Mapping[ImageKey, ImageBoard]) -> str | None:
+    def find_like(self, poses: Mapping[ImageKey, Array]) -> str | None:
         """Name a capture in which every camera saw the board where it is now; None where it is new."""
         likes: dict[str, list[bool]] = {}
         for name, key, T_cam_board in self._poses:
-            if key in boards:
-                likes.setdefault(name, []).append(self._is_like(T_cam_board, boards[key].T_cam_board))
+            if key in poses:
+                likes.setdefault(name, []).append(self._is_like(T_cam_board, poses[key]))
         return next((name for name in sorted(likes) if all(likes[name])), None)
 
-    def are_alike(self, one: Mapping[ImageKey, ImageBoard], two: Mapping[ImageKey, ImageBoard]) -> bool:
+    def are_alike(self, one: Mapping[ImageKey, Array], two: Mapping[ImageKey, Array]) -> bool:
         """Check whether every camera that saw both boards saw them at one place; False where none did."""
         shared = one.keys() & two.keys()
-        likes = (self._is_like(one[key].T_cam_board, two[key].T_cam_board) for key in shared)
+        likes = (self._is_like(one[key], two[key]) for key in shared)
         return bool(shared) and all(likes)
 
     def _is_like(self, T_1: Array, T_2: Array) -> bool:
@@ -62,24 +57,9 @@ class Placements:
         return float(min(turns)) < self._min_turn_rad
 
 
-def known_placements(session: Session, min_move_m: float, min_turn_deg: float) -> Placements:
-    """Gather where the board was in a session's captures.
-
-    Captures made from folders carry no poses: their images are searched for the board once.
-    """
-    known = Placements(min_move_m, min_turn_deg)
-    for capture in session.captures:
-        try:
-            known.add_poses(capture.name, capture_poses(capture, session))
-        except LceRigError:
-            continue  # A damaged capture is named when it is used.
-    return known
-
-
-def board_figures(boards: Mapping[ImageKey, ImageBoard]) -> dict[str, Any]:
+def pose_figures(poses: Mapping[ImageKey, Array]) -> dict[str, Any]:
     """List where each camera saw the board, for a capture's meta data."""
-    poses = {".".join(key): np.round(board.T_cam_board, 9).tolist() for key, board in sorted(boards.items())}
-    return {"T_cam_board": poses}
+    return {"T_cam_board": {".".join(key): np.round(T, 9).tolist() for key, T in sorted(poses.items())}}
 
 
 def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:

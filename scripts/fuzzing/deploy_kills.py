@@ -131,7 +131,7 @@ def fuzz_deploy_kills(n: int, seed: int) -> DeployKillReport:
             start(["simulate", "--rig", "rlfs", str(session), "--captures", str(_N_CAPTURES), "--seed", "1"])
         )
         for variant in ((), ("--method", "paper", "--name", "other")):
-            must_end_well(start(["calibrate", str(session), "--draws", "5", *variant]))
+            must_end_well(start(["calibrate", str(session), *variant]))
         robots, targets = [], {}
         for k in range(_N_LANES):
             robots.append(_Robot(f"folder{k}", folder / f"robot{k}", lambda: None))

@@ -50,7 +50,7 @@ class Verb:
 
 
 VERBS = {
-    "calibrate": Verb("calibration", (("--draws", "5"), ("--draws", "5", "--method", "paper"))),
+    "calibrate": Verb("calibration", ((), ("--method", "paper"))),
     "verify": Verb("calibration/overlays", ((), ())),
     "intrinsics": Verb("intrinsics", (("--model", "radtan5"), ("--model", "rational"))),
 }

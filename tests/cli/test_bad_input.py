@@ -11,7 +11,9 @@ import yaml
 
 from lce_rig.cli.main import run
 from lce_rig.core.geometry import rotation_angle
+from lce_rig.rig import load_rig
 from lce_rig.session import Session
+from lce_rig.simulate import SimulationOptions, rig_truth, simulate_captures
 
 
 def edit_profile(session: Path, **changes) -> None:
@@ -106,12 +108,14 @@ def test_a_session_whose_captures_are_all_damaged_names_the_damage(lce_rig, sess
 @pytest.mark.long
 def test_a_plate_of_the_boards_size_that_stands_in_the_room_is_not_taken_for_the_board(tmp_path):
     """The decoy is in every scan; only the board moves with what the camera sees."""
-    session = tmp_path / "session"
-    words = ["simulate", "--rig", "rles", str(session), "--captures", "10", "--seed", "5", "--decoy"]
-    assert run(words) == 0
-    assert run(["calibrate", str(session), "--reference", str(session / "truth.json"), "--draws", "10"]) == 0
+    session, rig = tmp_path / "session", load_rig("rles")
+    options = replace(SimulationOptions.for_rig("rles"), has_decoy_plate=True)
+    with Session.create(session, rig) as writer:
+        for capture in simulate_captures(rig, n_captures=10, seed=5, options=options):
+            writer.add_capture(capture.images, capture.scans, {})
+    assert run(["calibrate", str(session)]) == 0
     pair = json.loads((session / "calibration" / "result.json").read_text())["pairs"][0]
-    truth = np.array(json.loads((session / "truth.json").read_text())["T_cam_lidar"])
+    truth = np.array(rig_truth(rig, 5, options)["T_cam_lidar"])
     assert len(pair["captures_used"]) >= 8
     assert np.degrees(rotation_angle(np.array(pair["T_cam_lidar"])[:3, :3], truth[:3, :3])) < 0.5
 

@@ -50,7 +50,7 @@ def test_a_lidars_bag_and_a_davis_file_make_a_session_that_a_second_run_leaves_a
     (capture,) = Session.open(tmp_path / "s").captures
     assert capture.event_cameras == ["davis"] and capture.has_image("davis", "frames")
     again = collect(lce_rig, folder, tmp_path / "s", "davis.aedat4", "lidar.bag")
-    assert again.code == 0 and "(0 new, 1 captured" in again.err
+    assert again.code == 0 and "(0 new, 1 held" in again.err
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lce_rig.collect.guidance import Coverage
+from lce_rig.collect.guidance.planner import Coverage
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
 from lce_rig.show.screen.live_view import Bell, PlainView, draw_outlines, qr_lines, render
 

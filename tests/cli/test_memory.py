@@ -15,9 +15,9 @@ sys.exit(run(sys.argv[1:]))
 
 
 def test_a_huge_file_costs_itself_and_no_memory(tmp_path: Path) -> None:
-    with (tmp_path / "huge.npz").open("wb") as file:
+    with (tmp_path / "huge.raw").open("wb") as file:
         file.truncate(1 << 40)
-    words = [sys.executable, "-c", PROGRAM, "reconstruct", tmp_path / "huge.npz", "-o", tmp_path / "out"]
+    words = [sys.executable, "-c", PROGRAM, "reconstruct", tmp_path / "huge.raw", "-o", tmp_path / "out"]
     outcome = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False)
     assert outcome.returncode == 5
-    assert "huge.npz" in outcome.stderr and "memory" in outcome.stderr and "Traceback" not in outcome.stderr
+    assert "huge.raw" in outcome.stderr and "memory" in outcome.stderr and "Traceback" not in outcome.stderr

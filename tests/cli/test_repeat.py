@@ -98,18 +98,7 @@ def test_a_copy_is_no_second_session(lce_rig, made, tmp_path):
     assert "monday" in outcome.err and "copy" in outcome.err
 
 
-def test_a_picture_in_two_sessions_makes_them_one_whatever_lies_beside_it(lce_rig, made):
-    a, b = made("monday", [0] * 6), made("tuesday", [0] * 6)
-    pixels = np.full((260, 346), 80, np.uint8)
-    for path, stamp_ns in ((a, 1), (b, None)):
-        with Session.open(path, writable=True) as session:
-            session.add_capture([Image("davis", "frames", stamp_ns, pixels)], [], {})
-    outcome = lce_rig("repeat", a, b)
-    assert outcome.code == 4
-    assert "monday" in outcome.err and "tuesday" in outcome.err
-
-
-def test_results_that_contain_the_same_session_are_not_compared(lce_rig, made):
+def test_a_picture_or_a_session_in_two_results_makes_them_one(lce_rig, made):
     paths = {name: made(name, [0] * 6) for name in ("monday", "tuesday", "wednesday")}
     opened = {name: Session.open(path) for name, path in paths.items()}
     for name in ("monday", "wednesday"):
@@ -117,10 +106,15 @@ def test_results_that_contain_the_same_session_are_not_compared(lce_rig, made):
         both = {name: opened[name], "tuesday": opened["tuesday"]}
         union = replace(own, captures_used=(f"{name}/000000", "tuesday/000000"))
         Result(opened[name], (union,), sessions=both).write(name="union")
-    outcome = lce_rig("repeat", paths["monday"], paths["wednesday"], "--name", "union")
+    assert lce_rig("repeat", paths["monday"], paths["wednesday"], "--name", "union").code == 4
+    assert lce_rig("repeat", paths["monday"], paths["wednesday"]).code == 0
+    pixels = np.full((260, 346), 80, np.uint8)
+    for name, stamp_ns in (("monday", 1), ("wednesday", None)):
+        with Session.open(paths[name], writable=True) as session:
+            session.add_capture([Image("davis", "frames", stamp_ns, pixels)], [], {})
+    outcome = lce_rig("repeat", paths["monday"], paths["wednesday"])
     assert outcome.code == 4
     assert "monday" in outcome.err and "wednesday" in outcome.err
-    assert lce_rig("repeat", paths["monday"], paths["wednesday"]).code == 0
 
 
 def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(lce_rig, made):

@@ -87,6 +87,10 @@ def test_overlays_are_drawn_beside_a_named_result_and_move_with_it(lce_rig, two_
     assert not (folder / "overlays").exists()
     assert (folder / "previous" / "overlays" / f"{used[0]}.png").exists()
     assert not (two_results / "overlays").exists()
+    found = listed(lce_rig, two_results)
+    assert found["paper/previous"]["is_outdated"] and not found["paper"]["is_outdated"]
+    assert lce_rig("verify", two_results, "--name", "nope").code == 4
+    assert lce_rig("calibrate", two_results, "--name", "paper/previous").code == 2
 
 
 def test_an_unreadable_result_is_listed_as_such(lce_rig, two_results):
@@ -94,19 +98,3 @@ def test_an_unreadable_result_is_listed_as_such(lce_rig, two_results):
     outcome = lce_rig("results", two_results)
     assert outcome.code == 0 and "paper" in outcome.out
     assert listed(lce_rig, two_results)["paper"]["problem"]
-
-
-@pytest.mark.long
-def test_the_result_before_a_named_one_is_listed_and_drawn(lce_rig, two_results):
-    assert lce_rig("calibrate", two_results, "--method", "paper", "--seed", "9", "--name", "paper").code == 0
-    used = json.loads((two_results / "results/paper/result.json").read_text())["pairs"][0]["captures_used"]
-    assert lce_rig("captures", two_results, "--reject", used[0]).code == 0
-    assert lce_rig("calibrate", two_results, "--method", "paper", "--name", "paper").code == 0
-    found = listed(lce_rig, two_results)
-    assert (
-        "paper/previous" in found
-        and found["paper/previous"]["is_outdated"]
-        and not found["paper"]["is_outdated"]
-    )
-    assert lce_rig("verify", two_results, "--name", "nope").code == 4
-    assert lce_rig("calibrate", two_results, "--name", "paper/previous").code == 2

@@ -20,7 +20,7 @@ def halves(simulated, tmp_path):
 @pytest.mark.long
 def test_several_sessions_give_one_result_in_the_first_and_change_nothing_else(lce_rig, halves):
     monday, tuesday = halves
-    outcome = lce_rig("calibrate", monday, tuesday, "--draws", "0")
+    outcome = lce_rig("calibrate", monday, tuesday)
     assert outcome.code == 0, outcome.err
     assert not (monday / "calibration").exists()
     assert not (tuesday / "calibration").exists()
@@ -36,7 +36,7 @@ def test_several_sessions_give_one_result_in_the_first_and_change_nothing_else(l
         checked = lce_rig("verify", *words, "--output", monday.parent / "drawn")
         assert checked.code == 0, checked.err
         assert "not used" not in checked.out
-    again = lce_rig("calibrate", tuesday, monday, "--draws", "0", "--name", "both")
+    again = lce_rig("calibrate", tuesday, monday, "--name", "both")
     assert again.code == 0, again.err
     assert (tuesday / "results" / "both" / "result.json").exists()
     shutil.rmtree(next(iter(sorted((tuesday / "captures").iterdir()))))

@@ -57,7 +57,7 @@ def spoilt(session: Path) -> Path:
 def run_twice(lce_rig, tmp_path, request):
     """Run a verb with and without words on copies of sessions; gives its exit code and what it prints."""
 
-    def call(verb: str, *sessions: Path, options: tuple[str, ...] = ()) -> tuple[int, Any]:
+    def call(verb: str, *sessions: Path) -> tuple[int, Any]:
         done = []
         for is_mute in (False, True):
             if is_mute:
@@ -65,7 +65,7 @@ def run_twice(lce_rig, tmp_path, request):
             copies = [tmp_path / ("mute" if is_mute else "told") / path.name for path in sessions]
             for path, copy in zip(sessions, copies, strict=True):
                 shutil.copytree(path, copy)
-            done.append(lce_rig(verb, *copies, *options, "--json"))
+            done.append(lce_rig(verb, *copies, "--json"))
         told, mute = (
             json.loads(each.out.replace(str(tmp_path / "mute"), str(tmp_path / "told"))) for each in done
         )
@@ -100,7 +100,7 @@ def test_check_refuses_the_same_captures_for_the_same_codes(run_twice, spoilt):
 
 @pytest.mark.long
 def test_calibrate_gives_the_same_extrinsics_verdict_and_reasons(run_twice, spoilt):
-    code, document = run_twice("calibrate", spoilt, options=("--draws", "10"))
+    code, document = run_twice("calibrate", spoilt)
     assert code == 0
     assert len(codes(document["pairs"][0]["captures_refused"])) >= 4
     assert document["pairs"][0]["findings"]
@@ -112,7 +112,7 @@ def test_calibrate_fails_for_the_same_reasons(run_twice, session):
     wrong = profile.read_text().replace("square_m: 0.068", "square_m: 0.075")
     assert wrong != profile.read_text()
     profile.write_text(wrong)
-    code, document = run_twice("calibrate", session, options=("--draws", "10"))
+    code, document = run_twice("calibrate", session)
     assert code == 7
     assert document["pairs"][0]["verdict"] == "fail"
     assert "error" in {each["severity"] for each in document["pairs"][0]["findings"]}
@@ -143,7 +143,7 @@ def test_repeat_finds_the_same_agreement(run_twice, halves):
 
 @pytest.mark.long
 def test_repeat_finds_the_same_disagreement(run_twice, halves, lce_rig):
-    assert lce_rig("calibrate", halves[1], "--draws", "0").code == 0
+    assert lce_rig("calibrate", halves[1]).code == 0
     path = moved(halves[1]) / "calibration" / "result.json"
     path.write_text(re.sub('"verdict": "(pass|marginal)"', '"verdict": "fail"', path.read_text()))
     profile = halves[1] / "rig.yaml"

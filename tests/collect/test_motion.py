@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
-from lce_rig.collect.offline.slow_motion import find_moving_moments
+from lce_rig.collect.gates import MotionGate, find_moments
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
@@ -25,7 +25,7 @@ def rig() -> Rig:
 
 def choose(detections: Iterable[BoardDetection], rig: Rig) -> tuple[list[CaptureMoment], dict[str, int]]:
     tally = Losses()
-    moments = find_moving_moments(detections, rig, Placements(0.15, 10.0), tally)
+    moments = find_moments(detections, MotionGate(rig, Placements(0.15, 10.0), tally))
     return list(moments), tally.by_code()
 
 

@@ -28,7 +28,7 @@ def folder(tmp_path):
     (path / "pcd").mkdir()
     rng = np.random.default_rng(0)
     for k in range(N_PAIRS):
-        pixels = rng.integers(0, 256, (360, 640), dtype=np.uint8)
+        pixels = rng.integers(0, 256, (260, 346), dtype=np.uint8)
         cv2.imwrite(str(path / "img" / f"{k:05d}.png"), pixels)
         cloud = np.zeros(
             4000, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4"), ("ring", "u2")]
@@ -48,12 +48,11 @@ def test_every_pair_becomes_a_capture_and_a_second_run_adds_none(tmp_path, folde
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig)
     assert report.captured == [f"{k:06d}" for k in range(N_PAIRS)]
-    paired, untimed = report.notes
-    assert paired.startswith("recording: 5 pairs") and "names" in paired
-    assert "no time" in untimed
+    assert any(note.startswith("recording: 5 pairs") and "names" in note for note in report.notes)
+    assert any("no time" in note for note in report.notes)
     with Session.resume(tmp_path / "s", rig) as session:
         again = run(session, folder, rig)
-    assert (again.captured, again.n_resumed, again.duplicates) == ([], N_PAIRS, {})
+    assert (again.captured, again.n_known) == ([], N_PAIRS)
     assert [e["event"] for e in session.read_journal()][-1] == "collected"
 
 
@@ -62,12 +61,12 @@ def test_a_rejected_pair_is_not_collected_again(tmp_path, folder, rig):
         run(session, folder, rig)
         session.reject("000003")
         again = run(session, folder, rig)
-        assert (again.captured, again.n_resumed, again.n_rejected) == ([], N_PAIRS - 1, 1)
+        assert (again.captured, again.n_known) == ([], N_PAIRS)
         # Nor under another name.
         (folder / "img" / "00003.png").rename(folder / "img" / "00009.png")
         (folder / "pcd" / "00003.pcd").rename(folder / "pcd" / "00009.pcd")
         renamed = run(session, folder, rig)
-    assert (renamed.captured, renamed.n_rejected) == ([], 1)
+    assert (renamed.captured, renamed.n_known) == ([], N_PAIRS)
 
 
 def test_the_same_data_in_another_file_is_a_duplicate(tmp_path, folder, rig):
@@ -76,7 +75,7 @@ def test_the_same_data_in_another_file_is_a_duplicate(tmp_path, folder, rig):
     (folder / "pcd" / "00007.pcd").write_bytes((folder / "pcd" / "00003.pcd").read_bytes())
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, folder, rig)
-    assert report.duplicates == {"00007.bmp + 00007.pcd": "000003"} and len(report.captured) == N_PAIRS
+    assert (report.n_known, len(report.captured)) == (1, N_PAIRS)
 
 
 def test_damaged_files_are_refused_with_their_cause_and_the_rest_is_captured(tmp_path, folder, rig):
@@ -102,20 +101,11 @@ def test_a_folder_of_which_nothing_can_be_read_is_an_error_that_names_the_first_
 
 def test_the_cap_is_kept_and_what_is_left_out_is_counted(tmp_path, folder, rig):
     with Session.create(tmp_path / "s", rig) as session:
-        report = run(session, folder, rig, max_captures=2, target=3)
-        assert len(session.captures) == 2 and report.n_missing == 1
+        report = run(session, folder, rig, target=2)
+        assert len(session.captures) == 2 and report.n_missing == 0
         assert any(note.startswith("3 pairs") and "2 captures" in note for note in report.notes)
         assert len(run(session, folder, rig, target=4).captured) == 2
         assert len(run(session, folder, rig).captured) == 1
-
-
-def test_pictures_of_another_size_are_said(tmp_path, folder, rig):
-    noise = np.random.default_rng(1).integers(0, 255, (480, 640), dtype=np.uint8)
-    cv2.imwrite(str(folder / "img" / "00002.png"), noise)
-    with Session.create(tmp_path / "s", rig) as session:
-        report = run(session, folder, rig)
-    ((found,),) = report.sizes.values()
-    assert (found.code, found.severity, found.subject) == ("image.size_other", "error", "cam.frames")
 
 
 COLLECTOR = """
@@ -157,6 +147,6 @@ def test_a_recording_by_others_becomes_a_session(tmp_path, recordings):
     rig = load_rig("rlfs")
     with Session.create(tmp_path / "s", rig) as session:
         report = run(session, recordings / "rlfs01", rig)
-    assert len(report.captured) == 18 and not report.refused and not report.duplicates
+    assert len(report.captured) == 18 and not report.refused
     assert any("ring field" in note and "elevation" in note for note in report.notes)
     assert Session.open(tmp_path / "s").captures[17].scan("lidar").ring.max() == 15

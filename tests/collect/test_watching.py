@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from lce_rig.collect.board_search import RestingTracker, glance_at, sight_ahead
 from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
-from lce_rig.collect.offline.search_ahead import RestingTracker, glance_at, sight_ahead
-from lce_rig.collect.offline.stillness import find_still_moments
+from lce_rig.collect.gates import StillnessGate, find_moments
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import transform
 from lce_rig.detect.finder import BoardFinder
@@ -67,7 +67,7 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> 
     assert not any(each.is_usable for each in seen)
     refusal = seen[-1].unfit["davis", "frames"]
     assert refusal.code == "image.small_squares" and refusal.figures["min_square_px"] == 1000
-    assert list(find_still_moments(seen, watcher.finder.board, 0.01)) == []
+    assert list(find_moments(seen, StillnessGate(watcher.finder.board, 0.01))) == []
     assert watcher.refusals.by_code()["image.small_squares"] == 30
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, differentiate, freedoms_of_plane
 from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.calibrate.systematic import systematic_covariances
-from lce_rig.collect.guidance.sensor_noise import ErrorModel, SensorModel
+from lce_rig.collect.guidance.sensor_model import ErrorModel, SensorModel
 from lce_rig.core.geometry import Array, invert, skew
 
 # The detector does not use shorter rings as lines.
@@ -148,8 +148,8 @@ def weigh_placements(model: SensorModel, T_cam_board: Array, T_cam_lidar: Array)
         T_cam_lidar: (4, 4) rough extrinsic: the profile's nominal, or an estimate.
     """
     rings = cross_board(model, invert(T_cam_lidar) @ T_cam_board)
-    hessian, by_plane, edge_noise = _in_board_frame(model, rings, T_cam_board, T_cam_lidar)
-    fit, by_laser = _plane_fit(model, rings, T_cam_board, T_cam_lidar)
+    moments, fit, by_laser = _plane_fit(model, rings, T_cam_board, T_cam_lidar)
+    hessian, by_plane, edge_noise = _in_board_frame(model, rings, moments, T_cam_board, T_cam_lidar)
     pose_cov = _pose_covariance(model, T_cam_board)
     of_pose = hessian[:, :, :6]
     noise = edge_noise + of_pose @ pose_cov @ np.swapaxes(of_pose, 1, 2)
@@ -172,7 +172,7 @@ def weigh_placements(model: SensorModel, T_cam_board: Array, T_cam_lidar: Array)
 
 
 def _in_board_frame(
-    model: SensorModel, rings: Rings, T_cam_board: Array, T_cam_lidar: Array
+    model: SensorModel, rings: Rings, moments: Array, T_cam_board: Array, T_cam_lidar: Array
 ) -> tuple[Array, Array, Array]:
     """Build half Hessians, half gradients by errors of the LiDAR's plane, and the noise of ring ends.
 
@@ -182,7 +182,6 @@ def _in_board_frame(
     errors = model.errors
     n, n_lasers = rings.n_points.shape
     n_ends = 2 * n_lasers
-    moments = _plane_moments(rings)
     total = np.maximum(rings.n_points.sum(axis=1), 1.0)[:, None, None]
     rows = np.zeros((N_UNKNOWNS, PLANE_FREEDOMS))
     rows[:6] = -freedoms_of_plane().T
@@ -219,51 +218,38 @@ def _in_board_frame(
     return hessian, by_plane, edge_noise
 
 
-def _plane_moments(rings: Rings) -> Array:
-    """Sum b b^T over the points of each board, (N, 3, 3)."""
-    basis = _node_basis(rings)
-    weights = rings.n_points[..., None] * _SHARES
-    return np.asarray(np.einsum("nlk,nlki,nlkj->nij", weights, basis, basis, optimize=True))
-
-
-def _node_basis(rings: Rings) -> Array:
-    """Evaluate b = (1, u, v) at the ends and the middle of each ring, (N, L, 3, 3)."""
-    nodes = rings.ends[:, :, :1] + _NODES[:, None] * (rings.ends[:, :, 1:] - rings.ends[:, :, :1])
-    return np.concatenate([np.ones((*nodes.shape[:-1], 1)), nodes], axis=-1)
-
-
 def _plane_fit(
     model: SensorModel, rings: Rings, T_cam_board: Array, T_cam_lidar: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Propagate range errors to the LiDAR's plane, which is fitted by least squares along its normal.
 
     Returns:
-        The covariance (N, 3, 3) that range noise leaves, and the plane's move (N, 3, L) by m of each laser.
+        The sum of b b^T over each board's points (N, 3, 3), the covariance (N, 3, 3) that range noise leaves,
+        and the plane's move (N, 3, L) by m of each laser.
     """
-    basis, weights, moments = _node_basis(rings), rings.n_points[..., None] * _SHARES, _plane_moments(rings)
+    nodes = rings.ends[:, :, :1] + _NODES[:, None] * (rings.ends[:, :, 1:] - rings.ends[:, :, :1])
+    basis = np.concatenate([np.ones((*nodes.shape[:-1], 1)), nodes], axis=-1)
+    weights = rings.n_points[..., None] * _SHARES
+    moments = np.einsum("nlk,nlki,nlkj->nij", weights, basis, basis, optimize=True)
     eye = _lidar_in_board(T_cam_board, T_cam_lidar)[:, None, None, :]
-    range_m = np.sqrt(np.sum((basis[..., 1:] - eye[..., :2]) ** 2, axis=-1) + eye[..., 2] ** 2)
+    range_m = np.sqrt(np.sum((nodes - eye[..., :2]) ** 2, axis=-1) + eye[..., 2] ** 2)
     incidence = -eye[..., 2] / range_m
     inverse = symmetric_inverse(moments + 1e-9 * np.eye(3))
     mean_square = np.sum(weights * incidence**2, axis=(1, 2)) / np.maximum(weights.sum(axis=(1, 2)), 1e-9)
     fit = (model.errors.range_m**2 * mean_square)[:, None, None] * inverse
     pull = np.einsum("nlk,nlki->nil", weights * incidence, basis)
-    return fit, inverse @ pull
+    return moments, fit, inverse @ pull
 
 
 def _pose_covariance(model: SensorModel, T_cam_board: Array) -> Array:
     """Predict the covariance (N, 6, 6) of the camera's pose of boards, axes of the board, about its centre.
 
-    Corners give (J^T J)^-1 sigma^2 with the pinhole's J; what is common to a capture is added.
+    Corners give sigma^2 (J^T J)^-1, as `pose_covariance` has it; what is common to a capture is added.
     """
     corners, errors = model.board.corners(), model.errors
     R, lens = T_cam_board[:, :3, :3], model.lens
     points = np.einsum("nij,kj->nki", R, corners) + T_cam_board[:, None, :3, 3]
-    x, y, z = np.moveaxis(points, -1, 0)
-    depth = np.maximum(z, 0.1)
-    by_point = np.zeros((*depth.shape, 2, 3))
-    by_point[..., 0, 0], by_point[..., 0, 2] = lens.fx_px / depth, -lens.fx_px * x / depth**2
-    by_point[..., 1, 1], by_point[..., 1, 2] = lens.fy_px / depth, -lens.fy_px * y / depth**2
+    by_point = lens.differentiate(points.reshape(-1, 3)).reshape(*points.shape[:2], 2, 3)
     by_shift = by_point @ R[:, None]
     by_turn = -by_shift @ skew(corners)
     J = np.concatenate([by_shift, by_turn], axis=-1).reshape(len(R), 2 * len(corners), 6)

@@ -4,13 +4,13 @@ That person faces the rig: what the camera sees on its right is on the person's 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from lce_rig.collect.guidance.candidates import SensorPlace, face_camera, facing_axes
-from lce_rig.core.geometry import Array, exp_so3, pose
+from lce_rig.collect.guidance.sensor_model import SensorPlace, face_camera, facing_axes
+from lce_rig.core.geometry import Array, exp_so3
 
 Kind = Literal["sideways", "nearer", "height", "tilt", "turn", "roll"]
 
@@ -174,40 +174,3 @@ def _level_axes(view: SensorPlace) -> tuple[Array, Array]:
     right = np.cross(np.array([0.0, 0.0, 1.0]), view.up)
     right /= max(float(np.linalg.norm(right)), 1e-9)
     return right, np.asarray(np.cross(view.up, right))
-
-
-_FIGURE = {
-    "sideways": "right_m",
-    "nearer": "ahead_m",
-    "height": "up_m",
-    "tilt": "tilt_deg",
-    "turn": "turn_deg",
-    "roll": "roll_deg",
-}
-
-
-@dataclass(frozen=True)
-class Person:
-    """A simulated person who follows instructions, more or less.
-
-    Attributes:
-        place_sigma_m: error along each axis.
-        turn_sigma_deg: error about each axis.
-        ignored_share: how often one of the instructions is not followed.
-    """
-
-    place_sigma_m: float = 0.10
-    turn_sigma_deg: float = 8.0
-    ignored_share: float = 0.2
-
-    def follow(self, view: SensorPlace, present: Array, wanted: Array, rng: np.random.Generator) -> Array:
-        """Move a board T_cam_board (4, 4) to where it is wanted, more or less."""
-        aim = describe_pose(view, wanted)
-        instructions = instruct(view, present, wanted)
-        if instructions and rng.random() < self.ignored_share:
-            ignored = rng.choice([instruction.kind for instruction in instructions])
-            aim = replace(aim, **{_FIGURE[ignored]: getattr(describe_pose(view, present), _FIGURE[ignored])})
-        aimed = build_pose(view, aim)
-        turn = exp_so3(np.radians(self.turn_sigma_deg) * rng.standard_normal(3))
-        place = aimed[:3, 3] + self.place_sigma_m * rng.standard_normal(3)
-        return pose(turn @ aimed[:3, :3], place)

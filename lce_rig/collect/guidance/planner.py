@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.collect.findings import CALIBRATE_KNOWN_PLACEMENT, CALIBRATE_LITTLE_GAIN
-from lce_rig.collect.guidance.candidates import DIAMOND_DEG, SensorPlace, spread_candidates
 from lce_rig.collect.guidance.evidence import (
     Evidence,
     Precision,
@@ -19,6 +18,7 @@ from lce_rig.collect.guidance.evidence import (
     weigh_placements,
 )
 from lce_rig.collect.guidance.instructions import describe_pose, instruct, is_there, say
+from lce_rig.collect.guidance.sensor_model import DIAMOND_DEG, SensorPlace, spread_candidates
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, rotation_angle
 

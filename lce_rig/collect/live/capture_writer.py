@@ -1,24 +1,137 @@
-"""Writes captures of a live collection and, on request, the raw streams beside them."""
+"""What becomes of a live capture: it is written, raw streams beside it on request, then learned from."""
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
 
-from lce_rig.collect.board_tracker import CaptureMoment
-from lce_rig.collect.live.learning import Learning
-from lce_rig.collect.offline.stored_events import StoredEvents
-from lce_rig.collect.placement_dedupe import board_figures
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
+from lce_rig.collect.guidance.planner import Planner
+from lce_rig.collect.live.guide import Guide, make_guides
+from lce_rig.collect.placement_dedupe import pose_figures
+from lce_rig.collect.worker import Worker
 from lce_rig.core.data import Sample
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.results import Observation
 from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.reading import LiveSource
 from lce_rig.io.ros.bag_recorder import FolderRecorder
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.timing.event_buffer import EventCut
+
+_NICE = 10
+
+
+class Learning:
+    """Calibrates the captures of each guide's sensors; open while its `with` block lasts."""
+
+    def __init__(self, rig: Rig, guides: Sequence[Guide]) -> None:
+        """Prepare; no process is started before there are captures enough."""
+        self._guides = guides
+        self._min_captures = rig.quality.min_captures
+        self._worker = Worker("calibrate captures", _Teacher, rig, nice=_NICE)
+        self._candidates: dict[int, list[Observation]] = {k: [] for k in range(len(guides))}
+        self._due: deque[int] = deque()
+        self._taught: deque[tuple[Guide, Planner | None]] = deque()
+        self._problem = ""
+        self._changed = threading.Condition()
+        self._is_closing = False
+        self._thread = threading.Thread(target=self._run, name="learn from captures", daemon=True)
+
+    def __enter__(self) -> "Learning":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End, without waiting for a calibration."""
+        with self._changed:
+            self._is_closing = True
+            self._changed.notify()
+        self._worker.__exit__(None, None, None)
+        self._thread.join()
+
+    def show(self, name: str, detection: BoardDetection) -> None:
+        """Take a capture's detection; returns at once."""
+        with self._changed:
+            for k, guide in enumerate(self._guides):
+                if guide.sees(detection):
+                    image, scans = detection.images[guide.key], detection.lidars[guide.lidar]
+                    self._candidates[k].append(Observation.of(name, image, scans))
+                    if len(self._candidates[k]) >= self._min_captures and k not in self._due:
+                        self._due.append(k)
+            self._changed.notify()
+
+    def forget(self, name: str) -> None:
+        """Forget a capture; returns at once, and the remaining ones are calibrated again."""
+        with self._changed:
+            for k, candidates in self._candidates.items():
+                left = [candidate for candidate in candidates if candidate.capture != name]
+                if len(left) < len(candidates):
+                    self._candidates[k] = left
+                    if k not in self._due:
+                        self._due.append(k)
+            self._changed.notify()
+
+    def teach(self) -> None:
+        """Pass the planners learned since the last call to their guides."""
+        with self._changed:
+            taught = list(self._taught)
+            self._taught.clear()
+        for guide, planner in taught:
+            guide.adopt(planner)
+
+    def notes(self) -> list[str]:
+        """Say what went wrong."""
+        return [self._problem] if self._problem else []
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._due or self._is_closing)
+                if self._is_closing:
+                    return
+                k = self._due.popleft()
+                candidates = list(self._candidates[k])
+            planner: Planner | None = None
+            try:
+                if len(candidates) >= self._min_captures:
+                    planner = self._worker.call("learn", k, candidates)
+            except Exception as error:  # Captures are safe even if a calibration fails.
+                if self._is_closing:
+                    return
+                self._problem = f"guidance does not learn from captures: {error}"
+            with self._changed:
+                # Captures that came, or were taken back, meanwhile: it is due again.
+                if k not in self._due:
+                    self._taught.append((self._guides[k], planner))
+
+
+class _Teacher:
+    """The object in the worker's process."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._board = rig.board.to_board()
+        self._guides = make_guides(rig)
+
+    def learn(self, k: int, candidates: Sequence[Observation]) -> Planner | None:
+        """Calibrate one guide's sensors; None where more captures are needed."""
+        try:
+            estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings("paper", n_draws=0))
+        except (NotEnoughDataError, np.linalg.LinAlgError):
+            return None
+        figures = estimate.diagnostics
+        return self._guides[k].prepare(
+            estimate.T_cam_lidar, figures.fit_plane_rms_m, figures.fit_edge_rms_m, len(estimate.used)
+        )
 
 
 class Task(NamedTuple):
@@ -38,19 +151,17 @@ class Task(NamedTuple):
 
 
 class CaptureWriter:
-    """Writes captures one after the other, and takes them back in the same order."""
+    """Writes captures one after the other, and takes them back in the same order.
+
+    Attributes:
+        session: open for writing.
+        learning: receives each capture that is safe.
+    """
 
     def __init__(self, session: Session, learning: Learning, disk: DiskWriter) -> None:
-        """Prepare.
-
-        Args:
-            session: open for writing.
-            learning: receives each capture that is safe.
-            disk: writes.
-        """
-        self._session = session
-        self._learning = learning
-        self._stored = StoredEvents()
+        """Prepare; see `CaptureWriter`."""
+        self.session = session
+        self.learning = learning
         self._done: deque[tuple[str, float | None]] = deque()
         self._sink: Sink[Task | str] = disk.add(session.path, self._write, is_vital=True)
 
@@ -81,25 +192,20 @@ class CaptureWriter:
             raise failure
         return done
 
-    def notes(self) -> list[str]:
-        """Describe problems of the stored events."""
-        return self._stored.notes()
-
     def _write(self, task: Task | str) -> None:
         """Store or reject, in the order of the requests: a capture is stored before it is taken back."""
         if isinstance(task, str):
-            self._session.reject(task, "taken back while collecting")
-            self._learning.forget(task)
+            self.session.reject(task, "taken back while collecting")
+            self.learning.forget(task)
             self._done.append((task, None))
             return
         detection, frame = task.moment.detection, task.moment.detection.frame
-        meta = {**task.meta, **task.moment.figures, **board_figures(detection.images)}
+        meta = {**task.meta, **task.moment.figures, **pose_figures(detection.poses)}
         events = [cut.events for cut in task.events]
-        name = self._session.add_capture(frame.images, frame.scans, meta, events)
+        name = self.session.add_capture(frame.images, frame.scans, meta, events)
         self._done.append((name, time.monotonic() - task.asked_s))
         # The capture is safe: the rest delays nothing.
-        self._stored.note(task.events)
-        self._learning.show(name, detection)
+        self.learning.show(name, detection)
 
 
 def record_streams(

@@ -9,99 +9,35 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from lce_rig.collect.board_search import BoardSearch
 from lce_rig.collect.board_tracker import (
     BoardDetection,
-    BoardTracker,
     CaptureMoment,
     ImageKey,
-    without_samples,
 )
-from lce_rig.collect.live.capture_triggers import SlowBoards, StillBoards
-from lce_rig.collect.live.capture_writer import CaptureWriter, Task, record_streams
+from lce_rig.collect.live.capture_triggers import (
+    Narration,
+    SlowBoards,
+    StillBoards,
+    narrate_refused,
+    narrate_unseen,
+)
+from lce_rig.collect.live.capture_writer import CaptureWriter, Learning, Task, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, count_in, make_guides
-from lce_rig.collect.live.learning import Learning
 from lce_rig.collect.live.monitor import Monitor
-from lce_rig.collect.live.narration import Narration, narrate_refused, narrate_unseen
 from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, LiveState, TakeBack
 from lce_rig.collect.placement_dedupe import Placements
-from lce_rig.collect.worker import Worker
-from lce_rig.core.findings import Refusal
-from lce_rig.core.results import ImageBoard
+from lce_rig.core.geometry import Array
 from lce_rig.devices import edge_cameras
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.reading import AttachedSensors, LiveSource
-from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock, pair_times
-from lce_rig.timing.scan_pairing import Frame
-
-# Interval of searches of a whole image while no board is in sight, which hold guidance up.
-_SEARCH_S = 0.3
-# Interval of thorough searches of an image without a board, which hold guidance up even longer.
-_THOROUGH_S = 3.0
-# Interval of searches of a scan for other things of the board's size while all known ones are followed.
-_RESCAN_S = 1.0
-# Such searches are as many times rarer than the longest of the last frames took, forgotten by this a frame.
-_RARE, _FORGET = 6.0, 0.95
-
-
-class BoardSearch(Worker):
-    """A `BoardTracker` in its process; frames' events, which it has no use for, stay here."""
-
-    def __init__(self, rig: Rig) -> None:
-        """Prepare; see `BoardTracker`."""
-        super().__init__("search for the board", _Search, rig)
-
-    def sight(self, frame: Frame) -> BoardDetection:
-        """Find the board in every image and scan of a frame.
-
-        Raises:
-            LceRigError: the profile cannot be used.
-        """
-        detection: BoardDetection = self.call("sight", replace(frame, events=()))
-        return replace(detection, frame=frame)
-
-    def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
-        """Search the frame of a moment as `check` does; see `BoardTracker.confirm`."""
-        frame = moment.detection.frame
-        bare = replace(moment.detection, frame=replace(frame, events=()))
-        confirmed: CaptureMoment | Refusal = self.call("confirm", replace(moment, detection=bare))
-        if isinstance(confirmed, Refusal):
-            return confirmed
-        return replace(confirmed, detection=replace(confirmed.detection, frame=frame))
-
-
-class _Search:
-    """The object in that process: it does not send the searched samples back."""
-
-    def __init__(self, rig: Rig) -> None:
-        self._tracker = BoardTracker(
-            rig, _SEARCH_S, thorough_interval_s=_THOROUGH_S, rescan_interval_s=_RESCAN_S
-        )
-        self._longest_s = 0.0
-
-    def sight(self, frame: Frame) -> BoardDetection:
-        began_s = time.monotonic()
-        detection = self._tracker.sight(frame)
-        # On a busy computer a thorough search may take longer than the time to the next one: rare searches
-        # must stay rare, or every frame waits for one.
-        self._longest_s = max(time.monotonic() - began_s, _FORGET * self._longest_s)
-        self._tracker.thorough_interval_s = max(_THOROUGH_S, _RARE * self._longest_s)
-        self._tracker.rescan_interval_s = max(_RESCAN_S, _RARE * self._longest_s)
-        return without_samples(detection)
-
-    def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
-        confirmed = self._tracker.confirm(moment)
-        if isinstance(confirmed, CaptureMoment):
-            return replace(confirmed, detection=without_samples(confirmed.detection))
-        return confirmed
-
 
 _WAIT_S = 0.1
 _TURN_S = 0.0005
@@ -149,8 +85,8 @@ def collect_live(
             keeper = CaptureWriter(session, learning, disk)
             clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
             with AttachedSensors(sources) as sensors, FrameFeed(rig, sensors, clock, board, record) as feed:
-                loop = _Loop(session, options, sensors, clock, feed, search, learning, keeper, guides, show)
-                loop.run(keys)
+                loop = _Loop(options, guides, feed, search, keeper)
+                loop.run(show, keys)
             disk.close()
             loop.take_kept()
             report = loop.close_books()
@@ -181,44 +117,37 @@ def _time_s(detection: BoardDetection) -> float:
 
 
 class _Asked(NamedTuple):
-    """A capture of this run: its name, the time of its detection, and each camera's board."""
+    """A capture of this run: its name, the time of its detection, and the board's pose by camera."""
 
     name: str
     time_ns: int
-    boards: Mapping[ImageKey, ImageBoard]
+    poses: Mapping[ImageKey, Array]
 
 
 class _Loop:
     def __init__(
         self,
-        session: Session,
         options: LiveOptions,
-        sensors: AttachedSensors,
-        clock: RigClock,
+        guides: Sequence[Guide],
         feed: FrameFeed,
         search: BoardSearch,
-        learning: Learning,
         keeper: CaptureWriter,
-        guides: Sequence[Guide],
-        show: Callable[[LiveState], None],
     ) -> None:
         self.report = LiveReport()
-        self._session, self._rig, self._options = session, session.rig, options
-        self._sensors, self._clock, self._feed, self._keeper = sensors, clock, feed, keeper
-        self._guides = guides
-        self._show = show
+        self._session, self._rig, self._options = keeper.session, keeper.session.rig, options
+        self._sensors, self._clock, self._feed, self._keeper = feed.sensors, feed.clock, feed, keeper
+        self._guides, self._search, self._learning = guides, search, keeper.learning
         self._began_s = time.monotonic()
-        self._search, self._learning = search, learning
         self._gate: StillBoards | SlowBoards | None = None
-        self._n_before = len(session.captures)
-        self._number = int(session.next_name)
+        self._n_before = len(self._session.captures)
+        self._number = int(self._session.next_name)
         self._asked: list[_Asked] = []
         self._kept: set[str] = set()
         self._captured_s = self._began_s
-        self._monitor = Monitor(session, options, sensors, clock)
+        self._monitor = Monitor(self._session, options, feed)
         self._last: BoardDetection | None = None
 
-    def run(self, keys: Callable[[], Key | TakeBack | None]) -> None:
+    def run(self, show: Callable[[LiveState], None], keys: Callable[[], Key | TakeBack | None]) -> None:
         """Go on until something ends it; what was lost until then is noted while the sensors are open."""
         while True:
             frame = self._feed.take(_WAIT_S)
@@ -232,11 +161,13 @@ class _Loop:
             key = keys()
             self._obey(key)
             ending = self._find_ending(key)
-            self._tell(has_frame=frame is not None, ending=ending)
+            if frame is not None or ending is not None or self._monitor.is_due():
+                show(self._state(has_ended=ending is not None))
             if ending is not None:
                 self.report.ending = ending
+                lost = {name: error for name, (error, _) in self._sensors.lost().items()}
+                self.report.notes += [f"{name} is lost: {e.what}. {e.hint}" for name, e in lost.items()]
                 self.report.is_enough = all(guide.is_usable for guide in self._guides)
-                self.report.lost = {name: error for name, (error, _) in self._sensors.lost().items()}
                 for name, status in self._sensors.statuses().items():
                     self.report.n_lost[name] = status.n_lost + status.n_dropped
                 return
@@ -265,7 +196,7 @@ class _Loop:
         predictions = [guide.predict() for guide in self._guides]
         report.predicted = [finding for finding in predictions if finding is not None]
         ties = self._clock.problems() + self._clock.account()
-        report.notes += self._keeper.notes() + self._learning.notes()
+        report.notes += self._learning.notes()
         report.notes += [f"{finding.subject}: {finding.sentence}" for finding in ties]
         self._session.journal(
             "collected live",
@@ -333,7 +264,7 @@ class _Loop:
         self._keeper.keep(Task(moment, gate.events_of(moment), meta, time.monotonic()))
         name = f"{self._number:06d}"
         self._number += 1
-        self._asked.append(_Asked(name, frame.time_ns, detection.images))
+        self._asked.append(_Asked(name, frame.time_ns, detection.poses))
         gate.note_capture(detection)
         self._captured_s = time.monotonic()
         for guide in self._guides:
@@ -375,14 +306,13 @@ class _Loop:
         if self._seeing_guide(detection) is None:
             self._monitor.cue("refused", "not captured: not every sensor sees the board")
             return
-        if self._asked:
-            # The board stands at the last capture, or was there within the hold.
-            last = self._asked[-1]
-            is_recent = time.monotonic() - self._captured_s < self._options.hold_s
-            places = Placements(_NOVEL_M, _NOVEL_DEG) if is_recent else Placements(_SAME_M, _SAME_DEG)
-            if self._find_gate().is_captured or places.are_alike(last.boards, detection.images):
-                self._monitor.cue("refused", f"not captured: {last.name} shows the board here; move it first")
-                return
+        # Of a board that was captured by itself just now the hand comes late.
+        is_recent = time.monotonic() - self._captured_s < self._options.hold_s
+        places = Placements(_NOVEL_M, _NOVEL_DEG) if is_recent else Placements(_SAME_M, _SAME_DEG)
+        if self._asked and places.are_alike(self._asked[-1].poses, detection.poses):
+            name = self._asked[-1].name
+            self._monitor.cue("refused", f"not captured: {name} shows the board here; move it first")
+            return
         confirmed = self._search.confirm(CaptureMoment(detection, {"by_hand": 1.0}))
         if isinstance(confirmed, CaptureMoment):
             self._capture(confirmed)
@@ -417,19 +347,14 @@ class _Loop:
     def _is_enough(self) -> bool:
         return all(guide.is_enough for guide in self._guides)
 
-    def _tell(self, *, has_frame: bool, ending: Ending | None) -> None:
-        if has_frame or ending is not None or self._monitor.is_due():
-            is_enough, has_ended = self._is_enough(), ending is not None
-            last = self._asked[-1].name if self._asked and not has_ended else ""
-            self._show(
-                self._monitor.state(
-                    self._n_captures,
-                    is_enough=is_enough,
-                    has_ended=has_ended,
-                    last_capture=last,
-                    goes_on="" if has_ended else self._explain(),
-                )
-            )
+    def _state(self, *, has_ended: bool) -> LiveState:
+        return self._monitor.state(
+            self._n_captures,
+            is_enough=self._is_enough(),
+            has_ended=has_ended,
+            last_capture=self._asked[-1].name if self._asked and not has_ended else "",
+            goes_on="" if has_ended else self._explain(),
+        )
 
     def _explain(self) -> str:
         """Say why it goes on, by the guide that needs most captures."""

@@ -46,6 +46,8 @@ class FrameFeed:
     """Reads the sensors, places samples on the rig's clock and pairs them; open while its `with` block lasts.
 
     Attributes:
+        sensors: open.
+        clock: ties the timestamps.
         losses: scans without an image of their time, and without events to make one of.
     """
 
@@ -71,8 +73,8 @@ class FrameFeed:
         """
         self.losses = Losses()
         self._rig = rig
-        self._sensors = sensors
-        self._clock = clock
+        self.sensors = sensors
+        self.clock = clock
         self._board = board
         self._record = record
         self._are_events_enough = are_events_enough
@@ -130,22 +132,22 @@ class FrameFeed:
         if time.monotonic() - self._refreshed_s < _REFRESH_S:
             return
         self._refreshed_s = time.monotonic()
-        states = {name: status.clock for name, status in self._sensors.statuses().items()}
+        states = {name: status.clock for name, status in self.sensors.statuses().items()}
         locked = [name for name, state in states.items() if state is not None and state.is_utc]
         board = self._board
         host, utc = (None, None) if board is None else (board.host_clock, board.utc_clock)
-        self._clock.refresh(host, utc, locked)
-        if board is not None and self._clock.needs_slow_triggers != self._is_slow:
+        self.clock.refresh(host, utc, locked)
+        if board is not None and self.clock.needs_slow_triggers != self._is_slow:
             self._is_slow = not self._is_slow
             board.start_triggers(SLOW_TRIGGERS_HZ if self._is_slow else None)
 
     def _samples(self) -> Iterator[Sample]:
         while not self._stop.is_set():
             self._refresh_clock()
-            came = self._sensors.take(_WAIT_S)
+            came = self.sensors.take(_WAIT_S)
             if came is None:
                 continue
-            for sample in self._clock.take(*came):
+            for sample in self.clock.take(*came):
                 if self._record is not None:
                     self._record(sample)
                 yield sample

@@ -7,30 +7,17 @@ import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection, ImageKey
 from lce_rig.collect.findings import (
-    GUIDE_FEW_CAPTURES,
+    GUIDE_CONTINUES,
     GUIDE_NO_BEAMS,
     GUIDE_NO_NOMINAL,
-    GUIDE_POSITION_ABOVE,
     GUIDE_PREDICTED,
-    GUIDE_ROTATION_ABOVE,
 )
-from lce_rig.collect.guidance import (
-    Coverage,
-    Guidance,
-    Instruction,
-    Planner,
-    SensorModel,
-    SensorPlace,
-    instruct,
-    is_there,
-    measure_coverage,
-    model_sensors,
-    outline_px,
-)
-from lce_rig.collect.guidance.planner import ENOUGH_SHARE
+from lce_rig.collect.guidance.instructions import Instruction, instruct, is_there
+from lce_rig.collect.guidance.planner import ENOUGH_SHARE, Coverage, Guidance, Planner, measure_coverage
+from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace, model_sensors, outline_px
 from lce_rig.collect.placement_dedupe import capture_poses
 from lce_rig.core.errors import LceRigError, ProfileError
-from lce_rig.core.findings import Figure, Finding, Refusal
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
@@ -194,16 +181,15 @@ class Guide:
         guidance = self.guidance
         if guidance is None or guidance.is_enough or not self._names:
             return None
-        figures: dict[str, Figure] = {"n_more": guidance.n_more, "n_least": guidance.n_least}
-        if guidance.n_captures < guidance.n_least:
-            return GUIDE_FEW_CAPTURES(self.key[0], **figures)
-        rotation_deg, position_m = guidance.stated_rotation_deg, guidance.stated_translation_m
-        limit_deg, limit_m = ENOUGH_SHARE * self._target_deg, ENOUGH_SHARE * self._target_mm / 1000
-        if rotation_deg / limit_deg > position_m / limit_m:
-            figures |= {"rotation_deg": rotation_deg, "limit_deg": limit_deg}
-            return GUIDE_ROTATION_ABOVE(self.key[0], **figures)
-        figures |= {"position_m": position_m, "limit_m": limit_m}
-        return GUIDE_POSITION_ABOVE(self.key[0], **figures)
+        return GUIDE_CONTINUES(
+            self.key[0],
+            n_more=guidance.n_more,
+            n_least=guidance.n_least,
+            rotation_deg=guidance.stated_rotation_deg,
+            limit_deg=ENOUGH_SHARE * self._target_deg,
+            position_mm=1000 * guidance.stated_translation_m,
+            limit_mm=ENOUGH_SHARE * self._target_mm,
+        )
 
     def predict(self) -> Finding | None:
         """Give the predicted standard deviations for the captures; None where nothing can be predicted."""

@@ -6,14 +6,14 @@ from collections import deque
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection
+from lce_rig.collect.live.capture_triggers import Narration
+from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.collect.live.guide import Guide
-from lce_rig.collect.live.narration import Narration, image_figures, scan_figures, stream_name
 from lce_rig.collect.live.state import Cue, Drawing, LiveOptions, LiveState, Phase, Sound, StreamState
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.devices.reading import AttachedSensors, SourceStatus
+from lce_rig.devices.reading import SourceStatus
 from lce_rig.session import Session
-from lce_rig.timing.rig_clock import RigClock
 
 _EVERY_S = 0.5
 _N_CUES, _N_LOG = 8, 40
@@ -32,15 +32,12 @@ class Monitor:
         reasons: why the board is not seen, by the stream's name.
     """
 
-    def __init__(
-        self, session: Session, options: LiveOptions, sensors: AttachedSensors, clock: RigClock
-    ) -> None:
+    def __init__(self, session: Session, options: LiveOptions, feed: FrameFeed) -> None:
         """Begin with nothing seen."""
         self.reasons: dict[str, Refusal] = {}
         self._session = session
         self._options = options
-        self._sensors = sensors
-        self._clock = clock
+        self._sensors, self._clock = feed.sensors, feed.clock
         self._began_s = self._told_s = self._asked_s = time.monotonic()
         self._statuses: dict[str, SourceStatus] = {}
         self._cues: deque[Cue] = deque(maxlen=_N_CUES)
@@ -60,12 +57,12 @@ class Monitor:
         """Take a detection, and remember why streams do not show the board."""
         self._detection, self._seen_s = detection, time.monotonic()
         for key, why in detection.unseen.items():
-            self.reasons[stream_name(key)] = why
+            self.reasons[".".join(key)] = why
         self.reasons.update(detection.unscanned)
         for key in detection.images:
-            self.reasons.pop(stream_name(key), None)
+            self.reasons.pop(".".join(key), None)
         for key, why in detection.unfit.items():
-            self.reasons[stream_name(key)] = why
+            self.reasons[".".join(key)] = why
         for lidar in detection.lidars:
             self.reasons.pop(lidar, None)
 
@@ -83,7 +80,7 @@ class Monitor:
         )
         if picture is not None:
             self._drawing = Drawing(
-                stream_name(guide.key),
+                ".".join(guide.key),
                 picture.pixels,
                 None if present is None else guide.outline_px(present),
                 None if guide.wanted is None else guide.outline_px(guide.wanted),
@@ -189,50 +186,40 @@ class Monitor:
     def _streams(self) -> tuple[StreamState, ...]:
         """List every stream: channels of cameras, LiDARs, then what else there is."""
         rig, streams = self._session.rig, []
+        detection = None if self._is_stale() else self._detection
+        images = [] if detection is None else [(i.sensor, i.channel) for i in detection.frame.images]
         for name, camera in rig.cameras.items():
             status = self._statuses.get(name, SourceStatus(name))
             for channel, settings in camera.channels.items():
+                figures = None
+                if detection is not None and (name, channel) in images:
+                    board = (
+                        None if (name, channel) in detection.unfit else detection.images.get((name, channel))
+                    )
+                    figures = f"{board.distance_m:.1f} m, {board.reprojection_px:.2f} px" if board else ""
                 # Only its source knows the rates of frames and events of one camera.
-                is_framed = settings.kind == "frames"
-                kind_hz = status.rates_hz.get(settings.kind, status.rate_hz if is_framed else 0.0)
-                streams.append(self._camera_stream(name, channel, is_framed, kind_hz, status))
+                usual_hz = status.rate_hz if settings.kind == "frames" else 0.0
+                rate_hz = status.rates_hz.get(settings.kind, usual_hz)
+                streams.append(self._stream(f"{name}.{channel}", status, rate_hz, figures))
         for name in rig.lidars:
-            streams.append(self._lidar_stream(name, self._statuses.get(name, SourceStatus(name))))
-        for name, status in self._statuses.items():
-            if name not in {*rig.cameras, *rig.lidars}:
-                streams.append(StreamState(name, status.rate_hz, status.n_lost, None, self._trouble(name)))
-        return tuple(streams)
+            status, figures = self._statuses.get(name, SourceStatus(name)), None
+            if detection is not None and detection.images:
+                boards = detection.lidars.get(name)
+                figures = (
+                    f"{boards[0].quality.n_rings} rings, {len(boards[0].points)} points" if boards else ""
+                )
+            streams.append(self._stream(name, status, status.rate_hz, figures))
+        others = (each for name, each in self._statuses.items() if name not in {*rig.cameras, *rig.lidars})
+        return (*streams, *(self._stream(each.sensor, each, each.rate_hz, None) for each in others))
 
-    def _camera_stream(
-        self, camera: str, channel: str, is_framed: bool, rate_hz: float, status: SourceStatus
-    ) -> StreamState:
-        name, detection = f"{camera}.{channel}", None if self._is_stale() else self._detection
-        n_lost = status.n_lost + status.n_dropped
-        pictures = {(i.sensor, i.channel) for i in detection.frame.images} if detection else set()
-        if detection is None or (camera, channel) not in pictures:
-            return StreamState(name, rate_hz, n_lost, None, self._trouble(camera) if is_framed else "")
-        board = detection.images.get((camera, channel))
-        if board is None or (camera, channel) in detection.unfit:
-            why = self.reasons.get(name)
-            reason = self._trouble(camera) or (why.sentence if why else "no board")
-            return StreamState(name, rate_hz, n_lost, False, reason)
-        return StreamState(name, rate_hz, n_lost, True, self._trouble(camera), image_figures(board))
-
-    def _lidar_stream(self, lidar: str, status: SourceStatus) -> StreamState:
-        detection, n_lost = None if self._is_stale() else self._detection, status.n_lost + status.n_dropped
-        if detection is None or not detection.images:
-            return StreamState(lidar, status.rate_hz, n_lost, None, self._trouble(lidar))
-        boards = detection.lidars.get(lidar)
-        if not boards:
-            why = self.reasons.get(lidar)
-            reason = self._trouble(lidar) or (why.sentence if why else "no board")
-            return StreamState(lidar, status.rate_hz, n_lost, False, reason)
-        return StreamState(lidar, status.rate_hz, n_lost, True, self._trouble(lidar), scan_figures(boards[0]))
-
-    def _trouble(self, sensor: str) -> str:
-        """Say what is wrong with a sensor now; "" where nothing is."""
-        lost = self._sensors.lost().get(sensor)
-        return "" if lost is None else f"lost: {lost[0].what}"
+    def _stream(self, name: str, status: SourceStatus, rate_hz: float, figures: str | None) -> StreamState:
+        """Describe a stream; figures of its board are "" where it is not seen, None where not looked for."""
+        lost = self._sensors.lost().get(status.sensor)
+        reason = "" if lost is None else f"lost: {lost[0].what}"
+        if figures == "" and not reason:
+            reason = self.reasons[name].sentence if name in self.reasons else "no board"
+        sees_board = None if figures is None else bool(figures)
+        return StreamState(name, rate_hz, status.n_lost + status.n_dropped, sees_board, reason, figures or "")
 
     def _notes(self) -> tuple[str, ...]:
         verdict = self._clock.verdict()

@@ -9,67 +9,26 @@ import math
 import multiprocessing
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from types import TracebackType
 
 import numpy as np
 
-from lce_rig.collect.findings import CLOCK_SIMULATED, STREAM_SIMULATED_SLOWLY
-from lce_rig.collect.guidance import HeldPose, Person, SensorPlace, build_pose, model_sensors
+from lce_rig.collect.findings import CLOCK_SIMULATED
+from lce_rig.collect.guidance.instructions import HeldPose, build_pose, describe_pose, instruct
+from lce_rig.collect.guidance.sensor_model import SensorPlace, model_sensors
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.worker import start_without_interrupts
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
-from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, invert
+from lce_rig.core.geometry import Array, exp_so3, invert, pose
 from lce_rig.devices.reading import ClockState, Inbox, LiveSource, SourceStatus
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.poses import between
-
-# Rendering a moving board takes longer than the sensors would: slower than this is reported.
-USUAL = 2.0
-# Nothing is said of a simulation that has only begun.
-LEAST_S = 4.0
-
-
-class SimulatedPace:
-    """How much slower than real time a simulation runs; may be asked from any thread.
-
-    Args:
-        period_s: simulated time between two turns of the simulation.
-        now_s: the clock.
-    """
-
-    def __init__(self, period_s: float, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._period_s = period_s
-        self._now_s = now_s
-        self._began_s = math.inf
-        self._n_turns = 0
-
-    def begin(self) -> None:
-        """Count from now on."""
-        self._began_s = self._now_s()
-
-    def turn(self) -> None:
-        """Count a turn."""
-        self._n_turns += 1
-
-    @property
-    def simulated_s(self) -> float:
-        """Simulated time since the beginning."""
-        return self._n_turns * self._period_s
-
-    def problem(self) -> Finding | None:
-        """Report a computer that is too slow, by its factor since the beginning; None where it keeps up."""
-        elapsed_s = self._now_s() - self._began_s
-        factor = elapsed_s / max(self.simulated_s, self._period_s)
-        if elapsed_s < LEAST_S or factor < USUAL:
-            return None
-        return STREAM_SIMULATED_SLOWLY(factor=round(factor))
-
 
 # For each camera: what it sees of the room is rendered first.
 START_S = 120.0
@@ -88,9 +47,8 @@ _WAIT_S, _N_SLOTS = 0.2, 32
 class SimulatedSource(LiveSource):
     """One simulated sensor; see `LiveSource`."""
 
-    def __init__(self, sensor: str, pace: SimulatedPace | None = None) -> None:
+    def __init__(self, sensor: str) -> None:
         super().__init__(sensor, sensor, math.inf)
-        self._pace = pace
         self._taken = Inbox[Image | Scan]()
         self._failure: SourceError | None = None
 
@@ -115,14 +73,8 @@ class SimulatedSource(LiveSource):
 
     def describe(self) -> SourceStatus:
         """Say how the sensor does."""
-        problem = self._pace.problem() if self._pace else None
-        return SourceStatus(
-            self.sensor,
-            n_lost=self._taken.n_dropped[self.sensor],
-            clock=ClockState(CLOCK_SIMULATED()),
-            problems=() if problem is None else (problem,),
-            device="simulated",
-        )
+        clock, n_lost = ClockState(CLOCK_SIMULATED()), self._taken.n_dropped[self.sensor]
+        return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, device="simulated")
 
     def put(self, sample: Image | Scan) -> None:
         """Take a sample of the simulation."""
@@ -139,7 +91,6 @@ class SimulatedRig:
 
     Attributes:
         sources: of its sensors: frames and scans. Events cannot be simulated in real time.
-        pace: how much slower than real time it runs.
     """
 
     def __init__(self, rig: Rig, seed: int) -> None:
@@ -160,10 +111,11 @@ class SimulatedRig:
                 f"rig {rig.name!r} has no camera with frames; events are not simulated in real time",
                 "Simulate a recording instead: lce-rig simulate --recording FOLDER.",
             )
-        self.pace = SimulatedPace(1 / min(lidar.rate_hz for lidar in rig.lidars.values()))
-        self._by_sensor = {name: SimulatedSource(name, self.pace) for name in [*framed, *rig.lidars]}
+        self._period_s = 1 / min(lidar.rate_hz for lidar in rig.lidars.values())
+        self._simulated_s = 0.0
+        self._by_sensor = {name: SimulatedSource(name) for name in [*framed, *rig.lidars]}
         self._counted = next(iter(rig.lidars))
-        self._views = {name: _view(rig, name) for name in framed}
+        self._views = {name: _view(rig, name, self._counted) for name in framed}
         self._sent_s = -1e9
         self._last: tuple[int, bytes] | None = None
         self._changed_s = 0.0
@@ -195,7 +147,6 @@ class SimulatedRig:
         if isinstance(answer, LceRigError):
             self._process.join()
             raise answer
-        self.pace.begin()
         self._reader = threading.Thread(target=self._read, name="read simulated rig", daemon=True)
         self._reader.start()
         return self
@@ -214,7 +165,7 @@ class SimulatedRig:
         drawing = state.drawing
         if drawing is None or drawing.wanted is None or state.phase in ("holding", "saving"):
             return
-        wanted, now_s = (state.n_captures, drawing.wanted.tobytes()), self.pace.simulated_s
+        wanted, now_s = (state.n_captures, drawing.wanted.tobytes()), self._simulated_s
         if wanted != self._last:
             self._last, self._changed_s = wanted, now_s
             self._sent_s = -1e9
@@ -236,17 +187,16 @@ class SimulatedRig:
                 return
             self._by_sensor[sample.sensor].put(sample)
             if sample.sensor == self._counted:
-                self.pace.turn()
+                self._simulated_s += self._period_s
 
 
-def _view(rig: Rig, camera: str) -> SensorPlace:
-    """Look through a camera as the drawing has it: people do not know the true extrinsic."""
-    lidar = next(iter(rig.lidars))
+def _view(rig: Rig, camera: str, lidar: str) -> SensorPlace:
+    """Look through a camera as the drawing has it: people do not know the true extrinsics."""
     nominal = rig.nominal(camera, lidar)
     if nominal is None:
         raise ProfileError(
-            f"rig {rig.name!r} has no nominal extrinsic of {camera} and {lidar}, which its simulation needs",
-            "Add it under nominal_extrinsics.",
+            f"rig {rig.name!r} has no nominal extrinsics of {camera} and {lidar}, which its simulation needs",
+            "Add them under nominal_extrinsics.",
         )
     return SensorPlace.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
 
@@ -283,6 +233,43 @@ def _simulate(connection: Connection, rig: Rig, seed: int, views: Mapping[str, S
             time.sleep(max(0.0, due_s - time.monotonic()))
     except (EOFError, OSError, KeyboardInterrupt):
         return
+
+
+_FIGURE = {
+    "sideways": "right_m",
+    "nearer": "ahead_m",
+    "height": "up_m",
+    "tilt": "tilt_deg",
+    "turn": "turn_deg",
+    "roll": "roll_deg",
+}
+
+
+@dataclass(frozen=True)
+class Person:
+    """A simulated person who follows instructions, more or less.
+
+    Attributes:
+        place_sigma_m: error along each axis.
+        turn_sigma_deg: error about each axis.
+        ignored_share: how often one of the instructions is not followed.
+    """
+
+    place_sigma_m: float = 0.10
+    turn_sigma_deg: float = 8.0
+    ignored_share: float = 0.2
+
+    def follow(self, view: SensorPlace, present: Array, wanted: Array, rng: np.random.Generator) -> Array:
+        """Move a board T_cam_board (4, 4) to where it is wanted, more or less."""
+        aim = describe_pose(view, wanted)
+        instructions = instruct(view, present, wanted)
+        if instructions and rng.random() < self.ignored_share:
+            ignored = rng.choice([instruction.kind for instruction in instructions])
+            aim = replace(aim, **{_FIGURE[ignored]: getattr(describe_pose(view, present), _FIGURE[ignored])})
+        aimed = build_pose(view, aim)
+        turn = exp_so3(np.radians(self.turn_sigma_deg) * rng.standard_normal(3))
+        place = aimed[:3, 3] + self.place_sigma_m * rng.standard_normal(3)
+        return pose(turn @ aimed[:3, :3], place)
 
 
 class Walker:

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.collect.guidance import Coverage
+from lce_rig.collect.guidance.planner import Coverage
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
@@ -72,7 +72,6 @@ class LiveReport:
         latencies_s: from each decision until its capture was safe on the disk.
         n_frames: frames looked at.
         n_lost: samples lost or dropped, by sensor.
-        lost: sensors that were lost when it ended, and why, by name.
         error: the sensor that is lost for good; None where none is.
         notes: what else was odd.
         predicted: the predicted standard deviations, for each camera and LiDAR of which they are known.
@@ -87,7 +86,6 @@ class LiveReport:
     latencies_s: list[float] = field(default_factory=list)
     n_frames: int = 0
     n_lost: dict[str, int] = field(default_factory=dict)
-    lost: dict[str, SourceError] = field(default_factory=dict)
     error: SourceError | None = None
     notes: list[str] = field(default_factory=list)
     predicted: list[Finding] = field(default_factory=list)

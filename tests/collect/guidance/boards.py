@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from lce_rig.collect.guidance import SensorModel, SensorPlace, combine, weigh_placements
-from lce_rig.collect.guidance.sensor_noise import ErrorModel
+from lce_rig.collect.guidance.evidence import combine, weigh_placements
+from lce_rig.collect.guidance.sensor_model import ErrorModel, SensorModel, SensorPlace
 from lce_rig.core.geometry import Array, invert
 from lce_rig.rig import QualitySettings
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, random_pose, scan_board

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.collect.guidance import Coverage, HeldPose, Planner, build_pose, measure_coverage
+from lce_rig.collect.guidance.instructions import HeldPose, build_pose
+from lce_rig.collect.guidance.planner import Coverage, Planner, measure_coverage
 from tests.collect.guidance.boards import view
 
 VIEW = view()

@@ -13,8 +13,8 @@ from lce_rig.calibrate.estimate import estimate_observations
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.calibrate.systematic import ring_sensitivities
-from lce_rig.collect.guidance import combine, sigmas, weigh_placements
-from lce_rig.collect.guidance.sensor_noise import ErrorModel
+from lce_rig.collect.guidance.evidence import combine, sigmas, weigh_placements
+from lce_rig.collect.guidance.sensor_model import ErrorModel
 from lce_rig.core.geometry import difference, invert
 from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, scan_board

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.collect.guidance import HeldPose, build_pose, describe_pose, instruct, is_there, say
+from lce_rig.collect.guidance.instructions import HeldPose, build_pose, describe_pose, instruct, is_there, say
 from tests.collect.guidance.boards import placements, view
 
 VIEW = view()

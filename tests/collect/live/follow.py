@@ -5,9 +5,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lce_rig.collect.guidance import HeldPose, Person, SensorPlace, build_pose, model_sensors
+from lce_rig.collect.guidance.instructions import HeldPose, build_pose
 from lce_rig.collect.guidance.planner import MIN_MOVE_M, MIN_TURN_DEG
+from lce_rig.collect.guidance.sensor_model import SensorPlace, model_sensors
 from lce_rig.collect.live.guide import Guide, make_guides
+from lce_rig.collect.live.simulated import Person
 from lce_rig.core.geometry import Array, rotation_angle
 from lce_rig.rig import Rig
 

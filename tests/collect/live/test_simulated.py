@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from lce_rig.collect.guidance import HeldPose, Person, SensorPlace, build_pose, model_sensors
-from lce_rig.collect.live.simulated import WALK_MPS, Walker
+from lce_rig.collect.guidance.instructions import HeldPose, build_pose
+from lce_rig.collect.guidance.sensor_model import SensorPlace, model_sensors
+from lce_rig.collect.live.simulated import WALK_MPS, Person, Walker
 from lce_rig.core.geometry import Array, invert
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene

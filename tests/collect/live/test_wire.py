@@ -26,9 +26,9 @@ def test_captures_appear_by_themselves_and_hold_what_was_sent(
     wire: Start, reel: Reel, tmp_path: Path
 ) -> None:
     rig, session = wire(), tmp_path / "session"
-    with Collecting(rig.profile, session, "--hold", "0", "--frames", "2") as collecting:
+    with Collecting(rig.profile, session, "--hold", "0", "--captures", "2") as collecting:
         assert collecting.wait() == 0
-    with Collecting(rig.profile, session, "--hold", "0", "--frames", "3") as again:
+    with Collecting(rig.profile, session, "--hold", "0", "--captures", "3") as again:
         assert again.wait() == 0
     captures, sent = check_whole(session), read_sent(reel, rig.rig.lidars["lidar"])
     assert [capture.name for capture in captures] == ["000000", "000001", "000002"]

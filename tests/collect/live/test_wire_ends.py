@@ -102,5 +102,5 @@ def test_a_camera_whose_command_writes_no_pictures_is_named_where_nothing_was_ca
     rig.profile.write_text(dump_rig(rig.rig.model_copy(update={"cameras": {"cam": broken}})))
     with Collecting(rig.profile, tmp_path / "session", "--timeout", "3") as collecting:
         assert collecting.wait() == 6
-    said = collecting.said.partition("error: ")[2]
-    assert "cam is" in said and "no Y4M" in said and "lidar is" not in said
+    said = collecting.said.partition("ended: ")[0]
+    assert "cam is lost" in said and "no Y4M" in said and "lidar is lost" not in said

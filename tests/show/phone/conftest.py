@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from lce_rig.collect.guidance import Coverage
+from lce_rig.collect.guidance.planner import Coverage
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
 from lce_rig.show.phone.preview import Preview
 

@@ -1,9 +1,11 @@
-"""The board searched for in a recording's images by another process, and only where it may be at rest.
+"""The board searched for by another process: in the newest frame of a live rig, or ahead in a recording.
 
-Comparing images at an eighth of their size takes half a millisecond. A board is searched for where something
-has come to rest since the last search, and followed where it is at rest itself.
+In a recording only images in which the board may be at rest are searched. Comparing images at an eighth of
+their size takes half a millisecond. A board is searched for where something has come to rest since the last
+search, and followed where it is at rest itself.
 """
 
+import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,9 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, ImageKey, without_samples
+from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, ImageKey
 from lce_rig.collect.worker import Worker
 from lce_rig.core.data import Image
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import Frame
@@ -128,7 +131,7 @@ class RestingTracker(BoardTracker):
             is_same = _is_same(glances[key].small, self._searched[key][1].small)
             are_moving.append(key in self._seen or int(np.sum(~is_same)) >= _BOARD_PX)
         detection = self.sight_in_images(replace(frame, images=tuple(worth)))
-        return replace(without_samples(detection), is_moving=not worth and any(are_moving))
+        return replace(_without_samples(detection), is_moving=not worth and any(are_moving))
 
     def _is_worthwhile(self, key: ImageKey, time_ns: int) -> bool:
         glance, seen = self._glances[key], self._seen.get(key)
@@ -151,6 +154,11 @@ class RestingTracker(BoardTracker):
         if is_due:
             self._searched_well[key] = time_ns, glance
         return is_due
+
+
+def _without_samples(detection: BoardDetection) -> BoardDetection:
+    """Drop the images and scans that were searched, which take long to send to another process."""
+    return replace(detection, frame=replace(detection.frame, images=(), scans=()))
 
 
 def _in_scans(tracker: BoardTracker, frame: Frame, images: Future[BoardDetection]) -> BoardDetection:
@@ -181,3 +189,65 @@ def _is_same(one: NDArray[np.float32], two: NDArray[np.float32]) -> NDArray[np.b
         return np.zeros(one.shape, dtype=np.bool_)
     change = one - two
     return np.asarray(np.abs(change - np.median(change)) < _CHANGE)
+
+
+# Interval of searches of a whole image while no board is in sight, which hold guidance up.
+_SEARCH_S = 0.3
+# Interval of thorough searches of an image without a board, which hold guidance up even longer.
+_THOROUGH_S = 3.0
+# Interval of searches of a scan for other things of the board's size while all known ones are followed.
+_RESCAN_S = 1.0
+# Such searches are as many times rarer than the longest of the last frames took, forgotten by this a frame.
+_RARE, _FORGET = 6.0, 0.95
+
+
+class BoardSearch(Worker):
+    """A `BoardTracker` in its process; frames' events, which it has no use for, stay here."""
+
+    def __init__(self, rig: Rig) -> None:
+        """Prepare; see `BoardTracker`."""
+        super().__init__("search for the board", _Search, rig)
+
+    def sight(self, frame: Frame) -> BoardDetection:
+        """Find the board in every image and scan of a frame.
+
+        Raises:
+            LceRigError: the profile cannot be used.
+        """
+        detection: BoardDetection = self.call("sight", replace(frame, events=()))
+        return replace(detection, frame=frame)
+
+    def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
+        """Search the frame of a moment as `check` does; see `BoardTracker.confirm`."""
+        frame = moment.detection.frame
+        bare = replace(moment.detection, frame=replace(frame, events=()))
+        confirmed: CaptureMoment | Refusal = self.call("confirm", replace(moment, detection=bare))
+        if isinstance(confirmed, Refusal):
+            return confirmed
+        return replace(confirmed, detection=replace(confirmed.detection, frame=frame))
+
+
+class _Search:
+    """The object in that process: it does not send the searched samples back."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._tracker = BoardTracker(
+            rig, _SEARCH_S, thorough_interval_s=_THOROUGH_S, rescan_interval_s=_RESCAN_S
+        )
+        self._longest_s = 0.0
+
+    def sight(self, frame: Frame) -> BoardDetection:
+        began_s = time.monotonic()
+        detection = self._tracker.sight(frame)
+        # On a busy computer a thorough search may take longer than the time to the next one: rare searches
+        # must stay rare, or every frame waits for one.
+        self._longest_s = max(time.monotonic() - began_s, _FORGET * self._longest_s)
+        self._tracker.thorough_interval_s = max(_THOROUGH_S, _RARE * self._longest_s)
+        self._tracker.rescan_interval_s = max(_RESCAN_S, _RARE * self._longest_s)
+        return _without_samples(detection)
+
+    def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
+        confirmed = self._tracker.confirm(moment)
+        if isinstance(confirmed, CaptureMoment):
+            return replace(confirmed, detection=_without_samples(confirmed.detection))
+        return confirmed

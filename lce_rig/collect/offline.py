@@ -4,24 +4,20 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
+from lce_rig.collect.board_search import sight_ahead
 from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.findings import CALIBRATE_SAME_PLACEMENT
-from lce_rig.collect.offline.search_ahead import sight_ahead
-from lce_rig.collect.offline.slow_motion import find_moving_moments
-from lce_rig.collect.offline.stillness import find_still_moments
-from lce_rig.collect.offline.stored_events import StoredEvents
-from lce_rig.collect.placement_dedupe import Placements, board_figures, capture_poses, known_placements
+from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments
+from lce_rig.collect.placement_dedupe import Placements, capture_poses, pose_figures
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
-from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
-from lce_rig.detect.image.search import compare_size
 from lce_rig.io.joining import join_recordings, require_sensors
 from lce_rig.io.protocol import (
     ContinuousRecording,
     PairedRecording,
-    PairFiles,
     Recording,
     serials_of,
 )
@@ -48,14 +44,12 @@ class CollectOptions:
     """What becomes a capture.
 
     Attributes:
-        max_captures: the session is never filled beyond this; None for no limit.
-        target: number of captures wanted: recordings are read until the session has as many.
+        target: number of captures wanted: recordings are read until the session has as many; None for all.
         min_move_m, min_turn_deg: a board differs from one captured before when it moved or turned as far; for
             continuous recordings only.
         max_motion_m: how far a board that stands still may move; None takes the profile's.
     """
 
-    max_captures: int | None = None
     target: int | None = None
     min_move_m: float = 0.15
     min_turn_deg: float = 10.0
@@ -68,26 +62,20 @@ class CollectReport:
 
     Attributes:
         captured: names of the new captures.
-        n_resumed: pairs and moments that an earlier run had captured already.
-        n_rejected: those whose captures were rejected since.
-        duplicates: capture that holds the same data, by label.
+        n_known: pairs and moments that the session holds already, among rejected captures too.
         refused: why something became no capture, by label.
         counts: what kept moments of a continuous recording from becoming captures.
         notes: what was chosen, assumed or left out, in words.
-        sizes: what was found of images of another size than the intrinsics, by stream and size.
         errors: recordings that could not be read to their end; what was captured before is kept.
         n_missing: captures short of the target.
         has_events: whether any recording held events, which make the board's motion wanted.
     """
 
     captured: list[str] = field(default_factory=list)
-    n_resumed: int = 0
-    n_rejected: int = 0
-    duplicates: dict[str, str] = field(default_factory=dict)
+    n_known: int = 0
     refused: dict[str, Refusal] = field(default_factory=dict)
     counts: Losses = field(default_factory=Losses)
     notes: list[str] = field(default_factory=list)
-    sizes: dict[str, list[Finding]] = field(default_factory=dict)
     errors: list[SourceError] = field(default_factory=list)
     n_missing: int = 0
     has_events: bool = False
@@ -131,7 +119,6 @@ class _Collector:
         self._session = session
         self._options = options
         self._progress = progress
-        self._stored = StoredEvents()
         self._rejected = {capture.name: capture for capture in session.rejected}
         # Captures, rejected ones included, by the key of their data.
         self._names_by_key: dict[str, str] = {}
@@ -151,12 +138,17 @@ class _Collector:
         failures: list[SourceError] = []
         n_left_out = 0
         for done, files in enumerate(recording.pairs):
-            message = files.label
             if self._is_enough():
                 n_left_out += 1
                 continue
             try:
-                message = self._take_pair(files)
+                key = files.key()
+                if key in self._names_by_key:
+                    message = self._count_known(files.label, self._names_by_key[key])
+                else:
+                    pair = files.read()
+                    self.note(pair.notes)
+                    message = self._store(key, files.label, pair.images, pair.scans, {})
             except SourceError as error:
                 failures.append(error)
                 self.report.refused[files.label] = refusal_of("read", error, "record")
@@ -178,12 +170,13 @@ class _Collector:
         """
         require_sensors(recording)
         options = self._options
-        known = known_placements(self._session, options.min_move_m, options.min_turn_deg)
+        known = Placements(options.min_move_m, options.min_turn_deg)
         # Where a capture of this recording was rejected, another moment of that placement is not wanted.
-        for key, name in self._names_by_key.items():
-            if name in self._rejected and key.startswith(f"{recording.key}:"):
-                with suppress(LceRigError):
-                    known.add_poses(name, capture_poses(self._rejected[name], self._session))
+        unwanted = {name for key, name in self._names_by_key.items() if key.startswith(f"{recording.key}:")}
+        rejected = [capture for name, capture in self._rejected.items() if name in unwanted]
+        for capture in [*self._session.captures, *rejected]:
+            with suppress(LceRigError):  # A damaged capture is named when it is used.
+                known.add(capture.name, capture_poses(capture, self._session))
         # A camera that sends events and no images is watched in images reconstructed as the stream runs.
         with_images = {stream.sensor for stream in recording.streams if stream.kind == "images"}
         events = [stream for stream in recording.streams if stream.kind == "events"]
@@ -225,12 +218,10 @@ class _Collector:
         if recording.n_samples >= _LONG_SAMPLES:
             are_still = not has_events and max_motion_m <= _GLANCED_M
             detections = sight_ahead(tracker, frames, is_still_wanted=are_still)
+        gate: StillnessGate | MotionGate = StillnessGate(rig.board.to_board(), max_motion_m)
         if has_events:
-            taken = Placements(options.min_move_m, options.min_turn_deg)
-            moments = find_moving_moments(detections, rig, taken, losses)
-        else:
-            moments = find_still_moments(detections, rig.board.to_board(), max_motion_m)
-        for moment in moments:
+            gate = MotionGate(rig, Placements(options.min_move_m, options.min_turn_deg), losses)
+        for moment in find_moments(detections, gate):
             confirmed = tracker.confirm(moment)
             if isinstance(confirmed, Refusal):
                 losses.add(confirmed)
@@ -248,15 +239,12 @@ class _Collector:
             SourceError: nothing could be read and the session is empty.
         """
         report = self.report
-        self.note(self._stored.notes())
         if self._options.target is not None:
             report.n_missing = max(0, self._options.target - self._n_captures)
         self._session.journal(
             "collected",
             captured=len(report.captured),
-            resumed=report.n_resumed,
-            rejected=report.n_rejected,
-            duplicates=report.duplicates,
+            known=report.n_known,
             refused={label: refusal.text for label, refusal in report.refused.items()},
             counts=report.counts.by_code(),
             errors=[error.what for error in report.errors],
@@ -265,15 +253,6 @@ class _Collector:
             raise report.errors[0]
         return report
 
-    def _take_pair(self, files: PairFiles) -> str:
-        key = files.key()
-        if key in self._names_by_key:
-            return self._count_known(files.label, self._names_by_key[key])
-        pair = files.read()
-        self.note(pair.notes)
-        self._note_sizes(pair.images)
-        return self._store(key, files.label, pair.images, pair.scans, {})
-
     def _take_moment(
         self,
         recording: ContinuousRecording,
@@ -281,23 +260,21 @@ class _Collector:
         images: Sequence[Image],
         known: Placements,
     ) -> None:
-        frame, boards = moment.detection.frame, moment.detection.images
+        frame, poses = moment.detection.frame, moment.detection.poses
         stamps = [scan.stamp_ns for scan in frame.scans] + [image.stamp_ns for image in images]
         key = f"{recording.key}:{'/'.join(str(stamp) for stamp in stamps)}"
         label = f"at {stamps[0]} ns"
         if key in self._names_by_key:
             self._count_known(label, self._names_by_key[key])
             return
-        if known.find_like(boards) is not None:
+        if known.find_like(poses) is not None:
             self.report.counts.add(CALIBRATE_SAME_PLACEMENT.refusal())
             return
-        self._note_sizes(images)
-        self._stored.note(frame.events)
         events = [cut.events for cut in frame.events]
         serials = serials_of(recording)
-        figures = {**moment.figures, **board_figures(boards), **({SERIALS: serials} if serials else {})}
+        figures = {**moment.figures, **pose_figures(poses), **({SERIALS: serials} if serials else {})}
         self._store(key, label, images, frame.scans, figures, events)
-        known.add(self._names_by_key.get(key, label), boards)
+        known.add(self._names_by_key.get(key, label), poses)
 
     def _store(
         self,
@@ -309,11 +286,8 @@ class _Collector:
         events: Sequence[Events] = (),
     ) -> str:
         duplicate = self._session.find_duplicate(images, scans, events)
-        if duplicate in self._rejected:
-            return self._count_known(label, duplicate)
         if duplicate is not None:
-            self.report.duplicates[label] = duplicate
-            return f"{label} is a duplicate of {duplicate}"
+            return self._count_known(label, duplicate)
         meta = {"source": {"key": key, "label": label}, **figures}
         name = self._session.add_capture(images, scans, meta, events)
         self._names_by_key[key] = name
@@ -322,16 +296,11 @@ class _Collector:
         return f"{label} captured as {name}"
 
     def _count_known(self, label: str, name: str) -> str:
-        """Count what an earlier run captured as this capture; rejected captures stay rejected."""
-        if name in self._rejected:
-            self.report.n_rejected += 1
-            return f"{label} is capture {name}, which is rejected"
-        self.report.n_resumed += 1
+        self.report.n_known += 1
         return f"{label} is capture {name} already"
 
     def _is_enough(self) -> bool:
-        limits = self._options.max_captures, self._options.target
-        return any(limit is not None and self._n_captures >= limit for limit in limits)
+        return self._options.target is not None and self._n_captures >= self._options.target
 
     def _read(self, recording: ContinuousRecording, torn: list[SourceError]) -> Iterator[Sample]:
         """Yield samples up to a tear, whose error goes to `torn`: moments before it are still captured."""
@@ -344,10 +313,3 @@ class _Collector:
                     self._progress(done, recording.n_samples, f"{len(self.report.captured)} captured")
         except SourceError as error:
             torn.append(error)
-
-    def _note_sizes(self, images: Iterable[Image]) -> None:
-        for image in images:
-            finding = compare_size(image, self._session.rig.cameras[image.sensor].to_intrinsics())
-            if finding is not None:
-                size = f"{image.pixels.shape[1]}x{image.pixels.shape[0]}"
-                self.report.sizes.setdefault(f"{finding.subject} {size}", []).append(finding)

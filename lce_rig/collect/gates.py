@@ -1,0 +1,334 @@
+"""Moments worth a capture: the board at rest, or the best of every place that a moving board passes.
+
+Events need motion, LiDAR wants stillness. A detection will do where, in a camera that sends events, the board
+
+- is not faster than `quality.max_board_speed_mps`,
+- made at least `quality.min_events_px` events a pixel of it in the second before,
+- and moves at 3 cm/s or more, or made plenty of events all the same: it has just stopped, or the rig moves.
+  Light that flickers does not count.
+
+Of such moments that follow each other within seconds and lie within a placement's reach of each other, the
+one is taken whose events are whole, and whose speed is nearest to 10 cm/s and most steady.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
+from lce_rig.collect.findings import IMAGE_MADE_FEW_EVENTS, IMAGE_STOOD_STILL, READ_NO_EVENTS_AT_SCAN
+from lce_rig.collect.placement_dedupe import Placements
+from lce_rig.core.board import Board
+from lce_rig.core.findings import Refusal
+from lce_rig.core.geometry import Array
+from lce_rig.core.losses import Losses
+from lce_rig.core.results import LidarBoard
+from lce_rig.detect.events.event_limits import explain_missing_board, look_for_flicker, too_fast
+from lce_rig.detect.events.figures import MEMORY_NS, event_quality, outline_px
+from lce_rig.rig import Rig
+from lce_rig.timing.event_buffer import EventCut
+from lce_rig.timing.rig_time import rig_time_ns
+
+# For how long a board has to stand still.
+_WINDOW_S = 0.5
+
+
+class StillnessGate:
+    """Takes detections in order of time, and gives the stillest moment of every stretch of stillness.
+
+    It is the middle of a window in which nothing moved more than its figure `motion_m`. A stretch ends when
+    the board moves, is lost, or has stood for `dwell_s`; it is then reported once.
+
+    Args:
+        board: the profile's.
+        max_motion_m: how far it may move in a window; a hand never holds it quite still.
+        dwell_s: after this long a capture is taken without waiting for the board to be moved on.
+
+    Attributes:
+        motion_m: how far the board moved in the last window; infinite where there is no whole one.
+        held_s: for how long the present stretch has lasted, since its first whole window; None out of one.
+    """
+
+    def __init__(self, board: Board, max_motion_m: float, dwell_s: float = 2.0) -> None:
+        self.motion_m = np.inf
+        self.held_s: float | None = None
+        self._board = board
+        self._max_motion_m, self._dwell_ns = max_motion_m, dwell_s * 1e9
+        self._window: deque[BoardDetection] = deque()
+        self._best: CaptureMoment | None = None
+        self._best_m = np.inf
+        self._since_ns = 0
+
+    def take(self, detection: BoardDetection) -> list[CaptureMoment]:
+        """Take the next detection, and give the moment of a stretch that has ended with it."""
+        now_ns = detection.frame.time_ns
+        self.motion_m = self._measure(detection)
+        is_still = self.motion_m <= self._max_motion_m
+        if is_still:
+            self._since_ns = now_ns if self._best is None else self._since_ns
+            if self._best is None or self.motion_m < self._best_m:
+                middle = self._window[len(self._window) // 2]
+                self._best = CaptureMoment(middle, {"motion_m": round(self.motion_m, 6)})
+                self._best_m = self.motion_m
+        self.held_s = (now_ns - self._since_ns) * 1e-9 if is_still else None
+        if self._best is not None and (not is_still or now_ns - self._since_ns > self._dwell_ns):
+            return self.finish()
+        return []
+
+    def finish(self) -> list[CaptureMoment]:
+        """Give the moment of the stretch that lasts, where there is one, and end it."""
+        best, self._best, self.held_s = self._best, None, None
+        return [] if best is None else [best]
+
+    def _measure(self, detection: BoardDetection) -> float:
+        """Put a detection into the window and measure how far the board moved in it."""
+        window = self._window
+        now_ns, window_ns = detection.frame.time_ns, _WINDOW_S * 1e9
+        # Start again after a gap, or where the clock was set back.
+        if not detection.is_usable or (window and not 0 < now_ns - window[-1].frame.time_ns < window_ns):
+            window.clear()
+        if detection.is_usable:
+            window.append(detection)
+        while len(window) > 2 and now_ns - window[1].frame.time_ns >= window_ns:
+            window.popleft()
+        is_full = len(window) > 2 and now_ns - window[0].frame.time_ns >= 0.999 * window_ns
+        return _motion_m(window, self._board, self._max_motion_m) if is_full else np.inf
+
+
+def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) -> float:
+    """Measure how far the board moved within a window.
+
+    Corners show motion across the line of sight much better than poses do; planes show motion along it.
+    """
+    middle = window[len(window) // 2]
+    motions: list[float] = []
+    for key, reference in middle.images.items():
+        others = [s.images[key].corners_px for s in window if key in s.images]
+        grid = reference.corners_px.reshape(board.rows, board.cols, 2)
+        square_px = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
+        # The order may start at the other end of the pattern where it has no unique top.
+        shift_px = max(
+            min(_rms(corners - reference.corners_px), _rms(corners[::-1] - reference.corners_px))
+            for corners in others
+        )
+        motions.append(shift_px * board.square_m / max(square_px, 1e-6))
+    lidar_motions = [
+        max(_plane_motion_m(candidate, detection.lidars.get(lidar, []), max_motion_m) for detection in window)
+        for lidar, candidates in middle.lidars.items()
+        for candidate in candidates
+    ]
+    # Walls and tables always stand still: the cameras, which identify the board by its pattern, must agree.
+    return max(max(motions), min(lidar_motions))
+
+
+def _rms(difference: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
+
+
+def _plane_motion_m(reference: LidarBoard, candidates: list[LidarBoard], max_motion_m: float) -> float:
+    """Measure by how much the plane of the nearest candidate passes by the reference's centre.
+
+    The centre itself is known along the board to a few centimetres only, and serves to tell plates apart.
+    """
+    centre = reference.T_lidar_board[:3, 3]
+    distances = [float(np.linalg.norm(c.T_lidar_board[:3, 3] - centre)) for c in candidates]
+    if not distances or min(distances) > 0.1 + max_motion_m:
+        return float("inf")
+    plane = candidates[int(np.argmin(distances))].plane
+    return float(abs(plane[:3] @ centre + plane[3]))
+
+
+SPEED_WINDOW_S = 0.5
+# Neither too few events nor smear.
+BEST_SPEED_MPS = 0.1
+
+_LEAST_DETECTIONS = 3
+# Slower boards make no events, unless there are as many a pixel in a second as below.
+_MIN_SPEED_MPS = 0.03
+_PLENTY_EVENTS_PX = 4.0
+
+
+def judge_detection(
+    detection: BoardDetection, around: Sequence[BoardDetection], rig: Rig
+) -> CaptureMoment | Refusal | None:
+    """Check whether a detection is worth a capture.
+
+    Args:
+        detection: the board in its frame.
+        around: all detections shortly before and after, itself among them.
+        rig: the profile.
+
+    Returns:
+        The moment; why it is none; or None where the tracker has counted why.
+    """
+    cuts = {cut.sensor: cut for cut in detection.frame.events}
+    if detection.images and not cuts:
+        return READ_NO_EVENTS_AT_SCAN.refusal()
+    watched = [key for key in sorted(detection.images) if key[0] in cuts]
+    if not watched:
+        # The events explain why their images do not show the board.
+        for (camera, channel), refusal in sorted(detection.unseen.items()):
+            if rig.cameras[camera].channels[channel].kind == "events" and camera in cuts:
+                stamp_ns = detection.frame.time_ns - cuts[camera].offset_ns
+                recent = cuts[camera].events.between(stamp_ns - MEMORY_NS, stamp_ns)
+                return explain_missing_board(recent, stamp_ns, refusal, rig.quality)
+        return None
+    if not detection.lidars:
+        return None
+    judged = [_judge_camera(key, detection, around, cuts[key[0]], rig) for key in watched]
+    return next((verdict for verdict in judged if isinstance(verdict, CaptureMoment)), judged[0])
+
+
+def _judge_camera(
+    key: ImageKey,
+    detection: BoardDetection,
+    around: Sequence[BoardDetection],
+    cut: EventCut,
+    rig: Rig,
+) -> CaptureMoment | Refusal | None:
+    if key in detection.unfit:
+        return detection.unfit[key]
+    motion = _follow(key, around)
+    if motion is None:
+        return None
+    image = next(i for i in detection.frame.images if (i.sensor, i.channel) == key)
+    # Frames and events of one camera may have clocks, or delays, of their own.
+    time_ns = rig_time_ns(image, rig)
+    stamp_ns = (detection.frame.time_ns if time_ns is None else time_ns) - cut.offset_ns
+    # Count the events per pixel of the board in the second before its image.
+    recent = cut.events.between(stamp_ns - MEMORY_NS, stamp_ns)
+    camera, board = rig.cameras[key[0]], detection.images[key]
+    outline = outline_px(board.T_cam_board, rig.board.to_board(), camera.to_intrinsics())
+    (speed_mps, unsteady_m), events_px = motion, event_quality(recent, stamp_ns, outline).events_px
+    limits = rig.quality
+    made = {"events_px": events_px, "min_events_px": limits.min_events_px}
+    if speed_mps > limits.max_board_speed_mps:
+        return too_fast(speed_mps, limits)
+    is_slow = speed_mps < _MIN_SPEED_MPS
+    if is_slow and events_px < max(_PLENTY_EVENTS_PX, limits.min_events_px):
+        return IMAGE_STOOD_STILL.refusal(**made)
+    if events_px < limits.min_events_px:
+        return IMAGE_MADE_FEW_EVENTS.refusal(**made, speed_mps=speed_mps)
+    if is_slow:
+        lamps = look_for_flicker(recent)
+        if lamps is not None:
+            return lamps
+    figures = {"speed_mps": speed_mps, "unsteady_m": unsteady_m, "events_px": events_px}
+    return CaptureMoment(detection, {name: round(figure, 5) for name, figure in figures.items()})
+
+
+def _follow(key: ImageKey, around: Sequence[BoardDetection]) -> tuple[float, float] | None:
+    """Fit a straight and steady way to the plate's middle: speed in m/s, and the rms distance from it in m.
+
+    The middle is well known even where the tilt is not. None where the board was seen too seldom.
+    """
+    seen = [s for s in around if key in s.images]
+    if len(seen) < _LEAST_DETECTIONS:
+        return None
+    time_s = 1e-9 * np.array([s.frame.time_ns - seen[0].frame.time_ns for s in seen])
+    way: Array = np.stack([s.images[key].T_cam_board[:3, 3] for s in seen])
+    time_s, way = time_s - time_s.mean(), way - way.mean(axis=0)
+    velocity = time_s @ way / (time_s @ time_s)
+    rest = way - time_s[:, None] * velocity
+    return float(np.linalg.norm(velocity)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
+
+
+# A way that strays from a straight one by this counts as much as a speed e times too high or low.
+_UNSTEADY_M = 0.01
+
+
+class MotionGate:
+    """Takes detections in order of time, and gives the best moment of every place that the board passes.
+
+    Args:
+        rig: the profile.
+        taken: no placements yet; it says how far apart they must be.
+        tally: receives why other detections are no moments.
+        patience_s: for so long a moment waits for a better one of the same place.
+
+    Attributes:
+        judged: the last detection that could be judged: a moment that will do, or why it does not; None where
+            no camera of events saw the board.
+    """
+
+    def __init__(self, rig: Rig, taken: Placements, tally: Losses, patience_s: float = 2.0) -> None:
+        self.judged: CaptureMoment | Refusal | None = None
+        self._rig, self._taken, self._tally = rig, taken, tally
+        self._half_ns, self._patience_ns = SPEED_WINDOW_S * 0.5e9, patience_s * 1e9
+        # The last of those near in time wait for their neighbours, and moments for better ones.
+        self._near: deque[BoardDetection] = deque()
+        self._n_waiting = 0
+        self._pending: deque[CaptureMoment] = deque()
+
+    def take(self, detection: BoardDetection) -> list[CaptureMoment]:
+        """Take the next detection, and give the moments that nothing better can follow."""
+        near, now_ns, moments = self._near, detection.frame.time_ns, list[CaptureMoment]()
+        if near and now_ns <= near[-1].frame.time_ns:
+            # The clocks were set back.
+            moments = self._judge_until(np.inf)
+            near.clear()
+        near.append(detection)
+        self._n_waiting += 1
+        moments += self._judge_until(now_ns - self._half_ns)
+        while near[-max(self._n_waiting, 1)].frame.time_ns - near[0].frame.time_ns > self._half_ns:
+            near.popleft()
+        return moments
+
+    def finish(self) -> list[CaptureMoment]:
+        """Give what is left when nothing more comes."""
+        moments = self._judge_until(np.inf)
+        self._near.clear()
+        while self._pending:
+            moments += self._decide_oldest()
+        return moments
+
+    def _judge_until(self, end_ns: float) -> list[CaptureMoment]:
+        """Judge the detections that wait up to a time; give the moments that nothing better came after."""
+        moments: list[CaptureMoment] = []
+        while self._n_waiting and self._near[-self._n_waiting].frame.time_ns <= end_ns:
+            detection = self._near[-self._n_waiting]
+            self._n_waiting -= 1
+            now_ns = detection.frame.time_ns
+            around = [each for each in self._near if abs(each.frame.time_ns - now_ns) <= self._half_ns]
+            self.judged = judge_detection(detection, around, self._rig)
+            if isinstance(self.judged, Refusal):
+                self._tally.add(self.judged)
+            while self._pending and not (
+                0 <= now_ns - self._pending[0].detection.frame.time_ns < self._patience_ns
+            ):
+                moments += self._decide_oldest()
+            if isinstance(self.judged, CaptureMoment) and self._taken.find_like(detection.poses) is None:
+                self._pending.append(self.judged)
+        return moments
+
+    def _decide_oldest(self) -> list[CaptureMoment]:
+        """Give up the oldest moment, unless it stands when the best of all are taken first, one a place."""
+        oldest = self._pending.popleft()
+        if self._taken.find_like(oldest.detection.poses) is not None:
+            return []
+
+        def badness(moment: CaptureMoment) -> tuple[bool, float]:
+            is_short = any(cut.missing_ns > 0 for cut in moment.detection.frame.events)
+            speed_ratio = max(moment.figures["speed_mps"], 1e-3) / BEST_SPEED_MPS
+            return is_short, abs(float(np.log(speed_ratio))) + moment.figures["unsteady_m"] / _UNSTEADY_M
+
+        kept: list[CaptureMoment] = []
+        for moment in sorted((oldest, *self._pending), key=badness):
+            poses = moment.detection.poses
+            if any(self._taken.are_alike(poses, other.detection.poses) for other in kept):
+                continue
+            if moment is oldest:
+                self._taken.add(str(oldest.detection.frame.time_ns), poses)
+                return [oldest]
+            kept.append(moment)
+        return []
+
+
+def find_moments(
+    detections: Iterable[BoardDetection], gate: StillnessGate | MotionGate
+) -> Iterator[CaptureMoment]:
+    """Yield the moments of a recording; they depend on it alone, so that a second run finds the same."""
+    for detection in detections:
+        yield from gate.take(detection)
+    yield from gate.finish()

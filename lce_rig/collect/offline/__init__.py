@@ -1,1 +1,0 @@
-"""Captures from recordings, unattended."""
