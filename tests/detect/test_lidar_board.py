@@ -18,11 +18,13 @@ from scans import (
     room,
 )
 
+from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import exp_so3, invert, pose, transform
+from lce_rig.core.results import LidarBoard
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import Limits, find_lidar_boards
+from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board
 
 POINT_BEAM = Beam(0.0, 0.0)
 ROOM = room(13.0)
@@ -93,6 +95,24 @@ def test_board_is_found_at_5_m_by_its_four_rings():
 def test_tilted_board_is_found(yaw_deg, pitch_deg):
     T = place(2.3, -30, 45, yaw_deg, pitch_deg)
     assert_is_board(find(cast([board_plate(T), *ROOM], sigma_m=0.01)), T)
+
+
+@pytest.mark.parametrize("yaw_deg", [45, -52, 60])
+@pytest.mark.parametrize("lost", ["nothing", "behind", "both"])
+def test_board_whose_dark_squares_return_nothing_or_from_too_far_is_found_where_expected(yaw_deg, lost):
+    """A VLP-16 loses them at 42 to 66 deg, or measures them up to 8 cm behind the plane."""
+    board, T = Board(6, 5, 0.15, 1.1, 0.95), place(3.5, 30, 0, yaw_deg, 10)
+    scan = cast([board_plate(T, board), *ROOM], sigma_m=0.006, seed=3)
+    local = transform(invert(T), scan.points.astype(np.float64))
+    column, row = np.floor(local[:, :2].T / board.square_m + [[3.5], [3.0]])
+    is_on = (np.abs(local[:, 2]) < 0.05) & (column >= 0) & (column < 7) & (row >= 0) & (row < 6)
+    is_dark = is_on & ((column + row) % 2 == 0)
+    is_gone = is_dark & {"nothing": True, "behind": False, "both": scan.ring % 2 == 0}[lost]
+    farther = 1 + 0.06 / abs(T[:3, 2] @ T[:3, 3]) * (is_dark & ~is_gone)
+    points = (scan.points * farther[:, None]).astype(np.float32)
+    expected = T @ pose(exp_so3(np.array([0.02, 0.02, 0.02])), np.array([0.03, -0.03, 0.02]))
+    found = look_for_board(replace(scan, points=points).select(~is_gone), board, expected)
+    assert_is_board([found] if isinstance(found, LidarBoard) else found, T, within_m=0.06, within_deg=3)
 
 
 @pytest.mark.parametrize("sigma_m", [0.0, 0.016, 0.032, 0.048, 0.06, 0.08, 0.1])

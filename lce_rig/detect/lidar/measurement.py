@@ -223,6 +223,7 @@ def refine(
     placement: Placement,
     limit_m: float,
     max_beyond: float = np.inf,
+    dark_m: float = 0.0,
 ) -> tuple[PlaneView, Placement] | None:
     """Fit the plane to the single returns inside the outline, and the outline to the beams about it.
 
@@ -233,6 +234,7 @@ def refine(
         placement: first guess of the outline.
         limit_m: largest error of an outline; what is far worse is not improved further.
         max_beyond: most returns in the plane beyond the outline, per return inside, to look closer.
+        dark_m: as in the view.
 
     Returns:
         The beams about the plate and the outline among them, with its error; None if too few returns lie
@@ -244,7 +246,7 @@ def refine(
     for k in range(3):
         centre = centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m]
         placement = replace(placement, u_m=0.0, v_m=0.0)
-        view = view_plane(scan, near, plane, centre, radius_m, tolerance_m)
+        view = view_plane(scan, near, plane, centre, radius_m, tolerance_m, dark_m)
         if k == 0:
             error_m = rate(scan, view, placement)
             if error_m > 2.0 * limit_m:
@@ -259,7 +261,7 @@ def refine(
         plane = fit_plane_to_ranges(points, plane, scale_m * float(np.linalg.norm(centre)) / plane[3])
         height = points @ plane[:3] + plane[3]
         tolerance_m = 3.5 * 1.4826 * median(np.abs(height)) + 0.004
-        view = view_plane(scan, near, plane, view.origin, radius_m, tolerance_m)
+        view = view_plane(scan, near, plane, view.origin, radius_m, tolerance_m, dark_m)
         registered = register(scan, view, placement)
         if registered is None:
             return None

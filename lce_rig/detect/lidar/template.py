@@ -13,6 +13,7 @@ N_ANGLES = 12
 CAP_M = 0.10
 MAX_SAMPLES = 64
 MIN_ON_RING = 3  # returns that make a chord
+DARK_DEPTH_M = 0.10  # a dark square that a beam grazes is measured as lying so far behind the plane at most
 # What a beam says about the outline: it ends a chord, or should lie inside or outside.
 END, INSIDE, OUTSIDE, UNUSED = range(4)
 
@@ -29,6 +30,8 @@ class PlaneView:
         uv: (M, 2) where each beam pierces the plane, m.
         height_m: (M,) distance of each return from the plane, positive before it.
         tolerance_m: returns within it lie on the plane.
+        dark_m: longest way across a dark square whose beams return nothing, or weakly from too far; 0 where
+            all squares return alike.
     """
 
     plane: Array
@@ -38,11 +41,17 @@ class PlaneView:
     uv: Array
     height_m: Array
     tolerance_m: float
+    dark_m: float = 0.0
 
     @property
     def is_on(self) -> NDArray[np.bool_]:
         """Which beams return from the plane (M,)."""
         return np.abs(self.height_m) <= self.tolerance_m
+
+    @property
+    def is_behind(self) -> NDArray[np.bool_]:
+        """Which beams pass through the plane (M,), and not through a dark square."""
+        return self.height_m < -(max(self.tolerance_m, DARK_DEPTH_M) if self.dark_m else self.tolerance_m)
 
 
 @dataclass(frozen=True)
@@ -84,7 +93,13 @@ def beams_about(scan: OrderedScan, centre: Array, radius_m: float) -> Indices:
 
 
 def view_plane(
-    scan: OrderedScan, among: Indices, plane: Array, centre: Array, radius_m: float, tolerance_m: float
+    scan: OrderedScan,
+    among: Indices,
+    plane: Array,
+    centre: Array,
+    radius_m: float,
+    tolerance_m: float,
+    dark_m: float = 0.0,
 ) -> PlaneView:
     """Pierce a plane by those beams that do so within a radius of a point.
 
@@ -94,7 +109,7 @@ def view_plane(
         plane: (4,) as (n, d), n towards the LiDAR.
         centre: (3,) m, near the plane.
         radius_m: of the disc that is looked at.
-        tolerance_m: returns within it lie on the plane.
+        tolerance_m, dark_m: as in the view.
     """
     normal, d = plane[:3], plane[3]
     origin = centre - (centre @ normal + d) * normal
@@ -105,7 +120,7 @@ def view_plane(
     is_near = (along_normal < 0) & (np.einsum("ij,ij->i", pierced, pierced) <= radius_m**2)
     axes = plane_axes(normal)
     uv = pierced[is_near] @ axes
-    return PlaneView(plane, axes, origin, among[is_near], uv, along_normal[is_near] + d, tolerance_m)
+    return PlaneView(plane, axes, origin, among[is_near], uv, along_normal[is_near] + d, tolerance_m, dark_m)
 
 
 def plane_axes(normal: Array) -> Array:
@@ -140,7 +155,10 @@ def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tup
         return on[:0], on[:0]
     ring = scan.ring[view.member[on]]
     turn = np.mod(np.diff(scan.azimuth[view.member[on]]), 2 * np.pi)
-    is_cut = (np.diff(ring) != 0) | (turn > MAX_STEPS * scan.step_rad)
+    is_new_ring = np.diff(ring) != 0
+    is_cut = is_new_ring | (turn > MAX_STEPS * scan.step_rad)
+    if view.dark_m:
+        is_cut &= is_new_ring | ~_crosses_dark_square(view, placement, on)
     start = np.concatenate([[0], np.flatnonzero(is_cut) + 1])
     end = np.append(start[1:], len(on)) - 1
     is_inside = placement.distance_m(view.uv[on]) < 0
@@ -149,6 +167,15 @@ def find_chords(scan: OrderedScan, view: PlaneView, placement: Placement) -> tup
     best = order[np.diff(ring[start][order], prepend=-1) != 0]
     best = best[n_inside[best] >= MIN_ON_RING]
     return on[start[best]], on[end[best]]
+
+
+def lost_share(scan: OrderedScan, view: PlaneView, placement: Placement) -> float:
+    """Compute the share of the beams between the chords' ends that do not return from the plane."""
+    first, last = find_chords(scan, view, placement)
+    azimuth = scan.azimuth[view.member]
+    turn = np.abs(np.mod(azimuth[last] - azimuth[first] + np.pi, 2 * np.pi) - np.pi)
+    n_on = np.append(0, np.cumsum(view.is_on))
+    return 1.0 - float((n_on[last + 1] - n_on[first]).sum() / (turn / scan.step_rad + 1.0).sum())
 
 
 def register(scan: OrderedScan, view: PlaneView, start: Placement) -> Placement | None:
@@ -191,12 +218,37 @@ def _samples(scan: OrderedScan, view: PlaneView, placement: Placement) -> tuple[
     bound[first] += 1
     bound[last + 1] -= 1
     is_inside = view.is_on & (np.cumsum(bound[:-1]) > 0)
-    inside, outside = view.uv[is_inside], view.uv[view.height_m < -view.tolerance_m]
+    inside, outside = view.uv[is_inside], view.uv[view.is_behind]
     # Beams far from any border say the same as their neighbours: a sample is enough.
     inside = inside[:: max(1, -(-len(inside) // MAX_SAMPLES))]
     outside = outside[:: max(1, -(-len(outside) // MAX_SAMPLES))]
     kind = np.repeat([END, INSIDE, OUTSIDE], [len(ends), len(inside), len(outside)])
+    if view.dark_m:
+        # The border lies farther out than an end beyond which a dark square may lie.
+        kind[: len(ends)][_is_before_dark(scan, view, first, last)] = INSIDE
     return np.concatenate([ends, inside, outside]), kind
+
+
+def _crosses_dark_square(view: PlaneView, placement: Placement, on: Indices) -> NDArray[np.bool_]:
+    """Tell between which neighbours of the beams on the plane (K,) a dark square may lie (K - 1,).
+
+    The way between them is short and inside the outline, and no beam between them returns from elsewhere.
+    """
+    is_inside = placement.distance_m(view.uv[on]) < 0
+    is_short = np.linalg.norm(np.diff(view.uv[on], axis=0), axis=1) <= view.dark_m
+    n_elsewhere = np.cumsum(view.is_behind | (view.height_m > view.tolerance_m))
+    is_clear = np.diff(n_elsewhere[on]) == 0
+    return np.asarray(is_short & is_clear & is_inside[1:] & is_inside[:-1])
+
+
+def _is_before_dark(scan: OrderedScan, view: PlaneView, first: Indices, last: Indices) -> NDArray[np.bool_]:
+    """Tell beyond which ends (2 C,) of chords the ring goes on, but not with a beam that passes by."""
+    end = np.concatenate([first, last])
+    beyond = np.clip(end + np.repeat([-1, 1], len(first)), 0, len(view.uv) - 1)
+    turn = scan.azimuth[view.member[beyond]] - scan.azimuth[view.member[end]]
+    turn = np.abs(np.mod(turn + np.pi, 2 * np.pi) - np.pi)
+    passes = view.is_behind[beyond] & (turn <= MAX_STEPS * scan.step_rad)
+    return np.asarray((scan.ring[view.member[beyond]] == scan.ring[view.member[end]]) & ~passes)
 
 
 def register_ends(ends: Array, board: Board) -> list[Placement]:
