@@ -374,6 +374,11 @@ LASER_OFFSET = Kind(
     "correct them in the LiDAR's driver",
     severity="warning",
 )
+LASER_ANGLES = Kind(
+    "verdict.laser_angles",
+    "the lasers' {angle}s differ from those of the scans by {rms_deg:deg} rms (limit {limit_deg:deg})",
+    "check the LiDAR's model and beam table in the driver that made the point clouds",
+)
 CAMERA_CHANGED = Kind(
     "verdict.camera_changed",
     "{subject}: relative pose from the images changes significantly at capture {capture}, by " + _APART,

@@ -67,7 +67,7 @@ def expand(
     p = FIRST_RING + len(rings) + 1
     gradients, hessians = np.zeros((len(features), p)), np.zeros((len(features), p, p))
     for k, (f, seen) in enumerate(zip(features, observations, strict=True)):
-        r_plane, J_plane = _plane_rows(f, T_cam_lidar, seen.lidar, rings)
+        r_plane, J_plane = plane_rows(f, T_cam_lidar, seen.lidar, rings)
         r_end, by_end = end_rows(f, T_cam_lidar, board)
         J_end = np.zeros((len(r_end), p))
         J_end[:, [*range(FIRST_RING), SCALE]] = by_end
@@ -75,11 +75,11 @@ def expand(
         for r, J, weight in ((r_plane, J_plane, by_plane), (r_end, J_end, 1 / sigmas.end_m**2)):
             gradients[k] += weight * r @ J
             hessians[k] += weight * J.T @ J
-    prior = _prior(len(rings), laser_bias_sigma_m, range_offset_sigma_m)
+    prior = priors_of_constants(len(rings), laser_bias_sigma_m, range_offset_sigma_m)
     return Quadratics(gradients, hessians, prior, np.zeros(p), group_placements(observations))
 
 
-def _plane_rows(
+def plane_rows(
     f: CaptureFeatures, T: Array, lidar: LidarBoard, rings: NDArray[np.int16]
 ) -> tuple[Array, Array]:
     """Linearise the plane's residual for points as measured: values, derivatives by the x of `expand`.
@@ -95,7 +95,7 @@ def _plane_rows(
     return plane_residuals(f, T, points), J
 
 
-def _prior(n_rings: int, laser_m: float, offset_m: float) -> Array:
+def priors_of_constants(n_rings: int, laser_m: float, offset_m: float) -> Array:
     """Write priors as information (p, p): of the edge shift, of offsets about their mean, of the mean."""
     prior = np.zeros((FIRST_RING + n_rings + 1, FIRST_RING + n_rings + 1))
     prior[SHIFT, SHIFT] = 1 / EDGE_SHIFT_SIGMA_M**2

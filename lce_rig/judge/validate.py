@@ -7,7 +7,7 @@ groups of captures that disagree by 1.1 and 1.2 deg (acfr_vlp16, os1_64) are not
 and 51 mm from its reference, would be reported to 0.22 deg and 10 mm instead of 0.59 deg and 24 mm.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from lce_rig.judge.contributions import (
 )
 from lce_rig.judge.findings import WIDENED
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
+from lce_rig.judge.laser_angles import estimate_angles
 from lce_rig.judge.local_quadratic import SCALE, expand
 from lce_rig.judge.negative_control import NegativeControl, run_control, run_control_with_constants
 from lce_rig.judge.nuisances import Nuisances, estimate_nuisances
@@ -145,6 +146,7 @@ class Validation:
         contrasts: subsets of the captures that should agree.
         control: residuals of held-out captures when the result is moved.
         nuisances: the nuisance parameters.
+        laser_angles: errors of the lasers' angles in deg, as `estimate_angles`.
         intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
     """
 
@@ -158,6 +160,7 @@ class Validation:
     contrasts: tuple[Contrast, ...]
     control: NegativeControl | None
     nuisances: Nuisances | None
+    laser_angles: Mapping[str, float]
     intrinsics: IntrinsicsCheck | None
 
 
@@ -185,6 +188,7 @@ def validate(
     intrinsics = check_intrinsics(thinned, lens, board) if views else None
     widened_by, remark, control, nuisances = 1.0, None, None, None
     contrasts: tuple[Contrast, ...] = ()
+    laser_angles: Mapping[str, float] = {}
     observations = [estimate.fitted[name] for name in estimate.used]
     expansion = expand(
         observations,
@@ -208,6 +212,7 @@ def validate(
         of_rejected = find_moved(observations, rejected, board, estimate.T_cam_lidar, lidar)
         contrasts = (*of_rejected, *contrast_halves(settled, centres), *find_groups(settled))
         nuisances = estimate_nuisances(expansion, rings)
+        laser_angles = estimate_angles(observations, board, estimate.T_cam_lidar, lidar)
     contradictions = list(find_contradictions(estimate, intrinsics, nuisances, contrasts, rig))
     cov_shared = profile_covariance(known)
     cov_agreed = widened_by**2 * estimate.cov + cov_shared
@@ -222,6 +227,7 @@ def validate(
         contrasts=contrasts,
         control=control,
         nuisances=nuisances,
+        laser_angles=laser_angles,
         intrinsics=intrinsics,
     )
 

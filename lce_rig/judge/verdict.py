@@ -39,6 +39,7 @@ from lce_rig.judge.findings import (
     verdict_of,
 )
 from lce_rig.judge.intrinsics_check import lens_findings
+from lce_rig.judge.laser_angles import angle_findings
 from lce_rig.judge.negative_control import control_findings
 from lce_rig.judge.nuisances import nuisance_findings
 from lce_rig.judge.split_consistency import split_findings
@@ -79,6 +80,7 @@ def judge(
     findings = [
         *_certificate(estimate),
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
+        *angle_findings(examination.laser_angles),
         *_plate(estimate, board),
         *nuisance_findings(examination.nuisances, board, rig.lidars[lidar], rig.verdict),
         *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
