@@ -6,6 +6,7 @@ extrinsics of both cameras with one LiDAR give the same pose independently.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,10 +18,18 @@ from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.results import Observation
-from lce_rig.judge.findings import CAMERAS_DIFFER, CAMERAS_SCATTER, SURPRISING_CHI2, failing
+from lce_rig.judge.findings import (
+    CAMERAS_DIFFER,
+    CAMERAS_EXCHANGED,
+    CAMERAS_SCATTER,
+    SURPRISING_CHI2,
+    failing,
+)
+from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.judge.relative_pose import mean_pose, relative_covariance, relative_pose
 from lce_rig.judge.split_consistency import contrast_halves, split_findings
-from lce_rig.rig import CalibrationSettings, VerdictSettings
+from lce_rig.lens.lens_estimate import BoardView
+from lce_rig.rig import CalibrationSettings, NominalExtrinsic, Rig, VerdictSettings
 
 # Fewer placements do not determine the scatter.
 _MIN_PLACEMENTS = 4
@@ -30,6 +39,8 @@ _MIN_JACKKNIFE = 10
 _STUDENT = 5.0
 # Scatter of boards above this multiple of the typical value has a cause.
 _MAX_SCATTER = 2.0
+# Exchanged cameras fit the nominal poses better by at least this, a likelihood ratio of 400.
+_EXCHANGED_CHI2 = 12.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +177,67 @@ def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_fir
     middles = [(T_second_first @ one.image.T_cam_board[:, 3])[:3] for one, _ in shared]
     seen = [other.image.T_cam_board[:3, 3] for _, other in shared]
     return float(np.sqrt(np.mean(np.sum((np.array(middles) - seen) ** 2, axis=1))))
+
+
+class CameraEvidence(NamedTuple):
+    """A calibrated camera, as far as its name can be wrong.
+
+    Attributes:
+        name: of the camera.
+        T_cam_lidar, cov: its extrinsics, (4, 4) and (6, 6).
+        views: of the board in its images.
+        lens: the profile's lens compared with them.
+    """
+
+    name: str
+    T_cam_lidar: Array
+    cov: Array
+    views: Sequence[BoardView]
+    lens: IntrinsicsCheck | None
+
+
+def find_exchanged(rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence) -> list[Finding]:
+    """Find two cameras whose images came under each other's name.
+
+    Exchanged, they fit the profile better: the nominal poses by more than chance allows, tolerances taken as
+    three standard deviations; or the lenses, where neither fits its own camera.
+
+    Args:
+        rig: the profile, with both cameras.
+        lidar: of both.
+        first, second: the cameras.
+    """
+    reasons = []
+    if _mounting_gain(rig, lidar, first, second) > _EXCHANGED_CHI2:
+        reasons.append("mounting")
+    sizes = [rig.cameras[each.name].resolution_px for each in (first, second)]
+    misfits = [each.lens is not None and each.lens.verdict() != "pass" for each in (first, second)]
+    if all(misfits) and sizes[0] == sizes[1]:
+        board = rig.board.to_board()
+        lenses = [rig.cameras[each.name].to_intrinsics() for each in (second, first)]
+        checks = [
+            check_intrinsics(each.views, lens, board)
+            for each, lens in zip((first, second), lenses, strict=True)
+        ]
+        if all(check is not None and check.verdict() == "pass" for check in checks):
+            reasons.append("lenses")
+    return [CAMERAS_EXCHANGED(f"{first.name} and {second.name}", fits=tuple(reasons))] if reasons else []
+
+
+def _mounting_gain(rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence) -> float:
+    """Compute by how much chi-squared about the nominal poses falls if two cameras are exchanged."""
+    nominal = [rig.nominal(each.name, lidar) for each in (first, second)]
+    if None in nominal:
+        return 0.0
+
+    def chi2(camera: CameraEvidence, expected: NominalExtrinsic | None) -> float:
+        assert expected is not None
+        tolerances = np.repeat([expected.tolerance_m, np.radians(expected.tolerance_deg)], 3) / 3
+        x = difference(camera.T_cam_lidar, expected.to_matrix())
+        return float(x @ np.linalg.solve(camera.cov + np.diag(tolerances**2), x))
+
+    named = chi2(first, nominal[0]) + chi2(second, nominal[1])
+    return named - chi2(first, nominal[1]) - chi2(second, nominal[0])
 
 
 def camera_findings(

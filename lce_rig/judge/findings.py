@@ -397,6 +397,11 @@ CAMERAS_SCATTER = Kind(
     "hold the board still between the images and check the intrinsics",
     severity="warning",
 )
+CAMERAS_EXCHANGED = Kind(
+    "verdict.cameras_exchanged",
+    "{subject} are exchanged: each fits the profile's {fits} of the other",
+    "check which topic, port or file belongs to which camera, and collect again",
+)
 CAMERAS_DIFFER = Kind(
     "verdict.cameras_differ",
     "{subject}: board positions differ by {rms_m:mm} rms ({images_rms_m:mm} from the images alone), "

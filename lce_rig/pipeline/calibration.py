@@ -30,7 +30,7 @@ from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
-from lce_rig.judge.camera_pairs import CameraPair, camera_findings, relate
+from lce_rig.judge.camera_pairs import CameraEvidence, CameraPair, camera_findings, find_exchanged, relate
 from lce_rig.judge.reach import point_uncertainties
 from lce_rig.judge.relative_pose import relative_pose
 from lce_rig.judge.session_check import find_meetings
@@ -148,7 +148,8 @@ def calibrate_detections(
     if scene is not None:
         begin(progress, "estimating from the scene")
         solved = [_with_scene(rig, each, scene(each)) for each in solved]
-    calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
+    exchanged = _exchanged(rig, detections, solved)
+    calibrations = [_judged(rig, detections, solved, links, exchanged[k], k) for k in range(len(solved))]
     for k, c in enumerate(calibrations):
         truth = None if reference is None else reference.of(c.camera, c.lidar)
         if truth is not None:
@@ -219,6 +220,22 @@ def _examine(
     rig: Rig, detections: Detections, pairs: Sequence[Pair], estimate: CalibrationEstimate
 ) -> Validation:
     """Check an estimate on its own captures and images."""
+    views = _views(detections, pairs, estimate)
+    first, used = pairs[0], estimate.captures_of(estimate.used)
+    lens = rig.cameras[first.camera].to_intrinsics()
+    rejected = []
+    if estimate.refused:
+        # Of several channels, the first shows the boards.
+        channels = [channel.channel for channel in estimate.channels]
+        pair = next(pair for pair in pairs if pair.channel in channels)
+        clocks = clocks_of(rig, pair.camera, pair.lidar)
+        meetings = find_meetings(rig, detections, pair, estimate.T_cam_lidar, estimate.channels, clocks)
+        rejected = [each.at_scan_time for name, each in meetings.items() if name not in used]
+    return validate(estimate, rig, rig.lidars[first.lidar], lens, views, rejected)
+
+
+def _views(detections: Detections, pairs: Sequence[Pair], estimate: CalibrationEstimate) -> list[BoardView]:
+    """List the camera's boards in the captures used."""
     channels = {channel.channel for channel in estimate.channels}
     views = []
     for name in sorted(estimate.captures_of(estimate.used)):
@@ -226,16 +243,28 @@ def _examine(
             image = detections.images[pair.camera, pair.channel].get(name)
             if pair.channel in channels and isinstance(image, ImageBoard):
                 views.append(BoardView(name, pair.channel, image))
-    first, used = pairs[0], estimate.captures_of(estimate.used)
-    lens = rig.cameras[first.camera].to_intrinsics()
-    rejected = []
-    if estimate.refused:
-        # Of several channels, the first shows the boards.
-        pair = next(pair for pair in pairs if pair.channel in channels)
-        clocks = clocks_of(rig, pair.camera, pair.lidar)
-        meetings = find_meetings(rig, detections, pair, estimate.T_cam_lidar, estimate.channels, clocks)
-        rejected = [each.at_scan_time for name, each in meetings.items() if name not in used]
-    return validate(estimate, rig, rig.lidars[first.lidar], lens, views, rejected)
+    return views
+
+
+def _exchanged(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> list[list[Finding]]:
+    """Find cameras whose images came under each other's name, for each of them."""
+    found: list[list[Finding]] = [[] for _ in solved]
+    for (i, one), (j, other) in combinations(enumerate(solved), 2):
+        if one.lidar == other.lidar:
+            cameras = [
+                CameraEvidence(
+                    each.camera,
+                    each.T_cam_lidar,
+                    each.cov,
+                    _views(detections, each.pairs, each.estimate),
+                    each.validation.intrinsics,
+                )
+                for each in (one, other)
+            ]
+            findings = find_exchanged(rig, one.lidar, *cameras)
+            found[i] += findings
+            found[j] += findings
+    return found
 
 
 def _links(rig: Rig, solved: Sequence[_Solved]) -> list[_Link]:
@@ -309,12 +338,17 @@ def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
 
 
 def _judged(
-    rig: Rig, detections: Detections, solved: Sequence[_Solved], links: Sequence[_Link], k: int
+    rig: Rig,
+    detections: Detections,
+    solved: Sequence[_Solved],
+    links: Sequence[_Link],
+    exchanged: Sequence[Finding],
+    k: int,
 ) -> Calibration:
     """Judge the extrinsics of index k and assemble their result."""
     own, estimate, validation = solved[k], solved[k].estimate, solved[k].validation
     mine = [link for link in links if k in link[:2]]
-    others = [finding for *_, findings in mine for finding in findings]
+    others = [*exchanged, *(finding for *_, findings in mine for finding in findings)]
     if own.share is not None:
         others += share_findings(own.share)
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
