@@ -29,7 +29,7 @@ from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
 from lce_rig.export.reference import read_reference
-from lce_rig.judge.findings import weakest_words
+from lce_rig.judge.findings import consequences, weakest_words
 from lce_rig.pipeline.result_files import UNION, Result, WrittenResult, new_result_parts
 from lce_rig.pipeline.union import require_unit
 from lce_rig.session.provenance import provenance_of
@@ -353,7 +353,12 @@ def _lines(c: Calibration) -> list[str]:
     lines += _titled("scene", [] if c.scene is None else scene_texts(c.scene))
     for name, why in c.captures_refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]")
-    return lines + [f"  [{colour}]{show.escape(finding.sentence)}[/]" for finding in c.findings]
+    following = consequences(c.findings)
+    for finding in c.findings:
+        follows = finding.code in following and finding.severity != "note"
+        text = f"  follows: {finding.text}" if follows else finding.sentence
+        lines.append(f"  [{colour}]{show.escape(text)}[/]")
+    return lines
 
 
 def _titled(title: str, texts: Sequence[str]) -> list[str]:

@@ -12,7 +12,7 @@ import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, json_option, session_argument
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.findings import Refusal
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.lidar.search import plane_limit_m
@@ -49,9 +49,13 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
         }
         for pair, refused in refusals.items()
     }
+    plates = {pair: _plates(opened.rig, detections, pair, refused) for pair, refused in refusals.items()}
     if as_json:
         pairs = [
-            {"camera": pair.camera, "channel": pair.channel, "lidar": pair.lidar, "captures": captures}
+            {
+                **{"camera": pair.camera, "channel": pair.channel, "lidar": pair.lidar, "captures": captures},
+                "findings": [finding.as_json() for finding in plates[pair]],
+            }
             for pair, captures in records.items()
         ]
         show.print_json({"format_version": 1, "rig": opened.rig.name, "pairs": pairs})
@@ -59,12 +63,28 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
         for pair, refused in refusals.items():
             show.print_table(_table(detections, pair, records[pair]))
             _summarise(opened.rig, detections, pair, refused)
+            for finding in plates[pair]:
+                show.say(finding.sentence)
     if all(len(refused) == len(detections.captures(pair)) for pair, refused in refusals.items()):
         raise NotEnoughDataError(
             f"{session}: no capture is usable",
             "Follow the actions above"
             + ("." if debug_images else ", or draw the detections with --debug-images."),
         )
+
+
+def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> list[Finding]:
+    """Compare the plate's size in all scans of a pair with the profile; other things of its size are not."""
+    from lce_rig.judge.verdict import plate_findings
+
+    scans: list[LidarBoard | Refusal] = []
+    for name in detections.captures(pair):
+        scan = detections.of(pair, name)[1]
+        if isinstance(scan, Refusal):
+            scans.append(scan)
+        elif name not in refused or refused[name].stage == "image":
+            scans.append(scan[0])
+    return plate_findings(scans, rig.board.to_board())
 
 
 def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | None) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Kinds of findings against extrinsics and intrinsics: reasons and notes of a verdict."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 from lce_rig.core.calibration import WeakestMotion
@@ -11,6 +11,31 @@ from lce_rig.core.phrasing import as_line, figures_apart, fill
 Verdict = Literal["pass", "marginal", "fail"]
 SURPRISING_CHI2 = 16.81
 """99 % of the chi-squared distribution with six degrees of freedom: differences beyond it are significant."""
+_OF_DISTANCES = (
+    "verdict.two_groups verdict.shares_differ verdict.camera_shares_differ verdict.control "
+    "verdict.plane_residual verdict.edge_residual verdict.held_out verdict.rotation_uncertain "
+    "verdict.translation_uncertain verdict.scene verdict.scene_not_used "
+)
+_OF_POSES = _OF_DISTANCES + (
+    "verdict.cameras_differ verdict.channels_differ verdict.planes_apart verdict.sensors_disagree "
+    "verdict.few_used verdict.few_placements verdict.far_from_nominal verdict.edge_shift "
+    "verdict.laser_offset verdict.scale "
+)
+_FOLLOWS: Mapping[str, Sequence[str]] = {
+    "verdict.cameras_exchanged": f"{_OF_POSES}verdict.intrinsics".split(),
+    "verdict.moved": _OF_POSES.split(),
+    "verdict.changed": _OF_POSES.split(),
+    "verdict.camera_changed": _OF_POSES.split(),
+    "verdict.plate_size": (
+        ["verdict.edge_shift", "verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]
+    ),
+    "verdict.laser_angles": _OF_POSES.split(),
+    "verdict.intrinsics": (
+        f"{_OF_DISTANCES}verdict.scale verdict.far_from_nominal verdict.cameras_differ".split()
+    ),
+    "verdict.scale": _OF_DISTANCES.split(),
+}
+"""What follows from a cause, the causes that explain most first."""
 _VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}
 _APART = "{rotation_deg:deg}, {translation_m:mm}"
 _LENS = "check that the intrinsics belong to this lens and that the board is flat"
@@ -65,6 +90,25 @@ _LEAST_TRANSLATION = "{weakest:motion}, sigma {weakest_sigma_m:1mm}"
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict that results from findings."""
     return _VERDICTS[worst(findings)]
+
+
+def consequences(findings: Iterable[Finding]) -> dict[str, str]:
+    """Map the codes of findings that follow from others to the code of their cause."""
+    codes = [finding.code for finding in findings if finding.severity != "note"]
+    causes = [code for code in _FOLLOWS if code in codes]
+    return {code: cause for cause in reversed(causes) for code in codes if code in _FOLLOWS[cause]}
+
+
+def by_cause(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """List the worst causes first, then what follows from them, then notes."""
+    following, order = consequences(findings), list(_FOLLOWS)
+
+    def rank(finding: Finding) -> tuple[bool, bool, bool, int]:
+        is_note, is_error = finding.severity == "note", finding.severity == "error"
+        place = order.index(finding.code) if finding.code in order else len(order)
+        return is_note, finding.code in following, not is_error, 0 if is_note else place
+
+    return tuple(sorted(findings, key=rank))
 
 
 def failing(is_fail: bool) -> Severity:
@@ -177,10 +221,14 @@ def _known_better(finding: Finding) -> str:
 
 
 def _plate(finding: Finding) -> str:
-    """The plate's {side} is {measured_m} in the scans, {profile_m} in the profile."""
+    """Plates measure {measured_m} in {side} in {n_captures} captures, the profile says {profile_m}."""
     percent = 100 * (finding.figure("measured_m") / finding.figure("profile_m") - 1)
-    sizes = fill("{side} {measured_m:.3f} m in the scans, {profile_m:.3f} m in the profile", finding.figures)
-    return f"plate {sizes}: {abs(percent):.1f} % {'larger' if percent > 0 else 'smaller'}"
+    sizes = fill(
+        "plates measure {measured_m:.3f} m in {side} in {n_captures} captures, "
+        "{profile_m:.3f} m in the profile",
+        finding.figures,
+    )
+    return f"{sizes}: {abs(percent):.1f} % {'larger' if percent > 0 else 'smaller'}"
 
 
 def _sensors_disagree(finding: Finding) -> str:

@@ -28,6 +28,7 @@ _OUTLIER = 4.0
 # Lasers on recordings differ from their data sheet by up to 0.08 deg rms in elevation, 0.11 in azimuth.
 _MAX_DEG = 0.13
 _CHANCE = 1e-4
+_PLATE_M = 0.03
 
 
 def estimate_angles(
@@ -52,11 +53,13 @@ def estimate_angles(
     rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
     L, R = len(rings), T_cam_lidar[:3, :3]
     lens = FIRST_RING + L
-    angles = lens + 2
+    angles = lens + 3
+    # The plate may be wider, and less high, than the profile has it.
+    is_of_width = 2 * np.abs(board.edges()[1][:, 0]) - 1
     H, g = np.zeros((angles + 2 * L, angles + 2 * L)), np.zeros(angles + 2 * L)
 
     def by_angles(points: Array, ring: NDArray[np.int16], normals: Array) -> Array:
-        """Differentiate residuals (N,) by lens (2) and each ring's azimuth and elevation (2 L)."""
+        """Differentiate residuals (N,) by lens (2), each ring's azimuth and elevation (2 L), in 3 + 2 L."""
         x, y, z = points.T
         level = np.hypot(x, y)
         up, across = np.array([0.0, 0.0, 1.0]), np.stack([-y, x, 0 * x], axis=1)
@@ -64,7 +67,8 @@ def estimate_angles(
         moves = [across / level[:, None], np.arctan2(z, level)[:, None] * up, across, raised]
         lateral, vertical, azimuth, elevation = (-np.sum((move @ R.T) * normals, axis=1) for move in moves)
         own = np.searchsorted(rings, ring)[:, None] == np.arange(L)
-        return np.column_stack([lateral, vertical, own * azimuth[:, None], own * elevation[:, None]])
+        of_rings = own * azimuth[:, None], own * elevation[:, None]
+        return np.column_stack([lateral, vertical, np.zeros(len(points)), *of_rings])
 
     for f, seen in zip(features, observations, strict=True):
         points = np.asarray(seen.lidar.points, dtype=np.float64)
@@ -73,15 +77,16 @@ def estimate_angles(
         weight = PLANE_FREEDOMS / (sigmas.plane_m**2 * max(len(points), 1))
         H, g = H + weight * J.T @ J, g + weight * r_plane @ J
         r_end, J_end = end_rows(f, T_cam_lidar, board)
-        normals = f.edge_normals[end_residuals(f, T_cam_lidar, board)[1]]
+        edge = end_residuals(f, T_cam_lidar, board)[1]
         no_ranges = np.zeros((len(r_end), L))
-        by_ring = by_angles(f.edge_points, seen.lidar.edge_ring, normals)
+        by_ring = by_angles(f.edge_points, seen.lidar.edge_ring, f.edge_normals[edge])
+        by_ring[:, 2] = is_of_width[edge]
         J = np.hstack([J_end[:, :FIRST_RING], no_ranges, by_ring])
         is_end = np.abs(r_end - np.median(r_end)) < _OUTLIER * sigmas.end_m
         H, g = H + J[is_end].T @ J[is_end] / sigmas.end_m**2, g + r_end[is_end] @ J[is_end] / sigmas.end_m**2
     priors = Priors()
     H[:lens, :lens] += priors_of_constants(L, lidar.laser_bias_sigma_m, lidar.range_offset_sigma_m)[:-1, :-1]
-    known = [priors.lateral_m, priors.vertical_m, *np.full(2 * L, _LOOSE_RAD)]
+    known = [priors.lateral_m, priors.vertical_m, _PLATE_M, *np.full(2 * L, _LOOSE_RAD)]
     H[lens:, lens:] += np.diag(1 / np.square(known))
     cov = np.linalg.inv(H)
     x = -cov @ g

@@ -1,6 +1,6 @@
 """The verdict on extrinsics: each finding is a reason with its figures and an action."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,8 +9,10 @@ import numpy as np
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion, SceneShare, WeakestMotion
-from lce_rig.core.findings import Finding, ranked
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, largest_sizes, rotation_angle, sigma_sizes, tangent_sizes
+from lce_rig.core.results import LidarBoard
+from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.contributions import largest, measure_action, uncertainty_notes
 from lce_rig.judge.findings import (
     CHANNELS_DIFFER,
@@ -35,6 +37,7 @@ from lce_rig.judge.findings import (
     SURPRISING_CHI2,
     TRANSLATION_UNCERTAIN,
     Verdict,
+    by_cause,
     failing,
     verdict_of,
 )
@@ -81,7 +84,7 @@ def judge(
         *_certificate(estimate),
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
         *angle_findings(examination.laser_angles),
-        *_plate(estimate, board),
+        *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
         *nuisance_findings(examination.nuisances, board, rig.lidars[lidar], rig.verdict),
         *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
         *others,
@@ -103,9 +106,9 @@ def _verdict(findings: Sequence[Finding], cov: Array) -> tuple[Verdict, tuple[Fi
     """Draw the verdict; where it is marginal, a note says how wrong the extrinsics may be."""
     verdict, others = verdict_of(findings), [f for f in findings if f.code != "verdict.may_be_off"]
     if verdict != "marginal":
-        return verdict, ranked(others)
+        return verdict, by_cause(others)
     rotation_deg, translation_m = largest_sizes(cov)
-    return verdict, ranked([MAY_BE_OFF(rotation_deg=rotation_deg, translation_m=translation_m), *others])
+    return verdict, by_cause([MAY_BE_OFF(rotation_deg=rotation_deg, translation_m=translation_m), *others])
 
 
 def with_opinion(calibration: Calibration, opinion: SceneOpinion) -> Calibration:
@@ -299,23 +302,37 @@ def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) ->
     ]
 
 
-def _plate(estimate: CalibrationEstimate, board: Board) -> list[Finding]:
-    """Compare the plate's size from the LiDAR with the profile; the uncertainty is mainly the beam's spot."""
+def plate_findings(scans: Iterable[LidarBoard | Refusal], board: Board) -> list[Finding]:
+    """Compare the plate's size from the LiDAR with the profile; the uncertainty is mainly the beam's spot.
+
+    Args:
+        scans: boards, and refusals: a plate refused for its size counts as measured.
+        board: of the profile.
+    """
+    sizes: dict[str, list[tuple[float, float]]] = {"width": [], "height": []}
+    for scan in scans:
+        if isinstance(scan, LidarBoard):
+            q = scan.quality
+            sizes["width"].append((q.width_m, q.width_sigma_m))
+            sizes["height"].append((q.height_m, q.height_sigma_m))
+        elif scan.code == LIDAR_OTHER_SIZE.code:
+            measured = scan.figure("measured_m"), scan.figure("sigma_m")
+            sizes[str(scan.figures["side"])].append(measured)
     found = []
-    records = [estimate.observations[name].lidar.quality for name in estimate.used]
-    for side, wanted_m, sides in (
-        ("width", board.width_m, [(q.width_m, q.width_sigma_m) for q in records]),
-        ("height", board.height_m, [(q.height_m, q.height_sigma_m) for q in records]),
-    ):
-        known = [each for each in sides if each[1] < PLATE_KNOWN_M]
+    for side, wanted_m in (("width", board.width_m), ("height", board.height_m)):
+        known = [each for each in sizes[side] if each[1] < PLATE_KNOWN_M]
         if len(known) < 3:
             continue
         measured_m, sigma_m = (float(median) for median in np.median(known, axis=0))
         if abs(measured_m - wanted_m) > 2 * sigma_m:
-            severity = failing(abs(measured_m - wanted_m) > PLATE_FAIL * wanted_m)
             found.append(
                 PLATE_SIZE(
-                    severity=severity, side=side, measured_m=measured_m, sigma_m=sigma_m, profile_m=wanted_m
+                    severity=failing(abs(measured_m - wanted_m) > PLATE_FAIL * wanted_m),
+                    side=side,
+                    measured_m=measured_m,
+                    sigma_m=sigma_m,
+                    profile_m=wanted_m,
+                    n_captures=len(known),
                 )
             )
     return found

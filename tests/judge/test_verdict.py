@@ -10,8 +10,18 @@ from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.core.calibration import Certificate
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import perturb
+from lce_rig.detect.findings import LIDAR_OTHER_SIZE
+from lce_rig.judge.findings import (
+    CONTROL,
+    LAST_REJECTED,
+    NOT_CERTIFIED,
+    SCALE_OFF,
+    SHARES_DIFFER,
+    by_cause,
+    consequences,
+)
 from lce_rig.judge.validate import validate
-from lce_rig.judge.verdict import judge
+from lce_rig.judge.verdict import judge, plate_findings
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import BOARD, CAMERA, simulate
@@ -148,12 +158,36 @@ def test_a_plate_of_another_size_than_the_profiles_is_named(estimate, factor, ex
     )
 
 
+def test_a_plate_refused_for_its_size_counts_as_measured():
+    figures = {"side": "width", "measured_m": 0.9, "sigma_m": 0.01, "profile_m": BOARD.width_m}
+    refused = [LIDAR_OTHER_SIZE.refusal(**figures)] * 3
+    (finding,) = plate_findings(refused, BOARD)
+    assert (finding.code, finding.severity) == ("verdict.plate_size", "error")
+    assert (finding.figures["n_captures"], finding.figures["measured_m"]) == (3, 0.9)
+    assert plate_findings(refused[:2], BOARD) == []
+
+
 def test_the_worst_reason_comes_first(estimate, verdict_of):
     residuals = tuple(replace(r, held_out_m=1.0) for r in estimate.residuals)
     doubtful = replace(estimate, certificate=Certificate(False, 1.0), residuals=residuals)
     verdict, reasons = verdict_of(doubtful)
     assert verdict == "fail"
     assert [reason.code for reason in reasons] == ["verdict.not_certified", "verdict.held_out"]
+
+
+def test_what_follows_from_a_cause_stands_below_it():
+    control = CONTROL(rotation_deg=1.0, translation_m=0.01, direction="rotation_x")
+    shares = SHARES_DIFFER(
+        severity="warning", first="near", second="far", rotation_deg=1.0, translation_m=0.1
+    )
+    scale = SCALE_OFF(
+        severity="warning", scale=0.01, scale_sigma=0.001, square_m=0.069, profile_square_m=0.07
+    )
+    note = LAST_REJECTED(capture="000014")
+    certificate = NOT_CERTIFIED(severity="error", gap=0.1)
+    listed = by_cause([note, control, shares, scale, certificate])
+    assert listed == (certificate, scale, control, shares, note)
+    assert consequences(listed) == {"verdict.control": scale.code, "verdict.shares_differ": scale.code}
 
 
 def test_squares_of_the_wrong_size_are_told_from_the_distances():
