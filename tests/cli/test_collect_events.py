@@ -41,18 +41,6 @@ def collect(lce_rig, folder: Path, session: Path, *names: str):
     return lce_rig("collect", "--rig", "rles", session, *sources)
 
 
-def test_a_lidars_bag_and_a_davis_file_make_a_session_that_a_second_run_leaves_alone(
-    lce_rig, folder, tmp_path
-) -> None:
-    outcome = collect(lce_rig, folder, tmp_path / "s", "lidar.bag", "davis.aedat4")
-    assert outcome.code == 0, outcome.err
-    assert "1 capture (1 new)" in outcome.err and "davis.events" in outcome.err
-    (capture,) = Session.open(tmp_path / "s").captures
-    assert capture.event_cameras == ["davis"] and capture.has_image("davis", "frames")
-    again = collect(lce_rig, folder, tmp_path / "s", "davis.aedat4", "lidar.bag")
-    assert again.code == 0 and "(0 new, 1 held" in again.err
-
-
 @pytest.mark.parametrize(
     ("names", "said"),
     [

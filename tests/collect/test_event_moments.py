@@ -161,20 +161,6 @@ def test_clocks_that_do_not_overlap_are_an_error_before_anything_is_searched(tmp
     assert report.captured == ["000000"] and len(report.errors) == 1
 
 
-def test_a_recording_of_one_kind_of_sensor_is_an_error_that_says_what_is_missing(tmp_path, lidar) -> None:
-    write_aedat4(tmp_path / "events.aedat4", moves.events())
-    for path, cause in (
-        (lidar, "no images and no events"),
-        (tmp_path / "events.aedat4", "no scans of a LiDAR"),
-    ):
-        part = open_recording(path, moves.rig(), SourceOptions(is_part=True))
-        with (
-            Session.create(tmp_path / f"session of {path.stem}", moves.rig()) as session,
-            pytest.raises(SourceError, match=cause),
-        ):
-            collect(session, [part])
-
-
 def test_captures_whose_events_begin_late_are_kept(tmp_path) -> None:
     start_ns = moves.recording().start_ns + 900_000_000
     late = [s for s in moves.samples() if not isinstance(s, Events) or s.t_ns[0] >= start_ns]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.guidance.evidence import sigmas
-from lce_rig.collect.guidance.instructions import is_there
-from lce_rig.collect.guidance.planner import Planner
+from lce_rig.collect.guidance.instructions import HeldPose, build_pose, is_there
+from lce_rig.collect.guidance.planner import Coverage, Planner, measure_coverage
 from lce_rig.collect.guidance.sensor_model import (
     NEAREST_M,
     SensorPlace,
@@ -176,3 +176,32 @@ def test_where_it_was_sent_a_board_is_refused_only_if_it_was_captured_there():
 def test_no_board_is_refused_for_a_better_place_out_of_reach():
     bold, crowd, present = crowded()
     assert bold.adds_nothing(crowd, present, avoid=bold.candidates) is None
+
+
+HERE = HeldPose(right_m=0.0, ahead_m=2.5, up_m=0.0, tilt_deg=0.0, turn_deg=0.0, roll_deg=45.0)
+
+
+def coverage(planner, *changes):
+    poses = [build_pose(planner.view, replace(HERE, **change)) for change in changes]
+    return measure_coverage(view(), np.array(poses).reshape(-1, 4, 4), planner.candidates)
+
+
+def test_nothing_is_covered_by_nothing_nor_by_one_board(planner):
+    assert coverage(planner) == Coverage(0, 0, 0, 0, 0)
+    assert coverage(planner, {}) == Coverage(0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("bar", "changes"),
+    [
+        ("left_right", [{"right_m": -1.2}, {"right_m": 1.2}]),
+        ("up_down", [{"up_m": -0.5}, {"up_m": 0.5}]),
+        ("near_far", [{"ahead_m": 1.4}, {"ahead_m": 5.5}]),
+        ("roll", [{"roll_deg": 30.0}, {"roll_deg": 60.0}]),
+        ("tilt", [{"tilt_deg": 20.0}, {"tilt_deg": -20.0}, {"turn_deg": 20.0}, {"turn_deg": -20.0}]),
+    ],
+)
+def test_each_bar_fills_by_its_own_movement(planner, bar, changes):
+    assert getattr(coverage(planner, *changes), bar) == pytest.approx(1.0, abs=0.15)
+    others = replace(coverage(planner, *changes), **{bar: 0.0})
+    assert max(vars(others).values()) < 0.6

@@ -1,4 +1,4 @@
-"""The predicted covariance against the calibration's own matrices and against its errors over many seeds."""
+"""Predicted rings and covariance against scans, the calibration's own matrices and its errors over seeds."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -13,9 +13,9 @@ from lce_rig.calibrate.estimate import estimate_observations
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.calibrate.systematic import ring_sensitivities
-from lce_rig.collect.guidance.evidence import combine, sigmas, weigh_placements
+from lce_rig.collect.guidance.evidence import combine, cross_board, sigmas, weigh_placements
 from lce_rig.collect.guidance.sensor_model import ErrorModel
-from lce_rig.core.geometry import difference, invert
+from lce_rig.core.geometry import difference, invert, transform
 from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, scan_board
 from tests.collect.guidance.boards import SURROGATE, model, placements, predict_covariance
@@ -113,3 +113,36 @@ def test_worse_residuals_than_expected_are_learned():
     same = prior.learned(prior.plane_m, prior.edge_m, 15)
     assert same.side_m == pytest.approx(prior.side_m)
     assert same.tilt_rad == pytest.approx(prior.tilt_rad)
+
+
+def test_rings_and_their_points_are_those_of_a_scan():
+    poses = invert(T_FORWARD) @ placements(20, seed=1)
+    rings = cross_board(model(), poses)
+    rng = np.random.default_rng(2)
+    for k, T_lidar_board in enumerate(poses):
+        scan = scan_board(T_lidar_board, rng, Scenario(range_sigma_m=0.0), BOARD)
+        counts = np.bincount(scan.ring, minlength=16)
+        is_long = counts > 10
+        # One more or less at either end, and what lies between two samples of the prediction.
+        assert np.all(np.abs(rings.n_points[k] - counts)[is_long] <= 2 + 0.05 * counts[is_long])
+
+
+def test_rings_end_where_a_scan_s_rings_end():
+    poses = invert(T_FORWARD) @ placements(20, seed=3)
+    rings = cross_board(model(), poses)
+    rng = np.random.default_rng(4)
+    for k, T_lidar_board in enumerate(poses):
+        scan = scan_board(T_lidar_board, rng, Scenario(range_sigma_m=0.0), BOARD)
+        ends = transform(invert(T_lidar_board), scan.edge_points)[:, :2]
+        step_m = rings.spacing_m[k, scan.edge_ring]
+        predicted = rings.ends[k, scan.edge_ring]
+        miss = np.linalg.norm(predicted - ends[:, None], axis=-1).min(axis=1)
+        assert np.all(miss <= 1.5 * step_m + 0.02)
+
+
+def test_a_board_outside_the_vertical_field_has_no_rings():
+    above = np.eye(4)
+    above[:3, :3] = [[0, 0, -1], [-1, 0, 0], [0, 1, 0]]
+    above[:3, 3] = [2.0, 0.0, 2.0]
+    assert cross_board(model(), above[None]).n_rings[0] == 0
+    assert cross_board(model(), np.zeros((0, 4, 4))).n_points.shape == (0, 16)

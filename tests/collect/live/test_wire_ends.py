@@ -1,4 +1,4 @@
-"""How a live collection ends: politely, by signals, or by force; and that its recordings can be read."""
+"""A collection on sensors that send over UDP and pipes: what it holds, how it ends, and its recordings."""
 
 import random
 import signal
@@ -19,8 +19,10 @@ from tests.collect.live.conftest import LOOPS_PER_HOLD
 from tests.collect.live.sent import (
     captured_names,
     check_sent,
+    check_stamps,
     check_whole,
     errors,
+    journal_of,
     read_sent,
 )
 
@@ -104,3 +106,29 @@ def test_a_camera_whose_command_writes_no_pictures_is_named_where_nothing_was_ca
         assert collecting.wait() == 6
     said = collecting.said.partition("ended: ")[0]
     assert "cam is lost" in said and "no Y4M" in said and "lidar is lost" not in said
+
+
+@pytest.mark.long
+def test_captures_appear_by_themselves_and_hold_what_was_sent(
+    wire: Start, reel: Reel, tmp_path: Path
+) -> None:
+    rig, session = wire(), tmp_path / "session"
+    with Collecting(rig.profile, session, "--hold", "0", "--captures", "2") as collecting:
+        assert collecting.wait() == 0
+    with Collecting(rig.profile, session, "--hold", "0", "--captures", "3") as again:
+        assert again.wait() == 0
+    captures, sent = check_whole(session), read_sent(reel, rig.rig.lidars["lidar"])
+    assert [capture.name for capture in captures] == ["000000", "000001", "000002"]
+    assert captured_names(collecting.said) + captured_names(again.said) == [each.name for each in captures]
+    for capture in captures:
+        check_stamps(capture, check_sent(capture, sent), reel.n_placements)
+    assert [entry["ending"] for entry in journal_of(session)] == ["frames", "frames"]
+
+
+def test_a_collection_without_captures_ends_in_time_and_says_what_to_check(
+    wire: Start, tmp_path: Path
+) -> None:
+    with Collecting(wire().profile, tmp_path / "session", "--hold", "30", "--timeout", "1") as collecting:
+        assert collecting.wait() == 6
+    assert len(errors(collecting.said)) == 1
+    assert [entry["ending"] for entry in journal_of(tmp_path / "session")] == ["timeout"]
