@@ -145,7 +145,13 @@ def test_a_capture_with_a_bad_manifest_is_refused_alone(lce_rig, session, change
 
 @pytest.mark.parametrize(
     "text",
-    ["[" * 100_000, '{"T_cam_lidar": [[' + "9" * 401 + "]]}", '{"T_cam_lidar": [[1e999]]}', "\ufeff{}"],
+    [
+        "[" * 100_000,
+        '{"T_cam_lidar": [[1, 2], [3, 4]]}',
+        '{"T_cam_lidar": [[' + "9" * 401 + "]]}",
+        '{"T_cam_lidar": [[1e999]]}',
+        "\ufeff{}",
+    ],
 )
 def test_a_reference_that_cannot_be_read_is_a_session_error(lce_rig, session, tmp_path, text):
     (tmp_path / "ref.json").write_text(text, encoding="utf-8")

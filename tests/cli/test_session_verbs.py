@@ -98,13 +98,6 @@ def test_the_reference_never_enters_the_estimate(lce_rig, session):
     assert plain == against
 
 
-def test_a_reference_that_is_no_rigid_transform_exits_with_4(lce_rig, session, tmp_path):
-    (tmp_path / "bad.json").write_text('{"T_cam_lidar": [[1, 2], [3, 4]]}')
-    outcome = lce_rig("calibrate", session, "--reference", tmp_path / "bad.json")
-    assert outcome.code == 4
-    assert "bad.json" in outcome.err and "T_cam_lidar" in outcome.err
-
-
 def test_verify_before_anything_was_calibrated_exits_with_4(lce_rig, session):
     assert lce_rig("verify", session).code == 4
 
@@ -239,15 +232,6 @@ def test_too_few_captures_exit_with_6_and_say_how_many_are_needed(lce_rig, sessi
         assert outcome.code == (6 if verb == "calibrate" else 0)
         assert "4 of 4 captures" in outcome.err + outcome.out
         assert "minimum 6" in outcome.err + outcome.out
-
-
-def test_a_damaged_capture_is_named_and_the_others_still_count(lce_rig, session):
-    (session / "captures" / "000004" / "lidar.pcd").write_bytes(b"# .PCD v0.7")
-    outcome = lce_rig("check", session)
-    assert outcome.code == 0
-    assert "15 of 16 captures" in outcome.out
-    assert "000004: read:" in outcome.out
-    assert "lidar.pcd" in outcome.out
 
 
 def test_simulating_into_a_session_that_exists_exits_with_4(lce_rig, session):

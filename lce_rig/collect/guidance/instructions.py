@@ -3,7 +3,7 @@
 That person faces the rig: what the camera sees on its right is on the person's left.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,22 +20,6 @@ MOST_AT_ONCE = 3
 DEAD_BANDS = {"sideways": 0.12, "nearer": 0.15, "height": 0.10, "tilt": 8.0, "turn": 8.0, "roll": 15.0}
 #: Within so many dead bands of every wanted figure the board is there.
 THERE = 1.5
-
-
-@dataclass(frozen=True)
-class Instruction:
-    """One thing to do.
-
-    Attributes:
-        kind: what changes.
-        amount: by how much, in m or deg; positive to the camera's right, nearer, up, top towards the rig,
-            the person's left side towards the rig, clockwise as the person sees it.
-        text: the same in words.
-    """
-
-    kind: Kind
-    amount: float
-    text: str
 
 
 @dataclass(frozen=True)
@@ -98,7 +82,7 @@ def build_pose(view: SensorPlace, held: HeldPose) -> Array:
     return np.asarray(poses[0])
 
 
-def instruct(view: SensorPlace, present: Array, wanted: Array) -> list[Instruction]:
+def instruct(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, str]:
     """Say what to do, largest first, at most `MOST_AT_ONCE`; empty where the board is there.
 
     Args:
@@ -106,19 +90,16 @@ def instruct(view: SensorPlace, present: Array, wanted: Array) -> list[Instructi
         present: (4, 4) T_cam_board now.
         wanted: (4, 4) T_cam_board to reach.
     """
-    instructions = [
-        _instruction(kind, amount)
-        for kind, amount in _changes(view, present, wanted).items()
-        if abs(amount) > DEAD_BANDS[kind]
-    ]
+    changes = _changes(view, present, wanted)
     # Dead bands make ways and angles comparable.
-    instructions.sort(key=lambda instruction: -abs(instruction.amount) / DEAD_BANDS[instruction.kind])
-    return instructions[:MOST_AT_ONCE]
+    sizes = {kind: abs(amount) / DEAD_BANDS[kind] for kind, amount in changes.items()}
+    largest = sorted((kind for kind in sizes if sizes[kind] > 1), key=lambda kind: -sizes[kind])
+    return {kind: _in_words(kind, changes[kind]) for kind in largest[:MOST_AT_ONCE]}
 
 
-def say(instructions: Sequence[Instruction]) -> str:
+def say(instructions: Mapping[Kind, str]) -> str:
     """Join instructions to one sentence; "hold still" where there are none."""
-    return ", ".join(instruction.text for instruction in instructions) or "hold still"
+    return ", ".join(instructions.values()) or "hold still"
 
 
 def is_there(view: SensorPlace, present: Array, wanted: Array) -> bool:
@@ -128,7 +109,11 @@ def is_there(view: SensorPlace, present: Array, wanted: Array) -> bool:
 
 
 def _changes(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, float]:
-    """Compute the signed changes by kind, m and deg, as `Instruction.amount`."""
+    """Compute the signed changes by kind, m and deg.
+
+    They are positive to the camera's right, nearer, up, the top towards the rig, the person's left side
+    towards the rig, and clockwise as the person sees it.
+    """
     now, then = describe_pose(view, present), describe_pose(view, wanted)
     # A pattern looks the same from either end.
     roll_deg = (then.roll_deg - now.roll_deg + 90) % 180 - 90
@@ -145,24 +130,22 @@ def _changes(view: SensorPlace, present: Array, wanted: Array) -> dict[Kind, flo
     }
 
 
-def _instruction(kind: Kind, amount: float) -> Instruction:
+def _in_words(kind: Kind, amount: float) -> str:
     size = abs(amount)
     if kind == "sideways":
         steps = round(size / STEP_M)
         way = "one step" if steps == 1 else f"{steps} steps"
         way = f"{10 * round(10 * size)} cm" if size < 0.75 * STEP_M else way
-        text = f"{way} {'left' if amount > 0 else 'right'}"
-    elif kind == "nearer":
-        text = f"{size:.1f} m {'closer' if amount > 0 else 'back'}"
-    elif kind == "height":
-        text = f"{'raise' if amount > 0 else 'lower'} it {100 * size:.0f} cm"
-    elif kind == "tilt":
-        text = f"tilt the {'top' if amount > 0 else 'bottom'} {_angle(size)}towards the rig"
-    elif kind == "turn":
-        text = f"turn the {'left' if amount > 0 else 'right'} side {_angle(size)}towards the rig"
-    else:
-        text = f"rotate it {_angle(size)}{'clockwise' if amount > 0 else 'anticlockwise'}"
-    return Instruction(kind, amount, text)
+        return f"{way} {'left' if amount > 0 else 'right'}"
+    if kind == "nearer":
+        return f"{size:.1f} m {'closer' if amount > 0 else 'back'}"
+    if kind == "height":
+        return f"{'raise' if amount > 0 else 'lower'} it {100 * size:.0f} cm"
+    if kind == "tilt":
+        return f"tilt the {'top' if amount > 0 else 'bottom'} {_angle(size)}towards the rig"
+    if kind == "turn":
+        return f"turn the {'left' if amount > 0 else 'right'} side {_angle(size)}towards the rig"
+    return f"rotate it {_angle(size)}{'clockwise' if amount > 0 else 'anticlockwise'}"
 
 
 def _angle(size_deg: float) -> str:

@@ -12,7 +12,7 @@ from lce_rig.collect.findings import (
     GUIDE_NO_NOMINAL,
     GUIDE_PREDICTED,
 )
-from lce_rig.collect.guidance.instructions import Instruction, instruct, is_there
+from lce_rig.collect.guidance.instructions import Kind, instruct, is_there
 from lce_rig.collect.guidance.planner import ENOUGH_SHARE, Coverage, Guidance, Planner, measure_coverage
 from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace, model_sensors, outline_px
 from lce_rig.collect.placement_dedupe import capture_poses
@@ -206,10 +206,10 @@ class Guide:
             is_enough=guidance.is_enough,
         )
 
-    def instruct(self, present: Array) -> list[Instruction]:
+    def instruct(self, present: Array) -> dict[Kind, str]:
         """Say what to do with a board (4, 4)."""
         if self._planner is None or self.wanted is None:
-            return []
+            return {}
         return instruct(self._planner.view, present, self.wanted)
 
     def is_there(self, present: Array) -> bool:

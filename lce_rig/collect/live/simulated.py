@@ -264,7 +264,7 @@ class Person:
         aim = describe_pose(view, wanted)
         instructions = instruct(view, present, wanted)
         if instructions and rng.random() < self.ignored_share:
-            ignored = rng.choice([instruction.kind for instruction in instructions])
+            ignored = rng.choice(list(instructions))
             aim = replace(aim, **{_FIGURE[ignored]: getattr(describe_pose(view, present), _FIGURE[ignored])})
         aimed = build_pose(view, aim)
         turn = exp_so3(np.radians(self.turn_sigma_deg) * rng.standard_normal(3))
