@@ -29,11 +29,6 @@ def test_every_edge_lies_on_the_outline_with_its_normal_outwards():
         assert points[k] @ normals[k] > 0
 
 
-def test_a_pattern_looks_the_same_turned_when_its_squares_add_up_to_an_even_number():
-    assert BOARD.is_symmetric
-    assert not Board(9, 6, 0.068, 0.8, 0.6).is_symmetric
-
-
 def test_the_distance_inside_the_nearest_edge_is_that_to_its_line():
     points = np.random.default_rng(0).uniform(-0.6, 0.6, (500, 2))
     middles, normals = BOARD.edges()

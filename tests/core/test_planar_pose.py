@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, difference, exp_so3, perturb, pose, rotation_angle, transform
-from lce_rig.core.planar_pose import PlanarPose, mirror_tilt, refine_pose, solve_planar_pose
+from lce_rig.core.planar_pose import PlanarPose, refine_pose, solve_planar_pose
 
 BOARD = Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
 RADTAN = Intrinsics(
@@ -125,26 +125,6 @@ def test_starts_of_a_picture_before_lead_to_the_same_minima(n_starts: int, swapp
     assert np.abs(led.T_cam_board - alone.T_cam_board).max() < 1e-6
     assert np.abs(led.T_cam_board_alternative - alone.T_cam_board_alternative).max() < 1e-5
     assert led.chi2_gap == pytest.approx(alone.chi2_gap, rel=1e-4)
-
-
-@given(tilt_deg=st.floats(1, 60), about_deg=st.floats(-180, 180), z=st.floats(0.5, 6.0))
-def test_mirroring_the_tilt_twice_changes_nothing_and_once_keeps_the_centre(
-    tilt_deg: float, about_deg: float, z: float
-) -> None:
-    T, centre = looking(tilt_deg, about_deg, 20, (0.2, 0.1, z)), np.zeros(3)
-    once = mirror_tilt(T, centre)
-    assert np.allclose(once[:3, 3], T[:3, 3], atol=1e-12)
-    assert np.linalg.det(once[:3, :3]) == pytest.approx(1.0)
-    assert np.allclose(mirror_tilt(once, centre), T, atol=1e-9)
-
-
-@CAMERAS
-def test_the_pose_does_not_depend_on_the_order_of_the_corners(camera: Intrinsics) -> None:
-    corners = seen(looking(30, 10, 20, (0.1, 0.1, 2.0)), camera, 0.2, 4)
-    order = np.random.default_rng(0).permutation(len(corners))
-    shuffled = solve_planar_pose(corners[order], BOARD.corners()[order], camera)
-    assert shuffled is not None
-    assert np.allclose(shuffled.T_cam_board, solve(corners, camera).T_cam_board, atol=1e-7)
 
 
 def test_corners_outside_the_lens_model_give_no_pose() -> None:

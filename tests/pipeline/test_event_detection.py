@@ -112,11 +112,6 @@ def test_the_stamp_is_the_median_firing_time_of_the_first_lidars_board(seen):
     assert stamp({}) is None
 
 
-def test_scans_without_stamps_leave_the_end_of_the_stream(tmp_path, stream):
-    board = found_in(session_of(tmp_path, stream, stamp_ns=None))
-    assert board.stamp_ns == int(stream.t_ns[-1])
-
-
 def test_another_scan_under_the_same_name_gives_another_picture(tmp_path, stream):
     first = found_in(session_of(tmp_path / "a", stream))
     other = session_of(tmp_path / "b", stream, stamp_ns=SCAN_NS - 40 * MS)

@@ -1,7 +1,6 @@
 """A session keeps what it was given, exactly, and lets nobody else write to it."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -25,17 +24,6 @@ def test_a_capture_comes_back_exactly_as_it_was_given(tmp_path, rig, samples):
     for field in ("points", "intensity", "ring", "offset_ns"):
         given, read = getattr(scans[0], field), getattr(scan, field)
         assert given.dtype == read.dtype and np.array_equal(given, read), field
-
-
-def test_a_grey_picture_and_a_scan_without_times_come_back_too(tmp_path, rig):
-    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
-    scan = Scan("lidar", None, np.ones((2, 3), np.float32), np.zeros(2, np.float32), np.zeros(2, np.int16))
-    session = Session.create(tmp_path / "s", rig)
-    session.add_capture([Image("cam", "frames", None, grey)], [scan], {})
-    capture = session.captures[0]
-    assert np.array_equal(capture.image("cam", "frames").pixels, grey)
-    assert capture.scan("lidar").offset_ns is None and capture.scan("lidar").stamp_ns is None
-    assert capture.has_image("cam", "frames") and not capture.has_image("cam", "events")
 
 
 @pytest.mark.parametrize("offsets", [[-5, 7], [0, 2**40], [0, 2**32 - 1]])
@@ -137,17 +125,12 @@ def test_a_session_whose_creation_was_cut_off_is_created_anew(tmp_path, rig):
     assert Session.open(tmp_path / "s").captures == []
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[]", '{"format_version": "x"}', "\x00"])
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[]", '{"format_version": "x"}', '{"format_version": 99}', "\x00"]
+)
 def test_a_damaged_marker_is_named(tmp_path, rig, text):
     Session.create(tmp_path / "s", rig).close()
     (tmp_path / "s" / "session.json").write_text(text)
-    with pytest.raises(SessionError, match=r"session\.json"):
-        Session.open(tmp_path / "s")
-
-
-def test_sessions_of_a_newer_version_are_refused(tmp_path, rig):
-    Session.create(tmp_path / "s", rig).close()
-    (tmp_path / "s" / "session.json").write_text('{"format_version": 99}')
     with pytest.raises(SessionError):
         Session.open(tmp_path / "s")
 
@@ -187,8 +170,8 @@ def test_the_same_data_is_recognised_whatever_their_stamps(tmp_path, rig, sample
 
 def test_the_journal_is_appended_and_a_torn_line_is_skipped(tmp_path, rig):
     session = Session.create(tmp_path / "s", rig)
-    with (tmp_path / "s" / "journal.jsonl").open("a") as file:
-        file.write('{"event": "tor')
+    with (tmp_path / "s" / "journal.jsonl").open("ab") as file:
+        file.write(b'[1]\n{"event"\n\xff\n{"event": "tor')
     session.journal("collected", captured=3)
     assert [e["event"] for e in session.read_journal()] == ["created", "collected"]
     assert session.read_journal()[-1]["captured"] == 3
@@ -200,14 +183,6 @@ def test_other_things_among_the_captures_are_not_captures(tmp_path, rig, samples
     for name in ("backup", "00001x", ".hidden"):
         (tmp_path / "s" / "captures" / name).mkdir()
     assert [c.name for c in session.captures] == ["000000"]
-
-
-def test_numbers_of_removed_captures_are_not_used_for_others_in_between(tmp_path, rig, samples):
-    session = Session.create(tmp_path / "s", rig)
-    for seed in range(3):
-        session.add_capture(*samples(seed), {})
-    shutil.rmtree(session.captures[1].path)
-    assert session.add_capture(*samples(9), {}) == "000003"
 
 
 def test_cached_arrays_come_back_and_damage_counts_as_nothing(tmp_path):
