@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from lce_rig.export import export
     from lce_rig.export.reference import Reference, read_reference
     from lce_rig.io.protocol import SourceOptions
+    from lce_rig.pipeline.calibrate_sessions import calibrate
     from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
     from lce_rig.pipeline.detect_session import detect
-    from lce_rig.pipeline.drift import DriftReport, drift
     from lce_rig.pipeline.result_files import Result
-    from lce_rig.pipeline.union import calibrate
     from lce_rig.pipeline.verification import Verification, verify
+    from lce_rig.pipeline.watch_drift import DriftReport, drift
     from lce_rig.rig import Rig, load_rig
     from lce_rig.session import Session
 
@@ -101,10 +101,10 @@ _HOMES = {
     "lce_rig.export.reference": ("Reference", "read_reference"),
     "lce_rig.pipeline.collect_recordings": ("collect_from",),
     "lce_rig.pipeline.detect_session": ("detect",),
-    "lce_rig.pipeline.drift": ("DriftReport", "drift"),
+    "lce_rig.pipeline.watch_drift": ("DriftReport", "drift"),
     "lce_rig.pipeline.comparison": ("Repeat", "repeat"),
     "lce_rig.pipeline.result_files": ("Result",),
-    "lce_rig.pipeline.union": ("calibrate",),
+    "lce_rig.pipeline.calibrate_sessions": ("calibrate",),
     "lce_rig.pipeline.verification": ("Verification", "verify"),
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),

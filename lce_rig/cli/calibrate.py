@@ -30,8 +30,8 @@ from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
 from lce_rig.export.reference import read_reference
 from lce_rig.judge.findings import consequences, weakest_words
+from lce_rig.pipeline.calibrate_sessions import require_unit
 from lce_rig.pipeline.result_files import UNION, Result, WrittenResult, new_result_parts
-from lce_rig.pipeline.union import require_unit
 from lce_rig.session.provenance import provenance_of
 
 _AXES = ("x right", "y down", "z forward")

@@ -9,9 +9,9 @@ from lce_rig.cli import show
 from lce_rig.cli.options import cameras_option, require_sensors, session_argument, split_names
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.judge.intrinsics_check import describe as figures_of
-from lce_rig.pipeline.intrinsics import MeasuredIntrinsics, measure_intrinsics
 from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
 from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
+from lce_rig.pipeline.measure_intrinsics import MeasuredIntrinsics, measure_intrinsics
 from lce_rig.session import Session
 
 _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")

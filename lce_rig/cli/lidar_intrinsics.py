@@ -10,7 +10,7 @@ from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option
 from lce_rig.core.errors import UsageError
-from lce_rig.pipeline.lidar_intrinsics import measure_lidar, save_lidar
+from lce_rig.pipeline.measure_lidar import measure_lidar, save_lidar
 from lce_rig.session import Session
 
 

@@ -1,7 +1,7 @@
 """Pose of a planar board from its corners in one image: both local minima, with covariance."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ _MAX_STEPS = 30
 _SAME_POSE_RAD = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class PlanarPose:
+class PlanarPose(NamedTuple):
     """The minima of the reprojection cost f = sum |project(T p_i) - u_i|^2 of one board.
 
     Attributes:

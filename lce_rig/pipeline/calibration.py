@@ -114,7 +114,7 @@ def calibrate_detections(
     Args:
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
-        options, cameras, channels, reference, progress: as of `union.calibrate`.
+        options, cameras, channels, reference, progress: as of `calibrate_sessions.calibrate`.
         scene: asks the scene about the boards' extrinsics; None for the boards alone.
 
     Returns:

@@ -13,15 +13,15 @@ from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.core.progress import Progress, silent
 from lce_rig.judge.repeatability import Repeatability
-from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, OTHER_BOARD, OUTDATED
-from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
-from lce_rig.pipeline.union import (
+from lce_rig.pipeline.calibrate_sessions import (
     calibrate,
     compare_sensors,
     require_independent,
     require_same,
     session_names,
 )
+from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, OTHER_BOARD, OUTDATED
+from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
 from lce_rig.session import Session
 from lce_rig.session.session import CAPTURES
 
@@ -79,9 +79,9 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
         )
     results = {name: list(_read(session, stored[name].folder).pairs) for name in chosen}
     comparisons, lonely = compare_sensors(results, are_independent=False)
-    _require_some(comparisons, results, "results")
+    failures = _require_some(comparisons, results, "results")
     outdated = [OUTDATED(name) for name in chosen if stored[name].is_outdated]
-    return Repeat(session.rig.name, comparisons, (), (*outdated, *lonely, *_failures(results)))
+    return Repeat(session.rig.name, comparisons, (), (*outdated, *lonely, *failures))
 
 
 def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: Progress = silent) -> Repeat:
@@ -154,23 +154,21 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
         if session.rig.board != first.rig.board
     ]
     comparisons, lonely = compare_sensors(results)
-    _require_some(comparisons, results, "sessions")
-    findings = (*other_boards, *troubles, *lonely, *_failures(results))
+    failures = _require_some(comparisons, results, "sessions")
+    findings = (*other_boards, *troubles, *lonely, *failures)
     return Repeat(first.rig.name, comparisons, tuple(calibrated), findings)
 
 
 def _require_some(
     comparisons: Sequence[Repeatability], results: dict[str, list[Calibration]], what: str
-) -> None:
+) -> list[Finding]:
+    """Refuse results without a comparison; name those that failed."""
     if not comparisons:
         sensors = {name: ", ".join(f"{c.camera} and {c.lidar}" for c in own) for name, own in results.items()}
         raise SessionError(
             f"no camera and LiDAR are calibrated in two of the {what}",
             "\n".join(f"{name}: {own or 'its result holds no sensors'}" for name, own in sensors.items()),
         )
-
-
-def _failures(results: dict[str, list[Calibration]]) -> list[Finding]:
     return [
         FAILED(name, camera=c.camera, lidar=c.lidar)
         for name, own in results.items()
@@ -199,10 +197,6 @@ def _read(session: Session, folder: Path) -> ResultFile:
             f"{path} belongs to rig {saved.rig!r}, its session to rig {session.rig.name!r}",
             "Run `lce-rig calibrate` again.",
         )
-    for calibration in saved.pairs:
-        if np.linalg.eigvalsh(calibration.cov).min() <= 0:
-            raise SessionError(
-                f"{path}: the covariance of {calibration.camera} and {calibration.lidar} has no inverse",
-                "Run `lce-rig calibrate` again.",
-            )
+    if any(np.linalg.eigvalsh(c.cov).min() <= 0 for c in saved.pairs):
+        raise SessionError(f"{path}: a covariance has no inverse", "Run `lce-rig calibrate` again.")
     return saved

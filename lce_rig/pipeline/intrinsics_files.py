@@ -17,7 +17,7 @@ from lce_rig.core.phrasing import as_line
 from lce_rig.export.camera_info import camera_info_text
 from lce_rig.export.writing import number, numbers
 from lce_rig.judge.findings import verdict_of
-from lce_rig.pipeline.intrinsics import MeasuredIntrinsics
+from lce_rig.pipeline.measure_intrinsics import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_foreign
 from lce_rig.rig import (
     Rig,

@@ -9,7 +9,7 @@ import lce_rig as lce
 from lce_rig.core.errors import ResultRefusedError
 from lce_rig.core.geometry import perturb
 from lce_rig.detect.detection import Detections
-from lce_rig.pipeline.lidar_intrinsics import measure_lidar
+from lce_rig.pipeline.measure_lidar import measure_lidar
 from tests.calibrate.boards import Scenario, simulate
 
 

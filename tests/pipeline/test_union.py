@@ -12,8 +12,8 @@ from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionE
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections
+from lce_rig.pipeline.calibrate_sessions import join_detections
 from lce_rig.pipeline.result_files import as_named_in, inputs_sha256
-from lce_rig.pipeline.union import join_detections
 from lce_rig.rig import find_profile, parse_rig, set_value
 from tests.calibrate.boards import T_FORWARD, simulate
 

@@ -10,8 +10,8 @@ import pytest
 from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3
-from lce_rig.pipeline.drift import PairDrift, judge
 from lce_rig.pipeline.scene_captures import SceneCaptures
+from lce_rig.pipeline.watch_drift import PairDrift, judge
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulatedCapture, truth_extrinsics
 from lce_rig.timing.scan_pairing import Frame

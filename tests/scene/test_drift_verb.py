@@ -19,8 +19,8 @@ from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
 from lce_rig.io.network import build_frame
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.pipeline.drift import drift, judge
 from lce_rig.pipeline.scene_captures import SceneCaptures, Thinned
+from lce_rig.pipeline.watch_drift import drift, judge
 from lce_rig.rig import Rig, dump_rig
 from lce_rig.scene.alignment import AXES
 from lce_rig.session import Session

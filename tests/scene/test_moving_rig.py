@@ -7,8 +7,8 @@ import pytest
 
 from lce_rig.core.calibration import ResultFile
 from lce_rig.core.geometry import perturb
-from lce_rig.pipeline.drift import judge
 from lce_rig.pipeline.scene_captures import SceneCaptures
+from lce_rig.pipeline.watch_drift import judge
 from lce_rig.scene.alignment import AXES
 from lce_rig.scene.rig_motion import estimate_motion
 from lce_rig.timing.scan_pairing import Frame

@@ -240,13 +240,7 @@ def compare_sensors(
     groups: dict[tuple[str, str], dict[str, Calibration]] = {}
     for name, calibrations in results.items():
         for calibration in calibrations:
-            group = groups.setdefault((calibration.camera, calibration.lidar), {})
-            if name in group:
-                raise SessionError(
-                    f"{name}: its result holds {calibration.camera} and {calibration.lidar} twice",
-                    "Run `lce-rig calibrate` again.",
-                )
-            group[name] = calibration
+            groups.setdefault((calibration.camera, calibration.lidar), {})[name] = calibration
     comparisons = [
         compare_calibrations(group, are_independent=are_independent)
         for _, group in sorted(groups.items())
