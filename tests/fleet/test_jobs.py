@@ -3,7 +3,7 @@
 import pytest
 
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, UsageError
-from lce_rig.fleet.jobs import Entry, find_jobs
+from lce_rig.fleet.jobs import find_jobs
 from lce_rig.fleet.storage import Storage
 
 
@@ -94,16 +94,3 @@ def test_a_root_without_sessions_is_refused(tmp_path):
         find_jobs(Storage.at(tmp_path))
     with pytest.raises(UsageError):
         find_jobs(Storage.at(tmp_path / "absent"))
-
-
-@pytest.mark.parametrize(
-    ("pattern", "path", "fields"),
-    [
-        ("{robot}/*", "r1/a", {"robot": "r1"}),
-        ("{robot}-{site}.bag", "r1-hall.bag", {"robot": "r1", "site": "hall"}),
-        ("**/{robot}/s", "x/y/r2/s", {"robot": "r2"}),
-        ("{robot}/*", "r1/a/b", {}),
-    ],
-)
-def test_fields_are_read_from_a_path(pattern, path, fields):
-    assert Entry(path=pattern).fields_of(path) == fields

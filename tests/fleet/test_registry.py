@@ -48,13 +48,6 @@ def test_a_table_that_is_lost_or_behind_is_written_again_from_the_folders(regist
     assert registry.consolidate(rebuild=True).equals(whole)
 
 
-def test_a_result_that_is_set_aside_leaves_the_table(registry, row):
-    fresh = write(registry, row(folder="r1/a", source="1")) + write(registry, row(folder="r1/b", source="2"))
-    registry.consolidate(fresh)
-    registry.set_aside("r1/a")
-    assert folders(registry.consolidate()) == ["r1/b"]
-
-
 def test_a_later_result_of_a_source_takes_the_place_of_the_earlier_which_is_kept(registry, row):
     write(registry, row(folder="r1/old", source="s", finished="2026-01-01T00:00:00Z"), "result.json")
     write(registry, row(folder="r1/new", source="s", finished="2026-01-02T00:00:00Z"))

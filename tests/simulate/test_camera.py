@@ -46,20 +46,6 @@ def test_corners_lie_where_the_truth_projects_them(
     assert np.abs(error.mean(axis=0)).max() < 0.02
 
 
-def test_a_detector_finds_the_board_in_a_noisy_picture(room: Room, board: Board, backdrop: Backdrop) -> None:
-    import cv2
-
-    T = PLACEMENTS[0]
-    scene = Scene(room.raycaster, build_carrier("person", board, T, np.random.default_rng(0)), board, T)
-    picture = render_image(scene, backdrop, CameraNoise(), np.random.default_rng(0)).grey
-    is_found, corners = cv2.findChessboardCornersSB(picture, (board.cols, board.rows))
-    assert is_found
-    truth, _ = backdrop.intrinsics.project(transform(invert(backdrop.T_world_cam) @ T, board.corners()))
-    found = corners.reshape(-1, 2)
-    error = min((found - truth, found[::-1] - truth), key=lambda d: float(np.sum(d**2)))
-    assert np.sqrt(np.mean(error**2)) < 0.1
-
-
 @pytest.mark.parametrize("model", sorted(LENSES))
 def test_rays_through_pixels_project_back_onto_them(model: str) -> None:
     lens = LENSES[model]

@@ -106,20 +106,6 @@ def test_a_ramp_gives_as_many_events_of_its_sign_as_thresholds_fit_into_it() -> 
     assert np.allclose(1e-9 * (first.t_ns - START_NS), expected_s, atol=1e-4)
 
 
-def test_stamps_lie_between_the_subframes_where_the_ramp_crosses() -> None:
-    scene = ripples(3)
-    coarse, fine = (record(QUIET_EVENTS, scene, duration_s=0.2, step_s=s)[0] for s in (0.004, 0.0005))
-    assert len(coarse) == pytest.approx(len(fine), rel=0.01)
-    first_s = []
-    for events in (coarse, fine):
-        pixel, index = np.unique(pixel_of(events), return_index=True)
-        when = np.full(SHAPE[0] * SHAPE[1], np.nan)
-        when[pixel] = 1e-9 * (events.t_ns[index] - START_NS)
-        first_s.append(when)
-    late_s = first_s[0] - first_s[1]
-    assert np.nanmedian(np.abs(late_s)) < 1e-4, "far below the coarse step of 4 ms"
-
-
 def test_events_come_in_order_of_whole_microseconds_across_packets() -> None:
     packets = record(EventNoise(), ripples(), n_packets=10)
     t_ns = np.concatenate([packet.t_ns for packet in packets])
@@ -183,9 +169,3 @@ def test_thresholds_spread_from_pixel_to_pixel_and_from_event_to_event() -> None
     )
     assert intervals_ns(steady).std() < 1e5
     assert intervals_ns(shaky).std() * 10e-9 == pytest.approx(0.03, rel=0.1)
-
-
-def test_stamps_carry_the_offset_of_the_cameras_clock() -> None:
-    plain, shifted = (record(QUIET_EVENTS, ripples(), offset_ns=offset)[0] for offset in (0, -15_000_000))
-    assert np.array_equal(shifted.t_ns, plain.t_ns - 15_000_000)
-    assert np.array_equal(shifted.x, plain.x)

@@ -7,9 +7,8 @@ import pytest
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
-from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M, LidarNoise, SimulationOptions
+from lce_rig.simulate.options import LidarNoise
 from lce_rig.simulate.room import Room, build_carrier
 from lce_rig.simulate.scene import PLATE, Raycaster, Scene, Surface
 from lce_rig.simulate.surfaces import merge, rectangle
@@ -168,24 +167,6 @@ def test_dark_squares_and_weak_returns_read_long(board: Board, T_world_lidar: Ar
     assert 0.2 < is_dark.mean() < 0.5
     assert np.median(depth[~is_dark]) == pytest.approx(0.0005, abs=2e-4)
     assert np.median(depth[is_dark]) == pytest.approx(0.008 + 0.03 * (1 - 20 / 30), abs=1e-3)
-
-
-def test_only_returns_between_the_range_limits_are_reported(scene: Scene, T_world_lidar: Array) -> None:
-    scan = scan_of(scene, T_world_lidar, LidarNoise(), min_range_m=2.5, max_range_m=4.0)
-    range_m = np.linalg.norm(scan.points, axis=1)
-    assert len(range_m) > 100
-    assert range_m.min() > 2.48 and range_m.max() < 4.02
-
-
-@pytest.mark.parametrize("level", [1, 4, 10])
-def test_noise_levels_are_the_papers(level: int, board: Board, T_world_lidar: Array) -> None:
-    scene = Scene(Raycaster(()), [], board, board_before_lidar(2.5))
-    noise = SimulationOptions(noise_level=level).noise_of(VLP_16)
-    scan = scan_of(scene, T_world_lidar, replace(noise, dropout=0.0))
-    xyz = in_board(scene, T_world_lidar, scan)
-    inner = np.all(np.abs(xyz[:, :2]) < [0.3, 0.2], axis=1)
-    sigma = PAPER_RANGE_SIGMA_M[level - 1]
-    assert xyz[inner, 2].std() == pytest.approx(sigma, rel=0.15, abs=1e-3)
 
 
 def test_rim_noise_moves_points_near_the_border_and_no_others(board: Board, T_world_lidar: Array) -> None:

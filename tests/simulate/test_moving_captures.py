@@ -190,10 +190,3 @@ def test_a_camera_of_events_alone_is_enough_for_a_moving_board_only() -> None:
     assert capture.images == [] and len(capture.events) == 1
     with pytest.raises(ProfileError):
         next(simulate_captures(rig, n_captures=1, seed=6, options=replace(BRIEF, motion="still")))
-
-
-@pytest.mark.parametrize("name", ["rlfs", "rles", "sss"])
-def test_any_rigs_board_is_held_still_unless_it_is_told_to_move(name: str) -> None:
-    assert SimulationOptions.for_rig(name).motion == "still"
-    moving = SimulationOptions.for_rig(name, motion="moving")
-    assert moving == replace(SimulationOptions.for_rig(name), motion="moving")

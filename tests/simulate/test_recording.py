@@ -1,18 +1,13 @@
 """A recording yields samples in order, of one board, and survives the file formats of event cameras."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import invert, transform
-from lce_rig.io.events import open_events
 from lce_rig.rig import Rig
 from lce_rig.simulate import HandMotion, SimulatedRecording, SimulationOptions, simulate_recording
 from lce_rig.simulate.captures import stamp_of
-from tests.io.events.aedat4_files import write_aedat4
-from tests.io.events.bags import write_event_bag
 
 from .test_moving_captures import found_corners, moving_rig
 
@@ -32,11 +27,6 @@ def recording(rig: Rig) -> SimulatedRecording:
 @pytest.fixture(scope="module")
 def samples(recording: SimulatedRecording) -> list[Image | Scan | Events]:
     return list(recording)
-
-
-@pytest.fixture(scope="module")
-def packets(samples: list[Image | Scan | Events]) -> list[Events]:
-    return [sample for sample in samples if isinstance(sample, Events)]
 
 
 def test_samples_come_in_order_at_each_sensors_own_rate(
@@ -69,17 +59,3 @@ def test_pictures_and_scans_show_the_board_where_the_truth_has_it(
             assert on_board.sum() > 50
             assert np.abs(np.median(xyz[on_board, 2])) < 0.01
     assert n_seen >= 4
-
-
-@pytest.mark.parametrize("name", ["events.aedat4", "events.bag", "events_ros2"])
-def test_events_come_back_from_files_as_they_were(tmp_path: Path, packets: list[Events], name: str) -> None:
-    path = tmp_path / name
-    if name.endswith(".aedat4"):
-        write_aedat4(path, packets)
-    else:
-        write_event_bag(path, packets)
-    read = list(open_events(path, sensor="cam"))
-    for column in ("t_ns", "x", "y", "polarity"):
-        back, given = (np.concatenate([getattr(part, column) for part in parts]) for parts in (read, packets))
-        assert np.array_equal(back, given)
-    assert {(part.sensor, part.width_px, part.height_px) for part in read} == {("cam", 346, 260)}

@@ -1,16 +1,14 @@
 """Simulated packets carry what was simulated, as a VLP-16 would send it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, gprmc
+from wire.vlp16_packets import STREAMED_VLP16, Vlp16Packets
 
 from lce_rig.core import velodyne
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array
-from lce_rig.io.velodyne.packet import read_data_packet, read_position_packet
+from lce_rig.io.velodyne.packet import read_data_packet
 from lce_rig.io.velodyne.stream import Vlp16Stream
 from lce_rig.simulate.options import LidarNoise
 from lce_rig.simulate.room import Room, build_carrier
@@ -79,32 +77,6 @@ def test_packets_leave_at_the_rate_of_a_vlp16_and_pass_every_check() -> None:
     np.testing.assert_allclose(leaves_us, 1327.104, atol=0.001)
 
 
-def test_position_packets_tell_of_the_clock() -> None:
-    clock = Vlp16Clock("synchronising", is_valid=False, error_us=5_000_000)
-    packets = packets_of(room_scans(1), clock=clock)
-    positions = [packet for packet in packets if packet.port == velodyne.POSITION_PORT]
-    assert len(positions) == 6
-    for packet in positions:
-        read = read_position_packet(packet.payload)
-        assert velodyne.PPS_STATES[read.pps] == "synchronising"
-        assert read.us == packet.sent_ns // 1000 % velodyne.HOUR_US + 5_000_000
-        assert read.nmea.startswith("$GPRMC,2213") and not read.is_fix
-        assert read.nmea_s is not None and read.nmea_s in (13 * 60 + 19, 13 * 60 + 20)
-    silent = packets_of(room_scans(1), clock=Vlp16Clock("absent", has_nmea=False))
-    read = read_position_packet(silent[1].payload)
-    assert (read.pps, read.nmea, read.nmea_s) == (0, "", None)
-
-
-def test_sentences_carry_time_date_and_checksum() -> None:
-    sentence = gprmc(T0_NS + 900_000_000)
-    assert sentence.startswith("$GPRMC,221320,A,") and ",141123," in sentence
-    checksum = 0
-    for character in sentence[1 : sentence.index("*")]:
-        checksum ^= ord(character)
-    assert sentence.endswith(f"*{checksum:02X}")
-    assert len(sentence) <= 80
-
-
 def test_a_scan_after_a_break_begins_a_packet_of_its_own() -> None:
     later = room_scan(T0_NS + 3_000_000_000)
     sender = Vlp16Packets()
@@ -116,12 +88,3 @@ def test_a_scan_after_a_break_begins_a_packet_of_its_own() -> None:
     stream = Vlp16Stream("lidar", settings())
     assert len(push(stream, packets)) == 2
     assert stream.flaws() == []
-
-
-def test_a_scan_that_no_vlp16_could_send_is_refused() -> None:
-    scan = room_scan(T0_NS)
-    assert scan.offset_ns is not None
-    with pytest.raises(ValueError, match="no firing"):
-        Vlp16Packets().feed(replace(scan, offset_ns=scan.offset_ns + 1000))
-    with pytest.raises(ValueError):
-        Vlp16Packets().feed(replace(scan, offset_ns=None))

@@ -402,13 +402,3 @@ def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(
     assert n > 15 and n_new > 2 and n_old > 2
     deploy(result("c", 0.2), rig, settings, place=sound)
     assert len(list((robot / "releases").glob(f"*/{RECORD}"))) == 2
-
-
-def test_a_set_is_known_by_what_sha256sum_prints(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").write_text("1")
-    (tmp_path / "b").mkdir()
-    (tmp_path / "b" / "c.txt").write_text("2")
-    (tmp_path / RECORD).write_text("{}")
-    lines = subprocess.run(["sha256sum", "a.txt", "b/c.txt"], capture_output=True, check=True, cwd=tmp_path)
-    printed = subprocess.run(["sha256sum"], input=lines.stdout, capture_output=True, check=True).stdout
-    assert set_sha256(content_of(tmp_path)) == printed.decode().split()[0]
