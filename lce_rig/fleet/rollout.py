@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from lce_rig.core.errors import CommandError, LceRigError, NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.progress import Progress, silent
 from lce_rig.fleet.deploy import deployment
-from lce_rig.fleet.deploy.deployment import read_targets
 from lce_rig.fleet.deploy.place import run_bounded
+from lce_rig.fleet.deploy.targets import read_targets
 from lce_rig.fleet.jobs import folder_name
 from lce_rig.fleet.registry import Registry
 from lce_rig.pipeline.result_files import RESULT

@@ -14,9 +14,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, NamedTuple
-
-from pydantic import ConfigDict, Field, ValidationError
+from typing import NamedTuple
 
 from lce_rig.core.calibration import MADE_BY, ResultFile, read_result
 from lce_rig.core.errors import (
@@ -25,7 +23,6 @@ from lce_rig.core.errors import (
     ResultRefusedError,
     SessionError,
     TargetError,
-    UsageError,
 )
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
@@ -53,9 +50,7 @@ from lce_rig.fleet.deploy.releases import (
 from lce_rig.fleet.findings import DEPLOY_FAILED, DEPLOY_OLDER, DEPLOY_OTHER_ROBOT, DEPLOY_OTHER_SERIAL
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
-from lce_rig.rig.loading import explain, read_document, read_profile
-from lce_rig.rig.settings import RobotName, Settings
-from lce_rig.rig.target_settings import ROBOT_FIELD, TargetSettings
+from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
 from lce_rig.session.replacing import copy_over
 
@@ -454,61 +449,3 @@ def _run(place: Place, target: TargetSettings, release: str) -> str | None:
         what = f"{release} is in place, but its command ended with {code or ran.code}: {target.run}"
         raise CommandError(what, f"{said[-4000:]}\n{again}".strip())
     return output
-
-
-TARGETS_FILE = "deploy.yaml"
-
-
-class _TargetsFile(Settings):
-    # A rig's profile can be given, too: only its targets are read.
-    model_config = ConfigDict(extra="ignore")
-    targets: Annotated[dict[RobotName, TargetSettings], Field(min_length=1)]
-
-
-def read_targets(path: Path) -> dict[str, TargetSettings]:
-    """Read the block `targets` of a file; paths of this computer become absolute.
-
-    Raises:
-        ProfileError: no such file, or an invalid one; every problem with line and key.
-    """
-    document = read_document(read_profile(path), str(path))
-    try:
-        content = _TargetsFile.model_validate(document.data)
-    except ValidationError as error:
-        raise explain(error, document) from error
-    return {name: target.located(path.parent) for name, target in content.targets.items()}
-
-
-def find_target(name: str, file: Path | None, session: Path | None, rig: Rig | None) -> TargetSettings:
-    """Find a target: in the file if one is given, else beside the session, else in its profile.
-
-    Args:
-        name: of the target.
-        file: that lists targets.
-        session: its folder; deploy.yaml is looked for in its parent.
-        rig: the session's profile.
-
-    Raises:
-        ProfileError: a file is invalid.
-        UsageError: there is no target of this name, or it stands for many robots.
-    """
-    targets: dict[str, TargetSettings] = {}
-    beside = None if session is None else session.resolve().parent / TARGETS_FILE
-    if file is not None:
-        targets = read_targets(file)
-    else:
-        targets |= {} if rig is None else rig.targets
-        if beside is not None and beside.is_file():
-            targets |= read_targets(beside)
-    target = targets.get(name)
-    if target is not None and ROBOT_FIELD in target.to:
-        if not target.robot:
-            raise UsageError(f"target {name!r} stands for many robots", "Use `lce-rig fleet deploy`.")
-        return target.for_robot(target.robot)
-    if target is not None:
-        return target
-    where = file or beside or TARGETS_FILE
-    hint = (
-        f"Known targets: {', '.join(targets)}." if targets else f"List targets in {where}, or in the profile."
-    )
-    raise UsageError(f"no target is called {name!r}", hint)

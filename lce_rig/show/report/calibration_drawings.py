@@ -82,10 +82,6 @@ _CELLS, _MIN_IN_CELL, _MOST_LABELS = 14, 5, 10
 _DISTANCES_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0)
 # Causes of less than this, in percent, are in the table only.
 _LEAST_SHARE = 0.5
-_CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 73)), np.sin(np.linspace(0, 2 * np.pi, 73))])
-# From behind, from above, from the side: the camera's axes to the right and vertically in each view.
-_VIEWS = ((0, 1), (0, 2), (2, 1))
-_AXES = ("x right", "y down", "z forward")
 
 
 def _image_axes(lens: Intrinsics, below_in: float = 0.0) -> tuple[Any, Any]:
@@ -153,20 +149,6 @@ def draw_from_above(
     axes.set_ylim(low[1], high[1])
     axes.set_axis_off()
     return drawing(figure, "Boards around the LiDAR, from above")
-
-
-def draw_ranges_and_angles(evidence: Evidence, links: Mapping[str, str]) -> Markup:
-    """Draw each board's distance from the LiDAR and the angle at which the beam meets it."""
-    figure, (axes,) = new_axes(2.4)
-    angle_deg = np.array([o.lidar.quality.incidence_deg for o in evidence.observations])
-    points = axes.scatter(evidence.range_m, angle_deg, s=26, color=BLUE, alpha=0.8, linewidths=0)
-    points.set_urls([links[o.capture] for o in evidence.observations])
-    axes.set_xlim(0, 1.1 * float(evidence.range_m.max()))
-    axes.set_ylim(0, max(60.0, 1.1 * float(angle_deg.max())))
-    axes.set_xlabel("distance from the LiDAR, m")
-    axes.set_title("angle to the beam, deg")
-    axes.grid()
-    return drawing(figure, "Distance and angle of the boards")
 
 
 def _add_shapes(axes: Any, shapes: Sequence[Array], links: list[str], alpha: float) -> None:
@@ -298,27 +280,6 @@ def principal_axes(cov: Array) -> tuple[Array, Array]:
     largest = np.abs(directions).argmax(axis=0)
     directions = directions * np.sign(directions[largest, range(3)])
     return np.sqrt(np.maximum(variances[order], 0)), directions
-
-
-def draw_ellipsoid(cov: Array, unit: str, label: str) -> Markup:
-    """Draw a covariance (3, 3) from three sides: 1 and 2 standard deviations, and its principal axes."""
-    sigmas, directions = principal_axes(cov)
-    limit = 2.3 * float(np.sqrt(np.diag(cov).max()))
-    figure, row = new_axes(1.65, 3, between_in=0.42)
-    for axes, (right, down) in zip(row, _VIEWS, strict=True):
-        shape = np.linalg.cholesky(cov[np.ix_([right, down], [right, down])] + 1e-12 * limit**2 * np.eye(2))
-        for n_sigmas, width in ((1, 1.4), (2, 0.7)):
-            axes.plot(*(n_sigmas * shape @ _CIRCLE), color=BLUE, linewidth=width)
-        for sigma, direction in zip(sigmas, directions.T, strict=True):
-            end = sigma * direction[[right, down]]
-            axes.plot(*np.stack([-end, end]).T, color=ORANGE, linewidth=1)
-        axes.set_xlim(-limit, limit)
-        axes.set_ylim(limit if down == 1 else -limit, -limit if down == 1 else limit)
-        axes.set_aspect("equal")
-        axes.set_xlabel(f"{_AXES[right]}, {unit}")
-        axes.set_title(f"{_AXES[down]}, {unit}")
-        axes.locator_params(nbins=3)
-    return drawing(figure, label)
 
 
 def draw_by_distance(calibration: Calibration, lens: Intrinsics) -> Markup:

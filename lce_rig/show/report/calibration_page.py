@@ -143,7 +143,6 @@ def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str
             )
             for cause in c.contributions
         ],
-        "worked": None if evidence is None else work_point(c, lens, evidence),
         "captures": captures,
         "clocks": _clock_rows(c),
         "lens": [finding.sentence for finding in c.findings if finding.code in _LENS_CODES],
@@ -158,13 +157,7 @@ def _drawings(
     c: Calibration, board: Board, lens: Intrinsics, evidence: Evidence | None, anchor: str
 ) -> dict[str, Markup]:
     """Draw a result; without its boards its uncertainty alone."""
-    drawn = {
-        "rotation": drawings.draw_ellipsoid(
-            np.degrees(np.degrees(c.cov[3:, 3:])), "deg", "Uncertainty of the rotation"
-        ),
-        "translation": drawings.draw_ellipsoid(1e6 * c.cov[:3, :3], "mm", "Uncertainty of the translation"),
-        "by_distance": drawings.draw_by_distance(c, lens),
-    }
+    drawn = {"by_distance": drawings.draw_by_distance(c, lens)}
     if c.contributions:
         drawn["causes"] = drawings.draw_causes(c)
     if evidence is not None:
@@ -172,7 +165,6 @@ def _drawings(
         drawn |= {
             "in_image": drawings.draw_in_image(evidence, board, lens, links),
             "from_above": drawings.draw_from_above(c, evidence, board, lens, links),
-            "ranges": drawings.draw_ranges_and_angles(evidence, links),
             "by_capture": drawings.draw_by_capture(c, links),
             "by_ring": drawings.draw_by_ring(evidence),
             "by_range": drawings.draw_by_range(evidence, links),
@@ -300,61 +292,3 @@ def _camera_rows(c: Calibration) -> list[Row]:
             apart = f"{other.apart_rotation_deg:.3f} deg, {1000 * other.apart_translation_m:.1f} mm"
         rows.append((other.camera, other.n_captures, sigma, apart, f"{1000 * other.board_rms_m:.1f} mm"))
     return rows
-
-
-def work_point(calibration: Calibration, lens: Intrinsics, evidence: Evidence) -> dict[str, Any]:
-    """Choose the point nearest to the middle of the board in the capture of median range, and project it.
-
-    The arithmetic starts from the digits that are printed.
-
-    Returns:
-        Capture and ring, the lines of the arithmetic, the pixel (u, v) that they lead to, and the point's
-        distance from the board's plane as the camera sees it (off_plane_mm, positive behind it).
-    """
-    k = int(np.argsort(evidence.range_m, kind="stable")[len(evidence.range_m) // 2])
-    lidar = evidence.observations[k].lidar
-    nearest = int(np.argmin(np.linalg.norm(lidar.points - lidar.T_lidar_board[:3, 3], axis=1)))
-    p = np.round(lidar.points[nearest], 4)
-    T = np.round(calibration.T_cam_lidar[:3], 6)
-    in_camera = T[:, :3] @ p + T[:, 3]
-    lines = ["p_lidar = ({:.4f}, {:.4f}, {:.4f}) m".format(*p)]
-    for axis, row, value in zip("xyz", T, in_camera, strict=True):
-        terms = [f"{a:.6f} * {_factor(b, 4)}" for a, b in zip(row[:3], p, strict=True)]
-        total = " + ".join([*terms, f"{row[3]:.6f}"]).replace("+ -", "- ")
-        lines.append(f"{axis}_cam = {total} = {value:.4f} m")
-    xy, steps = _onto_image(np.round(in_camera, 4), lens)
-    u, v = lens.fx_px * xy[0] + lens.cx_px, lens.fy_px * xy[1] + lens.cy_px
-    lines += steps
-    lines.append(f"u = fx x' + cx = {lens.fx_px:.2f} * {_factor(xy[0], 5)} + {lens.cx_px:.2f} = {u:.1f} px")
-    lines.append(f"v = fy y' + cy = {lens.fy_px:.2f} * {_factor(xy[1], 5)} + {lens.cy_px:.2f} = {v:.1f} px")
-    in_scan = np.flatnonzero(evidence.capture == k)[nearest]
-    return {
-        "capture": evidence.observations[k].capture,
-        "ring": int(lidar.ring[nearest]),
-        "lines": lines,
-        "pixel": (float(u), float(v)),
-        "off_plane_mm": 1000 * float(evidence.plane_m[in_scan]),
-    }
-
-
-def _factor(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if value >= 0 else f"({value:.{digits}f})"
-
-
-def _onto_image(p: Array, lens: Intrinsics) -> tuple[Array, list[str]]:
-    """Apply the lens to a point of the camera: x', y' before the camera matrix, and the steps."""
-    pixel, _ = lens.project(p)
-    distorted = (pixel - [lens.cx_px, lens.cy_px]) / [lens.fx_px, lens.fy_px]
-    x, y = p[0] / p[2], p[1] / p[2]
-    steps = [f"x / z = {x:.5f}, y / z = {y:.5f}"]
-    if lens.model == "equidistant":
-        steps.append(f"angle from the axis = atan(|(x / z, y / z)|) = {np.arctan(np.hypot(x, y)):.5f} rad")
-    coefficients = ", ".join(f"{value:g}" for value in lens.distortion)
-    if any(lens.distortion) or lens.model == "equidistant":
-        steps.append(
-            f"with the distortion ({lens.model}: {coefficients}) x' = {distorted[0]:.5f}, "
-            f"y' = {distorted[1]:.5f}"
-        )
-    else:
-        steps.append("the lens has no distortion: x' = x / z, y' = y / z")
-    return distorted, steps
