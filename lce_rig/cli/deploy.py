@@ -10,8 +10,9 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
 from lce_rig.core.errors import UsageError
 from lce_rig.fleet.deploy import deployment
-from lce_rig.fleet.deploy.deployment import Deployed, Plan, Standing, find_target
+from lce_rig.fleet.deploy.deployment import Deployed, Plan, Standing
 from lce_rig.fleet.deploy.releases import ReleaseRecord
+from lce_rig.fleet.deploy.targets import find_target
 from lce_rig.pipeline.result_files import result_parts
 from lce_rig.rig.target_settings import TargetSettings
 

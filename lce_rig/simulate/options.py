@@ -10,9 +10,6 @@ from lce_rig.core.data_sheets import VLP_16, DataSheet
 from lce_rig.core.geometry import Array
 from lce_rig.simulate.surfaces import Material, Mesh
 
-#: Range noise of the paper's simulated sets, levels 1..10, m.
-PAPER_RANGE_SIGMA_M = (0.0, 0.008, 0.016, 0.024, 0.032, 0.040, 0.048, 0.060, 0.080, 0.100)
-
 Carrier = Literal["stand", "person", "none"]
 Motion = Literal["still", "moving"]
 Part = tuple[str, Mesh, Material, Array]
@@ -156,8 +153,6 @@ class SimulationOptions:
 
     Attributes:
         carrier: what carries the board.
-        noise_level: 1..10, the paper's simulated sets: the range noise of `PAPER_RANGE_SIGMA_M` and noise on
-            points near the board's rim instead of the LiDAR's own; None for that.
         lidar: errors of all LiDARs; None for those of each one's data sheet.
         range_sigma_m, range_offset_m: replace those of every LiDAR; None for `lidar` unchanged.
         camera: the cameras' errors.
@@ -183,7 +178,6 @@ class SimulationOptions:
     """
 
     carrier: Carrier = "stand"
-    noise_level: int | None = None
     lidar: LidarNoise | None = None
     range_sigma_m: float | None = None
     range_offset_m: float | None = None
@@ -217,12 +211,7 @@ class SimulationOptions:
             noise = replace(noise, range_sigma_m=self.range_sigma_m)
         if self.range_offset_m is not None:
             noise = replace(noise, range_offset_m=self.range_offset_m)
-        if self.noise_level is None:
-            return noise
-        sigma_m = PAPER_RANGE_SIGMA_M[self.noise_level - 1]
-        # The paper's simulator spreads points at the rim by 0.003 rad times the range, whatever the level.
-        quiet = replace(noise, laser_sigma_m=0.0, dark_bias_m=0.0, weak_bias_m=0.0, edge_growth_m=0.0)
-        return replace(quiet, range_sigma_m=sigma_m, rim_spread_rad=0.0015)
+        return noise
 
     @classmethod
     def for_rig(cls, name: str, motion: Motion = "still") -> "SimulationOptions":

@@ -10,12 +10,11 @@ from typing import get_args
 
 import numpy as np
 
-from benchmarks.paper_sets import LEVELS, LIDAR, PaperSet, paper_rig, paper_set
+from benchmarks.paper_sets import LEVELS, LIDAR, RANGE_SIGMA_M, PaperSet, paper_rig, paper_set
 from benchmarks.tables import compare, print_head, print_row, rms
 from lce_rig.calibrate import CalibrateOptions, EstimateSettings, fit_extrinsic
 from lce_rig.core.calibration import Method
 from lce_rig.core.results import ImageBoard, Observation
-from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
 
 # Of the paper's Algorithm 1 on one set, by level.
 _PUBLISHED_DEG = (0.0917, 0.0690, 0.0802, 0.0854, 0.2512, 0.1624, 0.1577, 0.2020, 0.2448, 0.4001)
@@ -30,7 +29,7 @@ def bench_paper(n_seeds: int, folder: Path) -> None:
         folder: their detections are kept in it.
     """
     sets = [paper_set(folder / "sets", seed) for seed in range(n_seeds)]
-    print_head(f"{n_seeds} sets", *(f"{100 * PAPER_RANGE_SIGMA_M[level - 1]:.1f} cm" for level in LEVELS))
+    print_head(f"{n_seeds} sets", *(f"{100 * RANGE_SIGMA_M[level - 1]:.1f} cm" for level in LEVELS))
     for method in get_args(Method):
         errors = np.array([[_errors(one, level, method) for level in LEVELS] for one in sets])
         print_row(f"rotation deg, {method}", *(f"{rms(column):.3f}" for column in errors[:, :, 0].T))

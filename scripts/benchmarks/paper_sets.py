@@ -15,19 +15,29 @@ from lce_rig.detect.detection import ImageDetection, LidarDetection, from_arrays
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session.durable import load_arrays, store_arrays
-from lce_rig.simulate import SimulationOptions
+from lce_rig.simulate import LidarNoise, SimulationOptions
 from lce_rig.simulate.captures import StagedBoard
 from lce_rig.simulate.lidar import measure_sweep, sweep_scene
-from lce_rig.simulate.options import PAPER_RANGE_SIGMA_M
 from lce_rig.simulate.poses import hold_board
 from lce_rig.simulate.stage import IMAGE, PLACEMENT, SCAN, Stage, set_stage, truth_extrinsics
 
-LEVELS = range(1, len(PAPER_RANGE_SIGMA_M) + 1)
+#: Range noise by level, m.
+RANGE_SIGMA_M = (0.0, 0.008, 0.016, 0.024, 0.032, 0.040, 0.048, 0.060, 0.080, 0.100)
+LEVELS = range(1, len(RANGE_SIGMA_M) + 1)
 N_CAPTURES = 30
 CAMERA, LIDAR = "cam", "lidar"
 # The paper's exact extrinsic as its files give it, to five digits.
 _ROTATION = ((-0.27068, -0.94215, -0.19768), (0.15218, 0.16088, -0.97517), (0.95056, -0.29404, 0.099833))
 _TRANSLATION_M = (0.41853, -0.30504, -0.14758)
+
+
+def paper_noise(level: int) -> LidarNoise:
+    """Give the paper's noise of a level: white on all ranges, and on azimuths near the board's rim."""
+    quiet = replace(
+        LidarNoise.of(VLP_16), laser_sigma_m=0.0, dark_bias_m=0.0, weak_bias_m=0.0, edge_growth_m=0.0
+    )
+    # The paper's simulator spreads points at the rim by 0.003 rad times the range, whatever the level.
+    return replace(quiet, range_sigma_m=RANGE_SIGMA_M[level - 1], rim_spread_rad=0.0015)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +97,7 @@ class _Maker:
     def __init__(self, seed: int) -> None:
         self._seed, self.rig = seed, paper_rig()
         # Any level: what the beams meet is the same for all.
-        self._options = replace(SimulationOptions.for_rig("sss"), noise_level=LEVELS[0])
+        self._options = replace(SimulationOptions.for_rig("sss"), lidar=paper_noise(LEVELS[0]))
         self.T_cam_lidar = truth_extrinsics(self.rig, seed, self._options)[CAMERA, LIDAR]
 
     @cached_property
@@ -106,7 +116,7 @@ class _Maker:
         )
         scans = {}
         for level in LEVELS:
-            noise = replace(self._options, noise_level=level).noise_of(VLP_16)
+            noise = paper_noise(level)
             scan = measure_sweep(sweep, model, noise, stage.rng(index, SCAN, level), sensor=LIDAR)
             scans[level] = BoardFinder(self.rig).scan(scan)
         return Placement(BoardFinder(self.rig).image(image), scans)
