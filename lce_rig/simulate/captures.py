@@ -101,10 +101,9 @@ class StagedBoard:
 
     def view(self, camera: str) -> MovingView:
         """Look at the board through a camera's lens."""
-        options = self.stage.options
-        backdrop = self.stage.backdrops[camera]
+        stage = self.stage
         return MovingView(
-            backdrop, self.stage.board, self.trajectory, self.scene_at, options.camera, options.flicker_depth
+            stage.backdrops[camera], stage.board, self.trajectory, self.scene_at, stage.options.camera
         )
 
     def take_events(

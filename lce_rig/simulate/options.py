@@ -154,7 +154,7 @@ class SimulationOptions:
     Attributes:
         carrier: what carries the board.
         lidar: errors of all LiDARs; None for those of each one's data sheet.
-        range_sigma_m, range_offset_m: replace those of every LiDAR; None for `lidar` unchanged.
+        range_sigma_m: replaces that of every LiDAR; None for `lidar` unchanged.
         camera: the cameras' errors.
         distance_m: range of the board's distance from the camera; where the LiDAR would see less than four
             fifths of the plate, no board is placed (a diamond of 1 m nearer than about 1.4 m).
@@ -172,7 +172,6 @@ class SimulationOptions:
         events_span_s: how long before and after a scan's timestamp a capture's events begin and end.
         exposure_s: of a moving board's images.
         frame_every_s: between the images of a camera that runs freely while the board moves.
-        flicker_depth: how much the lamps' light swings, to event cameras, at 100 Hz.
         frame_offset_s, event_offset_s: how far the timestamps of images and of events are ahead of the
             LiDAR's clock, which is the rig's.
     """
@@ -180,7 +179,6 @@ class SimulationOptions:
     carrier: Carrier = "stand"
     lidar: LidarNoise | None = None
     range_sigma_m: float | None = None
-    range_offset_m: float | None = None
     camera: CameraNoise = field(default_factory=CameraNoise)
     distance_m: tuple[float, float] = (1.2, 4.0)
     roll_deg: tuple[float, float] = (45.0, 15.0)
@@ -196,7 +194,6 @@ class SimulationOptions:
     events_span_s: tuple[float, float] = (1.2, 0.15)
     exposure_s: float = 0.008
     frame_every_s: float = 0.05
-    flicker_depth: float = 0.0
     frame_offset_s: float = 0.0
     event_offset_s: float = 0.0
 
@@ -209,8 +206,6 @@ class SimulationOptions:
         noise = self.lidar or LidarNoise.of(sheet)
         if self.range_sigma_m is not None:
             noise = replace(noise, range_sigma_m=self.range_sigma_m)
-        if self.range_offset_m is not None:
-            noise = replace(noise, range_offset_m=self.range_offset_m)
         return noise
 
     @classmethod

@@ -126,7 +126,6 @@ def clip_window(bounds_px: Array, backdrop: Backdrop) -> Window | None:
 Float = NDArray[np.float32]
 _KEY_NS = 250_000_000
 _STEP_PX = 0.4
-_FLICKER_HZ, _STEPS_PER_FLICKER = 100.0, 16
 _STEP_NS = (500_000, 5_000_000)
 _ALONG = np.linspace(0, 1, 17)[:, None, None]
 # Mean square distance of a pixel's area from its middle, px^2, along one axis.
@@ -143,7 +142,6 @@ class MovingView:
         trajectory: where it is.
         scene_at: the scene at a time of the rig's clock, ns: for the carrier.
         lens: the camera's errors; blur, exposure and vignetting count.
-        flicker_depth: the lamps' light is 1 + depth sin(2 pi f t) at 100 Hz.
     """
 
     backdrop: Backdrop
@@ -151,7 +149,6 @@ class MovingView:
     trajectory: Trajectory
     scene_at: Callable[[int], Scene]
     lens: CameraNoise
-    flicker_depth: float = 0.0
     _keys: dict[int, tuple[CarrierLayer | None, Array]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -190,18 +187,12 @@ class MovingView:
         if layers is not None:
             seen[window] += both[..., 2] - both[..., 3] * seen[window]
         seen *= self._gain
-        if self.flicker_depth > 0:
-            cycle = (1e-9 * (t_ns % 1_000_000_000)) * _FLICKER_HZ
-            seen *= np.float32(1 + self.flicker_depth * np.sin(2 * np.pi * cycle))
         return np.asarray(seen)
 
     def step_ns(self, t_ns: int) -> int:
         """Choose how long after t_ns the next sub-frame is due."""
         speed = speed_px_s(self.trajectory, self.board, self.backdrop, t_ns)
-        step_ns = 1e9 * _STEP_PX / max(speed, 1e-3)
-        if self.flicker_depth > 0:
-            step_ns = min(step_ns, 1e9 / (_STEPS_PER_FLICKER * _FLICKER_HZ))
-        return int(np.clip(step_ns, *_STEP_NS))
+        return int(np.clip(1e9 * _STEP_PX / max(speed, 1e-3), *_STEP_NS))
 
     def _board(self, window: Window, T_world_board: Array, light: Array) -> tuple[Float, Float]:
         """Compute the board's radiance and its cover (h, w) of each pixel, 0..1."""
