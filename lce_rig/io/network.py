@@ -2,10 +2,10 @@
 
 import socket
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import dpkt  # type: ignore[import-untyped]
@@ -129,7 +129,7 @@ def build_frame(datagram: Datagram) -> bytes:
     return bytes(dpkt.ethernet.Ethernet(src=_SENSOR_CARD, dst=_EVERY_CARD, data=bytes(ip)))
 
 
-class PcapWriter:
+class PcapWriter(AbstractContextManager["PcapWriter"]):
     """A pcap file that tcpdump, Wireshark and VeloView open, with arrivals in ns; a context manager.
 
     Every second it is handed to the operating system. Torn off anywhere, it is read up to there.
@@ -163,12 +163,5 @@ class PcapWriter:
         """
         self._file.close()
 
-    def __enter__(self) -> "PcapWriter":
-        """Write within a `with` block."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the file."""
+    def __exit__(self, *_: object) -> None:
         self.close()

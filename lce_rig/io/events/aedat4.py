@@ -15,9 +15,9 @@ import struct
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO, NamedTuple, TypeVar
 from xml.sax.saxutils import escape
 
@@ -291,7 +291,7 @@ def _decompress(data: bytes) -> bytes:
     return bytes(import_module(module).decompress(data)) if module else data
 
 
-class Aedat4Writer:
+class Aedat4Writer(AbstractContextManager["Aedat4Writer"]):
     """An AEDAT4 file with one stream of events, which DV and dv-processing open; a context manager.
 
     dv-processing takes events one by one, at a microsecond each; the flatbuffers are few and fixed, so they
@@ -341,12 +341,7 @@ class Aedat4Writer:
         """
         self._file.close()
 
-    def __enter__(self) -> "Aedat4Writer":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

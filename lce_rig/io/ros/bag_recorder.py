@@ -11,7 +11,7 @@ References:
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -152,7 +152,7 @@ def _serialize(message: Any, msgtype: str, is_ros1: bool) -> memoryview:
     return data
 
 
-class BagRecorder:
+class BagRecorder(AbstractContextManager["BagRecorder"]):
     """A bag open for writing; a context manager.
 
     Samples go to the disk a megabyte at a time and are not kept. A bag that was never closed, because the
@@ -174,14 +174,6 @@ class BagRecorder:
         self._numbers: Counter[str] = Counter()
         self._connections: dict[str, tuple[str, Any]] = {}
         self._failure: SourceError | None = None
-        if path.exists() or path.is_symlink():
-            raise SourceError(
-                f"{path} exists already", "Name another file: recordings are never overwritten."
-            )
-        if path.suffix in (".mcap", ".db3"):
-            raise SourceError(
-                f"{path}: a ROS 2 bag is a folder", f"Name it {path.with_suffix('')}, or end it in .bag."
-            )
         self._writer: Any = open_bag_writer(path)
         with self._disk():
             self._writer.open()
@@ -227,12 +219,7 @@ class BagRecorder:
                 self._writer.close()
         self._writer = None
 
-    def __enter__(self) -> "BagRecorder":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _: object, error: BaseException | None, *__: object) -> None:
         try:
             self.close()
         except SourceError:
@@ -282,7 +269,7 @@ def not_writable(path: Path, error: BaseException) -> SourceError:
     )
 
 
-class FolderRecorder:
+class FolderRecorder(AbstractContextManager["FolderRecorder"]):
     """A new folder with a bag of all samples and an AEDAT4 file of each camera's events; a context manager.
 
     Attributes:
@@ -336,9 +323,6 @@ class FolderRecorder:
             SourceError: the disk is full.
         """
         self.__exit__(None, None, None)
-
-    def __enter__(self) -> "FolderRecorder":
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
