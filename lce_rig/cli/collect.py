@@ -14,7 +14,8 @@ from lce_rig.collect import CollectOptions
 from lce_rig.collect.live.guide import predict
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.io import open_recordings
-from lce_rig.io.protocol import PairedRecording, SourceOptions
+from lce_rig.io.folder.folder import FolderRecording
+from lce_rig.io.protocol import SourceOptions
 from lce_rig.pipeline.collect_recordings import fill_session
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
@@ -171,7 +172,7 @@ def collect(
     with show.progress_bar("collecting") as progress:
         report = fill_session(rig, recordings, session, CollectOptions(target=n_wanted), progress)
     n_captures = len(Session.open(session).captures)
-    if topics and any(isinstance(recording, PairedRecording) for recording in recordings):
+    if topics and any(isinstance(recording, FolderRecording) for recording in recordings):
         show.warn("--topic is ignored for a folder of images and point clouds")
     _tell(report, session, n_captures)
     if n_captures == 0:

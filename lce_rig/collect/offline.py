@@ -14,10 +14,10 @@ from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
 from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
+from lce_rig.io.folder.folder import FolderRecording
 from lce_rig.io.joining import join_recordings, require_sensors
 from lce_rig.io.protocol import (
     ContinuousRecording,
-    PairedRecording,
     Recording,
     serials_of,
 )
@@ -102,7 +102,7 @@ def collect(
     for recording in join_recordings(recordings, session.rig):
         collector.note(recording.notes)
         try:
-            if isinstance(recording, PairedRecording):
+            if isinstance(recording, FolderRecording):
                 collector.take_pairs(recording)
             elif isinstance(recording, ContinuousRecording):
                 collector.take_moments(recording)
@@ -129,7 +129,7 @@ class _Collector:
                     self._names_by_key[source["key"]] = capture.name
         self._n_captures = len(session.captures)
 
-    def take_pairs(self, recording: PairedRecording) -> None:
+    def take_pairs(self, recording: FolderRecording) -> None:
         """Capture every pair of a folder.
 
         Raises:
@@ -146,9 +146,9 @@ class _Collector:
                 if key in self._names_by_key:
                     message = self._count_known(files.label, self._names_by_key[key])
                 else:
-                    pair = files.read()
-                    self.note(pair.notes)
-                    message = self._store(key, files.label, pair.images, pair.scans, {})
+                    images, scan, notes = files.read()
+                    self.note(notes)
+                    message = self._store(key, files.label, images, (scan,), {})
             except SourceError as error:
                 failures.append(error)
                 self.report.refused[files.label] = refusal_of("read", error, "record")

@@ -1,12 +1,12 @@
 """The interface of every recording, and the sensors of the rig that its data belong to."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
-from lce_rig.core.data import Image, Sample, Scan, Stream
+from lce_rig.core.data import Sample, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import event_channel
@@ -39,40 +39,6 @@ class SourceOptions:
     is_part: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedPair:
-    """The samples of one board placement.
-
-    Attributes:
-        label: the files it came from, for messages: "00003.png + 00003.pcd".
-        key: fingerprint of those files; the same files give the same key wherever they lie.
-        notes: what was assumed or skipped, in words.
-    """
-
-    label: str
-    key: str
-    images: tuple[Image, ...]
-    scans: tuple[Scan, ...]
-    notes: tuple[str, ...] = ()
-
-
-class PairFiles(Protocol):
-    """A pair that has not been read yet."""
-
-    @property
-    def label(self) -> str:
-        """The files' names, for messages."""
-        ...
-
-    def key(self) -> str:
-        """Fingerprint the files without decoding them."""
-        ...
-
-    def read(self) -> RecordedPair:
-        """Decode the files; SourceError names the one that cannot be read."""
-        ...
-
-
 class Recording(Protocol):
     """Anything recorded.
 
@@ -83,13 +49,6 @@ class Recording(Protocol):
 
     path: Path
     notes: list[str]
-
-
-@runtime_checkable
-class PairedRecording(Recording, Protocol):
-    """A recording with matched images and point clouds of each board placement."""
-
-    pairs: Sequence[PairFiles]
 
 
 @runtime_checkable

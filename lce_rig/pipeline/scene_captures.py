@@ -18,8 +18,9 @@ from lce_rig.core.progress import Progress
 from lce_rig.devices import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.io import open_recordings
+from lce_rig.io.folder.folder import FolderRecording
 from lce_rig.io.joining import join_recordings, require_sensors
-from lce_rig.io.protocol import ContinuousRecording, PairedRecording
+from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.rig import Rig
 from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.views import MAX_CAPTURES
@@ -126,7 +127,7 @@ class SceneCaptures:
         """
         for recording in join_recordings(open_recordings(paths, self._rig), self._rig):
             try:
-                if isinstance(recording, PairedRecording):
+                if isinstance(recording, FolderRecording):
                     self._take_pairs(recording, progress)
                 elif isinstance(recording, ContinuousRecording):
                     self._take_stream(recording, progress)
@@ -137,13 +138,13 @@ class SceneCaptures:
                 self.notes.append(f"not read to its end: {error.what}")
             self.notes += recording.notes
 
-    def _take_pairs(self, recording: PairedRecording, progress: Progress) -> None:
+    def _take_pairs(self, recording: FolderRecording, progress: Progress) -> None:
         pairs = evenly(recording.pairs, MAX_CAPTURES * len(self._pairs))
         failures: list[SourceError] = []
         for done, files in enumerate(pairs, start=1):
             try:
-                pair = files.read()
-                self._take(pair.label, pair.images, pair.scans)
+                images, scan, _ = files.read()
+                self._take(files.label, images, (scan,))
             except SourceError as error:
                 failures.append(error)
             progress(done, len(pairs))

@@ -11,7 +11,7 @@ import pytest
 from lce_rig.core.errors import SourceError
 from lce_rig.core.files import encode_pcd
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.protocol import PairedRecording
+from lce_rig.io.folder.folder import FolderRecording
 from lce_rig.rig import load_rig
 from tests.notes import has_note
 
@@ -36,21 +36,21 @@ def make_folder(tmp_path, room):
 )
 def test_folders_are_found_by_name_or_by_what_they_hold(make_folder, rig, room, names):
     recording = open_recording(make_folder(names=names), rig)
-    assert isinstance(recording, PairedRecording)
+    assert isinstance(recording, FolderRecording)
     (note,) = recording.notes
     assert has_note([note], "2 pairs", "equal file") and "partner" not in note
-    pair = recording.pairs[1].read()
-    assert pair.label == "00001.png + 00001.pcd"
-    assert pair.images[0].pixels.shape == (72, 128, 3) and pair.images[0].pixels.max() == 11
-    assert (pair.images[0].sensor, pair.images[0].channel, pair.scans[0].sensor) == ("cam", "frames", "lidar")
-    np.testing.assert_array_equal(pair.scans[0].ring, room["ring"])
+    assert recording.pairs[1].label == "00001.png + 00001.pcd"
+    (image,), scan, _ = recording.pairs[1].read()
+    assert image.pixels.shape == (72, 128, 3) and image.pixels.max() == 11
+    assert (image.sensor, image.channel, scan.sensor) == ("cam", "frames", "lidar")
+    np.testing.assert_array_equal(scan.ring, room["ring"])
 
 
 def test_names_that_are_times_become_stamps(make_folder, rig):
     path = make_folder(["2311.422000", "2376.322000"], ["2311.405000", "2376.205000"])
     recording = open_recording(path, rig)
-    pair = recording.pairs[0].read()
-    assert pair.images[0].stamp_ns == 2311_422_000_000 and pair.scans[0].stamp_ns == 2311_405_000_000
+    (image,), scan, _ = recording.pairs[0].read()
+    assert image.stamp_ns == 2311_422_000_000 and scan.stamp_ns == 2311_405_000_000
     assert has_note(recording.notes[:1], "sorted order", "0.117 s")
 
 
@@ -72,7 +72,7 @@ def test_channel_and_sensors_can_be_chosen(make_folder):
     rig = load_rig("rles")
     camera = next(iter(rig.cameras))
     recording = open_recording(make_folder(), rig, SourceOptions(channel="events"))
-    assert recording.pairs[0].read().images[0].channel == "events"
+    assert recording.pairs[0].read()[0][0].channel == "events"
     assert has_note(open_recording(make_folder(), rig).notes, "images assigned", f"camera {camera}")
     for options, cause in [
         (SourceOptions(camera="side"), f"no camera 'side'; it has {camera}"),
@@ -118,7 +118,7 @@ TWO = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
 def test_pictures_in_folders_named_after_cameras_go_with_the_same_cloud(make_folder, names):
     make_folder(images=("00000", "00001"), clouds=("00000", "00001", "00002"), names=(names[0], "pcd"))
     recording = open_recording(make_folder(("00001", "00002", "00003"), (), (names[1], "pcd")), TWO)
-    seen = [[(i.sensor, i.channel, int(i.pixels.max())) for i in p.read().images] for p in recording.pairs]
+    seen = [[(i.sensor, i.channel, int(i.pixels.max())) for i in p.read()[0]] for p in recording.pairs]
     left, right = ("left", "frames"), ("right", "frames")
     assert seen == [[(*left, 10)], [(*left, 11), (*right, 10)], [(*right, 11)]]
     folder = Path(names[1]).name
@@ -133,7 +133,7 @@ def test_one_of_several_cameras_can_be_read_by_itself(make_folder):
     make_folder(names=("img/left", "pcd"))
     path = make_folder(names=("img/right", "pcd"))
     (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs
-    assert [image.sensor for image in pair.read().images] == ["right"]
+    assert [image.sensor for image in pair.read()[0]] == ["right"]
     shutil.rmtree(path / "img" / "right")
     with pytest.raises(SourceError):
         open_recording(path, TWO, SourceOptions(camera="right"))
@@ -145,13 +145,13 @@ def test_pictures_are_not_taken_for_those_of_a_camera_that_nobody_named(make_fol
         open_recording(path, TWO)
     assert "--camera left" in caught.value.hint and "img/right/" in caught.value.hint
     (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs
-    assert pair.read().images[0].sensor == "right"
+    assert pair.read()[0][0].sensor == "right"
 
 
 def test_two_pictures_of_one_name_are_two_pairs(make_folder, rig):
     path = make_folder()
     shutil.copy(path / "img" / "00000.png", path / "img" / "00000.bmp")
-    assert [len(pair.read().images) for pair in open_recording(path, rig).pairs] == [1, 1, 1]
+    assert [len(pair.read()[0]) for pair in open_recording(path, rig).pairs] == [1, 1, 1]
 
 
 @pytest.mark.parametrize("name", ["img/00001.png", "pcd/00001.pcd"])
@@ -169,7 +169,7 @@ def test_no_time_and_no_returns_are_said(make_folder, rig, room):
     cloud = room[["x", "y", "z", "intensity", "ring"]].copy()
     cloud["x"][:7] = np.nan
     (path / "pcd" / "00000.pcd").write_bytes(encode_pcd(cloud))
-    notes = open_recording(path, rig).pairs[0].read().notes
+    notes = open_recording(path, rig).pairs[0].read()[2]
     assert len(notes) == 2 and "no time" in notes[0] and has_note(notes[1:], "00000.pcd", "7 points")
 
 
@@ -187,5 +187,5 @@ def test_no_time_and_no_returns_are_said(make_folder, rig, room):
 def test_recordings_by_others_are_paired_as_their_makers_meant(recordings, rig, name, n_pairs, method):
     recording = open_recording(recordings / name, rig)
     assert len(recording.pairs) == n_pairs and method in recording.notes[0]
-    pair = recording.pairs[-1].read()
-    assert len(pair.scans[0].points) > 10_000 and pair.scans[0].ring.max() <= 15
+    _, scan, _ = recording.pairs[-1].read()
+    assert len(scan.points) > 10_000 and scan.ring.max() <= 15

@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Image
+from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.folder.decoding import DECODERS, SUFFIXES, read_cloud, read_image
-from lce_rig.io.protocol import PairMethod, RecordedPair, SourceOptions, choose_camera, choose_lidar
+from lce_rig.io.protocol import PairMethod, SourceOptions, choose_camera, choose_lidar
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.timing.clock_fit import nearest
 
@@ -238,8 +238,8 @@ class PairOnDisk:
                 digest.update(hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 
-    def read(self) -> RecordedPair:
-        """Decode all files.
+    def read(self) -> tuple[tuple[Image, ...], Scan, list[str]]:
+        """Decode all files; also says, in words, what was assumed or skipped.
 
         Raises:
             SourceError: one is missing, empty, truncated or damaged.
@@ -251,7 +251,7 @@ class PairOnDisk:
         if reading.n_without_return:
             n = reading.n_without_return
             notes.append(f"{self.cloud_path.name}: {n} points without a return skipped")
-        return RecordedPair(self.label, self.key(), images, (reading.scan,), tuple(notes))
+        return images, reading.scan, notes
 
 
 class FolderRecording:
