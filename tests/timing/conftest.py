@@ -1,5 +1,10 @@
-"""The small rig of the collection's tests."""
+"""A rig of one camera and one LiDAR."""
 
-from tests.collect.conftest import rig
+import pytest
 
-__all__ = ["rig"]
+from lce_rig.rig import Rig, load_rig
+
+
+@pytest.fixture(scope="session")
+def rig() -> Rig:
+    return load_rig("rlfs")
