@@ -431,8 +431,7 @@ class Extrinsics(Protocol):
         """(6, 6)."""
 
 
-def _with_state(opinion: SceneOpinion, write: Callable[[SceneOpinion], Any]) -> Any:
-    return {"state": opinion.state, **write(opinion)}
+_WITH_STATE = WrapSerializer(lambda opinion, write: {"state": opinion.state, **write(opinion)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -499,7 +498,12 @@ class Calibration:
     cov_shared: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
     contributions: tuple[Contribution, ...] = ()
     scene_share: SceneShare | None = None
-    scene: Annotated[SceneOpinion, WrapSerializer(_with_state)] | None = None
+    scene: (
+        Annotated[
+            SceneOpinion, WrapSerializer(lambda opinion, write: {"state": opinion.state, **write(opinion)})
+        ]
+        | None
+    ) = None
     weakest: Annotated[WeakestMotion | None, _ANY, _IN_MEMORY] = None
     held_out_m: Annotated[float, _ANY, _IN_MEMORY] = math.nan
     residuals: Annotated[tuple[CaptureResidual, ...], _ANY, _IN_MEMORY] = ()

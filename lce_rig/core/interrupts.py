@@ -81,7 +81,14 @@ def watch_for_interrupts() -> None:
     """
     global _watch
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN and _watch is None:
-        sys.unraisablehook = _without_interrupts(sys.unraisablehook)
+        hook = sys.unraisablehook
+
+        def leave_out_interrupts(unraisable: Any) -> None:
+            # They reached code that cannot raise them; the watch ends the program then.
+            if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+                hook(unraisable)
+
+        sys.unraisablehook = leave_out_interrupts
         # Python's last steps go without handlers, and Ctrl-C would hide how the program went.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
         _watch = _InterruptWatch()
@@ -104,16 +111,6 @@ def patience(grace_s: float) -> Iterator[None]:
         yield
     finally:
         _watch.grace_s = before_s
-
-
-def _without_interrupts(hook: Any) -> Any:
-    """Leave out interrupts that reached code which cannot raise them; the watch ends the program then."""
-
-    def tell(unraisable: Any) -> None:
-        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
-            hook(unraisable)
-
-    return tell
 
 
 @contextmanager

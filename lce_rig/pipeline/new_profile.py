@@ -129,8 +129,11 @@ def new_profile(
         "cameras": blocks,
     }
     rig_from_document(Document(source, data, root=None))
-    head = f"# {name}: written by `lce-rig rigs new`; `lce-rig rigs show FILE` shows every setting.\n"
-    return head + "".join(map(_commented, dump_yaml(data).splitlines())), notes
+    lines = [f"# {name}: written by `lce-rig rigs new`; `lce-rig rigs show FILE` shows every setting."]
+    for line in dump_yaml(data).splitlines():
+        comment = _COMMENTS.get(line.strip().partition(":")[0])
+        lines.append(f"{line:<40} # {comment}" if comment else line)
+    return "\n".join(lines) + "\n", notes
 
 
 def _board(board: Board) -> dict[str, Any]:
@@ -191,11 +194,6 @@ def _camera(
             for kind, channel in (channels or {"frames": {"kind": "frames"}}).items()
         },
     }
-
-
-def _commented(line: str) -> str:
-    comment = _COMMENTS.get(line.strip().partition(":")[0])
-    return f"{line:<40} # {comment}\n" if comment else f"{line}\n"
 
 
 def clouds_in(folder: Path) -> list[Path]:

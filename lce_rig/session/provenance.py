@@ -111,14 +111,10 @@ def _profile(rig: Rig) -> dict[str, Any]:
         for channel in camera.get("channels", {}).values():
             settings = channel.get("reconstruction") or {}
             if settings.get("model"):
-                settings["model"] = _file_sha256(Path(settings["model"]))
+                path, settings["model"] = Path(settings["model"]), "unreadable"
+                with suppress(OSError):
+                    settings["model"] = hashlib.sha256(path.read_bytes()).hexdigest()
     return profile
-
-
-def _file_sha256(path: Path) -> str:
-    with suppress(OSError):
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    return "unreadable"
 
 
 def _canonical(value: Any) -> bytes:

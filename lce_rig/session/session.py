@@ -144,7 +144,15 @@ class Session:
                 f"{path} is a session of rig {session.rig.name!r}, not of this rig {rig.name!r}: {shown}",
                 "Collect into another folder, or use the profile in the session (its rig.yaml).",
             )
-        session._adopt(keep_identity(session.rig, rig))
+        # What may differ: addresses of attached sensors, the robot, serial numbers.
+        adopted = keep_identity(session.rig, rig)
+        if adopted != session.rig:
+            try:
+                replace_file(path / PROFILE, dump_rig(adopted).encode())
+            except OSError as error:
+                session.close()
+                raise _not_writable(path, error) from error
+            session.rig = adopted
         return session
 
     def __enter__(self) -> "Session":
@@ -158,17 +166,6 @@ class Session:
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-
-    def _adopt(self, rig: Rig) -> None:
-        """Adopt what may differ in the profile: addresses of attached sensors, the robot, serial numbers."""
-        if rig == self.rig:
-            return
-        try:
-            replace_file(self.path / PROFILE, dump_rig(rig).encode())
-        except OSError as error:
-            self.close()
-            raise _not_writable(self.path, error) from error
-        self.rig = rig
 
     @property
     def captures(self) -> list[Capture]:
