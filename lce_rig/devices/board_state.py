@@ -23,8 +23,8 @@ from lce_rig.rig.sync_settings import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import ClockTracker
 
-# Which times and running numbers can be, and which tell that the board restarted: a line may be damaged and
-# keep its sum. One odd value is skipped; two in a row that agree are believed.
+# Which times can be, and which tell that the board restarted: a line may be damaged and keep its sum. One odd
+# time is skipped; two in a row that agree are believed.
 
 # A line is written within milliseconds of its event, and read whenever the computer gets to it.
 ROOM_NS = 2 * NS_PER_S
@@ -73,40 +73,6 @@ class BoardTime:
         return True
 
 
-class RunningNumber:
-    """The running number of a line's pulses.
-
-    Attributes:
-        n_lost: numbers that never came.
-    """
-
-    def __init__(self) -> None:
-        self.n_lost = 0
-        self._last: tuple[int, int] | None = None
-        self._least_period_us = 0
-        self._odd: int | None = None
-
-    def accepts(self, number: int, t_us: int) -> bool:
-        """Judge a number; one that skips others must have left them the time to happen."""
-        if self._last is not None:
-            n_steps, elapsed_us = number - self._last[0], t_us - self._last[1]
-            if n_steps < 1 or (n_steps > 1 and elapsed_us < (n_steps - 0.5) * self._least_period_us):
-                is_confirmed = self._odd is not None and number == self._odd + 1
-                self._odd = number
-                if not is_confirmed:
-                    return False
-            else:
-                self.n_lost += n_steps - 1
-                if n_steps == 1 and elapsed_us > 0:
-                    self._least_period_us = min(self._least_period_us or elapsed_us, elapsed_us)
-        self._last, self._odd = (number, t_us), None
-        return True
-
-    def restart(self) -> None:
-        """Take the next number for the first of a new row."""
-        self._last = self._odd = None
-
-
 class Arrival(NamedTuple):
     """When a message came: by the time of day, which may be set at any moment, and by a clock never set."""
 
@@ -121,7 +87,7 @@ class BoardState:
         reader: reads the lines, and counts damaged ones.
         n_pulses: pulses handed on, by line.
         n_lost_by_line: pulses whose messages never came, by line; gaps in the running numbers tell.
-        n_implausible: messages whose figures cannot be.
+        n_implausible: messages whose times cannot be.
         restarted_ns: when the board last restarted, by the steady clock; None where it did not.
         heard_ns: when the last message came, or the port was opened, by the steady clock.
         hello, status, error: the last of each; None before the first.
@@ -151,7 +117,7 @@ class BoardState:
         self._opened_ns = 0
         self._lines = dict(lines)
         self._time = BoardTime()
-        self._numbers: dict[str, RunningNumber] = {}
+        self._last_numbers: dict[str, int] = {}
         self._asked: tuple[int, int] | None = None
 
     def opened(self, steady_ns: int) -> None:
@@ -275,19 +241,16 @@ class BoardState:
         return tuple(problems)
 
     def _pulse(self, line: str, count: int, t_us: int, arrival: Arrival) -> list[Pulse]:
-        number = self._numbers.setdefault(line, RunningNumber())
-        if not number.accepts(count, t_us):
-            self.n_implausible += 1
-            return []
-        if number.n_lost:
-            self.n_lost_by_line[line] = number.n_lost
+        n_lost = count - self._last_numbers.get(line, count - 1) - 1
+        if n_lost > 0:
+            self.n_lost_by_line[line] += n_lost
+        self._last_numbers[line] = count
         self.n_pulses[line] += 1
         return [Pulse(line, t_us * 1000, count, arrival.host_ns)]
 
     def _restart(self, arrival: Arrival) -> None:
         self.restarted_ns = arrival.steady_ns
-        for number in self._numbers.values():
-            number.restart()
+        self._last_numbers.clear()
         self._asked = None
         self.host_tracker.restart()
         self.utc_tracker.restart()

@@ -26,27 +26,21 @@ class Sink(Generic[T]):
         path: where.
         n_written: items written.
         n_dropped: items that the disk was too slow for.
+        n_waiting: items not written yet.
         failure: why nothing more is written; None while it is.
     """
 
     def __init__(
-        self, writer: "DiskWriter", path: Path, write: Callable[[T], object], is_vital: bool
+        self, writer: "DiskWriter", path: Path, write: Callable[[T], object], finish: Callable[[], None]
     ) -> None:
-        self.path = path
-        self.n_written = self.n_dropped = 0
+        self.path, self.write, self.finish = path, write, finish
+        self.n_written = self.n_dropped = self.n_waiting = 0
         self.failure: LceRigError | None = None
-        self.is_vital = is_vital
-        self.write = write
         self._writer = writer
 
     def put(self, item: T, n_bytes: int = 0) -> None:
         """Have an item written; never blocks. Where too much waits it is dropped, but for vital sinks."""
         self._writer.put(self, item, n_bytes)
-
-    @property
-    def is_busy(self) -> bool:
-        """Whether an item is not written yet."""
-        return self._writer.is_writing(self)
 
     def findings(self) -> list[Finding]:
         """List the gaps in the written data and their causes."""
@@ -68,10 +62,10 @@ class DiskWriter:
     def __init__(self, most_waiting_bytes: int = MOST_WAITING_BYTES) -> None:
         self._most_waiting_bytes = most_waiting_bytes
         self._n_waiting_bytes = 0
-        self._sinks: list[tuple[Sink[Any], Callable[[], None]]] = []
+        self._sinks: list[Sink[Any]] = []
+        self._vital_sinks: list[Sink[Any]] = []
         self._vital: deque[tuple[Sink[Any], Any, int]] = deque()
         self._others: deque[tuple[Sink[Any], Any, int]] = deque()
-        self._current: Sink[Any] | None = None
         self._changed = threading.Condition()
         self._is_closing = False
         self._thread = threading.Thread(target=self._run, name="write to disk", daemon=True)
@@ -92,8 +86,10 @@ class DiskWriter:
             finish: called in that thread after the last item.
             is_vital: its items go first and are never dropped, and its failure is an error.
         """
-        sink = Sink(self, path, write, is_vital)
-        self._sinks.append((sink, finish))
+        sink = Sink(self, path, write, finish)
+        self._sinks.append(sink)
+        if is_vital:
+            self._vital_sinks.append(sink)
         return sink
 
     def __enter__(self) -> "DiskWriter":
@@ -117,45 +113,41 @@ class DiskWriter:
             self._is_closing = True
             self._changed.notify()
         self._thread.join()
-        for sink, _ in self._sinks:
-            if sink.is_vital and sink.failure is not None:
+        for sink in self._vital_sinks:
+            if sink.failure is not None:
                 raise sink.failure
 
     def put(self, sink: Sink[T], item: T, n_bytes: int) -> None:
         """Queue an item; see `Sink.put`."""
+        is_vital = sink in self._vital_sinks
         with self._changed:
-            if sink.failure is not None or (self._is_closing and not sink.is_vital):
+            if sink.failure is not None or (self._is_closing and not is_vital):
                 return
-            if sink.is_vital:
-                self._vital.append((sink, item, 0))
+            if is_vital:
+                n_bytes = 0
             elif self._n_waiting_bytes + n_bytes > self._most_waiting_bytes:
                 sink.n_dropped += 1
                 return
-            else:
-                self._others.append((sink, item, n_bytes))
-                self._n_waiting_bytes += n_bytes
+            (self._vital if is_vital else self._others).append((sink, item, n_bytes))
+            self._n_waiting_bytes += n_bytes
+            sink.n_waiting += 1
             self._changed.notify()
-
-    def is_writing(self, sink: Sink[T]) -> bool:
-        """Whether an item of a sink is not written yet."""
-        with self._changed:
-            return sink in (self._current, *(other for other, _, _ in (*self._vital, *self._others)))
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._current = None
                 self._changed.wait_for(lambda: self._vital or self._others or self._is_closing)
                 queue = self._vital or self._others
                 if not queue:
                     break
                 sink, item, n_bytes = queue.popleft()
-                self._current = sink
                 self._n_waiting_bytes -= n_bytes
             if sink.failure is None and self._try(sink, partial(sink.write, item)):
                 sink.n_written += 1
-        for sink, finish in self._sinks:
-            self._try(sink, finish)
+            with self._changed:
+                sink.n_waiting -= 1
+        for sink in self._sinks:
+            self._try(sink, sink.finish)
 
     def _try(self, sink: Sink[Any], act: Callable[[], object]) -> bool:
         try:

@@ -1,15 +1,13 @@
 """Images from a command's standard output: GStreamer, ffmpeg or any program that writes them.
 
-They come one behind the other: Y4M, PNM (PGM and PPM), JPEG, or raw.
+They come one behind the other: Y4M, JPEG, or raw.
 
 References:
     https://wiki.multimedia.cx/index.php/YUV4MPEG2
-    https://netpbm.sourceforge.net/doc/pgm.html, https://netpbm.sourceforge.net/doc/ppm.html
     ITU-T T.81, annex B (the segments of a JPEG)
 """
 
 import os
-import re
 import selectors
 import signal
 import subprocess
@@ -36,7 +34,6 @@ _N_BEGIN = 16
 _TAIL_BYTES = 2000
 _MAX_HEADER = 4096
 _MAX_JPEG = 1 << 26
-_PNM_HEADER = re.compile(rb"(P[56])\s+(?:#[^\n]*\n\s*)*(\d+)\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s")
 # They differ in where a chroma sample sits.
 _Y4M_COLOURS = ("mono", "420", "420jpeg", "420mpeg2", "420paldv")
 _SOI, _EOI, _SOS = b"\xff\xd8", b"\xff\xd9", 0xDA
@@ -48,7 +45,7 @@ _EXAMPLE = (
 class ImagePipeSource(LiveSource):
     """A camera read by a command of the profile; see `LiveSource`.
 
-    The command writes Y4M, PGM, PPM or JPEG images, one behind the other, or raw ones of a pixel_format.
+    The command writes Y4M or JPEG images, one behind the other, or raw ones of a pixel_format.
     Such a stream carries no usable timestamps: those given are the arrival of an image's last byte
     as it is, and the status says so.
 
@@ -90,7 +87,7 @@ class ImagePipeSource(LiveSource):
             if code is None:
                 what = f"{self._who}: driver.pixel_format {wanted!r} is not read here"
                 known = ", ".join(code.strip() for code in FORMATS)
-                raise SourceError(what, f"It can be {known}, or missing for Y4M, PGM, PPM and JPEG.")
+                raise SourceError(what, f"It can be {known}, or missing for Y4M and JPEG.")
             size = self._settings.resolution_px
             self._stream = JpegImages() if FORMATS[code].is_compressed else RawImages(code, *size)
         with ExitStack() as stack:
@@ -163,7 +160,7 @@ class ImagePipeSource(LiveSource):
             self._stream = find_stream(self._begin)
             if self._stream is None:
                 begin = self._begin[:16]
-                what = f"{self._who}: its command writes no Y4M, PGM, PPM or JPEG; it begins {begin!r}"
+                what = f"{self._who}: its command writes no Y4M or JPEG; it begins {begin!r}"
                 raise SourceError(what, f"For raw images set driver.pixel_format. An example: {_EXAMPLE}")
         try:
             for pixels in self._stream.feed(data):
@@ -317,23 +314,6 @@ class Y4mImages(ImageStream):
         self._n_bytes, self._decode = decoder.n_bytes, decoder.decode
 
 
-class PnmImages(ImageStream):
-    """PGM and PPM files of 8 bits, one behind the other."""
-
-    def _cut(self) -> bytes | None:
-        match = _PNM_HEADER.match(self._rest, 0, _MAX_HEADER)
-        if match is None:
-            if len(self._rest) >= _MAX_HEADER or bytes(self._rest[:2]) not in (b"", b"P", b"P5", b"P6"):
-                raise ValueError(f"a PGM or PPM image was expected, {bytes(self._rest[:20])!r} came")
-            return None
-        width, height, most = (int(text) for text in match.groups()[1:])
-        if most > 255:
-            raise ValueError(
-                f"PGM or PPM with values up to {most} is not read here: let the command write 8 bit"
-            )
-        return self._take(match.end() + width * height * (3 if match.group(1) == b"P6" else 1))
-
-
 class JpegImages(ImageStream):
     """JPEG files, one behind the other; anything between them is skipped."""
 
@@ -377,8 +357,6 @@ def find_stream(begin: bytes) -> ImageStream | None:
     """Choose the kind of a stream by its first bytes; None where they fit none."""
     if begin.startswith(b"YUV4MPEG2 "):
         return Y4mImages()
-    if begin.startswith((b"P5", b"P6")):
-        return PnmImages()
     if begin.startswith(_SOI) or begin.startswith(b"--"):  # "--": the boundary of a multipart stream
         return JpegImages()
     return None

@@ -11,7 +11,6 @@ References:
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -61,7 +60,6 @@ CLOCKS = ("monotonic", "monotonic_raw", "tsc", "tsc_minus", "boottime", "realtim
 """Candidates, in the order in which equally good ones are taken."""
 
 
-@dataclass(frozen=True)
 class FrameTiming:
     """How the rows of an image are exposed and read.
 
@@ -73,44 +71,30 @@ class FrameTiming:
         t_end of frame      - (H-m) l - e/2      the last row is read                                      (3)
         t_trigger + delay   + m l + e/2                                                                    (4)
 
+    Args:
+        settings: the camera's: line time and delay; its exposure goes before the camera's own.
+        n_rows: H, of the image.
+        exposure_us: of a row, as the camera says; None where unknown, which counts as none.
+
     Attributes:
-        n_rows: of the image.
-        exposure_ns: of a row; None where unknown.
-        line_time_ns: from row to row.
-        trigger_delay_ns: from the trigger's edge to the start of the first row's exposure.
+        exposure_us: of a row; None where unknown.
     """
 
-    n_rows: int
-    exposure_ns: float | None
-    line_time_ns: float = 0.0
-    trigger_delay_ns: float = 0.0
+    def __init__(self, settings: DriverSettings, n_rows: int, exposure_us: float | None = None) -> None:
+        self.exposure_us = settings.frame_timing.exposure_us or exposure_us
+        self._timing, self._n_rows = settings.frame_timing, n_rows
 
     def to_mid_ns(self, mark: Mark) -> int:
-        """Return the time from a timestamp's moment to the middle of the exposure, (1) to (4).
-
-        An unknown exposure counts as none.
-        """
-        half_ns = 0.5 * (self.exposure_ns or 0.0)
-        rows_ns = 0.5 * (self.n_rows - 1) * self.line_time_ns
+        """Return the time from a timestamp's moment to the middle of the exposure, (1) to (4)."""
+        half_us, line_us = 0.5 * (self.exposure_us or 0.0), self._timing.line_time_us
+        rows_us = 0.5 * (self._n_rows - 1) * line_us
         if mark == "start_of_exposure":
-            return round(rows_ns + half_ns)
+            return round(1000 * (rows_us + half_us))
         if mark == "start_of_frame":
-            return round(rows_ns - half_ns)
+            return round(1000 * (rows_us - half_us))
         if mark == "end_of_frame":
-            return round(rows_ns - self.n_rows * self.line_time_ns - half_ns)
-        return round(self.trigger_delay_ns + rows_ns + half_ns)
-
-
-def frame_timing(settings: DriverSettings, n_rows: int, exposure_us: float | None = None) -> FrameTiming:
-    """Take the timing from the profile; the exposure from the camera where the profile has none."""
-    timing = settings.frame_timing
-    exposure_us = timing.exposure_us or exposure_us
-    return FrameTiming(
-        n_rows,
-        None if exposure_us is None else 1000 * exposure_us,
-        1000 * timing.line_time_us,
-        1000 * timing.trigger_delay_us,
-    )
+            return round(1000 * (rows_us - self._n_rows * line_us - half_us))
+        return round(1000 * (self._timing.trigger_delay_us + rows_us + half_us))
 
 
 def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
@@ -234,7 +218,7 @@ class V4l2Source(LiveSource):
         self._notes: list[Finding] = []
         self._device_in_words = self._serial = ""
         self._mark: Mark = "start_of_frame"
-        self._timing = FrameTiming(settings.resolution_px[1], None)
+        self._timing = FrameTiming(settings.driver, settings.resolution_px[1])
 
     def open(self) -> None:
         """Open, set up and start the camera.
@@ -282,7 +266,7 @@ class V4l2Source(LiveSource):
             delay_ms = self._clock.delay_ns * 1e-6
             moved = findings.MID_EXPOSURE(clock=self._clock.used, mark=self._mark, delay_ms=delay_ms)
             clock = ClockState(moved)
-            if self._timing.exposure_ns is None:
+            if self._timing.exposure_us is None:
                 problems.append(findings.EXPOSURE_UNKNOWN())
         return SourceStatus(
             self.sensor,
@@ -310,19 +294,15 @@ class V4l2Source(LiveSource):
             raise SourceError(
                 f"{where} {what}", f"It offers {listing}: set driver.pixel_format to one of them."
             )
-        layout = device.set_layout(code, width, height)
-        if (layout.width, layout.height) != (width, height):
-            raise SourceError(
-                f"{where} sends {layout.width}x{layout.height} px in {code.strip()}, "
-                f"the intrinsics belong to {width}x{height} px",
-                "Choose one of its sizes (`v4l2-ctl --list-formats-ext`), or measure the intrinsics again.",
+        granted, stride = device.set_layout(code, width, height)
+        if granted != (code, width, height):
+            form = "{1}x{2} px in {0}".format
+            what = f"{where} sends {form(*granted)}, the profile wants {form(code, width, height)}"
+            hint = (
+                "Choose one of its formats (`v4l2-ctl --list-formats-ext`); measure intrinsics at its size."
             )
-        if layout.code != code:
-            raise SourceError(
-                f"{where} sends {layout.code.strip()}, not {code.strip()} as it was asked for",
-                f"Set driver.pixel_format to {layout.code.strip()}.",
-            )
-        return PixelDecoder(code, width, height, layout.stride)
+            raise SourceError(what, hint)
+        return PixelDecoder(code, width, height, stride)
 
     def read(self) -> list[LiveSample]:
         """Return the image that came; see `LiveSource`."""
@@ -359,4 +339,4 @@ class V4l2Source(LiveSource):
         self._exposure_read_s = time.monotonic()
         is_given = self._settings.driver.frame_timing.exposure_us is not None
         exposure_us = None if is_given else read_exposure_us(self._device, self._known)
-        self._timing = frame_timing(self._settings.driver, self._settings.resolution_px[1], exposure_us)
+        self._timing = FrameTiming(self._settings.driver, self._settings.resolution_px[1], exposure_us)

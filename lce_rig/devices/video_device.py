@@ -30,15 +30,6 @@ _LIST_CONTROLS = "`v4l2-ctl --list-ctrls-menus` lists the settings and their num
 _LOCKED = f"An automatic mode or a running stream may lock it: set that mode, too. {_LIST_CONTROLS}"
 
 
-class Layout(NamedTuple):
-    """How a device lays its images out: pixel format, px, bytes from row to row (0: compressed)."""
-
-    code: str
-    width: int
-    height: int
-    stride: int
-
-
 class RawFrame(NamedTuple):
     """One image as the kernel hands it over.
 
@@ -119,8 +110,11 @@ class VideoDevice:
             ask.index += 1
         return codes
 
-    def set_layout(self, code: str, width: int, height: int) -> Layout:
-        """Ask for a form of images; gives what the device will deliver instead if it must.
+    def set_layout(self, code: str, width: int, height: int) -> tuple[tuple[str, int, int], int]:
+        """Ask for a form of images.
+
+        Returns:
+            The pixel format and size, px, that will be delivered, and the bytes from row to row.
 
         Raises:
             SourceError: another program streams from it.
@@ -134,7 +128,7 @@ class VideoDevice:
         except OSError as error:
             raise self._explain(error, "does not take an image format") from None
         granted = pix.pixelformat.decode("ascii", "replace").ljust(4)
-        return Layout(granted, pix.width, pix.height, pix.bytesperline)
+        return (granted, pix.width, pix.height), pix.bytesperline
 
     def set_rate(self, rate_hz: float) -> None:
         """Ask for images a second; the device may choose another rate."""

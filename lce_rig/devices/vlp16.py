@@ -23,11 +23,10 @@ from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.core.phrasing import as_line
 from lce_rig.devices import findings
 from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
-from lce_rig.devices.velodyne_web import VelodyneWeb, find_problems
+from lce_rig.devices.velodyne_web import VelodyneWeb
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.velodyne.stream import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
@@ -40,7 +39,6 @@ _MAX_OFF_RATE = 0.05
 _WAIT_S = 0.1
 _GATHER_S = 0.005
 _WEB_TIMEOUT_S = 1.0
-_EVERYBODY = "255.255.255.255"
 
 # Two seconds of data packets, as the kernel accounts for them.
 _WANTED_BUFFER_BYTES = 4 << 20
@@ -68,7 +66,7 @@ class Vlp16Source(LiveSource):
         sensor: its name in the profile.
         settings: its block of the profile.
         silence_s: without packets for so long, it is taken to be gone.
-        web_port: of the sensor's web server, which is asked when no packets come.
+        web_port: of the sensor's web server, which is asked for the serial number.
     """
 
     def __init__(
@@ -181,7 +179,7 @@ class Vlp16Source(LiveSource):
             )
 
     def explain_silence(self, *, has_sent: bool) -> SourceError:
-        """Find the likeliest reason; the sensor's web page is asked."""
+        """Find the likeliest reason."""
         assert self._stream is not None  # it was open
         sensor, port, address, flaws = self.sensor, self._port, self._address, self._stream.flaws()
         whose = f" from {address}" if address else ""
@@ -201,22 +199,11 @@ class Vlp16Source(LiveSource):
         if self._strangers:
             there = ", ".join(sorted(self._strangers))
             return SourceError(what, f"Packets come from {there}: set driver.address in the profile.")
-        address = address or velodyne.FACTORY_ADDRESS
-        try:
-            report = VelodyneWeb(address, self._web_port, _WEB_TIMEOUT_S).read()
-        except SourceError:
-            hint = (
-                f"Its web page http://{address} does not answer either. Check its power and cable; that this "
-                "computer has an address in its network (192.168.1.x, mask 255.255.255.0); driver.address."
-            )
-            return SourceError(what, hint)
-        advice = [as_line(problem.sentence) for problem in find_problems(report, self._settings)]
-        if report.host and report.host != _EVERYBODY:
-            advice.append(f"Data go to {report.host} only: check that this is this computer.")
-        firewall = f"Open UDP port {port} in this computer's firewall (sudo ufw allow {port}/udp)."
-        return SourceError(
-            what, " ".join([f"Its web page http://{address} answers.", *(advice or [firewall])])
+        hint = (
+            "Check its power and cable, that this computer has an address in its network (192.168.1.x, mask "
+            f"255.255.255.0), driver.address, and that the firewall lets UDP port {port} in."
         )
+        return SourceError(what, f"{hint} `lce-rig doctor` compares its web page with the profile.")
 
     def _take(self, datagram: Datagram, stream: Vlp16Stream, *, is_data: bool) -> Scan | None:
         if self._address and datagram.source != self._address:

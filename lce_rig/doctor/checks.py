@@ -90,7 +90,7 @@ def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
         yield findings.FAILED(what=seen.failure.what, hint=seen.failure.hint)
         return
     assert seen.status is not None  # a sensor that neither opened nor failed has a failure of its own
-    figures: dict[str, Any] = {"device": seen.status.device, "driver": exam.driver(sensor)}
+    figures: dict[str, Any] = {"device": seen.status.device}
     report = exam.web.get(sensor)
     if isinstance(report, WebReport):
         figures |= {name: getattr(report, name) for name in ("firmware", "serial")}
@@ -106,8 +106,8 @@ def check_settings(exam: Examination, sensor: str) -> Iterator[Finding]:
         if exam.seen[sensor].status is not None:
             yield findings.SETTINGS_UNKNOWN(what=report.what)
     elif report is not None:
-        names = ("rotor_hz", "returns", "fov_deg", "host", "data_port")
-        figures: dict[str, Any] = {name: getattr(report, name) for name in names}
+        names = ("returns", "fov_deg", "host", "data_port")
+        figures: dict[str, Any] = {name: getattr(report, name) or None for name in names}
         yield findings.SETTINGS(**figures)
         problems = find_problems(report, exam.rig.lidars[sensor])
         # The pulse has a line of its own.

@@ -1,78 +1,26 @@
 """Kinds of findings of the doctor: the computer, each sensor's device, stream, clock and pulses."""
 
 from functools import partial
-from textwrap import shorten
 
 from lce_rig.core.findings import Finding, Kind
-
-_MAX_COMMAND = 50
 
 _note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
 
 
 def _answers(finding: Finding) -> str:
-    """The {driver} reads {device}, firmware {firmware}, serial number {serial}."""
+    """{device} answers, firmware {firmware}, serial number {serial}."""
     figures = finding.figures
-    device = str(figures["device"] or f"answers (driver {figures['driver']})")
-    parts = [shorten(device, _MAX_COMMAND, placeholder=" ...") if figures["driver"] == "command" else device]
-    parts += [f"{name} {figures[name]}" for name in ("firmware", "serial") if figures.get(name)]
-    return ", ".join(parts)
-
-
-def _expected(finding: Finding) -> str:
-    is_known = finding.figures["expected_hz"] is not None
-    return f" ({finding.figure('expected_hz'):g} expected)" if is_known else ""
+    parts = [str(figures["device"] or "answers")]
+    return ", ".join(
+        parts + [f"{name} {figures[name]}" for name in ("firmware", "serial") if figures.get(name)]
+    )
 
 
 def _rate(finding: Finding) -> str:
     """{stream} come at {rate_hz}, {expected_hz} expected."""
-    return f"{finding.figure('rate_hz'):.1f} {finding.figures['stream']}/s{_expected(finding)}"
-
-
-def _none(finding: Finding) -> str:
-    """No {stream} come, {expected_hz} expected."""
-    return f"no {finding.figures['stream']}{_expected(finding)}"
-
-
-def _stopped(finding: Finding) -> str:
-    """{stream} came at {rate_hz}, {expected_hz} expected, and then none for {silent_s}."""
-    return f"{_rate(finding)}, none for {finding.figure('silent_s'):.1f} s"
-
-
-def _events(finding: Finding) -> str:
-    """{events_per_s} events come a second."""
-    return f"{finding.figure('events_per_s') / 1e6:.2f} M events/s"
-
-
-def _complete(finding: Finding) -> str:
-    """No packet of {n_packets} and no sample is lost."""
-    return f"{_received(finding)}none lost"
-
-
-def _losses(finding: Finding) -> str:
-    """Of {n_packets} packets {n_lost} were lost, {n_dropped} samples not read in time: {share} of all."""
-    late = f", {finding.figures['n_dropped']} not read in time" if finding.figures["n_dropped"] else ""
-    return f"{_received(finding)}{finding.figures['n_lost']} lost{late}"
-
-
-def _received(finding: Finding) -> str:
-    n_packets = finding.figures["n_packets"]
-    return "" if n_packets is None else f"{n_packets} packets, "
-
-
-def _settings(finding: Finding) -> str:
-    """The LiDAR's page shows {rotor_hz}, returns {returns}, view {fov_deg}, data to {host} {data_port}."""
-    figures, parts = finding.figures, list[str]()
-    if figures["rotor_hz"] is not None:
-        parts.append(f"{60 * finding.figure('rotor_hz'):.0f} rpm")
-    if figures["returns"]:
-        parts.append(str(figures["returns"]))
-    if isinstance(figures["fov_deg"], tuple):
-        parts.append(f"{' to '.join(map(str, figures['fov_deg']))} deg")
-    if figures["host"] or figures["data_port"]:
-        port = f":{figures['data_port']}" if figures["data_port"] else ""
-        parts.append(f"to {figures['host']}{port}")
-    return ", ".join(parts)
+    is_known = finding.figures["expected_hz"] is not None
+    expected = f" ({finding.figure('expected_hz'):g} expected)" if is_known else ""
+    return f"{finding.figure('rate_hz'):.1f} {finding.figures['stream']}/s{expected}"
 
 
 def _pulse(finding: Finding) -> str:
@@ -128,14 +76,18 @@ RATE_OFF = _warning(
         "trigger": "set its trigger mode in driver.controls, and check the line",
     },
 )
-NO_STREAM = Kind("stream.none", _none, "check its trigger line; a triggered camera waits for pulses")
-STOPPED = Kind("stream.stopped", _stopped, "check cable and power, and its trigger line")
-EVENT_RATE = _note("stream.events", _events)
+NO_STREAM = Kind("stream.none", "no {stream}", "check its trigger line; a triggered camera waits for pulses")
+STOPPED = Kind(
+    "stream.stopped",
+    "{rate_hz:.1f} {stream}/s, then none for {silent_s:.1f} s",
+    "check cable and power, and its trigger line",
+)
+EVENT_RATE = _note("stream.events", "{events_per_s:,.0f} events/s")
 NO_EVENTS = Kind("stream.no_events", "no events", "uncover the lens, and check the biases in driver.controls")
-COMPLETE = _note("stream.complete", _complete)
+COMPLETE = _note("stream.complete", "none lost")
 LOSSES = Kind(
     "stream.losses",
-    _losses,
+    "{n_lost} lost, {n_dropped} not read in time",
     "check its cable; close other programs (top shows which are busy)",
     actions={"named": ""},
 )
@@ -144,7 +96,7 @@ SETTINGS_UNKNOWN = _warning(
     "firmware and settings unknown: {what}",
     "check that driver.address is its own, and that no firewall blocks it",
 )
-SETTINGS = _note("settings.read", _settings)
+SETTINGS = _note("settings.read", "{returns} returns, {fov_deg} deg, to {host}, port {data_port}")
 
 PULSE = _note("clock.pulse", _pulse)
 WITHOUT_PULSES = _note(

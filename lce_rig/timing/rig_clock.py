@@ -355,9 +355,10 @@ class RigClock:
         return [self._at_pulse(each.image, each.stamp_ns) for each in matched] if was_matching else []
 
     def _at_pulse(self, image: Image, board_ns: int) -> Image:
-        """Stamp an image by the pulse that made it."""
+        """Stamp an image by the pulse that made it; as it is while no clock is known."""
         clock = self._utc or self._host
-        assert clock is not None  # without it no image was matched
+        if clock is None:  # A clock that jumped has no model until a few answers have come.
+            return image
         return replace(image, stamp_ns=clock.convert(board_ns))
 
     def _place(self, sample: Sample) -> Sample:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.v4l2 import FrameTiming, frame_timing, stamped_moment
+from lce_rig.devices.v4l2 import FrameTiming, stamped_moment
 from lce_rig.rig import DriverSettings, FrameTimingSettings
 
 ROWS = st.integers(2, 1080)
@@ -25,17 +25,21 @@ def test_every_mark_leads_to_the_middle_of_the_middle_row(
         "start_of_frame": reads[0],
         "end_of_frame": reads[-1] + line_time_ns,
     }
-    timing = FrameTiming(n_rows, exposure_ns, line_time_ns, delay_ns)
+    frame = FrameTimingSettings(
+        exposure_us=exposure_ns / 1000 or None,
+        line_time_us=line_time_ns / 1000,
+        trigger_delay_us=delay_ns / 1000,
+    )
+    timing = FrameTiming(DriverSettings(frame_timing=frame), n_rows)
     for mark, stamp in marks.items():
         assert abs(stamp + timing.to_mid_ns(mark) - middle) <= 1  # type: ignore[arg-type]
 
 
 def test_the_profile_comes_before_the_camera() -> None:
     settings = DriverSettings(frame_timing=FrameTimingSettings(exposure_us=8000, line_time_us=22.5))
-    timing = frame_timing(settings, 720, exposure_us=100)
-    assert (timing.exposure_ns, timing.line_time_ns) == (8_000_000, 22_500)
-    assert frame_timing(DriverSettings(), 720, 100).exposure_ns == 100_000
-    assert frame_timing(DriverSettings(), 720).exposure_ns is None
+    assert FrameTiming(settings, 720, exposure_us=100).exposure_us == 8000
+    assert FrameTiming(DriverSettings(), 720, 100).exposure_us == 100
+    assert FrameTiming(DriverSettings(), 720).exposure_us is None
 
 
 @pytest.mark.parametrize(

@@ -239,7 +239,7 @@ def explain(lidar: LidarSettings, packets: list[SensorPacket] | None = None, **o
 def test_an_absent_sensor_is_an_error_that_says_what_to_check(lidar: LidarSettings) -> None:
     error = explain(lidar)
     assert HERE in error.what and str(lidar.driver.port) in error.what
-    for word in ("power", "cable", "192.168.1.x", "driver.address"):
+    for word in ("power", "cable", "192.168.1.x", "driver.address", "firewall"):
         assert word in error.hint
 
 

@@ -11,8 +11,6 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.velodyne_web import VelodyneWeb, find_problems
-from lce_rig.devices.vlp16 import Vlp16Source
-from lce_rig.rig.sensors import DriverSettings
 from tests.io.vlp16_room import settings
 
 INFO = {
@@ -160,22 +158,3 @@ def test_what_keeps_scans_from_coming_is_found_with_its_figures(
         (problem,) = find_problems(web.read(), settings())
     assert problem.code == "settings.differs"
     assert tuple(problem.figures[name] for name in ("setting", "value", "expected")) == figures
-
-
-@pytest.mark.parametrize(
-    ("host", "advice"),
-    [
-        ({"addr": "255.255.255.255", "dport": 2368}, "firewall"),
-        ({"addr": "192.168.1.77", "dport": 2368}, "192.168.1.77"),
-        ({"addr": "255.255.255.255", "dport": 3000}, "3000"),
-    ],
-)
-def test_a_silent_sensor_is_asked_where_it_sends_to(host: dict[str, Any], advice: str) -> None:
-    lidar = settings(driver=DriverSettings(address="127.0.0.1", port=2368))
-    with serving({**PAGES, "settings": {**SETTINGS, "host": host}}) as (_, web):
-        port = int(web.url.rpartition(":")[2])
-        with pytest.raises(SourceError) as caught:
-            Vlp16Source("lidar", lidar, silence_s=0.2, web_port=port).__enter__()
-    error = caught.value
-    assert all(figure in error.what for figure in ("127.0.0.1", "2368", "0.2 s"))
-    assert "http://127.0.0.1" in error.hint and advice in error.hint

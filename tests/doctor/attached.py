@@ -102,7 +102,7 @@ def attach(attached: Attached, folder: Path) -> Iterator[tuple[Rig, int]]:
         "controls": {"position_port": ports[1]},
     }
     command = ["false"] if attached.pixels is None else _camera(attached.pixels, folder)
-    document["cameras"]["cam"]["driver"] = {"type": "command", "command": command}
+    document["cameras"]["cam"]["driver"] = {"type": "command", "command": command, "pixel_format": "GREY"}
     trigger = {"channel": 0, "rate_hz": 1 / PERIOD_S, "max_delay_s": 0.04}
     document["sync"] = {"device": "/dev/not-there", "triggers": {"cam": trigger}}
     with ExitStack() as stack:
@@ -150,7 +150,6 @@ def picture_of(board: Board, square_px: int = 20) -> NDArray[np.uint8]:
 
 
 def _camera(pixels: NDArray[np.uint8], folder: Path) -> list[str]:
-    height, width = pixels.shape
-    path = folder / "picture.pgm"
-    path.write_bytes(f"P5 {width} {height} 255\n".encode() + pixels.tobytes())
+    path = folder / "picture"
+    path.write_bytes(pixels.tobytes())
     return [sys.executable, "-c", CAMERA, str(path), str(PERIOD_S), str(DELAY_S)]

@@ -104,6 +104,23 @@ def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arriva
     assert abs(np.mean(errors_ns)) < 2_000_000
 
 
+def test_images_keep_their_time_while_a_clock_that_jumped_has_no_model() -> None:
+    clock, board = RigClock(synced("rlfs", "cam"), has_board=True), Board()
+    refresh(clock, board, LOCKED)
+    came: list[Image] = []
+    for k in range(20):
+        if k == 10:
+            clock.refresh(None, None, [])
+        came += [
+            image
+            for image in clock.take("sync", Pulse("cam", k * PERIOD_NS, k, 0))
+            if isinstance(image, Image)
+        ]
+        stamp_ns = T0_NS + HOST_AHEAD_NS + k * PERIOD_NS + 10_000_000
+        came += [image for image in clock.take("cam", picture(stamp_ns, k)) if isinstance(image, Image)]
+    assert came[-1].count == 19 and came[-1].stamp_ns == came[-1].host_ns
+
+
 def test_a_pulse_that_the_camera_missed_is_found_and_told() -> None:
     clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)

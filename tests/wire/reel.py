@@ -65,7 +65,7 @@ def make_reel(folder: Path, rig: Rig, n_placements: int, seed: int = 0) -> Reel:
 
     Args:
         folder: a new one.
-        rig: with one VLP-16; cameras with frames send UYVY where their driver names it, else PGM.
+        rig: with one VLP-16; cameras with frames send UYVY where their driver names it, else GREY.
         n_placements: places of the board that all sensors find it at.
         seed: of truth, room, placements and noise.
     """
@@ -124,8 +124,7 @@ def _placements(scene: LiveScene, rig: Rig, n: int) -> Iterator[tuple[list[Scan]
 def _encode(image: Image, rig: Rig) -> bytes:
     height, width = image.pixels.shape[:2]
     if rig.cameras[image.sensor].driver.pixel_format != "UYVY":
-        grey = image.grey
-        return b"P5\n%d %d\n255\n" % (width, height) + grey.tobytes()
+        return image.grey.tobytes()
     y, cr, cb = cv2.split(cv2.cvtColor(image.pixels, cv2.COLOR_BGR2YCrCb))
     uyvy = np.empty((height, width, 2), np.uint8)
     uyvy[:, :, 1] = y

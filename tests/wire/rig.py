@@ -142,6 +142,7 @@ class WireRig:
                             "device": None,
                             "controls": {},
                             "command": self._command(name),
+                            "pixel_format": camera.driver.pixel_format or "GREY",
                         }
                     )
                 }

@@ -168,7 +168,7 @@ class CaptureWriter:
     @property
     def is_busy(self) -> bool:
         """Whether a capture is not on the disk, or not taken back, yet."""
-        return self._sink.is_busy
+        return self._sink.n_waiting > 0
 
     def keep(self, task: Task) -> None:
         """Have a capture written; returns at once."""

@@ -30,8 +30,10 @@ class Sent:
 
 def read_sent(reel: Reel, lidar: LidarSettings) -> Sent:
     """Decode a reel without any transport."""
+    shape = reel.n_pictures, 260, 346
     pictures = [
-        np.stack([_read_pgm(data) for data in reel.pictures("cam", k)]) for k in range(reel.n_placements)
+        np.frombuffer(b"".join(reel.pictures("cam", k)), np.uint8).reshape(shape)
+        for k in range(reel.n_placements)
     ]
     return Sent(pictures, [_decode(reel.packets(k), lidar) for k in range(reel.n_placements)])
 
@@ -83,12 +85,6 @@ def journal_of(session: Path) -> list[dict[str, Any]]:
     """Read how each run ended."""
     lines = (session / "journal.jsonl").read_text().splitlines()
     return [entry for entry in map(json.loads, lines) if entry["event"] == "collected live"]
-
-
-def _read_pgm(data: bytes) -> NDArray[np.uint8]:
-    magic, width, height, most = data[:20].split()[:4]
-    assert (magic, most) == (b"P5", b"255")
-    return np.frombuffer(data[-int(width) * int(height) :], np.uint8).reshape(int(height), int(width))
 
 
 def _decode(packets: list[bytes], lidar: LidarSettings) -> list[Scan]:
