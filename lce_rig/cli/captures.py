@@ -11,7 +11,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
 from lce_rig.core.errors import SessionError, UsageError
 from lce_rig.pipeline.result_files import CURRENT, StoredResult, stored_results
-from lce_rig.session import Capture, Session
+from lce_rig.session import Session
 
 
 @click.command()
@@ -76,7 +76,6 @@ def _require_there(session: Session, rejecting: set[str], restoring: set[str]) -
 
 
 def _records(session: Session, stored: Sequence[StoredResult]) -> list[dict[str, Any]]:
-
     # The cameras whose current result used each capture.
     used: dict[str, list[str]] = {}
     for result in stored:
@@ -84,21 +83,18 @@ def _records(session: Session, stored: Sequence[StoredResult]) -> list[dict[str,
             for name in calibration.captures_used:
                 used.setdefault(name, []).append(calibration.camera)
     states = [(each, "kept") for each in session.captures] + [(each, "rejected") for each in session.rejected]
-    states.sort(key=lambda item: int(item[0].name))
-    return [_record(capture, state, used.get(capture.name, [])) for capture, state in states]
-
-
-def _record(capture: Capture, state: str, used_by: list[str]) -> dict[str, Any]:
-
-    record = {"name": capture.name, "state": state, "used_by": used_by}
-    try:
-        source = capture.meta.get("source")
-        streams = [".".join(key) for key in capture.image_keys]
-        streams += [f"{camera}.events" for camera in capture.event_cameras] + capture.lidars
-    except SessionError as error:
-        return {**record, "streams": [], "source": "", "damage": error.what}
-    label = source.get("label", "") if isinstance(source, dict) else ""
-    return {**record, "streams": streams, "source": str(label), "damage": None}
+    records = []
+    for capture, state in sorted(states, key=lambda item: int(item[0].name)):
+        record = {"name": capture.name, "state": state, "used_by": used.get(capture.name, [])}
+        try:
+            source = capture.meta.get("source")
+            streams = [".".join(key) for key in capture.image_keys]
+            streams += [f"{camera}.events" for camera in capture.event_cameras] + capture.lidars
+            label = str(source.get("label", "")) if isinstance(source, dict) else ""
+            records.append({**record, "streams": streams, "source": label, "damage": None})
+        except SessionError as error:
+            records.append({**record, "streams": [], "source": "", "damage": error.what})
+    return records
 
 
 def _table(records: list[dict[str, Any]]) -> Any:

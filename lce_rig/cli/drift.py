@@ -124,7 +124,6 @@ _COLOURS = {"unchanged": "none", "changed": "red", "unknown": "yellow"}
 
 
 def _table(pair: PairDrift) -> Any:
-
     opinions = [("scene", pair.drift.axes if pair.drift.curves else None)]
     opinions += [] if pair.board is None else [("board", pair.board.axes)]
     title = f"{pair.calibration.camera}, {pair.calibration.lidar} (camera: x right, y down, z forward)"
@@ -150,7 +149,6 @@ def _figures(axis: AxisDrift | None) -> tuple[str, str]:
 
 
 def _summary(pair: PairDrift) -> list[str]:
-
     line = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
     if pair.board is not None:
         line += (

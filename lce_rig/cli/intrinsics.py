@@ -130,7 +130,6 @@ def _table(measured: MeasuredIntrinsics) -> Any:
 
 
 def _findings(measured: MeasuredIntrinsics) -> list[str]:
-
     lines = []
     if measured.check is None:
         lens = measured.given

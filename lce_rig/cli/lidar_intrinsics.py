@@ -72,7 +72,6 @@ def _print(document: dict[str, Any]) -> None:
 
 
 def _document(errors: LidarErrors) -> dict[str, Any]:
-
     estimate = errors.found
     values, sigmas = estimate.lasers.copy(), estimate.lasers_sigma.copy()
     values[1:], sigmas[1:] = np.degrees(values[1:]), np.degrees(sigmas[1:])

@@ -57,7 +57,15 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
                 "rig": compared.rig,
                 "calibrated": compared.calibrated,
                 "findings": compared.findings,
-                "pairs": [_pair(comparison) for comparison in compared.comparisons],
+                "pairs": [
+                    {
+                        name.replace("reported_", "claimed_"): value
+                        for name, value in vars(c).items()
+                        if name != "names"
+                    }
+                    | {"sessions": c.names, "agrees": c.agrees, "finding": c.finding}
+                    for c in compared.comparisons
+                ],
             }
         )
     else:
@@ -77,7 +85,6 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
 
 
 def _deviations(comparison: Repeatability) -> Any:
-
     headings = (">x mm", ">y mm", ">z mm", ">about x deg", ">about y deg", ">about z deg")
     table = show.plain_table(f"{_sensors(comparison)}: difference from the mean", "session", *headings)
     for name, tangent in zip(comparison.names, comparison.deviations, strict=True):
@@ -117,8 +124,3 @@ def _summary(comparison: Repeatability) -> list[str]:
 
 def _sensors(comparison: Repeatability) -> str:
     return f"{comparison.camera} and {comparison.lidar}"
-
-
-def _pair(c: Repeatability) -> dict[str, Any]:
-    figures = {name.replace("reported_", "claimed_"): value for name, value in vars(c).items()}
-    return figures | {"sessions": figures.pop("names"), "agrees": c.agrees, "finding": c.finding}

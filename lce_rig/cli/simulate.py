@@ -181,7 +181,6 @@ def _options(rig: Rig, motion: Any, choices: dict[str, Any]) -> SimulationOption
 
 
 def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options: SimulationOptions) -> None:
-
     if path.exists():
         raise SessionError(
             f"{path} exists already", "Choose another folder; a simulation is never continued."
@@ -207,7 +206,6 @@ def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options:
 def _simulate_recording(
     folder: Path, rig: Rig, duration_s: float, seed: int, options: SimulationOptions, ros: int
 ) -> None:
-
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
     with FolderRecorder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:
         write_truth(folder / TRUTH, rig_truth(rig, seed, options) | recording_truth(recording))

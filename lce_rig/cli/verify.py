@@ -88,7 +88,6 @@ def _table(checked: Any) -> Any:
 
 
 def _summary(checked: Any) -> list[str]:
-
     lines = []
     if checked.metrics is not None:
         m = checked.metrics

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment, ImageKey
 from lce_rig.collect.worker import Worker
-from lce_rig.core.data import Image
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig
@@ -96,7 +95,14 @@ def glance_at(frames: Iterable[Frame]) -> Iterator[tuple[Frame, Glances]]:
     """Compare each frame's images with those of the frames before and after it."""
     held: tuple[Frame, dict[ImageKey, Glance]] | None = None
     for frame in frames:
-        glances = {(image.sensor, image.channel): Glance(_shrink(image), []) for image in frame.images}
+        glances = {}
+        for image in frame.images:
+            height, width = image.pixels.shape[:2]
+            factor = max(round(width / _SMALL_PX), 1)
+            size = max(width // factor, 1), max(height // factor, 1)
+            small = cv2.resize(image.pixels, size, interpolation=cv2.INTER_AREA)
+            grey = np.asarray(small if small.ndim == 2 else small.mean(axis=2), dtype=np.float32)
+            glances[image.sensor, image.channel] = Glance(grey, [])
         if held is not None:
             for key in held[1].keys() & glances.keys():
                 before, after = held[1][key], glances[key]
@@ -173,14 +179,6 @@ def _has_come_to_rest(
         return True
     is_new = glance.resting() & ~_is_same(glance.small, searched[1].small)
     return int(np.sum(is_new)) >= _BOARD_PX
-
-
-def _shrink(image: Image) -> NDArray[np.float32]:
-    height, width = image.pixels.shape[:2]
-    factor = max(round(width / _SMALL_PX), 1)
-    size = max(width // factor, 1), max(height // factor, 1)
-    small = cv2.resize(image.pixels, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(small if small.ndim == 2 else small.mean(axis=2), dtype=np.float32)
 
 
 def _is_same(one: NDArray[np.float32], two: NDArray[np.float32]) -> NDArray[np.bool_]:

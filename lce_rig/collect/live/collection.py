@@ -348,21 +348,19 @@ class _Loop:
         return all(guide.is_enough for guide in self._guides)
 
     def _state(self, *, has_ended: bool) -> LiveState:
+        lacking = [why for guide in self._guides if (why := guide.explain()) is not None]
+        goes_on = ""
+        if lacking and not has_ended:
+            # It goes on for the guide that needs most captures.
+            most = max(lacking, key=lambda why: why.figures.get("n_more") or 0)
+            goes_on = (f"{most.subject}: " if len(self._guides) > 1 else "") + most.sentence
         return self._monitor.state(
             self._n_captures,
             is_enough=self._is_enough(),
             has_ended=has_ended,
             last_capture=self._asked[-1].name if self._asked and not has_ended else "",
-            goes_on="" if has_ended else self._explain(),
+            goes_on=goes_on,
         )
-
-    def _explain(self) -> str:
-        """Say why it goes on, by the guide that needs most captures."""
-        lacking = [why for guide in self._guides if (why := guide.explain()) is not None]
-        if not lacking:
-            return ""
-        most = max(lacking, key=lambda why: why.figures.get("n_more") or 0)
-        return (f"{most.subject}: " if len(self._guides) > 1 else "") + most.sentence
 
     def _active_guide(self, detection: BoardDetection) -> Guide:
         """Pick the guide to show: among cameras that see the board, the one with fewest captures.
