@@ -15,6 +15,7 @@ from lce_rig.rig import Rig, load_rig
 from tests.io.events import encoders
 from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 from tests.io.events.encoders import listed, random_events
+from tests.io.events.test_files import WRITERS
 from tests.notes import has_note
 
 T0_US = 1_700_000_000_000_000
@@ -88,6 +89,12 @@ def test_frames_out_of_order_are_left_out_and_counted(tmp_path: Path, rig: Rig) 
     recording = opened(path, rig)
     assert len(images_of(recording)) == 2
     assert has_note(recording.notes, "a.aedat4", "frames: 1 out")
+
+
+@pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.raw", "a.txt"])
+def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path: Path, rig: Rig, name: str) -> None:
+    WRITERS[name](tmp_path / name, EVENTS)
+    assert len(events_of(opened(tmp_path / name, rig))) == len(EVENTS)
 
 
 def test_serial_numbers_in_heads_of_files_are_told(tmp_path: Path, rig: Rig) -> None:
