@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from wire.vlp16_packets import SensorPacket, Vlp16Clock
+from wire.vlp16_packets import SensorPacket, Vlp16Clock, free_ports
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
@@ -27,14 +27,6 @@ from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of, room_scans, settin
 
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"
 PATIENT_S = 10.0
-
-
-def free_ports() -> tuple[int, int]:
-    kind = socket.AF_INET, socket.SOCK_DGRAM
-    with socket.socket(*kind) as data, socket.socket(*kind) as position:
-        data.bind(("", 0))
-        position.bind(("", 0))
-        return data.getsockname()[1], position.getsockname()[1]
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets
+from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, free_ports
 
 from lce_rig.core import velodyne
 from lce_rig.core.board import Board
@@ -60,14 +60,6 @@ class Vlp16Sender(threading.Thread):
                     time.sleep(max(0.0, (packet.sent_ns - time.time_ns()) * 1e-9 - 0.001))
                     sender.sendto(packet.payload, (HERE, self._ports[packet.port]))
                 stamp_ns += STREAMED_VLP16.period_ns
-
-
-def free_ports() -> tuple[int, int]:
-    kind = socket.AF_INET, socket.SOCK_DGRAM
-    with socket.socket(*kind) as data, socket.socket(*kind) as position:
-        data.bind(("", 0))
-        position.bind(("", 0))
-        return data.getsockname()[1], position.getsockname()[1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from lce_rig.rig import Rig, dump_rig, load_rig
 from wire.reel import Reel
+from wire.vlp16_packets import free_ports
 
 _TESTS = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{_TESTS}:{_TESTS.parent}", "OMP_NUM_THREADS": "1"}
@@ -36,15 +36,6 @@ def small_rig(*, is_guided: bool = True) -> Rig:
             "quality": quality,
         }
     )
-
-
-def free_ports() -> tuple[int, int]:
-    """Find two UDP ports that nobody uses."""
-    kind = socket.AF_INET, socket.SOCK_DGRAM
-    with socket.socket(*kind) as data, socket.socket(*kind) as position:
-        data.bind(("", 0))
-        position.bind(("", 0))
-        return data.getsockname()[1], position.getsockname()[1]
 
 
 class WireRig:

@@ -1,5 +1,6 @@
 """Scans as VLP-16 packets: data packets, and position packets with PPS and NMEA."""
 
+import socket
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 
@@ -181,6 +182,15 @@ class Vlp16Packets:
 
     def _count_us(self, time_ns: int) -> int:
         return (time_ns // 1000 + self.clock.error_us) % velodyne.HOUR_US
+
+
+def free_ports() -> tuple[int, int]:
+    """Find two UDP ports that nobody uses."""
+    kind = socket.AF_INET, socket.SOCK_DGRAM
+    with socket.socket(*kind) as data, socket.socket(*kind) as position:
+        data.bind(("", 0))
+        position.bind(("", 0))
+        return data.getsockname()[1], position.getsockname()[1]
 
 
 def gprmc(time_ns: int, is_valid: bool = True) -> str:
