@@ -7,7 +7,6 @@ from lce_rig.core.findings import Finding, Kind, Stage
 MOVE_SLOWLY = "move the board sideways slowly, about 10 cm/s, from 1 s before the capture"
 _SLOWER = "move it slower, about 10 cm/s"
 _CORNERS = "{n_cols}x{n_rows} inner corners"
-_OTHER = _CORNERS + " expected, {n_cols_seen}x{n_rows_seen} detected"
 _WHOLE = "show the whole pattern, uncovered; inner corners are where four squares meet, one less than squares"
 _UNCOVER = "uncover the whole pattern; if it has these corners, correct board.inner_corners in the profile"
 _FOCUS = "hold the board still, expose shorter, come closer, focus the lens"
@@ -22,6 +21,13 @@ def _flicker(finding: Finding) -> str:
     frequency_hz = finding.figures["frequency_hz"]
     rhythm = f" at {frequency_hz:.0f} Hz" if frequency_hz else ""
     return f"most events come from light that flickers{rhythm}"
+
+
+def _other_grid(finding: Finding) -> str:
+    """{n_cols}x{n_rows} inner corners expected, {n_cols_seen}x{n_rows_seen} or a part detected."""
+    at = finding.figures
+    seen = f"{at['n_cols_seen']}x{at['n_rows_seen']}" if "n_cols_seen" in at else "a part of a pattern"
+    return f"{at['n_cols']}x{at['n_rows']} inner corners expected, {seen} detected"
 
 
 def _lost(finding: Finding) -> str:
@@ -92,25 +98,26 @@ IMAGE_NO_BOARD = Kind(
 )
 IMAGE_UNCLEAR = Kind(
     "image.unclear",
-    "the " + _CORNERS + " are too unclear to measure",
+    "the corners are too unclear to measure (" + _CORNERS + " expected)",
     "hold the board still, closer and better lit",
     actions={"events": f"{MOVE_SLOWLY}; come closer"},
 )
 IMAGE_CUT_OFF = Kind(
     "image.cut_off",
-    "board cut off by the {side} border: " + _OTHER,
+    "board cut off by the {side} border: not all of the " + _CORNERS + " detected",
     "move the board away from the {side} border",
 )
-IMAGE_PART = Kind("image.part", _OTHER, _UNCOVER, actions={"events": f"{MOVE_SLOWLY}; {_UNCOVER}"})
+IMAGE_PART = Kind("image.part", _other_grid, _UNCOVER, actions={"events": f"{MOVE_SLOWLY}; {_UNCOVER}"})
 IMAGE_PART_OF_SMALL = Kind(
     "image.part_of_small",
-    "squares of {square_px:.1f} px are too small (minimum {min_square_px:g} px): "
-    "{n_cols_seen}x{n_rows_seen} of " + _CORNERS + " detected",
+    "squares of {square_px:.1f} px are too small (minimum {min_square_px:g} px): not all of the "
+    + _CORNERS
+    + " detected",
     "come closer, by {closer_share:percent} of the distance or more",
 )
 IMAGE_OTHER_BOARD = Kind(
     "image.other_board",
-    _OTHER,
+    _other_grid,
     "correct board.inner_corners in the profile: one less than squares along each side",
 )
 IMAGE_LOW_CONTRAST = Kind(

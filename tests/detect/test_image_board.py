@@ -234,7 +234,7 @@ def test_wrong_inner_corners_are_named_with_those_seen(
 def test_a_board_of_which_a_part_is_found_because_it_is_far_is_refused_for_its_squares() -> None:
     pixels = draw(SYMMETRIC, DAVIS, looking(40, 80, 45, (0, 0, 5.2)), seed=2, blur_px=1.2)
     refusal = refused(pixels, SYMMETRIC, DAVIS)
-    assert refusal.code == "image.part_of_small"
+    assert refusal.code == "image.part_of_small" and "n_cols_seen" not in refusal.figures
     facing_px = DAVIS.fx_px * SYMMETRIC.square_m / 5.2
     assert facing_px * np.cos(np.radians(40)) < refusal.figure("square_px") < facing_px
     assert refusal.figure("min_square_px") == 5.0
@@ -245,6 +245,8 @@ def test_a_board_cut_off_by_the_border_is_said_to_be() -> None:
     pixels = draw(SYMMETRIC, shifted, looking(5, 0, 5, (0.0, 0.0, 1.8)))
     refusal = refused(pixels, SYMMETRIC, shifted)
     assert (refusal.code, refusal.figures["side"]) == ("image.cut_off", "right")
+    # A part of a pattern says nothing about the number of its corners.
+    assert "n_cols_seen" not in refusal.figures
 
 
 @pytest.mark.long

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
-from lce_rig.core.findings import Refusal
+from lce_rig.core.findings import Figure, Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageQuality
 from lce_rig.detect.findings import (
@@ -28,6 +28,8 @@ from lce_rig.detect.image.saddle import Crossings
 _EDGE_WIDTH_PER_SIGMA = 2.56
 LEAST_SQUARE_PX = 5.0
 """Least side of a square, foreshortened by the tilt, from which corners are found without fail."""
+# The outer squares of a line that is not on the board are all alike.
+_MIN_OUTER_CONTRAST = 0.35
 # Wider images are searched at this width at most.
 _SEARCHED_PX = 1280
 
@@ -83,6 +85,12 @@ def extent(grey: NDArray[np.uint8], grid_px: Array) -> tuple[float, bool]:
     return min(outer), is_beyond
 
 
+def is_whole(grey: NDArray[np.uint8], grid_px: Array) -> bool:
+    """Tell whether a grid of corners is a whole pattern, and so its number of corners that of a board."""
+    outer_contrast, goes_on = extent(grey, grid_px)
+    return outer_contrast >= _MIN_OUTER_CONTRAST and not goes_on
+
+
 def _widened(grid_px: Array) -> Array:
     """Extrapolate one more line of corners on every side."""
     wide = np.concatenate(
@@ -128,6 +136,8 @@ def explain_other_grid(
 ) -> Refusal:
     """Say that another grid of corners is in the image than the profile's, or only a part of it is found.
 
+    The number of corners detected is stated only if they are a whole pattern.
+
     Args:
         grey: (H, W) the image.
         board: the board wanted.
@@ -140,7 +150,7 @@ def explain_other_grid(
     # The grid turned the way that is nearer to the board.
     turned = ((cols, rows), (rows, cols))
     seen = min(turned, key=lambda size: abs(size[0] - wanted[0]) + abs(size[1] - wanted[1]))
-    figures = {"n_cols": wanted[0], "n_rows": wanted[1], "n_cols_seen": seen[0], "n_rows_seen": seen[1]}
+    figures: dict[str, Figure] = {"n_cols": wanted[0], "n_rows": wanted[1]}
     action = "events" if is_from_events else ""
     if seen == wanted:
         return IMAGE_UNCLEAR.refusal(action=action, **figures)
@@ -152,13 +162,15 @@ def explain_other_grid(
     square = max(float(np.linalg.norm(np.diff(seen_px, axis=axis), axis=-1).max()) for axis in (0, 1))
     if is_part and to_border[side] < 1.5 * square:
         return IMAGE_CUT_OFF.refusal(**figures, side=side)
+    if is_whole(grey, seen_px):
+        figures |= {"n_cols_seen": seen[0], "n_rows_seen": seen[1]}
     if is_part:
         least_px = max(LEAST_SQUARE_PX * max(1.0, width / _SEARCHED_PX), min_square_px)
         square_px = square_size_px(grey, board.cols * board.rows)
         if square_px < least_px:
             closer_share = 1 - square_px / least_px
-            size = {"square_px": square_px, "min_square_px": least_px, "closer_share": closer_share}
-            return IMAGE_PART_OF_SMALL.refusal(**figures, **size)
+            figures |= {"square_px": square_px, "min_square_px": least_px, "closer_share": closer_share}
+            return IMAGE_PART_OF_SMALL.refusal(**figures)
         # A pattern that goes on beyond the corners found is neither covered nor another one.
         kind = IMAGE_UNCLEAR if extent(grey, seen_px)[1] else IMAGE_PART
         return kind.refusal(action=action, **figures)

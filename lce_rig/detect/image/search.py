@@ -26,8 +26,8 @@ from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
 from lce_rig.detect.image.quality import (
     explain_absence,
     explain_other_grid,
-    extent,
     grid_quality,
+    is_whole,
     quality_problem,
 )
 from lce_rig.detect.image.saddle import Crossings, fit_crossings
@@ -51,8 +51,6 @@ _FOLLOWED_SAMPLES = 13
 _RESTING_PX = 0.5
 # A grid of corners with a smaller measurable fraction is rejected.
 _MIN_FITTED = 0.5
-# The outer squares of a line that is not on the board are all alike.
-_MIN_OUTER_CONTRAST = 0.35
 
 
 def find_image_board(
@@ -105,8 +103,7 @@ def find_image_board(
     if crossings is None or np.mean(crossings.is_fitted) < _MIN_FITTED:
         return explain_absence(grey, board, is_from_events, min_square_px)
     quality = grid_quality(grey, crossings)
-    outer_contrast, goes_on = extent(grey, crossings.grid_px)
-    if outer_contrast < _MIN_OUTER_CONTRAST or goes_on:
+    if not is_whole(grey, crossings.grid_px):
         seen = seen_grid(grey)
         seen = crossings.grid_px if seen is None else seen
         return explain_other_grid(grey, board, seen, is_from_events, min_square_px)
@@ -227,8 +224,7 @@ def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> C
         return None
     fitted_px = crossings.grid_px.reshape(-1, 2)
     is_in_order = np.array_equal(order_corners(grey, fitted_px, board), fitted_px)
-    outer_contrast, goes_on = extent(grey, crossings.grid_px)
-    return crossings if is_in_order and outer_contrast >= _MIN_OUTER_CONTRAST and not goes_on else None
+    return crossings if is_in_order and is_whole(grey, crossings.grid_px) else None
 
 
 def _find_in_region(
