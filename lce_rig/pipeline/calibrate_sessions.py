@@ -18,7 +18,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.core.progress import Progress, begin, silent
-from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
+from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection
 from lce_rig.export.reference import Reference
 from lce_rig.judge.repeatability import Repeatability, compare_calibrations
 from lce_rig.judge.verdict import with_opinion
@@ -91,7 +91,10 @@ def calibrate(
     judged = []
     for c in pairs:
         # The scene of the first session that holds captures of these sensors.
-        name = next(name for name in named if Pair.of(c) in by_name[name].pairs)
+        sensors = c.camera, c.lidar
+        name = next(
+            name for name in named if any((p.camera, p.lidar) == sensors for p in by_name[name].pairs)
+        )
         opinion = hear_scene(named[name], by_name[name], by_boards(c))
         agreement = agreements.get((c.camera, c.lidar), ())
         judged.append(with_opinion(replace(c, findings=(*c.findings, *agreement)), opinion))

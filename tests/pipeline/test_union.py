@@ -141,3 +141,15 @@ def test_sessions_without_a_scene_keep_the_result_of_the_boards(make):
     (both,) = lce.calibrate(sessions, found, options=FAST, use_scene=True).pairs
     assert (both.scene_share.state, both.scene_share.n_captures) == ("unknown", 0)
     np.testing.assert_array_equal(both.cov, by_boards.cov)
+
+
+def test_channels_of_one_camera_give_one_result_of_one_session_and_of_several(make):
+    text = set_value(TEXT, "cameras.cam.channels.events", "{kind: events}")
+    sessions, both = [make("monday", text), make("tuesday", text)], []
+    for seed in (0, 1):
+        detections = seen(12, seed)
+        images = detections.images["cam", "frames"]
+        both.append(Detections({("cam", name): images for name in ("frames", "events")}, detections.lidars))
+    (alone,) = lce.calibrate(sessions[0], both[0], options=FAST).pairs
+    (together,) = lce.calibrate(sessions, both, options=FAST).pairs
+    assert set(alone.channels) == set(together.channels) == {"frames", "events"}
