@@ -100,7 +100,8 @@ def test_a_camera_whose_command_writes_no_pictures_is_named_where_nothing_was_ca
     rig = wire()
     command = ("sh", "-c", "while :; do echo this is no picture; sleep 0.1; done")
     camera = rig.rig.cameras["cam"]
-    broken = camera.model_copy(update={"driver": camera.driver.model_copy(update={"command": command})})
+    driver = camera.driver.model_copy(update={"command": command, "pixel_format": None})
+    broken = camera.model_copy(update={"driver": driver})
     rig.profile.write_text(dump_rig(rig.rig.model_copy(update={"cameras": {"cam": broken}})))
     with Collecting(rig.profile, tmp_path / "session", "--timeout", "3") as collecting:
         assert collecting.wait() == 6
