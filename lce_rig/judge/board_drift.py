@@ -1,4 +1,8 @@
-"""What boards in view say about deployed extrinsics: `verify`'s residuals, axis by axis."""
+"""What boards in view say about deployed extrinsics: `verify`'s residuals, axis by axis and all together.
+
+Pitch and height hide each other axis by axis: boards at one distance allow either. All six axes together have
+the change x with covariance C, of the boards and the deployed extrinsics, and x^T C^-1 x is chi-squared.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,11 +12,11 @@ import numpy as np
 
 from lce_rig.calibrate import Clocks
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
-from lce_rig.calibrate.result import capture_residual, summarise
+from lce_rig.calibrate.result import capture_residual, lever_arm, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, perturb
+from lce_rig.core.geometry import Array, perturb, tangent_sizes
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.local_quadratic import SCALE, expand
@@ -20,12 +24,72 @@ from lce_rig.judge.session_check import find_meetings
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State
-from lce_rig.scene.findings import BOARD_CHANGED, BOARD_UNSURE
+from lce_rig.scene.findings import BOARD_CHANGED, BOARD_CHANGED_JOINTLY, BOARD_HIDES, BOARD_UNSURE
 
 # What results of one rig differ by from session to session, m and rad, order of AXES.
 _BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.12, 0.10, 0.12])])
 _OUTLIER = 3.0  # times the median residual
 _MIN_PLACEMENTS = 3  # The scatter of fewer says little.
+# Six axes together changed beyond this, 99.9 % of the chi-squared distribution with six degrees of freedom.
+_CHANGED_CHI2 = 22.46
+# Axes of a joint change are those that moved by so many of their own standard deviations, or the farthest.
+_NAMED_SIGMAS = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class JointDrift:
+    """The change of all six axes together.
+
+    Attributes:
+        change: (6,) tangent (translation m, rotation rad).
+        cov: (6, 6) of it, the deployed extrinsics' own included.
+        lever_m: rms distance of the boards, which makes angles comparable with distances.
+    """
+
+    change: Array
+    cov: Array
+    lever_m: float
+
+    @property
+    def chi2(self) -> float:
+        """Squared Mahalanobis distance of the change."""
+        return float(self.change @ np.linalg.solve(self.cov, self.change))
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether the change is significant."""
+        return self.chi2 > _CHANGED_CHI2
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes that moved; none without a significant change."""
+        if not self.is_changed:
+            return ()
+        sizes = np.abs(self.change) / np.sqrt(np.diag(self.cov))
+        return tuple(np.array(AXES)[sizes >= min(_NAMED_SIGMAS, sizes.max())].tolist())
+
+    @property
+    def finding(self) -> Finding:
+        """The change, as a finding."""
+        rotation_deg, translation_m = tangent_sizes(self.change)
+        sigmas = float(np.sqrt(self.chi2))
+        return BOARD_CHANGED_JOINTLY(
+            axes=self.axes, rotation_deg=rotation_deg, translation_m=translation_m, sigmas=sigmas
+        )
+
+    @property
+    def hidden(self) -> Finding:
+        """The largest change that the boards would not show, along the direction that they know least."""
+        scale = np.r_[np.ones(3), np.full(3, self.lever_m)]
+        values, vectors = np.linalg.eigh(self.cov * np.outer(scale, scale))
+        # A shift of the mean by this much exceeds the threshold in about 95 % of trials.
+        size = np.sqrt(_CHANGED_CHI2) + POWER_SIGMAS
+        rotation_deg, translation_m = tangent_sizes(size * np.sqrt(values[-1]) * vectors[:, -1] / scale)
+        weights = np.abs(vectors[:, -1])
+        turn, shift = AXES[3 + int(np.argmax(weights[3:]))], AXES[int(np.argmax(weights[:3]))]
+        return BOARD_HIDES(
+            rotation_deg=rotation_deg, translation_m=translation_m, rotation=turn, translation=shift
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +102,14 @@ class BoardDrift:
         metrics: residuals of the deployed extrinsics, as `verify` has them.
         n_boards: captures in which both sensors see the board.
         n_placements: places at which it was held.
+        joint: the change of all axes together.
     """
 
     axes: tuple[AxisDrift, ...]
     metrics: Metrics
     n_boards: int
     n_placements: int
+    joint: JointDrift
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
@@ -53,16 +119,23 @@ class BoardDrift:
             "mpe_m": self.metrics.mpe_m,
             "mee_m": self.metrics.mee_m,
             "axes": [axis.document() for axis in self.axes],
+            "joint": {
+                "change": self.joint.change.tolist(),
+                "covariance": self.joint.cov.tolist(),
+                "chi2": self.joint.chi2,
+            },
         }
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Axes that the boards find changed, or cannot tell."""
-        return tuple(
+        """All axes together, axes that the boards find changed or cannot tell, and what they hide."""
+        joint = (self.joint.finding,) if self.joint.is_changed else ()
+        axes = tuple(
             (BOARD_CHANGED if axis.state == "changed" else BOARD_UNSURE)(axis.axis, **axis.figures)
             for axis in self.axes
             if axis.state != "unchanged"
         )
+        return (*joint, *axes, self.joint.hidden)
 
 
 def watch_boards(
@@ -110,7 +183,17 @@ def watch_boards(
         moved = perturb(calibration.T_cam_lidar, alone[first].optimum()[0] * np.eye(6)[first])
         rest = _expand(seen, board, moved, lidar)
         axes = [axes[axis] if axis == first else _judge(axis, rest, float(sigmas[axis])) for axis in range(6)]
-    return BoardDrift(tuple(axes), summarise(residuals), len(seen), len(cost.groups))
+    joint = JointDrift(*_change_of_all(cost, calibration.cov), lever_arm(seen))
+    return BoardDrift(tuple(axes), summarise(residuals), len(seen), len(cost.groups), joint)
+
+
+def _change_of_all(cost: Quadratics, cov_deployed: Array) -> tuple[Array, Array]:
+    """Estimate the change (6,) of all axes and its covariance (6, 6), by residuals or jackknife if wider."""
+    change, cov = cost.optimum()[:6], cost.covariance()[:6, :6]
+    without_each = cost.without_each()[:, :6]
+    scatter = jackknife_scatter(without_each - without_each.mean(axis=0))
+    wider = max(float(np.trace(np.linalg.solve(cov, scatter))) / 6, 1.0)
+    return change, wider * cov + cov_deployed + np.diag(_BIAS**2)
 
 
 def _alone(cost: Quadratics, axis: int) -> Quadratics:

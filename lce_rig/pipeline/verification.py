@@ -5,12 +5,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from lce_rig.calibrate import Clocks
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.progress import Progress, silent
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.detect.events.search import EventImage
+from lce_rig.judge.board_drift import watch_boards
 from lce_rig.judge.session_check import SessionCheck, check_session
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import detect, event_channels, event_picture
@@ -26,6 +29,7 @@ from lce_rig.pipeline.result_files import (
     stored_results,
 )
 from lce_rig.pipeline.witness import hear_scene
+from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.session import DEBUG
 from lce_rig.show.overlays.overlay import ImageWithEvents
@@ -149,14 +153,33 @@ def verify(
     for c in calibrations:
         scene, clocks = hear_scene(session, detections, c), clocks_of(session.rig, c.camera, c.lidar)
         for channel in sorted(c.channels):
-            if Pair(c.camera, channel, c.lidar) in detections.pairs:
-                checks.append(check_session(session.rig, detections, c, channel, clocks, scene))
+            pair = Pair(c.camera, channel, c.lidar)
+            if pair in detections.pairs:
+                check = check_session(session.rig, detections, c, channel, clocks, scene)
+                # A result of this session has been judged by these boards.
+                if not c.captures_used:
+                    check = _with_boards(session.rig, detections, check, clocks)
+                checks.append(check)
     if not checks:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
         raise SessionError(f"{session.path} holds no captures of {wanted}", "Check the result's session.")
     return Verification(
         session, tuple(checks), tuple(calibrations), detections, event_image, own_result, name
     )
+
+
+def _with_boards(rig: Rig, detections: Detections, check: SessionCheck, clocks: Clocks) -> SessionCheck:
+    """Add what boards say of the six axes together: residuals hide a rotation that a translation undoes."""
+    pair = check.pair
+    images, scans = {}, {}
+    for name in detections.captures(pair):
+        image, scan = detections.of(pair, name)
+        if isinstance(image, ImageBoard) and isinstance(scan, list):
+            images[name], scans[name] = image, scan
+    board = watch_boards(rig, check.calibration, pair.channel, images, scans, clocks)
+    if board is None or not board.joint.is_changed:
+        return check
+    return replace(check, findings=(board.joint.finding, *check.findings))
 
 
 def _extrinsics(

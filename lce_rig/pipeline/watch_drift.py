@@ -29,6 +29,7 @@ from lce_rig.scene.findings import (
     CHANGED_WITH_BOARD,
     CLOCKS_APART,
     CLOCKS_INSTEAD,
+    CONTRADICTION,
     EVENTS_OF_STANDING_RIG,
     NO_FIRING_TIMES,
     NO_SAMPLES,
@@ -64,15 +65,34 @@ class PairDrift:
 
     @property
     def states(self) -> dict[str, State]:
-        """Both opinions on each axis: changed if either says so, unchanged if either covers it."""
+        """Both opinions on each axis: unchanged if either covers it, unknown where they contradict.
+
+        A change is what one of them finds and the other does not refute; or the boards in all axes together.
+        """
         scene = {axis.axis: axis.state for axis in self.drift.axes}
         if self.board is None:
             return scene
         order: tuple[State, ...] = ("changed", "unchanged", "unknown")
-        return {
+        states = {
             axis.axis: next(state for state in order if state in (scene[axis.axis], axis.state))
             for axis in self.board.axes
         }
+        states |= dict.fromkeys((each.subject for each in self.contradictions), "unknown")
+        return states | dict.fromkeys(self.board.joint.axes, "changed")
+
+    @property
+    def contradictions(self) -> list[Finding]:
+        """Axes that one of both finds changed, and the other measured to be nearer to unchanged."""
+        found = []
+        for scene, board in zip(self.drift.axes, () if self.board is None else self.board.axes, strict=False):
+            pair = {scene.state: scene, board.state: board}
+            if pair.keys() != {"changed", "unchanged"}:
+                continue
+            change, other = pair["changed"].change, pair["unchanged"].change
+            if abs(other) < abs(other - change):
+                figures = {f"board_{scene.unit}": board.change, f"board_sigma_{scene.unit}": board.sigma}
+                found.append(CONTRADICTION(scene.axis, **scene.figures, **figures))
+        return found
 
     @property
     def state(self) -> State:
@@ -101,7 +121,7 @@ class PairDrift:
         """The verdict first, then the scene's opinion on each axis and what is missing, then the board's."""
         if self.board is None:
             return self.drift.findings
-        return (self.summary, *self.drift.findings, *self.board.findings)
+        return (self.summary, *self.contradictions, *self.drift.findings, *self.board.findings)
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
@@ -114,6 +134,7 @@ class PairDrift:
             "n_captures": self.drift.n_captures,
             "n_edges": self.drift.n_edges,
             "axes": [axis.document() for axis in self.drift.axes],
+            "contradictions": [each.subject for each in self.contradictions],
             "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
             "T_cam_lidar_best": self.drift.T_best.tolist(),
             "covariance_best": None if self.drift.cov_best is None else self.drift.cov_best.tolist(),

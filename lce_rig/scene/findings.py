@@ -30,6 +30,17 @@ def _board_unsure(finding: Finding) -> str:
     return f"board, {axis}: changes below {_size(finding, 'smallest')} would not be seen"
 
 
+def _contradiction(finding: Finding) -> str:
+    """Scene {change_deg} or {change_m} +- {sigma_deg}, {sigma_m}, boards {board_deg}, {board_sigma_deg}.
+
+    Or {board_m}, {board_sigma_m}.
+    """
+    axis = fill("{subject:motion}", {"subject": finding.subject})
+    scene = f"{_size(finding, 'change', '+')} +- {_size(finding, 'sigma')}"
+    board = f"{_size(finding, 'board', '+')} +- {_size(finding, 'board_sigma')}"
+    return f"scene and boards contradict each other, {axis}: scene {scene}, boards {board}"
+
+
 def _axis_unchanged(finding: Finding) -> str:
     """No change of {smallest_m} or {smallest_deg}; {change_m}, {change_deg}, {sigma_m}, {sigma_deg}."""
     axis = fill("{subject:motion}", {"subject": finding.subject})
@@ -81,7 +92,25 @@ UNKNOWN_WITH_BOARD = Kind(
     severity="warning",
 )
 BOARD_CHANGED = Kind("scene.board_changed", _board_changed)
+BOARD_CHANGED_JOINTLY = Kind(
+    "scene.board_changed_jointly",
+    "boards: all axes together changed by {rotation_deg:deg}, {translation_m:mm}, {sigmas:.1f} standard "
+    "deviations: {axes:motion}",
+    _FASTEN,
+)
+BOARD_HIDES = Kind(
+    "scene.board_hides",
+    "boards: {rotation:motion} by {rotation_deg:deg} with {translation:motion} by {translation_m:mm}, "
+    "or less, would not be seen",
+    severity="note",
+)
 BOARD_UNSURE = Kind("scene.board_unsure", _board_unsure, "hold the board at more places", severity="note")
+CONTRADICTION = Kind(
+    "scene.contradiction",
+    _contradiction,
+    "check clocks and intrinsics, and collect a session with the board",
+    severity="warning",
+)
 NO_SAMPLES = Kind(
     "scene.no_samples",
     "no image or events of {subject} within the tolerance of a scan of {lidar}",

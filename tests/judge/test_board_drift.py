@@ -1,0 +1,71 @@
+"""Boards in view judge deployed extrinsics in all six axes together, and beside the scene."""
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import Clocks
+from lce_rig.core.calibration import Calibration, Metrics
+from lce_rig.core.geometry import Array, perturb
+from lce_rig.judge.board_drift import BoardDrift, JointDrift, watch_boards
+from lce_rig.pipeline.watch_drift import PairDrift
+from lce_rig.rig import load_rig
+from lce_rig.scene.alignment import AXES
+from lce_rig.scene.drift import AxisDrift, Drift, State
+from tests.calibrate.boards import T_FORWARD, Scenario, simulate
+from tests.saved_results import made_calibration
+
+RIG = load_rig("rlfs")
+SIGMAS = np.r_[np.full(3, 0.004), np.radians([0.08, 0.08, 0.04])]
+
+
+def deployed(change: Array) -> Calibration:
+    return made_calibration(perturb(T_FORWARD, change), np.diag(SIGMAS**2))
+
+
+def watched(calibration: Calibration, seed: int) -> BoardDrift:
+    boards = simulate(15, seed, Scenario(laser_bias_sigma_m=0.008, footprint_m=0.006))
+    images = {board.capture: board.image for board in boards}
+    scans = {board.capture: [board.lidar] for board in boards}
+    found = watch_boards(RIG, calibration, "frames", images, scans, Clocks())
+    assert found is not None
+    return found
+
+
+def test_a_rotation_that_a_translation_hides_axis_by_axis_is_seen_jointly() -> None:
+    hidden = np.array([0, 0.05, 0, np.radians(1.01), 0, 0])
+    for seed in range(3):
+        board = watched(deployed(hidden), seed)
+        assert board.joint.is_changed
+        assert {"translation_y", "rotation_x"} & set(board.joint.axes)
+        assert "scene.board_changed_jointly" in [finding.code for finding in board.findings]
+
+
+def test_extrinsics_that_hold_are_not_doubted_jointly() -> None:
+    for seed in range(12):
+        board = watched(deployed(np.zeros(6)), seed)
+        assert (board.joint.is_changed, board.joint.axes) == (False, ())
+        # What boards cannot see is a note.
+        assert [f.severity for f in board.findings if f.code == "scene.board_hides"] == ["note"]
+
+
+def axes(states: dict[str, tuple[State, float]]) -> tuple[AxisDrift, ...]:
+    found = []
+    for axis in AXES:
+        state, change = states.get(axis, ("unchanged", 0.0))
+        found.append(AxisDrift(axis, state, change, 0.16, 0.7))
+    return tuple(found)
+
+
+@pytest.mark.parametrize(("board_deg", "state"), [(0.10, "unknown"), (0.45, "changed")])
+def test_boards_refute_or_confirm_a_change_that_the_scene_sees(board_deg: float, state: State) -> None:
+    calibration = deployed(np.zeros(6))
+    scene = axes({"rotation_z": ("changed", 0.54)})
+    drift = Drift(scene, (), T_FORWARD, T_FORWARD, None, {}, 15, 4000)
+    joint = JointDrift(np.zeros(6), np.diag(SIGMAS**2), 2.5)
+    boards = BoardDrift(
+        axes({"rotation_z": ("unchanged", board_deg)}), Metrics(0.01, 0.01, 0.1), 15, 15, joint
+    )
+    pair = PairDrift(calibration, drift, boards, None)
+    assert (pair.states["rotation_z"], pair.state) == (state, state)
+    contradicts = [finding.subject for finding in pair.findings if finding.code == "scene.contradiction"]
+    assert contradicts == (["rotation_z"] if state == "unknown" else [])
