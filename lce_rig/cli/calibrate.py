@@ -10,6 +10,7 @@ import numpy as np
 
 import lce_rig as lce
 from lce_rig.cli import show
+from lce_rig.cli.captures import put_aside
 from lce_rig.cli.options import (
     cameras_option,
     event_image_option,
@@ -37,19 +38,18 @@ from lce_rig.session.provenance import provenance_of
 _AXES = ("x right", "y down", "z forward")
 _OPINIONS = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
 _UNITS = {"deg": "deg", "m": "mm"}
+# Reasons that are printed without --explain, and the distance of the point whose uncertainty is.
+_N_REASONS, _FAR_M = 3, 10.0
 
 
 def uncertainty_lines(c: Calibration) -> list[str]:
     """State extrinsics's standard deviations, by axis and for points at several distances."""
 
-    def by_axis(values: Array, digits: str) -> str:
-        return ", ".join(f"{axis} {value:{digits}}" for axis, value in zip(_AXES, values, strict=True))
-
     sigmas = np.sqrt(np.diag(c.cov))
     lines = [
         f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
-        f"               about {by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
-        f"               along {by_axis(1000 * sigmas[:3], '.1f')} mm",
+        f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
+        f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
     ]
     if c.scene_share is not None and c.scene_share.state == "used":
         sigma_deg, sigma_m = sigma_sizes(c.scene_share.cov_boards)
@@ -65,6 +65,10 @@ def uncertainty_lines(c: Calibration) -> list[str]:
         for title, cells in rows.items():
             lines.append(f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip())
     return lines
+
+
+def _by_axis(values: Array, digits: str) -> str:
+    return ", ".join(f"{axis} {value:{digits}}" for axis, value in zip(_AXES, values, strict=True))
 
 
 def scene_texts(opinion: SceneOpinion) -> list[str]:
@@ -183,6 +187,13 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
     "[default of several sessions: union].",
 )
 @robot_option
+@click.option(
+    "--without",
+    callback=split_names,
+    metavar="CAPTURE[,CAPTURE]",
+    help="Reject these captures first, as `lce-rig captures --reject` does; --restore there takes them back.",
+)
+@click.option("--explain", is_flag=True, help="Print everything that was estimated and tested.")
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
 @click.option("--no-report", is_flag=True, help="Do not write report.html.")
@@ -195,6 +206,8 @@ def calibrate(
     use_scene: bool,
     name: str | None,
     robot: str | None,
+    without: list[str] | None,
+    explain: bool,
     as_json: bool,
     force: bool,
     no_report: bool,
@@ -216,6 +229,10 @@ def calibrate(
     paths = sessions or (Path("session"),)
     name = UNION if name is None and len(paths) > 1 else name
     new_result_parts(name)
+    if without:
+        if len(paths) > 1:
+            raise UsageError("--without applies to one session", "Reject them by: lce-rig captures SESSION")
+        put_aside(paths[0], without, "calibrate --without")
     opened = [lce.Session.open(path) for path in paths]
     require_unit(opened)
     for each in opened:
@@ -255,39 +272,41 @@ def calibrate(
         show.warn(f"{reference} has no T_cam_lidar for these sensors")
     # The result is on the disk and on the screen before its report is drawn, which takes about as long.
     written = result.write(name=name, force=force, report=False)
-    _show(result, written, as_json=as_json)
+    _show(result, written, is_explained=explain, as_json=as_json)
     lacking = _lacking(wanted, {pair.camera for each in detections for pair in each.pairs}, result.pairs)
     if lacking is not None and any(c.verdict == "fail" for c in result.pairs):
         show.warn(str(lacking))
     if not no_report:
         with show.progress_bar("drawing the report"):
             page = result.write_report(name=name)
-        show.note(f"report: {page}")
+        show.note(f"  report       {page}")
+    if all(c.verdict != "fail" for c in result.pairs):
+        of_session = "" if paths[0] == Path("session") else f" {paths[0]}"
+        show.note(f"  next         lce-rig verify{of_session}{'' if name is None else f' --name {name}'}")
     exit_by_verdict(result.pairs, are_printed=not as_json)
     if lacking is not None:
         raise lacking
 
 
-def _show(result: Result, written: WrittenResult, *, as_json: bool) -> None:
+def _show(result: Result, written: WrittenResult, *, is_explained: bool, as_json: bool) -> None:
     """Print the extrinsics, and the files with them."""
     folder = written.files[0].parent
     if as_json:
         show.print_json(result.document())
     else:
         for calibration in result.pairs:
-            show.print_lines(_lines(calibration))
+            show.print_lines(_lines(calibration, is_explained=is_explained))
         for calibration in result.pairs:
             show.print_lines(camera_lines(calibration, result.pairs))
-        names = ", ".join(str(file.relative_to(folder)) for file in written.files)
-        show.note(f"written: {names} in {folder}")
+        others = f" and {len(written.files) - 1} for the robot" if len(written.files) > 1 else ""
+        show.note(f"  files        {folder}/: result.json{others}")
     for finding in written.findings:
         if finding.severity != "note":
             show.warn(finding.sentence)
-    if written.previous is not None:
-        if len(written.files) == 1 and written.has_usable_previous:
-            show.warn(f"this result is not exported; the last usable result is in {written.previous}")
-        else:
-            show.note(f"the result before it is in {written.previous}")
+    if written.previous is not None and len(written.files) == 1 and written.has_usable_previous:
+        show.warn(f"this result is not exported; the last usable result is in {written.previous}")
+    elif written.previous is not None and is_explained:
+        show.note(f"the result before it is in {written.previous}")
 
 
 def _lacking(
@@ -325,8 +344,53 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = 
         raise ResultRefusedError(f"failed: {pairs}; do not use this result", "" if are_printed else causes)
 
 
-def _lines(c: Calibration) -> list[str]:
-    colour, metrics = show.COLOURS[c.verdict], c.metrics
+def _lines(c: Calibration, *, is_explained: bool) -> list[str]:
+    """Tell the verdict, its reasons, the extrinsics and their uncertainty; explained, all that was tested."""
+    colour, has_failed = show.COLOURS[c.verdict], c.verdict == "fail"
+    following = consequences(c.findings)
+    reasons = [finding for finding in c.findings if finding.severity != "note"]
+    causes = [finding for finding in reasons if finding.code not in following]
+    lines = [f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]"]
+    for finding in reasons if is_explained else causes[:_N_REASONS]:
+        follows = "follows: " if finding.code in following else ""
+        lines.append(f"  [{colour}]{follows}{show.escape(finding.text)}[/]")
+        if finding.advice and not follows and (is_explained or finding is causes[0]):
+            lines.append(f"    -> {show.escape(finding.advice)}")
+    if len(causes) > _N_REASONS and not is_explained:
+        lines.append(f"  {show.counted(len(causes) - _N_REASONS, 'more reason')}: --explain, or report.html")
+    if is_explained or not has_failed:
+        lines += ["  T_cam_lidar (p_cam = R p_lidar + t)", *show.matrix_lines(c.T_cam_lidar, "    ")]
+    lines += uncertainty_lines(c) if is_explained else _short_uncertainty(c)
+    lines.append(f"  captures     {len(c.captures_used)} used of {c.n_captures}")
+    if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
+        lines.append(
+            f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
+        )
+    return lines + _explanation(c) if is_explained else lines
+
+
+def _short_uncertainty(c: Calibration) -> list[str]:
+    """State the standard deviations, by axis unless the result has failed, and those of a point 10 m away."""
+    sigmas = np.sqrt(np.diag(c.cov))
+    lines = [
+        f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)"
+    ]
+    if c.verdict == "fail":
+        return lines
+    lines += [f"    about      {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg"]
+    lines += [f"    along      {_by_axis(1000 * sigmas[:3], '.1f')} mm"]
+    for point in c.uncertainty:
+        if point.distance_m == _FAR_M:
+            lines.append(
+                f"  {_FAR_M:g} m away    a point is off by {point.centre_px:.1f} px, "
+                f"{100 * point.centre_m:.1f} cm; in a corner {point.corner_px:.1f} px"
+            )
+    return lines
+
+
+def _explanation(c: Calibration) -> list[str]:
+    """State residuals, certificate, channels, cameras, the scene, unused captures and notes."""
+    metrics = c.metrics
     held_out = f"held out {1000 * c.held_out_m:.1f} mm, " if math.isfinite(c.held_out_m) else ""
     certificate = f"none (method {c.method} has no certificate)"
     if math.isfinite(c.certificate.gap):
@@ -334,31 +398,17 @@ def _lines(c: Calibration) -> list[str]:
         certificate += " of Algorithm 1, where the estimate starts" if c.is_start_certified else ""
         certificate += f", gap {c.certificate.gap:.0e}"
     lines = [
-        f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]",
-        "  T_cam_lidar (p_cam = R p_lidar + t)",
-        *show.matrix_lines(c.T_cam_lidar, "    "),
-        *uncertainty_lines(c),
-        f"  captures     {len(c.captures_used)} used of {c.n_captures}, "
-        f"board found by both sensors in {c.n_detected}",
+        f"  detected     board found by both sensors in {c.n_detected}",
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
         f"{held_out}corners {metrics.reprojection_px:.2f} px",
         f"  certificate  {certificate}",
         *_titled("channels", _channel_texts(c)),
         *together_lines(c),
+        *_titled("scene", [] if c.scene is None else scene_texts(c.scene)),
     ]
-    if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
-        lines.append(
-            f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
-        )
-    lines += _titled("scene", [] if c.scene is None else scene_texts(c.scene))
     for name, why in c.captures_refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]")
-    following = consequences(c.findings)
-    for finding in c.findings:
-        follows = finding.code in following and finding.severity != "note"
-        text = f"  follows: {finding.text}" if follows else finding.sentence
-        lines.append(f"  [{colour}]{show.escape(text)}[/]")
-    return lines
+    return lines + [f"  {show.escape(note.sentence)}" for note in c.findings if note.severity == "note"]
 
 
 def _titled(title: str, texts: Sequence[str]) -> list[str]:

@@ -51,6 +51,19 @@ def captures(
         show.note(f"made from other captures: result {names}. Run `lce-rig calibrate` again")
 
 
+def put_aside(session: Path, names: Sequence[str], reason: str) -> None:
+    """Reject captures by name; those that are rejected already stay so.
+
+    Raises:
+        UsageError: a name is not that of a capture. Then none is rejected.
+    """
+    with lce.Session.open(session, writable=True) as opened:
+        names = sorted(set(map(_full, names)) - {capture.name for capture in opened.rejected})
+        _require_there(opened, set(names), set())
+        for name in names:
+            opened.reject(name, reason)
+
+
 def _full(name: str) -> str:
     """Return a capture's name with its leading zeros, which may be omitted."""
     return name.zfill(6) if name.isascii() and name.isdigit() else name

@@ -55,8 +55,8 @@ EXPORTS: dict[str, Format] = {
     "tf_static_bag": Format(
         "ros_bag:export_tf_static_bag", "tf_static/: a ROS 2 bag with latched /tf_static"
     ),
-    "kalibr": _usual("other_tools:export_kalibr", "camchain_LIDAR.yaml: Kalibr's camera chain"),
-    "autoware": _usual(
+    "kalibr": Format("other_tools:export_kalibr", "camchain_LIDAR.yaml: Kalibr's camera chain"),
+    "autoware": Format(
         "autoware:export_autoware",
         "sensor_kit_calibration.yaml, sensors_calibration.yaml: Autoware's individual_params",
     ),

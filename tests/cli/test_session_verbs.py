@@ -49,6 +49,24 @@ def test_calibrate_uses_the_scene_if_asked_and_keeps_the_result_of_the_boards_be
     assert share["n_captures"] == 16 and share["n_edges"] > 0
 
 
+def test_a_result_fits_twelve_lines_of_a_terminal_and_explains_itself_if_asked(lce_rig, calibrated):
+    brief = lce_rig("calibrate", calibrated)
+    lines = (brief.out + brief.err).splitlines()
+    assert brief.code == 0 and len(lines) <= 12
+    assert max(map(len, brief.out.splitlines())) <= 80
+    assert len(lce_rig("calibrate", calibrated, "--explain").out.splitlines()) > 12
+
+
+def test_without_rejects_captures_before_it_calibrates(lce_rig, calibrated):
+    assert lce_rig("calibrate", calibrated, "--without", "4,99").code == 2
+    assert not (calibrated / "rejected").exists()
+    for _ in range(2):
+        assert lce_rig("calibrate", calibrated, "--without", "4,000007", "--no-report").code == 0
+    used = read(calibrated / "calibration" / "result.json")["pairs"][0]["captures_used"]
+    assert len(used) == 14 and not {"000004", "000007"} & set(used)
+    assert lce_rig("calibrate", calibrated, calibrated, "--without", "1").code == 2
+
+
 def test_the_same_session_gives_the_same_bytes(lce_rig, calibrated):
     first = (calibrated / "calibration" / "result.json").read_bytes()
     lce_rig("calibrate", calibrated)
