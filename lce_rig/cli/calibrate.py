@@ -278,8 +278,10 @@ def calibrate(
         show.warn(str(lacking))
     if not no_report:
         with show.progress_bar("drawing the report"):
-            page = result.write_report(name=name)
-        show.note(f"  report       {page}")
+            result.write_report(name=name)
+    n_others, page = len(written.files) - 1, "" if no_report else ", report.html"
+    others = f" and {n_others} for the robot" if n_others else ""
+    show.note(f"  files        {written.files[0].parent}/: result.json{page}{others}")
     if all(c.verdict != "fail" for c in result.pairs):
         of_session = "" if paths[0] == Path("session") else f" {paths[0]}"
         show.note(f"  next         lce-rig verify{of_session}{'' if name is None else f' --name {name}'}")
@@ -290,7 +292,6 @@ def calibrate(
 
 def _show(result: Result, written: WrittenResult, *, is_explained: bool, as_json: bool) -> None:
     """Print the extrinsics, and the files with them."""
-    folder = written.files[0].parent
     if as_json:
         show.print_json(result.document())
     else:
@@ -298,8 +299,6 @@ def _show(result: Result, written: WrittenResult, *, is_explained: bool, as_json
             show.print_lines(_lines(calibration, is_explained=is_explained))
         for calibration in result.pairs:
             show.print_lines(camera_lines(calibration, result.pairs))
-        others = f" and {len(written.files) - 1} for the robot" if len(written.files) > 1 else ""
-        show.note(f"  files        {folder}/: result.json{others}")
     for finding in written.findings:
         if finding.severity != "note":
             show.warn(finding.sentence)

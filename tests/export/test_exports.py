@@ -49,7 +49,7 @@ def test_every_format_survives_any_pose(rles: Rig, make: Make, tmp_path: Path, T
     T_cam_lidar = invert(T_lidar_body @ T_BODY_OPTICAL)
     usual = {"extrinsics.yaml", "rles.urdf", "camera_info_davis.yaml", "static_transforms.txt"}
     assert {path.name for path in export([make(T_cam_lidar)], rles, tmp_path)} == usual
-    export([make(T_cam_lidar)], rles, tmp_path, formats=["kalibr", "autoware"])
+    export([make(T_cam_lidar)], rles, tmp_path / "others", formats=["kalibr", "autoware"])
     import yourdfpy
 
     robot = yourdfpy.URDF.load(str(tmp_path / "rles.urdf"), load_meshes=False, build_scene_graph=True)
