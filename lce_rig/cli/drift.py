@@ -14,6 +14,7 @@ from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageErr
 from lce_rig.core.interrupts import patience
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import open_live
+from lce_rig.pipeline.verification import profile_behind
 from lce_rig.pipeline.watch_drift import DriftReport, PairDrift, drift_live
 from lce_rig.pipeline.watch_drift import drift as watch_drift
 from lce_rig.rig import Rig, load_rig
@@ -76,7 +77,8 @@ def drift(
     else:
         sources = recordings or (Path("session"),)
         with show.progress_bar("reading") as progress:
-            report = watch_drift(sources, saved, rig=rig, progress=progress)
+            profile = None if result is None or saved is None else profile_behind(result, saved)
+            report = watch_drift(sources, saved, rig=rig, profile=profile, progress=progress)
     for text in report.notes:
         show.note(text)
     files = [] if output is None else report.write(output)

@@ -12,6 +12,7 @@ from lce_rig.cli.options import event_image_option, json_option, session_argumen
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.findings import worst
 from lce_rig.detect.detection import Pair
+from lce_rig.pipeline.verification import profile_behind
 
 
 @click.command()
@@ -50,13 +51,23 @@ def verify(
         raise UsageError("--result and --name exclude each other", "Name a file or a result of the session.")
     opened = lce.Session.open(session)
     saved = None if result is None else lce.read_result(result)
+    profile = None if result is None or saved is None else profile_behind(result, saved)
     with show.progress_bar("detecting") as progress:
-        verification = lce.verify(opened, saved, name=name, event_image=event_image, progress=progress)
+        verification = lce.verify(
+            opened, saved, name=name, profile=profile, event_image=event_image, progress=progress
+        )
+    for note in verification.notes:
+        show.warn(note.sentence)
     with show.progress_bar("drawing") as progress:
         checks = verification.write(output, progress=progress)
     if as_json:
         show.print_json(
-            {"format_version": 2, "rig": opened.rig.name, "pairs": [c.document() for c in checks]}
+            {
+                "format_version": 2,
+                "rig": opened.rig.name,
+                "pairs": [c.document() for c in checks],
+                "findings": [note.as_json() for note in verification.notes],
+            }
         )
     else:
         for checked in checks:

@@ -50,3 +50,9 @@ MOVED = Kind(
         "odd_one": "leave out {odd_one}: the sensors were moved, or the session is wrong; the others agree"
     },
 )
+OTHER_PROFILE = Kind(
+    "verify.other_profile",
+    "the profile of these samples differs from the result's in {keys}: judged with the result's intrinsics",
+    "calibrate again if lens, board or mounting were changed",
+    severity="warning",
+)

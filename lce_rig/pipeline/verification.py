@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 
 from lce_rig.calibrate import Clocks
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import SessionError
-from lce_rig.core.findings import Refusal
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.progress import Progress, silent
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, Pair
@@ -17,6 +18,7 @@ from lce_rig.judge.board_drift import watch_boards
 from lce_rig.judge.session_check import SessionCheck, check_session
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import detect, event_channels, event_picture
+from lce_rig.pipeline.findings import OTHER_PROFILE
 from lce_rig.pipeline.matching import match_sensors
 from lce_rig.pipeline.result_files import (
     OVERLAYS,
@@ -29,11 +31,15 @@ from lce_rig.pipeline.result_files import (
     stored_results,
 )
 from lce_rig.pipeline.witness import hear_scene
-from lce_rig.rig import Rig
+from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Capture, Session
-from lce_rig.session.session import DEBUG
+from lce_rig.session.identity import differing_keys
+from lce_rig.session.session import DEBUG, PROFILE
 from lce_rig.show.overlays.overlay import ImageWithEvents
 from lce_rig.show.overlays.overlay_files import draw_check, is_overlay
+
+# Keys of cameras and LiDARs that extrinsics depend on.
+_OF_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +54,7 @@ class Verification:
         event_image: how images were reconstructed from raw events for the detections.
         own_result: content of the session's result.json if the calibrations come from it, else None.
         name: of that result; None for the one in calibration/.
+        notes: in what the session's profile differs from the result's.
     """
 
     session: Session
@@ -57,6 +64,7 @@ class Verification:
     event_image: EventImage | None
     own_result: bytes | None
     name: str | None = None
+    notes: tuple[Finding, ...] = ()
 
     @property
     def unchecked(self) -> tuple[Calibration, ...]:
@@ -130,6 +138,7 @@ def verify(
     detections: Detections | None = None,
     *,
     name: str | None = None,
+    profile: Rig | None = None,
     event_image: EventImage | None = None,
     progress: Progress = silent,
 ) -> Verification:
@@ -139,6 +148,7 @@ def verify(
         session: may differ from the session that the extrinsics come from.
         result: of `calibrate` or `read_result`; None for the session's result.json.
         name: of the session's result to check; None for the one in calibration/.
+        profile: with which the result was made, as `profile_behind` finds it: its lenses count.
         detections: of this session; None to detect the board first.
         event_image: how images were reconstructed from raw events for the detections.
         progress: called with (done, total) while the board is detected.
@@ -148,6 +158,9 @@ def verify(
             sensors.
     """
     calibrations, own_result = _extrinsics(session, result, name)
+    rig, notes = with_lenses_of(session.rig, profile)
+    if rig is not session.rig:
+        session, detections = Session(session.path, rig, None), None
     detections = detections or detect(session, event_image=event_image, progress=progress)
     checks = []
     for c in calibrations:
@@ -164,8 +177,47 @@ def verify(
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
         raise SessionError(f"{session.path} holds no captures of {wanted}", "Check the result's session.")
     return Verification(
-        session, tuple(checks), tuple(calibrations), detections, event_image, own_result, name
+        session, tuple(checks), tuple(calibrations), detections, event_image, own_result, name, notes
     )
+
+
+def profile_behind(path: Path, result: ResultFile) -> Rig | None:
+    """Read the profile with which a result was made: that of the session around result.json.
+
+    Returns:
+        None where there is no such profile, or where it is not the one that the result names.
+    """
+    for folder in path.resolve().parents[:3]:
+        profile = folder / PROFILE
+        if profile.is_file() and sha256(profile.read_bytes()).hexdigest() in result.inputs_sha256.values():
+            return load_rig(profile)
+    return None
+
+
+def with_lenses_of(rig: Rig, profile: Rig | None) -> tuple[Rig, tuple[Finding, ...]]:
+    """Give a rig the lenses with which a result was made, and name the keys that matter and differ.
+
+    Another lens moves boards and edges, and would look like a sensor that moved.
+
+    Args:
+        rig: of the samples.
+        profile: of the result; None where it is not known.
+    """
+    if profile is None:
+        return rig, ()
+    cameras, changed = dict(rig.cameras), []
+    for key in differing_keys(profile, rig):
+        if key.path[0] == "board" or not _OF_SENSORS.isdisjoint(key.path[1:]):
+            changed.append(".".join(key.path))
+    if profile.nominal_extrinsics != rig.nominal_extrinsics:
+        changed.append("nominal_extrinsics")
+    for name in cameras.keys() & profile.cameras.keys():
+        if profile.cameras[name].resolution_px == cameras[name].resolution_px:
+            lens = profile.cameras[name].intrinsics
+            cameras[name] = cameras[name].model_copy(update={"intrinsics": lens})
+    if not changed:
+        return rig, ()
+    return rig.model_copy(update={"cameras": cameras}), (OTHER_PROFILE(keys=", ".join(changed)),)
 
 
 def _with_boards(rig: Rig, detections: Detections, check: SessionCheck, clocks: Clocks) -> SessionCheck:

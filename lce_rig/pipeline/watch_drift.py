@@ -21,6 +21,7 @@ from lce_rig.judge.board_drift import BoardDrift, watch_boards
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.result_files import RESULT, result_parts
 from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, own_offset_ns
+from lce_rig.pipeline.verification import with_lenses_of
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import evenly
@@ -182,6 +183,7 @@ def drift(
     result: ResultFile | None = None,
     *,
     rig: Rig | None = None,
+    profile: Rig | None = None,
     progress: Progress = silent,
 ) -> DriftReport:
     """Compare the extrinsics of a result with the scene of a session or of recordings.
@@ -193,6 +195,7 @@ def drift(
             the same time, such as a pcap and a camera's file.
         result: the deployed extrinsics; None for the session's own result.
         rig: the profile of a recording; a session has its own.
+        profile: with which the result was made, as `profile_behind` finds it: its lenses count.
         progress: called with (done, total) captures, or images and scans.
 
     Raises:
@@ -204,6 +207,7 @@ def drift(
         place = " and ".join(map(str, paths))
         if result is None:
             raise SessionError(f"{place}: a recording has no result", "Name one with --result FILE.")
+        rig, notes = with_lenses_of(rig, profile)
         captures = SceneCaptures(rig, result, place)
         captures.take_recordings(paths, progress)
     elif len(paths) != 1:
@@ -211,10 +215,11 @@ def drift(
     else:
         session = Session.open(paths[0])
         result = result or read_result(session.path.joinpath(*result_parts(None), RESULT))
-        rig = session.rig
+        rig, notes = with_lenses_of(session.rig, profile)
         captures = SceneCaptures(rig, result, str(session.path))
         captures.take_session(session, progress)
-    return judge(rig, result, captures)
+    report = judge(rig, result, captures)
+    return replace(report, notes=(*(note.sentence for note in notes), *report.notes))
 
 
 def drift_live(

@@ -1,0 +1,45 @@
+"""Deployed extrinsics are judged with the lenses that they were estimated with."""
+
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+from lce_rig.pipeline.verification import profile_behind, with_lenses_of
+from lce_rig.rig import Rig, dump_rig, load_rig
+from tests.saved_results import made_calibration, result_file
+
+RIG = load_rig("rlfs")
+
+
+def with_lens(**update: float) -> Rig:
+    camera = RIG.cameras["cam"]
+    lens = camera.intrinsics.model_copy(update=update)
+    return RIG.model_copy(update={"cameras": {"cam": camera.model_copy(update={"intrinsics": lens})}})
+
+
+def test_the_keys_that_differ_are_named_and_the_result_s_lens_counts() -> None:
+    board = RIG.board.model_copy(update={"square_m": 0.071})
+    rig, (note,) = with_lenses_of(with_lens(cx_px=660.0).model_copy(update={"board": board}), RIG)
+    assert note.code == "verify.other_profile"
+    assert note.figures["keys"] == "board.square_m, cameras.cam.intrinsics.cx_px"
+    assert rig.cameras["cam"].intrinsics == RIG.cameras["cam"].intrinsics
+    assert rig.board.square_m == 0.071
+
+
+def test_the_same_profile_or_none_changes_nothing() -> None:
+    described = RIG.model_copy(update={"description": "another"})
+    assert with_lenses_of(described, RIG) == (described, ())
+    assert with_lenses_of(RIG, None) == (RIG, ())
+
+
+def test_a_result_s_profile_is_that_of_its_session_if_it_is_still_the_same(tmp_path: Path) -> None:
+    profile, file = tmp_path / "rig.yaml", tmp_path / "calibration/front/result.json"
+    file.parent.mkdir(parents=True)
+    profile.write_text(dump_rig(RIG))
+    digest = sha256(profile.read_bytes()).hexdigest()
+    calibration = made_calibration(np.eye(4), np.eye(6))
+    result = result_file("rlfs", [calibration], {"rig.yaml": digest})
+    assert profile_behind(file, result) == load_rig(profile)
+    profile.write_text(dump_rig(with_lens(cx_px=660.0)))
+    assert profile_behind(file, result) is None
