@@ -13,8 +13,8 @@ from lce_rig.cli.options import EVENT_IMAGES, FiniteRange
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
-from lce_rig.detect.events.flicker import measure_flicker
 from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor
+from lce_rig.detect.events.reconstruct.filters import measure_flicker
 from lce_rig.io.events import open_events
 from lce_rig.io.events.event_recording import EventRecording
 from lce_rig.show.overlays.overlay_files import write_gif, write_picture, write_video

@@ -24,8 +24,8 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import LidarBoard
-from lce_rig.detect.events.event_limits import explain_missing_board, look_for_flicker, too_fast
 from lce_rig.detect.events.figures import MEMORY_NS, event_quality, outline_px
+from lce_rig.detect.limits_met import explain_missing_board, look_for_flicker, too_fast
 from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_time import rig_time_ns

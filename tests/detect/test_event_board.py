@@ -20,8 +20,8 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.events.event_limits import gate_event_board
 from lce_rig.detect.events.search import TRACK_NS, find_event_board, find_in_reconstruction, reconstructor_for
+from lce_rig.detect.limits_met import gate_event_board
 from lce_rig.rig import QualitySettings, ReconstructionSettings
 
 MS = 1_000_000

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Events
-from lce_rig.detect.events.flicker import measure_flicker
+from lce_rig.detect.events.reconstruct.filters import measure_flicker
 from lce_rig.io.events import open_events
 
 WIDTH, HEIGHT = 160, 120

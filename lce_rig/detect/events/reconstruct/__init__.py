@@ -2,8 +2,7 @@
 
 from lce_rig.detect.events.reconstruct.model import ReconstructionModel, model_bytes
 from lce_rig.detect.events.reconstruct.reconstructor import ReconstructionOptions, Reconstructor
-from lce_rig.detect.events.reconstruct.voxels import event_map, normalise_voxels, voxel_grid
-from lce_rig.detect.events.reconstruct.windows import WindowOptions
+from lce_rig.detect.events.reconstruct.windows import WindowOptions, event_map, normalise_voxels, voxel_grid
 
 __all__ = [
     "ReconstructionModel",

@@ -11,7 +11,7 @@ import numpy as np
 
 from lce_rig.core.errors import ProfileError, SourceError, reason_of
 from lce_rig.core.interrupts import without_interrupt
-from lce_rig.detect.events.reconstruct.voxels import FloatArray
+from lce_rig.detect.events.reconstruct.windows import FloatArray
 
 States = tuple[FloatArray, ...]
 _MAX_MULTIPLE = 256

@@ -14,8 +14,16 @@ from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
 from lce_rig.detect.events.reconstruct.filters import NoiseFilter
 from lce_rig.detect.events.reconstruct.model import ReconstructionModel, States
-from lce_rig.detect.events.reconstruct.voxels import FloatArray, event_map, normalise_voxels, voxel_grid
-from lce_rig.detect.events.reconstruct.windows import WindowOptions, WindowRule, active_share, window_rule
+from lce_rig.detect.events.reconstruct.windows import (
+    FloatArray,
+    WindowOptions,
+    WindowRule,
+    active_share,
+    event_map,
+    normalise_voxels,
+    voxel_grid,
+    window_rule,
+)
 from lce_rig.detect.findings import (
     READ_AFTER_EVENTS,
     READ_BEFORE_EVENTS,
