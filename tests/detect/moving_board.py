@@ -114,3 +114,32 @@ def cut(events, n_batches, seed=0):
         )
         for first, last in pairwise(bounds)
     ]
+
+
+def noise(rate_hz=0.5, duration_s=1.4, seed=1):
+    """Make events anywhere, of either polarity, so many a second and pixel."""
+    rng = np.random.default_rng(seed)
+    n = round(rate_hz * duration_s * WIDTH_PX * HEIGHT_PX)
+    t_us = rng.integers(0, round(duration_s * 1e6), n)
+    return events_of(
+        t_us * 1000, rng.integers(0, WIDTH_PX, n), rng.integers(0, HEIGHT_PX, n), rng.random(n) < 0.5
+    )
+
+
+def lamps(frequency_hz, duration_s=1.4, n_each=600):
+    """Make all pixels brighten in one half of each period, and darken in the other."""
+    rng = np.random.default_rng(0)
+    half_ns = round(0.5e9 / frequency_hz)
+    start_ns = np.repeat(np.arange(0, round(duration_s * 1e9), half_ns), n_each)
+    return events_of(
+        start_ns + rng.integers(0, half_ns * 4 // 5000, len(start_ns)) * 1000,
+        rng.integers(0, WIDTH_PX, len(start_ns)),
+        rng.integers(0, HEIGHT_PX, len(start_ns)),
+        (start_ns // half_ns) % 2 == 0,
+    )
+
+
+def join(*streams):
+    """Put streams into one."""
+    columns = [[getattr(s, name) for s in streams] for name in ("t_ns", "x", "y", "polarity")]
+    return events_of(*(np.concatenate(column) for column in columns))

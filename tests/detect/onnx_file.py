@@ -1,4 +1,4 @@
-"""ONNX files written by hand, without the onnx package: only what hostile networks need."""
+"""ONNX files written by hand, without the onnx package: networks that copy their inputs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,17 +24,6 @@ def text(field: int, value: str | bytes) -> bytes:
     return _varint(field << 3 | 2) + _varint(len(content)) + content
 
 
-def external_tensor(name: str, dims: Sequence[int], location: str) -> bytes:
-    entry = text(1, "location") + text(2, location)
-    return (
-        b"".join(number(1, n) for n in dims)
-        + number(2, FLOAT)
-        + text(8, name)
-        + text(13, entry)
-        + number(14, 1)
-    )
-
-
 def integers(name: str, values: Sequence[int]) -> bytes:
     return text(5, text(1, name) + b"".join(number(8, value) for value in values) + number(20, 7))
 
@@ -53,34 +42,33 @@ def value(name: str, dims: Dims) -> bytes:
     return text(1, name) + text(2, text(1, number(1, FLOAT) + text(2, sizes)))
 
 
-def graph(
-    nodes: Sequence[bytes], inputs: Sequence[bytes], outputs: Sequence[bytes], tensors: Sequence[bytes] = ()
-) -> bytes:
-    parts = [(1, nodes), (5, tensors), (11, inputs), (12, outputs)]
-    return text(2, "g") + b"".join(text(field, each) for field, items in parts for each in items)
+def write_network(
+    path: Path, inputs: Sequence[tuple[str, Dims]], outputs: Sequence[Dims], *, drops_rows: bool = False
+) -> Path:
+    """Write a graph of opset 17: the first output is the mean over bins, the others copy inputs.
 
+    Args:
+        path: of the file.
+        inputs: names and shapes.
+        outputs: shapes.
+        drops_rows: whether the second output is the mean over the rows of its input.
+    """
 
-def write(path: Path, content: bytes) -> Path:
-    """Write a graph as a file of opset 17."""
-    path.write_bytes(number(1, 8) + text(7, content) + text(8, text(1, "") + number(2, 17)))
-    return path
+    def mean(name: str, output: str, axis: int) -> bytes:
+        return node("ReduceMean", [name], [output], integers("axes", [axis]) + integer("keepdims", 1))
 
-
-VOXELS = value("v", [1, 5, "height", "width"])
-PICTURE = value("p", [1, 1, "height", "width"])
-MEAN = node("ReduceMean", ["v"], ["p"], integers("axes", [1]) + integer("keepdims", 1))
-
-
-def recurrent_network(path: Path, dims: Dims) -> Path:
-    """Carry one state on as it is."""
-    nodes = [MEAN, node("Identity", ["s"], ["t"])]
-    return write(path, graph(nodes, [VOXELS, value("s", dims)], [PICTURE, value("t", dims)]))
-
-
-def network_with_weights_in(path: Path, location: str) -> Path:
-    """Add a weight that lies in another file."""
-    nodes = [
-        node("ReduceMean", ["v"], ["q"], integers("axes", [1]) + integer("keepdims", 1)),
-        node("Add", ["q", "w"], ["p"]),
+    nodes = []
+    for k in range(len(outputs)):
+        source = inputs[min(k, len(inputs) - 1)][0]
+        is_mean = k == 0 or (drops_rows and k == 1)
+        nodes.append(
+            mean(source, f"o{k}", 2 if k else 1) if is_mean else node("Identity", [source], [f"o{k}"])
+        )
+    parts = [
+        (1, nodes),
+        (11, [value(name, dims) for name, dims in inputs]),
+        (12, [value(f"o{k}", dims) for k, dims in enumerate(outputs)]),
     ]
-    return write(path, graph(nodes, [VOXELS], [PICTURE], [external_tensor("w", [1], location)]))
+    graph = text(2, "g") + b"".join(text(field, item) for field, items in parts for item in items)
+    path.write_bytes(number(1, 8) + text(7, graph) + text(8, text(1, "") + number(2, 17)))
+    return path

@@ -12,6 +12,9 @@ from moving_board import (
     Motion,
     board_events,
     events_of,
+    join,
+    lamps,
+    noise,
 )
 
 from lce_rig.core.board import Board
@@ -54,20 +57,6 @@ def find(events, stamp_ns=STAMP, limits=LIMITS, method="network", **more):
 def truth_m(stamp_ns):
     """Where the board's middle is in the camera's x and y."""
     return STEADY.shift_px(stamp_ns * 1e-9) / FOCAL_PX * DEPTH_M
-
-
-def join(*streams):
-    columns = [[getattr(s, name) for s in streams] for name in ("t_ns", "x", "y", "polarity")]
-    return events_of(*(np.concatenate(column) for column in columns))
-
-
-def noise(rate_hz=0.5, duration_s=1.4, seed=1):
-    rng = np.random.default_rng(seed)
-    n = round(rate_hz * duration_s * WIDTH_PX * HEIGHT_PX)
-    t_us = rng.integers(0, round(duration_s * 1e6), n)
-    return events_of(
-        t_us * 1000, rng.integers(0, WIDTH_PX, n), rng.integers(0, HEIGHT_PX, n), rng.random(n) < 0.5
-    )
 
 
 def test_the_board_is_found_and_followed_to_either_side_where_it_truly_is(detection):
@@ -131,15 +120,7 @@ def test_a_board_that_stands_still_is_told_to_move():
 
 
 def test_flickering_lamps_are_named_with_their_frequency():
-    lamp = np.repeat(np.arange(0, 1_400, 5) * MS, 600)
-    rng = np.random.default_rng(0)
-    storm = events_of(
-        lamp + rng.integers(0, 4_000, len(lamp)) * 1000,
-        rng.integers(0, WIDTH_PX, len(lamp)),
-        rng.integers(0, HEIGHT_PX, len(lamp)),
-        (lamp // (5 * MS)) % 2 == 0,
-    )
-    board = find(join(noise(0.3), storm)).board
+    board = find(join(noise(0.3), lamps(100))).board
     assert board.code == "image.flicker"
     assert board.figure("frequency_hz") == pytest.approx(100, abs=1)
 

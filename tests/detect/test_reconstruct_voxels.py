@@ -1,13 +1,21 @@
-"""Voxel grids, event maps and noise filters."""
+"""Voxel grids, event maps, noise filters, and lamps that flicker."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from moving_board import Motion, board_events, events_of
+from moving_board import Motion, board_events, events_of, join, lamps, noise
 
 from lce_rig.detect.events.reconstruct import event_map, normalise_voxels, voxel_grid
-from lce_rig.detect.events.reconstruct.filters import hot_pixels, without_background_activity
+from lce_rig.detect.events.reconstruct.filters import (
+    hot_pixels,
+    measure_flicker,
+    without_background_activity,
+)
+from lce_rig.io.events import open_events
 
 
 def random_events(n, seed, width_px=12, height_px=9, duration_ns=50_000_000):
@@ -63,3 +71,37 @@ def test_most_noise_goes_and_nearly_all_events_of_the_board_stay():
     noise_only = random_events(300, 5, 160, 120, 300_000_000)
     assert len(without_background_activity(board)) > 0.98 * len(board)
     assert len(without_background_activity(noise_only)) < 0.25 * len(noise_only)
+
+
+def test_lamps_that_flicker_are_told_from_motion() -> None:
+    flicker = measure_flicker(lamps(100))
+    assert flicker.is_storm
+    assert flicker.frequency_hz == pytest.approx(100.0, abs=2.0)
+    assert flicker.coherence > 0.9
+    board = board_events(Motion(), 1.0)
+    for scene in (board, noise(5.0), join(board, noise(1.0))):
+        assert not measure_flicker(scene).is_storm
+
+
+def test_events_of_one_polarity_alone_are_a_storm() -> None:
+    scene = noise(5.0)
+    assert measure_flicker(replace(scene, polarity=np.ones(len(scene), bool))).is_storm
+    sparse = noise(0.02)
+    assert not measure_flicker(sparse).is_storm
+
+
+@pytest.mark.dataset
+@pytest.mark.parametrize(
+    ("name", "is_storm"), [("event_packet_ros1.bag", True), ("davis346_apriltag_libcaer_cmp.mcap", False)]
+)
+def test_a_real_room_with_mains_light_is_told_from_one_without(
+    recordings: Path, name: str, is_storm: bool
+) -> None:
+    if not (recordings / "events").is_dir():
+        pytest.skip("no recordings of events")
+    recording = open_events(recordings / "events" / name)
+    first_ns, last_ns = recording.span_ns
+    flicker = measure_flicker(recording.read(first_ns, last_ns))
+    assert flicker.is_storm == is_storm
+    if is_storm:
+        assert flicker.frequency_hz == pytest.approx(120.0, abs=1.0)
