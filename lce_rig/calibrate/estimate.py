@@ -1,5 +1,6 @@
 """The method, from the boards that both sensors saw to extrinsics with their uncertainty.
 
+    fit_session_lens     the camera's intrinsics and the board's shape, from the images and the profile
     find_consensus       the captures of each channel that agree on one rigid transform
     join_scans           the images of all channels that share a scan
     estimate_motion      time offsets and motion of the boards: one pose of the board at the time of each scan
@@ -27,6 +28,7 @@ from lce_rig.calibrate.observations import Clocks, join_scans, pooled_noise_px
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.plane_and_ends import along_normals
 from lce_rig.calibrate.result import CalibrationEstimate
+from lce_rig.calibrate.session_lens import fit_session_lens
 from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import ChannelResult
@@ -36,6 +38,9 @@ from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import Observation
 
 _N_SHARES = 7
+# A scale of the camera's distances so many prior deviations from that of the profile contradicts it, and is
+# then estimated with this deviation.
+_SCALE_SIGMAS, _FREE_SCALE = 3.0, 0.02
 
 
 def estimate_extrinsics(
@@ -58,6 +63,7 @@ def estimate_extrinsics(
     Raises:
         NotEnoughDataError: no channel has enough captures, or they leave a direction undetermined.
     """
+    candidates, settings = _with_session_lens(candidates, board, settings)
     agreed, noise_px = _agree(candidates, board)
     matched = {name: consensus.observations for name, consensus in agreed.items()}
     scans, conflicts = join_scans(matched, candidates)
@@ -83,7 +89,7 @@ def estimate_extrinsics(
     estimate = estimate_observations(motion.observations(), board, settings, progress)
     estimate = _with_consensus(estimate, list(agreed.values()))
 
-    fast = replace(settings, n_draws=0, tolerances=None)
+    fast = replace(settings, n_draws=0, tolerances=None, lens=None)
     by_channel = {name: motion.observations(name if len(agreed) > 1 else None) for name in sorted(agreed)}
     channels = []
     for name, observations in by_channel.items():
@@ -138,8 +144,8 @@ def fit_extrinsic(
         NotEnoughDataError: too few captures, captures that agree with no extrinsics, or captures that leave a
             direction undetermined, which is named.
     """
-    consensus = find_consensus(candidates, board)
-    settings = settings or EstimateSettings()
+    by_channel, settings = _with_session_lens({"": candidates}, board, settings or EstimateSettings())
+    consensus = find_consensus(by_channel[""], board)
     estimate = estimate_observations(consensus.observations, board, settings, progress)
     return _with_consensus(estimate, [consensus])
 
@@ -168,7 +174,22 @@ def estimate_observations(
         return by_scatter(start, board, settings)
     priors, usual = what_is_known(settings)
     joint = maximise_likelihood([start.observations], board, [start.T_cam_lidar], priors, usual)
+    if abs(float(joint.state.scale[0])) > _SCALE_SIGMAS * np.max(priors.scale):
+        # Squares that LiDAR and profile disagree on are as large as the LiDAR says.
+        priors = replace(priors, scale=_FREE_SCALE)
+        joint = maximise_likelihood([start.observations], board, [joint.T_cam_lidar[0]], priors, usual)
     return by_likelihood(start, joint, board, settings)
+
+
+def _with_session_lens(
+    candidates: Mapping[str, Sequence[Observation]], board: Board, settings: EstimateSettings
+) -> tuple[Mapping[str, Sequence[Observation]], EstimateSettings]:
+    """Fit the lens of a profile that is not exact, and the boards' poses with it."""
+    if settings.tolerances is None or settings.tolerances.lens.is_exact:
+        return candidates, settings
+    lens = fit_session_lens(candidates, board, settings.tolerances.lens)
+    refitted = {name: lens.refit(observations) for name, observations in candidates.items()}
+    return refitted, replace(settings, lens=lens)
 
 
 def _agree(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.calibration import DEFAULT_METHOD, Method
 from lce_rig.core.geometry import Array
@@ -82,13 +83,15 @@ class EstimateSettings(CalibrateOptions):
         laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
         range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
         known: constant errors of the LiDAR that were measured before; None if there are none.
-        tolerances: of the profile's lens and board; None does not compute their effect.
+        tolerances: of the profile's lens and board; None takes both as exact.
+        lens: of the session, which `estimate_extrinsics` fits first where there are tolerances.
     """
 
     laser_bias_sigma_m: float = 0.0
     range_offset_sigma_m: float = 0.0
     known: KnownLidar | None = None
     tolerances: Tolerances | None = None
+    lens: SessionLens | None = None
 
     @classmethod
     def of(

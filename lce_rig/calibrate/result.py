@@ -10,6 +10,7 @@ from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import KnownLidar
 from lce_rig.calibrate.plane_and_ends import ends_on_board, plane_residuals
 from lce_rig.calibrate.quadratics import Quadratics
+from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.calibrate.tolerances import Sensitivity
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Metrics
@@ -47,8 +48,8 @@ class CalibrationEstimate:
     Attributes:
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera: from the noise of the captures
-            and from the sensors' errors that are common to all of them. Errors of the profile's lens
-            and board are not in it, but in `sensitivities`.
+            and from the sensors' errors that are common to all of them. Errors of lens and board are not in
+            it, but in `sensitivities`.
         certificate: of Algorithm 1's final cost over all captures used, from whose solution other methods
             start.
         refused: why each other capture is not used.
@@ -58,11 +59,12 @@ class CalibrationEstimate:
         residuals: one per capture used, in the order of `observations`.
         diagnostics: further figures.
         method: that found it, as `CalibrateOptions.method`.
-        sensitivities: how far errors of the profile's lens and board move the result; empty without
+        sensitivities: how far errors of lens and board move the result; empty without
             `EstimateSettings.tolerances`.
         cost: the method's own cost about its result, capture by capture, in the extrinsics (and those of
             cameras estimated with it) alone, boards' poses eliminated; None if the method has none.
         lidar: constant errors of the LiDAR that were estimated with it; None if the method knows none.
+        lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
         channels: the result of each channel of the camera alone; empty if they were not separated.
@@ -82,11 +84,20 @@ class CalibrationEstimate:
     sensitivities: tuple[Sensitivity, ...] = ()
     cost: Quadratics | None = None
     lidar: KnownLidar | None = None
+    lens: SessionLens | None = None
     estimated_with: tuple[str, ...] = ()
     same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     channels: tuple[ChannelResult, ...] = ()
     channel_difference: Array | None = None
     channel_difference_cov: Array | None = None
+
+    @property
+    def cov_with_lens(self) -> Array:
+        """Cross-covariance (6, P) of extrinsics and intrinsics; empty without a lens of the session."""
+        if self.lens is None:
+            return np.zeros((6, 0))
+        (by_lens,) = (each for each in self.sensitivities if each.source == "intrinsics")
+        return np.asarray(by_lens.moves.T @ self.lens.directions[:, : self.lens.estimate.model.size])
 
     @property
     def used(self) -> tuple[str, ...]:

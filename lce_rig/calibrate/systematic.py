@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.algorithm_1.moments import Problem, Solutions
 from lce_rig.calibrate.features import CaptureFeatures, extract_features, see_lidar
 from lce_rig.calibrate.quadratics import symmetric_inverse
-from lce_rig.calibrate.tolerances import Sensitivity, Tolerances, Variant, sensitivities_of, vary
+from lce_rig.calibrate.session_lens import SessionLens
+from lce_rig.calibrate.tolerances import Sensitivity, Tolerances, sensitivities_of, vary
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Observation
@@ -74,20 +75,24 @@ def profile_sensitivities(
     solution: Solutions,
     information: Array,
     known: Tolerances,
+    lens: SessionLens | None,
 ) -> tuple[Sensitivity, ...]:
-    """Differentiate the solution by errors of the profile's lens and board, as (1) does by range offsets.
+    """Differentiate the solution by errors of lens and board, as (1) does by range offsets.
 
     Args:
         observations, board, problem, solution, information: as of `ring_sensitivities`.
-        known: the profile's lens and its standard deviations.
+        known: standard deviations of the board.
+        lens: of the session.
     """
-    variants = vary(observations, board, known)
+    variants = vary(observations, board, lens, bends_scans=True)
     changes = []
     for assumed, group in groupby(variants, key=lambda variant: variant.board):
-        same_board = tuple(group)
+        same_board = [(variant.apply(observations), variant.board) for variant in group]
 
-        def features_of(k: int, same_board: tuple[Variant, ...] = same_board) -> list[CaptureFeatures]:
-            return [extract_features(variant.observations[k], variant.board) for variant in same_board]
+        def features_of(
+            k: int, same_board: list[tuple[list[Observation], Board]] = same_board
+        ) -> list[CaptureFeatures]:
+            return [extract_features(moved[k], assumed) for moved, assumed in same_board]
 
         by_capture = _changes(features_of, assumed, problem, solution)
         changes.append(by_capture.reshape(len(observations), len(same_board), -1).sum(axis=0))

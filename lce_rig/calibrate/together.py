@@ -88,6 +88,7 @@ def calibrate_together(
             method=own.method,
             lidar=lidar_of(joint),
             sensitivities=own.sensitivities,
+            lens=own.lens,
             cost=expand_joint(joint, k, placement),
             estimated_with=tuple(other for other in names if other != name),
             same_scan=own.same_scan,

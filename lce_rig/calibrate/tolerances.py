@@ -1,41 +1,28 @@
-"""The effect of what a profile says wrongly about lens and board, within its standard deviations.
+"""The effect of errors of lens and board, within their standard deviations.
 
 These errors are the same in every capture: no scatter between captures shows them. Each is turned into what
-it does to the observations, from which a method finds how far its result moves (`systematic`, `refine`).
+it does to the observations, from which a method finds how far its result moves (`systematic`, `uncertainty`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
-from lce_rig.calibrate.quadratics import symmetric_inverse
+from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.core.board import Board
-from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, invert, perturb, skew, transform
+from lce_rig.core.geometry import Array, invert, perturb, transform
 from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.lens.models import LensPrior
 from lce_rig.rig import BoardSettings, CameraSettings
 
-Source = Literal[
-    "focal_length",
-    "principal_point",
-    "distortion",
-    "square_size",
-    "pattern_offset",
-    "plate_size",
-    "board_bow",
-]
-LENS: tuple[Source, ...] = ("focal_length", "principal_point", "distortion")
-"""Errors of one camera; the others are of the board, which all cameras see."""
+Source = Literal["intrinsics", "square_size", "pattern_offset", "plate_size", "board_bow"]
 
-# Where a profile states no standard deviation of a lens, in focal lengths: what calibrations of the same lens
-# with a checkerboard differ by.
-_FOCAL, _PRINCIPAL_POINT, _DISTORTION = 1.5e-3, 1e-3, 5e-4
-# As a fraction of a square: a millimetre in a metre.
-_SQUARE = 1e-3
+# As a fraction of a square, where a profile states none: two millimetres in a metre.
+_SQUARE = 2e-3
 # All effects are linear; steps only keep clear of rounding.
-_STEP, _STEP_PX = 1e-3, 1.0
+_STEP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -43,21 +30,14 @@ class Tolerances:
     """Standard deviations of a profile's lens and board.
 
     Attributes:
-        lens: the intrinsics.
-        focal_length: of both focal lengths alike, relative.
-        principal_point_px: of each coordinate.
-        distortion_px: of the radial displacement of a pixel in the image's corner, which grows with the third
-            power of the distance from the middle.
+        lens: the intrinsics with theirs.
         square_size: relative.
         pattern_offset_m: of each coordinate of the pattern's centre on the plate.
         plate_m: of each side of the plate.
         bow_m: of the middle's height over the ends, along the width and along the height.
     """
 
-    lens: Intrinsics
-    focal_length: float
-    principal_point_px: float
-    distortion_px: float
+    lens: LensPrior
     square_size: float
     pattern_offset_m: float
     plate_m: float
@@ -66,38 +46,24 @@ class Tolerances:
     @classmethod
     def of(cls, camera: CameraSettings, board: BoardSettings) -> "Tolerances":
         """Read a profile's camera and board; defaults take the place of what it leaves out."""
-        lens, focal_px = camera.intrinsics, camera.intrinsics.fx_px
+        squares_m = _SQUARE * board.square_m if board.square_sigma_m is None else board.square_sigma_m
         return cls(
-            lens=camera.to_intrinsics(),
-            focal_length=_FOCAL if lens.focal_sigma_px is None else lens.focal_sigma_px / focal_px,
-            principal_point_px=_or(lens.principal_point_sigma_px, _PRINCIPAL_POINT * focal_px),
-            distortion_px=_or(lens.distortion_sigma_px, _DISTORTION * focal_px),
-            square_size=_or(board.square_sigma_m, _SQUARE * board.square_m) / board.square_m,
+            lens=LensPrior.read(camera, board),
+            square_size=squares_m / board.square_m,
             pattern_offset_m=board.pattern_offset_sigma_m,
             plate_m=board.plate_sigma_m,
             bow_m=board.bow_sigma_m,
         )
 
-    @property
-    def scale(self) -> float:
-        """Relative standard deviation of distances along the camera's line of sight."""
-        return float(np.hypot(self.focal_length, self.square_size))
-
     def sigma(self, source: Source) -> float:
-        """Return the standard deviation of a source, in its own unit."""
+        """Return the standard deviation of a source, in its own unit; errors of a lens have unit size."""
         return {
-            "focal_length": self.focal_length,
-            "principal_point": self.principal_point_px,
-            "distortion": self.distortion_px,
+            "intrinsics": 1.0,
             "square_size": self.square_size,
             "pattern_offset": self.pattern_offset_m,
             "plate_size": self.plate_m,
             "board_bow": self.bow_m,
         }[source]
-
-
-def _or(sigma: float | None, usual: float) -> float:
-    return usual if sigma is None else sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,20 +86,33 @@ class Sensitivity:
         return np.asarray(size**2 * self.moves.T @ self.moves)
 
 
-class Variant(NamedTuple):
-    """What the sensors would have seen with one error of the profile.
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """An error of lens or board, and what it does to the observations.
 
     Attributes:
         source: what is wrong.
         step: by how much, in the source's own unit.
-        observations: one per capture.
+        pose_moves: (F, 6) tangents by which it moves T_cam_board of each capture.
         board: the board that the method assumes.
+        bow_axis: the axis along which the plate of the scans is bent, if it is.
     """
 
     source: Source
     step: float
-    observations: list[Observation]
+    pose_moves: Array
     board: Board
+    bow_axis: int | None = None
+
+    def apply(self, observations: Sequence[Observation]) -> list[Observation]:
+        """Move the observations."""
+        moved = []
+        for o, move in zip(observations, self.pose_moves, strict=True):
+            image, lidar = replace(o.image, T_cam_board=perturb(o.image.T_cam_board, move)), o.lidar
+            if self.bow_axis is not None:
+                lidar = bend(lidar, self.bow_axis, self.step, self.board)
+            moved.append(replace(o, image=image, lidar=lidar))
+        return moved
 
 
 def sensitivities_of(variants: Sequence[Variant], moves: Array, known: Tolerances) -> tuple[Sensitivity, ...]:
@@ -146,53 +125,39 @@ def sensitivities_of(variants: Sequence[Variant], moves: Array, known: Tolerance
     )
 
 
-def vary(observations: Sequence[Observation], board: Board, known: Tolerances) -> list[Variant]:
-    """List what the sensors would have seen with each error of the profile.
+def vary(
+    observations: Sequence[Observation], board: Board, lens: SessionLens | None, *, bends_scans: bool
+) -> list[Variant]:
+    """List errors of lens and board with their effects on observations.
 
     Args:
         observations: F captures.
         board: as the profile says.
-        known: the profile's lens; errors with a standard deviation of zero are kept, as a contradiction may
-            give them another.
+        lens: of the session; None leaves its errors out.
+        bends_scans: whether the plate of the scans may be bent; not where a method estimates the bend.
     """
     poses = np.array([observation.image.T_cam_board for observation in observations])
+    still = np.zeros((len(poses), 6))
     variants = []
-    for source, axis, step, shifts_px, shifts_m in _image_errors(poses, board, known.lens):
-        moved = perturb(poses, _pose_moves(poses, board, known.lens, shifts_px, shifts_m))
-        changed = [
-            replace(o, image=replace(o.image, T_cam_board=T))
-            for o, T in zip(observations, moved, strict=True)
-        ]
-        if source == "board_bow":
-            changed = [replace(o, lidar=bend(o.lidar, axis, step, board)) for o in changed]
-        variants.append(Variant(source, step, changed, board))
+    if lens is not None:
+        variants += [Variant("intrinsics", 1.0, move, board) for move in lens.moves(poses)]
+    # All squares larger by a fraction: boards are as much farther away. The pattern's centre on the plate.
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    middle = R @ [*board.pattern_offset_m, 0.0]
+    variants.append(Variant("square_size", _STEP, _STEP * _translations(t + middle), board))
+    for axis in range(2):
+        variants.append(Variant("pattern_offset", _STEP, -_STEP * _translations(R[:, :, axis]), board))
+    for axis in range(2 if bends_scans else 0):
+        variants.append(Variant("board_bow", _STEP, still, board, axis))
     for side in ("width_m", "height_m"):
         assumed = replace(board, **{side: getattr(board, side) + _STEP})
-        variants.append(Variant("plate_size", _STEP, list(observations), assumed))
+        variants.append(Variant("plate_size", _STEP, still, assumed))
     return variants
 
 
-def _image_errors(
-    poses: Array, board: Board, lens: Intrinsics
-) -> Iterator[tuple[Source, int, float, Array, Array]]:
-    """List the errors that move corners.
-
-    Yields:
-        Source, axis, step, shifts (F, M, 2) in px, shifts (M, 3) on the board in m.
-    """
-    corners = board.corners()
-    by_errors = lens.differentiate_by_errors(transform(poses, corners))
-    still_px, still_m = np.zeros(by_errors.shape[:-1]), np.zeros_like(corners)
-    middle = np.array([*board.pattern_offset_m, 0.0])
-    yield "focal_length", 0, _STEP, _STEP * by_errors[..., 0], still_m
-    for axis in range(2):
-        yield "principal_point", axis, _STEP_PX, _STEP_PX * by_errors[..., 1 + axis], still_m
-    yield "distortion", 0, _STEP_PX, _STEP_PX * by_errors[..., 3], still_m
-    yield "square_size", 0, _STEP, still_px, _STEP * (corners - middle)
-    for axis in range(2):
-        yield "pattern_offset", axis, _STEP, still_px, still_m + _STEP * np.eye(3)[axis]
-    for axis in range(2):
-        yield "board_bow", axis, _STEP, still_px, bow(corners, axis, _STEP, board)
+def _translations(shifts: Array) -> Array:
+    """Write shifts (F, 3) of boards as tangents (F, 6)."""
+    return np.concatenate([shifts, np.zeros_like(shifts)], axis=1)
 
 
 def bow(points_board: Array, axis: int, height_m: float, board: Board) -> Array:
@@ -201,23 +166,6 @@ def bow(points_board: Array, axis: int, height_m: float, board: Board) -> Array:
     shifts = np.zeros_like(points_board)
     shifts[:, 2] = height_m * (1 - (points_board[:, axis] / half) ** 2)
     return shifts
-
-
-def _pose_moves(poses: Array, board: Board, lens: Intrinsics, shifts_px: Array, shifts_m: Array) -> Array:
-    """Fit tangents (F, 6) of T_cam_board to shifts of the corners in the image and on the board.
-
-    With J the derivative of a corner's pixel by the pose and A by its point, the pose moves by
-    (sum J^T J)^-1 sum J^T (shift_px + A R shift_m).
-    """
-    corners = board.corners()
-    R = poses[:, :3, :3]
-    turned = corners @ np.swapaxes(R, 1, 2)
-    by_point = lens.differentiate((turned + poses[:, None, :3, 3]).reshape(-1, 3))
-    by_point = np.nan_to_num(by_point.reshape(*turned.shape[:2], 2, 3))
-    J = np.concatenate([by_point, -by_point @ skew(turned)], axis=-1)
-    shifts = shifts_px + (by_point @ (shifts_m @ np.swapaxes(R, 1, 2))[..., None])[..., 0]
-    H = np.einsum("fmai,fmaj->fij", J, J)
-    return np.asarray((symmetric_inverse(H) @ np.einsum("fmai,fma->fi", J, shifts)[..., None])[..., 0])
 
 
 def bend(lidar: LidarBoard, axis: int, height_m: float, board: Board) -> LidarBoard:

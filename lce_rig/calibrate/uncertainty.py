@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
-from lce_rig.calibrate.likelihood.fit import JointEstimate, stack_camera
-from lce_rig.calibrate.likelihood.layout import SHIFTS
+from lce_rig.calibrate.likelihood.fit import JointEstimate
+from lce_rig.calibrate.likelihood.layout import OWN, SHIFTS
 from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
-from lce_rig.calibrate.likelihood.model import Assembly, linearise
+from lce_rig.calibrate.likelihood.model import assemble, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import EstimateSettings
@@ -49,7 +49,8 @@ def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> C
     return replace(
         report(start, start.T_cam_lidar, cov[:6, :6], board, figures),
         fitted={observation.capture: observation for observation in start.fitted},
-        sensitivities=() if known is None else profile_sensitivities(*captures, known),
+        sensitivities=() if known is None else profile_sensitivities(*captures, known, settings.lens),
+        lens=settings.lens,
     )
 
 
@@ -75,10 +76,11 @@ def by_likelihood(
         algorithm_1_offset_m=offset_m,
     )
     estimate = report(start, joint.T_cam_lidar[0], cov, board, figures)
-    estimate = replace(estimate, method="ml", lidar=lidar_of(joint), cost=expand_joint(joint, 0, placement))
+    cost = expand_joint(joint, 0, placement)
+    estimate = replace(estimate, method="ml", lidar=lidar_of(joint), cost=cost, lens=settings.lens)
     if settings.tolerances is None:
         return estimate
-    variants = vary(start.observations, board, settings.tolerances)
+    variants = vary(start.observations, board, settings.lens, bends_scans=False)
     moves = moves_under(joint, start.observations, variants, board)
     return replace(estimate, sensitivities=sensitivities_of(variants, moves, settings.tolerances))
 
@@ -147,22 +149,24 @@ def moves_under(
     Returns:
         (V, 6) tangents (translation m, rotation rad).
     """
-    order = {name: k for k, name in enumerate(sorted(o.capture for o in used))}
-    here, changes = Assembly(joint.terms, joint.priors), []
-    for variant in variants:
-        images = (stack_camera(variant.observations, order, variant.board),)
-        lidars = {o.capture: o.lidar for o in variant.observations}
-        is_of_image = variant.board == board and all(o.lidar is lidars[o.capture] for o in used)
-        if is_of_image:
-            moved = here.with_images(images)
-        else:
-            scans = stack_scans([interior(lidars[name], variant.board) for name in order], variant.board)
-            terms = linearise(scans, images, variant.board, joint.state, joint.trust)
-            moved = Assembly(terms, joint.priors)
-        gradients = moved.at(joint.levels).cost.gradients
-        changes.append((gradients - joint.cost.gradients).sum(axis=0))
-    moves = np.linalg.solve(joint.cost.information, np.transpose(changes))
-    return np.asarray(-(joint.to_extrinsics[0] @ moves).T)
+    reduced = assemble(joint.terms, joint.levels, joint.priors)
+    G = len(reduced.gradient)
+    changes = np.zeros((len(variants), G))
+    of_images = [k for k, variant in enumerate(variants) if variant.board == board]
+    moves = np.array([variants[k].pose_moves for k in of_images])
+    by_moves = joint.terms.gradients_by_pose_moves(joint.levels, moves)
+    by_own, by_common = by_moves[:, : OWN.size], by_moves[:, OWN.size :]
+    changes[of_images] = np.sum(by_common - np.swapaxes(reduced.own_steps[:, :, :G], 1, 2) @ by_own, axis=0).T
+    lidars = {o.capture: o.lidar for o in used}
+    for k, variant in enumerate(variants):
+        if variant.board != board:
+            scans = stack_scans(
+                [interior(lidars[name], variant.board) for name in sorted(lidars)], variant.board
+            )
+            terms = linearise(scans, joint.terms.images, variant.board, joint.state, joint.trust)
+            moved = assemble(terms, joint.levels, joint.priors).cost
+            changes[k] = (moved.gradients - joint.cost.gradients).sum(axis=0)
+    return np.asarray(-(joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, changes.T)).T)
 
 
 def inflate(

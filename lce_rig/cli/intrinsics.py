@@ -93,7 +93,7 @@ def intrinsics(
 def _head(measured: MeasuredIntrinsics) -> list[str]:
     estimate = measured.estimate
     n = len({view.capture for view in estimate.views})
-    (along_width, along_height, aspect), sigma = estimate.shape, estimate.shape_sigma
+    (along_width, along_height, aspect), sigma = estimate.pattern_shape
     lines = [
         f"[bold]{measured.camera}[/] ({', '.join(measured.channels)}): {estimate.model.name} from "
         f"{len(estimate.views)} images of {n} captures",

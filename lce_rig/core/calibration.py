@@ -27,6 +27,7 @@ from pydantic_core import core_schema
 from typing_extensions import NotRequired, TypedDict
 
 import lce_rig
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
 from lce_rig.core.findings import Figure, Finding, Refusal, Severity, Stage
@@ -86,6 +87,8 @@ Pose = Annotated[Array, _array(Any, _pose)]
 """(4, 4), a rigid transform."""
 Covariance = Annotated[Array, _array(Annotated[list[_Six], Field(min_length=6, max_length=6)], _covariance)]
 """(6, 6), tangent (translation m, rotation rad), axes of the camera."""
+Matrix = Annotated[Array, _array(list[list[Annotated[float, Field(ge=-_MOST, le=_MOST)]]])]
+"""(n, m)."""
 Tangent = Annotated[Array, _array(_Six)]
 """(6,), translation m, rotation rad."""
 Number = Annotated[float, _number(-_MOST, math.nan)]
@@ -430,6 +433,10 @@ class Extrinsics(Protocol):
     def cov_shared(self) -> Array:
         """(6, 6)."""
 
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        """The camera's that belong to the extrinsics; None for the profile's."""
+
 
 _WITH_STATE = WrapSerializer(lambda opinion, write: {"state": opinion.state, **write(opinion)})
 
@@ -445,8 +452,8 @@ class Calibration:
         channel_results: the result of each of these alone.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
         cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
-        cov_shared: (6, 6) the part of it that all sessions of one lens and board have in common, as the
-            profile states these; zero if unknown.
+        cov_shared: (6, 6) the part of it that all sessions of one board have in common, as the profile states
+            this; zero if unknown.
         contributions: the causes of `cov`, the largest first.
         egt_rotation_deg, egt_translation_m: error against a reference given by the user; None without.
         verdict: "pass", "marginal" or "fail".
@@ -458,6 +465,11 @@ class Calibration:
         uncertainty: `cov` as errors of points at several distances; empty if no lens was at hand.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         other_cameras: those that saw the same boards held still.
+        intrinsics: of the camera, which belong to the extrinsics: by the profile and the session's images.
+            None in files of earlier versions, whose extrinsics belong to the profile's.
+        intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
+        intrinsics_cross_cov: (6, P) of `T_cam_lidar` with these.
+        square_m: the side of a square by the profile and the LiDAR.
         scene_share: the change of the extrinsics by the scene; None without `--use-scene`.
         scene: the opinion of the scene's edges; None if they were not compared.
         weakest: the least determined motion; None if it is read back.
@@ -497,6 +509,10 @@ class Calibration:
     other_cameras: tuple[OtherCamera, ...] = ()
     cov_shared: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
     contributions: tuple[Contribution, ...] = ()
+    intrinsics: Intrinsics | None = None
+    intrinsics_cov: Matrix | None = None
+    intrinsics_cross_cov: Matrix | None = None
+    square_m: Size | None = None
     scene_share: SceneShare | None = None
     scene: (
         Annotated[

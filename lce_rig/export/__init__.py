@@ -154,7 +154,7 @@ def export_formats(
     exporters = [load_exporter(name) for name in (usual_formats(rig) if formats is None else formats)]
     remove_exports(folder)
     require_usable(calibrations, is_forced=is_forced)
-    job = ExportJob(calibrations, rig, folder, robot, session)
+    job = ExportJob(calibrations, rig.with_lenses(calibrations), folder, robot, session)
     if rig.mount is not None and robot is not None and rig.mount.of in robot.above:
         joint = robot.above[rig.mount.of]
         angle_deg, distance_m = tangent_sizes(difference(joint.T_parent_child, rig.mount.to_matrix()))

@@ -21,13 +21,12 @@ from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes, tangent_sizes
 from lce_rig.judge.findings import KNOWN_BETTER, LARGEST_CAUSE, SURPRISING_CHI2
-from lce_rig.judge.intrinsics_check import IntrinsicsCheck
 from lce_rig.judge.nuisances import Nuisances
 from lce_rig.judge.split_consistency import Contrast, objections
 from lce_rig.rig import CalibrationSettings, Rig
 
-# A lens differs significantly below this probability, scales beyond this many standard deviations.
-_CHANCE, _SURE = 0.002, 3.0
+# Scales differ significantly beyond this many standard deviations.
+_SURE = 3.0
 # The session knows a quantity better than the profile below this ratio of their standard deviations.
 _CLEARLY = 0.5
 # Two subsets of the captures that contradict each other: the result is the mean of both.
@@ -60,7 +59,6 @@ def profile_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
 
 def find_contradictions(
     estimate: CalibrationEstimate,
-    check: IntrinsicsCheck | None,
     nuisances: Nuisances | None,
     contrasts: Sequence[Contrast],
     rig: Rig,
@@ -69,29 +67,15 @@ def find_contradictions(
 
     Args:
         estimate: with the sensitivities to errors of the profile.
-        check: the profile's lens compared with the session's boards.
         nuisances: the camera's scale.
         contrasts: subsets of the captures that should agree.
         rig: targets and limits.
     """
-    from scipy.special import fdtrc
-
     target, of_source = rig.calibration, {each.source: each for each in estimate.sensitivities}
-    if of_source and check is not None and check.errors is not None and check.errors_cov is not None:
-        lens = [of_source[name] for name in ("focal_length", "principal_point", "distortion")]
-        moves = np.concatenate([each.moves for each in lens])
-        sigmas = np.concatenate([np.full(len(each.moves), each.sigma) for each in lens])
-        errors, expected = np.array(check.errors), np.array(check.errors_cov) + np.diag(sigmas**2)
-        mean_square = float(errors @ np.linalg.solve(expected, errors)) / len(errors)
-        # The deviations come from few captures.
-        chance = float(fdtrc(len(errors), max(check.n_captures - 1, 1), mean_square))
-        # A lens that the verdict objects to contradicts as well, whatever the profile's standard deviations.
-        if chance < _CHANCE or check.verdict(target.target_sigma_deg) != "pass":
-            yield Contradiction("intrinsics", (errors @ moves)[None])
-    if of_source and nuisances is not None:
-        # The camera's distances and the LiDAR's, within the errors of focal length and squares.
-        squares, focal = of_source["square_size"], of_source["focal_length"]
-        variance = nuisances.scale_sigma**2 + squares.sigma**2 + focal.sigma**2
+    # The likelihood weighs the camera's distances and the LiDAR's itself.
+    if of_source and nuisances is not None and estimate.method == "paper" and estimate.lens is not None:
+        squares = of_source["square_size"]
+        variance = nuisances.scale_sigma**2 + squares.sigma**2 + estimate.lens.focal_sigma**2
         if nuisances.scale**2 > _SURE**2 * variance:
             yield Contradiction("scale", nuisances.scale * squares.moves)
     for contrast in objections(contrasts, target, rig.verdict):
@@ -160,26 +144,14 @@ class KnownBetter:
     profile_sigma: float
 
 
-def known_better(
-    check: IntrinsicsCheck | None, found: Nuisances | None, sensitivities: Sequence[Sensitivity]
-) -> tuple[KnownBetter, ...]:
-    """Find what the session's boards determine clearly better than the profile: lens, and the squares' size.
-
-    The squares' size follows from the LiDAR's distances, if the focal length is right.
-    """
-    sigma: dict[str, float] = {each.source: each.sigma for each in sensitivities}
-    candidates = []
-    if sigma and check is not None and check.errors is not None and check.errors_cov is not None:
-        deviations = np.sqrt(np.diag(np.array(check.errors_cov)))
-        for source, index in (("focal_length", [0]), ("principal_point", [1, 2])):
-            # Of both coordinates of the principal point, the one that is farther off.
-            worst = max(index, key=lambda k: abs(np.array(check.errors)[k]))
-            error, error_sigma = check.errors[worst], float(deviations[worst])
-            candidates.append(KnownBetter(source, error, error_sigma, sigma[source]))
-    if sigma and found is not None:
-        own = math.hypot(found.scale_sigma, sigma["focal_length"])
-        candidates.append(KnownBetter("square_size", -found.scale, own, sigma["square_size"]))
-    return tuple(each for each in candidates if each.error_sigma < _CLEARLY * each.profile_sigma)
+def known_better(estimate: CalibrationEstimate, found: Nuisances | None) -> tuple[KnownBetter, ...]:
+    """Find whether the LiDAR's distances determine the squares' size clearly better than the profile."""
+    sigma = {each.source: each.sigma for each in estimate.sensitivities}
+    if found is None or estimate.lens is None or not sigma:
+        return ()
+    own, of_profile = math.hypot(found.scale_sigma, estimate.lens.focal_sigma), sigma["square_size"]
+    better = KnownBetter("square_size", -found.scale, own, of_profile)
+    return (better,) if own < _CLEARLY * of_profile else ()
 
 
 def uncertainty_notes(

@@ -49,14 +49,12 @@ _RANGES = (
     "and lower range_offset_sigma_m and laser_bias_sigma_m in the profile, or put more rings on the board"
 )
 _MEASURE_LENS = (
-    "measure the intrinsics (`lce-rig intrinsics --save-profile FILE`), or enter their standard deviations "
-    "in the profile"
+    "collect captures with the board in all four corners of the image, tilted by 30 to 45 deg, or enter "
+    "intrinsics that were measured well, with their standard deviations"
 )
 _MEASURE = {
     "resolve": "resolve what contradicts first: more captures do not reduce this",
-    "measure_focal_length": _MEASURE_LENS,
-    "measure_principal_point": _MEASURE_LENS,
-    "measure_distortion": _MEASURE_LENS,
+    "measure_intrinsics": _MEASURE_LENS,
     "measure_square_size": "measure across all squares, divide, and enter square_m and square_sigma_m",
     "measure_pattern_offset": (
         "measure the pattern's margins on all four sides of the plate, and enter pattern_offset_m and "
@@ -68,6 +66,8 @@ _MEASURE = {
 _CAUSES = {
     "captures": "the scatter of the captures",
     "lidar_ranges": "the LiDAR's constant range errors",
+    "intrinsics": "the intrinsics",
+    # As in results of earlier versions.
     "focal_length": "the focal length",
     "principal_point": "the principal point",
     "distortion": "the lens distortion",
@@ -154,6 +154,8 @@ def _intrinsics(finding: Finding) -> str:
         percent, sigma = 100 * (finding.figure("focal_ratio") - 1), 100 * finding.figure("focal_sigma")
         larger = "larger" if percent > 0 else "smaller"
         parts.append(f"focal length {abs(percent):.1f} +- {sigma:.1f} % {larger}")
+    if finding.severity == "note":
+        return f"the session's boards correct the profile's intrinsics: {'; '.join(parts[1:]) or parts[0]}"
     how = "do not fit" if finding.severity == "error" else "fit only roughly"
     return f"the profile's intrinsics {how}: {'; '.join(parts)}"
 
@@ -210,13 +212,12 @@ def _largest_cause(finding: Finding) -> str:
 def _known_better(finding: Finding) -> str:
     """The session's boards determine {source} to {error_sigma}, the profile to {profile_sigma}: {error}."""
     source = str(finding.figures["source"])
-    scale, unit = (1.0, "px") if source == "principal_point" else (100.0, "%")
     error, sigma, of_profile = (
-        scale * finding.figure(name) for name in ("error", "error_sigma", "profile_sigma")
+        100 * finding.figure(name) for name in ("error", "error_sigma", "profile_sigma")
     )
     return (
         f"the session's boards determine {cause_words(source)} better than the profile: {error:+.2f} +- "
-        f"{sigma:.2f} {unit} from it, which has +- {of_profile:.2f} {unit}"
+        f"{sigma:.2f} % from it, which has +- {of_profile:.2f} %"
     )
 
 
@@ -365,7 +366,11 @@ INTRINSICS = Kind(
     "verdict.intrinsics",
     _intrinsics,
     "check whether lens or resolution were changed. " + _SAVE,
-    actions={"refocused": "check whether the lens was refocused. " + _SAVE, "collect": _collect_first},
+    actions={
+        "refocused": "check whether the lens was refocused. " + _SAVE,
+        "collect": _collect_first,
+        "weighed": "use the result's intrinsics with its extrinsics. " + _SAVE,
+    },
 )
 INTRINSICS_BETTER = Kind(
     "intrinsics.better",

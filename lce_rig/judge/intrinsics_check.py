@@ -41,6 +41,8 @@ _VISIBLE = 1.2
 # Intrinsics for a profile determine pixels to the image's border. The standard deviation there may be as
 # large as the profile's error where boards were seen, within these limits.
 _KNOWN_PX = (1.0, 5.0)
+# Squared distance from the profile's intrinsics, in their standard deviations, of another lens.
+_OTHER_LENS = 36.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class IntrinsicsCheck:
             are of different families.
         covered: share of the image in which boards were seen.
         image_sigma_px: standard deviation of the fitted intrinsics, as `LensCertainty.image_sigma_px`.
+        surprise: of the fitted intrinsics, as `IntrinsicsEstimate.surprise`.
         errors: (4,) of the given intrinsics, as `Intrinsics.differentiate_by_errors`; None if they project
             too little.
         errors_cov: (4, 4) of these.
@@ -81,6 +84,7 @@ class IntrinsicsCheck:
     chance: float | None
     covered: float
     image_sigma_px: float
+    surprise: float | None = None
     errors: tuple[float, ...] | None = None
     errors_cov: tuple[tuple[float, ...], ...] | None = None
 
@@ -182,7 +186,7 @@ def compare_with_given(
     check = IntrinsicsCheck(
         n_captures=n_captures,
         rms_px=float(np.sqrt(np.mean(given_px**2))),
-        possible_px=fitted.held_out_rms_px,
+        possible_px=fitted.rms_px if np.isnan(fitted.held_out_rms_px) else fitted.held_out_rms_px,
         displacement_px=difference.rms_px,
         displacement_sigma_px=difference.sigma_px,
         displacement_deg=float(np.degrees(difference.rms_px / given_focal)),
@@ -193,6 +197,7 @@ def compare_with_given(
         chance=chance,
         covered=certainty.covered,
         image_sigma_px=certainty.image_sigma_px,
+        surprise=fitted.surprise,
         errors=errors,
         errors_cov=errors_cov,
     )
@@ -214,8 +219,9 @@ def judge_lens(
 ) -> Finding:
     """Judge whether the boards of a session determine the intrinsics better than the profile.
 
-    They do where the profile's do not fit and a pixel's standard deviation near the image's border is smaller
-    than the profile's error where boards were seen. All verbs judge by this.
+    Intrinsics from boards and profile are always at least as good as the profile's alone. Those of boards
+    alone are better where the profile's do not fit and a pixel's standard deviation near the image's border
+    is smaller than the profile's error where boards were seen. All verbs judge by this.
 
     Args:
         covered: share of the image in which boards were seen.
@@ -231,6 +237,8 @@ def judge_lens(
     figures: dict[str, Any] = {"covered": covered, "image_sigma_px": image_sigma_px, "limit_px": limit_px}
     if check is not None and check.verdict(target_deg) == "pass":
         return INTRINSICS_FIT(**figures)
+    if check is not None and check.surprise is not None:
+        return INTRINSICS_BETTER(**figures)
     return INTRINSICS_UNDETERMINED(**figures) if image_sigma_px > limit_px else INTRINSICS_BETTER(**figures)
 
 
@@ -256,6 +264,11 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
         "is_focal_off": check.is_focal_off,
     }
     action = "refocused" if check.is_focal_off else ""
-    if judgement.code == "intrinsics.undetermined":
+    severity = failing(check.verdict(target_deg) == "fail")
+    if check.surprise is not None:
+        # The result has the fitted intrinsics; only a lens that is hardly the profile's is a doubt.
+        severity = "warning" if check.surprise > _OTHER_LENS else "note"
+        action = action if severity == "warning" else "weighed"
+    elif judgement.code == "intrinsics.undetermined":
         action = "collect"
-    return INTRINSICS(severity=failing(check.verdict(target_deg) == "fail"), action=action, **figures)
+    return INTRINSICS(severity=severity, action=action, **figures)

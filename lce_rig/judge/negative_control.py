@@ -21,8 +21,8 @@ from lce_rig.judge.findings import CONTROL, failing
 from lce_rig.judge.local_quadratic import capture_costs, feature_sigmas
 from lce_rig.rig import CalibrationSettings
 
-# A gain in the wrong direction of this many standard errors is significant.
-_SURE = 2.0
+# A gain in the wrong direction of this many standard errors is significant, of more than these it fails.
+_SURE, _FAILS = 2.0, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +139,10 @@ def control_findings(control: NegativeControl | None) -> list[Finding]:
         return []
     move = control.moves[worst]
     rotation_deg, translation_m = tangent_sizes(move)
-    is_fail = bool(control.worse[worst] < -_SURE * control.worse_sigma[worst])
+    sigmas = -float(control.worse[worst] / control.worse_sigma[worst])
     return [
         CONTROL(
-            severity=failing(is_fail),
+            severity="note" if sigmas < _SURE else failing(sigmas > _FAILS),
             rotation_deg=rotation_deg,
             translation_m=translation_m,
             direction=main_motion(move),

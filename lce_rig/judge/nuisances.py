@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
+from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
 from lce_rig.judge.findings import EDGE_SHIFT, LASER_OFFSET, SCALE_OFF, failing
@@ -71,17 +72,24 @@ def _sigma(expansion: Quadratics, unknown: int) -> float:
 
 
 def nuisance_findings(
-    found: Nuisances | None, board: Board, lidar: LidarSettings, limits: VerdictSettings
+    found: Nuisances | None,
+    estimate: CalibrationEstimate,
+    board: Board,
+    lidar: LidarSettings,
+    limits: VerdictSettings,
 ) -> list[Finding]:
-    """Find implausible nuisance parameters: a scale error, edges beyond the beam, large range errors."""
+    """Find implausible nuisance parameters: a scale error, edges beyond the beam, large range errors.
+
+    The likelihood estimates the squares, with which it is consistent: their size is a note then.
+    """
     if found is None:
         return []
-    findings = []
+    findings, is_weighed = [], estimate.method == "ml" and estimate.lens is not None
     off = abs(found.scale) - _SURE * found.scale_sigma
     if off > 0 and abs(found.scale) > limits.max_scale_error:
         findings.append(
             SCALE_OFF(
-                severity=failing(off > _SCALE_FAIL * limits.max_scale_error),
+                severity="note" if is_weighed else failing(off > _SCALE_FAIL * limits.max_scale_error),
                 scale=found.scale,
                 scale_sigma=found.scale_sigma,
                 square_m=board.square_m / (1 + found.scale),

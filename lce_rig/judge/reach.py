@@ -1,21 +1,55 @@
-"""The effect of the extrinsics' uncertainty on a point measured by the LiDAR, in pixels and centimetres.
+"""The effect of the errors of extrinsics and intrinsics together on a point measured by the LiDAR.
 
 A point p = R q + t in the camera frame moves with the extrinsics by [I, -(p - t)^] times their tangent, as a
-rotation moves it about the LiDAR's origin.
+rotation moves it about the LiDAR's origin; its pixel moves with the intrinsics as well. Both errors are
+correlated: a principal point that is off turns the extrinsics, which leaves pixels where they are.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.calibration import PointUncertainty
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, skew
+from lce_rig.lens.difference import turn_of_lens
+from lce_rig.lens.models import LensModel, model_of
 
 DISTANCES_M = (5.0, 10.0, 20.0)
 # Beyond some radius the distortion is undefined; corners are moved to that radius.
 _INWARDS = np.linspace(0.0, 1.0, 41)[:-1]
-_STEP_M = 1e-4
+
+
+def joint_covariance(estimate: CalibrationEstimate, cov: Array) -> Array:
+    """Extend a covariance (6, 6) of extrinsics by the session's intrinsics: (6 + P, 6 + P).
+
+    Args:
+        estimate: with the lens; without one, nothing is added.
+        cov: of the extrinsics, which contains the effect of the lens.
+    """
+    if estimate.lens is None:
+        return cov
+    cross = estimate.cov_with_lens
+    return np.block([[cov, cross], [cross.T, estimate.lens.estimate.cov]])
+
+
+def effective_covariance(estimate: CalibrationEstimate, joint: Array) -> Array:
+    """Compute the covariance (6, 6) of the extrinsics used with the intrinsics of the same result.
+
+    The error of the intrinsics acts as a rotation of the camera, which is subtracted from that of the
+    extrinsics.
+
+    Args:
+        estimate: with the lens.
+        joint: (6 + P, 6 + P), `joint_covariance`.
+    """
+    if estimate.lens is None:
+        return joint
+    fitted = estimate.lens.estimate
+    turn = turn_of_lens(fitted.intrinsics, fitted.corners_px.reshape(-1, 2), fitted.model)
+    M = np.hstack([np.eye(6), np.vstack([np.zeros_like(turn), turn])])
+    return np.asarray(M @ joint @ M.T)
 
 
 def point_uncertainties(
@@ -25,7 +59,7 @@ def point_uncertainties(
 
     Args:
         T_cam_lidar: (4, 4).
-        cov: (6, 6) tangent (translation m, rotation rad).
+        cov: (6, 6) tangent (translation m, rotation rad), or (6 + P, 6 + P) with the intrinsics.
         lens: of the camera.
         distances_m: of the points.
 
@@ -34,9 +68,9 @@ def point_uncertainties(
     """
     middle = [(lens.width_px - 1) / 2, (lens.height_px - 1) / 2]
     rays = lens.unproject(np.concatenate([[middle], outermost_pixels(lens)]))
-    found = []
+    model, found = model_of(lens), []
     for distance_m in distances_m:
-        sigmas = [_sigmas(distance_m * ray, T_cam_lidar[:3, 3], cov, lens) for ray in rays]
+        sigmas = [_sigmas(distance_m * ray, T_cam_lidar[:3, 3], cov, lens, model) for ray in rays]
         corner_px, corner_m = np.max(sigmas[1:], axis=0)
         found.append(PointUncertainty(distance_m, *sigmas[0], float(corner_px), float(corner_m)))
     return tuple(found)
@@ -54,12 +88,10 @@ def outermost_pixels(lens: Intrinsics) -> Array:
     return np.array(corners)
 
 
-def _sigmas(point: Array, t: Array, cov: Array, lens: Intrinsics) -> tuple[float, float]:
+def _sigmas(point: Array, t: Array, cov: Array, lens: Intrinsics, model: LensModel) -> tuple[float, float]:
     """Compute the expected size of a point's error in the image, px, and in space, m."""
     by_tangent = np.concatenate([np.eye(3), -skew(point - t)], axis=1)
-    cov_point = by_tangent @ cov @ by_tangent.T
-    steps = _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
-    pixels, _ = lens.project(point + steps)
-    by_point = (pixels[:3] - pixels[3:]).T / (2 * _STEP_M)
-    cov_px = by_point @ cov_point @ by_point.T
+    _, by_point, by_lens = model.project(model.vector(lens), point)
+    by_all = np.concatenate([by_point @ by_tangent, by_lens], axis=1)[:, : len(cov)]
+    cov_px, cov_point = by_all @ cov @ by_all.T, by_tangent @ cov[:6, :6] @ by_tangent.T
     return float(np.sqrt(np.trace(cov_px))), float(np.sqrt(np.trace(cov_point)))

@@ -14,7 +14,6 @@ import numpy as np
 
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import CalibrationEstimate
-from lce_rig.calibrate.tolerances import Sensitivity
 from lce_rig.core.calibration import Contribution
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
@@ -28,14 +27,14 @@ from lce_rig.judge.contributions import (
     profile_covariance,
 )
 from lce_rig.judge.findings import WIDENED
-from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
+from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given
 from lce_rig.judge.laser_angles import estimate_angles
 from lce_rig.judge.local_quadratic import SCALE, expand
 from lce_rig.judge.negative_control import NegativeControl, run_control, run_control_with_constants
 from lce_rig.judge.nuisances import Nuisances, estimate_nuisances
+from lce_rig.judge.reach import effective_covariance, joint_covariance
 from lce_rig.judge.rejected_captures import find_moved
 from lce_rig.judge.split_consistency import Contrast, contrast_halves, find_groups
-from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import LidarSettings, Rig, VerdictSettings
 
 _N_DRAWS = 300
@@ -126,8 +125,6 @@ def widening(cov: Array, spread: Spread, limits: VerdictSettings) -> tuple[float
 
 # Fewer placements do not allow leave-one-out.
 _MIN_PLACEMENTS = 4
-# More images do not improve the check of the intrinsics, and take time.
-_MAX_VIEWS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +135,9 @@ class Validation:
         cov: (6, 6) to report: the estimate's, widened if resampling spreads it farther, with errors of the
             profile and what checks contradict.
         cov_agreed: (6, 6) the same without what checks contradict.
-        cov_shared: (6, 6) the part of it from errors of the profile's lens and board.
+        cov_with_lens: (6 + P, 6 + P) of extrinsics and the session's intrinsics, as `cov`.
+        cov_used: (6, 6) of extrinsics that are used with these intrinsics, as `cov`.
+        cov_shared: (6, 6) the part of it from errors of the profile's board.
         contributions: its causes, the largest first.
         known_better: what the session's boards determine better than the profile.
         widened_by: factor by which the standard deviations were widened; 1 if they were not.
@@ -152,6 +151,8 @@ class Validation:
 
     cov: Array
     cov_agreed: Array
+    cov_with_lens: Array
+    cov_used: Array
     cov_shared: Array
     contributions: tuple[Contribution, ...]
     known_better: tuple[KnownBetter, ...]
@@ -169,7 +170,6 @@ def validate(
     rig: Rig,
     lidar: LidarSettings,
     lens: Intrinsics,
-    views: Sequence[BoardView],
     rejected: Sequence[Observation] = (),
 ) -> Validation:
     """Check a result on its own captures.
@@ -178,14 +178,12 @@ def validate(
         estimate: the result of any method.
         rig: board, targets and limits.
         lidar: its range error settings.
-        lens: of the camera.
-        views: its boards in the captures used.
+        lens: of the camera, as the profile says.
         rejected: captures in which both sensors see the board, that the estimate does not use.
     """
     board, known = rig.board.to_board(), estimate.sensitivities
-    # More views do not improve the check of the intrinsics.
-    thinned = views[:: max(1, -(-len(views) // _MAX_VIEWS))]
-    intrinsics = check_intrinsics(thinned, lens, board) if views else None
+    fitted = None if estimate.lens is None else estimate.lens.estimate
+    intrinsics = None if fitted is None else compare_with_given(fitted, lens, board)[0]
     widened_by, remark, control, nuisances = 1.0, None, None, None
     contrasts: tuple[Contrast, ...] = ()
     laser_angles: Mapping[str, float] = {}
@@ -203,7 +201,7 @@ def validate(
         widened_by, remark = widening(estimate.cov, resample(estimate.cost or settled), rig.verdict)
         cov, moved = widened_by**2 * estimate.cov, (rig.calibration, rig.verdict.control_sigmas)
         if estimate.method == "ml":
-            with_constants = _with_prior_of_scale(expansion, known)
+            with_constants = _with_prior_of_scale(expansion, estimate)
             control = run_control_with_constants(with_constants, cov, estimate.lever_m, *moved)
         else:
             control = run_control(observations, board, estimate.T_cam_lidar, cov, settled, *moved)
@@ -213,15 +211,19 @@ def validate(
         contrasts = (*of_rejected, *contrast_halves(settled, centres), *find_groups(settled))
         nuisances = estimate_nuisances(expansion, rings)
         laser_angles = estimate_angles(observations, board, estimate.T_cam_lidar, lidar)
-    contradictions = list(find_contradictions(estimate, intrinsics, nuisances, contrasts, rig))
-    cov_shared = profile_covariance(known)
-    cov_agreed = widened_by**2 * estimate.cov + cov_shared
+    contradictions = list(find_contradictions(estimate, nuisances, contrasts, rig))
+    cov_agreed = widened_by**2 * estimate.cov + profile_covariance(known)
+    cov = cov_agreed + sum(each.cov for each in contradictions)
+    joint = joint_covariance(estimate, cov)
     return Validation(
-        cov=cov_agreed + sum(each.cov for each in contradictions),
+        cov=cov,
         cov_agreed=cov_agreed,
-        cov_shared=cov_shared,
+        cov_with_lens=joint,
+        cov_used=effective_covariance(estimate, joint),
+        # Each session has fitted its own lens.
+        cov_shared=profile_covariance([each for each in known if each.source != "intrinsics"]),
         contributions=list_contributions(estimate.diagnostics, widened_by, known, contradictions),
-        known_better=known_better(intrinsics, nuisances, known),
+        known_better=known_better(estimate, nuisances),
         widened_by=widened_by,
         remark=remark,
         contrasts=contrasts,
@@ -232,9 +234,10 @@ def validate(
     )
 
 
-def _with_prior_of_scale(expansion: Quadratics, sensitivities: Sequence[Sensitivity]) -> Quadratics:
-    """Let the camera's scale be wrong as the profile's focal length and squares may be."""
-    sigmas = [each.sigma for each in sensitivities if each.source in ("square_size", "focal_length")]
+def _with_prior_of_scale(expansion: Quadratics, estimate: CalibrationEstimate) -> Quadratics:
+    """Let the camera's scale be wrong as focal length and squares may be."""
+    sigmas = [each.sigma for each in estimate.sensitivities if each.source == "square_size"]
+    sigmas += [] if estimate.lens is None else [estimate.lens.focal_sigma]
     if not any(sigmas):
         return expansion.hold(SCALE)
     prior = expansion.prior.copy()

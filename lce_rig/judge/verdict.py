@@ -85,7 +85,7 @@ def judge(
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
         *angle_findings(examination.laser_angles),
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
-        *nuisance_findings(examination.nuisances, board, rig.lidars[lidar], rig.verdict),
+        *nuisance_findings(examination.nuisances, estimate, board, rig.lidars[lidar], rig.verdict),
         *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
         *others,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
@@ -181,8 +181,10 @@ def _certificate(estimate: CalibrationEstimate) -> list[Finding]:
 
 
 def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig) -> Iterator[Finding]:
-    agreed_deg, agreed_m = sigma_sizes(examination.cov_agreed)
-    sigmas, target, of_lidar = np.sqrt(np.diag(examination.cov)), rig.calibration, estimate.diagnostics
+    # Extrinsics are used with the intrinsics of the same result, whose errors compensate part of theirs.
+    cov, contradicted = examination.cov_used, examination.cov - examination.cov_agreed
+    agreed_deg, agreed_m = sigma_sizes(cov - contradicted)
+    sigmas, target, of_lidar = np.sqrt(np.diag(cov)), rig.calibration, estimate.diagnostics
     for kind, unit, first, axes, goal, agreed, of_lidar_alone, size in (
         (
             *(ROTATION_UNCERTAIN, "deg", 3, np.degrees(sigmas[3:]), target.target_sigma_deg, agreed_deg),
@@ -267,7 +269,7 @@ def _channels(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
 
 def _captures(estimate: CalibrationEstimate, n_captures: int, limits: QualitySettings) -> Iterator[Finding]:
     """Count captures in which the sensors disagree, captures used, and placements of the board."""
-    n_used, n_placements = len(estimate.used), int(estimate.diagnostics.n_placements)
+    n_used, n_placements = len(estimate.captures_of(estimate.used)), int(estimate.diagnostics.n_placements)
     disagreeing = sorted(k for k, why in estimate.refused.items() if why.stage in ("pair", "calibrate"))
     n_refused, n = len(disagreeing), len(disagreeing) + n_used
     if 4 * n_refused > n:

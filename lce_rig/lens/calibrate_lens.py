@@ -13,9 +13,19 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.lens.findings import OTHER_LENS
-from lce_rig.lens.fit import N_MODES, LensState, Setup, corners_of, fit, reduced, refine_poses, residuals_px
+from lce_rig.lens.fit import (
+    N_MODES,
+    LensState,
+    Setup,
+    corners_of,
+    fit,
+    reduced,
+    refine_poses,
+    residuals_px,
+    solve_scaled,
+)
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
-from lce_rig.lens.models import MODELS, LensModel, convert, model_of
+from lce_rig.lens.models import MODELS, LensModel, LensPrior, convert, model_of
 
 MIN_CAPTURES = 4
 N_FOLDS = 10
@@ -23,8 +33,18 @@ N_FOLDS = 10
 _ROUNDS, _STEADY = 6, 0.1
 # A board's noise is estimated from its own residuals and this many of its channel as a prior.
 _PRIOR_DOF = 30.0
+# Errors that a board's corners share and residuals hide: model of the lens, blur. Sessions of one rig whose
+# corners fit to 0.01 px differ as if all had at least this error.
+_SHARED_PX = 0.02
+# A profile's intrinsics that the boards contradict by more (squared, in standard deviations) are trusted
+# less: their covariance is widened to the mean of chi-squared with four degrees of freedom.
+_CONTRADICTION, _EXPECTED = 16.0, 4.0
+# Rounds of comparing the scatter of captures with the stated deviations.
+_SCATTER_ROUNDS = 3
 # Corners with residuals this many times the typical value of their channel are outliers.
 _BAD = 4.0
+# Directions of the intrinsics with a smaller share of the largest variance are the prior's.
+_DETERMINED = 1e-3
 # A capture that alone decides a direction has no others to be compared with.
 _LEAST_REST = 1e-3
 # A focal length with a larger relative standard deviation is undetermined.
@@ -37,25 +57,30 @@ def estimate_intrinsics(
     start: Intrinsics,
     model: LensModel,
     *,
+    prior: LensPrior | None = None,
     n_folds: int = N_FOLDS,
 ) -> IntrinsicsEstimate:
     """Fit intrinsics and board shape to the corners of all views, each with its own pose and noise level.
 
     Boards are weighted by their own residuals, so that blurred images and noisier channels count less, and
-    views that do not fit the others are refused by name.
+    views that do not fit the others are refused by name. Corners of one image err together: all weights
+    are divided by the ratio of the captures' scatter to what independent corners explain, before the
+    prior counts.
 
     Args:
         views: of at least `MIN_CAPTURES` captures.
         board: the board.
         start: an initial guess at the images' resolution; it may be wrong by a third.
         model: of the lens to fit.
-        n_folds: number of cross-validation folds.
+        prior: the profile's intrinsics; None to use the boards alone.
+        n_folds: number of cross-validation folds; 0 for none.
 
     Raises:
         NotEnoughDataError: too few captures, or captures that do not determine the focal length.
     """
-    _require_captures(views)
-    setup = Setup.of(np.array([view.board.corners_px for view in views]), board, model)
+    n_needed = MIN_CAPTURES if prior is None else 1
+    _require_captures(views, n_needed)
+    setup = Setup.of(np.array([view.board.corners_px for view in views]), board, model, prior)
     starts = np.array([view.board.T_cam_board for view in views])
     channels = np.array([view.channel for view in views])
     state = LensState(convert(start, model), np.zeros(len(setup.shapes)), starts)
@@ -71,11 +96,11 @@ def estimate_intrinsics(
         state = refine_poses(setup, fitted.with_poses(starts))
         # Boards that fit about as well as is typical of their channel.
         variances = _variances(setup, state)
-        fits = variances <= _BAD**2 * _usual(variances, channels)
+        fits = variances <= _BAD**2 * (_usual(variances, channels) + _SHARED_PX**2)
         if rounds_left == 0 or np.array_equal(fits, kept):
             break
         kept = fits
-        _require_captures([view for view, is_kept in zip(views, kept, strict=True) if is_kept])
+        _require_captures([view for view, is_kept in zip(views, kept, strict=True) if is_kept], n_needed)
     used = tuple(view for view, is_kept in zip(views, kept, strict=True) if is_kept)
     distances_px = _distances(setup, state)
     median_px = float(np.median(distances_px[kept]))
@@ -83,7 +108,7 @@ def estimate_intrinsics(
         views[k].name: OTHER_LENS.refusal(rms_px=float(distances_px[k]), median_px=median_px)
         for k in np.flatnonzero(~kept).tolist()
     }
-    return _estimate(setup.select(kept), fitted, weights, used, refused, start, n_folds)
+    return _estimate(setup.select(kept), fitted, weights, used, refused, start, n_folds, prior is not None)
 
 
 def distances_under(intrinsics: Intrinsics, views: Sequence[BoardView], board: Board) -> Array:
@@ -100,11 +125,11 @@ def distances_under(intrinsics: Intrinsics, views: Sequence[BoardView], board: B
     return _distances(setup, fit(setup, start, np.ones(len(views))))
 
 
-def _require_captures(views: Sequence[BoardView]) -> None:
+def _require_captures(views: Sequence[BoardView], n_needed: int) -> None:
     n = len({view.capture for view in views})
-    if n < MIN_CAPTURES:
+    if n < n_needed:
         raise NotEnoughDataError(
-            f"the board is in {n} captures (minimum {MIN_CAPTURES} for intrinsics)",
+            f"the board is in {n} captures (minimum {n_needed} for intrinsics)",
             "Collect 15 or more, tilted in different directions, all over the image",
         )
 
@@ -140,7 +165,8 @@ def _weights(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> Arra
     variances = _variances(setup, state)
     dof = 2 * setup.corners_px.shape[1] - 6
     usual = _usual(variances, channels)
-    return np.asarray((dof + _PRIOR_DOF) / (dof * variances + _PRIOR_DOF * usual + 1e-12))
+    pooled = (dof * variances + _PRIOR_DOF * usual) / (dof + _PRIOR_DOF)
+    return np.asarray(1 / (pooled + _SHARED_PX**2))
 
 
 def _distances(setup: Setup, state: LensState) -> Array:
@@ -156,75 +182,106 @@ def _estimate(
     refused: Mapping[str, Refusal],
     start: Intrinsics,
     n_folds: int,
+    has_prior: bool,
 ) -> IntrinsicsEstimate:
     captures = np.unique([view.capture for view in views], return_inverse=True)[1]
     advice = "add captures with the board tilted by 20 deg or more, left and right as well as up and down"
+    profile = setup
     try:
-        cov, inflation = _covariance(setup, state, weights, captures)
+        setup, state, weights, cov, inflation = _weigh_scatter(setup, state, weights, captures, has_prior)
     except np.linalg.LinAlgError as error:
         raise NotEnoughDataError("the captures do not determine the intrinsics", advice) from error
     P = setup.model.size
     focal_sigma = float(np.sqrt(cov[0, 0]) / state.lens[0])
     if not 0 <= focal_sigma < _MAX_FOCAL_SIGMA:
         raise NotEnoughDataError(f"focal length standard deviation {100 * focal_sigma:.0f} %", advice)
+    smooth = P + N_MODES
     return IntrinsicsEstimate(
         model=setup.model,
         intrinsics=setup.model.intrinsics(state.lens, start.width_px, start.height_px),
         cov=cov[:P, :P],
+        cov_with_board=cov[:smooth, :smooth],
         inflation=inflation,
         corners_board=corners_of(setup, state.shape),
+        shapes=setup.shapes[:N_MODES],
         shape=state.shape[:N_MODES],
-        shape_sigma=np.sqrt(np.diag(cov)[P : P + N_MODES]),
+        shape_sigma=np.sqrt(np.diag(cov)[P:smooth]),
         print_rms_m=float(np.sqrt(2 * np.mean(state.shape[N_MODES:] ** 2))),
         views=views,
         T_cam_board=state.T_cam_board,
         residuals_px=-residuals_px(setup, state),
         held_out_px=_held_out(setup, state, weights, captures, n_folds),
+        surprise=profile.surprise(state.lens) if has_prior else None,
         refused=refused,
     )
 
 
-def _covariance(
-    setup: Setup, state: LensState, weights: Array, captures: NDArray[np.intp]
-) -> tuple[Array, float]:
-    """Compute the covariance (Q, Q) of intrinsics and shape, inflated to the captures' scatter.
+def _weigh_scatter(
+    setup: Setup, state: LensState, weights: Array, captures: NDArray[np.intp], has_prior: bool
+) -> tuple[Setup, LensState, Array, Array, float]:
+    """Divide the weights by the captures' scatter, and widen a prior that the boards contradict.
 
-    H^-1 is valid for independent corner errors. In fact, model errors move all corners of an image together.
-    With gradient g_k and Hessian H_k of capture k, H = L L^T and S_k = L^-1 H_k L^-T, each
-    e_k = (I - S_k)^-1/2 L^-1 g_k has the covariance S_k if errors are independent, for any weights of single
-    captures. The ratio of the scatter sum_k L^-T e_k e_k^T L^-1 of the intrinsics to H^-1 inflates H^-1.
+    Returns:
+        Setup, state and weights with the covariance (Q, Q) of lens and shape, and the ratio of standard
+        deviations to those of independent corners.
+    """
+    inflation = 1.0
+    for _ in range(_SCATTER_ROUNDS):
+        ratio = _scatter_ratio(setup, state, weights, captures)
+        inflation, weights = inflation * ratio, weights / ratio
+        if has_prior:
+            surprise = setup.surprise(state.lens)
+            setup = setup.with_wider_lens(surprise / _EXPECTED) if surprise > _CONTRADICTION else setup
+        state = fit(setup, state, weights)
+    _, information = reduced(setup, state, weights)
+    cov = solve_scaled(information.sum(axis=0) + setup.information, np.eye(len(setup.mean)))
+    return setup, state, weights, cov, float(np.sqrt(inflation))
+
+
+def _scatter_ratio(setup: Setup, state: LensState, weights: Array, captures: NDArray[np.intp]) -> float:
+    """Compare the captures' scatter of the intrinsics with the covariance of independent corner errors.
+
+    In fact, model errors move all corners of an image together. With gradient g_k and Hessian H_k of
+    capture k, H = sum H_k + prior = L L^T and S_k = L^-1 H_k L^-T, each e_k = (I - S_k)^-1/2 L^-1 g_k has the
+    covariance S_k if errors are independent, for any weights of single captures. The scatter
+    sum_k L^-T e_k e_k^T L^-1 of the intrinsics is compared with H^-1 (sum_k H_k) H^-1.
+
+    Returns:
+        The mean ratio of variances in the directions that the captures determine, 1 at least.
 
     References:
         R. Bell, D. McCaffrey: Bias reduction in standard errors for linear regression with multi-stage
         samples. Survey Methodology 28 (2002).
     """
     gradients, information = reduced(setup, state, weights)
-    scale = 1.0 / np.sqrt(np.einsum("kii->i", information) + setup.information)
+    scale = 1.0 / np.sqrt(np.einsum("kii->i", information) + np.diag(setup.information))
     gradients, information = gradients * scale, information * np.outer(scale, scale)
-    L = np.linalg.cholesky(information.sum(axis=0) + np.diag(setup.information * scale**2))
+    data = information.sum(axis=0)
+    L = np.linalg.cholesky(data + setup.information * np.outer(scale, scale))
     back = np.linalg.inv(L)
     cov = back.T @ back
     # The shared unknowns absorb part of the residuals.
     n_residuals = len(weights) * (2 * setup.corners_px.shape[1] - 6)
-    lost = float(np.einsum("ij,kji->", cov, information))
-    cov *= n_residuals / max(n_residuals - lost, 1.0)
+    lost = float(np.vdot(cov, data))
+    expected = cov @ data @ cov * (n_residuals / max(n_residuals - lost, 1.0))
     P = setup.model.size
-    scatter = np.zeros((P, P))
+    moves = []
     for capture in range(int(captures.max()) + 1):
         own = captures == capture
         values, vectors = np.linalg.eigh(back @ information[own].sum(axis=0) @ back.T)
         e = vectors.T @ back @ gradients[own].sum(axis=0) / np.sqrt(np.maximum(1.0 - values, _LEAST_REST))
-        move = (back.T @ vectors @ e)[:P]
-        scatter += np.outer(move, move)
-    inflation = float(np.sqrt(max(np.trace(np.linalg.solve(cov[:P, :P], scatter)) / P, 1.0)))
-    return inflation**2 * cov * np.outer(scale, scale), inflation
+        moves.append((back.T @ vectors @ e)[:P])
+    sigma = np.sqrt(np.diag(expected)[:P])
+    variances, axes = np.linalg.eigh(expected[:P, :P] / np.outer(sigma, sigma))
+    along = np.sum((np.array(moves) / sigma @ axes) ** 2, axis=0) / np.maximum(variances, 1e-12)
+    return max(float(np.mean(along[variances > _DETERMINED * variances.max()])), 1.0)
 
 
 def _held_out(
     setup: Setup, state: LensState, weights: Array, captures: NDArray[np.intp], n_folds: int
 ) -> Array:
     """Rms distance (K,) of each board's corners under intrinsics and shape fitted to the other folds."""
-    distances = np.empty(len(captures))
+    distances = np.full(len(captures), np.nan)
     n = min(n_folds, int(captures.max()) + 1)
     for fold in range(n):
         out = captures % n == fold

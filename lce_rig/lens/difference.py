@@ -149,6 +149,19 @@ def lens_errors(
     return solve @ (pixels - given.project(rays)[0]).ravel(), by_lens @ cov @ by_lens.T
 
 
+def turn_of_lens(intrinsics: Intrinsics, corners_px: Array, model: LensModel) -> Array:
+    """Find the rotation of the camera (3, P) that projects like a change of each parameter of its lens.
+
+    Args:
+        intrinsics: the lens.
+        corners_px: (n, 2) where boards were seen; pixels differ least there.
+        model: whose parameters these are.
+    """
+    rays = intrinsics.unproject(corners_px)
+    turn, _ = _best_turn(model, model.vector(intrinsics), rays[np.isfinite(rays).all(axis=1)])
+    return -turn
+
+
 def certainty_of(intrinsics: Intrinsics, corners_px: Array, cov: Array, model: LensModel) -> LensCertainty:
     """Propagate the covariance of intrinsics to the image's pixels.
 

@@ -3,9 +3,10 @@
 Lens and board are shared by all images, the pose is each one's own: the normal equations have an arrow's
 shape, and eliminating the poses (Schur) leaves one small system however many images there are.
 
-The board deviates from its nominal shape. A bow of half a millimetre, a pattern a thousandth too long in one
-direction, corners displaced by a tenth of a millimetre: each moves the focal length or the principal point by
-more than the noise of the corners does.
+The board deviates from its nominal shape. A bow of half a millimetre, a twist, a pattern a thousandth too
+long in one direction, corners displaced by a tenth of a millimetre: each moves the focal length or the
+principal point by more than the noise of the corners does, and alike in every image. On a recording with a
+plate bent by 6 mm, a fit of two bows alone puts the principal point 20 px off.
 """
 
 from dataclasses import dataclass, replace
@@ -16,15 +17,20 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb, skew
 from lce_rig.core.planar_pose import mirror_tilt
-from lce_rig.lens.models import LensModel
+from lce_rig.lens.lens_estimate import IntrinsicsEstimate
+from lce_rig.lens.models import LensModel, LensPrior
 
-# Prior deviations of boards from the nominal shape: bowed by millimetres, printed longer in one direction by
-# a fraction, single corners displaced by a tenth of a millimetre.
+# Prior deviations of boards from the nominal shape: bowed by millimetres, bent otherwise by less, printed
+# longer in one direction by a fraction, the pattern and single corners displaced by a tenth of a millimetre.
 BOW_SIGMA_M = 0.003
+BEND_SIGMA_M = 0.001
 ASPECT_SIGMA = 0.002
 PRINT_SIGMA_M = 1e-4
-# Bow along width and height, aspect; then the corners' own offsets.
-N_MODES = 3
+# A board that the profile states to be exact.
+_EXACT_M = 1e-7
+# Bow along width and height, aspect, five further bends, seven smooth displacements of the pattern; then the
+# corners' own offsets.
+N_MODES = 15
 _MAX_STEPS = 40
 _POSE_STEPS = 15
 
@@ -37,7 +43,8 @@ class Setup:
         corners_px: (K, N, 2) of K boards, in the order of `Board.corners()`.
         corners_board: (N, 3) nominal, m.
         shapes: (S, N, 3) displacement of the corners per unit of each shape parameter.
-        shape_sigma: (S,) standard deviations of these a priori.
+        mean: (P + S,) lens and shape a priori.
+        information: (P + S, P + S) of it.
         model: of the lens.
         is_lens_free: whether the intrinsics are fitted; else only the board's shape and the poses are.
     """
@@ -45,17 +52,22 @@ class Setup:
     corners_px: Array
     corners_board: Array
     shapes: Array
-    shape_sigma: Array
+    mean: Array
+    information: Array
     model: LensModel
     is_lens_free: bool = True
 
     @classmethod
-    def of(cls, corners_px: Array, board: Board, model: LensModel) -> "Setup":
+    def of(cls, corners_px: Array, board: Board, model: LensModel, prior: LensPrior | None = None) -> "Setup":
         """Prepare boards (K, N, 2) for a fit.
 
-        Shapes are two bows, the aspect, and x and y of each corner. A bow is a parabola along either side of
-        the pattern, zero at its ends, positive towards the viewer; the aspect is the fraction by which the
-        pattern is longer along its width than along its height.
+        Shapes are `board_shapes`, and x and y of each corner.
+
+        Args:
+            corners_px: as measured.
+            board: the board.
+            model: of the lens.
+            prior: of lens and board; None where nothing is known of the lens.
 
         References:
             D. Kogan, mrcal: the deformed calibration object.
@@ -63,25 +75,65 @@ class Setup:
             ICCV Workshops 2011.
         """
         corners = board.corners()
-        x, y = (corners[:, :2] - corners[:, :2].mean(axis=0)).T
-        zero, n = np.zeros_like(x), len(x)
-        bows = [np.stack([zero, zero, 1 - (side / np.abs(side).max()) ** 2], axis=1) for side in (x, y)]
-        modes = np.stack([*bows, np.stack([x / 2, -y / 2, zero], axis=1)])
+        n, P = len(corners), model.size
+        modes, sigma = board_shapes(board)
         offsets = np.zeros((n, 2, n, 3))
         offsets[np.arange(n), :, np.arange(n), :2] = np.eye(2)
         shapes = np.concatenate([modes, offsets.reshape(2 * n, n, 3)])
-        sigma = np.concatenate([[BOW_SIGMA_M, BOW_SIGMA_M, ASPECT_SIGMA], np.full(2 * n, PRINT_SIGMA_M)])
-        return cls(corners_px, corners, shapes, sigma, model)
+        shape_sigma = np.concatenate([sigma, np.full(2 * n, PRINT_SIGMA_M)])
+        mean, information = np.zeros(P + len(shapes)), np.zeros((P + len(shapes),) * 2)
+        coefficients = np.arange(4, P)
+        information[coefficients, coefficients] = np.array(model.prior_sigma) ** -2
+        if prior is not None:
+            mean[:P], information[:P, :P] = prior.of(model)
+            shape_sigma = np.full(len(shapes), _EXACT_M) if prior.is_board_exact else shape_sigma
+        information[P:, P:] = np.diag(shape_sigma**-2)
+        return cls(corners_px, corners, shapes, mean, information, model)
 
     def select(self, keep: NDArray[np.bool_]) -> "Setup":
         """Keep some boards (K,)."""
         return replace(self, corners_px=self.corners_px[keep])
 
-    @property
-    def information(self) -> Array:
-        """Information (P + S,) of the priors on intrinsics and shape, all about zero."""
-        lens = np.concatenate([np.full(4, np.inf), self.model.prior_sigma])
-        return np.asarray(1.0 / np.concatenate([lens, self.shape_sigma]) ** 2)
+    def surprise(self, lens: Array) -> float:
+        """Compute the squared distance of a lens (P,) from the prior's, in standard deviations."""
+        off = lens - self.mean[: len(lens)]
+        return float(off @ self.information[: len(lens), : len(lens)] @ off)
+
+    def with_wider_lens(self, factor: float) -> "Setup":
+        """Multiply the prior covariance of the lens."""
+        information, P = self.information.copy(), self.model.size
+        information[:P, :P] /= factor
+        return replace(self, information=information)
+
+
+def board_shapes(board: Board) -> tuple[Array, Array]:
+    """List smooth deviations of a board from its nominal shape.
+
+    Bends are heights of the plate towards the viewer, with zero mean and slope over the plate, so that the
+    board's frame stays in its middle: with u and v from -1 to 1 along width and height of the plate, 1/3 -
+    u^2 and 1/3 - v^2 (a bow by the height of the middle over the ends), u v (twist), and four of third order.
+    The pattern's aspect is the fraction by which it is longer along its width than along its height; second
+    order displaces it in x and y, and shears it.
+
+    Returns:
+        (15, N, 3) displacement of the corners per unit, and (15,) standard deviations a priori.
+    """
+    corners = board.corners()
+    u, v = 2 * corners[:, 0] / board.width_m, 2 * corners[:, 1] / board.height_m
+    about = (corners - corners.mean(axis=0))[:, :2]
+    x, y = (about / np.abs(about).max(axis=0)).T
+    zero = np.zeros_like(x)
+    bows = [1 / 3 - u**2, 1 / 3 - v**2]
+    bends = [u * v, u**3 - 0.6 * u, v**3 - 0.6 * v, (u**2 - 1 / 3) * v, u * (v**2 - 1 / 3)]
+    seconds = [x**2 - 1 / 3, y**2 - 1 / 3, x * y]
+    rows = [[zero, zero, bow] for bow in bows]
+    rows.append([about[:, 0] / 2, -about[:, 1] / 2, zero])
+    rows += [[zero, zero, bend] for bend in bends]
+    rows += [row for second in seconds for row in ([second, zero, zero], [zero, second, zero])]
+    rows.append([y, x, zero])
+    sigma = [BOW_SIGMA_M] * len(bows) + [ASPECT_SIGMA] + [BEND_SIGMA_M] * len(bends)
+    sigma += [PRINT_SIGMA_M] * (len(rows) - len(sigma))
+    return np.moveaxis(np.array(rows), 1, 2), np.array(sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +232,47 @@ def refine_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) -
     return state.with_poses(np.where(is_better[:, None, None], second, first))
 
 
+def fit_poses(estimate: IntrinsicsEstimate, corners_px: Array, starts: Array) -> tuple[Array, Array, Array]:
+    """Fit poses of boards (K, N, 2) to an estimated lens and board, each alone.
+
+    Returns:
+        T_cam_board (K, 4, 4), costs (K,) px^2 and information (K, 6, 6) for corners of 1 px.
+    """
+    setup, state = _of_estimate(estimate, corners_px, starts)
+    T, cost = _descend(setup, state)
+    _, J = _by_pose(setup, state.with_poses(T))
+    return T, cost, np.asarray(np.swapaxes(J, 1, 2) @ J)
+
+
+def pose_moves(estimate: IntrinsicsEstimate, T_cam_board: Array, errors: Array) -> Array:
+    """Compute how far fitted poses move with lens and board.
+
+    Args:
+        estimate: of both.
+        T_cam_board: (K, 4, 4) of boards.
+        errors: (n, P + 15) added to lens and shape.
+
+    Returns:
+        (n, K, 6) tangents -(sum J^T J)^-1 sum J^T G error, with J and G the derivatives of the corners.
+    """
+    setup, state = _of_estimate(
+        estimate, np.zeros((len(T_cam_board), *estimate.corners_board.shape[:1], 2)), T_cam_board
+    )
+    _, G, J = linearise(setup, state)
+    Jt = np.swapaxes(J, 1, 2)
+    return np.asarray(np.moveaxis(-np.linalg.solve(Jt @ J, Jt @ (G @ errors.T)), -1, 0))
+
+
+def _of_estimate(
+    estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Array
+) -> tuple[Setup, LensState]:
+    """Set up boards for an estimated lens and board."""
+    model, lens = estimate.model, estimate.model.vector(estimate.intrinsics)
+    unknown = np.zeros(model.size + len(estimate.shapes))
+    setup = Setup(corners_px, estimate.corners_board, estimate.shapes, unknown, np.diag(unknown), model)
+    return setup, LensState(lens, np.zeros(len(estimate.shapes)), T_cam_board)
+
+
 def _descend(setup: Setup, state: LensState) -> tuple[Array, Array]:
     """Levenberg-Marquardt on each pose separately; poses (K, 4, 4) and costs (K,) px^2."""
     damping = np.full(len(state.T_cam_board), 1e-4)
@@ -263,10 +356,10 @@ def _step(
     coupling, g_pose = Jt @ G, Jt @ residuals[..., None]
     eliminated = np.linalg.solve(H_pose, np.concatenate([coupling, g_pose], axis=-1))
     tall = (root * G).reshape(-1, G.shape[-1])
-    H = tall.T @ tall + np.diag(setup.information)
+    H = tall.T @ tall + setup.information
     H += damping * np.diag(np.diag(H))
-    right = np.concatenate([tall.T @ (root[..., 0] * residuals).ravel(), setup.information * state.shared])
-    right = right.reshape(2, -1).sum(axis=0)
+    right = tall.T @ (root[..., 0] * residuals).ravel()
+    right += setup.information @ (state.shared - setup.mean)
     lost = np.einsum("k,kpq,kpr->qr", weights, coupling, eliminated, optimize=True)
     first = 0 if setup.is_lens_free else setup.model.size
     step = np.zeros(len(H))
@@ -284,7 +377,8 @@ def solve_scaled(H: Array, right: Array) -> Array:
 
 def _cost(setup: Setup, state: LensState, residuals: Array, weights: Array) -> float:
     squares = np.sum(residuals.reshape(len(weights), -1) ** 2, axis=1)
-    return float(_finite(weights @ squares + setup.information @ state.shared**2))
+    off = state.shared - setup.mean
+    return float(_finite(weights @ squares + off @ setup.information @ off))
 
 
 def _finite(cost: Array) -> Array:

@@ -50,14 +50,15 @@ def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> t
             f"held-out captures fit worse ({estimate.held_out_rms_px:.2f} px) than captures used "
             f"({estimate.rms_px:.2f} px): add captures, or choose a model with fewer parameters"
         )
-    bow_m = max(estimate.shape[:2], key=abs)
+    shape, shape_sigma = estimate.pattern_shape
+    bow_m = max(shape[:2], key=abs)
     if abs(bow_m) > _BOW_M:
         way = "towards" if bow_m > 0 else "away from"
         texts.append(
             f"the board is bent: its middle is {1000 * abs(bow_m):.1f} mm {way} the viewer; "
             "use a stiffer plate"
         )
-    aspect, sigma = float(estimate.shape[2]), float(estimate.shape_sigma[2])
+    aspect, sigma = float(shape[2]), float(shape_sigma[2])
     if abs(aspect) > _ASPECT + 2 * sigma:
         way = "width" if aspect > 0 else "height"
         texts.append(

@@ -7,6 +7,7 @@ import numpy as np
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
+from lce_rig.rig import BoardSettings, CameraSettings
 
 # Models are compared on the rays of a grid of this many points across the image.
 _GRID = 24
@@ -118,13 +119,7 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
     """
     if intrinsics.model == model.family and len(intrinsics.distortion) <= len(model.coefficients):
         return model.vector(intrinsics)
-    u, v = np.meshgrid(
-        np.linspace(0, intrinsics.width_px - 1, _GRID), np.linspace(0, intrinsics.height_px - 1, _GRID)
-    )
-    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-    rays = intrinsics.unproject(pixels)
-    # A pinhole polynomial cannot project points beside or behind the camera.
-    is_seen = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.2)
+    pixels, rays = _rays(intrinsics)
     vector = np.concatenate(
         [
             [intrinsics.fx_px, intrinsics.fy_px, intrinsics.cx_px, intrinsics.cy_px],
@@ -133,11 +128,95 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
     )
     ridge = np.concatenate([np.zeros(4), np.ones(model.size - 4)])
     for _ in range(_STEPS):
-        predicted, _, J = model.project(vector, rays[is_seen])
+        predicted, _, J = model.project(vector, rays)
         J = J.reshape(-1, model.size)
         H = J.T @ J + np.diag(ridge)
-        vector = vector - np.linalg.solve(H, J.T @ (predicted - pixels[is_seen]).ravel() + ridge * vector)
+        vector = vector - np.linalg.solve(H, J.T @ (predicted - pixels).ravel() + ridge * vector)
     return vector
+
+
+# Where a profile states no standard deviation of its intrinsics, in focal lengths: the differences between
+# profiles and the boards of recordings. The last is of a pixel in the image's corner.
+_FOCAL, _PRINCIPAL_POINT, _DISTORTION = 4e-3, 4e-3, 2.5e-3
+# Of the ratio of both focal lengths.
+_ASPECT = 5e-4
+# The mean square over the image of a displacement that grows with the third power, by that in the corner.
+_OF_CORNER = 0.4
+# Intrinsics that a profile states to be exact.
+_EXACT, _EXACT_PX = 1e-7, 1e-4
+
+
+@dataclass(frozen=True)
+class LensPrior:
+    """A profile's intrinsics, and how exact they are.
+
+    Attributes:
+        lens: the intrinsics.
+        focal_length: standard deviation of both focal lengths alike, relative.
+        principal_point_px: of each coordinate.
+        distortion_px: of a pixel's displacement in the image's corner.
+        is_board_exact: whether the board has its nominal shape.
+    """
+
+    lens: Intrinsics
+    focal_length: float
+    principal_point_px: float
+    distortion_px: float
+    is_board_exact: bool = False
+
+    @classmethod
+    def read(cls, camera: CameraSettings, board: BoardSettings) -> "LensPrior":
+        """Read a profile's camera and board; defaults take the place of what it leaves out."""
+        stated, focal_px = camera.intrinsics, camera.intrinsics.fx_px
+
+        def sigma_px(value: float | None, usual: float) -> float:
+            return usual * focal_px if value is None else value
+
+        return cls(
+            lens=camera.to_intrinsics(),
+            focal_length=sigma_px(stated.focal_sigma_px, _FOCAL) / focal_px,
+            principal_point_px=sigma_px(stated.principal_point_sigma_px, _PRINCIPAL_POINT),
+            distortion_px=sigma_px(stated.distortion_sigma_px, _DISTORTION),
+            is_board_exact=board.bow_sigma_m == 0,
+        )
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether neither lens nor board has an error."""
+        return self.is_board_exact and not any(
+            (self.focal_length, self.principal_point_px, self.distortion_px)
+        )
+
+    def of(self, model: LensModel) -> tuple[Array, Array]:
+        """Give mean (P,) and information (P, P) of a model's parameters.
+
+        Distortion has the same standard deviation over the image whatever its shape: with D the derivative of
+        the n pixels of a grid by the coefficients, its information is D^T D / (n sigma^2).
+        """
+        vector, focal_px = convert(self.lens, model), self.lens.fx_px
+        rays = _rays(self.lens)[1]
+        _, _, by_lens = model.project(vector, rays)
+        D = by_lens[..., 4:].reshape(-1, model.size - 4)
+        information = np.zeros((model.size, model.size))
+        sigma_px = max(_OF_CORNER * self.distortion_px, _EXACT_PX)
+        information[4:, 4:] = D.T @ D / (len(rays) * sigma_px**2)
+        information[[2, 3], [2, 3]] = max(self.principal_point_px, _EXACT_PX) ** -2
+        aspect = min(_ASPECT, self.focal_length)
+        for row, sigma in (([0.5, 0.5], self.focal_length), ([1.0, -1.0], aspect)):
+            information[:2, :2] += np.outer(row, row) / (max(sigma, _EXACT) * focal_px) ** 2
+        return vector, information
+
+
+def _rays(lens: Intrinsics) -> tuple[Array, Array]:
+    """List pixels (n, 2) of a grid over the image and their rays (n, 3), where the lens has one.
+
+    A pinhole polynomial cannot project points beside or behind the camera.
+    """
+    u, v = np.meshgrid(np.linspace(0, lens.width_px - 1, _GRID), np.linspace(0, lens.height_px - 1, _GRID))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays = lens.unproject(pixels)
+    is_seen = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.2)
+    return pixels[is_seen], rays[is_seen]
 
 
 class _Radii(NamedTuple):

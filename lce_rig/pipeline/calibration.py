@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from lce_rig.calibrate.result import error_to_reference
 from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
@@ -31,6 +33,7 @@ from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.camera_pairs import CameraEvidence, CameraPair, camera_findings, find_exchanged, relate
+from lce_rig.judge.contributions import profile_covariance
 from lce_rig.judge.reach import point_uncertainties
 from lce_rig.judge.relative_pose import relative_pose
 from lce_rig.judge.session_check import find_meetings
@@ -83,7 +86,17 @@ class _Solved:
 
     @property
     def cov_shared(self) -> Array:
-        return self.validation.cov_shared
+        # Boards and scene share the session's lens, too.
+        return self.validation.cov_shared + self.cov_lens
+
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        return None if self.estimate.lens is None else self.estimate.lens.intrinsics
+
+    @property
+    def cov_lens(self) -> Array:
+        """The part (6, 6) of the covariance from the lens."""
+        return profile_covariance([e for e in self.estimate.sensitivities if e.source == "intrinsics"])
 
     @property
     def is_still(self) -> bool:
@@ -220,7 +233,6 @@ def _examine(
     rig: Rig, detections: Detections, pairs: Sequence[Pair], estimate: CalibrationEstimate
 ) -> Validation:
     """Check an estimate on its own captures and images."""
-    views = _views(detections, pairs, estimate)
     first, used = pairs[0], estimate.captures_of(estimate.used)
     lens = rig.cameras[first.camera].to_intrinsics()
     rejected = []
@@ -231,7 +243,9 @@ def _examine(
         clocks = clocks_of(rig, pair.camera, pair.lidar)
         meetings = find_meetings(rig, detections, pair, estimate.T_cam_lidar, estimate.channels, clocks)
         rejected = [each.at_scan_time for name, each in meetings.items() if name not in used]
-    return validate(estimate, rig, rig.lidars[first.lidar], lens, views, rejected)
+        if estimate.lens is not None and rejected:
+            rejected = estimate.lens.refit(rejected)
+    return validate(estimate, rig, rig.lidars[first.lidar], lens, rejected)
 
 
 def _views(detections: Detections, pairs: Sequence[Pair], estimate: CalibrationEstimate) -> list[BoardView]:
@@ -331,7 +345,7 @@ def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
     return replace(
         solved,
         estimate=fuse(solved.estimate, share, rig.board.to_board()),
-        validation=replace(solved.validation, cov=share.cov),
+        validation=replace(solved.validation, cov=share.cov, cov_used=share.cov),
         together=None,
         share=share,
     )
@@ -363,7 +377,10 @@ def _judged(
     refused = dict(own.refused)
     for name, why in estimate.refused.items():
         refused |= dict.fromkeys(estimate.captures_of([name]), why)
-    lens = rig.cameras[own.camera].to_intrinsics()
+    lens = rig.cameras[own.camera].to_intrinsics() if estimate.lens is None else estimate.lens.intrinsics
+    # The scene moves extrinsics, not the lens.
+    is_of_boards = own.share is None or own.share.state != "used"
+    joint = validation.cov_with_lens if is_of_boards else validation.cov
     return Calibration(
         camera=own.camera,
         channels=tuple(channel.channel for channel in estimate.channels),
@@ -384,7 +401,8 @@ def _judged(
         diagnostics=diagnostics,
         channel_results=estimate.channels,
         method=estimate.method,
-        uncertainty=point_uncertainties(estimate.T_cam_lidar, validation.cov, lens),
+        uncertainty=point_uncertainties(estimate.T_cam_lidar, joint, lens),
+        **_lens_of(estimate, rig),
         estimated_with=estimate.estimated_with,
         other_cameras=tuple(_other_camera(solved, link, k) for link in mine),
         scene_share=own.share,
@@ -393,6 +411,21 @@ def _judged(
         residuals=estimate.residuals,
         observations=estimate.observations,
     )
+
+
+def _lens_of(estimate: CalibrationEstimate, rig: Rig) -> dict[str, Any]:
+    """Give the intrinsics and squares that belong to the extrinsics, with their covariance."""
+    if estimate.lens is None:
+        return {}
+    stretched = (
+        1.0 if not np.isfinite(estimate.diagnostics.camera_scale) else 2 - estimate.diagnostics.camera_scale
+    )
+    return {
+        "intrinsics": estimate.lens.intrinsics,
+        "intrinsics_cov": estimate.lens.estimate.cov,
+        "intrinsics_cross_cov": estimate.cov_with_lens,
+        "square_m": rig.board.square_m * stretched,
+    }
 
 
 def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera:
@@ -404,7 +437,10 @@ def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera
     if own.together is not None and own.together is other.together:
         # Widened like both extrinsics.
         J = J * np.repeat([own.validation.widened_by, other.validation.widened_by], 6)
-        cov = np.asarray(J @ own.together.covariance_of(own.camera, other.camera) @ J.T)
+        joint = own.together.covariance_of(own.camera, other.camera)
+        joint[:6, :6] += own.cov_lens
+        joint[6:, 6:] += other.cov_lens
+        cov = np.asarray(J @ joint @ J.T)
     seen = None if pair.from_images is None else pair.from_images.T_second_first
     apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart)
     return OtherCamera(

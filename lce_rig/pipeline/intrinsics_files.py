@@ -199,9 +199,9 @@ def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
         "rms_px": estimate.rms_px,
         "held_out_px": estimate.held_out_rms_px,
         "board": {
-            "bow_m": estimate.shape[:2].tolist(),
-            "aspect": float(estimate.shape[2]),
-            "sigma": estimate.shape_sigma.tolist(),
+            "bow_m": estimate.pattern_shape[0][:2].tolist(),
+            "aspect": float(estimate.pattern_shape[0][2]),
+            "sigma": estimate.pattern_shape[1].tolist(),
             "print_rms_m": estimate.print_rms_m,
         },
         "covered": float(measured.certainty.is_covered.mean()),

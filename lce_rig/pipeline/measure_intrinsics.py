@@ -20,7 +20,7 @@ from lce_rig.lens.calibrate_lens import MIN_CAPTURES, Choice, choose_model, esti
 from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of, lens_errors
 from lce_rig.lens.lens_coverage import find_weaknesses
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
-from lce_rig.lens.models import MODELS, model_of
+from lce_rig.lens.models import MODELS, LensPrior, model_of
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
@@ -276,4 +276,8 @@ def _fit(
     if model == AUTO:
         return choose_model(views, board, start)
     lens_model = model_of(start) if model is None else MODELS[model]
-    return estimate_intrinsics(views, board, start, lens_model), None
+    # As `calibrate` weighs them; the profile's have no part in another model or resolution.
+    prior = LensPrior.read(rig.cameras[camera], rig.board)
+    sizes = [(lens.width_px, lens.height_px) for lens in (start, prior.lens)]
+    is_comparable = sizes[0] == sizes[1] and lens_model == model_of(prior.lens)
+    return estimate_intrinsics(views, board, start, lens_model, prior=prior if is_comparable else None), None

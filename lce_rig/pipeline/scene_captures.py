@@ -233,7 +233,7 @@ def _about_scan(cut: EventCut, scan: Scan, rig: Rig, c: Calibration) -> Events |
     scan_ns = rig_time_ns(scan, rig)
     if scan_ns is None or scan.offset_ns is None or not len(scan.points):
         return None
-    lens = rig.cameras[c.camera].to_intrinsics()
+    lens = rig.lens_of(c)
     pixels, is_valid = lens.project(transform(c.T_cam_lidar, scan.points))
     is_seen = is_valid & lens.is_inside(pixels)
     if not is_seen.any():

@@ -26,7 +26,7 @@ def view_of(
     """
     pairs = read_result(session.path.joinpath(*result_parts(name), RESULT)).pairs
     shared = tuple(c for c in pairs if c.lidar == pairs[0].lidar)
-    cameras = tuple(CameraIn3D(session.rig.cameras[c.camera].to_intrinsics(), c.T_cam_lidar) for c in shared)
+    cameras = tuple(CameraIn3D(session.rig.lens_of(c), c.T_cam_lidar) for c in shared)
     return cameras, shared
 
 
@@ -46,7 +46,7 @@ def capture_in_3d(session: Session, capture: Capture, calibrations: Sequence[Cal
         for channel in c.channels:
             if capture.has_image(c.camera, channel):
                 pixels = capture.image(c.camera, channel).pixels
-                lens = session.rig.cameras[c.camera].to_intrinsics()
+                lens = session.rig.lens_of(c)
                 own, is_own = colour_points(scan, pixels, c.T_cam_lidar, lens)
                 colours[is_own & ~is_seen] = own[is_own & ~is_seen]
                 is_seen |= is_own

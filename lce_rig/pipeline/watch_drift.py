@@ -170,7 +170,7 @@ class DriftReport:
                 continue
             name, image, view = pair.example
             c = pair.calibration
-            lens = self.rig.cameras[c.camera].to_intrinsics()
+            lens = self.rig.lens_of(c)
             board = () if pair.board is None else pair.board.axes
             title = f"{c.camera}, {c.lidar}  {name}"
             picture = draw_drift(pair.drift, image, view.edges, lens, title, pair.states, board)
@@ -266,7 +266,7 @@ class _Judge:
         self._motions: dict[int, RigMotion | None] = {}
 
     def pair(self, c: Calibration, kept: Sequence[Seen]) -> PairDrift:
-        lens = self._rig.cameras[c.camera].to_intrinsics()
+        lens = self._rig.lens_of(c)
         views: list[SceneView] = []
         whole: list[SceneView] = []
         boards: list[tuple[Seen, ImageBoard]] = []

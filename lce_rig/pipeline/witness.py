@@ -55,7 +55,7 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
         calibration: the extrinsics and their covariance.
     """
     views = scene_views(session, detections, calibration, OPINION_CAPTURES)
-    return opinion_of(views, session.rig.cameras[calibration.camera].to_intrinsics(), calibration)
+    return opinion_of(views, session.rig.lens_of(calibration), calibration)
 
 
 def scene_views(
@@ -110,7 +110,7 @@ def sharpen(sessions: Sequence[Session], found: Sequence[Detections], by_boards:
         found: detections of each: edges at the board and its holder are left out.
         by_boards: the extrinsics by the boards alone.
     """
-    lens = sessions[0].rig.cameras[by_boards.camera].to_intrinsics()
+    lens = sessions[0].rig.lens_of(by_boards)
     n_most = MAX_CAPTURES // len(sessions)
     views = [
         view

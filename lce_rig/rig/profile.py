@@ -1,12 +1,14 @@
 """The profile of a rig: start reading the schema here."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from lce_rig.core import velodyne
+from lce_rig.core.calibration import Extrinsics
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
@@ -71,6 +73,19 @@ class Rig(Settings):
     quality: QualitySettings = QualitySettings()
     calibration: CalibrationSettings = CalibrationSettings()
     verdict: VerdictSettings = VerdictSettings()
+
+    def lens_of(self, extrinsics: Extrinsics) -> Intrinsics:
+        """Return the intrinsics that belong to extrinsics: their own, else the profile's."""
+        own = extrinsics.intrinsics
+        return self.cameras[extrinsics.camera].to_intrinsics() if own is None else own
+
+    def with_lenses(self, extrinsics: Sequence[Extrinsics]) -> "Rig":
+        """Replace the cameras' intrinsics by those that belong to extrinsics; the first of a camera count."""
+        cameras = dict(self.cameras)
+        for each in reversed(extrinsics):
+            if each.camera in cameras:
+                cameras[each.camera] = self.cameras[each.camera].with_intrinsics(self.lens_of(each))
+        return self.model_copy(update={"cameras": cameras})
 
     @model_validator(mode="after")
     def _frames_are_unique(self) -> "Rig":

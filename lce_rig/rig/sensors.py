@@ -351,6 +351,12 @@ class CameraSettings(Settings):
         """Name the first channel of a kind; None if there is none."""
         return next((name for name, channel in self.channels.items() if channel.kind == kind), None)
 
+    def with_intrinsics(self, lens: Intrinsics) -> "CameraSettings":
+        """Replace the camera's intrinsics; their standard deviations stay those of the profile."""
+        values = {"model": lens.model, "distortion": lens.distortion}
+        values |= {name: getattr(lens, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+        return self.model_copy(update={"intrinsics": self.intrinsics.model_copy(update=values)})
+
     def to_intrinsics(self) -> Intrinsics:
         """Build the camera model for the algorithms."""
         lens = self.intrinsics

@@ -27,7 +27,7 @@ _EVENTS_NEAR_RAD = 0.06  # as far as the score is searched
 
 def build_view(rig: Rig, extrinsics: Extrinsics, name: str, image: Image | Events, scan: Scan) -> SceneView:
     """Find the edges of one capture's scan, and of its image or of events about the scan."""
-    lidar, lens = rig.lidars[extrinsics.lidar], rig.cameras[extrinsics.camera].to_intrinsics()
+    lidar, lens = rig.lidars[extrinsics.lidar], rig.lens_of(extrinsics)
     edges = find_depth_edges(scan, Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad))
     if isinstance(image, Image):
         return SceneView(name, edges, build_edge_field(image.grey, lens.fx_px))
@@ -52,7 +52,7 @@ def is_apart_from_board(
     """Find which points (N, 3) of the LiDAR's frame lie apart from the board in an image; all without one."""
     if isinstance(found, Refusal):
         return np.ones(len(points), dtype=np.bool_)
-    lens = rig.cameras[extrinsics.camera].to_intrinsics()
+    lens = rig.lens_of(extrinsics)
     outline = outline_px(found.T_cam_board, rig.board.to_board(), lens)
     hull = cv2.convexHull(outline[np.isfinite(outline).all(axis=1)].astype(np.float32))
     pixels, _ = lens.project(transform(extrinsics.T_cam_lidar, points))

@@ -20,7 +20,7 @@ _STREAM = 3
 
 def with_profile_errors(
     rig: Rig, session: StillSession, seed: int, sigma_px: float
-) -> tuple[Rig, Detections]:
+) -> tuple[Rig, Detections, Intrinsics]:
     """Draw how wrong a profile is, and what the sensors would have seen of the same session.
 
     The simulated plate and LiDAR stay what they are: the profile states another plate, and points move along
@@ -33,7 +33,7 @@ def with_profile_errors(
         sigma_px: noise of each corner's coordinates.
 
     Returns:
-        The profile to calibrate with, and its detections.
+        The profile to calibrate with, its detections, and the true lens.
     """
     rng = np.random.default_rng([seed, _STREAM])
     (camera, settings), (lidar, of_lidar) = next(iter(rig.cameras.items())), next(iter(rig.lidars.items()))
@@ -54,23 +54,25 @@ def with_profile_errors(
         if image is not None:
             images[name] = image
     scans = {
-        item.capture: [_as_scanned(found, board, bows_m, offset_m) for found in item.lidar]
+        item.capture: [_as_scanned(found, board, bows_m, offset_m) for found in item.places]
         for item in session.candidates
         if item.capture in images
     }
     plate = {"width_m": float(width_m), "height_m": float(height_m)}
     profile = rig.model_copy(update={"board": rig.board.model_copy(update=plate)})
     channel = next(iter(settings.channels))
-    return profile, Detections({(camera, channel): {name: images[name] for name in scans}}, {lidar: scans})
+    found = Detections({(camera, channel): {name: images[name] for name in scans}}, {lidar: scans})
+    return profile, found, lens
 
 
 def _draw_lens(known: Tolerances, rng: np.random.Generator) -> Intrinsics:
-    lens = known.lens
+    prior = known.lens
+    lens = prior.lens
     focal, cx_px, cy_px, corner_px = rng.standard_normal(4) * [
-        known.focal_length,
-        known.principal_point_px,
-        known.principal_point_px,
-        known.distortion_px,
+        prior.focal_length,
+        prior.principal_point_px,
+        prior.principal_point_px,
+        prior.distortion_px,
     ]
     radius = np.hypot(lens.width_px, lens.height_px) / 2 / lens.fx_px
     k1, *others = lens.distortion or (0.0,) * 4

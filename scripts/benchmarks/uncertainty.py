@@ -23,9 +23,10 @@ from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Terms, assemble, linearise
 from lce_rig.calibrate.likelihood.rays import EdgeRows, interior, stack_scans
 from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M
-from lce_rig.core.calibration import Method
+from lce_rig.core.calibration import Calibration, Method
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import VLP_16
-from lce_rig.core.geometry import Array, difference, invert
+from lce_rig.core.geometry import Array, difference, invert, transform
 from lce_rig.core.results import Observation
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
@@ -37,6 +38,8 @@ _FOUND_M = 0.05
 _FREEDOMS = 6
 # Of a normal distribution.
 _THREE_SIGMAS = 0.9973
+# Distance of the point whose error in the image is tabulated.
+_POINT_M = 10.0
 _DISPLACEMENT = SHIFTS[-2:]
 # Logarithms of simulated levels lie so near to those of recordings.
 _WITHIN = 1.5
@@ -85,9 +88,11 @@ class BoundedRun(Run):
 
 @dataclass(frozen=True, eq=False)
 class JudgedRun(Run):
-    """With the verdict."""
+    """With the verdict, and the error of a point 10 m away in the image's middle, claimed and true, px."""
 
     verdict: str
+    point_px: float
+    claimed_px: float
 
 
 def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: int = 30) -> None:
@@ -112,7 +117,7 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
     print("\nProfiles in error as their standard deviations say\n")
     print_head(
         "rig", "method", "sessions", "captures", "rms deg / mm", *head.split(", ")[-2:],
-        "95 % regions hold", "beyond 3 sigma", "pass, marginal, fail",
+        "95 % regions hold", "beyond 3 sigma", "10 m away, rms and reported px", "pass, marginal, fail",
     )  # fmt: skip
     for case, method in product(PROFILES_IN_ERROR, get_args(Method)):
         if only in case.label:
@@ -120,7 +125,8 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
             verdicts = Counter(run.verdict for run in own)
             counts = ", ".join(str(verdicts[verdict]) for verdict in ("pass", "marginal", "fail"))
             beyond = sum(nees_of(run) > chi2.ppf(_THREE_SIGMAS, _FREEDOMS) for run in own)
-            cells = (*_claim_cells(own), beyond, counts)
+            point = f"{rms([run.point_px for run in own]):.2f}, {rms([run.claimed_px for run in own]):.2f}"
+            cells = (*_claim_cells(own), beyond, point, counts)
             print_row(case.label, method, len(own), n_captures, *cells)
 
 
@@ -168,11 +174,22 @@ def _runs_in_error(
     rig = load_rig(case.rig)
     for seed in range(n_seeds):
         session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
-        profile, found = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
+        profile, found, lens = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
         options = CalibrateOptions(method=method, n_draws=0)
         (calibration,), _ = calibrate_detections(profile, found, options)
         error = difference(calibration.T_cam_lidar, session.T_cam_lidar)
-        yield JudgedRun(error, calibration.cov, calibration.verdict)
+        point_px = _point_error_px(calibration, session.T_cam_lidar, lens)
+        (claimed_px,) = (u.centre_px for u in calibration.uncertainty if u.distance_m == _POINT_M)
+        yield JudgedRun(error, calibration.cov, calibration.verdict, point_px, claimed_px)
+
+
+def _point_error_px(calibration: Calibration, T_cam_lidar: Array, lens: Intrinsics) -> float:
+    """Measure how far a point in the image's middle is drawn from where the true camera sees it."""
+    assert calibration.intrinsics is not None
+    middle = np.array([[(lens.width_px - 1) / 2, (lens.height_px - 1) / 2]])
+    point = _POINT_M * calibration.intrinsics.unproject(middle)
+    pixel, _ = lens.project(transform(T_cam_lidar @ invert(calibration.T_cam_lidar), point))
+    return float(np.linalg.norm(pixel - middle))
 
 
 def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[BoundedRun]:
@@ -222,7 +239,7 @@ def _at_truth(rig: Rig, session: StillSession) -> Terms:
     found = [item for item in session.candidates if is_board(session, item)]
     board = rig.board.to_board()
     scans = stack_scans([interior(item.lidar, board) for item in found], board)
-    pictures = stack_images(np.arange(len(found)), [item.image for item in found], board)
+    pictures = stack_images(np.arange(len(found)), [item.image for item in found])
     T = session.T_cam_lidar
     T_lidar_board = invert(T) @ np.array([session.T_cam_board[item.capture] for item in found])
     return linearise(

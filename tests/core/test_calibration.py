@@ -36,7 +36,8 @@ FIELDS = [
     *("n_captures", "n_detected", "captures_used", "captures_refused", "mpe_m", "mee_m", "mge_m"),
     *("reprojection_px", "certificate", "egt_rotation_deg", "egt_translation_m", "verdict", "reasons"),
     *("findings", "diagnostics", "channels", "method", "uncertainty", "estimated_with", "other_cameras"),
-    *("cov_shared", "contributions", "scene_share", "scene"),
+    *("cov_shared", "contributions", "intrinsics", "intrinsics_cov", "intrinsics_cross_cov", "square_m"),
+    *("scene_share", "scene"),
 ]
 REQUIRED = [
     *("camera", "channel", "lidar", "T_cam_lidar", "cov", "n_captures", "n_detected", "captures_used"),

@@ -74,15 +74,15 @@ def test_offsets_of_single_lasers_and_the_edge_shift_are_found():
 
 
 def test_what_cannot_be_gives_findings_and_what_can_is_not():
-    found = nuisances(observed())
+    found, estimate = nuisances(observed()), calibrated(20, 1)
     lidar = RIG.lidars["lidar"]
-    assert nuisance_findings(found, BOARD, lidar, LIMITS) == []
+    assert nuisance_findings(found, estimate, BOARD, lidar, LIMITS) == []
     for changed, code in (
         (replace(found, scale=0.03, scale_sigma=0.001), "verdict.scale"),
         (replace(found, edge_shift_m=0.05), "verdict.edge_shift"),
         (replace(found, laser_offset_m=-0.06, laser=7), "verdict.laser_offset"),
     ):
-        (finding,) = nuisance_findings(changed, BOARD, lidar, LIMITS)
+        (finding,) = nuisance_findings(changed, estimate, BOARD, lidar, LIMITS)
         assert finding.code == code
 
 
@@ -198,7 +198,7 @@ def test_few_placements_leave_nothing_to_be_left_out():
     estimate = calibrated(20, 1)
     few = {name: estimate.fitted[estimate.used[k % 3]] for k, name in enumerate(estimate.used)}
     estimate = replace(estimate, fitted=few)
-    examination = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA, [])
+    examination = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA)
     assert examination.control is None
     assert examination.contrasts == ()
     assert np.array_equal(examination.cov, estimate.cov)

@@ -22,6 +22,9 @@ _LENS = IntrinsicsSettings(
     cx_px=CAMERA.cx_px,
     cy_px=CAMERA.cy_px,
     distortion=CAMERA.distortion,
+    focal_sigma_px=1.3,
+    principal_point_sigma_px=0.9,
+    distortion_sigma_px=0.45,
 )
 _CAMERA = _SHIPPED.cameras["cam"].model_copy(update={"intrinsics": _LENS})
 RIG = _SHIPPED.model_copy(update={"cameras": {"cam": _CAMERA}})

@@ -9,7 +9,7 @@ import pytest
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.core.calibration import Certificate
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import perturb
+from lce_rig.core.geometry import difference, perturb
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.findings import (
     CONTROL,
@@ -22,9 +22,10 @@ from lce_rig.judge.findings import (
 )
 from lce_rig.judge.validate import validate
 from lce_rig.judge.verdict import judge, plate_findings
-from lce_rig.lens.lens_estimate import BoardView
+from lce_rig.lens.models import LensPrior
 from lce_rig.rig import load_rig
-from tests.calibrate.boards import BOARD, CAMERA, simulate
+from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, simulate
+from tests.calibrate.test_tolerances import KNOWN, REAL
 
 RIG = load_rig("rlfs")
 
@@ -36,8 +37,7 @@ def estimate():
 
 @functools.cache
 def examined(estimate, lens=CAMERA):
-    views = [BoardView(name, "frames", seen.image) for name, seen in estimate.observations.items()]
-    return validate(estimate, RIG, RIG.lidars["lidar"], lens, views)
+    return validate(estimate, RIG, RIG.lidars["lidar"], lens)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,8 @@ def verdict_of(estimate):
     """Judge a changed estimate by what the checks found on the sound one."""
 
     def judged(changed, n_captures=20, rig=RIG):
-        examination = replace(examined(estimate), cov=changed.cov, cov_agreed=changed.cov)
+        cov = changed.cov
+        examination = replace(examined(estimate), cov=cov, cov_agreed=cov, cov_used=cov)
         return judge(changed, examination, rig, "cam", "lidar", n_captures)
 
     return judged
@@ -104,7 +105,7 @@ def test_a_deviation_above_the_target_is_marginal_and_far_above_fails(estimate, 
 
 def test_a_contradiction_widens_the_claim_and_fails_nothing_by_its_width(estimate):
     cov = np.diag([1e-8] * 3 + [np.radians(9.0 * RIG.calibration.target_sigma_deg) ** 2 / 3] * 3)
-    examination = replace(examined(estimate), cov=cov, cov_agreed=estimate.cov)
+    examination = replace(examined(estimate), cov=cov, cov_used=cov, cov_agreed=estimate.cov)
     verdict, reasons = judge(estimate, examination, RIG, "cam", "lidar", 20)
     assert verdict == "marginal"
     assert [reason.code for reason in reasons] == ["verdict.rotation_uncertain", "verdict.may_be_off"]
@@ -205,11 +206,20 @@ def test_squares_of_the_wrong_size_are_told_from_the_distances():
     assert scale.figure("square_m") == pytest.approx(0.0735, abs=5e-4)
 
 
-def test_intrinsics_of_another_lens_are_named(estimate):
-    other = replace(CAMERA, fx_px=1.03 * CAMERA.fx_px, fy_px=1.03 * CAMERA.fy_px)
-    verdict, reasons = examined_verdict_of(estimate, lens=other)
-    assert verdict == "fail"
-    assert (reasons[0].code, reasons[0].severity) == ("verdict.intrinsics", "error")
+@pytest.mark.parametrize(("focal", "severity"), [(1.01, "note"), (1.04, "warning")])
+def test_a_lens_that_the_profile_has_wrong_is_corrected_and_named(focal, severity):
+    other = replace(CAMERA, fx_px=focal * CAMERA.fx_px, fy_px=focal * CAMERA.fy_px)
+    known = replace(KNOWN, lens=LensPrior(other, 0.004, 3.6, 2.2))
+    settings = EstimateSettings("ml", laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005, tolerances=known)
+    corrected = fit_extrinsic(simulate(20, 1, REAL), BOARD, settings)
+    verdict, reasons = examined_verdict_of(corrected, lens=other)
+    assert verdict == ("pass" if severity == "note" else "marginal")
+    (named,) = (reason for reason in reasons if reason.code == "verdict.intrinsics")
+    assert named.severity == severity
+    off_px = corrected.lens.intrinsics.fx_px - CAMERA.fx_px
+    assert abs(off_px) < 3 * corrected.lens.estimate.sigma[0]
+    error = difference(corrected.T_cam_lidar, T_FORWARD)
+    assert error @ np.linalg.solve(examined(corrected, other).cov, error) < 25
 
 
 def test_each_axis_is_named_where_the_target_is_missed(estimate, verdict_of):

@@ -75,7 +75,8 @@ def test_a_lens_moves_to_a_larger_model_unchanged_and_to_another_nearly():
 
 def test_lens_and_board_are_found_within_their_deviations(estimate):
     assert np.abs(deviations(estimate, WIDE)).max() < 4
-    assert np.all(np.abs(estimate.shape - [0.0012, -0.0006, 0.001]) < 4 * estimate.shape_sigma)
+    shape, sigma = estimate.pattern_shape
+    assert np.all(np.abs(shape - [0.0012, -0.0006, 0.001]) < 4 * sigma)
     assert estimate.sigma[0] < 0.005 * WIDE.fx_px
     assert estimate.refused == {}
     assert 0.06 < estimate.rms_px < estimate.held_out_rms_px < 0.1
@@ -93,7 +94,9 @@ def test_stated_deviations_are_true():
         nees.append(error @ np.linalg.solve(one.cov, error) / len(error))
     # 10 means of chi2 / 9 scatter by sqrt(2 / (9 * 10)) = 0.15 about 1.
     assert 0.6 < np.mean(nees) < 1.5
-    shapes = np.array([(one.shape - [0.001, 0, -0.001]) / one.shape_sigma for one in found])
+    shapes = np.array(
+        [(shape - [0.001, 0, -0.001]) / sigma for shape, sigma in (one.pattern_shape for one in found)]
+    )
     assert 0.6 < np.mean(shapes**2) < 1.5
 
 

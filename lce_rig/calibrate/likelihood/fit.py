@@ -113,7 +113,7 @@ def maximise_likelihood(
     by_name = {o.capture: (o, T) for camera, T in zip(cameras, T_cam_lidar, strict=True) for o in camera}
     order = {name: k for k, name in enumerate(sorted(by_name))}
     scans = stack_scans([interior(by_name[name][0].lidar, board) for name in order], board)
-    images = tuple(stack_camera(camera, order, board) for camera in cameras)
+    images = tuple(stack_camera(camera, order) for camera in cameras)
     if pose_ratios is not None:
         images = tuple(p.with_larger_errors(r) for p, r in zip(images, pose_ratios, strict=True))
     T_lidar_board = np.array([invert(T) @ o.image.T_cam_board for o, T in (by_name[name] for name in order)])
@@ -132,12 +132,10 @@ def maximise_likelihood(
     return _summarise(terms, now, priors)
 
 
-def stack_camera(
-    observations: Sequence[Observation], order: Mapping[str, int], board: Board
-) -> StackedImages:
+def stack_camera(observations: Sequence[Observation], order: Mapping[str, int]) -> StackedImages:
     """Stack one camera's images; `order` gives each capture's place by name."""
     capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
-    return stack_images(capture, [o.image for o in observations], board)
+    return stack_images(capture, [o.image for o in observations])
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,10 +327,9 @@ def _summarise(terms: Terms, levels: Levels, priors: Priors) -> JointEstimate:
     """
     state, cost = terms.state, assemble(terms, levels, priors).cost
     inverse, claimed = cost.covariance(), cost.prior
-    if not priors.profile_is_claimed:
-        of_profile = np.append(state.layout.scales, state.layout.z.of(["bow"]))
+    if not priors.scale_is_claimed:
         claimed = claimed.copy()
-        claimed[of_profile, of_profile] = 0.0
+        claimed[state.layout.scales, state.layout.scales] = 0.0
     scatter = inverse @ cost.hessians.sum(axis=0) @ inverse
     constants = inverse @ claimed @ inverse
     J = _to_extrinsics(state)

@@ -15,8 +15,6 @@ import numpy as np
 
 from lce_rig.calibrate.likelihood.layout import IMAGE, Indices
 from lce_rig.calibrate.likelihood.levels import PoseLevels
-from lce_rig.calibrate.likelihood.rays import bow_heights
-from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, difference, skew
 from lce_rig.core.results import ImageBoard
 
@@ -29,14 +27,12 @@ class StackedImages:
         capture: (P,) which of the stacked captures.
         T_cam_board: (P, 4, 4).
         cov: (P, 6, 6) of the corners' noise, tangent of T_cam_board.
-        by_bow: (P, 6, 2) how far the measured pose is off for a plate bent by 1 m (`rays.bow_heights`).
         shapes: (P, 6, 6) each, derivative of Q by the square of each of `PoseLevels`, by name.
     """
 
     capture: Indices
     T_cam_board: Array
     cov: Array
-    by_bow: Array
     shapes: Mapping[str, Array]
 
     def total_cov(self, levels: PoseLevels) -> Array:
@@ -52,13 +48,12 @@ class StackedImages:
         return replace(self, shapes=shapes)
 
 
-def stack_images(capture: Indices, images: Sequence[ImageBoard], board: Board | None = None) -> StackedImages:
+def stack_images(capture: Indices, images: Sequence[ImageBoard]) -> StackedImages:
     """Stack the images of one camera.
 
     Args:
         capture: (P,) which of the stacked captures they belong to.
         images: P of them.
-        board: its corners and size; without it, no plate is bent.
     """
     T = np.array([image.T_cam_board for image in images])
     cov = np.array([image.cov for image in images])
@@ -67,40 +62,14 @@ def stack_images(capture: Indices, images: Sequence[ImageBoard], board: Board | 
     about, along = (v[:, :, None] * v[:, None, :] for v in (normal, sight))
     shapes["tilt_rad"][:, 3:, 3:], shapes["spin_rad"][:, 3:, 3:] = np.eye(3) - about, about
     shapes["depth_m"][:, :3, :3], shapes["across_m"][:, :3, :3] = along, np.eye(3) - along
-    return StackedImages(
-        capture,
-        T,
-        cov,
-        np.zeros((len(T), 6, 2)) if board is None else _by_bow(T, board),
-        shapes,
-    )
+    return StackedImages(capture, T, cov, shapes)
 
 
-def _by_bow(T_cam_board: Array, board: Board) -> Array:
-    """Differentiate poses (P, 4, 4), fitted to a flat board, by the bows of the plate: (P, 6, 2).
-
-    With J the derivative of a corner's direction by the pose and A by its place, corners that rise by h move
-    the pose by (sum J^T J)^-1 sum J^T A h n.
-    """
-    corners = board.corners()
-    levers = corners @ np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
-    x, y, z = np.moveaxis(levers + T_cam_board[:, None, :3, 3], -1, 0)
-    A = np.zeros((*z.shape, 2, 3))
-    A[..., 0, 0] = A[..., 1, 1] = 1 / z
-    A[..., 0, 2], A[..., 1, 2] = -x / z**2, -y / z**2
-    J = np.concatenate([A, -A @ skew(levers)], axis=-1)
-    raised = (A @ T_cam_board[:, None, :3, 2, None]) * bow_heights(corners, board)[:, None]
-    H, g = np.einsum("pmai,pmaj->pij", J, J), np.einsum("pmai,pmab->pib", J, raised)
-    return np.asarray(np.linalg.solve(H, g))
-
-
-def image_rows(
-    images: StackedImages, T_cam_lidar: Array, T_lidar_board: Array, scale: float, bow_m: Array
-) -> Array:
+def image_rows(images: StackedImages, T_cam_lidar: Array, T_lidar_board: Array, scale: float) -> Array:
     """Linearise the tangent from T_cam_board to T_cam_lidar T_lidar_board.
 
     Returns:
-        (P, 6, 16) in columns of `IMAGE`. A scale s stretches what the camera measures to t_cam_board (1 + s):
+        (P, 6, 14) in columns of `IMAGE`. A scale s stretches what the camera measures to t_cam_board (1 + s):
         squares or a focal length that the profile has wrong.
     """
     Y = T_lidar_board[images.capture]
@@ -112,7 +81,6 @@ def image_rows(
     by_scale[:, :3, 0] = -images.T_cam_board[:, :3, 3]
     rows = np.zeros((len(Y), 6, IMAGE.size))
     rows[:, :, IMAGE["camera"]], rows[:, :, IMAGE["pose"]] = by_camera, by_pose
-    rows[:, :, IMAGE["scale"]], rows[:, :, IMAGE["bow"]] = by_scale, images.by_bow
+    rows[:, :, IMAGE["scale"]] = by_scale
     rows[:, :, -1] = difference(T_cam_lidar @ Y, images.T_cam_board) + scale * by_scale[..., 0]
-    rows[:, :, -1] += images.by_bow @ bow_m
     return rows

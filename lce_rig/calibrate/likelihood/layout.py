@@ -65,7 +65,7 @@ RING = Columns({"pose": 6, **_OF_LASER, **_FIELDS, "residual": 1})
 """Row of a ring's returns in a capture, by the board's pose."""
 END = Columns({"pose": 6, **_OF_LASER, **_FIELDS, "shifts": len(SHIFTS), "residual": 1})
 """Row of a ring end."""
-IMAGE = Columns({"camera": 6, "pose": 6, "scale": 1, "bow": 2, "residual": 1})
+IMAGE = Columns({"camera": 6, "pose": 6, "scale": 1, "residual": 1})
 """Row of a board's pose in an image."""
 OWN = Columns(_OWN)
 """Unknowns y of a capture."""

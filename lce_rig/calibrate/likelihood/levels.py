@@ -97,8 +97,8 @@ class Priors:
         azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
         known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
         scale: relative error of each camera's distances, from squares or focal length; one figure for all.
-        profile_is_claimed: whether the covariance contains the errors of scale and bow. It must not where the
-            effects of lens and board are added to it (`tolerances`).
+        scale_is_claimed: whether the covariance contains the error of the scale. It must not where the
+            effects of lens and squares are added to it (`tolerances`).
     """
 
     offset_m: float = 0.005
@@ -114,7 +114,7 @@ class Priors:
     elevation_rad: float = 2e-4
     known: KnownLidar | None = None
     scale: float | tuple[float, ...] = 0.001
-    profile_is_claimed: bool = True
+    scale_is_claimed: bool = True
 
     @property
     def independent(self) -> dict[str, Array]:
@@ -139,7 +139,10 @@ def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
     if options.tolerances is not None:
         # The effects of focal length and squares on the result contain what the scale does not absorb.
-        scale = max(options.tolerances.scale, _EXACT)
+        focal_sigma = (
+            options.tolerances.lens.focal_length if options.lens is None else options.lens.focal_sigma
+        )
+        scale = max(float(np.hypot(focal_sigma, options.tolerances.square_size)), _EXACT)
         bow_m = max(options.tolerances.bow_m, _EXACT)
-        priors = replace(priors, scale=scale, bow_m=bow_m, profile_is_claimed=False)
+        priors = replace(priors, scale=scale, bow_m=bow_m, scale_is_claimed=False)
     return priors, Levels(laser_m=options.laser_bias_sigma_m)

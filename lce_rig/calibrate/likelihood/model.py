@@ -5,7 +5,6 @@ by capture (Schur complement). `layout` names the unknowns.
 """
 
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 
@@ -58,9 +57,22 @@ class Terms:
     trust: Array
     rings: NDArray[np.int16]
 
-    def with_images(self, images: Sequence[StackedImages]) -> "Terms":
-        """Replace the images, seen at the same state."""
-        return replace(self, images=tuple(images), image_rows=_rows_of_images(images, self.state))
+    def gradients_by_pose_moves(self, levels: Levels, moves: Array) -> Array:
+        """Differentiate the gradients of the first camera's captures by moves of its image poses.
+
+        Args:
+            levels: of the noise.
+            moves: (V, P, 6) tangents of T_cam_board.
+
+        Returns:
+            (F, 7 + G, V) change of the gradients by [y, z].
+        """
+        images, rows, layout = self.images[0], self.image_rows[0], self.state.layout
+        weighted = -np.linalg.solve(images.total_cov(levels.pose), np.moveaxis(moves, 0, -1))
+        changes = np.zeros((len(self.trust), layout.row.size - 1, len(moves)))
+        products = np.swapaxes(rows[:, :, :-1], 1, 2) @ weighted
+        changes[images.capture[:, None], layout.image_row(0)[:-1]] = products
+        return np.asarray(changes * self.trust[:, None, None])
 
 
 def linearise(
@@ -83,9 +95,8 @@ def linearise(
 
 
 def _rows_of_images(images: Sequence[StackedImages], state: State) -> tuple[Array, ...]:
-    bow_m = state.z[state.layout.z["bow"]]
     return tuple(
-        image_rows(of_camera, T, state.T_lidar_board, scale, bow_m)
+        image_rows(of_camera, T, state.T_lidar_board, scale)
         for of_camera, T, scale in zip(images, state.T_cam_lidar, state.scale.tolist(), strict=True)
     )
 
@@ -168,13 +179,6 @@ class Assembly:
         self._range_block = lru_cache(maxsize=1)(partial(_range_block, terms))
         self._edge_block = lru_cache(maxsize=1)(partial(_edge_block, terms))
         self._image_block = lru_cache(maxsize=1)(partial(_image_block, terms))
-
-    def with_images(self, images: Sequence[StackedImages]) -> "Assembly":
-        """Replace the images; the other terms stay cached."""
-        other = copy(self)
-        other._terms = self._terms.with_images(images)
-        other._image_block = lru_cache(maxsize=1)(partial(_image_block, other._terms))
-        return other
 
     def at(self, levels: Levels) -> Reduced:
         """Weight all terms, eliminate the captures' own unknowns and add the priors."""

@@ -287,7 +287,7 @@ def _draw(
     picture = draw_overlay(
         view.image,
         scan,
-        rig.cameras[calibration.camera].to_intrinsics(),
+        rig.lens_of(calibration),
         calibration.T_cam_lidar,
         lidar_board=None if meeting is None else meeting.lidar_at_image_time,
         image_board=image_board if meeting is None else meeting.measured.image,

@@ -95,7 +95,7 @@ def calibration_page(
 
 def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str, Any]:
     """List the content of one camera and one LiDAR's part of the page, by the template's names."""
-    board, lens = rig.board.to_board(), rig.cameras[c.camera].to_intrinsics()
+    board, lens = rig.board.to_board(), rig.lens_of(c)
     evidence = gather(c, board, lens)
     captures = []
     for k, residual in enumerate(c.residuals):

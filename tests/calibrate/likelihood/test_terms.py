@@ -53,7 +53,7 @@ def scans(observations):
 
 @pytest.fixture(scope="module")
 def images(observations):
-    return stack_images(np.arange(4), [o.image for o in observations], BOARD)
+    return stack_images(np.arange(4), [o.image for o in observations])
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def test_ring_ends_displaced_against_all_returns_are_what_the_shifts_say(scans, 
 
 
 def test_derivatives_of_pictures_are_those_of_differences(images, T_lidar_board):
-    rows = image_rows(images, T_FORWARD, T_lidar_board, 0.0, np.zeros(2))
+    rows = image_rows(images, T_FORWARD, T_lidar_board, 0.0)
     for axis in range(6):
         tangent = STEP * np.eye(6)[axis]
         by_camera = [
@@ -190,7 +190,7 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
     F, z = len(terms.trust), terms.state.layout.z
     rows, noise = [], []
     by_camera = terms.image_rows[0]
-    names = {"camera": "camera 0", "scale": "scale 0", "bow": "bow"}
+    names = {"camera": "camera 0", "scale": "scale 0"}
 
     def own_pose(k):
         return slice(z.size + 6 * k, z.size + 6 * k + 6)

@@ -1,0 +1,128 @@
+"""The session's lens: the profile's intrinsics and the boards in the images, weighed by what they are worth.
+
+The LiDAR has no part in it. Its constant errors, a turn about the vertical of 0.1 to 0.2 deg in recordings,
+look like a shift of the principal point, and would move a lens that it may move. Lens and shape of the board
+therefore follow from the images and the profile alone; every pose of the board is fitted anew with them, and
+the extrinsics are estimated with these poses. The covariance of lens and board is propagated to first order:
+
+    cov_T = cov_T|K + J cov_K J^T,    cov_TK = J cov_K,    J = dT / dK                                     (1)
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from lce_rig.calibrate.observations import group_placements
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array, difference, perturb
+from lce_rig.core.results import ImageBoard, Observation
+from lce_rig.lens.calibrate_lens import estimate_intrinsics
+from lce_rig.lens.fit import fit_poses, pose_moves
+from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
+from lce_rig.lens.models import LensPrior, model_of
+
+# More images hardly improve a lens, and take time.
+_MAX_VIEWS = 80
+# Below this difference of costs, in corner variances, an image alone cannot decide between two poses.
+_AMBIGUOUS_CHI2 = 9.0
+
+
+@dataclass(frozen=True, eq=False)
+class SessionLens:
+    """A camera's intrinsics and the board's shape, from the profile and the session's images.
+
+    Attributes:
+        estimate: of both.
+        prior: the profile's.
+    """
+
+    estimate: IntrinsicsEstimate
+    prior: LensPrior
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera's."""
+        return self.estimate.intrinsics
+
+    @property
+    def focal_sigma(self) -> float:
+        """Relative standard deviation of the focal length."""
+        return float(self.estimate.sigma[0] / self.intrinsics.fx_px)
+
+    @cached_property
+    def directions(self) -> Array:
+        """Independent errors (n, P + 15) of lens and board, of one standard deviation each."""
+        cov = self.estimate.cov_with_board
+        sigma = np.sqrt(np.diag(cov))
+        variances, axes = np.linalg.eigh(cov / np.outer(sigma, sigma))
+        return np.asarray((np.sqrt(np.maximum(variances, 0.0)) * axes).T * sigma)
+
+    def moves(self, T_cam_board: Array) -> Array:
+        """Compute how far each of `directions` moves fitted poses (F, 4, 4): (n, F, 6) tangents."""
+        return pose_moves(self.estimate, T_cam_board, self.directions)
+
+    def refit(self, observations: Sequence[Observation]) -> list[Observation]:
+        """Fit the poses of observations anew with this lens and board."""
+        boards = [observation.image for observation in observations]
+        corners_px = np.array([board.corners_px for board in boards])
+        others = [board.T_cam_board_alternative for board in boards]
+        first = fit_poses(self.estimate, corners_px, np.array([board.T_cam_board for board in boards]))
+        starts = [b.T_cam_board if other is None else other for b, other in zip(boards, others, strict=True)]
+        second = fit_poses(self.estimate, corners_px, np.array(starts))
+        n = corners_px.shape[1]
+        refitted = []
+        for k, (observation, other) in enumerate(zip(observations, others, strict=True)):
+            (T, cost, H), (T_other, cost_other, H_other) = (
+                [part[k] for part in fit] for fit in (first, second)
+            )
+            if other is not None and cost_other < cost:
+                (T, cost, H), (T_other, cost_other) = (T_other, cost_other, H_other), (T, cost)
+            variance = max(float(cost) / max(2 * n - 6, 1), 1e-12)
+            gap = np.inf if other is None else (float(cost_other) - float(cost)) / variance
+            image = replace(
+                _moved(observation.image, T),
+                cov=variance * np.linalg.inv(H),
+                T_cam_board_alternative=None if other is None else T_other,
+                chi2_gap=gap,
+                is_ambiguous=gap < _AMBIGUOUS_CHI2,
+                reprojection_px=float(np.sqrt(cost / n)),
+                sigma_px=float(np.sqrt(variance)),
+            )
+            refitted.append(replace(observation, image=image))
+        return refitted
+
+
+def fit_session_lens(
+    candidates: Mapping[str, Sequence[Observation]], board: Board, prior: LensPrior
+) -> SessionLens:
+    """Fit the lens that all channels of a camera share, and the board's shape.
+
+    Args:
+        candidates: by channel, of each capture.
+        board: its specification.
+        prior: the profile's intrinsics.
+
+    Raises:
+        NotEnoughDataError: no channel has a board, or boards and profile leave the intrinsics undetermined.
+    """
+    every = [(channel, o) for channel, observations in candidates.items() for o in observations]
+    thinned = every[:: max(1, -(-len(every) // _MAX_VIEWS))]
+    placement = group_placements([observation for _, observation in thinned])
+    # Images of one placement share its errors.
+    views = [
+        BoardView(f"{number:06d}", channel, observation.image)
+        for number, (channel, observation) in zip(placement.tolist(), thinned, strict=True)
+    ]
+    estimate = estimate_intrinsics(views, board, prior.lens, model_of(prior.lens), prior=prior, n_folds=0)
+    return SessionLens(estimate, prior)
+
+
+def _moved(image: ImageBoard, T_cam_board: Array) -> ImageBoard:
+    """Replace a pose; images shortly before and after move by the same tangent."""
+    track = image.track_T_cam_board
+    if track is not None:
+        track = perturb(track, difference(T_cam_board, image.T_cam_board))
+    return replace(image, T_cam_board=T_cam_board, track_T_cam_board=track)

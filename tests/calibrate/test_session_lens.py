@@ -1,0 +1,105 @@
+"""The session's lens: weighed between profile and images, untouched by the LiDAR, with a joint covariance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.session_lens import fit_session_lens
+from lce_rig.core.geometry import difference, invert, perturb, transform
+from lce_rig.judge.contributions import profile_covariance
+from lce_rig.judge.reach import effective_covariance, joint_covariance, point_uncertainties
+from lce_rig.lens.models import LensPrior
+from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, simulate
+from tests.calibrate.test_tolerances import KNOWN, REAL, as_profiled, with_errors
+
+ROUGH = LensPrior(CAMERA, focal_length=0.004, principal_point_px=3.6, distortion_px=2.2)
+EXACT = LensPrior(CAMERA, 0.0, 0.0, 0.0, is_board_exact=True)
+SETTINGS = EstimateSettings("ml", laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+
+
+def of_profile(prior):
+    return replace(SETTINGS, tolerances=replace(KNOWN, lens=prior))
+
+
+@pytest.fixture(scope="module")
+def captures():
+    return simulate(20, 1, REAL)
+
+
+@pytest.mark.parametrize("errors", [(0.003, 4.0, -5.0, 2.0), (0.02, 10.0, -10.0, 0.0)])
+def test_the_lens_is_the_true_one_within_its_deviations_wherever_the_profile_lies(captures, errors):
+    prior = replace(ROUGH, lens=with_errors(CAMERA, errors))
+    lens = fit_session_lens({"frames": as_profiled(captures, prior.lens)}, BOARD, prior)
+    model = lens.estimate.model
+    off = model.vector(lens.intrinsics) - model.vector(CAMERA)
+    assert np.all(np.abs(off[:5]) < 3.5 * lens.estimate.sigma[:5])
+    assert (lens.estimate.surprise > 16) == (errors[0] > 0.01)
+
+
+def test_an_exact_profile_stays_as_it_is(captures):
+    lens = fit_session_lens({"frames": captures}, BOARD, EXACT)
+    model = lens.estimate.model
+    np.testing.assert_allclose(model.vector(lens.intrinsics), model.vector(CAMERA), rtol=1e-5)
+    np.testing.assert_allclose(lens.estimate.corners_board, BOARD.corners(), atol=1e-6)
+    for old, new in zip(captures, lens.refit(captures), strict=True):
+        moved = difference(new.image.T_cam_board, old.image.T_cam_board)
+        assert np.abs(moved).max() < 1e-4
+        np.testing.assert_allclose(new.image.cov, old.image.cov, rtol=0.02, atol=1e-12)
+
+
+def test_the_lidar_does_not_move_the_lens(captures):
+    turned = perturb(np.eye(4), np.array([0, 0, 0, 0, 0, np.radians(0.2)]))
+    moved = [
+        replace(
+            o,
+            lidar=replace(
+                o.lidar,
+                points=transform(turned, o.lidar.points),
+                edge_points=transform(turned, o.lidar.edge_points),
+                T_lidar_board=turned @ o.lidar.T_lidar_board,
+                plane=o.lidar.plane @ invert(turned),
+            ),
+        )
+        for o in captures
+    ]
+    first, second = (fit_extrinsic(each, BOARD, of_profile(ROUGH)) for each in (captures, moved))
+    assert first.lens.intrinsics == second.lens.intrinsics
+    shift = difference(second.T_cam_lidar, first.T_cam_lidar @ invert(turned))
+    assert np.abs(shift[3:]).max() < np.radians(0.01)
+
+
+@pytest.mark.parametrize("method", ["ml", "paper"])
+def test_extrinsics_move_with_the_lens_as_its_directions_say(captures, method):
+    estimate = fit_extrinsic(captures, BOARD, replace(of_profile(ROUGH), method=method))
+    lens = estimate.lens
+    (by_lens,) = (each for each in estimate.sensitivities if each.source == "intrinsics")
+    k = int(np.argmax(np.linalg.norm(by_lens.moves, axis=1)))
+    poses = lens.moves(np.array([o.image.T_cam_board for o in estimate.observations.values()]))[k]
+    moved = [
+        replace(o, image=replace(o.image, T_cam_board=perturb(o.image.T_cam_board, move)))
+        for o, move in zip(estimate.observations.values(), poses, strict=True)
+    ]
+    again = fit_extrinsic(moved, BOARD, replace(SETTINGS, method=method))
+    still = fit_extrinsic(list(estimate.observations.values()), BOARD, replace(SETTINGS, method=method))
+    change = difference(again.T_cam_lidar, still.T_cam_lidar)
+    np.testing.assert_allclose(change, by_lens.moves[k], atol=0.15 * np.linalg.norm(by_lens.moves[k]))
+
+
+def test_a_turn_by_the_principal_point_leaves_points_in_the_image_where_they_are(captures):
+    """Extrinsics and lens are known jointly better than each alone, and the true error agrees."""
+    prior = replace(ROUGH, lens=with_errors(CAMERA, (0, 5.0, -4.0, 0)))
+    estimate = fit_extrinsic(as_profiled(captures, prior.lens), BOARD, of_profile(prior))
+    cov = estimate.cov + profile_covariance(estimate.sensitivities)
+    joint = joint_covariance(estimate, cov)
+    assert np.linalg.eigvalsh(joint / np.sqrt(np.outer(np.diag(joint), np.diag(joint)))).min() > -1e-9
+    used = effective_covariance(estimate, joint)
+    assert np.trace(used[3:, 3:]) < np.trace(cov[3:, 3:])
+    lens = estimate.lens.intrinsics
+    (alone,), (together,) = (point_uncertainties(estimate.T_cam_lidar, c, lens, [10.0]) for c in (cov, joint))
+    assert together.centre_px < 0.8 * alone.centre_px
+    middle = np.array([[(lens.width_px - 1) / 2, (lens.height_px - 1) / 2]])
+    point = 10.0 * lens.unproject(middle)
+    pixel, _ = CAMERA.project(transform(T_FORWARD @ invert(estimate.T_cam_lidar), point))
+    assert np.linalg.norm(pixel - middle) < 3 * together.centre_px
