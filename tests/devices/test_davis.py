@@ -102,14 +102,9 @@ def test_all_that_dv_processing_wrote_comes_out(recording: Path) -> None:
     t_us = np.concatenate([part.t_ns for part in events]) // 1000
     written = [store(START_US + INTERVAL_US * k).numpy() for k in range(8)]
     assert (t_us == np.concatenate([part["timestamp"] for part in written])).all()
-    assert (
-        np.concatenate([part.x for part in events]) == np.concatenate([part["x"] for part in written])
-    ).all()
-    assert (
-        np.concatenate([part.y for part in events]) == np.concatenate([part["y"] for part in written])
-    ).all()
-    polarity = np.concatenate([part.polarity for part in events])
-    assert (polarity == np.concatenate([part["polarity"] for part in written]).astype(bool)).all()
+    for name in ("x", "y", "polarity"):
+        ours = np.concatenate([getattr(part, name) for part in events])
+        assert (ours == np.concatenate([part[name] for part in written])).all()
     assert {(part.sensor, part.width_px, part.height_px) for part in events} == {("davis", 346, 260)}
     assert source.status().serial == "00000499"
 

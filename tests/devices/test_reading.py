@@ -132,14 +132,6 @@ def test_what_comes_while_others_are_being_opened_is_no_loss() -> None:
         assert sensors.statuses()["s"].n_dropped == 0
 
 
-def test_a_sensor_that_stays_away_is_named_with_the_reason() -> None:
-    with AttachedSensors([Script(SourceError("gone"))], reopen_every_s=60.0) as sensors:
-        while not sensors.lost():
-            time.sleep(0.005)
-        error, since_s = sensors.lost()["s"]
-        assert error.what == "gone" and since_s <= time.monotonic()
-
-
 def test_all_is_closed_at_once_while_a_lost_sensor_is_being_opened_again() -> None:
     class Absent(Script):
         """Gone for good: opening it waits until it is told to give up."""

@@ -124,17 +124,6 @@ def test_a_board_that_begins_anew_is_set_again_and_told(says_hello):
     assert restarted.figures["n"] == 1
 
 
-def test_a_board_that_stalls_goes_on_where_it_was():
-    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
-        take(board, 10)
-        fake.is_stalled = True
-        time.sleep(0.3)
-        fake.is_stalled = False
-        pulses = take(board, 10)
-        assert len(pulses) == 10
-        assert "device.board_restarted" not in codes(board.status())
-
-
 def test_a_board_that_falls_silent_ends_the_samples_with_what_to_check():
     with FakeBoard() as fake, SyncBoard(settings(fake.path), silence_s=0.3) as board:
         take(board, 3)

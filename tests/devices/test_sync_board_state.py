@@ -152,11 +152,3 @@ def test_whatever_is_said_in_whatever_order_breaks_nothing(said):
             assert pulse.sensor in ("cam", "davis", "pps")
     shown = problems(state, now_s=steady_ns / S, heard_s=steady_ns / S)
     assert all(finding.sentence for finding in (state.clock_state().finding, *shown))
-
-
-def test_gaps_in_the_running_numbers_are_lost_pulses_and_a_restart_is_none():
-    state = BoardState({0: "cam"})
-    pulses(state, [*range(10), *range(14, 20)])
-    assert state.n_lost_by_line == {"cam": 4}
-    pulses(state, range(1, 10), start_s=2.0, board_s=0.0)
-    assert state.n_restarts == 1 and state.n_lost_by_line == {"cam": 4}

@@ -101,12 +101,9 @@ def test_the_sketch_is_sound_for_the_arduino_interface_it_uses(compiler):
     command = [
         compiler,
         *STRICT,
-        "-fsyntax-only",
-        "-x",
-        "c++",
-        "-include",
+        *["-fsyntax-only", "-x", "c++", "-include"],
         stub,
-        FIRMWARE / "lce1" / "lce1.ino",
+        FIRMWARE / "lce1/lce1.ino",
     ]
     checked = subprocess.run(command, capture_output=True, text=True)
     assert checked.returncode == 0, checked.stderr

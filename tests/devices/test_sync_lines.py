@@ -73,11 +73,6 @@ def test_wrong_sums_are_counted_and_unknown_sentences_told_apart():
     assert read(data) == ([], 1)
 
 
-def test_a_board_that_begins_anew_in_the_middle_of_a_line_is_understood():
-    hello = write_sentence("LCEHI,1,1.0,teensy40,1000000")
-    assert read(b"\xff\x00$LCETG,0,12,34" + hello)[0] == [Hello(1, "1.0", "teensy40", 1_000_000)]
-
-
 @given(st.lists(st.sampled_from(sorted(BODIES)), min_size=1, max_size=20), st.randoms(use_true_random=False))
 def test_lines_cut_anywhere_are_joined_again(bodies, random):
     data = b"".join(map(write_sentence, bodies))

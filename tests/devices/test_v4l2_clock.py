@@ -24,19 +24,16 @@ def test_the_clock_of_the_stamps_is_found(clock: str, age_ms: int) -> None:
     assert choose_clock(NOW[clock] - age_ms * MS, NOW) == (clock, 0)
 
 
-@pytest.mark.parametrize("age_ms", [-1, 201, 5000, -29_000])
-def test_stamps_from_the_future_or_too_old_fit_no_clock(age_ms: int) -> None:
-    assert choose_clock(NOW["monotonic"] - age_ms * MS, NOW) == (None, 0)
-
-
-def test_clocks_that_hardly_differ_are_no_doubt() -> None:
-    now = NOW | {"monotonic_raw": NOW["monotonic"] + 1 * MS, "boottime": NOW["monotonic"]}
-    assert choose_clock(NOW["monotonic"] - 20 * MS, now) == ("monotonic", 1 * MS)
-
-
-def test_clocks_that_both_fit_and_differ_are_said_to() -> None:
-    now = NOW | {"monotonic_raw": NOW["monotonic"] + 40 * MS}
-    assert choose_clock(NOW["monotonic"] - 20 * MS, now) == ("monotonic", 40 * MS)
+@pytest.mark.parametrize(
+    ("age_ms", "apart_ms", "chosen"),
+    [(age_ms, 0, (None, 0)) for age_ms in (-1, 201, 5000, -29_000)]
+    + [(20, 1, ("monotonic", MS)), (20, 40, ("monotonic", 40 * MS))],
+)
+def test_clocks_that_fit_and_differ_are_told_from_none(
+    age_ms: int, apart_ms: int, chosen: tuple[str | None, int]
+) -> None:
+    now = NOW | ({"monotonic_raw": NOW["monotonic"] + apart_ms * MS} if apart_ms else {})
+    assert choose_clock(NOW["monotonic"] - age_ms * MS, now) == chosen
 
 
 @pytest.mark.parametrize("clock", ["monotonic", "realtime"])

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder
+from tests.yuv import to_422, to_yuv
 
 WIDTH, HEIGHT = 22, 12
 
@@ -15,15 +16,6 @@ def smooth_picture(seed: int = 0) -> np.ndarray:
     """A picture (H, W, 3) BGR whose neighbours differ little, so that halved chroma loses little."""
     coarse = np.random.default_rng(seed).uniform(20, 235, (3, 4, 3)).astype(np.float32)
     return cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
-
-
-def to_yuv(bgr: np.ndarray) -> np.ndarray:
-    """ITU-R BT.601, video range: (H, W, 3) Y, U, V."""
-    blue, green, red = np.moveaxis(bgr.astype(float), 2, 0)
-    y = 16 + (65.481 * red + 128.553 * green + 24.966 * blue) / 255
-    u = 128 + (-37.797 * red - 74.203 * green + 112 * blue) / 255
-    v = 128 + (112 * red - 93.786 * green - 18.214 * blue) / 255
-    return np.rint(np.stack((y, u, v), 2)).astype(np.uint8)
 
 
 def pad(rows: np.ndarray, stride: int) -> bytes:
@@ -35,11 +27,7 @@ def encode(code: str, bgr: np.ndarray, padding: int) -> tuple[bytes, int]:
     """Write a picture in a pixel format; gives the bytes and the stride."""
     height, width = bgr.shape[:2]
     if code in ("UYVY", "YUYV"):
-        y, u, v = np.moveaxis(to_yuv(bgr), 2, 0)
-        rows = np.empty((height, width, 2), np.uint8)
-        at = {"UYVY": (1, 0, 0), "YUYV": (0, 1, 1)}[code]
-        rows[:, :, at[0]] = y
-        rows[:, 0::2, at[1]], rows[:, 1::2, at[2]] = u[:, 0::2], v[:, 1::2]
+        rows = to_422(bgr, code.lower())
         return pad(rows.reshape(height, -1), 2 * width + padding), 2 * width + padding
     if code in ("NV12", "YU12"):
         y, u, v = np.moveaxis(to_yuv(bgr), 2, 0)

@@ -35,29 +35,17 @@ SETTINGS = {
 PAGES: dict[str, Any] = {"info": INFO, "status": STATUS, "settings": SETTINGS}
 
 
-class FakeSensor:
-    """A sensor's web server; `pages` are what it answers.
-
-    Attributes:
-        pages: contents by name; bytes are sent as they are.
-    """
-
-    def __init__(self, pages: dict[str, Any]) -> None:
-        self.pages = json.loads(json.dumps({k: v for k, v in pages.items() if not isinstance(v, bytes)}))
-        self.pages.update({k: v for k, v in pages.items() if isinstance(v, bytes)})
-
-
 @contextmanager
-def serving(pages: dict[str, Any]) -> Iterator[tuple[FakeSensor, VelodyneWeb]]:
-    sensor = FakeSensor(pages)
+def serving(pages: dict[str, Any]) -> Iterator[VelodyneWeb]:
+    """Serve a sensor's pages by name; bytes are sent as they are."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             name = self.path.removeprefix("/cgi/").removesuffix(".json")
-            if name not in sensor.pages:
+            if name not in pages:
                 self.send_error(404)
                 return
-            content = sensor.pages[name]
+            content = pages[name]
             self.send_response(200)
             self.end_headers()
             self.wfile.write(content if isinstance(content, bytes) else json.dumps(content).encode())
@@ -69,16 +57,15 @@ def serving(pages: dict[str, Any]) -> Iterator[tuple[FakeSensor, VelodyneWeb]]:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         try:
-            yield sensor, VelodyneWeb("127.0.0.1", server.server_port)
+            yield VelodyneWeb("127.0.0.1", server.server_port)
         finally:
             server.shutdown()
             thread.join()
 
 
 def test_the_page_of_a_healthy_sensor_is_read_without_a_complaint() -> None:
-    with serving(PAGES) as (sensor, web):
+    with serving(PAGES) as web:
         report = web.read()
-        assert sensor.pages == PAGES
     assert (report.model, report.serial, report.firmware) == ("VLP-16", "AG43510116", "3.0.41.1")
     assert (report.pps, report.returns, report.host) == ("locked", "strongest", "255.255.255.255")
     assert report.is_motor_on and report.is_laser_on
@@ -99,7 +86,7 @@ def test_types_that_differ_by_firmware_do_not_matter() -> None:
             "host": {"addr": "192.168.1.100", "dport": "2368", "tport": "8308"},
         },
     }
-    with serving(odd) as (_, web):
+    with serving(odd) as web:
         report = web.read()
     assert (report.firmware, report.serial, report.is_motor_on, report.is_laser_on) == (
         "3.0.29.0",
@@ -115,7 +102,7 @@ def test_types_that_differ_by_firmware_do_not_matter() -> None:
     "nonsense", [{}, {"gps": 3, "motor": [], "rpm": None, "host": "x", "fov": {"start": {}}}]
 )
 def test_pages_that_say_nothing_of_use_give_an_empty_report(nonsense: dict[str, Any]) -> None:
-    with serving({"info": nonsense, "status": nonsense, "settings": nonsense}) as (_, web):
+    with serving({"info": nonsense, "status": nonsense, "settings": nonsense}) as web:
         report = web.read()
     assert report.rotor_hz is None and report.data_port is None and report.pps == ""
     assert find_problems(report, settings()) == []
@@ -124,7 +111,7 @@ def test_pages_that_say_nothing_of_use_give_an_empty_report(nonsense: dict[str, 
 @pytest.mark.parametrize("body", [b"<html>router</html>", b"[1, 2]", b"\xff\xfe", b"", b"[" * 100_000])
 def test_another_device_at_the_address_is_told_from_a_sensor(body: bytes) -> None:
     with (
-        serving({**PAGES, "info": body}) as (_, web),
+        serving({**PAGES, "info": body}) as web,
         pytest.raises(SourceError, match="cgi/info"),
     ):
         web.read()
@@ -154,7 +141,7 @@ WRONG: list[tuple[dict[str, Any], tuple[str, Any, Any]]] = [
 def test_what_keeps_scans_from_coming_is_found_with_its_figures(
     changes: dict[str, Any], figures: tuple[str, Any, Any]
 ) -> None:
-    with serving({key: {**page, **changes.get(key, {})} for key, page in PAGES.items()}) as (_, web):
+    with serving({key: {**page, **changes.get(key, {})} for key, page in PAGES.items()}) as web:
         (problem,) = find_problems(web.read(), settings())
     assert problem.code == "settings.differs"
     assert tuple(problem.figures[name] for name in ("setting", "value", "expected")) == figures

@@ -100,7 +100,7 @@ def attach(attached: Attached, folder: Path) -> Iterator[tuple[Rig, int]]:
     with ExitStack() as stack:
         host = {**PAGES["settings"]["host"], "dport": ports[0], "tport": ports[1]}
         settings = {**PAGES["settings"], "host": host}
-        _, web = stack.enter_context(serving({**PAGES, "settings": settings, **attached.pages}))
+        web = stack.enter_context(serving({**PAGES, "settings": settings, **attached.pages}))
         if attached.scan is not None:
             sender = Vlp16Sender(attached.scan, ports, attached.clock)
             sender.start()

@@ -99,12 +99,6 @@ def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path
             opened(path, rig, topics={"davis.events": wrong})
 
 
-def test_a_bag_with_a_lidar_and_events_alone_is_enough(tmp_path: Path, rig: Rig) -> None:
-    given = [s for s in one_second(50) if not isinstance(s, Image)]
-    recording = opened(record(tmp_path / "r.bag", rig, given), rig)
-    assert {stream.kind for stream in recording.streams} == {"events", "scans"}
-
-
 def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_path: Path, rig: Rig) -> None:
     samples = one_second(50)
     for name, kind in (("events", Events), ("scans", Scan), ("images", Image)):

@@ -13,7 +13,6 @@ import pytest
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
-from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.ros.bag_recorder import BagRecorder, FolderRecorder
 from lce_rig.rig import Rig, load_rig
 
@@ -47,44 +46,6 @@ def test_samples_come_back_as_they_were(tmp_path: Path, rles: Rig, name: str) ->
         assert np.array_equal(found_column, np.concatenate([getattr(p, column) for p in events])), column
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_rosbags_itself_reads_the_topics_types_and_stamps(tmp_path: Path, rles: Rig, name: str) -> None:
-    from rosbags.highlevel import AnyReader
-
-    path = record(tmp_path / name, rles, one_second(300))
-    with AnyReader([path]) as reader:
-        topics = {
-            connection.topic: (connection.msgtype, connection.msgcount) for connection in reader.connections
-        }
-        assert topics == {
-            "/davis/image_raw": ("sensor_msgs/msg/Image", 20),
-            "/velodyne_points": ("sensor_msgs/msg/PointCloud2", 10),
-            "/davis/events": ("dvs_msgs/msg/EventArray", 50),
-        }
-        frames = set()
-        counts = dict.fromkeys(topics, 0)
-        for connection, received_ns, data in reader.messages():
-            message = reader.deserialize(data, connection.msgtype)
-            stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-            assert 0 <= received_ns - stamp_ns <= 100_000_000
-            frames.add(message.header.frame_id)
-            if connection.topic == "/davis/events":
-                first = message.events[0]
-                assert first.ts.sec * 10**9 + first.ts.nanosec == stamp_ns
-            if connection.topic == "/velodyne_points":
-                assert [field.name for field in message.fields] == [
-                    "x",
-                    "y",
-                    "z",
-                    "intensity",
-                    "ring",
-                    "time",
-                ]
-            counts[connection.topic] += 1
-    assert counts == {topic: n for topic, (_, n) in topics.items()}
-    assert frames == {"davis_optical_frame", "velodyne"}
-
-
 def test_colour_pictures_and_scans_without_times_come_back_too(tmp_path: Path, rles: Rig) -> None:
     colour = picture(0, (20, 30, 3))
     given = replace(sweep(0), offset_ns=None, host_ns=None)
@@ -103,22 +64,6 @@ def test_stamps_mark_the_firing_that_the_profile_says(tmp_path: Path, has_times:
     given = sweep(3) if has_times else replace(sweep(3), offset_ns=None)
     _, (found,) = read(record(tmp_path / "r.bag", rig, [picture(0), given]), rig)
     assert found.stamp_ns == pytest.approx(given.stamp_ns, abs=4 if has_times else 0)
-
-
-def test_a_profile_without_topics_gets_some_of_its_sensors_names(tmp_path: Path) -> None:
-    from rosbags.rosbag1 import Reader
-
-    rig = load_rig("rles")
-    lidar = rig.lidars["lidar"].model_copy(update={"topic": None})
-    channels = {k: c.model_copy(update={"topic": None}) for k, c in rig.cameras["davis"].channels.items()}
-    camera = rig.cameras["davis"].model_copy(update={"channels": channels})
-    rig = rig.model_copy(update={"lidars": {"lidar": lidar}, "cameras": {"davis": camera}})
-    path = record(tmp_path / "r.bag", rig, [sweep(0), picture(0), packet(0), sweep(1)])
-    with Reader(path) as reader:
-        assert sorted(reader.topics) == ["/davis/events", "/davis/frames", "/lidar/points"]
-    options = SourceOptions(topics={"davis.frames": "/davis/frames", "lidar": "/lidar/points"})
-    images, scans = read(path, rig, options)
-    assert (len(images), len(scans)) == (1, 2)
 
 
 @pytest.mark.parametrize(
@@ -177,22 +122,6 @@ def test_memory_stays_flat_however_long_it_records(tmp_path: Path, rles: Rig, na
     assert held < 3_000_000 and peak < 8_000_000
 
 
-@pytest.mark.parametrize("ros", [1, 2])
-def test_a_folder_holds_a_bag_and_the_events_as_aedat4(tmp_path: Path, rles: Rig, ros: int) -> None:
-    folder = tmp_path / "deep" / "folder"
-    with FolderRecorder(folder, rles, ros) as recorder:
-        for sample in one_second():
-            recorder.write(sample)
-    assert sorted(path.name for path in folder.iterdir()) == sorted(["events.aedat4", recorder.bag.name])
-    for path in (recorder.bag, folder / "events.aedat4"):
-        for column, found in read_events(path).items():
-            given = np.concatenate([getattr(packet(k), column) for k in range(50)])
-            assert np.array_equal(found, given), (path.name, column)
-    assert [len(samples) for samples in read(recorder.bag, rles)] == [20, 10]
-    with pytest.raises(SourceError, match="exists already"):
-        FolderRecorder(folder, rles)
-
-
 @contextmanager
 def files_up_to(n_bytes: int) -> Iterator[None]:
     """Let no file grow beyond a size, as on a disk that is full."""
@@ -218,11 +147,6 @@ def test_a_full_disk_stops_the_recording(tmp_path: Path, rles: Rig, name: str) -
     assert 10 < n_taken < 50
     with pytest.raises(SourceError, match=name):
         open_recording(tmp_path / name, rles)
-
-
-def test_a_disk_that_is_full_at_the_end_is_named_too(tmp_path: Path, rles: Rig) -> None:
-    with files_up_to(100_000), pytest.raises(SourceError):
-        record(tmp_path / "r.bag", rles, [picture(0), picture(1)])
 
 
 def test_an_error_of_the_user_of_a_recorder_is_not_hidden_by_a_full_disk(tmp_path: Path, rles: Rig) -> None:

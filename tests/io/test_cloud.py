@@ -171,18 +171,6 @@ def test_rings_in_a_tilted_frame_stay_rings(room):
     assert len(np.unique(to_scan(room, "lidar", FIRST, "tilted").scan.ring)) == 16
 
 
-@pytest.mark.parametrize("nothing", [0.0, np.nan])
-def test_an_organised_cloud_keeps_its_returns_only(room, nothing):
-    organised = np.zeros(2 * len(room), room.dtype)
-    organised[::2] = room
-    for axis in "xyz":
-        organised[axis][1::2] = nothing
-    whole, sparse = to_scan(room, "lidar", FIRST, "room"), to_scan(organised, "lidar", FIRST, "organised")
-    assert np.array_equal(sparse.scan.points, whole.scan.points)
-    assert np.array_equal(sparse.scan.ring, whole.scan.ring)
-    assert sparse.n_without_return - whole.n_without_return == len(room)
-
-
 def test_more_rings_than_the_model_has_are_reported(room):
     assert to_scan(room, "lidar", FIRST, "here").notes == ()
     cloud = np.concatenate([room, room])

@@ -100,6 +100,8 @@ LINKS: dict[str, tuple[int, Callable[[bytes], bytes]]] = {
     "SLL2": (276, lambda f: ETHERNET_TYPE + bytes(18) + f[IP_AT:]),
     "raw": (101, lambda f: f[IP_AT:]),
     "BSD loopback": (0, lambda f: struct.pack("<I", 2) + f[IP_AT:]),
+    "OpenBSD loopback": (108, lambda f: struct.pack(">I", 2) + f[IP_AT:]),
+    "raw IPv4": (228, lambda f: f[IP_AT:]),
 }
 
 

@@ -61,6 +61,8 @@ def test_packets_pictures_and_events_of_a_folder_come_back_as_one_recording(
     events = np.concatenate([sample.t_ns for sample in samples if isinstance(sample, Events)])
     assert len(events) == 50 * 4000, "events lie in two files, and are read once"
     assert joined.key == read(folder, rles).key, "so that a second run knows what was captured"
+    with pytest.raises(SourceError, match="kept"):
+        FolderRecorder(folder, rles, ros)
 
 
 def test_a_file_that_a_killed_recorder_left_empty_is_passed_over_and_named(tmp_path: Path, rles: Rig) -> None:

@@ -16,6 +16,7 @@ from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.rig import load_rig
 from tests.damage import damaged
 from tests.notes import has_note
+from tests.yuv import to_422
 
 KINDS = ["ros1", "sqlite3", "mcap"]
 CAM, LIDAR = "/camera/image_raw", "/velodyne_points"
@@ -83,18 +84,6 @@ def test_a_folder_of_split_bags_is_read_in_order(tmp_path, rig, write_bag, strea
     assert np.diff([i.stamp_ns for i in images]).tolist() == [STEP_NS] * 5
 
 
-def _as_yuv(bgr, order):
-    # ITU-R BT.601, studio range, as cameras deliver it.
-    b, g, r = np.moveaxis(bgr.astype(float), -1, 0)
-    y = 16 + (65.738 * r + 129.057 * g + 25.064 * b) / 256
-    u = 128 + (-37.945 * r - 74.494 * g + 112.439 * b) / 256
-    v = 128 + (112.439 * r - 94.154 * g - 18.285 * b) / 256
-    chroma = np.stack([u, v], axis=-1)
-    chroma[:, 1::2] = chroma[:, ::2]
-    pairs = np.where(np.arange(bgr.shape[1]) % 2 == 0, chroma[..., 0], chroma[..., 1])
-    return np.stack([pairs, y] if order == "uyvy" else [y, pairs], axis=-1).astype(np.uint8)
-
-
 def _as_mosaic(bgr, pattern):
     letters = {"b": 0, "g": 1, "r": 2}
     mosaic = np.empty(bgr.shape[:2], np.uint8)
@@ -121,8 +110,8 @@ def test_pictures_of_any_encoding_look_the_same(
     pixels, wanted = {
         "mono8": (grey, grey), "8UC1": (grey, grey), "bgr8": (bgr, bgr), "8UC3": (bgr, bgr),
         "rgb8": (bgr[..., ::-1], bgr), "bgra8": (np.dstack([bgr, alpha]), bgr),
-        "rgba8": (np.dstack([bgr[..., ::-1], alpha]), bgr), "yuv422": (_as_yuv(bgr, "uyvy"), bgr),
-        "uyvy": (_as_yuv(bgr, "uyvy"), bgr), "yuv422_yuy2": (_as_yuv(bgr, "yuyv"), bgr),
+        "rgba8": (np.dstack([bgr[..., ::-1], alpha]), bgr), "yuv422": (to_422(bgr, "uyvy"), bgr),
+        "uyvy": (to_422(bgr, "uyvy"), bgr), "yuv422_yuy2": (to_422(bgr, "yuyv"), bgr),
         "mono16": (grey.astype(np.uint16) * 256, None),
     }.get(encoding) or (_as_mosaic(bgr, encoding[6:10]), bgr)  # fmt: skip
     messages = [
@@ -172,15 +161,6 @@ def test_topics_can_be_given_and_those_that_are_not_there_are_listed(tmp_path, r
     ]:
         with pytest.raises(SourceError, match=cause):
             open_recording(bag, rig, SourceOptions(topics=wrong))
-
-
-def test_the_only_topic_of_its_kind_is_taken_where_the_profile_names_none(tmp_path, rig, write_bag, stream):
-    bag = write_bag(tmp_path / "bag", "mcap", stream(2, cam="/a", lidar="/b"))
-    lidars = {"lidar": rig.lidars["lidar"].model_copy(update={"topic": None})}
-    channels = {"frames": rig.cameras["cam"].channels["frames"].model_copy(update={"topic": None})}
-    cameras = {"cam": rig.cameras["cam"].model_copy(update={"channels": channels})}
-    recording = open_recording(bag, rig.model_copy(update={"lidars": lidars, "cameras": cameras}))
-    assert has_note(recording.notes, "cam.frames", "from /a", "only topic")
 
 
 def test_a_channel_whose_topic_is_not_in_the_bag_is_done_without(tmp_path, write_bag, stream):

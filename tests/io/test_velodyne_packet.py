@@ -3,7 +3,6 @@
 import struct
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -53,15 +52,6 @@ def test_a_damaged_data_packet_is_refused_with_its_cause(
     read_data_packet(payload, 0)
     with pytest.raises(BadPacketError, match=cause):
         read_data_packet(spoil(payload), 0)
-
-
-def test_blocks_of_a_rotor_that_stands_still_are_refused(payload: bytes) -> None:
-    fields = np.frombuffer(payload, velodyne.DATA_PACKET).copy()
-    fields["blocks"]["azimuth"] = 12345
-    for mode in (velodyne.STRONGEST, velodyne.DUAL):
-        fields["mode"] = mode
-        with pytest.raises(BadPacketError, match="uneven_azimuths"):
-            read_data_packet(fields.tobytes(), 0)
 
 
 @given(st.binary(max_size=600))

@@ -9,7 +9,7 @@ from wire.vlp16_packets import SensorPacket, Vlp16Clock, Vlp16Packets
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.io.velodyne.stream import Vlp16Decoder, Vlp16Stream, keep_brighter, read_controls
+from lce_rig.io.velodyne.stream import Vlp16Stream, read_controls
 from lce_rig.rig.sensors import DriverSettings, TimestampSettings
 
 from .vlp16_room import (
@@ -17,7 +17,6 @@ from .vlp16_room import (
     NETWORK_NS,
     PERIOD_NS,
     T0_NS,
-    decode_by_manual,
     largest_errors,
     only_data,
     packets_of,
@@ -113,37 +112,13 @@ def test_a_change_to_dual_returns_is_followed(packets: list[SensorPacket]) -> No
     assert stream.mode == velodyne.DUAL and len(scans) == 8 - 1
 
 
-def test_mutated_packets_never_make_a_scan_that_breaks_its_own_rules() -> None:
-    rng = np.random.default_rng(0)
-    stream = stream_of()
-    n_scans = 0
-    for packet in only_data(packets_of(room_scans(10))):
-        body = bytearray(packet.payload)
-        if rng.random() < 0.3:
-            for at in rng.integers(0, len(body), rng.integers(1, 6)):
-                body[at] = rng.integers(256)
-        scan = stream.push_data(bytes(body), packet.sent_ns)
-        if scan is not None:
-            n_scans += 1
-            assert np.isfinite(scan.points).all() and 0 <= scan.ring.min() <= scan.ring.max() <= 15
-            assert scan.offset_ns is not None and np.all(np.diff(scan.offset_ns) > -100_000)
-            assert scan.offset_ns[0] >= 0 and scan.offset_ns[-1] < 101_000_000
-    assert n_scans >= 5 and sum(flaw.figure("n") for flaw in stream.flaws()) > 20
-
-
 @pytest.mark.parametrize(
-    ("controls", "cause"),
-    [
-        ({"rpm": 600}, "no 'rpm'; it has position_port, cut_deg"),
-        ({"position_port": "8308"}, "not a port"),
-        ({"position_port": 0}, "not a port"),
-        ({"cut_deg": True}, "not an angle"),
-        ({"cut_deg": 500.0}, "not an angle"),
-    ],
+    "controls",
+    [{"rpm": 600}, {"position_port": "8308"}, {"position_port": 0}, {"cut_deg": True}, {"cut_deg": 500.0}],
 )
-def test_what_cannot_be_meant_is_refused_with_its_key(controls: dict[str, object], cause: str) -> None:
+def test_what_cannot_be_meant_is_refused_with_its_key(controls: dict[str, object]) -> None:
     driver = DriverSettings.model_validate({"controls": controls})
-    with pytest.raises(SourceError, match=cause):
+    with pytest.raises(SourceError, match=next(iter(controls))):
         read_controls("lidar", settings(driver=driver))
 
 
@@ -205,12 +180,6 @@ def test_arrivals_that_waited_do_not_shift_stamps() -> None:
     assert late_ns.min() > -1000 and late_ns[1:].max() < 300_000
 
 
-def test_a_board_that_fakes_gps_is_good_enough() -> None:
-    stream = stream_of()
-    push(stream, packets_of(room_scans(2), clock=Vlp16Clock(is_valid=False)))
-    assert stream.clock.is_utc
-
-
 def test_without_position_packets_the_sensors_time_is_not_trusted(packets: list[SensorPacket]) -> None:
     stream = stream_of()
     scans = push(stream, only_data(packets))
@@ -239,26 +208,6 @@ def test_packets_without_any_arrival_give_scans_without_stamps(packets: list[Sen
     scans = push(stream_of(), packets, delay_ns=None)
     assert stamps(scans) == [None] * 5
     assert scans[0].host_ns is None
-
-
-@pytest.mark.parametrize("mode", [velodyne.STRONGEST, velodyne.DUAL])
-def test_points_are_those_of_the_manual(mode: int) -> None:
-    fields = np.frombuffer(
-        b"".join(packet.payload for packet in only_data(packets_of([room_scan(T0_NS)], mode))[:30]),
-        velodyne.DATA_PACKET,
-    ).copy()
-    if mode == velodyne.DUAL:
-        keep_brighter(fields)
-    starts_ns = [1000 * int(us) for us in fields["us"]]
-    points, intensity, ring, offset_ns = Vlp16Decoder(0.1, 200.0).decode(fields, starts_ns)
-    manual = decode_by_manual(fields)
-    ring_of_laser = np.array([0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15])
-    np.testing.assert_array_equal(ring, ring_of_laser[manual["laser"]])
-    np.testing.assert_array_equal(intensity, manual["reflectivity"])
-    time_ns = np.array(starts_ns)[manual["packet"]] + manual["time_ns"] - starts_ns[0]
-    assert np.abs(offset_ns - time_ns).max() <= 50
-    # The library rounds azimuths to 0.01 deg and takes the mean speed over a packet.
-    assert (np.linalg.norm(points - manual["points"], axis=1) / manual["range_m"]).max() < 3e-4
 
 
 def test_ranges_beyond_the_profiles_limits_give_no_points(packets: list[SensorPacket]) -> None:

@@ -1,4 +1,4 @@
-"""A round room as a VLP-16 sees it, made without ray casting, and a decoder written from the manual alone."""
+"""A round room as a VLP-16 sees it, made without ray casting."""
 
 from collections.abc import Iterable
 
@@ -94,45 +94,3 @@ def largest_errors(truth: Scan, decoded: Scan) -> tuple[float, float]:
     range_a, range_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
     across = np.linalg.norm(a / range_a[:, None] - b / range_b[:, None], axis=1)
     return float(np.abs(range_a - range_b).max()), float(across.max())
-
-
-def decode_by_manual(fields: np.ndarray) -> dict[str, np.ndarray]:
-    """Decode data packets (P,) as the manual says (chapter 9, appendix A), interpolating block by block.
-
-    Returns:
-        points (N, 3) m in the lidar frame, range_m, reflectivity, laser, azimuth_deg, packet (N,) and
-        time_ns (N,) after each packet's stamp.
-    """
-    elevation = np.radians([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
-    height = 1e-3 * np.array(
-        [11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2]
-    )
-    out: dict[str, list[np.ndarray]] = {}
-    for number, packet in enumerate(fields):
-        stride = 2 if packet["mode"] == 0x39 else 1
-        azimuth = packet["blocks"]["azimuth"].astype(float) / 100
-        gaps = (azimuth[stride::stride] - azimuth[:-stride:stride]) % 360
-        for block in range(12):
-            firing = block // stride
-            gap = gaps[min(firing, len(gaps) - 1)]
-            for channel in range(32):
-                count, reflectivity = packet["blocks"]["returns"][block][channel]
-                if count == 0:
-                    continue
-                laser = channel % 16
-                within_us = 55.296 * (channel // 16) + 2.304 * laser
-                angle_deg = (azimuth[block] + gap * within_us / 110.592) % 360
-                angle, reach = np.radians(angle_deg), 0.002 * count
-                point = [
-                    reach * np.cos(elevation[laser]) * np.cos(angle),
-                    -reach * np.cos(elevation[laser]) * np.sin(angle),
-                    reach * np.sin(elevation[laser]) + height[laser],
-                ]
-                row = {
-                    "points": point, "range_m": reach, "reflectivity": reflectivity, "laser": laser,
-                    "azimuth_deg": angle_deg, "packet": number,
-                    "time_ns": 110_592 * firing + round(1000 * within_us),
-                }  # fmt: skip
-                for key, value in row.items():
-                    out.setdefault(key, []).append(np.asarray(value))
-    return {key: np.array(values) for key, values in out.items()}

@@ -1,7 +1,6 @@
 """Deployments: a whole set or the earlier one, refused where it must be, and back byte for byte."""
 
 import contextlib
-import os
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -164,16 +163,6 @@ def test_a_command_that_fails_is_told_with_output_and_code_and_runs_again(
     assert [entry.get("exit") for entry in log_of(robot)] == [None, 3, 0]
 
 
-def test_so_many_releases_are_kept(result: Result, rig: Rig, local: TargetSettings, robot: Path) -> None:
-    few = with_settings(local, keep=2)
-    names = [deploy(result(f"{k}", 0.1 + 0.01 * k), rig, few).release.name for k in range(4)]
-    assert [each.name for each in standing(few).state.releases] == [names[3], names[2]]
-    rollback(few)
-    deploy(result("new", 0.2), rig, few)
-    # The one that it replaced stays, old as it is.
-    assert names[2] in {each.name for each in standing(few).state.releases}
-
-
 def test_releases_are_in_order_even_if_the_clock_was_set_back(
     result: Result, rig: Rig, local: TargetSettings, robot: Path
 ) -> None:
@@ -225,26 +214,6 @@ def test_files_that_the_disk_does_not_give_back_are_not_made_current(
     assert standing(local).state.current == first
     deploy(result("c", 0.2), rig, local)
     assert sorted(entry.name for entry in robot.glob(".*")) == [".lock"]
-
-
-def test_a_full_disk_leaves_the_earlier_set_and_the_next_deployment_clears_it(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
-) -> None:
-    robot.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=160k", "none", str(robot)], check=False)
-    if mounted.returncode:
-        pytest.skip("no file system may be mounted here")
-    try:
-        first = deploy(result("a"), rig, local)
-        large = result("b", 0.15)
-        (large / "large.bin").write_bytes(os.urandom(400_000))
-        with pytest.raises(TargetError):
-            deploy(large, rig, with_settings(local, files=["large.bin"]))
-        assert standing(local).state.current == first.release and not standing(local).changed
-        deploy(result("c", 0.2), rig, local)
-        assert len(list((robot / "releases").iterdir())) == 2
-    finally:
-        subprocess.run(["umount", str(robot)], check=True)
 
 
 LOST = "releases/20260101T000000Z-00000000"

@@ -9,7 +9,7 @@ import pytest
 
 from lce_rig.core.losses import Losses
 from lce_rig.io.events.aedat4 import Aedat4File, Aedat4Frame, decode_frame
-from tests.io.events.aedat4_files import RawFrame, write_davis
+from tests.io.events.aedat4_files import RawFrame, flatbuffer, write_davis
 from tests.io.events.encoders import random_events
 
 START_US = 1_700_000_000_000_000
@@ -78,6 +78,13 @@ def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path: Path) -> Non
     losses = Losses()
     assert [f.mid_exposure_ns for f in read(path, losses)] == [(START_US + 4000) * 1000]
     assert losses.by_code() == {"recording.broken_packets": 1, "recording.torn_end": 1}
+
+
+@pytest.mark.parametrize("n_bytes", [0, 99, 101])
+def test_a_frame_whose_size_contradicts_its_pixels_is_refused(n_bytes: int) -> None:
+    table = flatbuffer(b"FRME", {0: ("q", START_US), 6: ("h", 10), 7: ("h", 10), 10: bytes(n_bytes)})
+    with pytest.raises(ValueError):
+        decode_frame(table[4:])
 
 
 @pytest.mark.dataset

@@ -140,22 +140,6 @@ def test_stamps_that_wrap_inside_a_libcaer_packet_go_on() -> None:
     assert columns_listed(columns) == truth
 
 
-def test_packets_of_triggers_hold_no_events() -> None:
-    edges = [(10, 0, 3, True), (20, 0, 3, False)]
-    data = encoders.packet(encoders.mono(edges, 0), "trigger", is_ros1=True, base_ns=0)
-    assert list(PacketDecoder().decode(parsed(data, True))) == []
-
-
-@pytest.mark.parametrize("encoding", ["ros1", "cdr"])
-@given(n=st.integers(1, 40), seed=st.integers(0, 10**6), frame_id=st.text("abc_/", max_size=9))
-def test_event_arrays_come_back(encoding: str, n: int, seed: int, frame_id: str) -> None:
-    events = random_events(n, seed, start_us=1_700_000_000_000_000)
-    header, columns = decode_event_array(encode_event_array(events, frame_id, encoding), encoding)
-    assert columns_listed(columns) == listed(events)
-    assert (header.width_px, header.height_px, header.frame_id) == (346, 260, frame_id)
-    assert header.stamp_ns == events.t_ns[0]
-
-
 @pytest.mark.parametrize("is_ros1", [True, False])
 def test_event_arrays_are_what_ros_itself_reads(is_ros1: bool) -> None:
     store = typestore(is_ros1)

@@ -1,6 +1,5 @@
-"""States of a collection, a page that shows them, and a real browser."""
+"""States of a collection, and a page that shows them."""
 
-import shutil
 from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
@@ -12,9 +11,6 @@ from lce_rig.collect.guidance.planner import Coverage
 from lce_rig.collect.live.state import Cue, Drawing, LiveState, StreamState
 from lce_rig.show.phone.preview import Preview
 
-from .browser import Browser
-
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTH_PX, HEIGHT_PX = 640, 360
 PRESENT_PX = np.array([[100, 80], [200, 80], [200, 180], [100, 180], [100, 80]], float)
 WANTED_PX = np.array([[400, 100], [560, 100], [560, 260], [400, 260], [400, 100]], float)
@@ -65,20 +61,3 @@ def preview() -> Iterator[Preview]:
 
 def port_of(preview: Preview) -> int:
     return urlsplit(preview.urls[0]).port or 0
-
-
-@pytest.fixture(scope="session")
-def started_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """A headless browser for all tests."""
-    executable = next(filter(None, map(shutil.which, _BROWSERS)), None)
-    if executable is None:
-        pytest.skip(f"none of {', '.join(_BROWSERS)} is installed")
-    with Browser(executable, tmp_path_factory.mktemp("browser")) as started:
-        yield started
-
-
-@pytest.fixture
-def browser(started_browser: Browser) -> Iterator[Browser]:
-    """A headless browser without open pages."""
-    yield started_browser
-    started_browser.close_pages()

@@ -17,6 +17,14 @@ from .conftest import PRESENT_PX, picture, port_of, state
 from .watcher import Watcher
 
 
+def ask_for_states(port: int, query: str) -> bytes:
+    return (
+        f"GET /live?{query} HTTP/1.1\r\nHost: localhost:{port}\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+    )
+
+
 def test_all_of_a_state_arrives(preview: Preview) -> None:
     present = PRESENT_PX + 0.04
     present[1] = np.nan
@@ -113,11 +121,7 @@ def test_a_page_that_vanished_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> N
         preview.publish(state())
         port, query = port_of(preview), preview.urls[0].partition("?")[2]
         with socket.create_connection(("127.0.0.1", port)) as silent:
-            silent.sendall(
-                f"GET /live?{query} HTTP/1.1\r\nHost: localhost:{port}\r\n"
-                "Upgrade: websocket\r\nConnection: Upgrade\r\n"
-                "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
-            )
+            silent.sendall(ask_for_states(port, query))
             assert silent.recv(12) == b"HTTP/1.1 101"
             status, _, _ = watcher.get("live")
             assert status == 503
@@ -208,11 +212,7 @@ def test_closing_does_not_wait_for_pages_whose_line_is_full() -> None:
     with socket.socket() as full:
         full.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
         full.connect(("127.0.0.1", port))
-        full.sendall(
-            f"GET /live?{query} HTTP/1.1\r\nHost: localhost:{port}\r\n"
-            "Upgrade: websocket\r\nConnection: Upgrade\r\n"
-            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
-        )
+        full.sendall(ask_for_states(port, query))
         for n in (1, 2):
             preview.publish(state(drawing=Drawing("cam", noise.copy())))
             while preview.n_pictures < n:

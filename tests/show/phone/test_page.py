@@ -174,29 +174,3 @@ def test_phones_that_may_switch_their_screen_off_are_warned_of(preview: Preview,
     page.call("Page.reload")
     page.wait_until(f"!window.isOld && {OPEN} && !document.getElementById('hint').hidden")
     assert not page.complaints
-
-
-def test_a_page_in_the_background_is_sent_no_pictures(preview: Preview, browser: Browser) -> None:
-    hiding = """
-      window.isHidden = false;
-      Object.defineProperty(Document.prototype, 'hidden', { get: () => window.isHidden });
-    """
-    page = browser.open(preview.urls[0], first=hiding)
-    shown(preview, page, has_text("count", "7"))
-    page.evaluate("window.isHidden = true; document.dispatchEvent(new Event('visibilitychange'))")
-    time.sleep(0.3)
-    before = preview.n_pictures
-    for k in range(3):
-        shown(
-            preview,
-            page,
-            has_text("count", str(20 + k)),
-            n_captures=20 + k,
-            drawing=Drawing("cam", picture(k)),
-        )
-    assert preview.n_pictures == before
-    page.evaluate("window.isHidden = false; document.dispatchEvent(new Event('visibilitychange'))")
-    deadline_s = time.monotonic() + 5
-    while preview.n_pictures == before:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)

@@ -1,23 +1,10 @@
 """The report in a real browser: no sideways scrolling, no requests, overlays that open."""
 
-import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-
-from tests.show.phone.browser import Browser
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    names = ("chromium", "chromium-browser", "google-chrome")
-    executable = next(filter(None, map(shutil.which, names)), None)
-    if executable is None:
-        pytest.skip("no browser is installed")
-    with Browser(executable, tmp_path_factory.mktemp("profile")) as running:
-        yield running
 
 
 @pytest.fixture(scope="module")
