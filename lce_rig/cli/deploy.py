@@ -109,6 +109,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
                     for change in plan.sensors
                 ],
                 "objections": plan.objections,
+                "remarks": plan.remarks,
             }
         )
         return
@@ -124,6 +125,8 @@ def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
         show.say("nothing to change: these very files are in place")
     for name, how in plan.changed.items():
         show.say(show.escape(f"  {name}: {how}"))
+    for each in plan.remarks:
+        show.note(each.text)
     for each in plan.objections:
         show.warn(f"would be refused: {each.text}")
 
@@ -188,9 +191,12 @@ def _show_done(done: Deployed, target: TargetSettings, *, as_json: bool) -> None
                 "is_new": done.is_new,
                 "output": done.output,
                 "changed_there": dict(done.changed_there),
+                "remarks": done.remarks,
             }
         )
         return
+    for each in done.remarks:
+        show.note(each.text)
     state = "in place" if done.is_new else "in place already"
     show.say(f"{target.to}: {_described(done.release)} {state}")
     if done.is_new and done.replaces == done.release.replaces != "":

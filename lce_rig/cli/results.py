@@ -35,6 +35,8 @@ def results(session: Path, as_json: bool) -> None:
                 "written_s": result.written_s,
                 "is_outdated": result.is_outdated,
                 "problem": result.problem or None,
+                "date": None if result.file is None else result.file.provenance.date,
+                "imported": None if result.file is None else result.file.provenance.imported,
                 "pairs": [] if result.file is None else [_pair(c) for c in result.file.pairs],
             }
             for result in stored
@@ -45,6 +47,9 @@ def results(session: Path, as_json: bool) -> None:
         show.print_table(table)
     if not stored:
         show.say(f"no results in {session}: run `lce-rig calibrate`")
+    dates = {result.file.provenance.date_words: None for result in stored if result.file}
+    if any(dates):
+        show.note(f"captures of {'; '.join(filter(None, dates))}")
     for result in stored:
         if result.problem:
             show.warn(result.problem)

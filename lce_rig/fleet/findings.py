@@ -61,3 +61,8 @@ DEPLOY_OLDER = Kind(
     "the result's captures are of {date}, the deployed ones of {there}",
     "Deploy the newer session, or use `--rollback` to go back.",
 )
+DEPLOY_UNDATED = Kind(
+    "deploy.undated",
+    "not compared by age: the result's captures are of {date}, the deployed ones of {there}",
+    severity="note",
+)

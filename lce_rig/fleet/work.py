@@ -229,9 +229,9 @@ class _Opened:
 
 
 def _dated(row: Row, provenance: Provenance, ending: str) -> Row:
-    compact = provenance.date.replace("-", "").replace(":", "") or "undated"
+    compact = (provenance.date or "undated").replace("-", "").replace(":", "")
     return row | {
-        "date": provenance.date or None,
+        "date": provenance.date,
         "session_sha256": provenance.session_sha256,
         "folder": f"{row['robot']}/{compact}-{ending}",
     }

@@ -30,8 +30,9 @@ def provenance_of(sessions: Sequence[Session]) -> Provenance:
         raise SessionError(
             f"the captures are of several robots: {', '.join(robots)}", "Calibrate each robot alone."
         )
-    dates = [date for session in sessions if (date := date_of(session))]
-    return Provenance("".join(robots), serials_of(sessions), max(dates, default=""), content_sha256(sessions))
+    date = max(filter(None, map(date_of, sessions)), default=None)
+    imported = None if date else max(filter(None, map(_imported, sessions)), default=None)
+    return Provenance("".join(robots), serials_of(sessions), date, content_sha256(sessions), imported)
 
 
 def serials_of(sessions: Iterable[Session]) -> dict[str, str]:
@@ -61,21 +62,28 @@ def stated_serials(rig: Rig) -> dict[str, str]:
     return lidars | {name: camera.serial for name, camera in rig.cameras.items() if camera.serial}
 
 
-def date_of(session: Session) -> str:
+def date_of(session: Session) -> str | None:
     """Give the time of a session's last capture: of arrival, else by its timestamps if these are UTC.
 
-    Where captures tell no time, it is when they came into the session; "" where nothing tells.
+    None where the recording tells no time: the import into the session may be much later.
     """
     times_ns = [time_ns for capture in _readable(session.captures) for time_ns in capture.times_ns]
     in_utc = [time_ns for time_ns in times_ns if _FIRST_UTC_NS <= time_ns < _LAST_UTC_NS]
-    if in_utc:
-        return datetime.fromtimestamp(max(in_utc) // 10**9, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return _in_utc(datetime.fromtimestamp(max(in_utc) // 10**9, timezone.utc)) if in_utc else None
+
+
+def _imported(session: Session) -> str | None:
+    """Give the time at which a session's last capture came into it, by its journal."""
     noted = [entry.get("time") for entry in session.read_journal() if entry.get("event") == CAPTURED]
     dates = []
     for time in noted:
         with suppress(TypeError, ValueError, OverflowError):
             dates.append(datetime.fromisoformat(str(time)).astimezone(timezone.utc))
-    return max(dates).strftime("%Y-%m-%dT%H:%M:%SZ") if dates else ""
+    return _in_utc(max(dates)) if dates else None
+
+
+def _in_utc(time: datetime) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def content_sha256(sessions: Iterable[Session]) -> str:

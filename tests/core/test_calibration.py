@@ -140,9 +140,12 @@ def test_an_array_that_is_not_finite_is_refused(name: str, bad: float) -> None:
         as_text(calibration(**{name: array}))
 
 
-def test_provenance_and_hashes_of_inputs_are_read_back(tmp_path: Path) -> None:
+@pytest.mark.parametrize("times", [("2026-11-20T10:22:03Z", None), (None, "2026-11-20T10:22:03Z")])
+def test_provenance_and_hashes_of_inputs_are_read_back(
+    tmp_path: Path, times: tuple[str | None, str | None]
+) -> None:
     path = tmp_path / "result.json"
-    origin = Provenance("kestrel", {"lidar": "AG1", "cam": "7"}, "2026-11-20T10:22:03Z", "0f" * 32)
+    origin = Provenance("kestrel", {"lidar": "AG1", "cam": "7"}, times[0], "0f" * 32, times[1])
     inputs = {"rig.yaml": "0f" * 32, "captures/000000/meta.json": "a1" * 32}
     path.write_text(result_file("rles", [calibration()], inputs, origin).text())
     read = read_result(path)
@@ -204,6 +207,9 @@ def test_files_of_earlier_versions_are_read(tmp_path: Path) -> None:
 
     file = read_result(edited(tmp_path / "result.json", as_before))
     assert file.inputs_sha256 == {} and file.provenance == Provenance()
+    undated = {"robot": "", "serials": {}, "date": "", "session_sha256": ""}
+    path = edited(tmp_path / "result.json", lambda document: document.update(provenance=undated))
+    assert read_result(path).provenance.date is None
     (pair,) = file.pairs
     assert pair.channels == ("events", "frames") and pair.method == "paper" and not pair.cov_shared.any()
     (refusal,) = pair.captures_refused.values()

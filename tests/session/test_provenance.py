@@ -39,7 +39,7 @@ def test_what_captures_tell_and_what_the_profile_states_come_together(
     found = provenance_of([fill(tmp_path / "a", named, {}, {"lidar": "AG43510116"})])
     assert (found.robot, found.serials) == ("kestrel", {"cam": "C7", "lidar": "AG43510116"})
     # Of the last capture's scan, 10**18 ns and its seed.
-    assert found.date == "2001-09-09T01:46:40Z"
+    assert (found.date, found.imported) == ("2001-09-09T01:46:40Z", None)
 
 
 def test_two_units_of_one_sensor_are_no_result(
@@ -82,7 +82,7 @@ def test_the_fingerprint_changes_with_inputs_only(
     assert content_sha256([Session.open(tmp_path / "f")]) not in hashes
 
 
-def test_a_session_without_times_has_the_date_of_its_journal(
+def test_a_session_without_times_has_no_date_but_tells_when_it_was_imported(
     rig: Rig, samples: Samples, tmp_path: Path
 ) -> None:
     with Session.create(tmp_path / "a", rig) as session:
@@ -95,9 +95,12 @@ def test_a_session_without_times_has_the_date_of_its_journal(
         )
     session = Session.open(tmp_path / "a")
     written = next(entry["time"] for entry in session.read_journal() if entry["event"] == "captured")
-    assert provenance_of([session]).date == f"{written[:19]}Z"
+    origin = provenance_of([session])
+    assert (origin.date, origin.imported) == (None, f"{written[:19]}Z")
+    assert written[:10] in origin.date_words
     (tmp_path / "a" / "journal.jsonl").unlink()
-    assert provenance_of([session]).date == ""
+    origin = provenance_of([session])
+    assert (origin.date, origin.imported, origin.date_words) == (None, None, "")
 
 
 def test_a_robot_is_named_later_and_not_renamed(rig: Rig, tmp_path: Path) -> None:

@@ -47,7 +47,13 @@ from lce_rig.fleet.deploy.releases import (
     read_state,
     set_sha256,
 )
-from lce_rig.fleet.findings import DEPLOY_FAILED, DEPLOY_OLDER, DEPLOY_OTHER_ROBOT, DEPLOY_OTHER_SERIAL
+from lce_rig.fleet.findings import (
+    DEPLOY_FAILED,
+    DEPLOY_OLDER,
+    DEPLOY_OTHER_ROBOT,
+    DEPLOY_OTHER_SERIAL,
+    DEPLOY_UNDATED,
+)
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
@@ -83,6 +89,7 @@ class Plan:
         changed_there: current files that are not as they were deployed.
         sensors: changes of the extrinsics.
         objections: a deployment is refused for them unless it is forced.
+        remarks: what the checks could not compare.
     """
 
     record: ReleaseRecord
@@ -91,6 +98,7 @@ class Plan:
     changed_there: Mapping[str, str]
     sensors: tuple[SensorChange, ...]
     objections: tuple[Finding, ...]
+    remarks: tuple[Finding, ...] = ()
 
     @property
     def is_in_place(self) -> bool:
@@ -108,6 +116,7 @@ class Deployed:
         is_new: whether something changed; False if these very files were in place already.
         output: of the command that ran afterwards; None if none ran.
         changed_there: files of the earlier release that were not as they were deployed.
+        remarks: as of `Plan`.
     """
 
     release: ReleaseRecord
@@ -115,6 +124,7 @@ class Deployed:
     is_new: bool
     output: str | None = None
     changed_there: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[Finding, ...] = ()
 
 
 class Standing(NamedTuple):
@@ -193,7 +203,7 @@ def deploy(
                 place.must_run(DISCARD, record.name)
             raise
     output = _run(place, target, record.name)
-    return Deployed(record, record.replaces, True, output, planned.changed_there)
+    return Deployed(record, record.replaces, True, output, planned.changed_there, planned.remarks)
 
 
 def standing(target: TargetSettings) -> Standing:
@@ -270,6 +280,7 @@ def _plan(
         changed_there,
         tuple(sensors),
         tuple(_objections(saved, target, state.current)),
+        tuple(_remarks(saved, state.current)),
     )
 
 
@@ -315,7 +326,7 @@ def _record(saved: ResultFile, files: Mapping[str, str], state: TargetState) -> 
         files=dict(files),
         robot=origin.robot,
         serials=dict(origin.serials),
-        date=origin.date,
+        date=origin.date or "",
         session_sha256=origin.session_sha256,
         verdicts={f"{c.camera} and {c.lidar}": c.verdict for c in saved.pairs},
     )
@@ -347,6 +358,14 @@ def _objections(saved: ResultFile, target: TargetSettings, current: ReleaseRecor
     if origin.date and current.date and origin.date < current.date:
         objections.append(DEPLOY_OLDER(date=origin.date, there=current.date))
     return objections
+
+
+def _remarks(saved: ResultFile, current: ReleaseRecord | None) -> list[Finding]:
+    """Say where no date tells which captures are older."""
+    origin = saved.provenance
+    if current is None or (origin.date and current.date) or origin.session_sha256 == current.session_sha256:
+        return []
+    return [DEPLOY_UNDATED(date=origin.date_words or "unknown", there=current.date or "unknown")]
 
 
 def _changed_there(place: Place, state: TargetState, folder: Path) -> dict[str, str]:

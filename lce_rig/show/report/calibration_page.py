@@ -63,7 +63,7 @@ def report_text(
     facts = [
         ("rig", file.rig),
         ("robot", origin.robot),
-        ("date of the captures", origin.date),
+        ("date of the captures", origin.date_words),
         *((f"serial number of {name}", serial) for name, serial in sorted(origin.serials.items())),
         ("sessions", ", ".join(file.sessions)),
         ("method", ", ".join(dict.fromkeys(c.method for c in file.pairs))),

@@ -123,10 +123,14 @@ def test_the_target_may_name_its_robot_and_what_nothing_tells_is_no_objection(
 ) -> None:
     named = with_settings(local, robot="heron")
     assert codes(plan(result("a"), rig, named)) == ["deploy.other_robot"]
-    unknown = result("b", origin=replace(ORIGIN, robot="", serials={}, date=""))
+    unknown = result("b", origin=replace(ORIGIN, robot="", serials={}, date=None, session_sha256=""))
     assert codes(plan(unknown, rig, named)) == []
     deploy(unknown, rig, named)
-    assert codes(plan(result("c"), rig, local)) == []
+    dated = plan(result("c"), rig, local)
+    assert codes(dated) == []
+    assert [finding.code for finding in dated.remarks] == ["deploy.undated"]
+    assert deploy(result("e"), rig, local).remarks == dated.remarks
+    assert plan(result("d", 0.1), rig, local).remarks == ()
 
 
 def test_formats_and_further_files_are_chosen(
