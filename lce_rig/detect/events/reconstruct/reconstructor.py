@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,44 +31,11 @@ from lce_rig.detect.findings import (
     READ_NO_EVENTS,
 )
 
-# Why there is no image at a timestamp.
-
-
-def still_cold(n_steps: int, n_warm_up: int, seen_ns: int) -> Refusal:
-    """Too little of the stream precedes the timestamp for the network's state to have settled."""
-    figures = {"n_steps": n_steps, "n_warm_up": n_warm_up, "seen_s": 1e-9 * seen_ns}
-    return READ_NETWORK_SETTLING.refusal(**figures)
-
-
-def too_early(stamp_ns: int, first_ns: int) -> Refusal:
-    """The timestamp lies before the stream."""
-    return READ_BEFORE_EVENTS.refusal(gap_s=1e-9 * (first_ns - stamp_ns))
-
-
-def too_late(stamp_ns: int, last_ns: int | None) -> Refusal:
-    """The timestamp lies after the stream, or there is no stream."""
-    if last_ns is None:
-        return READ_NO_EVENTS.refusal()
-    return READ_AFTER_EVENTS.refusal(gap_s=1e-9 * (stamp_ns - last_ns))
-
-
 # From arbitrary scales to 8 bits, without flicker: intensities of the network, sums of polarities.
 
 _PERCENTILES = (1.0, 99.0)
 # Smallest spread that is stretched to the full range: below it there is noise, not contrast.
 _MIN_SPREAD = 0.05
-
-
-class GreyScale(Protocol):
-    """Mapping of a stream's images to 8 bits."""
-
-    def follow(self, picture: FloatArray) -> None:
-        """Take the next image of the stream into account, (H, W)."""
-        ...
-
-    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
-        """Map (H, W) to uint8."""
-        ...
 
 
 class SignedScale:
@@ -111,39 +78,17 @@ class IntensityScale:
         return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)
 
 
+GreyScale = IntensityScale | SignedScale
+"""Mapping of a stream's images to 8 bits."""
+
+
 def _bounds(picture: FloatArray) -> NDArray[np.float64]:
     # Every fourth pixel in each direction tells the percentiles well enough.
     return np.asarray(np.percentile(picture[::4, ::4], _PERCENTILES), dtype=np.float64)
 
 
-# Two ways from a window of events to a picture: the recurrent network and the event map.
-
-
-class EventImager(Protocol):
-    """Turns windows of events into images, one step per window."""
-
-    @property
-    def n_warm_up(self) -> int:
-        """Steps before images can be trusted."""
-        ...
-
-    def initial_states(self, height_px: int, width_px: int) -> States:
-        """Make the states before the first window."""
-        ...
-
-    def grey_scale(self) -> GreyScale:
-        """Make what maps the images of one stream to 8 bits."""
-        ...
-
-    def picture(
-        self, events: Events, start_ns: int, end_ns: int, states: States
-    ) -> tuple[FloatArray, States]:
-        """Make the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
-        ...
-
-
 class NetworkImager:
-    """The recurrent network.
+    """Makes images of windows of events by the recurrent network, one step a window.
 
     Args:
         model: ONNX file; None takes the shipped one.
@@ -166,13 +111,13 @@ class NetworkImager:
     def picture(
         self, events: Events, start_ns: int, end_ns: int, states: States
     ) -> tuple[FloatArray, States]:
-        """Take one step of the network."""
+        """Make the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
         voxels = normalise_voxels(voxel_grid(events, self.model.n_bins, start_ns, end_ns))
         return self.model.step(voxels, states)
 
 
 class MapImager:
-    """The event map: polarity sums of the window alone, nothing carried over."""
+    """Makes images of windows of events as event maps: polarity sums, nothing carried over."""
 
     n_warm_up = 0
 
@@ -250,7 +195,7 @@ class Reconstructor:
         self, model: Path | None = None, options: ReconstructionOptions = ReconstructionOptions()
     ) -> None:
         self.options = options
-        self._imager: EventImager = (
+        self._imager = (
             MapImager()
             if options.method == "map"
             else NetworkImager(model, options.n_warm_up, options.n_threads)
@@ -308,7 +253,10 @@ class Reconstructor:
             SourceError: the batches are of different sensors or go back in time.
             UsageError: neither or both of stamps_ns and every_ns, or timestamps out of order.
         """
-        _check_request(stamps_ns, every_ns)
+        if (stamps_ns is None) == (every_ns is None) or (every_ns is not None and every_ns <= 0):
+            raise UsageError("give either stamps_ns or every_ns above 0")
+        if stamps_ns is not None and np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
+            raise UsageError("stamps_ns must not decrease")
         self.reset()
         wanted = deque(stamps_ns or ())
         last_ns: int | None = None
@@ -325,8 +273,12 @@ class Reconstructor:
                 yield self._picture_at(wanted.popleft())
             self._advance(last_ns)
         for stamp_ns in wanted:
-            is_covered = last_ns is not None and stamp_ns - last_ns <= _MAX_AFTER_END_NS
-            yield self._picture_at(stamp_ns) if is_covered else too_late(stamp_ns, last_ns)
+            if last_ns is None:
+                yield READ_NO_EVENTS.refusal()
+            elif stamp_ns - last_ns <= _MAX_AFTER_END_NS:
+                yield self._picture_at(stamp_ns)
+            else:
+                yield READ_AFTER_EVENTS.refusal(gap_s=1e-9 * (stamp_ns - last_ns))
 
     def feed(self, events: Events) -> None:
         """Take the next events of a stream that runs on; `picture_at` gives its images.
@@ -351,7 +303,7 @@ class Reconstructor:
                 events; later images then depend on the requested timestamps.
         """
         if self._first_ns is None:
-            return too_late(stamp_ns, None)
+            return READ_NO_EVENTS.refusal()
         return self._picture_at(stamp_ns, is_step=is_step)
 
     def _begin(self, events: Events) -> None:
@@ -417,10 +369,11 @@ class Reconstructor:
     def _picture_at(self, stamp_ns: int, *, is_step: bool = False) -> Image | Refusal:
         assert self._first_ns is not None
         if stamp_ns <= self._first_ns:
-            return too_early(stamp_ns, self._first_ns)
+            return READ_BEFORE_EVENTS.refusal(gap_s=1e-9 * (self._first_ns - stamp_ns))
         self._advance(stamp_ns)
         if not self.is_warm:
-            return still_cold(self.n_steps, self._imager.n_warm_up, stamp_ns - self._first_ns)
+            seen_s, n_warm_up = 1e-9 * (stamp_ns - self._first_ns), self._imager.n_warm_up
+            return READ_NETWORK_SETTLING.refusal(n_steps=self.n_steps, n_warm_up=n_warm_up, seen_s=seen_s)
         window = self._current
         assert window is not None
         events = self._cleaned(window.events.between(window.start_ns, stamp_ns))
@@ -433,12 +386,3 @@ class Reconstructor:
         else:
             picture, _ = self._imager.picture(events, window.start_ns, stamp_ns, window.states)
         return Image(events.sensor, self.options.channel, stamp_ns, self._scale.to_grey(picture))
-
-
-def _check_request(stamps_ns: Sequence[int] | None, every_ns: int | None) -> None:
-    if (stamps_ns is None) == (every_ns is None):
-        raise UsageError("give either stamps_ns or every_ns")
-    if stamps_ns is not None and np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
-        raise UsageError("stamps_ns must not decrease")
-    if every_ns is not None and every_ns <= 0:
-        raise UsageError(f"every_ns is {every_ns} (minimum 1)")
