@@ -95,10 +95,12 @@ def _deviations(comparison: Repeatability) -> Any:
 
 
 def _differences(comparison: Repeatability) -> Any:
-    headings = ("first", "second", ">deg", ">mm", ">distance", ">chance")
+    headings = ("first", "second", ">deg", ">mm", ">mm at boards", ">distance", ">chance")
     table = show.plain_table("pairs of sessions", *headings)
     for pair in comparison.differences:
-        figures = (f"{pair.rotation_deg:.3f}", f"{1000 * pair.translation_m:.1f}", f"{pair.distance:.1f}")
+        at_boards = ", ".join(f"{1000 * m:.1f} at {at_m:g} m" for at_m, m in pair.displacements_m.items())
+        sizes = f"{pair.rotation_deg:.3f}", f"{1000 * pair.translation_m:.1f}"
+        figures = (*sizes, at_boards or "-", f"{pair.distance:.1f}")
         table.add_row(show.escape(pair.first), show.escape(pair.second), *figures, f"{pair.p:.2g}")
     return table
 

@@ -472,6 +472,7 @@ class Calibration:
         square_m: the side of a square by the profile and the LiDAR.
         scene_share: the change of the extrinsics by the scene; None without `--use-scene`.
         scene: the opinion of the scene's edges; None if they were not compared.
+        board_distances_m: 10 % and 90 % of the boards' distances from the camera; empty if unknown.
         weakest: the least determined motion; None if it is read back.
         held_out_m: rms residual of captures where they were not fitted; NaN if the method has none.
         residuals: of each capture used.
@@ -520,6 +521,7 @@ class Calibration:
         ]
         | None
     ) = None
+    board_distances_m: tuple[Size, ...] = ()
     weakest: Annotated[WeakestMotion | None, _ANY, _IN_MEMORY] = None
     held_out_m: Annotated[float, _ANY, _IN_MEMORY] = math.nan
     residuals: Annotated[tuple[CaptureResidual, ...], _ANY, _IN_MEMORY] = ()

@@ -9,7 +9,7 @@ import numpy as np
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, difference, log_so3
+from lce_rig.core.geometry import Array, difference, invert, log_so3
 from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE, RESULTS_AGREE, RESULTS_DISAGREE
 from lce_rig.judge.relative_pose import mean_pose
 
@@ -29,6 +29,8 @@ class PairDifference:
         distance: Mahalanobis distance d, d^2 = x^T (cov_1 + cov_2)^-1 x with x the tangent between them;
             for results of the same captures with 2 (cov_1 + cov_2).
         p: probability that correct calibrations differ this much or more.
+        displacements_m: by distance from the camera, both m: how far apart they place a point in the middle
+            of the image, where boards were near and far; empty where their distances are not known.
     """
 
     first: str
@@ -37,6 +39,7 @@ class PairDifference:
     translation_m: float
     distance: float
     p: float
+    displacements_m: Mapping[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +159,8 @@ def compare_calibrations(
         distance = float(np.sqrt(x @ np.linalg.solve(factor * (cov[i] + cov[j]), x)))
         angle_deg = float(np.degrees(np.linalg.norm(log_so3(T[i, :3, :3] @ T[j, :3, :3].T))))
         shift_m, p = float(np.linalg.norm(x[:3])), _tail(distance**2, 6)
-        differences.append(PairDifference(names[i], names[j], angle_deg, shift_m, distance, p))
+        apart_m = _displacements(calibrations[names[i]], calibrations[names[j]])
+        differences.append(PairDifference(names[i], names[j], angle_deg, shift_m, distance, p, apart_m))
     if are_independent:
         chi2, dof = _spread(T, cov), 6 * (len(names) - 1)
         p = _tail(chi2, dof)
@@ -193,6 +197,21 @@ def compare_calibrations(
         odd_one=blamed[0] if len(blamed) == 1 else None,
         are_independent=are_independent,
     )
+
+
+def _displacements(first: Calibration, second: Calibration) -> dict[float, float]:
+    """Compute how far apart two results place a point, at the near and far distance of both boards.
+
+    Rotation and translation of a result compensate each other where its boards were; what differs there
+    differs by any method.
+    """
+    distances = zip(first.board_distances_m, second.board_distances_m, strict=False)
+    from_first = second.T_cam_lidar @ invert(first.T_cam_lidar)
+    found = {}
+    for distance_m in (float(np.mean(pair)) for pair in distances):
+        point = np.array([0.0, 0.0, distance_m, 1.0])
+        found[round(distance_m, 1)] = float(np.linalg.norm((from_first @ point - point)[:3]))
+    return found
 
 
 def _spread(T: Array, cov: Array) -> float:

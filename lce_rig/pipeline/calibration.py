@@ -381,6 +381,7 @@ def _judged(
     # The scene moves extrinsics, not the lens.
     is_of_boards = own.share is None or own.share.state != "used"
     joint = validation.cov_with_lens if is_of_boards else validation.cov
+    distances_m = [np.linalg.norm(o.image.T_cam_board[:3, 3]) for o in estimate.observations.values()]
     return Calibration(
         camera=own.camera,
         channels=tuple(channel.channel for channel in estimate.channels),
@@ -406,6 +407,7 @@ def _judged(
         estimated_with=estimate.estimated_with,
         other_cameras=tuple(_other_camera(solved, link, k) for link in mine),
         scene_share=own.share,
+        board_distances_m=tuple(np.quantile(distances_m, (0.1, 0.9)).tolist()),
         weakest=find_weakest(validation.cov, estimate.lever_m),
         held_out_m=estimate.held_out_m,
         residuals=estimate.residuals,

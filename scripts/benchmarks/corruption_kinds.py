@@ -47,6 +47,7 @@ def _all() -> Iterator[Corruption]:
     yield from _scaled()
     yield from _elevations()
     yield from _other_places()
+    yield from _at_the_ends()
     yield from _lenses()
     yield from _prints()
     yield from _timing()
@@ -142,6 +143,11 @@ def _elevations() -> Iterator[Corruption]:
             f"elevations wrong by -{error_deg:g} to +{error_deg:g} deg",
             lambda s, error_deg=error_deg: _with_elevations(s, np.radians(error_deg)),  # type: ignore[misc]
         )
+    for angle in ("elevations", "azimuths"):
+        yield Corruption(
+            f"{angle} of every other ring wrong by +-0.5 deg",
+            lambda s, angle=angle: _with_other_table(s, angle),  # type: ignore[misc]
+        )
     # Whoever reads such a point cloud counts its rings from the lowest.
     yield Corruption("elevations in reversed order", _upside_down)
 
@@ -156,11 +162,26 @@ def _upside_down(samples: Samples) -> Samples:
 def _with_elevations(samples: Samples, error_rad: float) -> Samples:
     """Read each ring's elevation wrong: the lowest by -error, the highest by +error, linear in between."""
     highest = max(int(scan.ring.max()) for scan in samples.scans.values())
+    return _with_angles(samples, lambda ring: (0 * ring, error_rad * (2 * ring / highest - 1)))
+
+
+def _with_other_table(samples: Samples, angle: str) -> Samples:
+    """Read the angles of odd rings too large, of even ones too small."""
+
+    def errors(ring: Array) -> tuple[Array, Array]:
+        off = np.radians(0.5) * (2.0 * (ring % 2) - 1)
+        return (off, 0 * off) if angle == "azimuths" else (0 * off, off)
+
+    return _with_angles(samples, errors)
+
+
+def _with_angles(samples: Samples, errors: Callable[[Array], tuple[Array, Array]]) -> Samples:
+    """Add errors of azimuth and elevation to each ring."""
 
     def raised(scan: Scan) -> Scan:
         x, y, z = scan.points.astype(float).T
-        error = error_rad * (2 * scan.ring / highest - 1)
-        elevation, azimuth = np.arctan2(z, np.hypot(x, y)) + error, np.arctan2(y, x)
+        turned, lifted = errors(scan.ring.astype(float))
+        elevation, azimuth = np.arctan2(z, np.hypot(x, y)) + lifted, np.arctan2(y, x) + turned
         level = np.cos(elevation)
         rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
         return _moved(scan, np.linalg.norm(scan.points, axis=1)[:, None] * rays)
@@ -198,6 +219,24 @@ def _other_places() -> Iterator[Corruption]:
         )
 
 
+def _at_the_ends() -> Iterator[Corruption]:
+    """Move the LiDAR before the last captures, or after the first: where it stands in the end counts."""
+    for angle_deg in (1.5, 3.0, 5.0):
+        T = _about_x(angle_deg)
+        for n in (1, 2, 3, 4):
+            last = "capture" if n == 1 else f"{n} captures"
+            yield Corruption(
+                f"LiDAR turned by {angle_deg:g} deg before the last {last}",
+                lambda s, n=n, T=T: replace(_nudged(s, s.captures[-n:], T), T_lidar_moved=T),  # type: ignore[misc]
+                "one capture that disagrees may be of a board that moved" if n == 1 else "",
+            )
+        for n in (2, 3):
+            yield Corruption(
+                f"LiDAR turned by {angle_deg:g} deg after the first {n} captures",
+                lambda s, n=n, T=T: _nudged(s, s.captures[:n], T),  # type: ignore[misc]
+            )
+
+
 def _nudged(samples: Samples, names: Sequence[str], T_lidar_moved: Array) -> Samples:
     """Take the scans of some captures with the LiDAR elsewhere; its rings stay level."""
     scans = dict(samples.scans)
@@ -208,6 +247,10 @@ def _nudged(samples: Samples, names: Sequence[str], T_lidar_moved: Array) -> Sam
 
 def _about_z(angle_deg: float) -> Array:
     return pose(exp_so3(np.radians(angle_deg) * np.array([0.0, 0.0, 1.0])), np.zeros(3))
+
+
+def _about_x(angle_deg: float) -> Array:
+    return pose(exp_so3(np.radians(angle_deg) * np.array([1.0, 0.0, 0.0])), np.zeros(3))
 
 
 def _aside(shift_m: float) -> Array:
@@ -274,7 +317,7 @@ def _prints() -> Iterator[Corruption]:
             f"pattern {1000 * offset_m:.0f} mm off the plate's centre",
             lambda s, offset_m=offset_m: _with_board(s, _off_centre(s.rig.board, offset_m)),  # type: ignore[misc]
         )
-    for added_m in (0.01, 0.02):
+    for added_m in (0.01, 0.02, 0.035):
         yield Corruption(
             f"plate of the profile {1000 * added_m:.0f} mm larger",
             lambda s, added_m=added_m: _with_board(  # type: ignore[misc]

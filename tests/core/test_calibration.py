@@ -37,7 +37,7 @@ FIELDS = [
     *("reprojection_px", "certificate", "egt_rotation_deg", "egt_translation_m", "verdict", "reasons"),
     *("findings", "diagnostics", "channels", "method", "uncertainty", "estimated_with", "other_cameras"),
     *("cov_shared", "contributions", "intrinsics", "intrinsics_cov", "intrinsics_cross_cov", "square_m"),
-    *("scene_share", "scene"),
+    *("scene_share", "scene", "board_distances_m"),
 ]
 REQUIRED = [
     *("camera", "channel", "lidar", "T_cam_lidar", "cov", "n_captures", "n_detected", "captures_used"),
@@ -68,6 +68,7 @@ def full() -> Calibration:
         contributions=(Contribution("captures", 0.1, 0.01), Contribution("lidar_ranges", np.nan, 0.01)),
         scene_share=SceneShare("used", 2, 50, T, cov, T, 2 * cov, np.arange(6.0), np.ones(6), 3.0, 4),
         scene=SceneOpinion(2, 70, (AxisOpinion("rotation_x", "agrees", "deg", -0.1, 0.2, None),)),
+        board_distances_m=(1.5, 3.25),
     )
 
 

@@ -109,3 +109,15 @@ def test_results_of_the_same_captures_that_differ_beyond_any_correlation_are_nam
     found = compare_calibrations(group, are_independent=False).finding
     assert (found.code, found.severity) == ("results.disagree", "error")
     assert "events" in (found.figures["first"], found.figures["second"])
+
+
+def test_differences_are_stated_where_boards_were() -> None:
+    """A rotation that a translation undoes at 2 m displaces nothing there."""
+    lowered = perturb(np.eye(4), np.array([0.0, 2 * np.radians(0.2), 0.0, np.radians(0.2), 0.0, 0.0]))
+    results = {
+        name: made_calibration(T, 1e-6 * np.eye(6), board_distances_m=(2.0, 4.0))
+        for name, T in (("a", np.eye(4)), ("b", lowered))
+    }
+    (pair,) = compare_calibrations(results).differences
+    assert pair.displacements_m[2.0] < 0.0005
+    assert pair.displacements_m[4.0] == pytest.approx(2 * np.radians(0.2), rel=0.01)
