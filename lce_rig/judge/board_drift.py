@@ -20,7 +20,7 @@ from lce_rig.core.geometry import Array, perturb, tangent_sizes
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.local_quadratic import SCALE, expand
-from lce_rig.judge.session_check import find_meetings
+from lce_rig.judge.session_check import find_meetings, seen_by_own_lens
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
 from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State
@@ -160,7 +160,7 @@ def watch_boards(
     """
     T_cam_lidar, pair = calibration.T_cam_lidar, Pair(calibration.camera, channel, calibration.lidar)
     detections = Detections({(calibration.camera, channel): dict(images)}, {calibration.lidar: dict(scans)})
-    board = rig.board.to_board()
+    board, detections = rig.board.to_board(), seen_by_own_lens(rig, detections, calibration)
     meetings = find_meetings(rig, detections, pair, T_cam_lidar, calibration.channel_results, clocks)
     met = [meeting.at_scan_time for meeting in meetings.values()]
     if not met:

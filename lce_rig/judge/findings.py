@@ -21,6 +21,7 @@ _OF_POSES = _OF_DISTANCES + (
     "verdict.few_used verdict.few_placements verdict.far_from_nominal verdict.edge_shift "
     "verdict.laser_offset verdict.scale "
 )
+_OF_SIGMAS = ["verdict.rotation_uncertain", "verdict.translation_uncertain"]
 _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.cameras_exchanged": f"{_OF_POSES}verdict.intrinsics".split(),
     "verdict.moved": _OF_POSES.split(),
@@ -34,6 +35,10 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
         f"{_OF_DISTANCES}verdict.scale verdict.far_from_nominal verdict.cameras_differ".split()
     ),
     "verdict.scale": _OF_DISTANCES.split(),
+    "verdict.two_groups": _OF_SIGMAS,
+    "verdict.shares_differ": _OF_SIGMAS,
+    "verdict.cameras_differ": _OF_SIGMAS,
+    "verdict.channels_differ": _OF_SIGMAS,
 }
 """What follows from a cause, the causes that explain most first."""
 _VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}

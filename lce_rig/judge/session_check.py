@@ -16,8 +16,10 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, CaptureResidual, ChannelResult, Metrics, SceneOpinion
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
-from lce_rig.detect.detection import Detections, Pair
+from lce_rig.detect.detection import Detections, ImageDetection, Pair
+from lce_rig.detect.image.search import board_from_pose
 from lce_rig.judge.findings import ELSEWHERE, UNSEEN
 from lce_rig.judge.verdict import residuals_beyond, scene_findings
 from lce_rig.rig import Rig
@@ -215,7 +217,7 @@ def check_session(
         scene: the opinion of this session's scene.
     """
     pair = Pair(calibration.camera, channel, calibration.lidar)
-    board = rig.board.to_board()
+    board, detections = rig.board.to_board(), seen_by_own_lens(rig, detections, calibration)
     meetings = find_meetings(
         rig, detections, pair, calibration.T_cam_lidar, calibration.channel_results, clocks
     )
@@ -231,6 +233,35 @@ def check_session(
     action = "" if calibration.captures_used else "deployed"
     findings = (*findings, *scene_findings(scene, calibration, action))
     return SessionCheck(pair, calibration, findings, tuple(residuals), metrics, scene, meetings)
+
+
+def seen_by_own_lens(rig: Rig, detections: Detections, calibration: Calibration) -> Detections:
+    """Solve the boards' poses in images of a result's camera again, with the result's lens and squares.
+
+    Poses of moving boards, which come with those of further images, are kept.
+    """
+    lens = calibration.intrinsics
+    if lens is None:
+        return detections
+    board = rig.board.to_board()
+    corners = replace(board, square_m=calibration.square_m or board.square_m).corners()
+
+    def again(image: ImageDetection) -> ImageDetection:
+        if not isinstance(image, ImageBoard) or image.track_ns is not None:
+            return image
+        solved = solve_planar_pose(image.corners_px, corners, lens)
+        if solved is None:
+            return image
+        seen = board_from_pose(image.corners_px, solved, image.quality)
+        return replace(seen, events=image.events, stamp_ns=image.stamp_ns)
+
+    images = {
+        (camera, channel): {name: again(image) for name, image in of_channel.items()}
+        if camera == calibration.camera
+        else of_channel
+        for (camera, channel), of_channel in detections.images.items()
+    }
+    return replace(detections, images=images)
 
 
 def contradictions(metrics: Metrics | None, rig: Rig, n_elsewhere: int, n_seen: int) -> tuple[Finding, ...]:

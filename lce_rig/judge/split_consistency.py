@@ -85,6 +85,15 @@ class Contrast:
         """Whether the subsets are the captures before and after one of them."""
         return self.first == "before"
 
+    def minority(self, captures: Sequence[str]) -> Sequence[str]:
+        """Name the captures of a mounting of their own, of those in the order in which they were taken."""
+        if self.rejected is not None:
+            return self.rejected.captures
+        if self.group:
+            return [captures[k] for k in self.group]
+        n = self.n_first if self.is_change else 0
+        return captures[:n] if 2 * n < len(captures) else captures[n:]
+
     def excess(self, target: CalibrationSettings, limits: VerdictSettings) -> float:
         """Measure the difference in units of its limit; 0 if random subsets may differ as much."""
         if self.chance > limits.least_chance:

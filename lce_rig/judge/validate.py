@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.calibration import Contribution
@@ -34,7 +35,7 @@ from lce_rig.judge.negative_control import NegativeControl, run_control, run_con
 from lce_rig.judge.nuisances import Nuisances, estimate_nuisances
 from lce_rig.judge.reach import effective_covariance, joint_covariance
 from lce_rig.judge.rejected_captures import find_moved
-from lce_rig.judge.split_consistency import Contrast, contrast_halves, find_groups
+from lce_rig.judge.split_consistency import Contrast, contrast_halves, find_groups, objections
 from lce_rig.rig import LidarSettings, Rig, VerdictSettings
 
 _N_DRAWS = 300
@@ -210,7 +211,15 @@ def validate(
         of_rejected = find_moved(observations, rejected, board, estimate.T_cam_lidar, lidar)
         contrasts = (*of_rejected, *contrast_halves(settled, centres), *find_groups(settled))
         nuisances = estimate_nuisances(expansion, rings)
-        laser_angles = estimate_angles(observations, board, estimate.T_cam_lidar, lidar)
+        # Captures of another mounting would look like other angles.
+        apart = {
+            name
+            for each in objections(contrasts, rig.calibration, rig.verdict)
+            for name in each.minority(estimate.used)
+        }
+        agreeing = [observation for observation in observations if observation.capture not in apart]
+        if len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
+            laser_angles = estimate_angles(agreeing, board, estimate.T_cam_lidar, lidar)
     contradictions = list(find_contradictions(estimate, nuisances, contrasts, rig))
     cov_agreed = widened_by**2 * estimate.cov + profile_covariance(known)
     cov = cov_agreed + sum(each.cov for each in contradictions)
