@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, difference, exp_so3, perturb, pose, rotation_angle, transform
+from lce_rig.core.geometry import Array, difference, exp_so3, pose, rotation_angle, transform
 from lce_rig.core.planar_pose import PlanarPose, refine_pose, solve_planar_pose
 
 BOARD = Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
@@ -90,25 +90,6 @@ def test_both_minima_of_a_far_board_are_found_and_the_better_one_is_returned(cam
     assert cost <= cost_other
     assert solved.chi2_gap == pytest.approx((cost_other - cost) / solved.sigma_px**2, rel=1e-6)
     assert rotation_angle(other[:3, :3], solved.T_cam_board[:3, :3]) > np.radians(20)
-
-
-def test_no_minimum_is_lower_than_the_one_found_from_any_of_many_starts() -> None:
-    rng = np.random.default_rng(5)
-    for trial in range(12):
-        T = looking(rng.uniform(3, 40), rng.uniform(-180, 180), rng.uniform(-180, 180), (0.1, 0, 3.5))
-        corners = seen(T, RADTAN, 0.4, trial)
-        solved = solve(corners, RADTAN)
-        best = 54 * solved.reprojection_px**2
-        for _ in range(12):
-            start = perturb(T, np.concatenate([rng.normal(0, 0.05, 3), rng.normal(0, 0.6, 3)]))
-            assert refine_pose(start, corners, BOARD.corners(), RADTAN)[1] > best * (1 - 1e-6)
-
-
-def test_a_board_whose_minima_cannot_be_told_apart_has_a_small_gap_and_a_near_one_a_large_gap() -> None:
-    far = solve(seen(looking(8, 40, 0, (0.0, 0.0, 5.0)), RADTAN, 0.3, 3), RADTAN)
-    near = solve(seen(looking(30, 40, 0, (0.0, 0.0, 1.2)), RADTAN, 0.1, 3), RADTAN)
-    assert far.chi2_gap < 9.0
-    assert near.chi2_gap > 1000.0
 
 
 @pytest.mark.parametrize("n_starts", [1, 2])

@@ -186,11 +186,6 @@ def _joints(messages: list[Any]) -> dict[str, tuple[str, Array]]:
     return joints
 
 
-def _tf_static_bag(case: Case) -> Array:
-    joints = _joints(_messages(case.folder / "tf_static/tf_static.mcap")["/tf_static"])
-    return project(case.points_lidar, _chained(joints, *case.frames), case.lens)
-
-
 def _tf_static_rosbags(case: Case) -> Array:
     from rosbags.highlevel import AnyReader
 
@@ -326,7 +321,6 @@ READERS: dict[tuple[str, str], Callable[[Case], Array]] = {
     ("camera_info", "PyYAML, OpenCV"): _camera_info,
     ("static_tf", "shlex, scipy"): _static_tf,
     ("ros2_launch", "Python, stand-ins for `launch`"): _ros2_launch,
-    ("tf_static_bag", "mcap, mcap-ros2-support"): _tf_static_bag,
     ("tf_static_bag", "rosbags"): _tf_static_rosbags,
     ("kalibr", "PyYAML, OpenCV"): _kalibr,
     ("autoware", "PyYAML, scipy"): _autoware,

@@ -62,7 +62,6 @@ def test_a_table_of_comma_separated_values_serves_as_well(tmp_path):
         "sessions: [{path: '{robot}/{robot}'}]",
         "sessions: [{path: 'a**b'}]",
         "sessions: [{path: a, robot: " + "1" * 5000 + "}]",
-        "sessions: " + "[" * 5000,
         'sessions: [{path: "a\\0b"}]',
         "sessions: [{path: 2026-13-45T99:99:99Z}]",
     ],

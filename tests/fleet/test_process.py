@@ -59,6 +59,7 @@ def test_a_session_returns_its_rows_and_what_it_cost():
     assert first.peak_memory_mb > 10
 
 
+@pytest.mark.long
 def test_one_that_hangs_is_ended_at_its_time_limit():
     start_s = time.monotonic()
     ended = act("hang", limit_s=8.0)
@@ -66,7 +67,7 @@ def test_one_that_hangs_is_ended_at_its_time_limit():
     assert time.monotonic() - start_s < 30
 
 
-@pytest.mark.parametrize("way", ["eat", "gulp"])
+@pytest.mark.parametrize("way", ["gulp", pytest.param("eat", marks=pytest.mark.long)])
 def test_one_that_eats_memory_is_ended_at_its_limit(way):
     ended = act(way, limit_mb=700.0)
     assert (ended.rows, ended.reason) == (None, "out_of_memory")

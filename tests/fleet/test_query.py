@@ -2,7 +2,7 @@
 
 import pytest
 
-from lce_rig.core.errors import SessionError, UsageError
+from lce_rig.core.errors import UsageError
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.table import SCHEMA, as_table
@@ -53,14 +53,3 @@ def test_a_wrong_condition_names_the_columns(registry, where, tmp_path, monkeypa
         registry.read_table(where=where)
     assert "sigma_rotation_deg" in caught.value.hint
     assert not (tmp_path / "x.csv").exists()
-
-
-def test_a_wrong_column_names_those_that_there_are(registry):
-    with pytest.raises(UsageError) as caught:
-        registry.read_table(["wheels"])
-    assert "sigma_rotation_deg" in caught.value.hint
-
-
-def test_a_registry_without_a_table_is_refused(tmp_path):
-    with pytest.raises(SessionError):
-        Registry(Storage.at(tmp_path)).read_table(where="true")

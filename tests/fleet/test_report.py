@@ -56,10 +56,3 @@ def test_the_command_writes_page_and_findings(registry, tmp_path, capsys):
     assert document["causes"] == [{"severity": "no result", "code": "fleet.signal", "rows": 1, "robots": 1}]
     assert run(["fleet", "report", "--registry", folder, "-o", str(out), "--json", "/proc/x/y"]) == 4
     assert run(["fleet", "report", "--registry", str(tmp_path / "none"), "-o", str(out)]) == 4
-
-
-def test_a_page_of_nothing_says_so(row, tmp_path):
-    place = Registry(Storage.at(tmp_path))
-    place.write_table(as_table([row("r1"), row("r2")]))
-    text = FleetReport.of(place).page()
-    assert "<svg" not in text

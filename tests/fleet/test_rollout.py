@@ -21,6 +21,7 @@ from lce_rig.rig import dump_rig, load_rig
 from tests.export.conftest import calibration, some_pose
 from tests.saved_results import result_file
 
+PROFILE = dump_rig(load_rig("rles"))
 ROBOTS = tuple(f"r{k}" for k in range(1, 6))
 Add = Callable[..., None]
 
@@ -44,12 +45,11 @@ def add(registry: Registry) -> Add:
         known: dict[str, object] = {"status": "ok", "source": f"/sessions/{robot}/{date[:10]}"}
         row = {"robot": robot, "date": date, "folder": f"{robot}/{date[:10]}-0f", **known, **changes}
         with registry.result(str(row["folder"])) as draft:
-            rig = load_rig("rles")
             origin = Provenance(robot, {}, date, "0f" * 32)
             pair = calibration(some_pose(t=(x_m, 0, 0)), verdict=verdict)
             saved = result_file("rles", [pair], provenance=origin)
             (draft / "result.json").write_text(saved.text())
-            (draft / "rig.yaml").write_text(dump_rig(rig))
+            (draft / "rig.yaml").write_text(PROFILE)
             write_rows(draft, [row])
         registry.consolidate()
 
@@ -241,19 +241,3 @@ def test_a_mistake_is_an_error_before_anything_is_deployed(registry, targets, ta
         targets.write_text(text)
     with pytest.raises(error):
         FleetDeployment(registry, target, targets, check)
-
-
-def test_a_registry_that_is_no_folder_is_one_error(tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    (tmp_path / "deploy.yaml").write_text("targets: {nav: {to: /tmp/x}}")
-    words = [
-        "--registry",
-        str(tmp_path / "file"),
-        "--targets",
-        str(tmp_path / "deploy.yaml"),
-        "--target",
-        "nav",
-    ]
-    assert run(["fleet", "deploy", *words]) in (4, 5)
-    assert run(["fleet", "deploy", *words, "--rollback"]) == 0
-    assert "Traceback" not in capsys.readouterr().err

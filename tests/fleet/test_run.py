@@ -1,6 +1,5 @@
 """Sessions of several robots, from their folders to the table."""
 
-import json
 import os
 import shutil
 import signal
@@ -31,18 +30,7 @@ def run(root, registry, client, **changes):
 
 
 def content(folder):
-    """Read every file of a registry, without figures of time and memory, which differ between runs."""
-    files = {}
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        data = path.read_bytes()
-        if path.name == "fleet.json":
-            document = json.loads(data)
-            for row in document["rows"]:
-                for key in ("duration_s", "cpu_s", "peak_memory_mb", "finished", "source"):
-                    row.pop(key)
-            data = json.dumps(document).encode()
-        files[path.relative_to(folder).as_posix()] = data
-    return files
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_each_session_has_a_row_a_folder_and_a_cause_where_there_is_no_result(fleet_root, tmp_path, client):
@@ -95,14 +83,9 @@ def test_limits_end_a_session_and_no_other(fleet_root, tmp_path):
 
 def test_ctrl_c_at_a_terminal_ends_all_processes_with_one_line(fleet_root, tmp_path):
     words = [
-        sys.executable,
-        "-m",
-        "lce_rig",
-        "fleet",
-        "run",
+        *(sys.executable, "-m", "lce_rig", "fleet", "run"),
         str(fleet_root),
-        "--registry",
-        str(tmp_path / "r"),
+        f"--registry={tmp_path / 'r'}",
     ]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True) as ran:
         assert ran.stderr is not None

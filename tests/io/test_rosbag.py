@@ -151,16 +151,9 @@ def test_topics_can_be_given_and_those_that_are_not_there_are_listed(tmp_path, r
     topics = {"cam": "/front/image", "lidar": "/points"}
     images, scans = read(open_recording(bag, rig, SourceOptions(topics=topics)))
     assert (len(images), len(scans)) == (2, 2)
-    for wrong, cause in [
-        ({**topics, "cam": "/x"}, r"no topic /x for cam\.frames"),
-        (
-            {**topics, "cam": "/points"},
-            "/points for cam.frames is sensor_msgs/PointCloud2, not sensor_msgs/Comp",
-        ),
-        ({**topics, "side": "/x"}, "no sensor 'side'; it has cam, cam.frames, lidar"),
-    ]:
-        with pytest.raises(SourceError, match=cause):
-            open_recording(bag, rig, SourceOptions(topics=wrong))
+    for wrong, name in [({"cam": "/x"}, "/x"), ({"cam": "/points"}, "PointCloud2"), ({"side": "/x"}, "side")]:
+        with pytest.raises(SourceError, match=name):
+            open_recording(bag, rig, SourceOptions(topics={**topics, **wrong}))
 
 
 def test_a_channel_whose_topic_is_not_in_the_bag_is_done_without(tmp_path, write_bag, stream):

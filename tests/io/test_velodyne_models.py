@@ -191,5 +191,5 @@ def test_mrpts_recording_gives_its_scans_with_the_clock_in_doubt(recordings: Pat
 
 @pytest.mark.dataset
 def test_mrpts_hdl32_is_refused_by_name(recordings: Path, rig: Rig) -> None:
-    with pytest.raises(SourceError, match="500 packets of HDL-32E"):
+    with pytest.raises(SourceError, match="HDL-32E"):
         open_recording(recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_hdl32.pcap", rig)

@@ -71,37 +71,6 @@ def test_what_a_killed_writer_left_behind_is_cleared(tmp_path, rig, samples):
     assert not draft.exists()
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(folder)], capture_output=True
-    )
-    if mounted.returncode != 0:
-        pytest.skip("a small disk can only be mounted by root")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
-
-
-def test_a_full_disk_is_named_and_loses_nothing(small_disk, rig, samples):
-    session = Session.create(small_disk / "s", rig)
-    stored = []
-    with pytest.raises(SessionError) as caught:
-        for seed in range(200):
-            stored.append(session.add_capture(*samples(seed), {}))
-    session.close()
-    assert len(stored) > 3
-    assert f" {len(stored)} captures " in caught.value.hint
-    reopened = Session.open(small_disk / "s", writable=True)
-    for capture in reopened.captures:
-        capture.check()
-    assert [c.name for c in reopened.captures][: len(stored)] == stored
-    for entry in reopened.read_journal():
-        assert entry["event"] in ("created", "captured")
-    reopened.close()
-
-
 def test_a_file_that_may_not_grow_is_named_and_loses_nothing(tmp_path, rig, samples):
     session = Session.create(tmp_path / "s", rig)
     session.add_capture(*samples(0), {})
@@ -157,7 +126,7 @@ def test_what_a_capture_lacks_is_named_with_what_it_has(tmp_path, rig, samples):
     session.add_capture(*samples(0), {})
     with pytest.raises(SessionError, match=r"cam\.frames"):
         session.captures[0].scan("top")
-    with pytest.raises(SessionError, match="no capture '000007'"):
+    with pytest.raises(SessionError, match="000007"):
         session.capture("000007")
 
 

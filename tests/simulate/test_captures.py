@@ -12,7 +12,7 @@ from lce_rig.simulate import SimulatedCapture, simulate_captures, truth_extrinsi
 
 from .conftest import make_rig
 
-N_CAPTURES = 6
+N_CAPTURES = 4
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_the_papers_simulated_rig_has_exactly_its_extrinsic() -> None:
     )
 
 
-def test_every_board_is_in_the_picture_and_on_enough_rings(
+def test_boards_are_in_the_picture_on_enough_rings_spread_and_tilted(
     rig: Rig, captures: list[SimulatedCapture]
 ) -> None:
     lens = rig.cameras["cam"].to_intrinsics()
@@ -65,9 +65,6 @@ def test_every_board_is_in_the_picture_and_on_enough_rings(
         assert n_rings_on_board(rig, "lidar", capture) >= 5
         distance_m = np.linalg.norm(capture.T_cam_board["cam"][:3, 3])
         assert 1.2 <= distance_m <= 4.0
-
-
-def test_boards_are_spread_and_tilted(rig: Rig, captures: list[SimulatedCapture]) -> None:
     middles = np.array([corners_px(rig, "cam", capture).mean(axis=0) for capture in captures])
     assert np.all(np.ptp(middles, axis=0) > [100, 50])
     normals = np.array([capture.T_cam_board["cam"][:3, 2] for capture in captures])
@@ -78,7 +75,7 @@ def test_boards_are_spread_and_tilted(rig: Rig, captures: list[SimulatedCapture]
 def test_the_same_seed_gives_the_same_bytes_however_many_captures(
     rig: Rig, captures: list[SimulatedCapture]
 ) -> None:
-    again = list(simulate_captures(rig, n_captures=2, seed=11))
+    again = list(simulate_captures(rig, n_captures=1, seed=11))
     for one, other in zip(captures, again, strict=False):
         assert one.images[0].pixels.tobytes() == other.images[0].pixels.tobytes()
         assert one.scans[0].points.tobytes() == other.scans[0].points.tobytes()
@@ -102,7 +99,7 @@ MOUNTS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("mount", sorted(MOUNTS))
 def test_cameras_mounted_anyhow_see_the_board(mount: str) -> None:
     rig = make_rig(nominal_extrinsics=(nominal("cam", **MOUNTS[mount]),))
-    for capture in simulate_captures(rig, n_captures=2, seed=0):
+    for capture in simulate_captures(rig, n_captures=1, seed=0):
         assert rig.cameras["cam"].to_intrinsics().is_inside(corners_px(rig, "cam", capture)).all()
         assert n_rings_on_board(rig, "lidar", capture) >= 4
 

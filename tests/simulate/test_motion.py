@@ -7,7 +7,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, difference, exp_so3, invert, pose
 from lce_rig.simulate.options import HandMotion, LidarNoise
-from lce_rig.simulate.poses import Trajectory, carry_board, hold_board, sway_board
+from lce_rig.simulate.poses import Trajectory, carry_board, sway_board
 from lce_rig.simulate.scene import Raycaster, Scene
 
 from .conftest import VLP16, board_before_lidar, simulate_scan
@@ -84,14 +84,3 @@ def test_the_lidar_meets_a_moving_board_where_it_is_at_each_firing(
     assert np.abs(own).max() < 1e-3
     at_stamp = heights_m(scan, T_world_lidar, trajectory.at(scan.stamp_ns))
     assert np.abs(at_stamp).max() > 5 * np.abs(own).max()
-
-
-def test_a_board_that_does_not_move_gives_the_scan_of_a_still_one(board: Board, T_world_lidar: Array) -> None:
-    trajectory = hold_board(board_before_lidar(2.0))
-    moving = moving_scan(board, T_world_lidar, trajectory, LidarNoise())
-    scene = Scene(Raycaster(()), [], board, board_before_lidar(2.0))
-    still = simulate_scan(
-        scene, T_world_lidar, VLP16, LidarNoise(), np.random.default_rng(0), stamp_ns=ANCHOR_NS - 50_000_000
-    )
-    assert moving.points.tobytes() == still.points.tobytes()
-    assert moving.intensity.tobytes() == still.intensity.tobytes()

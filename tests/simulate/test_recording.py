@@ -11,6 +11,7 @@ from lce_rig.simulate.captures import stamp_of
 
 from .test_moving_captures import found_corners, moving_rig
 
+pytestmark = pytest.mark.long
 OPTIONS = SimulationOptions(carrier="person", hand=HandMotion(rest_s=0.1, carry_mps=2.0), exposure_s=0.002)
 
 

@@ -110,36 +110,16 @@ class WireRig:
         self._camera["unplug"].unlink()
 
     def _reachable(self, rig: Rig) -> Rig:
-        lidars = {
-            name: lidar.model_copy(
-                update={
-                    "driver": lidar.driver.model_copy(
-                        update={
-                            "port": self._ports[0],
-                            "address": "127.0.0.1",
-                            "controls": {"position_port": self._ports[1]},
-                        }
-                    )
-                }
-            )
-            for name, lidar in rig.lidars.items()
-        }
-        cameras = {
-            name: camera.model_copy(
-                update={
-                    "driver": camera.driver.model_copy(
-                        update={
-                            "type": "command",
-                            "device": None,
-                            "controls": {},
-                            "command": self._command(name),
-                            "pixel_format": camera.driver.pixel_format or "GREY",
-                        }
-                    )
-                }
-            )
-            for name, camera in rig.cameras.items()
-        }
+        def driven(sensor: Any, **driver: Any) -> Any:
+            return sensor.model_copy(update={"driver": sensor.driver.model_copy(update=driver)})
+
+        port, position_port = self._ports
+        udp = {"port": port, "address": "127.0.0.1", "controls": {"position_port": position_port}}
+        lidars = {name: driven(lidar, **udp) for name, lidar in rig.lidars.items()}
+        cameras = {}
+        for name, camera in rig.cameras.items():
+            pipe = {"type": "command", "device": None, "controls": {}, "command": self._command(name)}
+            cameras[name] = driven(camera, **pipe, pixel_format=camera.driver.pixel_format or "GREY")
         return rig.model_copy(update={"lidars": lidars, "cameras": cameras})
 
     def _command(self, camera: str) -> tuple[str, ...]:

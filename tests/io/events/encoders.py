@@ -23,12 +23,13 @@ def random_events(
 ) -> Events:
     """Events in order, some with equal stamps, neighbours in runs so that vectors have something to pack."""
     rng = np.random.default_rng(seed)
-    t_us = start_us + np.cumsum(rng.integers(0, step_us, n) * (rng.random(n) < 0.4))
+    steps_us = rng.integers(0, step_us, n) * (rng.random(n) < 0.4)
     x, y = rng.integers(0, size[0], n), rng.integers(0, size[1], n)
     in_run = rng.random(n) < 0.5
+    steps_us[1:][in_run[1:]] = 0
+    t_us = start_us + np.cumsum(steps_us)
     for i in range(1, n):
         if in_run[i]:
-            t_us[i:] -= t_us[i] - t_us[i - 1]
             x[i], y[i] = min(x[i - 1] + rng.integers(1, 4), size[0] - 1), y[i - 1]
     polarity = rng.random(n) < 0.5
     return Events("events", t_us * 1000, x.astype(np.uint16), y.astype(np.uint16), polarity, *size)

@@ -133,11 +133,6 @@ def test_near_points_cover_far_ones() -> None:
     assert np.array_equal(both, swapped)
 
 
-def test_an_empty_scan_and_missing_boards_are_drawn_too() -> None:
-    drawn = overlay(FOLDING, np.zeros((0, 3)))
-    assert np.all(picture_part(drawn, FOLDING) == 128)
-
-
 @pytest.mark.parametrize("has_image", [True, False])
 @pytest.mark.parametrize("has_lidar", [True, False])
 def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar: bool) -> None:

@@ -62,6 +62,7 @@ def test_it_says_when_the_collection_has_no_news_and_when_it_has_ended(browser: 
     assert page.evaluate("getComputedStyle(document.getElementById('outlines')).display") == "none"
 
 
+@pytest.mark.long
 def test_an_old_link_is_said_to_be_old(browser: Browser) -> None:
     first = Preview(port=0, token="first-token")
     page = browser.open(first.start())

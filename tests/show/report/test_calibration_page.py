@@ -25,7 +25,7 @@ def test_it_is_small_and_names_no_address(which, request):
     assert "http:" not in text and "https:" not in text and "<script" not in text
 
 
-@pytest.mark.parametrize("which", ["one_page", "two_page"])
+@pytest.mark.parametrize("which", ["one_page", pytest.param("two_page", marks=pytest.mark.long)])
 def test_every_link_leads_to_one_place(which, request):
     text = request.getfixturevalue(which)
     ids = re.findall(r' id="([^"]+)"', text)

@@ -1,35 +1,28 @@
 """The report in a real browser: no sideways scrolling, no requests, overlays that open."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
 
-@pytest.fixture(scope="module")
-def files(one_page, two_page, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("calibration")
-    for name, text in (("one", one_page), ("two", two_page)):
-        (folder / f"{name}.html").write_text(text, encoding="utf-8")
-    (folder / "overlays" / "cam").mkdir(parents=True)
-    cv2.imwrite(str(folder / "overlays" / "cam" / "000001.png"), np.full((1200, 1000, 3), 90, np.uint8))
-    return folder
-
-
 @pytest.mark.parametrize("width_px", [390, 1440])
-@pytest.mark.parametrize("name", ["one", "two"])
-def test_it_fits_the_screen_and_loads_nothing(browser, files, name, width_px):
-    page = browser.open((files / f"{name}.html").as_uri(), width_px, 844)
+@pytest.mark.parametrize("which", ["one_page", pytest.param("two_page", marks=pytest.mark.long)])
+def test_it_fits_the_screen_and_loads_nothing(browser, tmp_path, request, which, width_px):
+    file = tmp_path / "report.html"
+    file.write_text(request.getfixturevalue(which), encoding="utf-8")
+    page = browser.open(file.as_uri(), width_px, 844)
     assert page.evaluate("document.documentElement.scrollWidth") == width_px
     # A colour bar is a picture within the page.
     requested = [address for address in page.requested if not address.startswith("data:")]
-    assert requested == [(files / f"{name}.html").as_uri()]
+    assert requested == [file.as_uri()]
     assert page.complaints == []
 
 
-def test_a_bar_opens_the_capture_s_overlay(browser, files):
-    page = browser.open((files / "one.html").as_uri(), 390, 844)
+def test_a_bar_opens_the_capture_s_overlay(browser, one_page, tmp_path):
+    (tmp_path / "report.html").write_text(one_page, encoding="utf-8")
+    (tmp_path / "overlays" / "cam").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "overlays" / "cam" / "000001.png"), np.full((1200, 1000, 3), 90, np.uint8))
+    page = browser.open((tmp_path / "report.html").as_uri(), 390, 844)
     overlays = "[...document.querySelectorAll('.overlay')]"
     shown = f"{overlays}.filter((each) => each.offsetHeight).map((each) => each.id)"
     assert page.evaluate(shown) == []
