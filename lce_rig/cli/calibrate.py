@@ -33,6 +33,7 @@ from lce_rig.export.reference import read_reference
 from lce_rig.judge.findings import consequences, weakest_words
 from lce_rig.pipeline.calibrate_sessions import require_unit
 from lce_rig.pipeline.result_files import UNION, Result, WrittenResult, new_result_parts
+from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import provenance_of
 
 _AXES = ("x right", "y down", "z forward")
@@ -193,6 +194,13 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
     metavar="CAPTURE[,CAPTURE]",
     help="Reject these captures first, as `lce-rig captures --reject` does; --restore there takes them back.",
 )
+@click.option(
+    "--rig",
+    "profile",
+    metavar="FILE",
+    help="Give the session this profile of the same rig first, as `lce-rig intrinsics --save-profile` writes "
+    "one; the earlier one stays beside it as rig-1.yaml.",
+)
 @click.option("--explain", is_flag=True, help="Print everything that was estimated and tested.")
 @click.option("--json", "as_json", is_flag=True, help="Print result.json on stdout.")
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
@@ -207,6 +215,7 @@ def calibrate(
     name: str | None,
     robot: str | None,
     without: list[str] | None,
+    profile: str | None,
     explain: bool,
     as_json: bool,
     force: bool,
@@ -229,6 +238,10 @@ def calibrate(
     paths = sessions or (Path("session"),)
     name = UNION if name is None and len(paths) > 1 else name
     new_result_parts(name)
+    if profile is not None:
+        if len(paths) > 1:
+            raise UsageError("--rig applies to one session", "Calibrate each session alone with it first.")
+        _take_profile(paths[0], profile)
     if without:
         if len(paths) > 1:
             raise UsageError("--without applies to one session", "Reject them by: lce-rig captures SESSION")
@@ -288,6 +301,21 @@ def calibrate(
     exit_by_verdict(result.pairs, are_printed=not as_json)
     if lacking is not None:
         raise lacking
+
+
+def _take_profile(path: Path, profile: str) -> None:
+    """Give a session another profile of its rig, and say where the earlier one is.
+
+    Raises:
+        ProfileError: it is not a valid profile.
+        SessionError: it is of another rig.
+    """
+    rig = lce.load_rig(profile)
+    with lce.Session.open(path, writable=True) as session:
+        earlier = session.adopt(rig)
+        session.keep_text(read_profile(find_profile(profile)))
+    if earlier:
+        show.note(f"{profile} is the session's profile now; the earlier one is {path / earlier}")
 
 
 def _show(result: Result, written: WrittenResult, *, is_explained: bool, as_json: bool) -> None:

@@ -17,8 +17,9 @@ from lce_rig.io import open_recordings
 from lce_rig.io.folder.folder import FolderRecording
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.pipeline.collect_recordings import fill_session
-from lce_rig.rig import load_rig
+from lce_rig.rig import find_profile, load_rig, read_profile
 from lce_rig.session import Session
+from lce_rig.session.identity import MARKER
 
 
 def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
@@ -156,7 +157,10 @@ def collect(
     if not paths:
         _refuse_options(_OF_RECORDINGS, "applies to recordings only", "Add --from, or omit this option.")
 
-        run_live(rig, session, n_wanted, **live)
+        try:
+            run_live(rig, session, n_wanted, **live)
+        finally:
+            _keep_text(session, rig_name)
         return
     _refuse_options(tuple(live), "applies to live collection only", "Omit --from or this option.")
 
@@ -171,6 +175,7 @@ def collect(
     recordings = open_recordings(paths, rig, sources)
     with show.progress_bar("collecting") as progress:
         report = fill_session(rig, recordings, session, CollectOptions(target=n_wanted), progress)
+    _keep_text(session, rig_name)
     n_captures = len(Session.open(session).captures)
     if topics and any(isinstance(recording, FolderRecording) for recording in recordings):
         show.warn("--topic is ignored for a folder of images and point clouds")
@@ -181,6 +186,12 @@ def collect(
             hint = "Move the board slowly, about 10 cm/s, in view of both sensors; the causes are above."
         raise NotEnoughDataError(f"{session}: no capture from {', '.join(map(str, paths))}", hint)
     show_next(session, rig, predict(Session.open(session)), n_captures)
+
+
+def _keep_text(session: Path, rig_name: str) -> None:
+    """Keep the profile's comments in the session, for the profiles that are made from it."""
+    if (session / MARKER).exists():
+        Session.open(session).keep_text(read_profile(find_profile(rig_name)))
 
 
 _OF_RECORDINGS = ("pair", "pair_tolerance", "topics", "cameras", "channels", "lidars")

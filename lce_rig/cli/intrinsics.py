@@ -82,6 +82,7 @@ def intrinsics(
     if save_profile is not None:
         replaced = write_profile(opened, measured, save_profile, is_forced=force)
         show.note(f"written: {save_profile}, with new intrinsics of {', '.join(replaced)}")
+        show.note(f"next: lce-rig calibrate {session} --rig {save_profile}")
         for one in measured:
             if one.judgement.code != "intrinsics.better":
                 how = "new intrinsics forced" if one.camera in replaced else "intrinsics kept"

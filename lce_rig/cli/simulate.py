@@ -14,7 +14,7 @@ from lce_rig.cli.options import FiniteRange, rig_option
 from lce_rig.core.errors import SessionError, UsageError
 from lce_rig.core.files import read_json
 from lce_rig.io.ros.bag_recorder import FolderRecorder
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import Rig, find_profile, load_rig, read_profile
 from lce_rig.session import Session
 from lce_rig.simulate import (
     SimulationOptions,
@@ -139,7 +139,9 @@ def simulate(
         kinds = {channel.kind for camera in rig.cameras.values() for channel in camera.channels.values()}
         usual = "moving" if kinds == {"events"} else "still"
         options = _options(rig, choices["motion"] or usual, choices)
-        _simulate_session(session or Path("session"), rig, captures or _CAPTURES, seed, options)
+        path = session or Path("session")
+        _simulate_session(path, rig, captures or _CAPTURES, seed, options)
+        Session.open(path).keep_text(read_profile(find_profile(rig_name)))
         return
     if session is not None or captures is not None:
         other = f"the session {session}" if session is not None else "--captures"

@@ -21,7 +21,6 @@ from lce_rig.pipeline.measure_intrinsics import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_foreign
 from lce_rig.rig import (
     Rig,
-    dump_rig,
     find_profile,
     load_rig,
     parse_rig,
@@ -125,7 +124,7 @@ def save_profile(
         why = "; ".join(f"{one.camera}: {one.judgement.text}" for one in refused)
         actions = dict.fromkeys(as_line(one.judgement.advice) for one in refused)
         raise ResultRefusedError(f"{path} not written. {why}", " ".join([*actions, _FORCE]))
-    text = profile_text(session.rig)
+    text = profile_text(session)
     for one in measured:
         lens, block = one.intrinsics, f"cameras.{one.camera}"
         if (lens.width_px, lens.height_px) != session.rig.cameras[one.camera].resolution_px:
@@ -142,11 +141,12 @@ def save_profile(
     return tuple(one.camera for one in measured)
 
 
-def profile_text(rig: Rig) -> str:
-    """Find the text of a profile with comments: a shipped profile has them, a session's does not."""
+def profile_text(session: Session) -> str:
+    """Find the text of a session's profile with comments, as the session or this program holds it."""
+    rig = session.rig
     if rig.name in shipped_profiles() and load_rig(rig.name) == rig:
         return read_profile(find_profile(rig.name))
-    return dump_rig(rig)
+    return session.profile_text()
 
 
 def _head(rig: Rig, measured: MeasuredIntrinsics) -> list[str]:

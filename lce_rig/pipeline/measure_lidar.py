@@ -125,7 +125,7 @@ def save_lidar(session: Session, lidar: str | None, errors: LidarErrors, path: P
         f"lens_vertical_m_per_rad: {known.lens[1]:.5f}, lens_vertical_sigma_m_per_rad: "
         f"{known.lens_sigma[1]:.5f}, lasers: [{lasers}]}}"
     )
-    text = set_value(profile_text(session.rig), block, values)
+    text = set_value(profile_text(session), block, values)
     n = sum(errors.n_captures)
     text = f"# intrinsics of LiDAR {name}, measured by {MADE_BY} from {n} captures\n" + text
     parse_rig(text, str(path))

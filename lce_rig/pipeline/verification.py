@@ -187,10 +187,12 @@ def profile_behind(path: Path, result: ResultFile) -> Rig | None:
     Returns:
         None where there is no such profile, or where it is not the one that the result names.
     """
+    digests = result.inputs_sha256.values()
     for folder in path.resolve().parents[:3]:
-        profile = folder / PROFILE
-        if profile.is_file() and sha256(profile.read_bytes()).hexdigest() in result.inputs_sha256.values():
-            return load_rig(profile)
+        # Earlier profiles of a session stay in it as rig-1.yaml, rig-2.yaml, ...
+        for profile in (folder / PROFILE, *sorted(folder.glob("rig-*.yaml"))):
+            if profile.is_file() and sha256(profile.read_bytes()).hexdigest() in digests:
+                return load_rig(profile)
     return None
 
 

@@ -16,6 +16,10 @@ _MAY_DIFFER = re.compile(
 ).fullmatch
 # Known later than the first capture, perhaps; another one is another rig.
 _IS_IDENTITY = re.compile(r"robot|(lidars|cameras)\.[^.]+\.serial").fullmatch
+# Another one of these is another rig, whatever else agrees: samples were read by them.
+_OF_THE_RIG = re.compile(
+    r"name|robot|(lidars|cameras)\.[^.]+\.(serial|model)|cameras\.[^.]+\.channels\.[^.]+\.kind"
+).fullmatch
 _ABSENT = "absent"
 MARKER = "session.json"
 
@@ -87,6 +91,27 @@ def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
         if values[0] != values[1] and not may_differ:
             keys.append(DifferingKey(path, *values))
     return keys
+
+
+def foreign_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
+    """List the keys by which two profiles are of different rigs: name, robot, sensors and their channels.
+
+    Board, intrinsics, limits and what else is measured or chosen may differ.
+    """
+    keys = differing_keys(theirs, ours)
+    named = [key for key in keys if _OF_THE_RIG(".".join(key.path))]
+    missing = [key for key in keys if not all(_has_place(rig, key.path) for rig in (theirs, ours))]
+    return [*named, *(key for key in missing if key not in named)]
+
+
+def _has_place(rig: Rig, path: tuple[str, ...]) -> bool:
+    """Tell whether a rig has the sensor, and the channel, of a key."""
+    if path[0] == "lidars":
+        return path[1] in rig.lidars
+    if path[0] != "cameras":
+        return True
+    camera = rig.cameras.get(path[1])
+    return camera is not None and (path[2] != "channels" or path[3] in camera.channels)
 
 
 def keep_identity(earlier: Rig, rig: Rig) -> Rig:

@@ -10,23 +10,26 @@ import errno
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import LceRigError, SessionError, reading
-from lce_rig.rig import Rig, dump_rig, load_rig
+from lce_rig.rig import Rig, dump_rig, load_rig, parse_rig
 from lce_rig.session.capture import Capture, check_samples, event_channel
 from lce_rig.session.capture_files import content_hash, write_capture
-from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file
+from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file, write_atomically
 from lce_rig.session.identity import (
     MARKER,
+    DifferingKey,
     check_marker,
     differing_keys,
+    foreign_keys,
     keep_identity,
     marker_of,
     read_marker,
@@ -34,6 +37,8 @@ from lce_rig.session.identity import (
 from lce_rig.session.replacing import recover, replacing
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
+PROFILE_TEXT = "profile.yaml"
+"""The profile as its author wrote it, with comments; rig.yaml holds every value, and is what is read."""
 CAPTURES, REJECTED, DETECTIONS, DRAFT_PREFIX = "captures", "rejected", "detections", ".new-"
 CAPTURED = "captured"
 """The journal's event of a capture."""
@@ -137,13 +142,8 @@ class Session:
         differing = differing_keys(session.rig, rig)
         if differing:
             session.close()
-            shown = "; ".join(map(str, differing[:5])) + (
-                f"; and {len(differing) - 5} more" if len(differing) > 5 else ""
-            )
-            raise SessionError(
-                f"{path} is a session of rig {session.rig.name!r}, not of this rig {rig.name!r}: {shown}",
-                "Collect into another folder, or use the profile in the session (its rig.yaml).",
-            )
+            hint = "Collect into another folder, or use the profile in the session (its rig.yaml)."
+            raise _of_another_rig(session, rig, differing, hint)
         # What may differ: addresses of attached sensors, the robot, serial numbers.
         adopted = keep_identity(session.rig, rig)
         if adopted != session.rig:
@@ -154,6 +154,63 @@ class Session:
                 raise _not_writable(path, error) from error
             session.rig = adopted
         return session
+
+    def adopt(self, rig: Rig) -> str:
+        """Take another profile of the same rig as the session's; the earlier one stays beside it.
+
+        Detections are found again where they depend on what changed, as their keys in the cache do.
+
+        Args:
+            rig: with the session's name and sensors; board, intrinsics, limits and the like may differ.
+
+        Returns:
+            The file that holds the earlier profile, such as "rig-1.yaml"; "" where both are the same.
+
+        Raises:
+            SessionError: the profile is of another rig, the session is open read-only, or the disk is full.
+        """
+        self._require_lock()
+        foreign = foreign_keys(self.rig, rig)
+        if foreign:
+            raise _of_another_rig(self, rig, foreign, "Give a profile of the same rig.")
+        adopted = keep_identity(self.rig, rig)
+        if adopted == self.rig:
+            return ""
+        n = next(n for n in count(1) if not (self.path / f"rig-{n}.yaml").exists())
+        try:
+            # The earlier one first: stopped here, the session is as it was, with a copy of its profile.
+            for name, kept in ((PROFILE, f"rig-{n}.yaml"), (PROFILE_TEXT, f"profile-{n}.yaml")):
+                if (self.path / name).exists():
+                    replace_file(self.path / kept, (self.path / name).read_bytes())
+            replace_file(self.path / PROFILE, dump_rig(adopted).encode())
+        except OSError as error:
+            raise _not_writable(self.path, error) from error
+        self.rig = adopted
+        self.journal("profile", earlier=f"rig-{n}.yaml")
+        return f"rig-{n}.yaml"
+
+    def keep_text(self, text: str) -> None:
+        """Keep a profile's text with its comments, if it says what the session's profile says.
+
+        Raises:
+            SessionError: the disk is full or read-only.
+        """
+        if self._says(text):
+            write_atomically(self.path / PROFILE_TEXT, text)
+
+    def profile_text(self) -> str:
+        """Give the session's profile as its author wrote it, with comments; without it, every value."""
+        with suppress(OSError, ValueError):
+            text = (self.path / PROFILE_TEXT).read_text(encoding="utf-8")
+            if self._says(text):
+                return text
+        return dump_rig(self.rig)
+
+    def _says(self, text: str) -> bool:
+        """Tell whether a profile's text is that of this session, but for the robot and serial numbers."""
+        with suppress(LceRigError, KeyError):  # KeyError: it has other sensors
+            return keep_identity(self.rig, parse_rig(text)) == self.rig
+        return False
 
     def __enter__(self) -> "Session":
         return self
@@ -365,6 +422,14 @@ class Session:
         return self._names_by_content
 
 
+def _of_another_rig(session: Session, rig: Rig, keys: Sequence[DifferingKey], hint: str) -> SessionError:
+    shown = "; ".join(map(str, keys[:5])) + (f"; and {len(keys) - 5} more" if len(keys) > 5 else "")
+    return SessionError(
+        f"{session.path} is a session of rig {session.rig.name!r}, not of this rig {rig.name!r}: {shown}",
+        hint,
+    )
+
+
 def discard_if_empty(path: Path) -> bool:
     """Remove a session's folder if it holds nothing but the files of its creation.
 
@@ -375,12 +440,19 @@ def discard_if_empty(path: Path) -> bool:
         Whether it was removed. A folder with a capture or any other file is left unchanged.
     """
     with suppress(OSError):
-        if {entry.name for entry in path.iterdir()} - {MARKER, PROFILE, JOURNAL, LOCK, CAPTURES}:
+        if {entry.name for entry in path.iterdir()} - {
+            MARKER,
+            PROFILE,
+            PROFILE_TEXT,
+            JOURNAL,
+            LOCK,
+            CAPTURES,
+        }:
             return False
         if (path / CAPTURES).is_dir():
             (path / CAPTURES).rmdir()  # fails where there is a capture
         # The marker last, so that an interrupted removal leaves a session.
-        for name in (LOCK, JOURNAL, PROFILE, MARKER):
+        for name in (LOCK, JOURNAL, PROFILE_TEXT, PROFILE, MARKER):
             (path / name).unlink(missing_ok=True)
         path.rmdir()
         return True

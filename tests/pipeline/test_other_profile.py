@@ -41,5 +41,9 @@ def test_a_result_s_profile_is_that_of_its_session_if_it_is_still_the_same(tmp_p
     calibration = made_calibration(np.eye(4), np.eye(6))
     result = result_file("rlfs", [calibration], {"rig.yaml": digest})
     assert profile_behind(file, result) == load_rig(profile)
+    earlier = load_rig(profile)
+    profile.rename(tmp_path / "rig-1.yaml")
     profile.write_text(dump_rig(with_lens(cx_px=660.0)))
+    assert profile_behind(file, result) == earlier
+    (tmp_path / "rig-1.yaml").unlink()
     assert profile_behind(file, result) is None

@@ -1,0 +1,81 @@
+"""A session takes another profile of its rig, keeps the earlier one, and refuses another rig's."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lce_rig.cli.main import run
+from lce_rig.core.errors import SessionError
+from lce_rig.rig import Rig, dump_rig, load_rig, read_profile
+from lce_rig.session import Session
+from lce_rig.session.session import discard_if_empty
+
+
+def with_square(rig: Rig, square_m: float) -> Rig:
+    return rig.model_copy(update={"board": rig.board.model_copy(update={"square_m": square_m})})
+
+
+def test_the_new_profile_counts_and_every_earlier_one_stays(rig: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    named = rig.of_robot("kestrel")
+    Session.create(path, named).close()
+    with Session.open(path, writable=True) as session:
+        assert session.adopt(rig) == ""
+        assert session.adopt(with_square(rig, 0.071)) == "rig-1.yaml"
+        assert session.adopt(with_square(rig, 0.072)) == "rig-2.yaml"
+        assert session.rig.board.square_m == 0.072
+    assert Session.open(path).rig == with_square(named, 0.072)
+    assert load_rig(path / "rig-1.yaml") == named
+    assert load_rig(path / "rig-2.yaml") == with_square(named, 0.071)
+    noted = [entry["earlier"] for entry in session.read_journal() if entry["event"] == "profile"]
+    assert noted == ["rig-1.yaml", "rig-2.yaml"]
+
+
+def _another_name(rig: Rig) -> Rig:
+    return rig.model_copy(update={"name": "other"})
+
+
+def _another_unit(rig: Rig) -> Rig:
+    lidars = {name: each.model_copy(update={"serial": "B"}) for name, each in rig.lidars.items()}
+    return rig.model_copy(update={"lidars": lidars})
+
+
+def _another_sensor(rig: Rig) -> Rig:
+    return rig.model_copy(
+        update={"cameras": {"front": next(iter(rig.cameras.values()))}, "nominal_extrinsics": ()}
+    )
+
+
+@pytest.mark.parametrize("change", [_another_name, _another_unit, _another_sensor])
+def test_the_profile_of_another_rig_is_refused_and_nothing_changes(
+    rig: Rig, tmp_path: Path, change: Callable[[Rig], Rig]
+) -> None:
+    lidars = {name: each.model_copy(update={"serial": "A"}) for name, each in rig.lidars.items()}
+    Session.create(tmp_path / "s", rig.model_copy(update={"lidars": lidars})).close()
+    before = {file.name: file.read_bytes() for file in (tmp_path / "s").iterdir() if file.is_file()}
+    other = tmp_path / "other.yaml"
+    other.write_text(dump_rig(change(rig)))
+    assert run(["calibrate", str(tmp_path / "s"), "--rig", str(other)]) == SessionError.exit_code
+    after = {file.name: file.read_bytes() for file in (tmp_path / "s").iterdir() if file.is_file()}
+    assert after == before
+
+
+def test_the_author_s_comments_are_kept_as_long_as_the_text_says_the_same(tmp_path: Path) -> None:
+    path, rig = tmp_path / "s", load_rig("rlfs")
+    text = "# mine\n" + read_profile(Path(__file__).parents[2] / "rigs" / "rlfs.yaml")
+    with Session.create(path, rig.of_robot("kestrel")) as session:
+        session.keep_text(text)
+        assert session.profile_text() == text
+        session.adopt(with_square(rig, 0.071))
+        assert load_rig(path / "profile-1.yaml") == rig
+        assert session.profile_text() == dump_rig(session.rig)
+        session.keep_text(text)
+        assert session.profile_text() == dump_rig(session.rig)
+
+
+def test_a_session_that_stayed_empty_is_removed_with_its_comments(rig: Rig, tmp_path: Path) -> None:
+    with Session.create(tmp_path / "s", rig) as session:
+        session.keep_text(dump_rig(rig))
+    assert discard_if_empty(tmp_path / "s")
+    assert not (tmp_path / "s").exists()
