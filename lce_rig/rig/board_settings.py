@@ -22,7 +22,7 @@ class BoardSettings(Settings):
         width_m: outer width of the plate, along the columns.
         height_m: outer height of the plate, along the rows.
         pattern_offset_m: (x right, y up) of the pattern's centre from the plate's centre.
-        square_sigma_m: standard deviation of `square_m`; by default a thousandth of it.
+        square_sigma_m: standard deviation of `square_m`; by default 0.2 % of it.
         pattern_offset_sigma_m: standard deviation of each coordinate of `pattern_offset_m`.
         plate_sigma_m: standard deviation of `width_m` and of `height_m`.
         bow_sigma_m: standard deviation of the height of the plate's middle over its ends.
