@@ -220,15 +220,6 @@ def test_live_events_come_with_a_small_delay_and_a_lost_sender_is_gone() -> None
     assert "unplugged" in caught.value.hint
 
 
-def test_a_camera_that_falls_silent_is_said_to() -> None:
-    with (
-        sender(3) as (_, port),
-        DavisSource("davis", only_events(), over_network(port), silence_s=0.6) as source,
-        pytest.raises(SourceError, match=r"0\.6 s"),
-    ):
-        list(source.samples())
-
-
 def test_a_stream_that_the_profile_wants_must_be_there() -> None:
     with sender(1) as (_, port):
         source = DavisSource("davis", camera(), over_network(port))

@@ -171,26 +171,6 @@ def test_pictures_stamped_at_the_start_of_an_exposure_that_is_not_told_are_said(
         assert has_note(recording.notes, "its start", "used") == is_said
 
 
-@pytest.mark.dataset
-@pytest.mark.parametrize(
-    ("name", "size", "n"),
-    [("davis346_apriltag_libcaer_cmp.mcap", SIZE, 571_266), ("event_packet_ros1.bag", None, 343_474)],
-)
-def test_real_drivers_bags_open_with_a_profile_that_fits(
-    recordings: Path, rig: Rig, name: str, size: tuple[int, int] | None, n: int
-) -> None:
-    from lce_rig.io.events import open_events
-
-    path = recordings / "events" / name
-    resolution = size or open_events(path).resolution_px
-    camera = rig.cameras["davis"].model_copy(update={"resolution_px": resolution})
-    fitting = with_camera(rig.model_copy(update={"cameras": {"davis": camera}}), topic="/event_camera/events")
-    recording = opened(path, fitting, is_part=True)
-    samples = list(recording.samples())
-    assert sum(len(s) for s in samples if isinstance(s, Events)) == n
-    assert recording.streams[Stream("davis", "events", "events")] is not None
-
-
 def test_a_packet_whose_words_hold_many_events_each_is_decoded_in_pieces() -> None:
     rng = np.random.default_rng(0)
     words = np.tile(np.array([0x8000, 0x6001, 0x0005, 0x3000, 0x4FFF, 0x4FFF, 0x50FF], "<u2"), 40_000)

@@ -140,22 +140,3 @@ def test_a_file_that_ends_in_a_packet_gives_what_comes_before(tmp_path: Path, ri
     assert 0 < len(found) < len(EVENTS) and found == listed(EVENTS)[: len(found)] and 1 <= len(images) < 5
     assert has_note(recording.notes, "1 torn ends")
     assert recording.streams[EVENT_STREAM] == (int(EVENTS.t_ns[0]), int(EVENTS.t_ns[len(found) - 1]))
-
-
-@pytest.mark.dataset
-@pytest.mark.parametrize(
-    ("name", "size", "n_events", "n_frames"),
-    [
-        ("davis346_short.aedat4", (346, 260), 6676, 4),
-        ("dvs_320x240.aedat4", (320, 240), 111_954, 0),
-        ("evt3_pedestrians.raw", (1280, 720), 5000, 0),
-    ],
-)
-def test_real_files_open_with_a_profile_that_fits(
-    recordings: Path, rig: Rig, name: str, size: tuple[int, int], n_events: int, n_frames: int
-) -> None:
-    camera = rig.cameras["davis"].model_copy(update={"resolution_px": size})
-    recording = opened(recordings / "events" / name, rig.model_copy(update={"cameras": {"davis": camera}}))
-    samples = list(recording.samples())
-    assert sum(len(s) for s in samples if isinstance(s, Events)) == n_events
-    assert sum(isinstance(s, Image) for s in samples) == recording.n_samples == n_frames

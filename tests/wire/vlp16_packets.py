@@ -22,8 +22,6 @@ _DATA_PER_POSITION = 14
 # A GPS sends its sentence for a pulse a while after that pulse.
 _SENTENCE_DELAY_NS = 300_000_000
 _NS_PER_S = 1_000_000_000
-# Each simulated scan begins anywhere within a step; a rotor turns evenly. The step is spread over 12 deg.
-_EASED_BLOCKS = 30
 
 
 @dataclass(frozen=True)
@@ -63,8 +61,7 @@ class Vlp16Packets:
     """Cuts scans into packets; an incomplete packet waits for the next scan.
 
     Scans simulated with STREAMED_VLP16 and timestamped one period apart come out as they went in, within the
-    steps of range and azimuth, but for the first 12 deg behind the cut: there the azimuth is eased from
-    the phase of the scan before, by 0.2 deg at most.
+    steps of range and azimuth, if they begin at one azimuth, as those of a rotor do.
 
     Attributes:
         clock: how the sensor's clock is kept; may be replaced between scans.
@@ -82,7 +79,7 @@ class Vlp16Packets:
         self._blocks = np.zeros(0, velodyne.DATA_BLOCK)
         self._starts_ns = np.zeros(0, np.int64)
         self._n_data = 0
-        self._rotor: tuple[int, float] | None = None
+        self._next_ns = 0
 
     def feed(self, scan: Scan, last: Scan | None = None) -> list[SensorPacket]:
         """Send a scan; returns the packets that are full.
@@ -92,17 +89,10 @@ class Vlp16Packets:
         Args:
             scan: the strongest returns, on the model's grid of firings (as `simulate_scan` makes them).
             last: the last returns of the same revolution, in dual mode; None for the same.
-
-        Raises:
-            ValueError: a point lies on no firing, or the scan has no timestamp, times or points.
         """
-        if scan.stamp_ns is None or scan.offset_ns is None or len(scan.points) == 0:
-            raise ValueError("a scan without points or their times cannot be sent")
-        packets = []
-        if self._rotor is not None and scan.stamp_ns != self._rotor[0]:
-            packets = self.finish()
-            self._rotor = None
+        packets = self.finish() if scan.stamp_ns != self._next_ns else []
         blocks, starts_ns = self._to_blocks(scan, last or scan)
+        self._next_ns = int(scan.stamp_ns or 0) + self._model.period_ns
         self._blocks = np.concatenate([self._blocks, blocks])
         self._starts_ns = np.concatenate([self._starts_ns, starts_ns])
         n_whole = len(self._blocks) // velodyne.N_BLOCKS
@@ -134,28 +124,17 @@ class Vlp16Packets:
         starts_ns = int(strongest.stamp_ns or 0) + velodyne.BLOCK_NS * np.arange(n_blocks)
         blocks = np.zeros(n_blocks, velodyne.DATA_BLOCK)
         blocks["flag"] = velodyne.BLOCK_FLAG
-        steps = np.rint(self._azimuths_rad(strongest, n_blocks) / velodyne.AZIMUTH_STEP_RAD)
+        turned_rad = 2 * np.pi * velodyne.BLOCK_NS / self._model.period_ns * np.arange(n_blocks)
+        azimuth_rad = _start_azimuth_rad(strongest, self._model) + turned_rad
+        steps = np.rint(azimuth_rad / velodyne.AZIMUTH_STEP_RAD)
         blocks["azimuth"] = steps.astype(np.int64) % velodyne.AZIMUTH_STEPS
         if self._is_dual:
             blocks, starts_ns = np.repeat(blocks, 2), np.repeat(starts_ns, 2)
             blocks["returns"][0::2] = _returns(last, self._model, n_blocks)
             blocks["returns"][1::2] = _returns(strongest, self._model, n_blocks)
         else:
-            chosen = last if self._mode == velodyne.LAST else strongest
-            blocks["returns"] = _returns(chosen, self._model, n_blocks)
+            blocks["returns"] = _returns(strongest, self._model, n_blocks)
         return blocks, starts_ns
-
-    def _azimuths_rad(self, scan: Scan, n_blocks: int) -> Array:
-        """Find the sensor's azimuth (n_blocks,) at each block's first firing, eased from the last scan."""
-        start_rad = _start_azimuth_rad(scan, self._model)
-        turned_rad = 2 * np.pi * velodyne.BLOCK_NS / self._model.period_ns * np.arange(n_blocks + 1)
-        ease_rad = np.zeros(n_blocks)
-        if self._rotor is not None:
-            jump_rad = np.angle(np.exp(1j * (self._rotor[1] - start_rad)))
-            ease_rad = jump_rad * np.clip(1 - np.arange(n_blocks) / _EASED_BLOCKS, 0, None)
-        next_ns = int(scan.stamp_ns or 0) + n_blocks * velodyne.BLOCK_NS
-        self._rotor = next_ns, start_rad + float(turned_rad[-1])
-        return np.asarray(start_rad + turned_rad[:-1] + ease_rad)
 
     def _pop(self) -> list[SensorPacket]:
         """Take one data packet, and the position packet that follows it now and then."""
@@ -215,8 +194,7 @@ def _returns(scan: Scan, model: LidarModel, n_blocks: int) -> NDArray[np.void]:
     assert scan.offset_ns is not None
     laser = np.argsort(model.rings)[scan.ring]
     sequence, rest_ns = np.divmod(scan.offset_ns - laser * velodyne.FIRING_NS, velodyne.SEQUENCE_NS)
-    if rest_ns.any() or sequence.min() < 0 or sequence.max() >= 2 * n_blocks:
-        raise ValueError("the scan has points that lie on no firing of the model")
+    assert not rest_ns.any() and 0 <= sequence.min() <= sequence.max() < 2 * n_blocks
     from_laser: Array = scan.points.astype(np.float64)
     from_laser[:, 2] -= model.vertical_offsets_m[laser]
     steps = np.rint(np.linalg.norm(from_laser, axis=1) / velodyne.RANGE_STEP_M)

@@ -167,20 +167,6 @@ def test_a_command_that_fails_is_told_with_output_and_code_and_runs_again(
     assert [entry.get("exit") for entry in log_of(robot)] == [None, 3, 0]
 
 
-def test_releases_are_in_order_even_if_the_clock_was_set_back(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
-) -> None:
-    first = deploy(result("a"), rig, local).release
-    later = "20990101T000000Z" + first.name[16:]
-    (robot / "releases" / first.name).rename(robot / "releases" / later)
-    record = robot / "releases" / later / RECORD
-    record.write_text(record.read_text().replace(first.name, later))
-    (robot / "current").unlink()
-    (robot / "current").symlink_to(f"releases/{later}")
-    second = deploy(result("b", 0.15), rig, local).release
-    assert second.name[:16] == "20990101T000001Z" and standing(local).state.releases[0] == second
-
-
 class Meanwhile(Place):
     """A place at which something happens once new files have been copied."""
 

@@ -48,13 +48,6 @@ def test_events_are_drawn_where_they_fell_in_the_colour_of_most_of_them() -> Non
     assert coloured(picture, DARKER) == {(345, 259), (20, 40)}
 
 
-def test_as_many_brighter_as_darker_events_cancel_and_none_at_all_is_fine() -> None:
-    both = events_at([1, 2], [10, 10], [5, 5], [True, False])
-    for events in (both, events_at([], [], [], [])):
-        picture, _ = draw_events(IMAGE, events)
-        assert not coloured(picture, BRIGHTER) and not coloured(picture, DARKER)
-
-
 def test_events_off_a_picture_that_was_cut_are_left_out() -> None:
     cut = Image("cam", "events", None, grey(FOLDING)[:250])
     picture, _ = draw_events(cut, events_at([1, 2], [3, 4], [255, 4], [True, True]))

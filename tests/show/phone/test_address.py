@@ -1,5 +1,4 @@
 import ipaddress
-import socket
 
 import pytest
 
@@ -70,18 +69,6 @@ def test_links_lead_to_addresses_of_this_computer_that_others_reach() -> None:
             assert not ipaddress.ip_address(host).is_loopback
             with listen(host, 0):
                 pass  # only own addresses can be bound
-
-
-def test_both_kinds_of_address_are_served_at_once() -> None:
-    try:
-        opened = listen("::", 0)
-    except UsageError:
-        pytest.skip("this computer has no IPv6")
-    with opened:
-        port = opened.getsockname()[1]
-        for family, host in ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1")):
-            with socket.socket(family, socket.SOCK_STREAM) as client:
-                client.connect((host, port))
 
 
 def test_the_link_of_an_ipv6_address_has_brackets() -> None:

@@ -11,7 +11,7 @@ from lce_rig.show.phone.preview import Preview
 
 from .browser import Browser, Page
 from .conftest import HEIGHT_PX, PRESENT_PX, WANTED_PX, WIDTH_PX, picture, state
-from .screen import OPEN, has_text, shown
+from .screen import has_text, shown
 
 SIZES = [(360, 640), (640, 360), (1280, 720)]
 # Where the points of an outline lie on the screen.
@@ -94,27 +94,6 @@ def _compare_with_picture(page: Page, is_mirrored: bool) -> None:
     assert (wanted[:, 0].mean() < found[:, 0].mean()) == is_mirrored
 
 
-def test_pictures_follow_one_another(preview: Preview, browser: Browser) -> None:
-    page = browser.open(preview.urls[0])
-    page.wait_until(OPEN)
-    # Read from a copy, as reading makes a browser keep a picture elsewhere, and complain.
-    corner = """(() => {
-      const copy = new OffscreenCanvas(1, 1).getContext('2d', { willReadFrequently: true });
-      copy.drawImage(document.getElementById('picture'), -5, -5);
-      return copy.getImageData(0, 0, 1, 1).data[0];
-    })()"""
-    for level in (40, 120, 240):
-        preview.publish(state(drawing=Drawing("cam", picture(level))))
-        page.wait_until(f"Math.abs({corner} - {level}) <= 3")
-    assert page.evaluate("document.getElementById('picture').width") == WIDTH_PX
-    preview.publish(state(drawing=Drawing("cam", np.zeros((260, 346), np.uint8))))
-    page.wait_until("document.getElementById('picture').width === 346")
-    preview.publish(state(drawing=None))
-    page.wait_until("!document.getElementById('nothing').hidden")
-    assert page.each("#outlines path") == []
-    assert not page.complaints
-
-
 def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview: Preview, browser: Browser) -> None:
     page = browser.open(preview.urls[0])
     tip = "document.querySelector('#arrow .head')?.getAttribute('d').split('L')[0]"
@@ -160,17 +139,4 @@ def test_what_sensors_say_is_text_and_not_markup(preview: Preview, browser: Brow
     shown(preview, page, has_text("headline", evil), **said)
     markup = page.each("img, #say b, #log b, #streams b, #notes b")
     assert markup == []
-    assert not page.complaints
-
-
-def test_phones_that_may_switch_their_screen_off_are_warned_of(preview: Preview, browser: Browser) -> None:
-    page = browser.open(preview.urls[0], 360, 640)
-    page.wait_until(OPEN)
-    assert page.evaluate("document.getElementById('hint').hidden")
-    # On a plain link to another computer browsers hide the means to keep the screen on.
-    page.call("Page.addScriptToEvaluateOnNewDocument", source="delete Navigator.prototype.wakeLock")
-    page.call("Emulation.setTouchEmulationEnabled", enabled=True)
-    page.evaluate("window.isOld = true")
-    page.call("Page.reload")
-    page.wait_until(f"!window.isOld && {OPEN} && !document.getElementById('hint').hidden")
     assert not page.complaints
