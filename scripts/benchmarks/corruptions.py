@@ -6,20 +6,30 @@ from dataclasses import dataclass
 from typing import get_args
 
 from benchmarks.corruption_kinds import Corruption, corruptions
-from benchmarks.corruption_sessions import Detector, Samples, recorded_samples, simulated_samples
+from benchmarks.corruption_sessions import (
+    N_CAPTURES,
+    SEED,
+    Detector,
+    Samples,
+    recorded_samples,
+    simulated_samples,
+)
 from benchmarks.recordings import RIGS, SETS, RecordedSet
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration, Method
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array
-from lce_rig.detect.detection import Detections
+from lce_rig.detect.detection import Detections, ImageDetection
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.judge.findings import Verdict
 from lce_rig.pipeline.calibration import calibrate_detections
-from lce_rig.rig import Rig
+from lce_rig.rig import Rig, load_rig
+from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
 
 METHODS: tuple[Method, ...] = ("paper", "ml")
 _SIMULATED = ("rlfs", "rles")
+_EXCHANGED = "two_cameras"
 _RECORDED = (
     *(recorded for recorded in SETS if recorded.name == "rlfs02"),
     RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)),
@@ -82,6 +92,13 @@ def bench_corruptions(only: str = "") -> None:
         for outcomes in judge_session(samples, corruptions()):
             print_row(*_cells(outcomes))
             every += outcomes
+    if only in _EXCHANGED:
+        print(f"\n### {_EXCHANGED}\n")
+        print_head("corruption", *f"camera, method: verdict, {title}".split(", "), "first reason")
+        for outcome in exchanged_cameras():
+            cells = outcome.verdict, _pair(outcome.error), _pair(outcome.reported), f"{outcome.in_sigmas:.1f}"
+            print_row(outcome.corruption, outcome.session, outcome.method, *cells, _shortened(outcome.reason))
+            every.append(outcome)
     print("\n`*` The data cannot show it:\n")
     for kind in corruptions():
         if kind.unobservable:
@@ -111,6 +128,28 @@ def judge_session(samples: Samples, kinds: Sequence[Corruption]) -> Iterator[lis
         if corrupted is not None:
             found = detector.detect(corrupted)
             yield [_judge(corrupted, kind, found, method, truths[method]) for method in METHODS]
+
+
+def exchanged_cameras() -> Iterator[Outcome]:
+    """Calibrate two alike cameras as they are, and with their images exchanged."""
+    rig = load_rig(RIGS / f"{_EXCHANGED}.yaml")
+    options, (lidar,), names = SimulationOptions.for_rig(rig.name), rig.lidars, sorted(rig.cameras)
+    truths = truth_extrinsics(rig, SEED, options)
+    finder, scans = BoardFinder(rig), {}
+    images: dict[str, dict[str, ImageDetection]] = {name: {} for name in names}
+    for number, capture in enumerate(
+        simulate_captures(rig, n_captures=N_CAPTURES, seed=SEED, options=options)
+    ):
+        scans[f"{number:06d}"] = finder.scan(capture.scans[0])
+        for image in capture.images:
+            images[image.sensor][f"{number:06d}"] = finder.image(image)
+    for corruption, sources in (("none", names), ("images of the cameras exchanged", names[::-1])):
+        of_names = {(n, "frames"): images[source] for n, source in zip(names, sources, strict=True)}
+        for method in METHODS:
+            found = Detections(of_names, {lidar: scans})
+            for calibration in calibrate_detections(rig, found, CalibrateOptions(method=method))[0]:
+                truth, camera = truths[calibration.camera, lidar], f"{_EXCHANGED} {calibration.camera}"
+                yield _outcome(rig, (camera, corruption, method, ""), calibration, truth)
 
 
 def print_summary(outcomes: Sequence[Outcome]) -> None:
@@ -170,19 +209,21 @@ def _judge(
         calibration = _calibrate(samples.rig, found, method)
     except LceRigError as error:
         return _refused(samples, kind, method, error)
-    error_deg, error_mm = compare(calibration.T_cam_lidar, T_cam_lidar @ samples.T_lidar_moved)
+    what = samples.name, kind.name, method, kind.unobservable
+    return _outcome(samples.rig, what, calibration, T_cam_lidar @ samples.T_lidar_moved)
+
+
+def _outcome(rig: Rig, what: tuple[str, str, str, str], calibration: Calibration, truth: Array) -> Outcome:
+    error_deg, error_mm = compare(calibration.T_cam_lidar, truth)
     sigma_deg, sigma_mm = calibration.sigma_rotation_deg, 1000 * calibration.sigma_translation_m
     return Outcome(
-        samples.name,
-        kind.name,
-        method,
-        kind.unobservable,
+        *what,
         calibration.verdict,
         calibration.findings[0].sentence if calibration.findings else "",
         (error_deg, error_mm),
         (sigma_deg, sigma_mm),
         max(error_deg / sigma_deg, error_mm / sigma_mm),
-        samples.rig.calibration.in_targets(error_deg, error_mm / 1000),
+        rig.calibration.in_targets(error_deg, error_mm / 1000),
     )
 
 
