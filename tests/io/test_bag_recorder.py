@@ -150,13 +150,6 @@ def test_a_full_disk_stops_the_recording(tmp_path: Path, rles: Rig, name: str) -
         open_recording(tmp_path / name, rles)
 
 
-def test_an_error_of_the_user_of_a_recorder_is_not_hidden_by_a_full_disk(tmp_path: Path, rles: Rig) -> None:
-    with files_up_to(100_000), pytest.raises(KeyError), BagRecorder(tmp_path / "r.bag", rles) as recorder:
-        recorder.write(picture(0))
-        recorder.write(picture(1))
-        raise KeyError
-
-
 def test_a_full_disk_stops_a_folder_with_one_error(tmp_path: Path, rles: Rig) -> None:
     with (
         files_up_to(300_000),

@@ -42,18 +42,12 @@ def test_a_point_on_the_axis_of_rotation_belongs_to_no_laser_and_is_dropped(room
     assert reading.scan.ring.min() == 0
 
 
-def test_a_cloud_without_a_valid_point_is_refused(room):
-    cloud = room[:3].copy()
-    cloud["x"] = np.nan
-    with pytest.raises(SourceError):
-        to_scan(cloud, "lidar", FIRST, "here")
-    with pytest.raises(SourceError):
-        to_scan(room[:0], "lidar", FIRST, "here")
-
-
-def test_a_cloud_without_coordinates_is_refused(room):
-    with pytest.raises(SourceError):
-        to_scan(drop_fields(room, "z"), "lidar", FIRST, "here")
+def test_a_cloud_without_valid_points_or_coordinates_is_refused(room):
+    invalid = room[:3].copy()
+    invalid["x"] = np.nan
+    for cloud in (invalid, room[:0], drop_fields(room, "z")):
+        with pytest.raises(SourceError):
+            to_scan(cloud, "lidar", FIRST, "here")
 
 
 @pytest.mark.parametrize("name", ["ring", "channel", "laser_id", "RING"])

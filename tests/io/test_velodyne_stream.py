@@ -186,14 +186,10 @@ def test_a_board_that_fakes_gps_is_good_enough() -> None:
     assert stream.clock.is_utc
 
 
-def test_without_position_packets_the_sensors_time_is_not_trusted(packets: list[SensorPacket]) -> None:
+def test_position_packets_that_lack_or_stop_end_the_trust(packets: list[SensorPacket]) -> None:
     stream = stream_of()
-    scans = push(stream, only_data(packets))
-    assert len(scans) == 5
+    assert len(push(stream, only_data(packets))) == 5
     assert stream.clock.state().code == "clock.no_position_packets"
-
-
-def test_position_packets_that_stop_end_the_trust(packets: list[SensorPacket]) -> None:
     stream = stream_of()
     push(stream, packets)
     assert stream.clock.is_utc

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.data import EventColumns, Events, join_events
-from lce_rig.io.events.prophesee import EVT3, LIBCAER_CMP, Evt2Decoder, WordDecoder
+from lce_rig.io.events.prophesee import EVT3, Evt2Decoder, WordDecoder
 from lce_rig.io.ros.event_messages import PacketDecoder
 from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, decode_event_array, encode_event_array, typestore
 from tests.io.events import encoders
@@ -97,16 +97,6 @@ def test_words_of_no_known_code_are_counted_and_passed_over() -> None:
     events = decoder.decode(np.concatenate((np.array([1 << 12, 11 << 12, 14 << 12], "<u2"), words)))
     assert columns_listed(events) == truth
     assert decoder.n_unknown == 2
-
-
-@given(n=st.integers(1, 120), seed=st.integers(0, 10**6), start_us=st.integers(0, 1 << 50))
-def test_events_in_a_column_come_back_from_the_drivers_compression(n: int, seed: int, start_us: int) -> None:
-    events = random_events(n, seed, start_us=start_us)
-    truth = listed(events)
-    decoder = WordDecoder(LIBCAER_CMP)
-    decoder.start_packet()
-    columns = decoder.decode(np.frombuffer(encoders.libcaer_cmp(truth, start_us), "<u2"))
-    assert columns_listed(columns) == [(t - start_us, x, y, p) for t, x, y, p in truth]
 
 
 @pytest.mark.parametrize("is_ros1", [True, False])

@@ -31,11 +31,10 @@ def test_aedat4_is_read_as_its_makers_read_it(folder: Path, name: str) -> None:
     while (batch := recording.getNextEventBatch()) is not None:
         batches.append(batch.numpy().copy())
     truth = np.concatenate(batches)
-    t_ns, x, y, polarity = columns(folder / name)
+    t_ns, *others = columns(folder / name)
     assert np.array_equal(t_ns, truth["timestamp"] * 1000)
-    assert np.array_equal(x, truth["x"])
-    assert np.array_equal(y, truth["y"])
-    assert np.array_equal(polarity, truth["polarity"].astype(bool))
+    for field, column in zip(("x", "y", "polarity"), others, strict=True):
+        assert np.array_equal(column, truth[field])
 
 
 @pytest.mark.parametrize(

@@ -118,9 +118,8 @@ def test_dv_processing_reads_what_is_written(tmp_path: Path) -> None:
         batches.append(batch.numpy().copy())
     found = np.concatenate(batches)
     assert np.array_equal(found["timestamp"] * 1000, EVENTS.t_ns)
-    assert np.array_equal(found["x"], EVENTS.x)
-    assert np.array_equal(found["y"], EVENTS.y)
-    assert np.array_equal(found["polarity"].astype(bool), EVENTS.polarity)
+    for name in ("x", "y", "polarity"):
+        assert np.array_equal(found[name], getattr(EVENTS, name))
 
 
 def test_what_dv_processing_writes_is_read(tmp_path: Path) -> None:
@@ -196,7 +195,7 @@ def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path:
     assert has_note(recording.notes, "3 broken lines", "line 41", "'1 2 3'")
 
 
-def test_hdf5_of_another_layout_is_refused_with_what_it_holds(tmp_path: Path) -> None:
+def test_hdf5_of_another_layout_is_refused(tmp_path: Path) -> None:
     import h5py
 
     with h5py.File(tmp_path / "a.h5", "w") as file:
@@ -223,14 +222,12 @@ def test_rubbish_by_any_name_is_refused_in_one_line(tmp_path: Path, name: str) -
         assert "\n" not in caught.value.what
 
 
-def test_paths_that_are_no_recording_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(SourceError):
-        open_events(tmp_path / "a.aedat4")
+@pytest.mark.parametrize("name", ["a.aedat4", "a.mp4", "img"])
+def test_paths_that_are_no_recording_are_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / "a.mp4").touch()
     (tmp_path / "img").mkdir()
-    for name in ("a.mp4", "img"):
-        with pytest.raises(SourceError):
-            open_events(tmp_path / name)
+    with pytest.raises(SourceError):
+        open_events(tmp_path / name)
 
 
 FEW_EVENTS = EVENTS.select(slice(0, 200))
