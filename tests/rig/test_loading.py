@@ -95,7 +95,7 @@ def test_a_missing_file_or_a_folder_is_no_profile(name: str) -> None:
         (b"name: a\nboard:\n  x: 1\n  x: 2\n", ":4"),
         (b"name: !!python/object/apply:os.system [ls]\n", ":1"),
         (b"a: &a [*a, *a]\n", ":1"),
-        (b"[" * 5000, ""),
+        (b"[" * 500, ""),
         (b"name: 2026-13-45\n", ""),
         (b"name: !!bool x\n", ""),
         (b"a: 1\n" * 200_000, ""),

@@ -14,7 +14,7 @@ from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.subframes import GREY, MovingView
 
 from .conftest import PERFECT, render_image
-from .test_camera import PLACEMENTS
+from .test_camera import PLACEMENTS, placed, refined
 
 T_NS = 1_700_000_000_123_000_000
 
@@ -27,13 +27,6 @@ def make_view(
         return Scene(room.raycaster, build_carrier(carrier, board, T, np.random.default_rng(0)), board, T)
 
     return MovingView(backdrop, board, trajectory, scene_at, PERFECT)
-
-
-def refined(picture: np.ndarray, truth: Array) -> Array:
-    import cv2
-
-    start = truth.astype(np.float32).reshape(-1, 1, 2) + np.float32(0.3)
-    return np.asarray(cv2.cornerSubPix(picture, start, (4, 4), (-1, -1), (3, 50, 1e-4)).reshape(-1, 2))
 
 
 @pytest.mark.parametrize("T_world_board", PLACEMENTS, ids=["near", "middle", "side"])
@@ -71,8 +64,6 @@ def test_the_board_and_its_carrier_are_as_bright_as_in_pictures(
 def test_a_board_behind_a_wall_or_the_camera_is_not_seen(
     room: Room, board: Board, backdrop: Backdrop
 ) -> None:
-    from .test_camera import placed
-
     empty = make_view(room, board, backdrop, hold_board(placed(-2.0, 0.0, 0.0, 0.0, 45.0)), "none").at(T_NS)
     behind = make_view(room, board, backdrop, hold_board(placed(12.0, 0.0, 0.0, 0.0, 45.0)), "none").at(T_NS)
     assert np.array_equal(empty, behind)
