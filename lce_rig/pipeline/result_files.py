@@ -164,8 +164,11 @@ class Result:
 
         file = self.file()
         text = file.text()
-        page = report_text(self.session, self.sessions, file, text, OVERLAYS)
-        if folder is not None and not self._is_in_session(folder):
+        is_elsewhere = folder is not None and not self._is_in_session(folder)
+        previous = self.session.path.joinpath(*self._parts(name), PREVIOUS)
+        has_previous = not is_elsewhere and bool(_usable(previous))
+        page = report_text(self.session, self.sessions, file, text, OVERLAYS, has_previous=has_previous)
+        if folder is not None and is_elsewhere:
             write_atomically(Path(folder) / REPORT, page)
             return Path(folder) / REPORT
         parts = self._parts(name)

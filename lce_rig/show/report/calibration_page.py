@@ -2,7 +2,9 @@
 
 import hashlib
 import math
+import shlex
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from markupsafe import Markup
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
 from lce_rig.core.phrasing import as_line
 from lce_rig.detect.detection import Pair
@@ -21,9 +24,13 @@ from lce_rig.session import Session
 from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.calibration_drawings import Evidence, gather
 from lce_rig.show.report.page import as_markup, render, style
+from lce_rig.show.report.thumbnails import picture_of, worst_first
 
 Overlays = Callable[[Calibration, str], Sequence[str]]
 """Gives the paths of a capture's overlays, from the folder of the page."""
+
+Pictures = Callable[[Calibration, str], str]
+"""Gives the picture of a capture as a data URI; "" for none."""
 
 Row = Sequence[object]
 _STEP = 1e-6
@@ -31,10 +38,18 @@ _AXES = {"x": "x right", "y": "y down", "z": "z forward"}
 _LENS_CODES = ("verdict.intrinsics", "verdict.known_better", "verdict.scale")
 # The statement names the expected error at this distance.
 _USUAL_M = 10.0
+# Captures with more than this many times the median residual are marked. A page holds so many pictures.
+_STANDS_OUT, _MOST_PICTURES = 2.0, 96
 
 
 def report_text(
-    session: Session, sessions: Mapping[str, Session], file: ResultFile, text: str, overlays: str
+    session: Session,
+    sessions: Mapping[str, Session],
+    file: ResultFile,
+    text: str,
+    overlays: str,
+    *,
+    has_previous: bool = False,
 ) -> str:
     """Write the report of a result; the same result gives the same bytes.
 
@@ -43,6 +58,7 @@ def report_text(
         sessions: of an estimate from several, by name, `session` first.
         file: the result; text: the same as it is written.
         overlays: the folder of overlays beside the report.
+        has_previous: whether `previous/` beside the report holds a usable result.
     """
     n_pairs = sum(len(c.channels) for c in file.pairs)
 
@@ -72,11 +88,44 @@ def report_text(
         ("SHA-256 of result.json", hashlib.sha256(text.encode()).hexdigest()),
     ]
     facts = [(name, value) for name, value in facts if value]
-    return calibration_page(session.rig, file.pairs, facts=facts, overlays=paths)
+
+    def picture(c: Calibration, capture: str) -> str:
+        of_session, _, name = capture.rpartition("/")
+        source = sessions.get(of_session, session)
+        with suppress(LceRigError):
+            board, lens = session.rig.board.to_board(), session.rig.cameras[c.camera].to_intrinsics()
+            return picture_of(source.capture(name), c, capture, board, lens)
+        return ""
+
+    def rejecting(capture: str) -> str:
+        of_session, _, name = capture.rpartition("/")
+        if sessions:
+            where = shlex.quote(sessions.get(of_session, session).path.resolve().name)
+            return f"lce-rig captures {where} --reject {name}"
+        return f"lce-rig calibrate {shlex.quote(session.path.resolve().name)} --without {name}"
+
+    return calibration_page(
+        session.rig,
+        file.pairs,
+        facts=facts,
+        overlays=paths,
+        pictures=picture,
+        rejecting=rejecting,
+        folder=shlex.quote(session.path.resolve().name),
+        has_previous=has_previous,
+    )
 
 
 def calibration_page(
-    rig: Rig, calibrations: Sequence[Calibration], *, facts: Sequence[Row], overlays: Overlays
+    rig: Rig,
+    calibrations: Sequence[Calibration],
+    *,
+    facts: Sequence[Row],
+    overlays: Overlays,
+    pictures: Pictures = lambda _c, _capture: "",
+    rejecting: Callable[[str], str] = lambda capture: f"lce-rig calibrate SESSION --without {capture}",
+    folder: str = "SESSION",
+    has_previous: bool = False,
 ) -> str:
     """Write the report of a result as one HTML file: the same result gives the same bytes.
 
@@ -85,11 +134,21 @@ def calibration_page(
         calibrations: one for each camera and LiDAR.
         facts: names and values that identify the result, for the end of the page.
         overlays: gives the images of a capture; the page shows them once they are drawn.
+        pictures: gives the small picture of a capture.
+        rejecting: gives the command that rejects a capture.
+        folder: of the session, for commands.
+        has_previous: as of `report_text`.
     """
     pairs = []
     for k, c in enumerate(calibrations):
         with style(f"pair-{k}"):
-            pairs.append(_pair(rig, c, f"pair-{k}", overlays))
+            pair = _pair(rig, c, f"pair-{k}", overlays)
+            # As many of each camera, so that the whole page stays small.
+            pair["gallery"] = _gallery(c, pair["captures"], pictures, _MOST_PICTURES // len(calibrations))
+            pair["steps"] = _next_steps(c, folder, has_previous)
+            worst = pair["gallery"][:1]
+            pair["rejecting"] = rejecting(worst[0]["name"]) if worst else ""
+            pairs.append(pair)
     return render("calibration.html", rig=rig.name, pairs=pairs, facts=facts)
 
 
@@ -122,7 +181,6 @@ def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str
         "calibration": c,
         "anchor": anchor,
         "statement": _statement(c),
-        "steps": _next_steps(c),
         "body_frames": (rig.lidars[c.lidar].frame, rig.cameras[c.camera].frame),
         "pose": _pose_rows(c),
         "uncertainty": [
@@ -151,6 +209,21 @@ def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str
         "refused": [(name, why.stage, as_markup(why.sentence)) for name, why in c.captures_refused.items()],
         "drawings": _drawings(c, board, lens, evidence, anchor),
     }
+
+
+def _gallery(
+    c: Calibration, captures: Sequence[Mapping[str, Any]], pictures: Pictures, n_most: int
+) -> list[dict[str, Any]]:
+    """List captures with their pictures, those with the largest residuals first."""
+    order = worst_first([r.plane_mean_m for r in c.residuals], [r.edge_mean_m for r in c.residuals])
+    return [
+        {
+            **captures[k],
+            "picture": pictures(c, c.residuals[k].capture),
+            "stands_out": f"{ratio:.1f} x the median" if ratio > _STANDS_OUT else "",
+        }
+        for k, ratio in order[: max(n_most, 1)]
+    ]
 
 
 def _drawings(
@@ -205,16 +278,18 @@ def _others(c: Calibration, severity: str = "warning") -> str:
     return f" {n} other reason{'s' if n > 1 else ''} below." if n > 0 else ""
 
 
-def _next_steps(c: Calibration) -> list[str]:
+def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
     """List the next steps, the most urgent first: the findings' actions, then the checks before use."""
     asked = [finding.advice for finding in sorted(c.findings, key=lambda f: f.severity != "error")]
     steps = [as_line(text) for text in dict.fromkeys(asked) if text]
     if c.verdict == "fail":
-        return [*steps, "Then run `lce-rig calibrate` again. The last usable result is in `previous/`."]
+        earlier = " The last usable result is in `previous/`." if has_previous else ""
+        return [*steps, f"Then run `lce-rig calibrate {folder}` again.{earlier}"]
     return [
         *steps,
-        "Look at the overlays (`lce-rig verify`): ring ends must lie on the board's outline on all sides.",
-        "Collect a second session on another day and compare both with `lce-rig repeat`.",
+        f"Look at the overlays (`lce-rig verify {folder}`): "
+        "ring ends must lie on the board's outline on all sides.",
+        f"Collect a second session on another day and compare both: `lce-rig repeat {folder} OTHER_SESSION`.",
     ]
 
 

@@ -10,9 +10,10 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import invert
 from lce_rig.rig import load_rig
 from lce_rig.show.report.calibration_drawings import gather
+from lce_rig.show.report.calibration_page import calibration_page
 from tests.export.conftest import calibration as without_boards
 
-from .conftest import RLFS, page
+from .conftest import RLFS, overlay_of, page
 
 _DRAWINGS = 9
 
@@ -65,6 +66,13 @@ def test_a_failed_result_is_explained(one):
     assert "&lt;board&gt;" in text
     assert "<code>still</code>" in text
     assert text.count("<svg ") == _DRAWINGS
+
+
+@pytest.mark.parametrize("has_previous", [True, False])
+def test_the_earlier_result_is_named_only_where_there_is_one(one, has_previous):
+    failed = replace(one, verdict="fail")
+    text = calibration_page(RLFS, [failed], facts=[], overlays=overlay_of, has_previous=has_previous)
+    assert ("previous/" in text) is has_previous
 
 
 def test_a_result_that_was_read_from_a_file_lacks_only_its_boards():

@@ -4,6 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from lce_rig.show.report.calibration_page import calibration_page
+from lce_rig.show.report.thumbnails import data_uri
+from tests.show.report.conftest import RLFS, overlay_of
+
 
 @pytest.mark.parametrize("width_px", [390, 1440])
 @pytest.mark.parametrize("which", ["one_page", pytest.param("two_page", marks=pytest.mark.long)])
@@ -15,6 +19,19 @@ def test_it_fits_the_screen_and_loads_nothing(browser, tmp_path, request, which,
     # A colour bar is a picture within the page.
     requested = [address for address in page.requested if not address.startswith("data:")]
     assert requested == [file.as_uri()]
+    assert page.complaints == []
+
+
+@pytest.mark.parametrize("width_px", [390, 1440])
+def test_pictures_of_captures_are_part_of_the_page(browser, one, tmp_path, width_px):
+    picture = data_uri(np.full((720, 1280), 90, np.uint8), np.empty((0, 2)))
+    text = calibration_page(RLFS, [one], facts=[], overlays=overlay_of, pictures=lambda _c, _capture: picture)
+    (tmp_path / "report.html").write_text(text, encoding="utf-8")
+    page = browser.open((tmp_path / "report.html").as_uri(), width_px, 844)
+    images = "[...document.querySelectorAll('.gallery img')]"
+    assert page.evaluate(f"{images}.length") == len(one.residuals)
+    assert page.evaluate(f"{images}.every((each) => each.naturalWidth > 100 && each.width < 400)")
+    assert page.evaluate("document.documentElement.scrollWidth") == width_px
     assert page.complaints == []
 
 

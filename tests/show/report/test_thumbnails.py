@@ -1,0 +1,60 @@
+"""Pictures of captures on the page: small for any image, outline on the board, largest residuals first."""
+
+import base64
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from lce_rig.core.calibration import Calibration
+from lce_rig.show.report.calibration_page import calibration_page
+from lce_rig.show.report.thumbnails import MOST_BYTES, data_uri, worst_first
+from tests.show.report.conftest import RLFS, overlay_of
+
+
+def decoded(uri: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
+
+
+@pytest.mark.parametrize("shape", [(1200, 1920, 3), (260, 346), (3000, 200), (40, 30)])
+def test_a_picture_is_small_even_of_noise(shape: tuple[int, ...]) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    uri = data_uri(pixels, np.array([[np.nan, 1.0], [1e9, -1e9]]))
+    assert 0 < len(uri) <= MOST_BYTES
+    height, width = decoded(uri).shape[:2]
+    assert width / height == pytest.approx(shape[1] / shape[0], rel=0.05)
+
+
+def test_the_outline_lies_where_the_board_is() -> None:
+    square = np.array([[400.0, 200.0], [800.0, 200.0], [800.0, 500.0], [400.0, 500.0]])
+    drawn = decoded(data_uri(np.zeros((720, 1280, 3), np.uint8), square)).astype(int)
+    v, u = np.nonzero(drawn.sum(axis=2) > 150)
+    assert (u.min(), v.min(), u.max(), v.max()) == pytest.approx((100, 50, 200, 125), abs=3)
+
+
+def test_the_capture_that_stands_out_comes_first() -> None:
+    order = worst_first([0.004, 0.005, 0.006, float("nan")], [0.01, 0.05, 0.01, 0.01])
+    assert order[0][0] == 1 and order[0][1] == pytest.approx(5.0)
+    assert sorted(k for k, _ in order) == [0, 1, 2, 3]
+    assert worst_first([], []) == []
+
+
+def test_the_page_shows_every_capture_with_the_command_that_rejects_the_worst(one: Calibration) -> None:
+    residuals = list(one.residuals)
+    residuals[3] = replace(residuals[3], plane_mean_m=0.2)
+    picture = data_uri(np.zeros((72, 128), np.uint8), np.empty((0, 2)))
+    text = calibration_page(
+        RLFS,
+        [replace(one, residuals=tuple(residuals))],
+        facts=[],
+        overlays=overlay_of,
+        pictures=lambda _c, _capture: picture,
+        rejecting=lambda capture: f"lce-rig calibrate s --without {capture}",
+    )
+    shown = re.findall(r'alt="Capture ([^"]+)"', text)
+    assert sorted(shown) == sorted(r.capture for r in residuals)
+    assert shown[0] == residuals[3].capture
+    assert f"lce-rig calibrate s --without {shown[0]}" in text
+    assert text.count(picture) == len(residuals)
