@@ -1,35 +1,36 @@
 """`lce-rig check`: report the detections in every capture, and the cause and action for refused ones."""
 
 import math
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
 import lce_rig as lce
+from lce_rig.calibrate.observations import group_placements
 from lce_rig.cli import show
-from lce_rig.cli.options import event_image_option, json_option, session_argument
+from lce_rig.cli.options import event_image_option, explain_option, json_option, session_argument
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.lidar.search import plane_limit_m
-from lce_rig.pipeline.matching import refusals_of
+from lce_rig.pipeline.matching import candidates_of, refusals_of
 from lce_rig.pipeline.verification import write_debug_images
 from lce_rig.rig import Rig
 
 
 @click.command()
 @session_argument
+@explain_option
 @json_option
 @click.option("--debug-images", is_flag=True, help="Write one image per capture into SESSION/debug/.")
 @event_image_option
-def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) -> None:
-    """Report the detections in each capture of SESSION (default: session/), or the cause of refusal.
+def check(session: Path, explain: bool, as_json: bool, debug_images: bool, event_image: Any) -> None:
+    """Report how many captures of SESSION (default: session/) are usable, and why the others are not.
 
-    Exits with 6 if no capture is usable.
+    Usable: both sensors detect the board, and agree on its place. Exits with 6 if no capture is usable.
     """
     opened = lce.Session.open(session)
     if not opened.captures:
@@ -43,13 +44,16 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
             folder = write_debug_images(opened, detections, event_image=event_image, progress=progress)
         show.note(f"debug images: {folder}")
     refusals = {pair: refusals_of(opened.rig, detections, pair) for pair in detections.pairs}
+    plates = {pair: _plates(opened.rig, detections, pair, refused) for pair, refused in refusals.items()}
+    placements = {pair: _placements(detections, pair, refused) for pair, refused in refusals.items()}
     records = {
         pair: {
-            name: _record(*detections.of(pair, name), refused.get(name)) for name in detections.captures(pair)
+            name: _record(*detections.of(pair, name), refused.get(name))
+            | {"placement": placements[pair].get(name)}
+            for name in detections.captures(pair)
         }
         for pair, refused in refusals.items()
     }
-    plates = {pair: _plates(opened.rig, detections, pair, refused) for pair, refused in refusals.items()}
     if as_json:
         pairs = [
             {
@@ -61,11 +65,18 @@ def check(session: Path, as_json: bool, debug_images: bool, event_image: Any) ->
         show.print_json({"format_version": 1, "rig": opened.rig.name, "pairs": pairs})
     else:
         for pair, refused in refusals.items():
-            show.print_table(_table(detections, pair, records[pair]))
-            _summarise(opened.rig, detections, pair, refused)
-            for finding in plates[pair]:
-                show.say(finding.sentence)
-    if all(len(refused) == len(detections.captures(pair)) for pair, refused in refusals.items()):
+            if explain:
+                show.print_table(_table(detections, pair, records[pair]))
+                show.print_lines(_limits(opened.rig, detections, pair, refused))
+            names, needed = detections.captures(pair), opened.rig.quality.min_captures
+            show.print_lines(_head(pair, names, refused, needed))
+            show.print_lines(_causes(names, refused, plates[pair], is_whole=explain))
+            show.print_lines(_repeated(placements[pair], is_whole=explain))
+    n_usable = max(len(detections.captures(pair)) - len(refused) for pair, refused in refusals.items())
+    if n_usable >= opened.rig.quality.min_captures:
+        of_session = "" if session == Path("session") else f" {session}"
+        show.note(f"  next         lce-rig calibrate{of_session}")
+    if n_usable == 0:
         raise NotEnoughDataError(
             f"{session}: no capture is usable",
             "Follow the actions above"
@@ -149,32 +160,89 @@ def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, di
     return "-" if value is None or sigma_m > _SIDE_SIGMA_MAX_M else f"{scale * value:.{digits}f}"
 
 
-def _summarise(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> None:
-    """Print how many captures are usable, and each cause of refusal once, with its captures."""
-    captures = detections.captures(pair)
-    usable = [name for name in captures if name not in refused]
-    n_detected = len(usable) + sum(why.stage == "pair" for why in refused.values())
-    needed = rig.quality.min_captures
+def _limits(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> list[str]:
+    """State the limit of the plane's thickness, which is by capture."""
     limits_mm = [
         1000 * plane_limit_m(rig.quality.max_thickness_m, lidar[0].quality.range_noise_m)
-        for lidar in (detections.of(pair, name)[1] for name in usable)
-        if isinstance(lidar, list)
+        for name in detections.captures(pair)
+        if name not in refused and isinstance(lidar := detections.of(pair, name)[1], list)
     ]
-    if limits_mm:
-        low, high = f"{min(limits_mm):.0f}", f"{max(limits_mm):.0f}"
-        noise = f"max_thickness_m {1000 * rig.quality.max_thickness_m:g} mm and the scan's noise"
-        show.say(f"plane: limit {low if low == high else f'{low} to {high}'} mm ({noise})")
-    show.say(
-        f"{len(usable)} of {len(captures)} captures are usable"
-        + (f"; both sensors found the board in {n_detected}" if n_detected > len(usable) else "")
-        + (f" (minimum {needed} for `lce-rig calibrate`)" if len(usable) < needed else "")
-    )
-    names: dict[str, list[str]] = {}
-    for name, refusal in sorted(refused.items()):
-        text = f"{refusal.stage}: {refusal.text}\n    -> {refusal.advice}"
-        names.setdefault(text, []).append(name)
-    for text, captured in names.items():
-        show.say(f"  {', '.join(captured)}: {text}")
-    by_stage = Counter(refusal.stage for refusal in refused.values())
-    if len(by_stage) > 1:
-        show.say("  refused by stage: " + ", ".join(f"{stage} {n}" for stage, n in sorted(by_stage.items())))
+    if not limits_mm:
+        return []
+    low, high = f"{min(limits_mm):.0f}", f"{max(limits_mm):.0f}"
+    noise = f"max_thickness_m {1000 * rig.quality.max_thickness_m:g} mm and the scan's noise"
+    return [f"plane: limit {low if low == high else f'{low} to {high}'} mm ({noise})"]
+
+
+def _head(pair: Pair, names: Sequence[str], refused: Mapping[str, Refusal], needed: int) -> list[str]:
+    """State how many captures are usable, and whether they suffice."""
+    n_usable = len(names) - len(refused)
+    n_detected = n_usable + sum(why.stage == "pair" for why in refused.values())
+    colour = "red" if n_usable < needed else "yellow" if refused else "green"
+    line = f"[bold]{pair}[/]: [{colour}]{n_usable} of {len(names)} captures usable[/]"
+    if n_usable < needed:
+        line += f" (minimum {needed})"
+    lines = [line]
+    if n_detected > n_usable:
+        lines.append(f"  both sensors detect the board in {n_detected}")
+    return lines
+
+
+def _causes(
+    names: Sequence[str], refused: Mapping[str, Refusal], plates: Sequence[Finding], *, is_whole: bool
+) -> list[str]:
+    """List refused captures, those with one cause and action together; a cause of the whole session first.
+
+    Args:
+        names: of all captures.
+        refused: by name.
+        plates: what is wrong with the plate's size in all scans.
+        is_whole: whether to list every capture with its figures.
+    """
+    lines = []
+    for finding in plates:
+        colour = "red" if finding.severity == "error" else "yellow"
+        lines += show.cause_lines(finding.text, finding.advice, colour)
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name in names:
+        if name in refused:
+            groups.setdefault((refused[name].code, refused[name].advice), []).append(name)
+    for (_, advice), captures in sorted(groups.items(), key=lambda group: -len(group[1])):
+        stage, texts = refused[captures[0]].stage, [refused[name].text for name in captures]
+        if len(set(texts)) == 1:
+            who = f"all {len(names)}" if len(captures) == len(names) > 1 else show.name_ranges(captures)
+            lines += show.cause_lines(f"{who} {stage}: {texts[0]}", advice)
+        elif len(captures) > _MOST_LISTED and not is_whole:
+            who = show.name_ranges(captures)
+            lines += show.cause_lines(f"{who} {stage}, such as {captures[0]}: {texts[0]}", advice)
+        else:
+            lines += [
+                f"  {name} {stage}: {show.escape(text)}" for name, text in zip(captures, texts, strict=True)
+            ]
+            lines.append(f"    -> {show.escape(advice)}")
+    return lines
+
+
+# Captures that are refused for one cause with different figures; of more, those of the first stand for all.
+_MOST_LISTED = 4
+
+
+def _placements(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> dict[str, int]:
+    """Number the board's placements in the usable captures."""
+    usable = [each for each in candidates_of(detections, pair)[0] if each.capture not in refused]
+    numbers = group_placements(usable).tolist()
+    return {observation.capture: number for observation, number in zip(usable, numbers, strict=True)}
+
+
+def _repeated(placements: Mapping[str, int], *, is_whole: bool) -> list[str]:
+    """Name captures that show one placement; such captures are not independent."""
+    groups: dict[int, list[str]] = {}
+    for name, number in placements.items():
+        groups.setdefault(number, []).append(name)
+    repeated = sorted((names for names in groups.values() if len(names) > 1), key=len, reverse=True)
+    if not repeated:
+        return []
+    shown = repeated if is_whole else repeated[:2]
+    texts = [f"{show.name_ranges(names)} show one" for names in shown]
+    texts += [f"{len(repeated) - len(shown)} more repeated"] if len(shown) < len(repeated) else []
+    return [f"  {show.counted(len(groups), 'placement')}: {'; '.join(texts)}"]

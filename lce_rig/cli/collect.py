@@ -92,6 +92,9 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 )
 @click.option(
     "--captures",
+    # Earlier names of this option.
+    "--frames",
+    "--max-captures",
     "n_wanted",
     type=click.IntRange(1),
     metavar="N",
@@ -194,6 +197,7 @@ def _keep_text(session: Path, rig_name: str) -> None:
         Session.open(session).keep_text(read_profile(find_profile(rig_name)))
 
 
+_MOST_CAUSES = 5
 _OF_RECORDINGS = ("pair", "pair_tolerance", "topics", "cameras", "channels", "lidars")
 
 
@@ -242,7 +246,9 @@ def _tell(report: Any, session: Path, n_captures: int) -> None:
         show.warn(f"{label}: {refusal.sentence}")
     counts = report.counts.counts()
     if counts:
-        show.note("not captured:\n" + "\n".join(f"  {n} x {why.sentence}" for why, n in counts))
+        lines = [f"  {n} x {why.sentence}" for why, n in counts[:_MOST_CAUSES]]
+        lines += [f"  {len(counts) - _MOST_CAUSES} more causes"] if len(counts) > _MOST_CAUSES else []
+        show.note("not captured:\n" + "\n".join(lines))
     if report.n_missing:
         show.warn(f"{report.n_missing} captures short of the target")
     new = f"{len(report.captured)} new" + (f", {report.n_known} held already" if report.n_known else "")

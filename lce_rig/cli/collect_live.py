@@ -200,12 +200,23 @@ def _tell(
 
 
 def show_next(path: Path, rig: Rig, predicted: Sequence[Finding], n_captures: int) -> None:
-    """Print the predicted standard deviations and the next command."""
+    """State whether the target is predicted to be met, by which figures, and the next command."""
     for prediction in predicted:
-        show.note(prediction.sentence)
+        show.note(f"  {'target met' if is_met(prediction) else 'not yet met'}  {prediction.text}")
     if n_captures < rig.quality.min_captures:
-        show.note(f"{show.counted(n_captures, 'capture')} (minimum {rig.quality.min_captures}): collect more")
-    elif predicted and not all(prediction.figures["is_enough"] for prediction in predicted):
-        show.note("the target is not predicted to be met: collect more, or see what these captures give")
-    if n_captures >= rig.quality.min_captures:
-        show.note(f"next: lce-rig calibrate {path}")
+        show.note(f"  next         collect {rig.quality.min_captures - n_captures} more captures at least")
+        return
+    if predicted and not all(map(is_met, predicted)):
+        show.note("  next         collect more, or see the result so far:")
+    show.note(f"  next         lce-rig calibrate {path}")
+
+
+def is_met(prediction: Finding) -> bool:
+    """Tell whether the predicted standard deviations are within the profile's target.
+
+    The guide itself ends a collection later, when they are within it with a margin.
+    """
+    return all(
+        prediction.figure(figure) <= prediction.figure(target)
+        for figure, target in (("rotation_deg", "target_deg"), ("position_mm", "target_mm"))
+    )

@@ -28,6 +28,7 @@ from lce_rig.rig.target_settings import TargetSettings
 )
 @click.option("--name", metavar="NAME", help="Deploy this result of SESSION (see `lce-rig results`).")
 @click.option("--dry-run", is_flag=True, help="Print what would change; change nothing.")
+@click.option("--diff", is_flag=True, help="With --dry-run: print the lines that would change.")
 @click.option("--status", is_flag=True, help="Print what is at the target; change nothing.")
 @click.option("--rollback", is_flag=True, help="Restore the files that were there before.")
 @click.option("--release", metavar="NAME", help="With --rollback: restore this release (see --status).")
@@ -40,6 +41,7 @@ def deploy(
     targets: Path | None,
     name: str | None,
     dry_run: bool,
+    diff: bool,
     status: bool,
     rollback: bool,
     release: str | None,
@@ -59,6 +61,8 @@ def deploy(
     """
     if sum((dry_run, status, rollback)) > 1:
         raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
+    if diff and not dry_run:
+        raise UsageError("--diff applies to --dry-run only", "Add --dry-run.")
     if release is not None and not rollback:
         raise UsageError("--release applies to --rollback only", "Add --rollback.")
     if force and not reason.strip():
@@ -80,7 +84,8 @@ def deploy(
     target = find_target(target_name, targets, session, opened.rig)
     result = opened.path.joinpath(*result_parts(name))
     if dry_run:
-        _show_plan(deployment.plan(result, opened.rig, target, session=opened), target, as_json=as_json)
+        plan = deployment.plan(result, opened.rig, target, session=opened)
+        _show_plan(plan, target, has_diff=diff, as_json=as_json)
         return
     if target.run is not None:
         show.note(f"afterwards there: {target.run}")
@@ -88,7 +93,7 @@ def deploy(
     _show_done(done, target, as_json=as_json)
 
 
-def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
+def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: bool) -> None:
     if as_json:
         show.print_json(
             {
@@ -110,6 +115,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
                 ],
                 "objections": plan.objections,
                 "remarks": plan.remarks,
+                **({"diff": plan.diff} if has_diff else {}),
             }
         )
         return
@@ -123,12 +129,19 @@ def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
     _warn_of_changes(plan.changed_there)
     if plan.is_in_place:
         show.say("nothing to change: these very files are in place")
-    for name, how in plan.changed.items():
-        show.say(show.escape(f"  {name}: {how}"))
+    for how in dict.fromkeys(plan.changed.values()):
+        names = [name for name, change in plan.changed.items() if change == how]
+        show.say(f"  {_CHANGES.get(how, how)} {', '.join(names)}")
     for each in plan.remarks:
         show.note(each.text)
     for each in plan.objections:
         show.warn(f"would be refused: {each.text}")
+    if has_diff:
+        for line in plan.diff:
+            click.echo(line)
+
+
+_CHANGES = {"added": "new:", "missing": "removed:", "changed": "changed:"}
 
 
 def _show_standing(standing: Standing, target: TargetSettings, *, as_json: bool) -> None:

@@ -10,7 +10,7 @@ from rich.padding import Padding
 from rich.table import Table
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, json_option, rig_option
+from lce_rig.cli.options import FiniteRange, explain_option, json_option, rig_option
 from lce_rig.core.findings import worst
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import sensors
@@ -25,6 +25,7 @@ _FILE_WIDTH = 160
 
 @click.command()
 @rig_option
+@explain_option
 @json_option
 @click.option(
     "--duration",
@@ -43,11 +44,12 @@ _FILE_WIDTH = 160
     metavar="FOLDER",
     help="Measure the disk of this folder, in which sessions will be written  [default: the current one]",
 )
-def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
-    """Check this computer and every sensor of a rig, with one line per check and an action per fault.
+def doctor(rig_name: str, explain: bool, as_json: bool, duration: float, folder: Path) -> int:
+    """Check this computer and every sensor of a rig, and print faults with an action each.
 
-    ok: no fault. warn: collecting works, with limits. FAIL: collecting does not work, or its data would be
-    wrong. An absent device has one line; the others are checked all the same.
+    ok: no fault; --explain prints these checks, too. warn: collecting works, with limits. FAIL: collecting
+    does not work, or its data would be wrong. An absent device has one line; the others are checked all the
+    same.
 
     Exits with 5 if a check reports FAIL, else with 0.
     """
@@ -68,19 +70,27 @@ def doctor(rig_name: str, as_json: bool, duration: float, folder: Path) -> int:
         ]
         show.print_json({"format_version": 2, "rig": rig.name, "severity": severity, "checks": lines})
     else:
-        _print_checks(checks)
         n = Counter(check.severity for check in checks)
         if n["error"]:
-            show.say(f"{n['error']} FAIL, {n['warning']} warn, {n['note']} ok: follow the lines after ->")
+            show.say(f"not fit to collect: {n['error']} FAIL, {n['warning']} warn, {n['note']} ok")
         elif n["warning"]:
-            show.say(f"{n['warning']} warn, {n['note']} ok: fit to collect, with the limits above")
+            show.say(f"fit to collect, with limits: {n['warning']} warn, {n['note']} ok")
         else:
-            show.say(f"all {n['note']} ok: fit to collect")
+            show.say(f"fit to collect: all {n['note']} ok")
+        _print_checks(
+            checks if explain else [each for each in _worst_first(checks) if each.severity != "note"]
+        )
     return _EXIT_ERROR if severity == "error" else 0
+
+
+def _worst_first(checks: list[Check]) -> list[Check]:
+    return sorted(checks, key=lambda check: check.severity != "error")
 
 
 def _print_checks(checks: list[Check]) -> None:
     """Print a line per check, and its actions below it in the full width."""
+    if not checks:
+        return
     widths = [4, *(max(len(getattr(check, column)) for check in checks) for column in ("subject", "name"))]
     console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
     last = ""

@@ -2,15 +2,17 @@
 
 import math
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, json_option
+from lce_rig.cli.options import FiniteRange, explain_option, json_option
 from lce_rig.core.calibration import ResultFile, read_result
-from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
+from lce_rig.core.errors import LceRigError, NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.interrupts import patience
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import open_live
@@ -18,7 +20,7 @@ from lce_rig.pipeline.verification import profile_behind
 from lce_rig.pipeline.watch_drift import DriftReport, PairDrift, drift_live
 from lce_rig.pipeline.watch_drift import drift as watch_drift
 from lce_rig.rig import Rig, load_rig
-from lce_rig.scene.drift import AxisDrift
+from lce_rig.scene.drift import AxisDrift, State
 from lce_rig.scene.findings import STATES
 from lce_rig.show.screen.keys import controls
 
@@ -46,6 +48,7 @@ from lce_rig.show.screen.keys import controls
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Write images into this folder."
 )
+@explain_option
 @json_option
 def drift(
     recordings: tuple[Path, ...],
@@ -53,6 +56,7 @@ def drift(
     rig_name: str | None,
     seconds: float | None,
     output: Path | None,
+    explain: bool,
     as_json: bool,
 ) -> None:
     """Check on RECORDING (default: session/), without a board, whether extrinsics still hold.
@@ -87,16 +91,17 @@ def drift(
         show.print_json({"format_version": 1, "rig": report.rig.name, "pairs": pairs})
     else:
         for pair in report.pairs:
-            show.print_table(_table(pair))
-            show.print_lines(_summary(pair))
+            if explain:
+                show.print_table(_table(pair))
+            show.print_lines(_lines(pair, is_explained=explain))
         for file in files:
             show.say(f"image: {file}")
-    for state, error in (("changed", ResultRefusedError), ("unknown", NotEnoughDataError)):
+    outcomes: dict[State, type[LceRigError]] = {"changed": ResultRefusedError, "unknown": NotEnoughDataError}
+    for state, error in outcomes.items():
         concerned = [pair for pair in report.pairs if pair.state == state]
         if concerned:
-            first = concerned[0].summary
-            names = " and ".join(f"{pair.calibration.camera}, {pair.calibration.lidar}" for pair in concerned)
-            raise error(f"{names}: {first.text}", as_line(first.advice))
+            summary, names = concerned[0].summary, ", ".join(map(_sensors, concerned))
+            raise error(f"{STATES[state]}: {names}", as_line(summary.advice) if as_json else "")
 
 
 # What was seen is judged after Ctrl-C; a second one ends that too.
@@ -128,7 +133,7 @@ _COLOURS = {"unchanged": "none", "changed": "red", "unknown": "yellow"}
 def _table(pair: PairDrift) -> Any:
     opinions = [("scene", pair.drift.axes if pair.drift.curves else None)]
     opinions += [] if pair.board is None else [("board", pair.board.axes)]
-    title = f"{pair.calibration.camera}, {pair.calibration.lidar} (camera: x right, y down, z forward)"
+    title = f"{_sensors(pair)} (camera: x right, y down, z forward)"
     # With two opinions, all fits into 80 columns.
     headings = [
         heading for name, _ in opinions for heading in (f">{name}:\nbest fit at", ">would\nhave seen")
@@ -150,18 +155,78 @@ def _figures(axis: AxisDrift | None) -> tuple[str, str]:
     return best, f"{scale * axis.smallest:.{digits}f}" if math.isfinite(axis.smallest) else "-"
 
 
-def _summary(pair: PairDrift) -> list[str]:
-    line = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
-    if pair.board is not None:
-        line += (
-            f"; {show.counted(pair.board.n_boards, 'board')} at {pair.board.n_placements} places, residuals: "
-            f"planes {1000 * pair.board.metrics.mpe_m:.1f} mm, edges {1000 * pair.board.metrics.mee_m:.1f} mm"
+def _sensors(pair: PairDrift) -> str:
+    return f"{pair.calibration.camera}, {pair.calibration.lidar}"
+
+
+# Of one axis or one opinion; the lines by state name the axes already.
+_OF_AXES = (
+    "scene.axis_unchanged",
+    "scene.axis_changed",
+    "scene.large_scatter",
+    "scene.flat",
+    "scene.no_peak",
+    "scene.best_uncertain",
+    "scene.board_changed",
+    "scene.board_unsure",
+)
+_OF_SCENE = ("scene.unchanged", "scene.changed", "scene.unknown")
+
+
+def _lines(pair: PairDrift, *, is_explained: bool) -> list[str]:
+    """State the verdict, the axes by their state, further causes, and one action."""
+    colour = {"unchanged": "green", "changed": "red", "unknown": "yellow"}[pair.state]
+    data = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
+    data += "" if pair.board is None else f", {show.counted(pair.board.n_boards, 'board')}"
+    lines = [f"[bold]{_sensors(pair)}[/]: [{colour}]{STATES[pair.state]}[/] ({data})"]
+    opinions = [_opinion(pair, index) for index in range(len(pair.drift.axes))]
+    for state, title in _TITLES.items():
+        if state != pair.state or state != "unknown" or len(set(pair.states.values())) > 1:
+            parts = _by_kind([each for each in opinions if each.state == state])
+            lines += show.titled_lines(title, parts)
+    if pair.board is not None and is_explained:
+        metrics = pair.board.metrics
+        lines.append(
+            f"  boards at {pair.board.n_placements} places, residuals: planes {1000 * metrics.mpe_m:.1f} mm, "
+            f"edges {1000 * metrics.mee_m:.1f} mm"
         )
     # With a board, the verdict on both stands for the scene's own.
-    untold = {"scene.axis_unchanged", "scene.board_unsure"}
-    if pair.board is not None:
-        untold |= {"scene.unchanged", "scene.changed", "scene.unknown"}
-    return [
-        line,
-        *(show.escape(as_line(finding.text)) for finding in pair.findings if finding.code not in untold),
-    ]
+    omitted = {pair.summary.code, *(_OF_SCENE if pair.board is not None else ())}
+    for finding in pair.findings:
+        if finding.code in omitted and finding.code != "scene.few_edges":
+            continue
+        if is_explained or (finding.severity != "note" and finding.code not in _OF_AXES):
+            lines.append(f"  {show.escape(as_line(finding.text))}")
+    if pair.summary.advice:
+        lines.append(f"  -> {show.escape(as_line(pair.summary.advice))}")
+    return lines
+
+
+_TITLES: dict[State, str] = {"changed": "changed", "unknown": "cannot tell", "unchanged": "would see"}
+
+
+def _opinion(pair: PairDrift, index: int) -> AxisDrift:
+    """Return what the scene or the boards measured along an axis, whichever decided its state."""
+    scene = pair.drift.axes[index]
+    state = pair.states[scene.axis]
+    if pair.board is None:
+        return scene
+    deciding = [each for each in (scene, pair.board.axes[index]) if each.state == state]
+    best = min(deciding or [pair.board.axes[index]], key=lambda axis: axis.smallest)
+    return replace(best, state=state)
+
+
+def _by_kind(axes: Sequence[AxisDrift]) -> list[str]:
+    """Name axes of one state, those of rotation first: the change, or the smallest that would be seen."""
+    lines = []
+    for is_rotation, kind, unit in ((True, "about", "deg"), (False, "along", "mm")):
+        names = []
+        for axis in axes:
+            if axis.is_rotation is is_rotation:
+                best, smallest = _figures(axis)
+                figure = {"changed": best, "unknown": "", "unchanged": smallest}[axis.state]
+                names.append(f"{axis.axis[-1]} {figure}".strip())
+        if names:
+            has_figures = axes[0].state != "unknown"
+            lines.append(f"{kind} {', '.join(names)}{f' {unit}' if has_figures else ''}")
+    return lines

@@ -15,7 +15,7 @@ from lce_rig.cli.options import FiniteRange, json_option, registry_option, split
 from lce_rig.core.calibration import DEFAULT_METHOD, Method
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
 from lce_rig.core.interrupts import patience
-from lce_rig.core.phrasing import as_line
+from lce_rig.core.phrasing import as_line, significant
 from lce_rig.session.durable import write_atomically
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _SHOWN = (
     "sigma_rotation_deg",
     "sigma_translation_m",
 )
-_MOST_SHOWN, _MOST_FINDINGS = 1000, 20
+_MOST_SHOWN, _MOST_FINDINGS, _MOST_CAUSES = 100, 5, 5
 
 
 @click.group()
@@ -143,8 +143,12 @@ def run(
         return
     statuses = ", ".join(f"{status} {n}" for status, n in done.statuses.most_common())
     show.say(f"{show.counted(done.n_new, 'session')} run, {done.n_held} held already: {statuses}")
-    for cause, n in done.causes.most_common():
+    for cause, n in done.causes.most_common(_MOST_CAUSES):
         show.say(f"  {n} x {cause}")
+    if len(done.causes) > _MOST_CAUSES:
+        show.say(
+            f"  {len(done.causes) - _MOST_CAUSES} more causes: lce-rig fleet table --registry {registry}"
+        )
     show.say(f"{place.url}: {show.counted(len(done.table), 'row')} in the table")
 
 
@@ -213,7 +217,7 @@ def _cell(value: Any) -> str:
     if isinstance(value, list):
         return show.escape(" ".join(map(str, value)))
     if isinstance(value, float):
-        return f"{value:.4g}" if math.isfinite(value) else "-"
+        return significant(value, 4) if math.isfinite(value) else "-"
     return show.escape(str(value))
 
 
@@ -333,11 +337,12 @@ def deploy(
     else:
         counts = ", ".join(f"{_words(state)} {n}" for state, n in rollout.counts.most_common())
         show.say(f"{rollout.target}: {counts or 'nothing deployed yet'}")
-        table = show.plain_table("", "robot", "state", "release", "replaces")
-        for state in rollout.robots.values():
-            cells = (state.robot, _words(state.state), state.release or "-", state.replaces or "-")
-            table.add_row(*map(show.escape, cells))
-        show.print_table(table)
+        if status:
+            table = show.plain_table("", "robot", "state", "release", "replaces")
+            for state in rollout.robots.values():
+                cells = (state.robot, _words(state.state), state.release or "-", state.replaces or "-")
+                table.add_row(*map(show.escape, cells))
+            show.print_table(table)
         for state in rollout.robots.values():
             if state.detail:
                 show.note(f"{state.robot}: {_line(state)}")

@@ -6,8 +6,9 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import cameras_option, require_sensors, session_argument, split_names
+from lce_rig.cli.options import cameras_option, explain_option, require_sensors, session_argument, split_names
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
+from lce_rig.core.phrasing import as_line
 from lce_rig.judge.intrinsics_check import describe as figures_of
 from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
 from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
@@ -38,6 +39,7 @@ _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
     help="Write the session's profile to a new file, with the intrinsics that the session determines better.",
 )
 @click.option("--force", is_flag=True, help="With --save-profile: write all estimated intrinsics.")
+@explain_option
 @click.option("--json", "as_json", is_flag=True, help="Print intrinsics.json on stdout.")
 def intrinsics(
     session: Path,
@@ -46,6 +48,7 @@ def intrinsics(
     model: str | None,
     save_profile: Path | None,
     force: bool,
+    explain: bool,
     as_json: bool,
 ) -> None:
     """Estimate each camera's intrinsics from the boards in the images of SESSION (default: session/).
@@ -75,10 +78,11 @@ def intrinsics(
         show.print_json(document(opened.rig, measured))
     else:
         for one in measured:
-            show.print_lines(_head(one))
-            show.print_table(_table(one))
-            show.print_lines(_findings(one))
-    show.note("written: " + ", ".join(path.name for path in files) + f" in {files[0].parent}")
+            show.print_lines(_lines(one, is_explained=explain))
+            if explain:
+                show.print_table(_table(one))
+                show.print_lines(_explanation(one))
+    show.note(f"  files        {files[0].parent}/: {', '.join(path.name for path in files)}")
     if save_profile is not None:
         replaced = write_profile(opened, measured, save_profile, is_forced=force)
         show.note(f"written: {save_profile}, with new intrinsics of {', '.join(replaced)}")
@@ -91,22 +95,29 @@ def intrinsics(
         raise join_shortages(troubles)
 
 
-def _head(measured: MeasuredIntrinsics) -> list[str]:
-    estimate = measured.estimate
-    n = len({view.capture for view in estimate.views})
-    (along_width, along_height, aspect), sigma = estimate.pattern_shape
-    lines = [
-        f"[bold]{measured.camera}[/] ({', '.join(measured.channels)}): {estimate.model.name} from "
-        f"{len(estimate.views)} images of {n} captures",
-        f"  corners   {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on held-out captures",
-        f"  covered   {100 * measured.certainty.is_covered.mean():.0f} % of the image",
-        # The board's deviation from its nominal shape, estimated with the intrinsics.
-        f"  board     bow {1000 * along_width:+.1f}, {1000 * along_height:+.1f} mm (width, height), pattern "
-        f"{100 * aspect:+.2f} +- {100 * sigma[2]:.2f} % too wide, "
-        f"corner error {1000 * estimate.print_rms_m:.2f} mm",
+def _lines(measured: MeasuredIntrinsics, *, is_explained: bool) -> list[str]:
+    """State the judgement with its action, the fit, the intrinsics and the weakness that matters most."""
+    estimate, lens, judgement = measured.estimate, measured.intrinsics, measured.judgement
+    covered = f"{100 * measured.certainty.is_covered.mean():.0f}"
+    colour = {"intrinsics.fit": "green", "intrinsics.better": "red"}.get(judgement.code, "yellow")
+    lines = [f"[bold]{measured.camera}[/]: [{colour}]{show.escape(judgement.text)}[/]"]
+    lines += [f"  -> {show.escape(as_line(judgement.advice))}"] if judgement.advice else []
+    if measured.check is None:
+        size = f"{measured.given.width_px}x{measured.given.height_px}"
+        lines.append(f"  [red]the profile's intrinsics are for {size} px, the images have another size[/]")
+    lines += [
+        f"  estimate     {estimate.model.name}, {len(estimate.views)} images of "
+        f"{', '.join(measured.channels)}, {covered} % of the image covered",
+        f"  corners      {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on held-out ones",
+        f"  values       fx {lens.fx_px:.1f}, fy {lens.fy_px:.1f}, cx {lens.cx_px:.1f}, "
+        f"cy {lens.cy_px:.1f} px",
     ]
-    if measured.choice is not None:
-        lines.append(f"  model     {show.escape(measured.choice.reason)}")
+    if is_explained or judgement.code == "intrinsics.fit":
+        return lines
+    weaknesses = [text for text in measured.weaknesses if text not in judgement.sentence]
+    lines += [f"  [yellow]{show.escape(text)}[/]" for text in weaknesses[:1]]
+    if len(weaknesses) > 1:
+        lines.append(f"  {len(weaknesses) - 1} more: --explain")
     return lines
 
 
@@ -130,18 +141,23 @@ def _table(measured: MeasuredIntrinsics) -> Any:
     return table
 
 
-def _findings(measured: MeasuredIntrinsics) -> list[str]:
-    lines = []
-    if measured.check is None:
-        lens = measured.given
-        size = f"{lens.width_px}x{lens.height_px}"
-        lines.append(f"  [red]the profile's intrinsics are for {size} px, the images have another size[/]")
-    else:
+def _explanation(measured: MeasuredIntrinsics) -> list[str]:
+    """State the board's shape, the choice of the model, what does not fit, and images that are not used."""
+    estimate = measured.estimate
+    (along_width, along_height, aspect), sigma = estimate.pattern_shape
+    # The board's deviation from its nominal shape, estimated with the intrinsics.
+    lines = [
+        f"  board     bow {1000 * along_width:+.1f}, {1000 * along_height:+.1f} mm (width, height), pattern "
+        f"{100 * aspect:+.2f} +- {100 * sigma[2]:.2f} % too wide, "
+        f"corner error {1000 * estimate.print_rms_m:.2f} mm",
+    ]
+    if measured.choice is not None:
+        lines.append(f"  model     {show.escape(measured.choice.reason)}")
+    if measured.check is not None:
         lines.append(f"  {figures_of(measured.check)}")
     if measured.misfit is not None:
         colour = "red" if measured.misfit.severity == "error" else "yellow"
         lines.append(f"  [{colour}]{show.escape(measured.misfit.text)}[/]")
-    lines.append(f"  {show.escape(measured.judgement.sentence)}")
     lines += [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
     for name, why in measured.refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]")

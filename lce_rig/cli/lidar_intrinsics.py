@@ -8,7 +8,7 @@ import numpy as np
 
 from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors
 from lce_rig.cli import show
-from lce_rig.cli.options import json_option
+from lce_rig.cli.options import explain_option, json_option
 from lce_rig.core.errors import UsageError
 from lce_rig.pipeline.measure_lidar import measure_lidar, save_lidar
 from lce_rig.session import Session
@@ -23,9 +23,10 @@ from lce_rig.session import Session
     metavar="FILE",
     help="Write the first session's profile to a new file, with the estimated errors.",
 )
+@explain_option
 @json_option
 def lidar_intrinsics(
-    sessions: tuple[Path, ...], lidar: str | None, save_profile: Path | None, as_json: bool
+    sessions: tuple[Path, ...], lidar: str | None, save_profile: Path | None, explain: bool, as_json: bool
 ) -> None:
     """Estimate the constant errors of a LiDAR from the boards of one or several SESSIONs.
 
@@ -40,13 +41,13 @@ def lidar_intrinsics(
     with show.progress_bar("detecting") as progress:
         errors = measure_lidar(opened, lidar, progress=progress)
     document = _document(errors)
-    show.print_json(document) if as_json else _print(document)
+    show.print_json(document) if as_json else _print(document, is_explained=explain)
     if save_profile is not None:
         save_lidar(opened[0], lidar, errors, save_profile)
         show.note(f"written: {save_profile}")
 
 
-def _print(document: dict[str, Any]) -> None:
+def _print(document: dict[str, Any], *, is_explained: bool) -> None:
     mm, n_captures = 1e3, document["n_captures"]
     lateral, vertical = (
         f"{mm * document[f'lens_{value}']:+.1f} +- {mm * document[f'lens_{sigma}']:.1f} mm"
@@ -55,12 +56,27 @@ def _print(document: dict[str, Any]) -> None:
             ("vertical_m_per_rad", "vertical_sigma_m_per_rad"),
         )
     )
+    lasers = document["lasers"]
+    lines = [
+        f"{show.counted(sum(n_captures), 'capture')} of {show.counted(len(n_captures), 'session')}, "
+        f"{len(lasers)} lasers"
+    ]
+    for name, key, scale, digits, unit in (
+        ("range", "range{}_m", mm, 1, "mm"),
+        ("azimuth", "azimuth{}_deg", 1.0, 3, "deg"),
+        ("elevation", "elevation{}_deg", 1.0, 3, "deg"),
+    ):
+        errors = [scale * row[key.format("")] for row in lasers]
+        sigma = float(np.median([scale * row[key.format("_sigma")] for row in lasers]))
+        lines.append(
+            f"  {name:<13}{min(errors):+.{digits}f} to {max(errors):+.{digits}f} {unit} "
+            f"(median standard deviation {sigma:.{digits}f} {unit})"
+        )
     show.print_lines(
-        [
-            f"{show.counted(sum(n_captures), 'capture')} of {show.counted(len(n_captures), 'session')}",
-            f"  lens  {lateral} beside the axis, {vertical} per rad of elevation",
-        ]
+        [*lines, f"  {'lens':<13}{lateral} beside the axis", f"  {'':<13}{vertical} per rad of elevation"]
     )
+    if not is_explained:
+        return
     angles = (">azimuth deg", ">sigma", ">elevation deg", ">sigma")
     table = show.plain_table("", ">laser", ">range mm", ">sigma", *angles, ">returns")
     for row in document["lasers"]:

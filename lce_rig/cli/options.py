@@ -36,6 +36,8 @@ rig_option = click.option(
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
 
+explain_option = click.option("--explain", is_flag=True, help="Print all figures and causes.")
+
 robot_option = click.option(
     "--robot", metavar="NAME", help="Name the robot that carries the rig; the result says so."
 )

@@ -13,6 +13,7 @@ from lce_rig.cli.options import EVENT_IMAGES, FiniteRange
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
+from lce_rig.core.phrasing import significant
 from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor
 from lce_rig.detect.events.reconstruct.filters import measure_flicker
 from lce_rig.io.events import open_events
@@ -129,8 +130,8 @@ def _stamps(
     n_wanted = (wanted.stop - wanted.start - 1) // every_ns + 1
     if n_wanted > _MAX_IMAGES:
         raise UsageError(
-            f"{recording} lasts {1e-9 * (last_ns - first_ns):.3g} s: {n_wanted:.3g} images, "
-            f"maximum {_MAX_IMAGES}. Set --duration or a longer --every."
+            f"{recording} lasts {significant(1e-9 * (last_ns - first_ns), 3)} s: "
+            f"{significant(n_wanted, 3)} images, maximum {_MAX_IMAGES}. Set --duration or a longer --every."
         )
     return wanted
 

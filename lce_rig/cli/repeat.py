@@ -7,9 +7,9 @@ import click
 import numpy as np
 
 from lce_rig.cli import show
-from lce_rig.cli.options import json_option
+from lce_rig.cli.options import explain_option, json_option
 from lce_rig.core.errors import ResultRefusedError, UsageError
-from lce_rig.core.phrasing import as_line
+from lce_rig.core.phrasing import as_line, significant
 from lce_rig.judge.repeatability import Repeatability
 from lce_rig.pipeline.comparison import compare_results
 from lce_rig.pipeline.comparison import repeat as compare
@@ -24,8 +24,9 @@ from lce_rig.pipeline.comparison import repeat as compare
     multiple=True,
     help="Compare this named result (see `lce-rig results`); repeatable with one session.",
 )
+@explain_option
 @json_option
-def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) -> None:
+def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as_json: bool) -> None:
     """Compare the calibrations of two or more independent SESSIONs of one rig, or the results of one SESSION.
 
     The best test of extrinsics: collect again with new board placements, and compare the differences of the
@@ -70,9 +71,10 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], as_json: bool) ->
         )
     else:
         for comparison in compared.comparisons:
-            show.print_table(_deviations(comparison))
-            show.print_table(_differences(comparison))
-            show.print_lines(_summary(comparison))
+            show.print_lines(_lines(comparison))
+            if explain:
+                show.print_table(_deviations(comparison))
+                show.print_table(_differences(comparison))
     if compared.failed:
         raise ResultRefusedError(
             "; ".join(finding.text for finding in compared.failed), compared.failed[0].advice
@@ -101,27 +103,30 @@ def _differences(comparison: Repeatability) -> Any:
         at_boards = ", ".join(f"{1000 * m:.1f} at {at_m:g} m" for at_m, m in pair.displacements_m.items())
         sizes = f"{pair.rotation_deg:.3f}", f"{1000 * pair.translation_m:.1f}"
         figures = (*sizes, at_boards or "-", f"{pair.distance:.1f}")
-        table.add_row(show.escape(pair.first), show.escape(pair.second), *figures, f"{pair.p:.2g}")
+        table.add_row(show.escape(pair.first), show.escape(pair.second), *figures, significant(pair.p))
     return table
 
 
-def _summary(comparison: Repeatability) -> list[str]:
+def _lines(comparison: Repeatability) -> list[str]:
+    """State whether the sessions agree, the mean extrinsics, and the spread with the reported one."""
     c = comparison
     scatter = ""
     if c.scatter_rotation_deg is not None and c.scatter_translation_m is not None:
-        scatter = f", of which independent {c.scatter_rotation_deg:.3f} deg, "
-        scatter += f"{1000 * c.scatter_translation_m:.1f} mm"
-    lines = [
-        "mean T_cam_lidar (p_cam = R p_lidar + t)",
-        *show.matrix_lines(c.T_cam_lidar, "  "),
-        f"spread   {c.spread_rotation_deg:.3f} deg, {1000 * c.spread_translation_m:.1f} mm "
-        "(1 sigma of one session)",
-        f"reported {c.reported_rotation_deg:.3f} deg, {1000 * c.reported_translation_m:.1f} mm{scatter}",
-        f"chi2     {c.chi2:.1f} with {c.dof} degrees of freedom, chance {c.p:.2g}"
-        + ("" if c.are_independent else " (at least: the results share captures)"),
-    ]
+        scatter = f" (independent {c.scatter_rotation_deg:.3f} deg, {1000 * c.scatter_translation_m:.1f} mm)"
+    shared = "" if c.are_independent else ", at least: the results share captures"
     colour = "green" if c.agrees else "red"
-    return [*lines, f"[{colour}]{show.escape(as_line(c.finding.sentence))}[/]"]
+    lines = [f"[bold]{_sensors(c)}[/]: [{colour}]{show.escape(as_line(c.finding.text))}[/]"]
+    lines += [f"  -> {show.escape(as_line(c.finding.advice))}"] if c.finding.advice else []
+    return [
+        *lines,
+        "  mean T_cam_lidar (p_cam = R p_lidar + t)",
+        *show.matrix_lines(c.T_cam_lidar, "    "),
+        f"  spread       {c.spread_rotation_deg:.3f} deg, {1000 * c.spread_translation_m:.1f} mm "
+        "(1 sigma of one session)",
+        f"  reported     {c.reported_rotation_deg:.3f} deg, {1000 * c.reported_translation_m:.1f} mm"
+        + scatter,
+        f"  chance       {significant(c.p)}{shared} (chi2 {c.chi2:.1f}, {c.dof} degrees of freedom)",
+    ]
 
 
 def _sensors(comparison: Repeatability) -> str:

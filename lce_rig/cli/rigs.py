@@ -69,12 +69,19 @@ def list_profiles(as_json: bool) -> None:
 
 @rigs.command("show")
 @click.argument("rig_name", metavar="RIG")
+@click.option(
+    "--all", "is_whole", is_flag=True, help="Print defaults, too, and thresholds with their meaning."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print every setting as JSON.")
-def show_profile(rig_name: str, as_json: bool) -> None:
-    """Print every setting of the profile RIG, a name or a file, as YAML; thresholds with their meaning."""
+def show_profile(rig_name: str, is_whole: bool, as_json: bool) -> None:
+    """Print the profile RIG, a name or a file, as YAML without settings that have their default."""
     rig = load_rig(rig_name)
     if as_json:
         show.print_json(rig.model_dump(mode="json"))
+        return
+    if not is_whole:
+        click.echo(dump_rig(rig, is_whole=False), nl=False)
+        _print_warnings(rig)
         return
     block = ""
     for line in dump_rig(rig).splitlines():

@@ -4,15 +4,17 @@ import json
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import click
 
+from lce_rig.core.phrasing import significant
+
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
-_MOST_UNBROKEN = 24
+_MOST_UNBROKEN, _WIDTH = 24, 80
 
 
 def note(text: str) -> None:
@@ -43,6 +45,35 @@ def wrapped(text: str, stream: Any) -> str:
 def counted(n: int, noun: str) -> str:
     """Write a number with its noun: "1 capture", "2 captures"."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def name_ranges(names: Sequence[str]) -> str:
+    """List names of captures; three or more successive numbers as "000003 to 000007"."""
+    runs: list[list[str]] = []
+    for name in names:
+        is_next = runs and name.isdigit() and runs[-1][-1].isdigit() and int(name) == int(runs[-1][-1]) + 1
+        if is_next:
+            runs[-1].append(name)
+        else:
+            runs.append([name])
+    return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(run) for run in runs)
+
+
+def cause_lines(cause: str, action: str, colour: str = "none") -> list[str]:
+    """Write a cause and its action for `print_lines`, on one line if both fit a terminal's 80 columns."""
+    if not action:
+        return [f"  [{colour}]{escape(cause)}[/]"]
+    if len(f"  {cause} -> {action}") <= _WIDTH:
+        return [f"  [{colour}]{escape(cause)}[/] -> {escape(action)}"]
+    return [f"  [{colour}]{escape(cause)}[/]", f"    -> {escape(action)}"]
+
+
+def titled_lines(title: str, texts: Sequence[str]) -> list[str]:
+    """Write texts beside their title, on one line if they fit a terminal's 80 columns."""
+    line = f"  {title:<13}{'; '.join(texts)}"
+    if len(line) <= _WIDTH:
+        return [line] if texts else []
+    return [f"  {'' if k else title:<13}{text}" for k, text in enumerate(texts)]
 
 
 def warn(text: str) -> None:
@@ -105,7 +136,9 @@ class ProgressBar:
     def __call__(self, done: int, total: int) -> None:
         """Show how many are done."""
         speed = self._bar.tasks[0].speed
-        self._bar.update(self._task, completed=done, total=total, rate=f"{speed:.2g}/s" if speed else "")
+        self._bar.update(
+            self._task, completed=done, total=total, rate=f"{significant(speed)}/s" if speed else ""
+        )
 
     def begin(self, step: str) -> None:
         """Name the step; the bar moves to and fro until its (done, total) are known."""

@@ -8,10 +8,12 @@ import click
 import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.calibrate import exit_by_verdict, scene_texts
-from lce_rig.cli.options import event_image_option, json_option, session_argument
+from lce_rig.cli.options import event_image_option, explain_option, json_option, session_argument
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.findings import worst
 from lce_rig.detect.detection import Pair
+from lce_rig.judge.findings import consequences
+from lce_rig.judge.session_check import SessionCheck
 from lce_rig.pipeline.verification import profile_behind
 
 
@@ -31,6 +33,7 @@ from lce_rig.pipeline.verification import profile_behind
     metavar="FOLDER",
     help="Write the images into this folder.",
 )
+@explain_option
 @json_option
 @event_image_option
 def verify(
@@ -38,6 +41,7 @@ def verify(
     result: Path | None,
     name: str | None,
     output: Path | None,
+    explain: bool,
     as_json: bool,
     event_image: Any,
 ) -> None:
@@ -71,23 +75,23 @@ def verify(
         )
     else:
         for checked in checks:
-            show.print_table(_table(checked))
-            show.print_lines(_summary(checked))
+            if explain:
+                show.print_table(_table(checked))
+            show.print_lines(_lines(checked, is_explained=explain))
     for c in verification.unchecked:
         show.warn(f"{session} holds no captures of {Pair.of(c)}: not checked")
-    exit_by_verdict(verification.calibrations)
+    exit_by_verdict(verification.calibrations, are_printed=not as_json)
     contradicted = [checked for checked in checks if worst(checked.findings) == "error"]
     if contradicted:
+        causes = [f"{checked.pair}: {doubt.text}" for checked in contradicted for doubt in checked.findings]
         raise ResultRefusedError(
             f"the captures of {session} contradict the extrinsics of "
             + " and that of ".join(str(checked.pair) for checked in contradicted),
-            "\n".join(
-                f"{checked.pair}: {doubt.text}" for checked in contradicted for doubt in checked.findings
-            ),
+            "\n".join(causes) if as_json else "",
         )
 
 
-def _table(checked: Any) -> Any:
+def _table(checked: SessionCheck) -> Any:
     headings = ("capture", ">planes mm", ">rms", ">edges mm", ">rms", ">corners px", "")
     table = show.plain_table(str(checked.pair), *headings)
     for r in checked.residuals:
@@ -98,19 +102,31 @@ def _table(checked: Any) -> Any:
     return table
 
 
-def _summary(checked: Any) -> list[str]:
-    lines = []
+def _lines(checked: SessionCheck, *, is_explained: bool) -> list[str]:
+    """State whether the captures agree with the extrinsics, mean residuals and where the images are."""
+    c, doubts = checked.calibration, checked.findings
+    colour = {"note": "green", "warning": "yellow", "error": "red"}[worst(doubts)]
+    opinion = {"note": "agree with", "warning": "fit poorly", "error": "contradict"}[worst(doubts)]
+    lines = [f"[bold]{checked.pair}[/]: [{colour}]the captures {opinion} the extrinsics[/]"]
+    for finding in doubts:
+        lines += show.cause_lines(finding.text, finding.advice, colour)
+    if c.verdict != "pass":
+        lines[0] += f", [{show.COLOURS[c.verdict]}]whose verdict is {c.verdict.upper()}[/]"
+        following = consequences(c.findings)
+        causes = [each for each in c.findings if each.severity != "note" and each.code not in following]
+        for cause in causes if is_explained else causes[:1]:
+            lines += show.cause_lines(cause.text, cause.advice, show.COLOURS[c.verdict])
     if checked.metrics is not None:
         m = checked.metrics
         lines.append(
-            f"mean over captures: planes {1000 * m.mpe_m:.1f} mm, edges {1000 * m.mee_m:.1f} mm, "
-            f"together {1000 * m.mge_m:.1f} mm; corners {m.reprojection_px:.2f} px"
+            f"  residuals    planes {1000 * m.mpe_m:.1f} mm, edges {1000 * m.mee_m:.1f} mm, "
+            f"corners {m.reprojection_px:.2f} px (means)"
         )
-    lines.append(f"scene: {'; '.join(scene_texts(checked.scene))}")
-    lines.append(f"verdict of the calibration: {checked.calibration.verdict}")
-    lines.append(f"these captures: {'; '.join(finding.text for finding in checked.findings) or 'agree'}")
+    scene = scene_texts(checked.scene)
+    if checked.scene.state != "unknown" or is_explained:
+        lines += show.titled_lines("scene", scene if is_explained else scene[:1])
     if checked.contact_sheets:
         first, *others = checked.contact_sheets
         last = f" to {others[-1].name}" if others else ""
-        lines.append(f"images: {show.escape(str(first))}{last}")
+        lines.append(f"  images       {show.escape(str(first))}{last}")
     return lines

@@ -17,8 +17,8 @@ GUIDE_CONTINUES = Kind(
 )
 GUIDE_PREDICTED = Kind(
     "guide.predicted",
-    "{subject}: predicted standard deviations for {n_captures} captures: rotation {rotation_deg:2deg} "
-    "(target {target_deg:g}), position {position_mm:.0f} mm (target {target_mm:g})",
+    "{subject}: predicted {rotation_deg:2deg} (target {target_deg:g}), {position_mm:.1f} mm "
+    "(target {target_mm:g})",
     severity="note",
 )
 READ_EVENTS_NOT_BEGUN = Kind(

@@ -33,12 +33,16 @@ def _format(value: Any, spec: str, more: int = 0) -> str:
     """
     if value is None:
         return "unknown"
+    unit = next((unit for unit in _UNITS if spec.endswith(unit)), None)
     if isinstance(value, tuple):
-        return ", ".join(_format(each, spec, more) for each in value)
+        listed = [_format(each, spec, more) for each in value]
+        printed = "" if unit is None else _UNITS[unit][2]
+        return ", ".join([*(text.removesuffix(printed) for text in listed[:-1]), *listed[-1:]])
     if spec == "motion":
         return motion_words(str(value))
-    unit = next((unit for unit in _UNITS if spec.endswith(unit)), None)
     if unit is None:
+        if re.fullmatch(r"\.\dg", spec):
+            return significant(value, int(spec[1]))
         fixed = re.fullmatch(r"\.(\d)f", spec)
         return str(format(value, f".{int(fixed[1]) + more}f" if fixed else spec))
     factor, decimals, printed = _UNITS[unit]
@@ -86,6 +90,17 @@ def _more_digits(figure: tuple[float, str], limit: tuple[float, str]) -> int:
         if "unknown" in (first, second) or float(first) != float(second):
             return more
     return 0
+
+
+def significant(value: float, digits: int = 2) -> str:
+    """Print a figure for people with significant digits and without an exponent: 110, not 1.1e+02."""
+    text = f"{value:.{digits}g}"
+    if "e" not in text:
+        return text
+    return f"{value:.0f}" if abs(value) >= 1 else f"below {_SMALLEST:g}" if value >= 0 else f"{value:.6f}"
+
+
+_SMALLEST = 0.0001
 
 
 def figures_apart(value: float, limit: float) -> tuple[str, str]:

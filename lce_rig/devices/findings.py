@@ -3,6 +3,7 @@
 from functools import partial
 
 from lce_rig.core.findings import Finding, Kind
+from lce_rig.core.phrasing import significant
 
 _RAISE_LIMIT = (
     "raise the receive buffer limit, now {buffer_kib} KiB: sudo sysctl -w net.core.rmem_max=4194304"
@@ -17,7 +18,7 @@ def _board_clock(finding: Finding) -> str:
     for name, to in (("host", "the computer's"), ("utc", "UTC")):
         if f"{name}_by" in finding.figures:
             sigma_us = finding.figure(f"{name}_sigma_us")
-            sigma = f"{sigma_us / 1000:.1f} ms" if sigma_us >= 1000 else f"{sigma_us:.3g} us"
+            sigma = f"{sigma_us / 1000:.1f} ms" if sigma_us >= 1000 else f"{significant(sigma_us, 3)} us"
             drift = f"drift {finding.figure(f'{name}_drift_ppm'):+.1f} ppm, standard deviation {sigma}"
             parts.append(f"synchronised with {to} by {finding.figures[f'{name}_by']}: {drift}")
     synchronised = "; ".join(parts) or "not yet synchronised with the computer's"

@@ -17,6 +17,7 @@ from typing import Literal
 from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
+from lce_rig.core.phrasing import significant
 from lce_rig.devices import findings
 from lce_rig.devices import v4l2_abi as abi
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
@@ -186,7 +187,9 @@ class StampClock:
     def problems(self) -> list[Finding]:
         """List the problems of the timestamps."""
         if self._delays_ns and self.used is None:
-            ages = ", ".join(f"{name} {delay_ns / 1e6:.3g} ms" for name, delay_ns in self._delays_ns.items())
+            ages = ", ".join(
+                f"{name} {significant(delay_ns / 1e6, 3)} ms" for name, delay_ns in self._delays_ns.items()
+            )
             return [findings.NO_CLOCK_FITS(ages=ages)]
         if self._spread_ns > _HARMLESS_NS:
             return [findings.CLOCK_AMBIGUOUS(spread_ms=self._spread_ns * 1e-6)]

@@ -38,7 +38,7 @@ def _offset(finding: Finding) -> str:
     offset = ""
     if finding.figures["offset_ms"] is not None:
         ms = finding.figure("offset_ms")
-        offset = f" {ms / 1000:+.3g} s," if abs(ms) >= 1000 else f" {ms:+.1f} ms,"
+        offset = f" {ms / 1000:+.1f} s," if abs(ms) >= 1000 else f" {ms:+.1f} ms,"
     drift = f"{finding.figure('drift_ppm'):+.0f} +- {finding.figure('drift_sigma_ppm'):.0f} ppm"
     return f"{finding.subject}{offset} {drift}"
 

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert
+from lce_rig.core.phrasing import significant
 from lce_rig.export.findings import LENS_FITTED
 from lce_rig.export.job import ExportJob
 from lce_rig.export.writing import number, numbers, quaternion_wxyz, quoted, rows
@@ -120,8 +121,8 @@ def lens_lines(lens: FittedLens) -> list[str]:
     if not lens.max_px:
         return []
     return [
-        f"camera model fitted to that of the profile, which has more coefficients: {lens.rms_px:.3g} px rms, "
-        f"{lens.max_px:.3g} px at most over the image"
+        "camera model fitted to that of the profile, which has more coefficients: "
+        f"{significant(lens.rms_px, 3)} px rms, {significant(lens.max_px, 3)} px at most over the image"
     ]
 
 

@@ -13,7 +13,7 @@ from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.files import read_json
-from lce_rig.core.phrasing import as_line
+from lce_rig.core.phrasing import as_line, significant
 from lce_rig.export.camera_info import camera_info_text
 from lce_rig.export.writing import number, numbers
 from lce_rig.judge.findings import verdict_of
@@ -87,7 +87,7 @@ def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
         f"      model: {lens.model}",
     ]
     for index, key in enumerate(("fx_px", "fy_px", "cx_px", "cy_px")):
-        lines.append(f"      {key}: {number(getattr(lens, key))}   # +- {sigma[index]:.2g}")
+        lines.append(f"      {key}: {number(getattr(lens, key))}   # +- {significant(sigma[index])}")
     names = " ".join(measured.estimate.model.coefficients)
     spread = " ".join(f"{value:.1g}" for value in sigma[4:])
     lines.append(f"      distortion: {numbers(lens.distortion)}   # {names}, +- {spread}")

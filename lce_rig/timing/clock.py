@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
+from lce_rig.core.phrasing import significant
 
 NS_PER_S = 1_000_000_000
 HOUR_NS = 3600 * NS_PER_S
@@ -126,7 +127,7 @@ class ClockModel:
 
     def __str__(self) -> str:
         sigma_us = 1e-3 * self.sigma_ns(self.last_ns)
-        sigma = f"{sigma_us / 1000:.1f} ms" if sigma_us >= 1000 else f"{sigma_us:.3g} us"
+        sigma = f"{sigma_us / 1000:.1f} ms" if sigma_us >= 1000 else f"{significant(sigma_us, 3)} us"
         return f"{self.origin}: drift {1e6 * self.drift:+.1f} ppm, known to {sigma}"
 
 

@@ -62,7 +62,7 @@ def test_sessions_that_agree_end_with_a_line_that_says_so(lce_rig, made):
     assert sum(line.startswith(("monday", "tuesday", "wednesday")) for line in outcome.out.splitlines()) == 6
     (pair,) = compared(lce_rig, a, b, c)["pairs"]
     assert (pair["dof"], pair["finding"]["code"]) == (12, "repeat.agree")
-    assert pair["finding"]["text"][1:] in outcome.out.splitlines()[-1]
+    assert pair["finding"]["text"][1:] in outcome.out.splitlines()[0]
 
 
 def test_sessions_that_disagree_exit_with_7_and_the_odd_one_is_named(lce_rig, made):

@@ -31,14 +31,20 @@ def test_show_gives_the_figures_and_marks_what_is_not_default(
     path.write_text(f"{find_profile('rles').read_text(encoding='utf-8')}\nquality: {{min_rings: 7}}\n")
     assert run(["rigs", "show", str(path)]) == 0
     out = capsys.readouterr().out
+    assert "  min_rings: 7\n" in out and "min_points" not in out and "model: VLP-16" in out
+    assert run(["rigs", "show", str(path), "--all"]) == 0
+    out = capsys.readouterr().out
     lines = out.splitlines()
     at = lines.index("  min_rings: 7")
     assert lines[at - 1].startswith("  # ") and "4" in lines[at - 1]
 
 
-def test_show_prints_a_profile_that_loads_again(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("more", [[], ["--all"]])
+def test_show_prints_a_profile_that_loads_again(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, more: list[str]
+) -> None:
     path = tmp_path / "copy.yaml"
-    assert run(["rigs", "show", "rlfs"]) == 0
+    assert run(["rigs", "show", "rlfs", *more]) == 0
     path.write_text(capsys.readouterr().out, encoding="utf-8")
     assert load_rig(path) == load_rig("rlfs")
     assert run(["rigs", "show", str(path), "--json"]) == 0

@@ -78,7 +78,7 @@ def test_a_result_of_two_cameras_is_checked_on_captures_of_one(lce_rig, with_sec
     assert outcome.code == 0, outcome.err
     (warning,) = (line for line in outcome.err.splitlines() if "not checked" in line)
     assert "right.frames" in warning
-    assert "captures: agree" in outcome.out
+    assert "captures agree" in outcome.out
 
 
 def half_size(document):

@@ -12,11 +12,12 @@ def read(path):
     return json.loads(path.read_text())
 
 
-def test_check_shows_a_row_a_capture_and_counts_the_usable_ones(lce_rig, simulated):
+def test_check_counts_usable_captures_and_explains_them_in_a_row_each(lce_rig, simulated):
     outcome = lce_rig("check", simulated)
-    assert outcome.code == 0
-    assert sum(line.startswith("0000") for line in outcome.out.splitlines()) == 16
+    assert outcome.code == 0 and len((outcome.out + outcome.err).splitlines()) <= 3
     assert "16 of 16 captures" in outcome.out
+    explained = lce_rig("check", simulated, "--explain").out
+    assert sum(line.startswith("0000") for line in explained.splitlines()) == 16
     first = json.loads(lce_rig("check", simulated, "--json").out)["pairs"][0]["captures"]["000000"]
     assert first["is_usable"] and first["lidar"]["n_rings"] >= 4 and first["image"]["distance_m"] > 1
 
@@ -124,8 +125,8 @@ def test_verify_before_anything_was_calibrated_exits_with_4(lce_rig, session):
 @pytest.mark.long
 def test_verify_draws_every_capture_and_one_sheet(lce_rig, calibrated):
     outcome = lce_rig("verify", calibrated)
-    assert outcome.code == 0
-    assert "mean over" in outcome.out
+    assert outcome.code == 0 and len((outcome.out + outcome.err).splitlines()) <= 6
+    assert len(lce_rig("verify", calibrated, "--explain").out.splitlines()) > 16
     pictures = sorted(path.name for path in (calibrated / "calibration" / "overlays").iterdir())
     assert pictures == [*(f"{k:06d}.png" for k in range(16)), "contact_sheet.png"]
 

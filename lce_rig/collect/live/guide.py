@@ -199,9 +199,9 @@ class Guide:
         return GUIDE_PREDICTED(
             f"{self.key[0]}, {self.lidar}",
             n_captures=guidance.n_captures,
-            rotation_deg=guidance.sigma_rotation_deg,
+            rotation_deg=guidance.stated_rotation_deg,
             target_deg=self._target_deg,
-            position_mm=1000 * guidance.sigma_translation_m,
+            position_mm=1000 * guidance.stated_translation_m,
             target_mm=self._target_mm,
             is_enough=guidance.is_enough,
         )

@@ -4,6 +4,7 @@
 makes an earlier release current again. Each opens its own connections; nothing is kept between calls.
 """
 
+import difflib
 import getpass
 import json
 import shutil
@@ -90,6 +91,7 @@ class Plan:
         sensors: changes of the extrinsics.
         objections: a deployment is refused for them unless it is forced.
         remarks: what the checks could not compare.
+        diff: lines in which changed texts differ, as `diff -u` prints them.
     """
 
     record: ReleaseRecord
@@ -99,6 +101,7 @@ class Plan:
     sensors: tuple[SensorChange, ...]
     objections: tuple[Finding, ...]
     remarks: tuple[Finding, ...] = ()
+    diff: tuple[str, ...] = ()
 
     @property
     def is_in_place(self) -> bool:
@@ -273,15 +276,30 @@ def _plan(
         )
         for key in dict.fromkeys([*after, *before])
     ]
+    changed = differences(files, {} if state.current is None else state.current.files)
     return Plan(
         _record(saved, files, state),
         state,
-        differences(files, {} if state.current is None else state.current.files),
+        changed,
         changed_there,
         tuple(sensors),
         tuple(_objections(saved, target, state.current)),
         tuple(_remarks(saved, state.current)),
+        tuple(_text_changes(deployed, new, changed)),
     )
+
+
+def _text_changes(earlier: Path, new: Path, changed: Mapping[str, str]) -> list[str]:
+    """List the lines in which texts differ, as `diff -u` does; new and removed texts whole."""
+    lines: list[str] = []
+    for name in changed:
+        with suppress(OSError, ValueError):
+            before, after = (
+                path.read_text("utf-8").splitlines() if path.is_file() else []
+                for path in (earlier / name, new / name)
+            )
+            lines += difflib.unified_diff(before, after, f"deployed/{name}", f"new/{name}", lineterm="")
+    return lines
 
 
 def _stage(

@@ -10,6 +10,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, transform
+from lce_rig.core.phrasing import significant
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.show.overlays import canvas
@@ -267,7 +268,8 @@ def _legend(
     text_px = 11 * unit
     line_px = 2.1 * text_px
     entries = [
-        f"{name}  {value if isinstance(value, str) else f'{value:.3g}'}" for name, value in residuals.items()
+        f"{name}  {value if isinstance(value, str) else significant(value, 3)}"
+        for name, value in residuals.items()
     ]
     n_columns = 2 if len(entries) > 4 else 1
     n_lines = max(4, -(-len(entries) // n_columns))

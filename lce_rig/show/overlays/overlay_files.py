@@ -14,6 +14,7 @@ import numpy as np
 from lce_rig.core.calibration import Calibration, CaptureResidual
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.core.phrasing import significant
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.session_check import Meeting, SessionCheck
@@ -244,7 +245,8 @@ def draw_check(
     c, m = check.calibration, check.metrics
     line = (
         f"{len(names)} captures, {len(c.captures_used)} used; "
-        f"uncertainty {c.sigma_rotation_deg:.2g} deg, {1000 * c.sigma_translation_m:.2g} mm (1 sigma)"
+        f"uncertainty {significant(c.sigma_rotation_deg)} deg, "
+        f"{significant(1000 * c.sigma_translation_m)} mm (1 sigma)"
     )
     if m is not None:
         line += f"; mean over captures: {_residual_words(m.mpe_m, m.mee_m, m.reprojection_px)}"
@@ -319,7 +321,8 @@ def _legend(
         is_used = name in calibration.captures_used
         figures["capture"] = "used" if is_used else f"refused, {refusal.stage}" if refusal else "not used"
     figures["sigma"] = (
-        f"{calibration.sigma_rotation_deg:.2g} deg, {1000 * calibration.sigma_translation_m:.2g} mm"
+        f"{significant(calibration.sigma_rotation_deg)} deg, "
+        f"{significant(1000 * calibration.sigma_translation_m)} mm"
     )
     figures["verdict"] = calibration.verdict
     return figures

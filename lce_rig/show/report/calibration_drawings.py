@@ -15,6 +15,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.phrasing import significant
 from lce_rig.core.planar_pose import refine_pose
 from lce_rig.core.results import Observation
 from lce_rig.detect.events.figures import outline_px
@@ -257,7 +258,9 @@ def draw_corners(evidence: Evidence, lens: Intrinsics) -> Markup:
         arrows = axes.quiver(
             *means.T, color=BLUE, angles="xy", scale_units="xy", scale=scale, width=0.004, zorder=3
         )
-        axes.quiverkey(arrows, 0.92, 1.05, usual_px, f"{usual_px:.2g} px ", labelpos="W", labelcolor=INK)
+        axes.quiverkey(
+            arrows, 0.92, 1.05, usual_px, f"{significant(usual_px)} px ", labelpos="W", labelcolor=INK
+        )
     return drawing(figure, "Residuals of the corners in the image")
 
 

@@ -15,7 +15,7 @@ from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
-from lce_rig.core.phrasing import as_line
+from lce_rig.core.phrasing import as_line, significant
 from lce_rig.detect.detection import Pair
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words, weakest_words
@@ -251,7 +251,7 @@ def _statement(c: Calibration) -> str:
     """Sum a result up in one paragraph that anyone can sign, with its figures."""
     known = (
         f"The pose of camera {c.camera} relative to {c.lidar} has a standard deviation of "
-        f"{c.sigma_rotation_deg:.2g} deg and {1000 * c.sigma_translation_m:.2g} mm, from "
+        f"{significant(c.sigma_rotation_deg)} deg and {significant(1000 * c.sigma_translation_m)} mm, from "
         f"{len(c.captures_used)} of {c.n_captures} captures of the board"
     )
     if c.verdict == "fail":
