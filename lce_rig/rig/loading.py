@@ -113,7 +113,7 @@ def dump_rig(rig: Rig, *, is_whole: bool = True) -> str:
 
     Args:
         rig: the profile.
-        is_whole: whether to write settings that have their default, too; models of sensors are always written.
+        is_whole: whether to write settings that have their default, too; models always are.
     """
     whole = rig.model_dump(mode="json", exclude_none=True)
     if is_whole:

@@ -140,7 +140,7 @@ def test_a_capture_with_a_bad_manifest_is_refused_alone(lce_rig, session, change
     manifest.write_text(json.dumps(document))
     outcome = lce_rig("check", session)
     assert outcome.code == 0
-    assert "2 of 3 captures" in outcome.out and "000002: read:" in outcome.out
+    assert "2 of 3 captures" in outcome.out and "000002 read:" in outcome.out
 
 
 @pytest.mark.parametrize(

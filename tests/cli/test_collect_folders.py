@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from lce_rig.cli.collect import collect
 from lce_rig.core.files import encode_pcd
 
 TWO = Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"
@@ -67,3 +68,8 @@ def test_what_does_not_tell_whose_pictures_they_are_is_refused(lce_rig, folders,
     assert outcome.code == code
     assert told in outcome.err
     assert not (tmp_path / "session").exists()
+
+
+@pytest.mark.parametrize("name", ["--captures", "--frames", "--max-captures"])
+def test_earlier_names_of_the_number_of_captures_go_on(name):
+    assert collect.make_context("collect", ["--rig", "rlfs", name, "4"]).params["n_wanted"] == 4

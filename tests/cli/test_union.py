@@ -33,7 +33,7 @@ def test_several_sessions_give_one_result_in_the_first_and_change_nothing_else(l
     (listed,) = json.loads(lce_rig("results", monday, "--json").out)["results"]
     assert (listed["name"], listed["is_outdated"]) == ("union", False)
     for words in ((monday, "--name", "union"), (tuesday, "--result", union / "result.json")):
-        checked = lce_rig("verify", *words, "--output", monday.parent / "drawn")
+        checked = lce_rig("verify", *words, "--explain", "--output", monday.parent / "drawn")
         assert checked.code == 0, checked.err
         assert "not used" not in checked.out
     again = lce_rig("calibrate", tuesday, monday, "--name", "both")
