@@ -56,7 +56,7 @@ def test_stale_intrinsics_are_called_so_and_json_says_it_too(lce_rig, few):
     camera = json.loads(outcome.out)["cameras"][0]
     assert camera["judgement"]["code"] in ("intrinsics.better", "intrinsics.undetermined")
     profile_record = camera["profile"]
-    assert profile_record["verdict"] == "fail"
+    assert profile_record["verdict"] in ("marginal", "fail")
     assert profile_record["focal_ratio"] == pytest.approx(349.57 / 367.0, abs=0.01)
 
 
