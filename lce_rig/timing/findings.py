@@ -43,18 +43,16 @@ EDGES_NOT_THE_PULSES = Kind(
     "edges.not_the_pulses", "the detected edges are not the board's pulses", "check the wire"
 )
 
-BOARDS_MAY_MOVE = _note("sync.boards_may_move", "boards may move while they are captured")
+BOARDS_MAY_MOVE = _note("sync.boards_may_move", "boards may move")
 BOARDS_MUST_STAND = _note(
     "sync.boards_must_stand",
-    "boards must stand still while they are captured",
+    "boards must stand still",
     actions={
         "add_board": "add `sync` to the profile (docs/wiring-and-sync.md) to let boards move",
         "see_lines": "see the lines of these sensors and of the sync board",
     },
 )
-NO_BOARD = _warning(
-    "sync.no_board", "no sync board synchronises the cameras with the LiDAR", actions={"named": ""}
-)
+NO_BOARD = _warning("sync.no_board", "no sync board synchronises cameras and LiDAR", actions={"named": ""})
 NONE_IN_PROFILE = _warning("sync.none_in_profile", "{key} is none", actions={"named": ""})
 NOT_TIED = _warning(
     "sync.not_tied",
