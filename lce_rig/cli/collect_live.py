@@ -201,9 +201,11 @@ def _tell(
 
 def show_next(path: Path, rig: Rig, predicted: Sequence[Finding], n_captures: int) -> None:
     """State whether the target is predicted to be met, by which figures, and the next command."""
+    are_enough = n_captures >= rig.quality.min_captures
     for prediction in predicted:
-        show.note(f"  {'target met' if is_met(prediction) else 'not yet met'}  {prediction.text}")
-    if n_captures < rig.quality.min_captures:
+        state = "target met" if are_enough and is_met(prediction) else "target not met"
+        show.note(f"  {state}: {prediction.text}")
+    if not are_enough:
         show.note(f"  next         collect {rig.quality.min_captures - n_captures} more captures at least")
         return
     if predicted and not all(map(is_met, predicted)):
