@@ -27,7 +27,7 @@ from lce_rig.core.calibration import (
 )
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.geometry import Array, sigma_sizes
-from lce_rig.core.phrasing import motion_words
+from lce_rig.core.phrasing import motion_words, of_session
 from lce_rig.detect.detection import Pair
 from lce_rig.export.reference import read_reference
 from lce_rig.judge.findings import consequences, weakest_words
@@ -192,13 +192,13 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
     "--without",
     callback=split_names,
     metavar="CAPTURE[,CAPTURE]",
-    help="Reject these captures first, as `lce-rig captures --reject` does; --restore there takes them back.",
+    help="Reject these captures first, as `captures --reject` does; --restore there takes them back.",
 )
 @click.option(
     "--rig",
     "profile",
     metavar="FILE",
-    help="Give the session this profile of the same rig first, as `lce-rig intrinsics --save-profile` writes "
+    help="Give the session this profile of the same rig first, as `intrinsics --save-profile` writes "
     "one; the earlier one stays beside it as rig-1.yaml.",
 )
 @click.option("--explain", is_flag=True, help="Print everything that was estimated and tested.")
@@ -244,7 +244,10 @@ def calibrate(
         _take_profile(paths[0], profile)
     if without:
         if len(paths) > 1:
-            raise UsageError("--without applies to one session", "Reject them by: lce-rig captures SESSION")
+            raise UsageError(
+                "--without applies to one session",
+                "Reject them by: lce-rig captures SESSION --reject CAPTURE",
+            )
         put_aside(paths[0], without, "calibrate --without")
     opened = [lce.Session.open(path) for path in paths]
     require_unit(opened)
@@ -324,7 +327,7 @@ def _show(result: Result, written: WrittenResult, *, is_explained: bool, as_json
         show.print_json(result.document())
     else:
         for calibration in result.pairs:
-            show.print_lines(_lines(calibration, is_explained=is_explained))
+            show.print_lines(_lines(calibration, str(result.session.path), is_explained=is_explained))
         for calibration in result.pairs:
             show.print_lines(camera_lines(calibration, result.pairs))
     for finding in written.findings:
@@ -371,7 +374,7 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = 
         raise ResultRefusedError(f"failed: {pairs}; do not use this result", "" if are_printed else causes)
 
 
-def _lines(c: Calibration, *, is_explained: bool) -> list[str]:
+def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
     """Tell the verdict, its reasons, the extrinsics and their uncertainty; explained, all that was tested."""
     colour, has_failed = show.COLOURS[c.verdict], c.verdict == "fail"
     following = consequences(c.findings)
@@ -382,7 +385,7 @@ def _lines(c: Calibration, *, is_explained: bool) -> list[str]:
         follows = "follows: " if finding.code in following else ""
         lines.append(f"  [{colour}]{follows}{show.escape(finding.text)}[/]")
         if finding.advice and not follows and (is_explained or finding is causes[0]):
-            lines.append(f"    -> {show.escape(finding.advice)}")
+            lines.append(f"    -> {show.escape(of_session(finding.advice, path))}")
     if len(causes) > _N_REASONS and not is_explained:
         lines.append(f"  {show.counted(len(causes) - _N_REASONS, 'more reason')}: --explain, or report.html")
     if is_explained or not has_failed:

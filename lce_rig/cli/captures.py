@@ -48,7 +48,7 @@ def captures(
         show.say(counts + (f", {n_rejected} rejected" if n_rejected else ""))
     if outdated:
         names = ", ".join(outdated)
-        show.note(f"made from other captures: result {names}. Run `lce-rig calibrate` again")
+        show.note(f"made from other captures: result {names}. Run `lce-rig calibrate {session}` again")
 
 
 def put_aside(session: Path, names: Sequence[str], reason: str) -> None:

@@ -35,7 +35,7 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool, event
     opened = lce.Session.open(session)
     if not opened.captures:
         raise NotEnoughDataError(
-            f"{session} holds no captures", "Run lce-rig collect first (see its --help)."
+            f"{session} holds no captures", f"Run `lce-rig collect --rig RIG {session}` first."
         )
     with show.progress_bar("detecting") as progress:
         detections = lce.detect(opened, event_image=event_image, progress=progress)

@@ -189,7 +189,9 @@ def _tell(
         raise click.exceptions.Exit(130)
     remedy = "Run the same command again to continue."
     if simulated is None:
-        remedy = "Hold the board in view of all sensors at once; run `lce-rig doctor` to find the fault."
+        remedy = (
+            "Hold the board in view of all sensors at once; run `lce-rig doctor --rig RIG` to find the fault."
+        )
     if n_captures == 0:
         raise NotEnoughDataError("nothing was captured", remedy)
     if report.recording_error is not None:

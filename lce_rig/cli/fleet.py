@@ -181,7 +181,10 @@ def table(
     opened: Registry = Registry(Storage.at(registry))
     if rebuild:
         if not opened.place.exists():
-            raise SessionError(f"{opened.place.url} does not exist", "`lce-rig fleet run` writes a registry.")
+            raise SessionError(
+                f"{opened.place.url} does not exist",
+                "`lce-rig fleet run ROOT --registry FOLDER` writes a registry.",
+            )
         opened.consolidate(rebuild=True)
     chosen = opened.read_table(columns or (None if as_csv or as_json else _SHOWN), where)
     batches = chosen.to_batches(max_chunksize=10_000)

@@ -46,7 +46,7 @@ def results(session: Path, as_json: bool) -> None:
     for table in _tables(stored):
         show.print_table(table)
     if not stored:
-        show.say(f"no results in {session}: run `lce-rig calibrate`")
+        show.say(f"no results in {session}: run `lce-rig calibrate {session}`")
     dates = {result.file.provenance.date_words: None for result in stored if result.file}
     if any(dates):
         show.note(f"captures of {'; '.join(filter(None, dates))}")

@@ -74,7 +74,7 @@ DAMAGED_IMAGES = _warning(
 MESSAGES_SKIPPED = _warning(
     "stream.messages_skipped",
     "{n} messages damaged, repeated or late",
-    "record a bag: `lce-rig collect --from` names the cause",
+    "record a bag: `lce-rig collect --rig RIG --from FILE` names the cause",
 )
 DAMAGED_LINES = _warning(
     "stream.damaged_lines",

@@ -400,7 +400,7 @@ class AttachedSensors:
                     failures.append(error)
             if failures:
                 hints = [failures[0].hint, *(f"Also: {other.what}" for other in failures[1:])]
-                hints.append("`lce-rig doctor` looks at every device.")
+                hints.append("`lce-rig doctor --rig RIG` looks at every device.")
                 raise SourceError(failures[0].what, "\n  ".join(hint for hint in hints if hint))
             self._stack = stack.pop_all()
         self._inbox.n_dropped.clear()  # What came too soon, while others were being opened, is no loss.

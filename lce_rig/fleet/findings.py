@@ -44,7 +44,7 @@ WORKER_LOST = Kind(
 )
 
 DEPLOY_FAILED = Kind(
-    "deploy.failed", "the calibration of {subject} failed", "Collect again, see `lce-rig calibrate`."
+    "deploy.failed", "the calibration of {subject} failed", "Collect again, see `lce-rig calibrate SESSION`."
 )
 DEPLOY_OTHER_ROBOT = Kind(
     "deploy.other_robot",

@@ -168,7 +168,10 @@ class Registry:
         else:
             content = (self.place / TABLE).read()
             if content is None:
-                raise SessionError(f"{self.place.url} has no {TABLE}", "`lce-rig fleet run` writes it.")
+                raise SessionError(
+                    f"{self.place.url} has no {TABLE}",
+                    "`lce-rig fleet run ROOT --registry FOLDER` writes it.",
+                )
             source = io.BytesIO(content)
         if not where.strip():
             return read_table(source, names)

@@ -175,10 +175,13 @@ def read_table(source: Path | io.BytesIO, columns: Sequence[str] | None = None) 
             held = set(file.schema_arrow.names)
             table = file.read(columns=[name for name in names if name in held])
     except FileNotFoundError:
-        raise SessionError(f"{source}: there is no such table", "`lce-rig fleet run` writes it.") from None
+        raise SessionError(
+            f"{source}: there is no such table", "`lce-rig fleet run ROOT --registry FOLDER` writes it."
+        ) from None
     except (OSError, pa.ArrowException) as error:
         raise SessionError(
-            f"{source} cannot be read as a table: {error}", "`lce-rig fleet table --rebuild` writes it again."
+            f"{source} cannot be read as a table: {error}",
+            "`lce-rig fleet table --registry FOLDER --rebuild` writes it again.",
         ) from error
     if "robot" not in held:
         raise SessionError(f"{source} is not a table of results: it has no column robot")

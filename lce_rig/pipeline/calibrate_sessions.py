@@ -116,7 +116,7 @@ def require_unit(sessions: Sequence[Session]) -> dict[str, Session]:
         named,
         lambda key: key.path[0] in ("board", "cameras", "lidars"),
         "One estimate requires one board and one set of sensors. Correct the wrong rig.yaml, or calibrate "
-        "each session alone and compare them with `lce-rig repeat`.",
+        "each session alone and compare them with `lce-rig repeat SESSION OTHER_SESSION`.",
     )
     require_independent(named)
     return named

@@ -195,8 +195,8 @@ def _read(session: Session, folder: Path) -> ResultFile:
     if saved.rig != session.rig.name:
         raise SessionError(
             f"{path} belongs to rig {saved.rig!r}, its session to rig {session.rig.name!r}",
-            "Run `lce-rig calibrate` again.",
+            "Run `lce-rig calibrate SESSION` again.",
         )
     if any(np.linalg.eigvalsh(c.cov).min() <= 0 for c in saved.pairs):
-        raise SessionError(f"{path}: a covariance has no inverse", "Run `lce-rig calibrate` again.")
+        raise SessionError(f"{path}: a covariance has no inverse", "Run `lce-rig calibrate SESSION` again.")
     return saved

@@ -26,13 +26,13 @@ NO_AGREEMENT = Kind(
 OUTDATED = Kind(
     "results.outdated",
     "{subject}: the profile or the captures that it used have changed since",
-    "run `lce-rig calibrate` again with the same options",
+    "run `lce-rig calibrate SESSION` again with the same options",
     severity="warning",
 )
 FAILED = Kind(
     "repeat.failed",
     "the calibration of {subject} ({camera} and {lidar}) failed",
-    "run `lce-rig calibrate` for its reasons",
+    "run `lce-rig calibrate {subject}` for its reasons",
 )
 NOT_CALIBRATED = Kind("repeat.not_calibrated", "{subject}: {sensors}: {what}", "{hint}", severity="warning")
 ONLY_ONE = Kind(

@@ -129,7 +129,7 @@ def new_profile(
         "cameras": blocks,
     }
     rig_from_document(Document(source, data, root=None))
-    lines = [f"# {name}: written by `lce-rig rigs new`; `lce-rig rigs show FILE` shows every setting."]
+    lines = [f"# {name}: written by `rigs new`; `lce-rig rigs show FILE` shows every setting."]
     for line in dump_yaml(data).splitlines():
         comment = _COMMENTS.get(line.strip().partition(":")[0])
         lines.append(f"{line:<40} # {comment}" if comment else line)

@@ -224,7 +224,8 @@ class SceneCaptures:
             wanted = " or ".join(f"{c.camera} and {c.lidar}" for c in self._pairs)
             raise SourceError(
                 f"{self._source} holds no images and scans of {wanted} at the same time",
-                "Check the profile's topics and timestamps; `lce-rig doctor` looks at attached sensors.",
+                "Check the profile's topics and timestamps; "
+                "`lce-rig doctor --rig RIG` looks at attached sensors.",
             )
 
 

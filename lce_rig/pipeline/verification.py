@@ -99,7 +99,7 @@ class Verification:
             if self.own_result is not None and result_content(session, self.name) != self.own_result:
                 raise SessionError(
                     f"{session.path.joinpath(*parts[:-1])} was calibrated again while overlays were drawn",
-                    "Run `lce-rig verify` again.",
+                    f"Run `lce-rig verify {session.path}` again.",
                 )
             # Files that `verify` did not draw are kept, beside its images and in its folders.
             folders = {

@@ -38,7 +38,7 @@ def derive_text(
         ProfileError: the new profile would not be valid.
         UsageError: a value that is not YAML, or a path into something that has no keys.
     """
-    head = f"# {name}: made from {origin} by `lce-rig rigs new`; the comments below are from {origin}.\n"
+    head = f"# {name}: made from {origin} by `rigs new`; the comments below are from {origin}.\n"
     # The comments above the first key are about the other profile.
     text = head + set_value(text[_compose(text).start_mark.index :], "name", as_text(name))
     if "description" not in [key for key, _ in settings]:

@@ -19,7 +19,7 @@ UNKNOWN_MODEL = Kind(
     "{subject}: the beams of {value} are not known: recordings can be calibrated, live guidance and "
     "simulation need elevations_deg and columns",
     "enter them and your LiDAR's noise (docs/rig-profiles.md: LiDAR models), or make a new profile with "
-    "`lce-rig rigs new --lidar other --from RECORDING`",
+    "`lce-rig rigs new NAME --lidar other --from RECORDING`",
     severity="warning",
 )
 OTHER_DRIVER = Kind(

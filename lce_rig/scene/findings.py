@@ -3,7 +3,7 @@
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.phrasing import fill
 
-_BOARD = "collect a session with the board and run `lce-rig calibrate`"
+_BOARD = "collect a session with the board and run `lce-rig calibrate SESSION`"
 _FASTEN = f"fasten the sensors, {_BOARD}"
 _RECORD = "record where upright edges of furniture, doors or people stand before something farther away"
 
@@ -125,7 +125,7 @@ NO_FIRING_TIMES = Kind(
 CLOCKS_APART = Kind(
     "scene.clocks_apart",
     "while the rig moves, images of {subject} fit best {apart_s:+.2f} s from their timestamps",
-    "let the rig stand, or correct the clocks: `lce-rig doctor` measures them",
+    "let the rig stand, or correct the clocks: `lce-rig doctor --rig RIG` measures them",
     severity="warning",
 )
 CLOCKS_INSTEAD = Kind(

@@ -37,7 +37,7 @@ def check_marker(path: Path) -> None:
         SessionError: it is not a session, is damaged, or was made by a newer version.
     """
     if path.is_file():
-        hint = "Give the session's folder. `lce-rig collect --from FILE` makes a session from a recording."
+        hint = "Give the session's folder. `lce-rig collect --rig RIG --from FILE` makes one of a recording."
         raise SessionError(f"{path} is a file, but a session is a folder", hint)
     version = read_marker(path)["format_version"]
     if version > FORMAT_VERSION:
@@ -54,7 +54,9 @@ def read_marker(path: Path) -> dict[str, Any]:
         try:
             marker = read_json(path / MARKER)
         except FileNotFoundError:
-            hint = "Make one with `lce-rig collect` or `lce-rig simulate`."
+            hint = (
+                f"Make one with `lce-rig collect --rig RIG {path}` or `lce-rig simulate --rig rlfs {path}`."
+            )
             raise SessionError(f"{path} is not a session: it has no {MARKER}", hint) from None
     if not isinstance(marker, dict) or type(marker.get("format_version")) is not int:
         raise SessionError(f"{path / MARKER}: it has no format_version")

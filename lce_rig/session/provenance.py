@@ -51,7 +51,7 @@ def serials_of(sessions: Iterable[Session]) -> dict[str, str]:
                     raise SessionError(
                         f"{session.path}: {sensor} has serial number {other} in {first}, {serial} in {where}",
                         "One result requires one set of sensors: reject the captures of the other unit with "
-                        "`lce-rig captures`, or correct `serial` in rig.yaml.",
+                        f"`lce-rig captures {session.path}`, or correct `serial` in rig.yaml.",
                     )
     return {sensor: serial for sensor, (_, serial) in sorted(sources.items())}
 

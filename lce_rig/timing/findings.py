@@ -57,7 +57,7 @@ NONE_IN_PROFILE = _warning("sync.none_in_profile", "{key} is none", actions={"na
 NOT_TIED = _warning(
     "sync.not_tied",
     "the clock of {subject} is not synchronised with the rig's",
-    "run `lce-rig doctor`",
+    "run `lce-rig doctor --rig RIG`",
     actions={"named": ""},
 )
 TOO_UNCERTAIN = _warning(

@@ -452,7 +452,7 @@ def _commit(
         except LceRigError:
             raise TargetError(
                 f"{lost.what}; whether {release.name} is in place is not known",
-                "Run `lce-rig deploy --status`, or the same command again.",
+                "Run `lce-rig deploy --target TARGET --status`, or the same command again.",
             ) from lost
         if current is None or current.name != release.name:
             raise

@@ -58,7 +58,10 @@ def find_target(name: str, file: Path | None, session: Path | None, rig: Rig | N
     target = targets.get(name)
     if target is not None and ROBOT_FIELD in target.to:
         if not target.robot:
-            raise UsageError(f"target {name!r} stands for many robots", "Use `lce-rig fleet deploy`.")
+            raise UsageError(
+                f"target {name!r} stands for many robots",
+                f"Use `lce-rig fleet deploy --registry FOLDER --target {name}`.",
+            )
         return target.for_robot(target.robot)
     if target is not None:
         return target

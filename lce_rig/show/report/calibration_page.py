@@ -15,7 +15,7 @@ from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
-from lce_rig.core.phrasing import as_line, significant
+from lce_rig.core.phrasing import as_line, of_session, significant
 from lce_rig.detect.detection import Pair
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words, weakest_words
@@ -111,7 +111,7 @@ def report_text(
         overlays=paths,
         pictures=picture,
         rejecting=rejecting,
-        folder=shlex.quote(session.path.resolve().name),
+        folder=session.path.resolve().name,
         has_previous=has_previous,
     )
 
@@ -281,15 +281,16 @@ def _others(c: Calibration, severity: str = "warning") -> str:
 def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
     """List the next steps, the most urgent first: the findings' actions, then the checks before use."""
     asked = [finding.advice for finding in sorted(c.findings, key=lambda f: f.severity != "error")]
-    steps = [as_line(text) for text in dict.fromkeys(asked) if text]
+    steps = [as_line(of_session(text, folder)) for text in dict.fromkeys(asked) if text]
     if c.verdict == "fail":
         earlier = " The last usable result is in `previous/`." if has_previous else ""
-        return [*steps, f"Then run `lce-rig calibrate {folder}` again.{earlier}"]
+        return [*steps, f"Then run `lce-rig calibrate {shlex.quote(folder)}` again.{earlier}"]
     return [
         *steps,
-        f"Look at the overlays (`lce-rig verify {folder}`): "
+        f"Look at the overlays (`lce-rig verify {shlex.quote(folder)}`): "
         "ring ends must lie on the board's outline on all sides.",
-        f"Collect a second session on another day and compare both: `lce-rig repeat {folder} OTHER_SESSION`.",
+        "Collect a second session on another day and compare both: "
+        f"`lce-rig repeat {shlex.quote(folder)} OTHER_SESSION`.",
     ]
 
 
