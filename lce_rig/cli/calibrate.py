@@ -39,6 +39,7 @@ from lce_rig.session.provenance import provenance_of
 _AXES = ("x right", "y down", "z forward")
 _OPINIONS = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
 _UNITS = {"deg": "deg", "m": "mm"}
+_CORRECTED = {"verdict.intrinsics", "verdict.scale"}
 # Reasons that are printed without --explain, and the distance of the point whose uncertainty is.
 _N_REASONS, _FAR_M = 3, 10.0
 
@@ -380,7 +381,8 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
     following = consequences(c.findings)
     reasons = [finding for finding in c.findings if finding.severity != "note"]
     causes = [finding for finding in reasons if finding.code not in following]
-    lines = [f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/]"]
+    used = f"{len(c.captures_used)} of {c.n_captures} captures used"
+    lines = [f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"]
     for finding in reasons if is_explained else causes[:_N_REASONS]:
         follows = "follows: " if finding.code in following else ""
         lines.append(f"  [{colour}]{follows}{show.escape(finding.text)}[/]")
@@ -391,7 +393,13 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
     if is_explained or not has_failed:
         lines += ["  T_cam_lidar (p_cam = R p_lidar + t)", *show.matrix_lines(c.T_cam_lidar, "    ")]
     lines += uncertainty_lines(c) if is_explained else _short_uncertainty(c)
-    lines.append(f"  captures     {len(c.captures_used)} used of {c.n_captures}")
+    if not is_explained:
+        # Lens and squares that the result has corrected go with its extrinsics.
+        lines += [
+            f"  {show.escape(finding.text)}"
+            for finding in c.findings
+            if finding.code in _CORRECTED and finding.severity == "note"
+        ]
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
         lines.append(
             f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"

@@ -139,7 +139,11 @@ def _report(error: BaseException, *, show_traceback: bool) -> int:
     if isinstance(error, LceRigError):
         what, hint, code = error.what, error.hint, error.exit_code
     elif isinstance(error, ModuleNotFoundError):
-        what, hint, code = f"the package '{error.name}' is missing", f"pip install {error.name}", 5
+        what, hint, code = (
+            f"the package '{error.name}' is missing",
+            "Install it with the others: pip install lce-rig",
+            5,
+        )
         show_traceback |= (error.name or "").startswith("lce_rig")
     elif isinstance(error, MemoryError):
         what = str(error) or "more memory is needed than is free"
