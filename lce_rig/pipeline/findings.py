@@ -4,11 +4,13 @@ from lce_rig.core.findings import Finding, Kind
 
 
 def _commonest(finding: Finding) -> str:
-    """The commonest of {causes} of refusal with their counts, or: collect more captures."""
+    """The commonest of {causes} of refusal with their counts, and how many captures {n_needed} lacks."""
     causes = finding.figures["causes"]
     assert isinstance(causes, tuple)
     lines = [f"{cause[0]} x {cause[2]}" for cause in causes if isinstance(cause, tuple)]
-    return "\n".join(lines) or "collect more captures"
+    n_missing = int(finding.figure("n_needed") - finding.figure("n_detected"))
+    more = f"collect at least {n_missing} more, with the board at other places and tilts"
+    return "\n".join([*lines, more])
 
 
 FEW_DETECTED = Kind(

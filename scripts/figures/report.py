@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tests.page.browser import Browser
+
+from tests.show.phone.browser import Browser
 
 _WIDE_PX, _PHONE_PX, _HEIGHT_PX, _GAP_PX = 1180, 390, 1250, 30
 
