@@ -12,6 +12,7 @@ import click
 from lce_rig.cli import show
 from lce_rig.cli.options import require_sensors
 from lce_rig.core.errors import ProfileError, SourceError, UsageError
+from lce_rig.io import RECORDINGS
 from lce_rig.io.ros.bag_file import SUFFIXES, is_bag_file
 from lce_rig.pipeline.detect_session import check_networks
 from lce_rig.pipeline.new_profile import BOARD_FORM, clouds_in, parse_board, parse_intrinsics
@@ -253,6 +254,12 @@ def new_profile(
     _print_warnings(load_rig(path))
 
 
+_NUMBERS_HINT = (
+    "Leave --from out and give the figures: lce-rig rigs new NAME --lidar VLP-16 "
+    "--intrinsics radtan,1280x720,1000,1000,640,360,0,0,0,0 --board 8x6,0.07,0.767x0.626"
+)
+
+
 def _is_bag(path: Path) -> bool:
     """Tell a bag from a profile, by its suffix or what lies in the folder.
 
@@ -264,8 +271,10 @@ def _is_bag(path: Path) -> bool:
             return True
         raise SourceError(
             f"{path} holds no bag ({', '.join(SUFFIXES)}) and no point clouds in pcd/",
-            "Of a folder of images, give --lidar, --intrinsics and --board.",
+            _NUMBERS_HINT,
         )
+    if path.is_file() and path.suffix.lower() in RECORDINGS and path.suffix not in SUFFIXES:
+        raise SourceError(f"{path}: a {path.suffix} file does not tell the rig's sensors", _NUMBERS_HINT)
     if path.suffix in SUFFIXES and not path.exists():
         raise SourceError(f"{path} does not exist")
     return path.suffix in SUFFIXES

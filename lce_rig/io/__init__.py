@@ -29,6 +29,7 @@ _BAGS = frozenset({".bag", ".db3", ".mcap"})
 _PACKETS = frozenset({".pcap", ".pcapng"})
 _EVENTS = frozenset({".aedat4", ".raw", ".h5", ".hdf5"})
 _KINDS = (_BAGS, _PACKETS, _EVENTS)
+_CLOUDS = frozenset({".pcd", ".ply"})
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:
@@ -50,6 +51,8 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
     if kind in (".pcap", ".pcapng"):
         model = rig.lidars[choose_lidar(rig, options, [])].model.upper().removeprefix("OUSTER").lstrip(" -_")
         reader = "lce_rig.io.ouster:OusterRecording" if model.startswith("OS") else reader
+    if kind == "folder" and options.is_part and not _holds_clouds(path):
+        reader = "lce_rig.io.folder.folder:ImagesRecording"
     recording: Recording = resolve_name(reader)(path, rig, options)
     return recording
 
@@ -102,19 +105,30 @@ def list_parts(path: Path, rig: Rig, options: SourceOptions) -> list[tuple[Path,
         return [(path, options)]
     entries = sorted(entry for entry in path.iterdir() if entry.name[0] != ".")
     kinds = {suffix: [e for e in entries if e.is_file() and e.suffix.lower() in suffix] for suffix in _KINDS}
-    folders = [entry for entry in entries if entry.is_dir()]
+    folders, images = [entry for entry in entries if entry.is_dir()], list[Path]()
     if not all(any(file.suffix.lower() in _BAGS for file in folder.iterdir()) for folder in folders):
-        return [(path, options)]  # Of images and point clouds, whatever lies beside them.
+        if not kinds[_PACKETS] or _holds_clouds(path):
+            return [(path, options)]  # Of images and point clouds, whatever lies beside them.
+        folders, images = [], [path]
     # A bag in several pieces lies in one folder, and is read as one.
     bags = ([path] if kinds[_BAGS] else []) + folders
-    is_one_of_many = len(bags) + len(kinds[_PACKETS]) + len(kinds[_EVENTS]) > 1
+    is_one_of_many = len(bags) + len(images) + len(kinds[_PACKETS]) + len(kinds[_EVENTS]) > 1
     options = replace(options, is_part=options.is_part or is_one_of_many)
-    parts = [(bag, options) for bag in bags]
+    parts = [(part, options) for part in bags + images]
     for file in kinds[_PACKETS]:
         parts.append((file, replace(options, lidar=_named(file, rig.lidars) or options.lidar)))
     for file in kinds[_EVENTS]:
         parts.append((file, replace(options, camera=_named(file, rig.cameras) or options.camera)))
     return parts or [(path, options)]
+
+
+def _holds_clouds(folder: Path) -> bool:
+    return any(
+        file.suffix.lower() in _CLOUDS
+        for place in (folder, *folder.iterdir())
+        if place.is_dir()
+        for file in place.iterdir()
+    )
 
 
 def _named(file: Path, sensors: Collection[str]) -> str | None:

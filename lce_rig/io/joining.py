@@ -144,7 +144,7 @@ def require_sensors(recording: ContinuousRecording) -> None:
         raise SourceError(what, f"Also give the LiDAR's {example}")
     if kinds == {"scans"}:
         what = f"{recording.path}: no images and no events; it holds {holds}"
-        raise SourceError(what, f"Also give the camera's {example}")
+        raise SourceError(what, f"Also give the camera's {example}, or a folder of images")
 
 
 class JoinedRecording:

@@ -48,6 +48,10 @@ _COMMENTS = {
     "sync": "hardware (shared pulse), ptp or none",
 }
 BOARD_FORM = "COLSxROWS,SQUARE,WIDTHxHEIGHT[,RIGHT,UP], lengths in m, such as 8x6,0.07,0.767x0.626"
+_ROUGH_LENS = (
+    "Not measured yet? Rough ones will do: FX = FY = 0.8 times the width, CX and CY the image's middle, and "
+    "zeros; `lce-rig intrinsics` measures them later from the same captures."
+)
 _LENS_FORM = (
     "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0"
 )
@@ -103,7 +107,8 @@ def new_profile(
         if len(intrinsics) != len(groups):
             raise UsageError(
                 f"intrinsics of {len(intrinsics)} of {len(groups)} cameras given",
-                f"Give --intrinsics once for each --camera: a camera_info file, or {_LENS_FORM}.",
+                f"Give --intrinsics once for each --camera: a camera_info file, or {_LENS_FORM}.\n"
+                f"{_ROUGH_LENS}",
             )
     model = lidar_model or _UNKNOWN_MODEL
     notes = [_line(topic) for topic in topics]

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -21,6 +22,11 @@ from .vlp16_room import NETWORK_NS, packets_of, room_scans
 @pytest.fixture(scope="module")
 def rles() -> Rig:
     return load_rig("rles")
+
+
+@pytest.fixture(scope="module")
+def rlfs() -> Rig:
+    return load_rig("rlfs")
 
 
 def fill(folder: Path, rig: Rig, ros: int = 1) -> int:
@@ -112,3 +118,56 @@ def test_other_folders_are_read_as_a_whole(tmp_path: Path, rles: Rig, files: tup
     assert list_parts(tmp_path, rles, options) == [(tmp_path, options)]
     lone = tmp_path / "lone.pcap"
     assert list_parts(lone, rles, options) == [(lone, options)]
+
+
+def fill_with_pictures(folder: Path, place: str = "webcam", n: int = 5, torn: int | None = None) -> None:
+    """Record a second of packets, and pictures named after their times, ten a second."""
+    pictures = folder / place
+    pictures.mkdir(parents=True)
+    for k in range(n):
+        file = pictures / f"{T0_NS // 10**9}.{k:01d}50000.jpg"
+        cv2.imwrite(str(file), np.full((72, 128), 10 + k, np.uint8))
+        if k == torn:
+            file.write_bytes(file.read_bytes()[:100])
+    with PcapWriter(folder / "lidar.pcap") as packets:
+        for sent in packets_of(room_scans(10, T0_NS)):
+            arrival_ns = sent.sent_ns + NETWORK_NS
+            packets.write(Datagram(arrival_ns, "127.0.0.1", sent.port, sent.port, sent.payload))
+
+
+@pytest.mark.parametrize("paths", [["."], ["lidar.pcap", "webcam"], ["webcam", "lidar.pcap"]])
+def test_pictures_named_after_their_times_are_joined_with_packets(
+    tmp_path: Path, rlfs: Rig, paths: list[str]
+) -> None:
+    fill_with_pictures(tmp_path / "day", torn=3)
+    (joined,) = join_recordings(open_recordings([tmp_path / "day" / p for p in paths], rlfs), rlfs)
+    assert isinstance(joined, JoinedRecording)
+    samples = list(joined.samples())
+    second_ns = T0_NS // 10**9 * 10**9
+    images = [sample for sample in samples if isinstance(sample, Image)]
+    assert [image.pixels.flat[0] for image in images] == [10, 11, 12, 14]
+    assert [image.stamp_ns for image in images] == [second_ns + k * 10**8 + 5 * 10**7 for k in (0, 1, 2, 4)]
+    assert 8 <= sum(isinstance(sample, Scan) for sample in samples) <= 10
+    assert any(".350000.jpg" in note for note in joined.notes)
+
+
+def test_two_days_of_pictures_and_packets_stay_apart(tmp_path: Path, rlfs: Rig) -> None:
+    for day in ("monday", "tuesday"):
+        fill_with_pictures(tmp_path / day)
+    for file in (tmp_path / "tuesday/webcam").iterdir():
+        file.rename(file.with_name(f"{int(file.name[:10]) + 86400}{file.name[10:]}"))
+    joined = join_recordings(open_recordings([tmp_path / "monday", tmp_path / "tuesday"], rlfs), rlfs)
+    assert len(joined) == 2
+    list(joined[0].samples())  # type: ignore[attr-defined]
+    with pytest.raises(SourceError):  # The packets are still monday's.
+        list(joined[1].samples())  # type: ignore[attr-defined]
+
+
+def test_pictures_without_times_or_without_scans_are_refused(tmp_path: Path, rlfs: Rig) -> None:
+    fill_with_pictures(tmp_path)
+    with pytest.raises(SourceError):
+        open_recordings([tmp_path / "webcam"], rlfs)
+    for k, file in enumerate(sorted((tmp_path / "webcam").iterdir())):
+        file.rename(file.with_name(f"{k:05d}.jpg"))
+    with pytest.raises(SourceError):
+        open_recordings([tmp_path / "lidar.pcap", tmp_path / "webcam"], rlfs)

@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -12,11 +12,20 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Image, Scan, Stream
 from lce_rig.core.errors import SourceError, reading
+from lce_rig.core.losses import Losses
+from lce_rig.io.findings import NOT_DECODED
 from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.folder.decoding import DECODERS, SUFFIXES, read_cloud, read_image
-from lce_rig.io.protocol import PairMethod, SourceOptions, choose_camera, choose_lidar
+from lce_rig.io.protocol import (
+    PairMethod,
+    SourceOptions,
+    Span,
+    choose_camera,
+    choose_lidar,
+    fingerprint,
+)
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.timing.clock_fit import nearest
 
@@ -171,6 +180,8 @@ def _list(
     if len(holding) == 1:
         return next(iter(holding.values()))
     hint = f"Put them into {names[0]}/ below it; {', '.join(sorted(suffixes))} are read."
+    if names is CLOUD_FOLDERS:
+        hint += " Or give the LiDAR's recording of the same time as well: --from lidar.pcap."
     if holding:
         raise SourceError(f"{folder}: {what} lie in several folders: {', '.join(sorted(holding))}", hint)
     empty = next((name for name in names if name in folders), None)
@@ -254,6 +265,97 @@ class PairOnDisk:
         return images, reading.scan, notes
 
 
+def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) -> list[list[ImageOnDisk]]:
+    """List the images of each camera.
+
+    Raises:
+        SourceError: there are none, or none of the camera that was asked for, or their camera is not known.
+    """
+    found = _images_by_camera(folder, rig.cameras) if len(rig.cameras) > 1 else {}
+    if options.camera in found:
+        found = {options.camera: found[options.camera]}
+    elif found and options.camera in rig.cameras:
+        raise SourceError(f"{folder}: images of {', '.join(found)} found, none of {options.camera}")
+    by_camera: dict[str | None, list[Path]] = dict(found.items())
+    by_camera = by_camera or {None: _list(folder, IMAGE_FOLDERS, SUFFIXES, "images", notes)}
+    images = []
+    for name, paths in by_camera.items():
+        camera, channel = choose_camera(rig, options, notes, name)
+        times_ns = parse_times([path.stem for path in paths])
+        stamps_ns = [None] * len(paths) if times_ns is None else times_ns.tolist()
+        labels = [path.name if len(by_camera) == 1 else f"{path.parent.name}/{path.name}" for path in paths]
+        images.append(
+            [
+                ImageOnDisk(path, label, camera, channel, stamp_ns)
+                for path, label, stamp_ns in zip(paths, labels, stamps_ns, strict=True)
+            ]
+        )
+    return images
+
+
+class ImagesRecording:
+    """Images whose names are times, beside another's scans of the same moment; see `ContinuousRecording`.
+
+    Attributes:
+        path: the folder.
+        notes: what was chosen, and after reading the images that could not be read.
+        key: fingerprint of the first and the last image of each camera, and of their number.
+        n_samples: number of images.
+        streams: the images of each camera, with the times of the first and the last.
+    """
+
+    def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
+        """Find the images; nothing is decoded yet.
+
+        Raises:
+            SourceError: there are none, their camera is not known, or their names are no times.
+        """
+        self.path = path
+        self.notes: list[str] = []
+        self._images: list[tuple[int, ImageOnDisk]] = []
+        self.streams: dict[Stream, Span | None] = {}
+        ends: list[Path] = []
+        for images in _images(path, rig, options, self.notes):
+            timed = sorted(
+                ((image.stamp_ns, image) for image in images if image.stamp_ns is not None),
+                key=lambda item: item[0],
+            )
+            if not timed:
+                raise SourceError(
+                    f"{path}: the names of the images are no times ({images[0].path.name})",
+                    "Name each after its time on the clock of the other recording, in seconds since 1970 "
+                    "(1760000000.046122.jpg) or in ns; or put the point clouds into pcd/ beside them.",
+                )
+            (first_ns, first), (last_ns, last) = timed[0], timed[-1]
+            self.streams[Stream(first.camera, first.channel, "images")] = (first_ns, last_ns)
+            self._images += timed
+            ends += [first.path, last.path]
+        self._images.sort(key=lambda item: item[0])
+        self.n_samples = len(self._images)
+        self.key = f"{fingerprint(ends)}:{self.n_samples}"
+
+    def samples(self) -> Iterator[Image]:
+        """Yield the images, in order of time; those that cannot be read are counted in `notes`.
+
+        Raises:
+            SourceError: not one could be read.
+        """
+        losses, n_read = Losses(), 0
+        try:
+            for _, file in self._images:
+                try:
+                    image = file.read()
+                except SourceError as error:
+                    losses.add(NOT_DECODED(where=error.what))
+                    continue
+                n_read += 1
+                yield image
+        finally:
+            self.notes += [f"{self.path.name}: {finding.text}" for finding in losses.findings()]
+        if n_read == 0:
+            raise SourceError(f"{self.path}: not one image could be read")
+
+
 class FolderRecording:
     """Images and point clouds in folders side by side, or in one; images of several cameras in a folder each.
 
@@ -273,7 +375,7 @@ class FolderRecording:
         self.notes: list[str] = []
         self._rig, self._options = rig, options
         lidar = choose_lidar(rig, options, self.notes)
-        images = self._images()
+        images = _images(path, rig, options, self.notes)
         clouds = _list(path, CLOUD_FOLDERS, frozenset(DECODERS), "point clouds", self.notes)
         cloud_ns = parse_times([cloud.stem for cloud in clouds])
         # The second image of one camera that goes with a point cloud makes a pair of its own.
@@ -300,37 +402,6 @@ class FolderRecording:
                 None if cloud_ns is None else int(cloud_ns[j]),
             )
             for (j, _), held in sorted(together.items(), key=lambda item: item[0])
-        ]
-
-    def _images(self) -> list[list[ImageOnDisk]]:
-        """List the images of each camera.
-
-        Raises:
-            SourceError: there are none, or none of the camera that was asked for.
-        """
-        rig, wanted = self._rig, self._options.camera
-        found = _images_by_camera(self.path, rig.cameras) if len(rig.cameras) > 1 else {}
-        if not found:
-            images = _list(self.path, IMAGE_FOLDERS, SUFFIXES, "images", self.notes)
-            return [self._of_camera(images, None, is_alone=True)]
-        if wanted in rig.cameras:
-            if wanted not in found:
-                raise SourceError(f"{self.path}: images of {', '.join(found)} found, none of {wanted}")
-            found = {wanted: found[wanted]}
-        return [self._of_camera(paths, camera, is_alone=len(found) == 1) for camera, paths in found.items()]
-
-    def _of_camera(self, paths: Sequence[Path], camera: str | None, *, is_alone: bool) -> list[ImageOnDisk]:
-        camera, channel = choose_camera(self._rig, self._options, self.notes, camera)
-        times_ns = parse_times([path.stem for path in paths])
-        return [
-            ImageOnDisk(
-                path,
-                path.name if is_alone else f"{path.parent.name}/{path.name}",
-                camera,
-                channel,
-                None if times_ns is None else int(times_ns[i]),
-            )
-            for i, path in enumerate(paths)
         ]
 
     def _pair(self, images: Sequence[Sequence[ImageOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
