@@ -16,8 +16,10 @@ from lce_rig.session import Session
 
 @click.command()
 @session_argument
-@click.option("--reject", metavar="NAME", multiple=True, help="Reject this capture; repeatable.")
-@click.option("--restore", metavar="NAME", multiple=True, help="Restore this capture; repeatable.")
+@click.option("--reject", metavar="NAMES", multiple=True, help="Reject these captures, separated by commas.")
+@click.option(
+    "--restore", metavar="NAMES", multiple=True, help="Restore these captures, separated by commas."
+)
 @click.option("--reason", metavar="TEXT", default="", help="Write this reason into the session's journal.")
 @json_option
 def captures(
@@ -28,7 +30,7 @@ def captures(
     A rejected capture moves to SESSION/rejected/ with all its files. No command uses it, and `collect` does
     not take it again from the same recording. Restoring moves it back.
     """
-    rejecting, restoring = set(map(_full, reject)), set(map(_full, restore))
+    rejecting, restoring = _names(reject), _names(restore)
     with lce.Session.open(session, writable=bool(rejecting or restoring)) as opened:
         _require_there(opened, rejecting, restoring)
         for name in sorted(rejecting):
@@ -62,6 +64,11 @@ def put_aside(session: Path, names: Sequence[str], reason: str) -> None:
         _require_there(opened, set(names), set())
         for name in names:
             opened.reject(name, reason)
+
+
+def _names(options: Sequence[str]) -> set[str]:
+    """Split the captures' names of all options at commas."""
+    return {_full(name.strip()) for option in options for name in option.split(",")}
 
 
 def _full(name: str) -> str:

@@ -13,6 +13,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, explain_option, json_option, session_argument
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.phrasing import of_session
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.lidar.search import plane_limit_m
@@ -70,7 +71,8 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool, event
                 show.print_lines(_limits(opened.rig, detections, pair, refused))
             names, needed = detections.captures(pair), opened.rig.quality.min_captures
             show.print_lines(_head(pair, names, refused, needed))
-            show.print_lines(_causes(names, refused, plates[pair], is_whole=explain))
+            causes = _causes(names, refused, plates[pair], is_whole=explain)
+            show.print_lines([of_session(line, str(session)) for line in causes])
             show.print_lines(_repeated(placements[pair], is_whole=explain))
     n_usable = max(len(detections.captures(pair)) - len(refused) for pair, refused in refusals.items())
     if n_usable >= opened.rig.quality.min_captures:

@@ -78,6 +78,10 @@ def export(
     sensor that is nearest to the root of the robot's tree stays where it is. Each other one keeps its parent,
     and its pose there changes; one that the robot lacks is added. The rest of a URDF stays as it is.
     """
+    if str(session) in EXPORTS and not session.exists():
+        raise UsageError(
+            f"{session} is a format, not a session", f"Write: lce-rig export --formats {session} -o FOLDER"
+        )
     if (into is None) == (output is None):
         raise UsageError(
             "neither --output nor --into is given"

@@ -8,7 +8,7 @@ import click
 from lce_rig.cli import show
 from lce_rig.cli.options import cameras_option, explain_option, require_sensors, session_argument, split_names
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-from lce_rig.core.phrasing import as_line
+from lce_rig.core.phrasing import as_line, of_session
 from lce_rig.judge.intrinsics_check import describe as figures_of
 from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
 from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
@@ -78,7 +78,7 @@ def intrinsics(
         show.print_json(document(opened.rig, measured))
     else:
         for one in measured:
-            show.print_lines(_lines(one, is_explained=explain))
+            show.print_lines(_lines(one, str(session), is_explained=explain))
             if explain:
                 show.print_table(_table(one))
                 show.print_lines(_explanation(one))
@@ -95,13 +95,15 @@ def intrinsics(
         raise join_shortages(troubles)
 
 
-def _lines(measured: MeasuredIntrinsics, *, is_explained: bool) -> list[str]:
+def _lines(measured: MeasuredIntrinsics, session: str, *, is_explained: bool) -> list[str]:
     """State the judgement with its action, the fit, the intrinsics and the weakness that matters most."""
     estimate, lens, judgement = measured.estimate, measured.intrinsics, measured.judgement
     covered = f"{100 * measured.certainty.is_covered.mean():.0f}"
     colour = {"intrinsics.fit": "green", "intrinsics.better": "red"}.get(judgement.code, "yellow")
     lines = [f"[bold]{measured.camera}[/]: [{colour}]{show.escape(judgement.text)}[/]"]
-    lines += [f"  -> {show.escape(as_line(judgement.advice))}"] if judgement.advice else []
+    lines += (
+        [f"  -> {show.escape(as_line(of_session(judgement.advice, session)))}"] if judgement.advice else []
+    )
     if measured.check is None:
         size = f"{measured.given.width_px}x{measured.given.height_px}"
         lines.append(f"  [red]the profile's intrinsics are for {size} px, the images have another size[/]")

@@ -11,6 +11,7 @@ from lce_rig.cli.calibrate import exit_by_verdict, scene_texts
 from lce_rig.cli.options import event_image_option, explain_option, json_option, session_argument
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.findings import worst
+from lce_rig.core.phrasing import of_session
 from lce_rig.detect.detection import Pair
 from lce_rig.judge.findings import consequences
 from lce_rig.judge.session_check import SessionCheck
@@ -77,7 +78,7 @@ def verify(
         for checked in checks:
             if explain:
                 show.print_table(_table(checked))
-            show.print_lines(_lines(checked, is_explained=explain))
+            show.print_lines(_lines(checked, str(session), is_explained=explain))
     for c in verification.unchecked:
         show.warn(f"{session} holds no captures of {Pair.of(c)}: not checked")
     exit_by_verdict(verification.calibrations, are_printed=not as_json)
@@ -102,20 +103,21 @@ def _table(checked: SessionCheck) -> Any:
     return table
 
 
-def _lines(checked: SessionCheck, *, is_explained: bool) -> list[str]:
+def _lines(checked: SessionCheck, session: str, *, is_explained: bool) -> list[str]:
     """State whether the captures agree with the extrinsics, mean residuals and where the images are."""
     c, doubts = checked.calibration, checked.findings
     colour = {"note": "green", "warning": "yellow", "error": "red"}[worst(doubts)]
     opinion = {"note": "agree with", "warning": "fit poorly", "error": "contradict"}[worst(doubts)]
     lines = [f"[bold]{checked.pair}[/]: [{colour}]the captures {opinion} the extrinsics[/]"]
     for finding in doubts:
-        lines += show.cause_lines(finding.text, finding.advice, colour)
+        lines += show.cause_lines(finding.text, of_session(finding.advice, session), colour)
     if c.verdict != "pass":
         lines[0] += f", [{show.COLOURS[c.verdict]}]whose verdict is {c.verdict.upper()}[/]"
         following = consequences(c.findings)
         causes = [each for each in c.findings if each.severity != "note" and each.code not in following]
         for cause in causes if is_explained else causes[:1]:
-            lines += show.cause_lines(cause.text, cause.advice, show.COLOURS[c.verdict])
+            advice = of_session(cause.advice, session)
+            lines += show.cause_lines(cause.text, advice, show.COLOURS[c.verdict])
     if checked.metrics is not None:
         m = checked.metrics
         lines.append(

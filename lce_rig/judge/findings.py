@@ -381,7 +381,7 @@ INTRINSICS_BETTER = Kind(
     "intrinsics.better",
     "the session determines the intrinsics better than the profile: it covers {covered:percent} of the image "
     "and determines pixels near its border to {image_sigma_px:.2f} px (limit {limit_px:.2f} px)",
-    "put them into the profile",
+    "write them into one: `lce-rig intrinsics SESSION --save-profile FILE`",
     severity="note",
 )
 INTRINSICS_FIT = Kind(

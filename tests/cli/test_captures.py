@@ -34,11 +34,20 @@ def test_a_rejected_capture_is_used_no_more_until_it_is_restored(lce_rig, calibr
         ("--restore", "0"),
         ("--reject", "0", "--restore", "0"),
         ("--reject", "0", "--reject", "../captures/000001"),
+        ("--reject", "0,99"),
     ],
 )
 def test_one_wrong_name_moves_nothing(lce_rig, session, options):
     outcome = lce_rig("captures", session, *options)
     assert outcome.code == 2
+    assert {each["state"] for each in listed(lce_rig, session).values()} == {"kept"}
+
+
+def test_several_captures_are_named_at_once(lce_rig, session):
+    assert lce_rig("captures", session, "--reject", "1, 2", "--reject", "4").code == 0
+    rejected = {name for name, each in listed(lce_rig, session).items() if each["state"] == "rejected"}
+    assert rejected == {"000001", "000002", "000004"}
+    assert lce_rig("captures", session, "--restore", "1,2,4").code == 0
     assert {each["state"] for each in listed(lce_rig, session).values()} == {"kept"}
 
 

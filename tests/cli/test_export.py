@@ -38,6 +38,7 @@ def test_formats_are_chosen_and_the_target_is_named(lce_rig, calibrated, tmp_pat
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["rles.urdf"]
     assert lce_rig("export", calibrated, "-o", tmp_path / "out", "--formats", "usd").code == 2
     assert lce_rig("export", calibrated).code == 2
+    assert lce_rig("export", "kalibr", "-o", tmp_path / "format").code == 2
     both = ("--into", tmp_path / "none.urdf", "-o", tmp_path / "both")
     assert lce_rig("export", calibrated, *both).code == 2 and not (tmp_path / "both").exists()
     assert lce_rig("export", calibrated, "--into", tmp_path / "none.urdf").code == 4
