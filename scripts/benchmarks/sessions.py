@@ -1,9 +1,9 @@
 """Tell a mounting that changed between sessions from an estimate that errs: plates, their edges, their print.
 
-The plates that scans show are compared with those that images show, under the first session's extrinsics by
-Algorithm 1. A mounting that moved displaces whole plates: upper edges out, lower edges in. Ring ends that
-bleed move all edges outwards. A print that was glued elsewhere lies elsewhere within the outline that images
-show.
+The plates that scans show are compared with those that images show, under the first session's extrinsics
+and lens by Algorithm 1. A mounting that moved displaces whole plates: upper edges out, lower edges in. Ring
+ends that bleed move all edges outwards. A print that was glued elsewhere lies elsewhere within the outline
+that images show.
 """
 
 import tempfile
@@ -19,6 +19,7 @@ from benchmarks.tables import print_head, print_row
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.session import Session
 
@@ -36,25 +37,27 @@ def bench_sessions() -> None:
     rows: dict[str, list[tuple[float, ...]]] = defaultdict(list)
     edges: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     prints: dict[str, list[Array]] = defaultdict(list)
-    T_cam_lidar = None
+    reference = None
     with tempfile.TemporaryDirectory() as folder:
         for recorded in SETS:
             if recorded.name not in RIG:
                 continue
             path = Path(folder) / recorded.name
             recorded.collect(path)
-            if T_cam_lidar is None:
-                calibrated = lce.calibrate(Session.open(path), options=lce.CalibrateOptions("paper"))
-                T_cam_lidar = np.asarray(calibrated.pairs[0].T_cam_lidar)
+            if reference is None:
+                reference = lce.calibrate(Session.open(path), options=lce.CalibrateOptions("paper")).pairs[0]
             rig, detections = detect(path)
-            board, lens = rig.board.to_board(), next(iter(rig.cameras.values())).to_intrinsics()
+            board, lens = rig.board.to_board(), reference.intrinsics
+            assert lens is not None
             for capture, image in next(iter(detections.images.values())).items():
                 places = next(iter(detections.lidars.values())).get(capture)
                 if not isinstance(image, ImageBoard) or not isinstance(places, list):
                     continue
                 stamp = np.datetime64(image.stamp_ns or 0, "ns").astype("datetime64[D]")
                 name = recorded.name if image.stamp_ns is None else f"{recorded.name}, {stamp}"
-                T_lidar_board = invert(T_cam_lidar) @ image.T_cam_board
+                solved = solve_planar_pose(image.corners_px, board.corners(), lens, [image.T_cam_board])
+                assert solved is not None
+                T_lidar_board = invert(reference.T_cam_lidar) @ solved.T_cam_board
                 lidar = min(
                     places,
                     key=lambda place: float(
@@ -68,7 +71,7 @@ def bench_sessions() -> None:
                 picture = cv2.imread(
                     str(path / "captures" / capture / "cam.frames.png"), cv2.IMREAD_GRAYSCALE
                 )
-                prints[name].append(print_offset(picture, image.T_cam_board, board, lens))
+                prints[name].append(print_offset(picture, solved.T_cam_board, board, lens))
     print_head(
         "session",
         "captures",
