@@ -11,8 +11,7 @@ GUIDE_NO_NOMINAL = Kind(
 )
 GUIDE_CONTINUES = Kind(
     "guide.continues",
-    "captures to go: {n_more} (minimum {n_least}; predicted {rotation_deg:2deg}, {position_mm:.0f} mm, "
-    "limit {limit_deg:g} deg, {limit_mm:g} mm)",
+    "captures to go: {n_more} (ends at {n_least} captures, +-{limit_deg:g} deg, +-{limit_mm:g} mm)",
     severity="note",
 )
 GUIDE_PREDICTED = Kind(
