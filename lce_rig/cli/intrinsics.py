@@ -78,7 +78,9 @@ def intrinsics(
         show.print_json(document(opened.rig, measured))
     else:
         for one in measured:
-            show.print_lines(_lines(one, str(session), is_explained=explain))
+            is_followed = save_profile is not None and one.judgement.code == "intrinsics.better"
+            advice = "" if is_followed else of_session(one.judgement.advice, str(session))
+            show.print_lines(_lines(one, advice, is_explained=explain))
             if explain:
                 show.print_table(_table(one))
                 show.print_lines(_explanation(one))
@@ -95,15 +97,13 @@ def intrinsics(
         raise join_shortages(troubles)
 
 
-def _lines(measured: MeasuredIntrinsics, session: str, *, is_explained: bool) -> list[str]:
+def _lines(measured: MeasuredIntrinsics, advice: str, *, is_explained: bool) -> list[str]:
     """State the judgement with its action, the fit, the intrinsics and the weakness that matters most."""
     estimate, lens, judgement = measured.estimate, measured.intrinsics, measured.judgement
     covered = f"{100 * measured.certainty.is_covered.mean():.0f}"
     colour = {"intrinsics.fit": "green", "intrinsics.better": "red"}.get(judgement.code, "yellow")
     lines = [f"[bold]{measured.camera}[/]: [{colour}]{show.escape(judgement.text)}[/]"]
-    lines += (
-        [f"  -> {show.escape(as_line(of_session(judgement.advice, session)))}"] if judgement.advice else []
-    )
+    lines += [f"  -> {show.escape(as_line(advice))}"] if advice else []
     if measured.check is None:
         size = f"{measured.given.width_px}x{measured.given.height_px}"
         lines.append(f"  [red]the profile's intrinsics are for {size} px, the images have another size[/]")
