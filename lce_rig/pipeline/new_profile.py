@@ -32,6 +32,7 @@ _FAMILIES: dict[str, Literal["radtan", "equidistant"]] = {
     "equidistant": "equidistant",
     "fisheye": "equidistant",
 }
+_SLOWEST_LIDAR_HZ = 2.0
 _BOARD_SIGMAS = ("pattern_offset_sigma_m", "plate_sigma_m", "bow_sigma_m")
 _COMMENTS = {
     "board": "measure it; do not rely on the CAD model",
@@ -162,7 +163,8 @@ def _lidar(
     if topic is not None:
         block |= {"frame": topic.frame or block["frame"], "topic": topic.topic}
         rate_hz = round(topic.rate_hz or 0.0, 1)
-        block |= {"rate_hz": rate_hz} if rate_hz else {}
+        # Single scans, seconds apart, say nothing of how fast the LiDAR turns.
+        block |= {"rate_hz": rate_hz} if rate_hz >= _SLOWEST_LIDAR_HZ else {}
         cloud, where = topic.cloud, topic.topic
     if find_data_sheet(model) is None:
         if cloud is not None:
