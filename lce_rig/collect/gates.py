@@ -30,8 +30,8 @@ from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_time import rig_time_ns
 
-# For how long a board has to stand still.
-_WINDOW_S = 0.5
+# For how long a board has to stand still; samples farther apart than this are single shots.
+_WINDOW_S, _SINGLE_S = 0.5, 1.0
 
 
 class StillnessGate:
@@ -44,13 +44,20 @@ class StillnessGate:
         board: the profile's.
         max_motion_m: how far it may move in a window; a hand never holds it quite still.
         dwell_s: after this long a capture is taken without waiting for the board to be moved on.
+        takes_singles: whether a detection with none in the second before and after it is a moment, as of a
+            recording that was triggered once for each placement; nothing tells whether its board stood still.
 
     Attributes:
         motion_m: how far the board moved in the last window; infinite where there is no whole one.
         held_s: for how long the present stretch has lasted, since its first whole window; None out of one.
     """
 
-    def __init__(self, board: Board, max_motion_m: float, dwell_s: float = 2.0) -> None:
+    def __init__(
+        self, board: Board, max_motion_m: float, dwell_s: float = 2.0, *, takes_singles: bool = False
+    ) -> None:
+        self._takes_singles = takes_singles
+        self._last_ns: int | None = None
+        self._single: BoardDetection | None = None
         self.motion_m = np.inf
         self.held_s: float | None = None
         self._board = board
@@ -63,6 +70,10 @@ class StillnessGate:
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
         """Take the next detection, and give the moment of a stretch that has ended with it."""
         now_ns = detection.frame.time_ns
+        is_apart = self._last_ns is None or now_ns - self._last_ns > _SINGLE_S * 1e9
+        alone = self._take_single() if is_apart else []
+        self._single = detection if self._takes_singles and is_apart and detection.is_usable else None
+        self._last_ns = now_ns
         self.motion_m = self._measure(detection)
         is_still = self.motion_m <= self._max_motion_m
         if is_still:
@@ -73,11 +84,18 @@ class StillnessGate:
                 self._best_m = self.motion_m
         self.held_s = (now_ns - self._since_ns) * 1e-9 if is_still else None
         if self._best is not None and (not is_still or now_ns - self._since_ns > self._dwell_ns):
-            return self.finish()
-        return []
+            return [*alone, *self._end_stretch()]
+        return alone
 
     def finish(self) -> list[CaptureMoment]:
         """Give the moment of the stretch that lasts, where there is one, and end it."""
+        return [*self._take_single(), *self._end_stretch()]
+
+    def _take_single(self) -> list[CaptureMoment]:
+        single, self._single = self._single, None
+        return [] if single is None else [CaptureMoment(single, {})]
+
+    def _end_stretch(self) -> list[CaptureMoment]:
         best, self._best, self.held_s = self._best, None, None
         return [] if best is None else [best]
 

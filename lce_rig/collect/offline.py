@@ -218,7 +218,9 @@ class _Collector:
         if recording.n_samples >= _LONG_SAMPLES:
             are_still = not has_events and max_motion_m <= _GLANCED_M
             detections = sight_ahead(tracker, frames, is_still_wanted=are_still)
-        gate: StillnessGate | MotionGate = StillnessGate(rig.board.to_board(), max_motion_m)
+        gate: StillnessGate | MotionGate = StillnessGate(
+            rig.board.to_board(), max_motion_m, takes_singles=True
+        )
         if has_events:
             gate = MotionGate(rig, Placements(options.min_move_m, options.min_turn_deg), losses)
         for moment in find_moments(detections, gate):

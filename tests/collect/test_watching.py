@@ -71,6 +71,17 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> 
     assert watcher.refusals.by_code()["image.small_squares"] == 30
 
 
+def test_single_shots_of_a_recording_are_moments_and_passing_samples_are_not() -> None:
+    watcher = BoardTracker(rig(), 0.3, thorough_interval_s=0.0, rescan_interval_s=0.0)
+    times_s = (0.0, 4.0, 8.0, 8.1, 12.0)
+    seen = [see(watcher, k % len(placements()), time_s) for k, time_s in enumerate(times_s)]
+    assert all(each.is_usable for each in seen)
+    gate = StillnessGate(watcher.finder.board, 0.01, takes_singles=True)
+    taken = [round((moment.detection.frame.time_ns - T0_NS) * 1e-9, 1) for moment in find_moments(seen, gate)]
+    assert len(taken) == 3 and {8.0, 8.1}.isdisjoint(taken)
+    assert not list(find_moments(seen, StillnessGate(watcher.finder.board, 0.01)))
+
+
 def test_candidates_beyond_the_profiles_limits_are_no_board_in_the_scan() -> None:
     watcher = BoardTracker(strict(min_points=100_000), 0.3)
     detection = see(watcher, 0, 0.0)
