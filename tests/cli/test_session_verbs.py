@@ -174,7 +174,7 @@ def test_another_result_moves_the_earlier_one_and_its_overlays_to_previous(lce_r
     before = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert lce_rig("calibrate", calibrated).code == 0
     assert (folder / "overlays" / "contact_sheet.png").exists()
-    outcome = lce_rig("calibrate", calibrated, "--use-scene")
+    outcome = lce_rig("calibrate", calibrated, "--use-scene", "--explain")
     assert str(folder / "previous") in outcome.err.replace("\n", "")
     kept = folder / "previous"
     assert {path.relative_to(kept): path.read_bytes() for path in kept.rglob("*") if path.is_file()} == before
