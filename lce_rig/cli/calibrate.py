@@ -300,8 +300,8 @@ def calibrate(
     others = f" and {n_others} for the robot" if n_others else ""
     show.note(f"  files        {written.files[0].parent}/: result.json{page}{others}")
     if all(c.verdict != "fail" for c in result.pairs):
-        of_session = "" if paths[0] == Path("session") else f" {paths[0]}"
-        show.note(f"  next         lce-rig verify{of_session}{'' if name is None else f' --name {name}'}")
+        chosen = "" if paths[0] == Path("session") else f" {paths[0]}"
+        show.note(f"  next         lce-rig verify{chosen}{'' if name is None else f' --name {name}'}")
     exit_by_verdict(result.pairs, are_printed=not as_json)
     if lacking is not None:
         raise lacking
