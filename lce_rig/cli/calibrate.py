@@ -49,7 +49,7 @@ def uncertainty_lines(c: Calibration) -> list[str]:
 
     sigmas = np.sqrt(np.diag(c.cov))
     lines = [
-        f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)",
+        _sigma_line(c.sigma_rotation_deg, c.sigma_translation_m),
         f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
         f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
     ]
@@ -67,6 +67,10 @@ def uncertainty_lines(c: Calibration) -> list[str]:
         for title, cells in rows.items():
             lines.append(f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip())
     return lines
+
+
+def _sigma_line(sigma_deg: float, sigma_m: float) -> str:
+    return f"  uncertainty  {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)"
 
 
 def _by_axis(values: Array, digits: str) -> str:
@@ -144,7 +148,7 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
         ]
         if other.cov is not None:
             sigma_deg, sigma_m = sigma_sizes(other.cov)
-            lines.append(f"  uncertainty  {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)")
+            lines.append(_sigma_line(sigma_deg, sigma_m))
         if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
             separately = ", each camera estimated separately" if other.cov is not None else ""
             lines.append(
@@ -300,8 +304,7 @@ def calibrate(
     others = f" and {n_others} for the robot" if n_others else ""
     show.note(f"  files        {written.files[0].parent}/: result.json{page}{others}")
     if all(c.verdict != "fail" for c in result.pairs):
-        chosen = "" if paths[0] == Path("session") else f" {paths[0]}"
-        show.note(f"  next         lce-rig verify{chosen}{'' if name is None else f' --name {name}'}")
+        show.name_next("verify", paths[0], "" if name is None else f" --name {name}")
     exit_by_verdict(result.pairs, are_printed=not as_json)
     if lacking is not None:
         raise lacking
@@ -410,9 +413,7 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
 def _short_uncertainty(c: Calibration) -> list[str]:
     """State the standard deviations, by axis unless the result has failed, and those of a point 10 m away."""
     sigmas = np.sqrt(np.diag(c.cov))
-    lines = [
-        f"  uncertainty  {c.sigma_rotation_deg:.3f} deg, {1000 * c.sigma_translation_m:.1f} mm (1 sigma)"
-    ]
+    lines = [_sigma_line(c.sigma_rotation_deg, c.sigma_translation_m)]
     if c.verdict == "fail":
         return lines
     lines += [f"    about      {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg"]
@@ -440,17 +441,13 @@ def _explanation(c: Calibration) -> list[str]:
         f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
         f"{held_out}corners {metrics.reprojection_px:.2f} px",
         f"  certificate  {certificate}",
-        *_titled("channels", _channel_texts(c)),
+        *show.titled_lines("channels", _channel_texts(c)),
         *together_lines(c),
-        *_titled("scene", [] if c.scene is None else scene_texts(c.scene)),
+        *show.titled_lines("scene", [] if c.scene is None else scene_texts(c.scene)),
     ]
     for name, why in c.captures_refused.items():
         lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]")
     return lines + [f"  {show.escape(note.sentence)}" for note in c.findings if note.severity == "note"]
-
-
-def _titled(title: str, texts: Sequence[str]) -> list[str]:
-    return [f"  {'' if k else title:<13}{text}" for k, text in enumerate(texts)]
 
 
 def _channel_texts(calibration: Calibration) -> list[str]:

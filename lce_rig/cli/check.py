@@ -76,8 +76,7 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool, event
             show.print_lines(_repeated(placements[pair], is_whole=explain))
     n_usable = max(len(detections.captures(pair)) - len(refused) for pair, refused in refusals.items())
     if n_usable >= opened.rig.quality.min_captures:
-        chosen = "" if session == Path("session") else f" {session}"
-        show.note(f"  next         lce-rig calibrate{chosen}")
+        show.name_next("calibrate", session)
     if n_usable == 0:
         raise NotEnoughDataError(
             f"{session}: no capture is usable",

@@ -6,6 +6,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import click
@@ -74,6 +75,12 @@ def titled_lines(title: str, texts: Sequence[str]) -> list[str]:
     if len(line) <= _WIDTH:
         return [line] if texts else []
     return [f"  {'' if k else title:<13}{text}" for k, text in enumerate(texts)]
+
+
+def name_next(verb: str, session: Path, options: str = "") -> None:
+    """Name the verb to type next on stderr; the default session goes without saying."""
+    chosen = "" if session == Path("session") else f" {session}"
+    note(f"  next         lce-rig {verb}{chosen}{options}")
 
 
 def warn(text: str) -> None:
