@@ -14,7 +14,7 @@ from lce_rig.cli.options import FiniteRange, explain_option, json_option, rig_op
 from lce_rig.core.findings import worst
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import sensors
-from lce_rig.doctor.examine import Check, DoctorOptions, examine
+from lce_rig.doctor.checks import Check, DoctorOptions, examine
 from lce_rig.rig import load_rig
 
 _MARKS = {"note": "[green]ok[/]", "warning": "[yellow]warn[/]", "error": "[bold red]FAIL[/]"}

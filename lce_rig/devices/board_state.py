@@ -23,54 +23,15 @@ from lce_rig.rig.sync_settings import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import ClockTracker
 
-# Which times can be, and which tell that the board restarted: a line may be damaged and keep its sum. One odd
-# time is skipped; two in a row that agree are believed.
-
-# A line is written within milliseconds of its event, and read whenever the computer gets to it.
-ROOM_NS = 2 * NS_PER_S
+# An answer that takes longer came while the computer's clock was set.
+_MAX_ROUND_TRIP_NS = 2 * NS_PER_S
+# Messages are out of order by less; a board whose time goes back further has restarted.
 _MOST_BACK_NS = NS_PER_S
-
 _STALLED_S = 3.0
 _DAMAGED = 0.01
 _MIN_DAMAGED = 5
 _PPS_LATE_S = 2.5
 _NO_CLOCK_S = 5.0
-
-
-class BoardTime:
-    """The board's clock against one of the computer's that is never set.
-
-    Attributes:
-        n_restarts: how often it began anew.
-    """
-
-    def __init__(self) -> None:
-        self.n_restarts = 0
-        self._latest_ns: int | None = None
-        self._least_late_ns = 0
-        self._odd_late_ns: int | None = None
-
-    def accepts(self, board_ns: int, steady_ns: int) -> bool:
-        """Judge a time on the board's clock by when it came.
-
-        Messages may come late, and many at once; never early, and never much out of order.
-        """
-        late_ns = steady_ns - board_ns
-        if self._latest_ns is not None and (
-            board_ns < self._latest_ns - _MOST_BACK_NS or late_ns < self._least_late_ns - ROOM_NS
-        ):
-            is_confirmed = self._odd_late_ns is not None and abs(late_ns - self._odd_late_ns) < ROOM_NS
-            self._odd_late_ns = late_ns
-            if not is_confirmed:
-                return False
-            self.n_restarts += 1
-            self._latest_ns = None
-        self._odd_late_ns = None
-        if self._latest_ns is None:
-            self._latest_ns, self._least_late_ns = board_ns, late_ns
-        self._latest_ns = max(self._latest_ns, board_ns)
-        self._least_late_ns = min(self._least_late_ns, late_ns)
-        return True
 
 
 class Arrival(NamedTuple):
@@ -87,8 +48,8 @@ class BoardState:
         reader: reads the lines, and counts damaged ones.
         n_pulses: pulses handed on, by line.
         n_lost_by_line: pulses whose messages never came, by line; gaps in the running numbers tell.
-        n_implausible: messages whose times cannot be.
-        restarted_ns: when the board last restarted, by the steady clock; None where it did not.
+        n_restarts: how often the board restarted.
+        restarted_ns: when it last did, by the steady clock; None where it did not.
         heard_ns: when the last message came, or the port was opened, by the steady clock.
         hello, status, error: the last of each; None before the first.
         pps: the last pulse per second, with its arrival.
@@ -105,7 +66,7 @@ class BoardState:
         self.reader = LineReader()
         self.n_pulses: Counter[str] = Counter()
         self.n_lost_by_line: Counter[str] = Counter()
-        self.n_implausible = self.heard_ns = 0
+        self.n_restarts = self.heard_ns = 0
         self.restarted_ns: int | None = None
         self.hello: Hello | None = None
         self.status: BoardStatus | None = None
@@ -116,7 +77,7 @@ class BoardState:
         self.utc_tracker = ClockTracker("pulses per second")
         self._opened_ns = 0
         self._lines = dict(lines)
-        self._time = BoardTime()
+        self._latest_ns = 0
         self._last_numbers: dict[str, int] = {}
         self._asked: tuple[int, int] | None = None
 
@@ -140,12 +101,9 @@ class BoardState:
         """Take a message, and give the pulses that it tells of."""
         match message:
             case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | TimeReply(_, _, t_us):
-                n_restarts = self.n_restarts
-                if not self._time.accepts(t_us * 1000, arrival.steady_ns):
-                    self.n_implausible += 1
-                    return []
-                if self.n_restarts > n_restarts:
+                if t_us * 1000 < self._latest_ns - _MOST_BACK_NS:
                     self._restart(arrival)
+                self._latest_ns = max(self._latest_ns, t_us * 1000)
         match message:
             case Hello():
                 self.hello = message
@@ -161,7 +119,7 @@ class BoardState:
                 sent_ns, self._asked = self._asked[1], None
                 self.round_trip_ns = arrival.host_ns - sent_ns - 1000 * (tx_us - rx_us)
                 # A clock that is set between question and answer spoils both.
-                if 0 <= self.round_trip_ns <= ROOM_NS:
+                if 0 <= self.round_trip_ns <= _MAX_ROUND_TRIP_NS:
                     middle_ns = sent_ns + (arrival.host_ns - sent_ns) // 2
                     self.host_tracker.add(500 * (rx_us + tx_us), middle_ns, self.round_trip_ns / 2)
             case BoardStatus():
@@ -169,11 +127,6 @@ class BoardState:
             case BoardError():
                 self.error = message
         return []
-
-    @property
-    def n_restarts(self) -> int:
-        """How often the board restarted."""
-        return self._time.n_restarts
 
     @property
     def has_answered(self) -> bool:
@@ -211,7 +164,7 @@ class BoardState:
             return (findings.BOARD_SILENT(silent_s=silent_s),)
         has_waited = now_ns - self._opened_ns > _NO_CLOCK_S * NS_PER_S
         problems: list[Finding] = []
-        n_damaged = self.reader.n_damaged + self.n_implausible
+        n_damaged = self.reader.n_damaged
         n_lines = n_damaged + self.reader.n_messages
         if n_damaged >= _MIN_DAMAGED and n_damaged > _DAMAGED * n_lines:
             problems.append(findings.DAMAGED_LINES(n=n_damaged, n_lines=n_lines))
@@ -249,7 +202,8 @@ class BoardState:
         return [Pulse(line, t_us * 1000, count, arrival.host_ns)]
 
     def _restart(self, arrival: Arrival) -> None:
-        self.restarted_ns = arrival.steady_ns
+        self.n_restarts, self.restarted_ns = self.n_restarts + 1, arrival.steady_ns
+        self._latest_ns = 0
         self._last_numbers.clear()
         self._asked = None
         self.host_tracker.restart()

@@ -1,36 +1,28 @@
 """LCE1, the line protocol of lce-rig's sync board (docs/sync-protocol.md): bytes in, messages out.
 
 Sentences are framed as NMEA 0183 frames them: `$`, name and fields, `*`, and the exclusive or of what lies
-between. The sum is weak: two characters that trade places leave it unchanged. What passes is still compared
-with a strict grammar, and with what the board has said before (`BoardState`).
+between.
 """
 
 import re
-from collections.abc import Callable
 from functools import reduce
 from operator import xor
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 VERSION = 1
 MAX_LINE = 512
-# Microseconds that still fit into 64 bits as nanoseconds: 292 years.
-MAX_US = (2**63 - 1) // 1000
-MAX_COUNT = 2**32 - 1
 N_CHANNELS = 16
-
+# Microseconds of 31 years; in ns they still fit into 64 bits.
+_MAX_DIGITS = 15
 _SENTENCE = re.compile(rb"([!-#%-)+-~ ]+)\*([0-9A-Fa-f]{1,2})\Z")
-_NUMBER = re.compile(rb"(?:0|[1-9][0-9]{0,18})\Z")
-_WORD = re.compile(rb"[A-Za-z0-9._ -]{1,32}\Z")
-_TEXT = re.compile(rb"[!-)+-~ ]{0,80}\Z")
 
 
 class Hello(NamedTuple):
-    """The board has started, or identifies itself on request; `tick_hz` are its clock's steps per second."""
+    """The board has started, or identifies itself on request."""
 
     version: int
     firmware: str
     board: str
-    tick_hz: int
 
 
 class PpsEdge(NamedTuple):
@@ -67,10 +59,9 @@ class TimeReply(NamedTuple):
 
 
 class BoardStatus(NamedTuple):
-    """How the board does, once a second: bits, pulses per second so far, lines that the host did not read."""
+    """How the board does, once a second: bits, and how many lines the host did not read so far."""
 
     flags: int
-    n_pps: int
     n_lost: int
 
 
@@ -82,52 +73,6 @@ class BoardError(NamedTuple):
 
 
 Message: TypeAlias = Hello | PpsEdge | TriggerEdge | TimeReply | BoardStatus | BoardError
-
-
-def _count(field: bytes, largest: int = MAX_COUNT) -> int:
-    if not _NUMBER.match(field) or int(field) > largest:
-        raise ValueError(field)
-    return int(field)
-
-
-def _time_us(field: bytes) -> int:
-    return _count(field, MAX_US)
-
-
-def _matching(pattern: re.Pattern[bytes]) -> Callable[[bytes], str]:
-    def read(field: bytes) -> str:
-        if not pattern.match(field):
-            raise ValueError(field)
-        return field.decode("ascii")
-
-    return read
-
-
-_word = _matching(_WORD)
-SENTENCES: dict[bytes, tuple[Callable[..., Message], tuple[Callable[[bytes], Any], ...]]] = {
-    b"LCEHI": (Hello, (_count, _word, _word, _count)),
-    b"LCEPP": (
-        PpsEdge,
-        (
-            *(_count, _time_us),
-            lambda field: _count(field, MAX_US // 1_000_000) if field else None,
-            {b"G": "G", b"I": "I", b"N": "N"}.__getitem__,
-        ),
-    ),
-    b"LCETG": (
-        TriggerEdge,
-        (
-            lambda field: _count(field, N_CHANNELS - 1),
-            *(_count, _time_us),
-            {b"R": True, b"F": False}.__getitem__,
-        ),
-    ),
-    b"LCETM": (TimeReply, (_count, _time_us, _time_us)),
-    # The pulses of each line follow; the numbers of their edges say the same.
-    b"LCEST": (BoardStatus, (_count, _count, lambda fields: _count(fields.partition(b",")[0]))),
-    b"LCEER": (BoardError, (_count, _matching(_TEXT))),
-}
-"""The board's sentences by name: the message, and how each field is read; the last takes the rest."""
 
 
 def checksum(body: bytes) -> int:
@@ -155,6 +100,12 @@ def read_sentence(line: bytes) -> bytes:
     return framed[1]
 
 
+def _number(field: bytes) -> int:
+    if not field.isdigit() or len(field) > _MAX_DIGITS:
+        raise ValueError(field)
+    return int(field)
+
+
 def read_line(line: bytes) -> Message | None:
     """Read one line, without its end; None where it is text or another sentence.
 
@@ -165,18 +116,24 @@ def read_line(line: bytes) -> Message | None:
         raise ValueError(line)
     if b"$" not in line:
         return None
-    name, _, rest = read_sentence(line).partition(b",")
-    if name not in SENTENCES:
-        return None
-    kind, readers = SENTENCES[name]
-    fields = rest.split(b",", len(readers) - 1)
-    try:
-        message = kind(*(read(field) for read, field in zip(readers, fields, strict=True)))
-    except KeyError as error:
-        raise ValueError(line) from error
-    if isinstance(message, TimeReply) and message.rx_us > message.tx_us:
-        raise ValueError(line)
-    return message
+    match read_sentence(line).split(b","):
+        case [b"LCEHI", version, firmware, board, _]:
+            return Hello(_number(version), firmware.decode(), board.decode())
+        case [b"LCEPP", seq, t_us, utc_s, (b"G" | b"I" | b"N") as origin]:
+            second = _number(utc_s) if utc_s else None
+            return PpsEdge(_number(seq), _number(t_us), second, origin.decode())
+        case [b"LCETG", channel, number, t_us, (b"R" | b"F") as edge] if _number(channel) < N_CHANNELS:
+            return TriggerEdge(_number(channel), _number(number), _number(t_us), edge == b"R")
+        case [b"LCETM", cookie, rx_us, tx_us]:
+            return TimeReply(_number(cookie), _number(rx_us), _number(tx_us))
+        case [b"LCEST", flags, _, n_lost, *_]:
+            return BoardStatus(_number(flags), _number(n_lost))
+        case [b"LCEER", code, *text]:
+            return BoardError(_number(code), b",".join(text).decode())
+        case [b"LCEHI" | b"LCEPP" | b"LCETG" | b"LCETM" | b"LCEST", *_]:
+            raise ValueError(line)
+        case _:
+            return None
 
 
 class LineReader:

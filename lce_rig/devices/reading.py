@@ -33,12 +33,10 @@ class ClockState:
     Attributes:
         finding: whose time, and how it is tied to others.
         is_utc: whether it is the sensor's own time, tied to UTC by pulses and sentences.
-        ahead_s: by how much the sensor's clock is ahead of this computer's; None where unknown.
     """
 
     finding: Finding
     is_utc: bool = False
-    ahead_s: float | None = None
 
 
 @dataclass(frozen=True)

@@ -161,16 +161,15 @@ class Vlp16Source(LiveSource):
             stream, ports = self._stream, self._ports
             if stream is None:
                 return SourceStatus(self.sensor)
-            state, ahead_ns = stream.clock.state(), stream.clock.ahead_ns()
+            state = stream.clock.state()
             problems = [] if state.severity == "note" else [state]
             problems += self._find_losses(stream, ports)
             if self._recorder is not None:
                 problems += self._recorder.findings()
-            ahead_s = None if ahead_ns is None else ahead_ns * 1e-9
             return SourceStatus(
                 self.sensor,
                 n_lost=stream.losses.n("packet.lost") + self._n_lost_before,
-                clock=ClockState(state, stream.clock.is_utc, ahead_s),
+                clock=ClockState(state, stream.clock.is_utc),
                 problems=tuple(problems),
                 device=f"{stream.product.name} at {self._address}" if stream.n_data else "",
                 serial=self._serial,

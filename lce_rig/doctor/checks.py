@@ -1,7 +1,8 @@
-"""Every check: a function that yields findings, first how it is as a note, then what is wrong.
+"""Is this computer, with these sensors, fit to collect? Every check, and the table of them.
 
-A check of the computer takes the examination, all others the name of a sensor with it. A fault is a warning
-where collecting works, less well, and an error where it does not or its data are wrong.
+A check yields findings, first how it is as a note, then what is wrong. A check of the computer takes the
+examination, all others the name of a sensor with it. A fault is a warning where collecting works, less well,
+and an error where it does not or its data are wrong.
 """
 
 import ctypes
@@ -9,23 +10,25 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from lce_rig.core import velodyne
 from lce_rig.core.data import Image, Pulse
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Figure, Finding, Severity
+from lce_rig.core.findings import Figure, Finding, Severity, worst
+from lce_rig.devices import sensors, source_of
 from lce_rig.devices.findings import BOARD_NOT_TIED
-from lce_rig.devices.velodyne_web import WebReport, find_problems
+from lce_rig.devices.velodyne_web import VelodyneWeb, WebReport, find_problems
 from lce_rig.doctor import findings
-from lce_rig.doctor.observing import Examination, ObservedSensor
+from lce_rig.doctor.observing import Examination, ObservedSensor, observe
 from lce_rig.rig import Rig
 from lce_rig.rig.sync_settings import BOARD, PPS_LINE
-from lce_rig.timing.clock import ClockModel
-from lce_rig.timing.clock_fit import fit_arrivals
 from lce_rig.timing.rig_clock import RigClock, edge_line
 from lce_rig.timing.triggers import TriggerMatcher
 
@@ -41,10 +44,10 @@ _MAX_OFF_RATE, _MAX_OFF_PULSES = 0.05, 0.02
 _MAX_LOST_SHARE = 0.01
 _STOPPED_S = 1.0
 _US_PER_S = 1e6
+_WEB_TIMEOUT_S = 1.0
 _SIGMA_PER_MAD = 1.4826
 # Frames and lines come in bursts: how many are still on their way differs.
 _ROOM, _MAX_UNLIKE = 2, 0.01
-_MAX_DRIFT_PPM = 200.0
 
 
 def check_disk(exam: Examination, _subject: str = "") -> Iterator[Finding]:
@@ -141,7 +144,7 @@ def check_stream(exam: Examination, sensor: str) -> Iterator[Finding]:
     }
     n_missing = status.n_lost + status.n_dropped
     if n_missing:
-        n_came = len(seen.stamps.get(stream, ())) if status.n_packets is None else status.n_packets
+        n_came = len(seen.arrivals_ns.get(stream, ())) if status.n_packets is None else status.n_packets
         counts["share"] = share = n_missing / (max(n_came, 1) + status.n_lost)
         severity: Severity = "error" if share > _MAX_LOST_SHARE else "warning"
         yield findings.LOSSES(**counts, severity=severity, action="named" if problems else "")
@@ -170,15 +173,15 @@ def _rate(exam: Examination, seen: ObservedSensor, stream: str) -> Finding:
     A LiDAR's rate is its rotor's speed, by its own clock: scans arrive late on a busy computer.
     """
     rate_hz = 0.0 if seen.status is None else seen.status.rates_hz.get("scans", 0.0)
-    if stream != "scans" or not seen.stamps.get(stream) or rate_hz <= 0:
-        _, arrivals = seen.times(stream)
-        span_ns = int(arrivals[-1] - arrivals[0]) if len(arrivals) > 1 else 0
-        rate_hz = 1e9 * (len(arrivals) - 1) / span_ns if span_ns > 0 else 0.0
+    if stream != "scans" or stream not in seen.arrivals_ns or rate_hz <= 0:
+        arrivals_ns = seen.arrivals_ns.get(stream, [0])
+        span_ns = arrivals_ns[-1] - arrivals_ns[0]
+        rate_hz = 1e9 * (len(arrivals_ns) - 1) / span_ns if span_ns > 0 else 0.0
     expected_hz = wanted_rate_hz(exam.rig, seen.sensor, exam.driver(seen.sensor))
     figures: dict[str, Any] = {"stream": stream, "rate_hz": rate_hz, "expected_hz": expected_hz}
     if rate_hz == 0:
         return findings.NO_STREAM(**figures)
-    silent_s = (seen.ended_ns - seen.stamps[stream][-1][1]) * 1e-9
+    silent_s = (seen.ended_ns - seen.arrivals_ns[stream][-1]) * 1e-9
     if silent_s > max(_STOPPED_S, 3 / rate_hz):
         return findings.STOPPED(**figures, silent_s=silent_s)
     if expected_hz is None or abs(rate_hz / expected_hz - 1) <= _MAX_OFF_RATE:
@@ -302,46 +305,6 @@ def check_edges(exam: Examination, sensor: str) -> Iterator[Finding]:
     yield findings.EDGES_FITTED(n_edges=n_edges, n_pulses=n_pulses, drift_ppm=drift_ppm, rms_us=rms_us)
 
 
-def check_offsets(exam: Examination, _subject: str = "") -> Iterator[Finding]:
-    """Measure every stream's offset and drift against this computer's clock, by when its samples arrive."""
-    offsets, strays = list[Finding](), list[Finding]()
-    for sensor, seen in exam.seen.items():
-        model = seen.host_clock if sensor == BOARD else _by_arrivals(exam, seen)
-        if model is None or seen.status is None:
-            continue
-        # The model has the computer's time on the sensor's clock: its drift is the other way round.
-        drift_ppm, sigma_ppm = -1e6 * model.drift, 1e6 * float(np.sqrt(model.cov[1, 1]))
-        # How far timestamps are ahead of this computer's clock; what samples take to arrive is in it. A
-        # scan arrives a revolution after its timestamp, which its driver subtracts. A board's clock counts
-        # from when it was switched on.
-        offset_ms: float | None = (model.anchor_ns - model.reference_ns) * 1e-6
-        if sensor == BOARD or "scans" in seen.stamps:
-            ahead_s = seen.status.clock.ahead_s if seen.status.clock is not None else None
-            offset_ms = None if sensor == BOARD or ahead_s is None else 1000 * ahead_s
-        offset: dict[str, Figure] = {
-            "offset_ms": offset_ms,
-            "drift_ppm": drift_ppm,
-            "drift_sigma_ppm": max(sigma_ppm, 1),
-        }
-        offsets.append(Finding(findings.OFFSET.code, "note", sensor, offset))
-        if abs(drift_ppm) > _MAX_DRIFT_PPM + 3 * sigma_ppm:
-            strays.append(findings.DRIFTS(sensor, drift_ppm=drift_ppm, limit_ppm=_MAX_DRIFT_PPM))
-    if any(finding.subject != BOARD for finding in offsets):  # the board's own line says as much
-        yield from (*offsets, *strays)
-
-
-def _by_arrivals(exam: Examination, seen: ObservedSensor) -> ClockModel | None:
-    """Fit this computer's time on a sensor's clock; None of timestamps that are arrivals themselves."""
-    stream = next((name for name in ("scans", "events", "frames") if name in seen.stamps), None)
-    if stream is None or exam.driver(seen.sensor) == "command" or (stream == "scans" and not seen.is_utc):
-        return None
-    stamps, arrivals = seen.times(stream)
-    # A LiDAR's first scans may be stamped by arrival yet, until its position packets have come.
-    steps_back = np.flatnonzero(np.diff(stamps) <= 0)
-    first = int(steps_back[-1]) + 1 if len(steps_back) else 0
-    return fit_arrivals(stamps[first:], arrivals[first:], "arrivals")
-
-
 def check_sync(exam: Examination, _subject: str = "") -> Iterator[Finding]:
     """Judge whether boards may move while they are captured; absent sensors do not count."""
     rig, verdict = exam.rig, tie(exam).verdict()
@@ -378,3 +341,104 @@ def tie(exam: Examination) -> RigClock:
         clock.take(name, sample)
     clock.refresh(*models, locked)
     return clock
+
+
+CHECKS: dict[str, dict[str, Callable[[Examination, str], Iterable[Finding]]]] = {
+    "computer": {"disk": check_disk, "clock": check_computer_clock},
+    "lidar": {
+        "device": check_device,
+        "settings": check_settings,
+        "stream": check_stream,
+        "PPS": check_pps,
+    },
+    "camera": {
+        "device": check_device,
+        "stream": check_stream,
+        "clock": check_clock,
+        "pulses": check_frames_of_pulses,
+        "edges": check_edges,
+    },
+    "sync": {
+        "device": check_device,
+        "pulses": check_pulses_sent,
+        "clock": check_clock,
+    },
+    "rig": {"sync": check_sync},
+}
+"""Every check by its line's name; a line without findings is left out."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line: one thing looked at.
+
+    Attributes:
+        subject: "computer", a sensor's name in the profile, or "rig" for what concerns several.
+        name: what was looked at, in a word.
+        findings: of the check; those without a subject get the line's.
+    """
+
+    subject: str
+    name: str
+    findings: tuple[Finding, ...]
+
+    def __post_init__(self) -> None:
+        named = (each if each.subject else replace(each, subject=self.subject) for each in self.findings)
+        object.__setattr__(self, "findings", tuple(named))
+
+    @property
+    def severity(self) -> Severity:
+        """The worst of the findings."""
+        return worst(self.findings)
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """The figures of all findings together."""
+        return {name: figure for each in self.findings for name, figure in each.figures.items()}
+
+
+class DoctorOptions(NamedTuple):
+    """How to examine: for how long, where sessions are to be written, port of a VLP-16's web server."""
+
+    duration_s: float = 5.0
+    folder: Path = Path()
+    web_port: int = 80
+
+
+def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
+    """Look at the computer and every sensor of a rig.
+
+    What is absent or fails is an error; everything else is looked at all the same. Takes the duration, and
+    what the sensors take to open.
+
+    Args:
+        rig: the profile.
+        options: how to examine.
+
+    Returns:
+        A line for each thing looked at: the computer's, each sensor's, the rig's.
+    """
+    options = options or DoctorOptions()
+    seen = observe({sensor: partial(source_of, rig, sensor) for sensor in sensors(rig)}, options.duration_s)
+    exam = Examination(rig, options.folder, seen)
+    web = {
+        name: _read_web(rig, name, options.web_port) for name in rig.lidars if exam.driver(name) == "vlp16"
+    }
+    exam = replace(exam, web=web)
+    subjects = [("computer", "computer"), *((name, "lidar") for name in rig.lidars)]
+    subjects += [*((name, "camera") for name in rig.cameras), *([(BOARD, "sync")] if rig.sync else [])]
+    lines = [
+        Check(subject, name, tuple(check(exam, subject)))
+        for subject, kind in (*subjects, ("rig", "rig"))
+        for name, check in CHECKS[kind].items()
+    ]
+    return [line for line in lines if line.findings]
+
+
+def _read_web(rig: Rig, lidar: str, port: int) -> WebReport | SourceError:
+    """Ask the web page of a VLP-16; why it says nothing where it does not."""
+    address = rig.lidars[lidar].driver.address or velodyne.FACTORY_ADDRESS
+    try:
+        return VelodyneWeb(address, port, _WEB_TIMEOUT_S).read()
+    except SourceError as error:
+        return error

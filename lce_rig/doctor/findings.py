@@ -33,16 +33,6 @@ def _pulse(finding: Finding) -> str:
     return f"{pps}, no NMEA" if finding.figures["has_position"] else f"{pps}, no position packets"
 
 
-def _offset(finding: Finding) -> str:
-    """The clock of {subject} is {offset_ms} ahead and drifts by {drift_ppm} +- {drift_sigma_ppm}."""
-    offset = ""
-    if finding.figures["offset_ms"] is not None:
-        ms = finding.figure("offset_ms")
-        offset = f" {ms / 1000:+.1f} s," if abs(ms) >= 1000 else f" {ms:+.1f} ms,"
-    drift = f"{finding.figure('drift_ppm'):+.0f} +- {finding.figure('drift_sigma_ppm'):.0f} ppm"
-    return f"{finding.subject}{offset} {drift}"
-
-
 DISK = _note("computer.disk", "{free_mb:.0f} MB free, {write_mbps:.0f} MB/s flushed, in {folder}")
 DISK_FULL = Kind(
     "computer.disk_full", "too little space (minimum 5000 MB)", "make room, or choose another disk with -o"
@@ -105,12 +95,6 @@ WITHOUT_PULSES = _note(
     "without hardware, set lidars.*.timestamps sync: none, clock: host, and hold boards still",
 )
 NO_TIMESTAMPS = _note("clock.no_timestamps", "no timestamps yet")
-OFFSET = _note("clock.offset", _offset)
-DRIFTS = _warning(
-    "clock.drifts",
-    "the clock of {subject} drifts by {drift_ppm:+.0f} ppm (limit {limit_ppm:.0f} ppm)",
-    "stop programs that set this computer's clock, and close other programs",
-)
 EDGES_FITTED = _note(
     "edges.fitted", "{n_edges} of {n_pulses} pulses, drift {drift_ppm:+.1f} ppm, scatter {rms_us:.1f} us"
 )

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, LiveSample, Pulse
 from lce_rig.core.errors import SourceError
@@ -36,7 +35,7 @@ class ObservedSensor:
         failure: why it could not be opened, or ended early.
         watched_s: for how long it was open.
         ended_ns: when that ended, by the computer's time of day.
-        stamps: (timestamp, arrival) ns of each scan, image or batch, by "scans", "frames", "events".
+        arrivals_ns: of each scan, image or batch that has a timestamp, by "scans", "frames", "events".
         frames: every image, without its pixels.
         pulses: every pulse, of a board or seen by a camera.
         n_events: how many events came in all.
@@ -48,7 +47,7 @@ class ObservedSensor:
     failure: SourceError | None = None
     watched_s: float = 0.0
     ended_ns: int = 0
-    stamps: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+    arrivals_ns: dict[str, list[int]] = field(default_factory=dict)
     frames: list[Image] = field(default_factory=list)
     pulses: list[Pulse] = field(default_factory=list)
     n_events: int = 0
@@ -59,11 +58,6 @@ class ObservedSensor:
     def is_utc(self) -> bool:
         """Whether its timestamps are its own clock's, which is tied to UTC."""
         return self.status is not None and self.status.clock is not None and self.status.clock.is_utc
-
-    def times(self, stream: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the timestamps (N,) and arrivals (N,) of a stream, ns."""
-        pairs = np.array(self.stamps.get(stream, []), dtype=np.int64).reshape(-1, 2)
-        return pairs[:, 0], pairs[:, 1]
 
     def take(self, sample: LiveSample) -> None:
         """Note a sample."""
@@ -81,7 +75,7 @@ class ObservedSensor:
 
     def _note(self, stream: str, stamp_ns: int | None, host_ns: int | None) -> None:
         if stamp_ns is not None and host_ns is not None:
-            self.stamps.setdefault(stream, []).append((stamp_ns, host_ns))
+            self.arrivals_ns.setdefault(stream, []).append(host_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +162,7 @@ def _watch(
             except SourceError as error:
                 seen.failure = error
             # A sensor that never sent anything has no status.
-            if seen.failure is None or seen.stamps or seen.pulses:
+            if seen.failure is None or seen.arrivals_ns or seen.pulses:
                 seen.status = source.status()
                 seen.watched_s, seen.ended_ns = time.monotonic() - opened_s, time.time_ns()
                 if isinstance(source, SyncBoard):

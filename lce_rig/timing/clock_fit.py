@@ -1,4 +1,4 @@
-"""Clock models from readings: time requests and replies, edges timestamped by two clocks, arrivals.
+"""Clock models from readings: time requests and replies, and edges timestamped by two clocks.
 
 `ClockTracker` keeps the model of a running clock's last minute, and reports when one of the clocks jumps.
 """
@@ -14,13 +14,9 @@ from lce_rig.core.geometry import Array
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 
 MIN_PAIRS = 4
-# A timestamp in whole microseconds cannot scatter by less than this says.
-RESOLUTION_NS = 1000.0
-# A USB frame lasts 1 ms: what comes by USB may be as late as that every time.
-ARRIVAL_BIAS_NS = 1_000_000.0
+# A timestamp in whole microseconds cannot scatter by less.
+_FLOOR_NS = 1000.0 / np.sqrt(12)
 
-_MAX_GROUP = 5
-_WANTED_GROUPS = 12
 _QUICK = 0.4
 
 _SHARP = 0.1
@@ -31,6 +27,10 @@ _MIN_INLIERS = 3
 _MAX_PAIRS = 2048
 _N_WITNESSES = 3
 _STEP_SIGMAS = 8.0
+# Smaller steps are no jumps, however exact the readings are.
+_MIN_STEP_NS = 200_000.0
+# Drift changes with temperature: older readings do not count.
+_WINDOW_NS = 60 * NS_PER_S
 
 Stamps = NDArray[np.int64]
 
@@ -62,8 +62,8 @@ class TimePairs:
         return len(self.source_ns)
 
 
-def fit_clock(pairs: TimePairs, what: str, resolution_ns: float = RESOLUTION_NS) -> ClockModel | None:
-    """Fit offset and drift to readings of two clocks.
+def fit_clock(pairs: TimePairs, what: str) -> ClockModel | None:
+    """Fit offset and drift to readings of two clocks, without outliers.
 
     The quickest two fifths of the readings count. What one of them took beyond the very quickest,
     e_i = bound_i - min bound, put its middle wrong by up to +-e_i: by all of it where one way had it, by
@@ -78,7 +78,6 @@ def fit_clock(pairs: TimePairs, what: str, resolution_ns: float = RESOLUTION_NS)
     Args:
         pairs: the readings.
         what: what they are, in words: "time requests".
-        resolution_ns: step of the coarser clock.
 
     Returns:
         The model; None from fewer than 4 readings, or where all are of the same time.
@@ -87,84 +86,12 @@ def fit_clock(pairs: TimePairs, what: str, resolution_ns: float = RESOLUTION_NS)
         return None
     n_quick = max(MIN_PAIRS, int(np.ceil(_QUICK * len(pairs))))
     quick = pairs.select(pairs.bound_ns <= np.sort(pairs.bound_ns)[n_quick - 1])
-    least_ns = float(quick.bound_ns.min())
-    origin = f"{len(pairs)} {what}"
-    return _model(quick, quick.bound_ns - least_ns, origin, resolution_ns, least_ns / np.sqrt(3))
-
-
-def fit_arrivals(
-    stamp_ns: Stamps, arrival_ns: Stamps, what: str, bias_sigma_ns: float = ARRIVAL_BIAS_NS
-) -> ClockModel | None:
-    """Fit offset and drift of a device that cannot be asked, to when its messages arrived.
-
-    Messages come late and never early: of every few successive ones the least late is kept. How late even
-    those are, nothing tells; hence the bias.
-
-    Args:
-        stamp_ns: (N,) on the device's clock; rising.
-        arrival_ns: (N,) on the host's clock.
-        what: what they are, in words.
-        bias_sigma_ns: how late the quickest may be.
-    """
-    if len(stamp_ns) < MIN_PAIRS:
+    source_ns, least_ns = quick.source_ns, float(quick.bound_ns.min())
+    if source_ns.min() == source_ns.max():
         return None
-    late_ns = ((arrival_ns - arrival_ns[0]) - (stamp_ns - stamp_ns[0])).astype(np.float64)
-    elapsed_s = (stamp_ns - stamp_ns[0]) / NS_PER_S
-    # Without its drift, the lateness of messages seconds apart can be compared.
-    late_ns = late_ns - median_slope(elapsed_s, late_ns) * elapsed_s
-    size = int(np.clip(len(late_ns) // _WANTED_GROUPS, 1, _MAX_GROUP))
-    groups = late_ns[: len(late_ns) // size * size].reshape(-1, size)
-    least_late = np.asarray(np.arange(len(groups)) * size + groups.argmin(axis=1))
-    pairs = TimePairs.from_edges(stamp_ns, arrival_ns).select(least_late)
-    return _model(pairs, np.zeros(len(pairs)), f"{len(stamp_ns)} {what}", RESOLUTION_NS, bias_sigma_ns)
-
-
-def match_edges(
-    source_ns: Stamps, reference_ns: Stamps, coarse: ClockModel, tolerance_ns: float
-) -> TimePairs | None:
-    """Find which edges that one clock timestamped are which of another's, by a coarse model of the two.
-
-    Args:
-        source_ns: (N,) edges on the one clock; rising.
-        reference_ns: (M,) edges on the other; rising.
-        coarse: from the one clock to the other, right to within the tolerance.
-        tolerance_ns: how far off it may be.
-
-    Returns:
-        Edges that are nearest to each other both ways and within the tolerance; None where edges follow each
-        other so closely, within twice the tolerance, that a neighbour could be taken for the right one.
-    """
-    if not len(source_ns) or not len(reference_ns):
-        return TimePairs.from_edges(source_ns[:0], reference_ns[:0])
-    if len(reference_ns) > 1 and np.median(np.diff(reference_ns)) < 2 * tolerance_ns:
-        return None
-    predicted_ns = coarse.convert_all(source_ns)
-    edge = nearest(predicted_ns, reference_ns)
-    is_mutual = nearest(reference_ns, predicted_ns)[edge] == np.arange(len(source_ns))
-    is_near = np.abs(predicted_ns - reference_ns[edge]) <= tolerance_ns
-    keep = is_mutual & is_near
-    return TimePairs.from_edges(source_ns[keep], reference_ns[edge[keep]])
-
-
-def nearest(these_ns: Stamps, those_ns: Stamps) -> NDArray[np.intp]:
-    """Find the index (N,) of the nearest of `those_ns` to each of `these_ns`; both rising."""
-    right = np.clip(np.searchsorted(those_ns, these_ns), 1, max(len(those_ns) - 1, 1))
-    left = right - 1
-    right = np.minimum(right, len(those_ns) - 1)
-    return np.where(these_ns - those_ns[left] <= those_ns[right] - these_ns, left, right)
-
-
-def _model(
-    pairs: TimePairs, excess_ns: Array, origin: str, resolution_ns: float, bias_sigma_ns: float
-) -> ClockModel | None:
-    """Fit a line without outliers; where there is a bias, readings were delayed and err together."""
-    source_ns = pairs.source_ns
-    if len(pairs) < MIN_PAIRS or source_ns.min() == source_ns.max():
-        return None
-    origin_ns, reference_origin_ns = int(source_ns[0]), int(pairs.reference_ns[0])
-    y_ns = (pairs.reference_ns - reference_origin_ns) - (source_ns - origin_ns)
-    floor_ns = resolution_ns / np.sqrt(12)
-    fit = LineFit((source_ns - origin_ns) / NS_PER_S, y_ns.astype(np.float64), excess_ns, floor_ns)
+    origin_ns, reference_origin_ns = int(source_ns[0]), int(quick.reference_ns[0])
+    y_ns = ((quick.reference_ns - reference_origin_ns) - (source_ns - origin_ns)).astype(np.float64)
+    fit = LineFit((source_ns - origin_ns) / NS_PER_S, y_ns, quick.bound_ns - least_ns)
     keep = fit.inliers()
     fit = fit.select(keep).centred()
     line, residual = fit.solve()
@@ -174,15 +101,44 @@ def _model(
         anchor_ns=origin_ns + elapsed_ns,
         reference_ns=reference_origin_ns + elapsed_ns + round(line[0]),
         drift=float(line[1]) / NS_PER_S,
-        cov=scale @ fit.covariance(are_delayed=bias_sigma_ns > 0) @ scale,
-        bias_sigma_ns=float(bias_sigma_ns),
+        cov=scale @ fit.covariance(are_delayed=least_ns > 0) @ scale,
+        bias_sigma_ns=least_ns / np.sqrt(3),
         rms_ns=float(np.sqrt(residual @ residual / np.sum(fit.sigma_ns**-2.0))),
         first_ns=int(source_ns[keep].min()),
         last_ns=int(source_ns[keep].max()),
         n_used=int(keep.sum()),
         n_left_out=int((~keep).sum()),
-        origin=origin,
+        origin=f"{len(pairs)} {what}",
     )
+
+
+def match_edges(
+    source_ns: Stamps, reference_ns: Stamps, coarse: ClockModel, tolerance_ns: float
+) -> TimePairs:
+    """Find which edges that one clock timestamped are which of another's, by a coarse model of the two.
+
+    Args:
+        source_ns: (N,) edges on the one clock; rising.
+        reference_ns: (M,) edges on the other; rising, more than twice the tolerance apart.
+        coarse: from the one clock to the other, right to within the tolerance.
+        tolerance_ns: how far off it may be.
+
+    Returns:
+        Edges that are nearest to each other both ways and within the tolerance.
+    """
+    predicted_ns = coarse.convert_all(source_ns)
+    edge = nearest(predicted_ns, reference_ns)
+    is_mutual = nearest(reference_ns, predicted_ns)[edge] == np.arange(len(source_ns))
+    keep = is_mutual & (np.abs(predicted_ns - reference_ns[edge]) <= tolerance_ns)
+    return TimePairs.from_edges(source_ns[keep], reference_ns[edge[keep]])
+
+
+def nearest(these_ns: Stamps, those_ns: Stamps) -> NDArray[np.intp]:
+    """Find the index (N,) of the nearest of `those_ns` to each of `these_ns`; both rising."""
+    right = np.clip(np.searchsorted(those_ns, these_ns), 1, max(len(those_ns) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(those_ns) - 1)
+    return np.where(these_ns - those_ns[left] <= those_ns[right] - these_ns, left, right)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,20 +154,18 @@ class LineFit:
         x_s: (N,) time on the source's clock.
         y_ns: (N,) the reference's time minus the source's.
         excess_ns: (N,) e_i; 0 for edges.
-        floor_ns: no reading is better than this.
         origin_s: what was subtracted from x to centre it.
     """
 
     x_s: Array
     y_ns: Array
     excess_ns: Array
-    floor_ns: float
     origin_s: float = 0.0
 
     @property
     def sigma_ns(self) -> Array:
         """The readings' standard deviations (N,) before their scatter is known (2)."""
-        usual_ns = max(float(np.quantile(self.excess_ns, _SHARP)), np.sqrt(3) * self.floor_ns)
+        usual_ns = max(float(np.quantile(self.excess_ns, _SHARP)), np.sqrt(3) * _FLOOR_NS)
         return np.asarray(np.sqrt((usual_ns**2 + self.excess_ns**2) / 3))
 
     def select(self, keep: NDArray[np.bool_]) -> "LineFit":
@@ -243,7 +197,7 @@ class LineFit:
         inverse = np.linalg.inv(information)
         residual = value - design @ (inverse @ (design.T @ value))
         n, p = len(value), 2
-        scatter = max(float(residual @ residual) / (n - p), (self.floor_ns / float(self.sigma_ns.min())) ** 2)
+        scatter = max(float(residual @ residual) / (n - p), (_FLOOR_NS / float(self.sigma_ns.min())) ** 2)
         independent = scatter * inverse[:p, :p]
         if not are_delayed or n < 3 * _N_STRETCHES:
             return np.asarray(independent)
@@ -312,32 +266,21 @@ class ClockTracker:
     A reading far off the model is held back. One alone is forgotten as an outlier; three in a row that agree
     with each other mean that a clock has jumped, and begin a new model.
 
-    Args:
-        what: what the readings are, in words: "time requests".
-        window_s: how long readings count: drift changes with temperature.
-        min_step_ns: what is smaller is not a jump, however exact the readings are.
-        resolution_ns: step of the coarser clock.
+    Attributes:
+        steps: the jumps so far.
     """
 
-    def __init__(
-        self,
-        what: str,
-        window_s: float = 60.0,
-        min_step_ns: float = 200_000.0,
-        resolution_ns: float = RESOLUTION_NS,
-    ) -> None:
+    def __init__(self, what: str) -> None:
+        """Begin without readings; `what` they are, in words: "time requests"."""
         self.steps: list[ClockStep] = []
         self._what = what
-        self._window_ns = window_s * NS_PER_S
-        self._min_step_ns = min_step_ns
-        self._resolution_ns = resolution_ns
         self._pairs: deque[_Pair] = deque(maxlen=_MAX_PAIRS)
         self._suspects: list[_Pair] = []
         self._model: ClockModel | None = None
         self._n_new = 0
 
-    def add(self, source_ns: int, reference_ns: int, bound_ns: float = 0.0) -> ClockStep | None:
-        """Take a reading of both clocks; gives the jump that it proves, if it does.
+    def add(self, source_ns: int, reference_ns: int, bound_ns: float = 0.0) -> None:
+        """Take a reading of both clocks, and note the jump that it proves, if it does.
 
         Args:
             source_ns: on the source's clock.
@@ -348,22 +291,21 @@ class ClockTracker:
         if self._pairs:
             last = self._pairs[-1]
             # Requests that overtake each other are out of order by no more than their round trips.
-            room_ns = self._min_step_ns + 2 * (last.bound_ns + bound_ns)
-            if source_ns < last.source_ns - room_ns:
-                size_ns = (reference_ns - source_ns) - (last.reference_ns - last.source_ns)
-                return self._step([pair], size_ns)
+            if source_ns < last.source_ns - (_MIN_STEP_NS + 2 * (last.bound_ns + bound_ns)):
+                self._step([pair], (reference_ns - source_ns) - (last.reference_ns - last.source_ns))
+                return
         model = self._latest(max_new=max(1, len(self._pairs) // 8))
         if model is not None:
             sigma_ns = float(np.hypot(model.rms_ns, model.sigma_ns(source_ns)))
-            limit_ns = max(_STEP_SIGMAS * sigma_ns, self._min_step_ns) + bound_ns
+            limit_ns = max(_STEP_SIGMAS * sigma_ns, _MIN_STEP_NS) + bound_ns
             if abs(reference_ns - model.convert(source_ns)) > limit_ns:
-                return self._suspect(pair, model)
+                self._suspect(pair, model)
+                return
         self._suspects.clear()
         self._pairs.append(pair)
         self._n_new += 1
-        while self._pairs[0].source_ns < source_ns - self._window_ns:
+        while self._pairs[0].source_ns < source_ns - _WINDOW_NS:
             self._pairs.popleft()
-        return None
 
     @property
     def model(self) -> ClockModel | None:
@@ -381,28 +323,23 @@ class ClockTracker:
         if self._n_new >= max_new and len(self._pairs) >= MIN_PAIRS:
             source, reference, bound = zip(*self._pairs, strict=True)
             pairs = TimePairs(np.array(source, np.int64), np.array(reference, np.int64), np.array(bound))
-            self._model = fit_clock(pairs, self._what, self._resolution_ns)
+            self._model = fit_clock(pairs, self._what)
             self._n_new = 0
         return self._model
 
-    def _suspect(self, pair: _Pair, model: ClockModel) -> ClockStep | None:
+    def _suspect(self, pair: _Pair, model: ClockModel) -> None:
         """Hold a reading back; with two before it that agree, it proves a jump."""
         self._suspects = [*self._suspects, pair][-_N_WITNESSES:]
         if len(self._suspects) < _N_WITNESSES:
-            return None
+            return
         sizes_ns = [suspect.reference_ns - model.convert(suspect.source_ns) for suspect in self._suspects]
-        room_ns = max(_STEP_SIGMAS * model.rms_ns, self._min_step_ns) + 2 * max(
-            suspect.bound_ns for suspect in self._suspects
-        )
-        if max(sizes_ns) - min(sizes_ns) > room_ns:
-            return None
-        return self._step(self._suspects, round(float(np.median(sizes_ns))))
+        bound_ns = max(suspect.bound_ns for suspect in self._suspects)
+        if max(sizes_ns) - min(sizes_ns) <= max(_STEP_SIGMAS * model.rms_ns, _MIN_STEP_NS) + 2 * bound_ns:
+            self._step(self._suspects, round(float(np.median(sizes_ns))))
 
-    def _step(self, pairs: list[_Pair], size_ns: int) -> ClockStep:
+    def _step(self, pairs: list[_Pair], size_ns: int) -> None:
         """Begin a new model with the readings that prove a jump."""
-        step = ClockStep(pairs[0].source_ns, size_ns)
+        self.steps.append(ClockStep(pairs[0].source_ns, size_ns))
         self.restart()
         self._pairs.extend(pairs)
         self._n_new = len(pairs)
-        self.steps.append(step)
-        return step

@@ -18,7 +18,7 @@ from lce_rig.rig import Rig
 from lce_rig.rig.sync_settings import BOARD, PPS_LINE
 from lce_rig.timing import findings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
-from lce_rig.timing.clock_fit import MIN_PAIRS, RESOLUTION_NS, Stamps, fit_clock, match_edges
+from lce_rig.timing.clock_fit import MIN_PAIRS, Stamps, fit_clock, match_edges
 from lce_rig.timing.rig_time import rig_time_ns
 from lce_rig.timing.scan_pairing import Frame, middle_of_sweep_ns, tolerance_ns
 from lce_rig.timing.triggers import TriggerMatcher
@@ -218,10 +218,10 @@ class EdgeClock:
             self.problem = findings.EDGES_TOO_CLOSE(self._sensor, sigma_ms=sigma_ms, period_ms=period_ms)
             return None
         pairs = match_edges(seen_ns, sent_ns, start, min(self._coarse_error_ns, _NEAR * least_ns))
-        if pairs is None or len(pairs) < max(MIN_PAIRS, _MIN_MATCHED * len(seen_ns)):
+        if len(pairs) < max(MIN_PAIRS, _MIN_MATCHED * len(seen_ns)):
             self.problem = findings.EDGES_NOT_THE_PULSES(self._sensor)
             return None
-        self._model, self.problem = fit_clock(pairs, "edges", RESOLUTION_NS), None
+        self._model, self.problem = fit_clock(pairs, "edges"), None
         return self._model
 
 

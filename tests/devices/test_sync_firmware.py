@@ -124,7 +124,7 @@ def test_its_sentences_tell_every_second_of_the_calendar(host_board):
 
 def test_it_introduces_itself_and_makes_a_pulse_per_second(virtual):
     messages = virtual(5.5)
-    assert messages[0] == Hello(1, "1.0", "virtual", 1_000_000)
+    assert messages[0] == Hello(1, "1.0", "virtual")
     edges = of_kind(messages, PpsEdge)
     assert [edge.seq for edge in edges] == [1, 2, 3, 4, 5]
     assert {b.t_us - a.t_us for a, b in pairwise(edges)} == {1_000_000}

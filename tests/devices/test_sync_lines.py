@@ -9,8 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.devices.lce1 import (
-    MAX_COUNT,
-    MAX_US,
     BoardError,
     BoardStatus,
     Hello,
@@ -22,16 +20,15 @@ from lce_rig.devices.lce1 import (
 )
 
 BODIES = {
-    "LCEHI,1,1.0,teensy40,1000000": Hello(1, "1.0", "teensy40", 1_000_000),
+    "LCEHI,1,1.0,teensy40,1000000": Hello(1, "1.0", "teensy40"),
     "LCEPP,7,123456,1753000000,G": PpsEdge(7, 123456, 1_753_000_000, "G"),
     "LCEPP,7,123456,,N": PpsEdge(7, 123456, None, "N"),
     "LCETG,2,41,99,R": TriggerEdge(2, 41, 99, True),
     "LCETG,2,41,100,F": TriggerEdge(2, 41, 100, False),
     "LCETM,5,100,130": TimeReply(5, 100, 130),
-    "LCEST,3,60,0,1200,600": BoardStatus(3, 60, 0),
-    "LCEST,0,0,0": BoardStatus(0, 0, 0),
+    "LCEST,3,60,0,1200,600": BoardStatus(3, 0),
+    "LCEST,0,0,0": BoardStatus(0, 0),
     "LCEER,4,channel 9, unknown": BoardError(4, "channel 9, unknown"),
-    f"LCETG,15,{MAX_COUNT},{MAX_US},R": TriggerEdge(15, MAX_COUNT, MAX_US, True),
 }
 
 
@@ -53,15 +50,10 @@ def test_every_sentence_is_understood(body, message):
         "LCEPP,7,123456,,X",
         "LCETG,16,1,1,R",
         "LCETG,-1,1,1,R",
-        "LCETG,1,01,1,R",
         "LCETG,1,1.0,1,R",
         "LCETG,1,1,1,R,",
-        f"LCETG,1,{MAX_COUNT + 1},1,R",
-        f"LCETG,1,1,{MAX_US + 1},R",
-        "LCETM,5,131,130",
-        "LCEER,4",
+        f"LCETG,1,1,{10**15},R",
         "LCEST,1,2",
-        "LCEHI,1,\t,x,1",
     ],
 )
 def test_sentences_with_a_right_sum_and_wrong_fields_are_malformed(body):

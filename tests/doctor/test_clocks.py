@@ -12,7 +12,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, ClockState, LiveSource, SourceStatus
-from lce_rig.doctor.checks import check_clock, check_edges, check_offsets, check_sync, tie
+from lce_rig.doctor.checks import check_clock, check_edges, check_sync, tie
 from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
@@ -47,43 +47,6 @@ def davis(drift: float = -25e-6, offset_ns: int = 3_000_000, n: int = 20, **stat
         stamp_ns = START_NS + offset_ns + round((1 + drift) * sent_ns)
         seen.take(Pulse("cam", stamp_ns // 1000 * 1000, number, stamp_ns))
     return seen
-
-
-def test_the_drift_and_offset_of_every_stream_are_measured_against_the_computer() -> None:
-    drifting = camera()
-    drifting.stamps["frames"] = [
-        (START_NS + round((1 + 30e-6) * (stamp_ns - START_NS)) - 7_000_000, host_ns)
-        for stamp_ns, host_ns in drifting.stamps["frames"]
-    ]
-    line = look(check_offsets, examination(lidar(clock=LOCKED), drifting, sync_board(), rig=v4l2_rig()))
-    assert line is not None and line.severity == "note"
-    by_sensor = {found.subject: found for found in line.findings}
-    assert by_sensor["lidar"].figure("offset_ms") == pytest.approx(0.3)
-    assert by_sensor["cam"].figure("offset_ms") == pytest.approx(-7.0, abs=0.2)
-    assert by_sensor["cam"].figure("drift_ppm") == pytest.approx(30, abs=5)
-    assert by_sensor["sync"].figure("drift_ppm") == pytest.approx(40)
-
-
-def test_first_scans_that_were_stamped_by_arrival_do_not_count() -> None:
-    seen = lidar(clock=LOCKED)
-    late = [(stamp_ns + S, host_ns) for stamp_ns, host_ns in seen.stamps["scans"][:3]]
-    seen.stamps["scans"] = late + seen.stamps["scans"][3:]
-    line = look(check_offsets, examination(seen))
-    assert line is not None and abs(line.findings[0].figure("drift_ppm")) < 1
-
-
-def test_a_clock_that_is_being_set_is_told() -> None:
-    stepped = camera()
-    stepped.stamps["frames"] = [
-        (START_NS + round(1.01 * (stamp_ns - START_NS)), host_ns)
-        for stamp_ns, host_ns in stepped.stamps["frames"]
-    ]
-    line = look(check_offsets, examination(stepped, rig=v4l2_rig()))
-    assert line is not None and line.severity == "warning" and "clock.drifts" in codes(line)
-
-
-def test_scans_and_pictures_stamped_by_arrival_say_nothing_of_a_clock() -> None:
-    assert look(check_offsets, examination(lidar(), camera())) is None
 
 
 def test_a_davis_is_fitted_to_the_edges_it_saw() -> None:

@@ -7,7 +7,7 @@ import pytest
 from wire.vlp16_packets import Vlp16Clock
 
 from lce_rig.core.findings import worst
-from lce_rig.doctor.examine import Check, DoctorOptions, examine
+from lce_rig.doctor.checks import Check, DoctorOptions, examine
 from lce_rig.rig import Rig
 from tests.doctor.attached import Attached, attach, picture_of, scan_of
 from tests.doctor.observed import codes, make_rig
@@ -80,14 +80,6 @@ def test_its_lidar_is_locked_and_set_as_the_profile_wants(everything: tuple[Line
 
 def test_its_clocks_are_compared(everything: tuple[Lines, float, float]) -> None:
     lines, *_ = everything
-    if lines["lidar", "PPS"].severity == "note":  # a LiDAR that sends too late is not believed
-        compared = lines["rig", "clocks"].findings
-        # On a computer too busy to take arrivals in time, clocks seem to drift: no offset is told then.
-        if any(found.code == "clock.drifts" for found in compared):
-            return
-        offsets = {found.subject: found for found in compared}
-        assert {"lidar", "sync"} <= set(offsets)
-        assert abs(offsets["lidar"].figure("offset_ms")) <= 100
     assert "host_drift_ppm" in lines["sync", "clock"].figures
     assert lines["rig", "sync"].severity in ("note", "warning")
 

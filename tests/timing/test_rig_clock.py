@@ -19,7 +19,7 @@ LOCKED = ["lidar"]
 
 
 def tie(source_ns: np.ndarray, reference_ns: np.ndarray) -> ClockModel:
-    model = fit_clock(TimePairs.from_edges(source_ns, reference_ns), "edges", 1000.0)
+    model = fit_clock(TimePairs.from_edges(source_ns, reference_ns), "edges")
     assert model is not None
     return model
 
