@@ -4,21 +4,9 @@ References:
     https://docs.kernel.org/userspace-api/media/v4l/v4l2.html, linux/videodev2.h
 """
 
-from ctypes import (
-    POINTER,
-    Structure,
-    Union,
-    c_char,
-    c_int32,
-    c_int64,
-    c_long,
-    c_uint8,
-    c_uint32,
-    c_uint64,
-    c_ulong,
-    c_void_p,
-    sizeof,
-)
+import ctypes
+from ctypes import Structure, Union, c_int32, sizeof
+from typing import Any
 
 VIDEO_CAPTURE = 1
 MEMORY_MMAP = 1
@@ -37,145 +25,81 @@ INTEGER, BOOLEAN, MENU, INTEGER64, BITMASK, INTEGER_MENU = 1, 2, 3, 5, 8, 9
 EXPOSURE_ABSOLUTE_ID = 0x009A_0902
 """V4l2Control of the exposure, in units of 100 us."""
 
-
-class Capability(Structure):
-    """Identity and capabilities of a device."""
-
-    _fields_ = (
-        ("driver", c_char * 16),
-        ("card", c_char * 32),
-        ("bus_info", c_char * 32),
-        ("version", c_uint32),
-        ("capabilities", c_uint32),
-        ("device_caps", c_uint32),
-        ("reserved", c_uint32 * 3),
-    )
+_KINDS: dict[str, Any] = {
+    "char": ctypes.c_char,
+    "u8": ctypes.c_uint8,
+    "u32": ctypes.c_uint32,
+    "s32": ctypes.c_int32,
+    "u64": ctypes.c_uint64,
+    "s64": ctypes.c_int64,
+    "long": ctypes.c_long,
+    "pointer": ctypes.c_void_p,
+}
 
 
-class FormatDescription(Structure):
-    """One pixel format that a device offers."""
+def _lay_out(name: str, fields: str, base: type = Structure, **kinds: Any) -> Any:
+    """Lay out a structure of the kernel.
 
-    _fields_ = (
-        ("index", c_uint32),
-        ("type", c_uint32),
-        ("flags", c_uint32),
-        ("description", c_char * 32),
-        ("pixelformat", c_char * 4),
-        ("mbus_code", c_uint32),
-        ("reserved", c_uint32 * 3),
-    )
-
-
-class PixFormat(Structure):
-    """Size and layout of images."""
-
-    _fields_ = (
-        ("width", c_uint32),
-        ("height", c_uint32),
-        ("pixelformat", c_char * 4),
-        ("field", c_uint32),
-        ("bytesperline", c_uint32),
-        ("sizeimage", c_uint32),
-        ("colorspace", c_uint32),
-        ("priv", c_uint32),
-        ("flags", c_uint32),
-        ("ycbcr_enc", c_uint32),
-        ("quantization", c_uint32),
-        ("xfer_func", c_uint32),
-    )
+    Args:
+        name: of the structure.
+        fields: name, kind and, of an array, number of each, as "driver char 16, version u32".
+        base: Structure or Union.
+        kinds: structures that are parts of it, by the names of their fields.
+    """
+    layout = []
+    for field in fields.split(","):
+        label, kind, *n = field.split()
+        element = kinds[label] if label in kinds else _KINDS[kind]
+        layout.append((label, element * int(n[0]) if n else element))
+    return type(name, (base,), {"_fields_": layout})
 
 
-class _FormatUnion(Union):
-    # The kernel's union also holds pointers, which align it to 8 bytes.
-    _fields_ = (("pix", PixFormat), ("raw", c_uint8 * 200), ("aligned", c_void_p))
-
-
-class Format(Structure):
-    """Size and layout of images, by type of stream."""
-
-    _fields_ = (("type", c_uint32), ("fmt", _FormatUnion))
-
-
-class CaptureParameters(Structure):
-    """Rate of images, as the time of one in numerator / denominator seconds."""
-
-    _fields_ = (
-        ("type", c_uint32),
-        ("capability", c_uint32),
-        ("capturemode", c_uint32),
-        ("numerator", c_uint32),
-        ("denominator", c_uint32),
-        ("extendedmode", c_uint32),
-        ("readbuffers", c_uint32),
-        ("reserved", c_uint8 * 176),
-    )
-
-
-class BufferRequest(Structure):
-    """How many buffers to set aside."""
-
-    _fields_ = (
-        ("count", c_uint32),
-        ("type", c_uint32),
-        ("memory", c_uint32),
-        ("capabilities", c_uint32),
-        ("flags", c_uint8),
-        ("reserved", c_uint8 * 3),
-    )
-
-
-class _TimeValue(Structure):
-    _fields_ = (("seconds", c_long), ("microseconds", c_long))
-
-
-class _Memory(Union):
-    _fields_ = (("offset", c_uint32), ("userptr", c_ulong))
-
-
-class Buffer(Structure):
-    """One buffer: where it lies, and what the kernel says about the image in it."""
-
-    _fields_ = (
-        ("index", c_uint32),
-        ("type", c_uint32),
-        ("bytesused", c_uint32),
-        ("flags", c_uint32),
-        ("field", c_uint32),
-        ("timestamp", _TimeValue),
-        ("timecode", c_uint8 * 16),
-        ("sequence", c_uint32),
-        ("memory", c_uint32),
-        ("m", _Memory),
-        ("length", c_uint32),
-        ("reserved2", c_uint32),
-        ("request_fd", c_int32),
-    )
-
-
-class ControlQuery(Structure):
-    """One setting of a device, its kind and range."""
-
-    _fields_ = (
-        ("id", c_uint32),
-        ("type", c_uint32),
-        ("name", c_char * 32),
-        ("minimum", c_int64),
-        ("maximum", c_int64),
-        ("step", c_uint64),
-        ("default_value", c_int64),
-        ("flags", c_uint32),
-        ("elem_size", c_uint32),
-        ("elems", c_uint32),
-        ("nr_of_dims", c_uint32),
-        ("dims", c_uint32 * 4),
-        ("reserved", c_uint32 * 32),
-    )
+Capability = _lay_out(
+    "Capability",
+    "driver char 16, card char 32, bus_info char 32, version u32, capabilities u32, device_caps u32, "
+    "reserved u32 3",
+)
+FormatDescription = _lay_out(
+    "FormatDescription",
+    "index u32, type u32, flags u32, description char 32, pixelformat char 4, mbus_code u32, reserved u32 3",
+)
+PixFormat = _lay_out(
+    "PixFormat",
+    "width u32, height u32, pixelformat char 4, field u32, bytesperline u32, sizeimage u32, colorspace u32, "
+    "priv u32, flags u32, ycbcr_enc u32, quantization u32, xfer_func u32",
+)
+# The kernel's union also holds pointers, which align it to 8 bytes.
+_FormatUnion = _lay_out("_FormatUnion", "pix struct, raw u8 200, aligned pointer", Union, pix=PixFormat)
+Format = _lay_out("Format", "type u32, fmt union", fmt=_FormatUnion)
+CaptureParameters = _lay_out(
+    "CaptureParameters",
+    "type u32, capability u32, capturemode u32, numerator u32, denominator u32, extendedmode u32, "
+    "readbuffers u32, reserved u8 176",
+)
+"""Rate of images, as the time of one in numerator / denominator seconds."""
+BufferRequest = _lay_out(
+    "BufferRequest", "count u32, type u32, memory u32, capabilities u32, flags u8, reserved u8 3"
+)
+_TimeValue = _lay_out("_TimeValue", "seconds long, microseconds long")
+_Memory = _lay_out("_Memory", "offset u32, userptr u64", Union)
+Buffer = _lay_out(
+    "Buffer",
+    "index u32, type u32, bytesused u32, flags u32, field u32, timestamp struct, timecode u8 16, "
+    "sequence u32, memory u32, m union, length u32, reserved2 u32, request_fd s32",
+    timestamp=_TimeValue,
+    m=_Memory,
+)
+ControlQuery = _lay_out(
+    "ControlQuery",
+    "id u32, type u32, name char 32, minimum s64, maximum s64, step u64, default_value s64, flags u32, "
+    "elem_size u32, elems u32, nr_of_dims u32, dims u32 4, reserved u32 32",
+)
 
 
 class _ControlUnion(Union):
     _pack_ = 1
     _layout_ = "ms"
-    _fields_ = (("value", c_int32), ("value64", c_int64), ("pointer", c_void_p))
+    _fields_ = (("value", c_int32), ("value64", ctypes.c_int64), ("pointer", ctypes.c_void_p))
 
 
 class V4l2Control(Structure):
@@ -183,20 +107,19 @@ class V4l2Control(Structure):
 
     _pack_ = 1
     _layout_ = "ms"
-    _fields_ = (("id", c_uint32), ("size", c_uint32), ("reserved2", c_uint32), ("value", _ControlUnion))
-
-
-class V4l2Controls(Structure):
-    """The values of several settings."""
-
     _fields_ = (
-        ("which", c_uint32),
-        ("count", c_uint32),
-        ("error_idx", c_uint32),
-        ("request_fd", c_int32),
-        ("reserved", c_uint32),
-        ("controls", POINTER(V4l2Control)),
+        ("id", ctypes.c_uint32),
+        ("size", ctypes.c_uint32),
+        ("reserved2", ctypes.c_uint32),
+        ("value", _ControlUnion),
     )
+
+
+V4l2Controls = _lay_out(
+    "V4l2Controls",
+    "which u32, count u32, error_idx u32, request_fd s32, reserved u32, controls pointer",
+    controls=ctypes.POINTER(V4l2Control),
+)
 
 
 def _code(direction: int, number: int, kind: type[Structure] | type[c_int32]) -> int:
