@@ -15,16 +15,13 @@ TIME_WORDS_REPAIRED = _loss("time_words_repaired", "{n} inconsistent time words 
 UNKNOWN_WORDS = _loss("unknown_words", "{n} words of no known code skipped")
 PACKETS_LOST = _loss("packets_lost", "{n} packets lost in recording (first: {where})")
 BAG_TORN = _loss("bag_torn", "{n} places where the bag is torn (first: {where})")
-EVENTS_BEYOND_CLOCKS = _loss("events_beyond_clocks", "{n} events with timestamps beyond any clock skipped")
 EVENTS_BEFORE_CLOCK_SET = _loss(
     "events_before_clock_set", "{n} events before the clock was set skipped (first: {where})"
 )
 EVENTS_STRAY = _loss("events_stray", "{n} events with stray timestamps skipped (first: {where})")
-EVENTS_LATE = _loss("events_late", "{n} events that came too late skipped")
 EVENTS_SORTED = _loss("events_sorted", "{n} places where timestamps decrease by up to 20 ms, sorted")
 EVENTS_OFF_SENSOR = _loss("events_off_sensor", "{n} events off the sensor skipped (first: {where})")
 BROKEN_LINES = _loss("broken_lines", "{n} broken lines skipped (first: {where})")
-EVENTS_BEYOND_SENSORS = _loss("events_beyond_sensors", "{n} events beyond any sensor skipped")
 TORN_WORD = _loss("torn_word", "{n} bytes of a torn last word skipped")
 FRAMES_OUT_OF_ORDER = _loss("frames_out_of_order", "{n} out of order skipped")
 POINTS_WITHOUT_RETURN = _loss("points_without_return", "{n} points without a return")
@@ -34,22 +31,10 @@ CLOCK_SET_BACK = _loss("clock_set_back", "{n} jumps of the clock back by more th
 NOT_DECODED = _loss("not_decoded", "{n} could not be decoded (first: {where})")
 
 
-def _flaw(name: str, text: str) -> Kind:
-    """Declare a flaw of single packets, of kind `of`: data or position."""
-    return Kind(f"packet.{name}", f"{{n}} {{of}} packets {text}", severity="warning")
-
-
-WRONG_LENGTH = _flaw("wrong_length", "of wrong length skipped")
-WRONG_FLAG = _flaw("wrong_flag", "with a wrong block flag skipped")
-TIME_BEYOND_HOUR = _flaw("time_beyond_hour", "with a time beyond the hour skipped")
-AZIMUTH_BEYOND_360 = _flaw("azimuth_beyond_360", "with an azimuth beyond 360 deg skipped")
-UNKNOWN_FACTORY_BYTES = _flaw(
-    "unknown_factory_bytes", "with unknown factory bytes skipped (firmware before 3.0.29 sends none)"
+DAMAGED = Kind("packet.damaged", "{n} damaged packets skipped (first: {where})", severity="warning")
+OTHER_MODEL = Kind(
+    "packet.other_model", "{n} packets of another LiDAR model skipped (first: {where})", severity="warning"
 )
-UNEVEN_AZIMUTHS = _flaw("uneven_azimuths", "with uneven azimuths skipped")
-UNKNOWN_PPS = _flaw("unknown_pps", "with an unknown PPS state skipped")
-OTHER_MODEL = _flaw("other_model", "of another LiDAR model skipped")
-
 LOST = Kind("packet.lost", "{n} data packets lost", severity="warning")
 LATE = Kind("packet.late", "{n} data packets late or sent twice, skipped", severity="warning")
 CLOCK_SET = Kind("packet.clock_set", "the LiDAR's clock was set {n} times", severity="note")

@@ -233,11 +233,6 @@ class EventRecording:
                     height = max(height, int(stretch.y.max()) + 1)
             what = f"declares no resolution; {width}x{height}, the extent of its events, is used"
             self._assumed.append(what)
-        if width * height > MAX_EVENT_PIXELS:
-            raise SourceError(
-                f"{self.path} has events of a sensor of {width}x{height} pixels",
-                "No event camera has so many pixels: the file is damaged.",
-            )
         return width, height
 
     def _on_sensor(self, stretch: EventColumns, losses: Losses) -> EventColumns:
@@ -276,7 +271,7 @@ def in_time_order(path: Path, stretches: Iterator[EventColumns], losses: Losses)
     for stretch in stretches:
         is_time = (stretch.t_ns > -MAX_TIME_NS) & (stretch.t_ns < MAX_TIME_NS)
         current = stretch if is_time.all() else stretch.select(is_time)
-        losses.add(findings.EVENTS_BEYOND_CLOCKS(), len(stretch) - len(current))
+        losses.add(findings.EVENTS_STRAY(where="beyond any clock"), len(stretch) - len(current))
         if not len(current):
             continue
         if first_ns is None:
@@ -325,7 +320,7 @@ def _sorted(events: EventColumns, first_ns: int, delivered_ns: int | None, losse
         events = events.select(~stray)
     if delivered_ns is not None:
         is_late = events.t_ns < delivered_ns
-        losses.add(findings.EVENTS_LATE(), int(np.count_nonzero(is_late)))
+        losses.add(findings.EVENTS_STRAY(where="too late"), int(np.count_nonzero(is_late)))
         events = events.select(~is_late)
     n_back = int(np.count_nonzero(np.diff(events.t_ns) < 0))
     losses.add(findings.EVENTS_SORTED(), n_back)

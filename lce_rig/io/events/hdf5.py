@@ -55,23 +55,20 @@ class Hdf5Events(EventStream):
                 end = min(begin + _BLOCK_EVENTS, self._n_events)
                 try:
                     block = [np.asarray(column[begin:end]) for column in columns]
-                    yield self._to_columns(block, losses)
+                    yield self._to_columns(block)
                 except (OSError, RuntimeError, ValueError) as error:
                     if not begin:
                         raise
                     losses.add(findings.TORN_END(where=f"event {begin}: {reason_of(error)}"))
                     return
 
-    def _to_columns(self, block: list[NDArray[Any]], losses: Losses) -> EventColumns:
+    def _to_columns(self, block: list[NDArray[Any]]) -> EventColumns:
         t_us, x, y, polarity = block
         if t_us.dtype.kind == "f" and np.any(t_us % 1):
             raise ValueError("events/t holds fractions, not whole microseconds")
-        is_pixel = (x >= 0) & (x < 1 << 16) & (y >= 0) & (y < 1 << 16)
-        if not is_pixel.all():
-            losses.add(findings.EVENTS_BEYOND_SENSORS(), int(np.count_nonzero(~is_pixel)))
-            t_us, x, y, polarity = (column[is_pixel] for column in (t_us, x, y, polarity))
-        t_ns = to_ns(t_us, self._offset_us)
-        return EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)
+        # Pixels beyond 16 bits stay off any sensor.
+        x, y = (np.where((c >= 0) & (c < 1 << 16), c, (1 << 16) - 1).astype(np.uint16) for c in (x, y))
+        return EventColumns(to_ns(t_us, self._offset_us), x, y, polarity > 0)
 
 
 @contextmanager
@@ -88,18 +85,14 @@ def _open(path: Path) -> Iterator[Any]:
 
 
 def _column(file: Any, name: str) -> Any:
-    """Find a list of numbers; a link to another file is not followed.
+    """Find a list of numbers.
 
     Raises:
         ValueError: there is none of this name.
     """
-    import h5py
-
-    if not all(isinstance(file.get(n, getlink=True), h5py.HardLink) for n in ("events", name)):
-        raise ValueError(f"it has no {name}")
-    column = file[name]
-    if column.ndim != 1 or column.dtype.kind not in "biuf" or column.is_virtual or column.external:
-        raise ValueError(f"{name} is not a list of numbers in this file")
+    column = file.get(name)
+    if getattr(column, "ndim", 0) != 1 or column.dtype.kind not in "biuf":
+        raise ValueError(f"it has no list of numbers {name}")
     return column
 
 

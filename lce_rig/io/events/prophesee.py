@@ -28,15 +28,6 @@ from lce_rig.io.events.event_recording import NS_PER_US, EventStream, parse_size
 
 _BLOCK_BYTES = 1 << 18
 _WORDS = {"2": "<u4", "3": "<u2"}
-# Of files that name their sensor but not its resolution.
-_RESOLUTION_PX = {
-    "gen31": (640, 480),
-    "gen3": (640, 480),
-    "genx320": (320, 320),
-    "gen4": (1280, 720),
-    "imx636": (1280, 720),
-    "imx646": (1280, 720),
-}
 
 
 @dataclass
@@ -260,17 +251,6 @@ class PropheseeEvents(EventStream):
         if not (width and height):
             width, _, height = header.get("geometry", "").partition("x")
         self.resolution_px = parse_size(width, height)
-        if self.resolution_px is None and (width or height):
-            self.notes.append(
-                f"{path.name}: its header's size {width[:9]}x{height[:9]} is not a sensor's and is ignored"
-            )
-        elif self.resolution_px is None:
-            generation = header.get("sensor_generation", "").replace(".", "")
-            sensor = (
-                f"{header.get('plugin_name', '')} {header.get('sensor_name', '')} gen{generation}".lower()
-            )
-            sizes = (px for name, px in _RESOLUTION_PX.items() if name in sensor)
-            self.resolution_px = next(sizes, None)
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events of the file, block by block."""

@@ -246,19 +246,11 @@ class BagEvents(EventStream):
             losses.add(findings.BAG_TORN(where=error.what))
 
     def _only_topic(self) -> str:
-        """Name the only topic with events; triggers have topics of their own."""
+        """Name the only topic with events."""
         topics = self._bag.topics
         fitting = sorted(name for name, (kind, n) in topics.items() if kind in EVENT_TYPES and n > 0)
-        if len(fitting) > 1:
-            fitting = [name for name in fitting if not self._holds_triggers(name)]
         if len(fitting) != 1:
             fault = f"events on {len(fitting)} topics" if fitting else "no topic with events"
             hint = f"{list_topics(topics)}. Say which topic holds the camera's events."
             raise SourceError(f"{self._bag.path}: {fault}", hint)
         return fitting[0]
-
-    def _holds_triggers(self, topic: str) -> bool:
-        for _, message in self._messages(topic, Losses()):
-            with suppress(ValueError):
-                return message.msgtype in PACKET_TYPES and parse_packet(message).encoding == "trigger"
-        return False

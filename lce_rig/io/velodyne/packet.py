@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import velodyne
-from lce_rig.core.findings import Kind
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
 
@@ -32,16 +31,10 @@ _MAX_DISAGREEMENT_NS = 20_000_000
 
 
 class BadPacketError(ValueError):
-    """A payload that is not a packet of the LiDAR.
+    """A payload that is not a packet of the LiDAR; `model` names the Velodyne whose packet it is, if any."""
 
-    Attributes:
-        kind: its flaw.
-        model: the maker's name, where it is a sound packet of another Velodyne.
-    """
-
-    def __init__(self, kind: Kind, model: str = "") -> None:
-        super().__init__(kind.code)
-        self.kind = kind
+    def __init__(self, what: str, model: str = "") -> None:
+        super().__init__(what)
         self.model = model
 
 
@@ -118,22 +111,22 @@ def read_data_packet(
         BadPacketError: it is not a data packet of that model.
     """
     if len(payload) != velodyne.DATA_BYTES:
-        raise BadPacketError(findings.WRONG_LENGTH)
+        raise BadPacketError(f"{len(payload)} bytes")
     # Four times faster without NumPy; packets come 754 times per second.
     *heads, us, mode, product = _HEADS.unpack_from(payload)
     flags, azimuth = heads[0::2], heads[1::2]
     if flags != _FLAGS:
-        raise BadPacketError(findings.WRONG_FLAG)
+        raise BadPacketError("wrong block flag")
     if us >= velodyne.HOUR_US:
-        raise BadPacketError(findings.TIME_BEYOND_HOUR)
+        raise BadPacketError(f"time {us} us beyond the hour")
     if max(azimuth) >= velodyne.AZIMUTH_STEPS:
-        raise BadPacketError(findings.AZIMUTH_BEYOND_360)
+        raise BadPacketError("azimuth beyond 360 deg")
     if product != wanted.code and product in velodyne.PRODUCTS and mode in velodyne.RETURN_MODES:
-        raise BadPacketError(findings.OTHER_MODEL, velodyne.PRODUCTS[product])
+        raise BadPacketError(f"of a {velodyne.PRODUCTS[product]}", velodyne.PRODUCTS[product])
     if product != wanted.code or mode not in velodyne.RETURN_MODES:
-        raise BadPacketError(findings.UNKNOWN_FACTORY_BYTES)
+        raise BadPacketError("unknown factory bytes (firmware before 3.0.29 sends none)")
     if not _is_even(azimuth, mode == velodyne.DUAL, wanted.block_ns):
-        raise BadPacketError(findings.UNEVEN_AZIMUTHS)
+        raise BadPacketError("uneven azimuths")
     fields = np.frombuffer(payload, velodyne.DATA_PACKET)[0]
     return DataPacket(host_ns, us, mode, wanted, np.array(azimuth, np.int64), fields)
 
@@ -160,13 +153,13 @@ def read_position_packet(payload: bytes | memoryview) -> PositionPacket:
         BadPacketError: it is not a position packet.
     """
     if len(payload) != velodyne.POSITION_BYTES:
-        raise BadPacketError(findings.WRONG_LENGTH)
+        raise BadPacketError(f"{len(payload)} bytes")
     fields = np.frombuffer(payload, velodyne.POSITION_PACKET)[0]
     us, pps = int(fields["us"]), int(fields["pps"])
     if us >= velodyne.HOUR_US:
-        raise BadPacketError(findings.TIME_BEYOND_HOUR)
+        raise BadPacketError(f"time {us} us beyond the hour")
     if pps >= len(velodyne.PPS_STATES):
-        raise BadPacketError(findings.UNKNOWN_PPS)
+        raise BadPacketError("unknown PPS state")
     raw = bytes(fields["nmea"]).split(b"\0")[0]
     nmea_s, is_fix = _read_rmc(raw)
     nmea = raw.strip().decode("ascii", "replace")

@@ -235,24 +235,20 @@ class Vlp16Stream:
         self._last_stamp_ns: int | None = None
 
     def flaws(self) -> list[Finding]:
-        """List the flaws of single packets of either kind."""
-        return [
-            Finding(loss.code, loss.severity, figures={**loss.figures, "of": loss.subject})
-            for loss in self.losses.findings()
-            if loss.subject
-        ]
+        """List the packets that are damaged or another model's."""
+        kinds = {findings.DAMAGED.code, findings.OTHER_MODEL.code}
+        return [loss for loss in self.losses.findings() if loss.code in kinds]
 
     def account(self) -> list[str]:
         """List the losses in words."""
-        lost = [loss for loss in self.losses.findings() if not loss.subject]
-        return [loss.text for loss in lost + self.flaws()]
+        return [loss.text for loss in self.losses.findings()]
 
     def push_position(self, payload: bytes | memoryview) -> None:
         """Take a position packet; a bad one is counted."""
         try:
             self.clock.position = read_position_packet(payload)
         except BadPacketError as error:
-            self.losses.add(error.kind("position"))
+            self.losses.add(findings.DAMAGED(where=f"position packet: {error}"))
             return
         self.n_position += 1
 
@@ -266,9 +262,9 @@ class Vlp16Stream:
         try:
             packet = read_data_packet(payload, host_ns, self.product)
         except BadPacketError as error:
-            self.losses.add(error.kind("data"))
-            if error.model:
-                self.other_models[error.model] += 1
+            kind = findings.OTHER_MODEL if error.model else findings.DAMAGED
+            self.losses.add(kind(where=f"data packet: {error}"))
+            self.other_models.update([error.model] if error.model else [])
             return None
         place = self._order.place(packet)
         if place == "late":

@@ -81,16 +81,6 @@ def test_a_damaged_record_ends_the_events_and_the_loss_is_said(tmp_path: Path) -
     assert any("torn" in note for note in recording.notes)
 
 
-def test_the_topic_is_found_among_triggers_and_others(tmp_path: Path) -> None:
-    edges = [(10, 0, 1, True), (400, 0, 1, False)]
-    trigger = encoders.packet(encoders.mono(edges, 0), "trigger", is_ros1=True)
-    sent = [("/event_camera/triggers", 10**9, trigger), *messages(is_ros1=True)]
-    path = write_packet_bag(tmp_path / "a.bag", sent)
-    assert everything(open_events(path)) == TRUTH
-    with pytest.raises(SourceError):
-        open_events(path, topic="/event_camera/triggers")
-
-
 def test_two_cameras_need_a_topic_and_the_topics_are_listed(tmp_path: Path) -> None:
     sent = messages(is_ros1=True)
     path = write_packet_bag(tmp_path / "a.bag", sent + [("/other", t, data) for _, t, data in sent[:3]])

@@ -1,4 +1,4 @@
-"""Recordings of real cameras by others, against the makers' own library or a decoder word by word."""
+"""Recordings of real cameras by others, against the makers' own library or kept figures."""
 
 from pathlib import Path
 
@@ -45,7 +45,7 @@ def test_aedat4_is_read_as_its_makers_read_it(folder: Path, name: str) -> None:
         ("evt3_pedestrians.raw", 5000, 45_210_000, [3_415_152, 1_425_333, 2_894]),
     ],
 )
-def test_events_are_those_of_a_decoder_word_by_word(
+def test_events_of_recorded_cameras_keep_their_number_duration_and_sums(
     folder: Path, name: str, n: int, duration_ns: int, sums: list[int]
 ) -> None:
     t_ns, *others = columns(folder / name)

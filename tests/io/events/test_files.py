@@ -168,9 +168,8 @@ def test_a_torn_word_of_a_raw_file_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("head", "encode"),
     [
-        ("% evt 2.0\n% plugin_name hal_plugin_gen31_fx3\n", encoders.evt2),
+        ("% evt 2.0\n% geometry 640x480\n", encoders.evt2),
         ("% format EVT2;height=480;width=640\n% end\n", encoders.evt2),
-        ("% evt 2.0\n% sensor_generation 3.1\n% end\n", encoders.evt2),
         ("% format EVT3;height=480;width=640\n% end\n", encoders.evt3),
     ],
 )
