@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -408,37 +408,6 @@ class SceneOpinion:
     def strongest(self) -> AxisOpinion | None:
         """The axis that contradicts by most standard deviations; None if none does."""
         return max(self.of("contradicts"), key=lambda axis: abs(axis.change) / axis.sigma, default=None)
-
-
-class Extrinsics(Protocol):
-    """What other evidence needs of extrinsics that boards gave, judged or not; fields as of `Calibration`."""
-
-    @property
-    def camera(self) -> str:
-        """Name of the camera."""
-
-    @property
-    def lidar(self) -> str:
-        """Name of the LiDAR."""
-
-    @property
-    def T_cam_lidar(self) -> Array:
-        """(4, 4)."""
-
-    @property
-    def cov(self) -> Array:
-        """(6, 6)."""
-
-    @property
-    def cov_shared(self) -> Array:
-        """(6, 6)."""
-
-    @property
-    def intrinsics(self) -> Intrinsics | None:
-        """The camera's that belong to the extrinsics; None for the profile's."""
-
-
-_WITH_STATE = WrapSerializer(lambda opinion, write: {"state": opinion.state, **write(opinion)})
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,10 +5,10 @@ the scene's opinion
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,11 +20,10 @@ from lce_rig.calibrate import (
     estimate_extrinsics,
 )
 from lce_rig.calibrate.observability import find_weakest
-from lce_rig.calibrate.result import error_to_reference
+from lce_rig.calibrate.result import capture_residual, error_to_reference
 from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
-from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
@@ -42,7 +41,6 @@ from lce_rig.judge.verdict import judge, share_findings
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE
 from lce_rig.pipeline.matching import candidates_of
-from lce_rig.pipeline.witness import Sharpen, fuse
 from lce_rig.rig import Rig
 
 
@@ -77,23 +75,6 @@ class _Solved:
         return self.pairs[0].lidar
 
     @property
-    def T_cam_lidar(self) -> Array:
-        return self.estimate.T_cam_lidar
-
-    @property
-    def cov(self) -> Array:
-        return self.validation.cov
-
-    @property
-    def cov_shared(self) -> Array:
-        # Boards and scene share the session's lens, too.
-        return self.validation.cov_shared + self.cov_lens
-
-    @property
-    def intrinsics(self) -> Intrinsics | None:
-        return None if self.estimate.lens is None else self.estimate.lens.intrinsics
-
-    @property
     def cov_lens(self) -> Array:
         """The part (6, 6) of the covariance from the lens."""
         return profile_covariance([e for e in self.estimate.sensitivities if e.source == "intrinsics"])
@@ -103,9 +84,33 @@ class _Solved:
         """Whether boards stood still, so that images need no motion compensation."""
         return all(channel.time_offset_s is None for channel in self.estimate.channels)
 
+    def evidence(self, detections: Detections) -> CameraEvidence:
+        """List what shows whether the images are of this camera, with its boards in the captures used."""
+        channels = [channel.channel for channel in self.estimate.channels]
+        views = []
+        for name in sorted(self.estimate.captures_of(self.estimate.used)):
+            for channel in (pair.channel for pair in self.pairs if pair.channel in channels):
+                image = detections.images[self.camera, channel].get(name)
+                if isinstance(image, ImageBoard):
+                    views.append(BoardView(name, channel, image))
+        T, validation = self.estimate.T_cam_lidar, self.validation
+        return CameraEvidence(self.camera, T, validation.cov, views, validation.intrinsics)
 
-_Link = tuple[int, int, CameraPair, list[Finding]]
-"""Two cameras that saw the same boards, by their indices among those with an estimate, and contradictions."""
+
+class _Link(NamedTuple):
+    """Two cameras of one LiDAR.
+
+    Attributes:
+        members: their indices among those with an estimate.
+        pair: both compared by the still boards that both saw; None without any.
+        contradictions: between their images and extrinsics.
+        exchanged: whether images came under each other's name.
+    """
+
+    members: tuple[int, int]
+    pair: CameraPair | None
+    contradictions: list[Finding]
+    exchanged: list[Finding]
 
 
 def calibrate_detections(
@@ -116,7 +121,7 @@ def calibrate_detections(
     cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
     reference: Reference | None = None,
-    scene: Sharpen | None = None,
+    scene: Callable[[Calibration], SceneShare] | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Calibration], list[Finding]]:
     """Estimate and judge the extrinsics of every camera with every LiDAR from their detections.
@@ -156,13 +161,16 @@ def calibrate_detections(
         raise join_shortages([NotEnoughDataError.of(shortage) for shortage in shortages])
     if len(alone) > 1:
         begin(progress, "comparing and joining cameras")
-    links = _links(rig, alone)
+    links = _compare(rig, detections, alone)
     solved = _solve_together(rig, detections, alone, links)
+    calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
     if scene is not None:
         begin(progress, "estimating from the scene")
-        solved = [_with_scene(rig, each, scene(each)) for each in solved]
-    exchanged = _exchanged(rig, detections, solved)
-    calibrations = [_judged(rig, detections, solved, links, exchanged[k], k) for k in range(len(solved))]
+        for k, c in enumerate(calibrations):
+            # Boards and scene share the session's lens, too.
+            share = scene(replace(c, cov_shared=c.cov_shared + solved[k].cov_lens))
+            solved[k] = _with_scene(rig, solved[k], share)
+        calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
     for k, c in enumerate(calibrations):
         truth = None if reference is None else reference.of(c.camera, c.lidar)
         if truth is not None:
@@ -248,49 +256,19 @@ def _examine(
     return validate(estimate, rig, rig.lidars[first.lidar], lens, rejected)
 
 
-def _views(detections: Detections, pairs: Sequence[Pair], estimate: CalibrationEstimate) -> list[BoardView]:
-    """List the camera's boards in the captures used."""
-    channels = {channel.channel for channel in estimate.channels}
-    views = []
-    for name in sorted(estimate.captures_of(estimate.used)):
-        for pair in pairs:
-            image = detections.images[pair.camera, pair.channel].get(name)
-            if pair.channel in channels and isinstance(image, ImageBoard):
-                views.append(BoardView(name, pair.channel, image))
-    return views
-
-
-def _exchanged(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> list[list[Finding]]:
-    """Find cameras whose images came under each other's name, for each of them."""
-    found: list[list[Finding]] = [[] for _ in solved]
-    for (i, one), (j, other) in combinations(enumerate(solved), 2):
-        if one.lidar == other.lidar:
-            cameras = [
-                CameraEvidence(
-                    each.camera,
-                    each.T_cam_lidar,
-                    each.cov,
-                    _views(detections, each.pairs, each.estimate),
-                    each.validation.intrinsics,
-                )
-                for each in (one, other)
-            ]
-            findings = find_exchanged(rig, one.lidar, *cameras)
-            found[i] += findings
-            found[j] += findings
-    return found
-
-
-def _links(rig: Rig, solved: Sequence[_Solved]) -> list[_Link]:
-    """Compare cameras of one LiDAR that saw the same still boards."""
+def _compare(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> list[_Link]:
+    """Compare the cameras of each LiDAR by the still boards that both saw, and by each other's names."""
     links = []
-    for (i, one), (j, other) in combinations(enumerate(solved), 2):
-        if one.lidar == other.lidar and one.is_still and other.is_still:
-            # Contradicting captures widen a method's covariance; that must not hide the contradiction.
-            pair = relate(one.estimate, other.estimate)
-            if pair is not None:
-                names = one.camera, other.camera
-                links.append((i, j, pair, camera_findings(pair, names, rig.calibration, rig.verdict)))
+    for members in combinations(range(len(solved)), 2):
+        one, other = (solved[k] for k in members)
+        if one.lidar != other.lidar:
+            continue
+        # Contradicting captures widen a method's covariance; that must not hide the contradiction.
+        pair = relate(one.estimate, other.estimate) if one.is_still and other.is_still else None
+        names = one.camera, other.camera
+        findings = [] if pair is None else camera_findings(pair, names, rig.calibration, rig.verdict)
+        exchanged = find_exchanged(rig, one.lidar, one.evidence(detections), other.evidence(detections))
+        links.append(_Link(members, pair, findings, exchanged))
     return links
 
 
@@ -302,10 +280,12 @@ def _solve_together(
     A camera that contradicts another is excluded, as it would corrupt the other's extrinsics.
     """
     group = list(range(len(alone)))
-    for first, second, _, findings in links:
-        if not findings:
+    for (first, second), pair, contradictions, _ in links:
+        if pair is not None and not contradictions:
             group = [group[first] if number == group[second] else number for number in group]
-    contradicted = {group[i] for i, j, _, findings in links if findings and group[i] == group[j]}
+    contradicted = {
+        group[i] for (i, j), _, contradictions, _ in links if contradictions and group[i] == group[j]
+    }
     solved = list(alone)
     for number in sorted(set(group) - contradicted):
         members = [k for k in range(len(alone)) if group[k] == number]
@@ -324,7 +304,7 @@ def _solve_together(
 def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone: _Solved) -> _Solved:
     """Replace a camera's own estimate by its part of a joint one."""
     estimate = together.estimates[alone.camera]
-    sigma_deg, sigma_m = sigma_sizes(alone.cov)
+    sigma_deg, sigma_m = sigma_sizes(alone.validation.cov)
     estimate = replace(
         estimate,
         diagnostics=replace(
@@ -342,9 +322,15 @@ def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
     """Take the extrinsics of boards and scene; the checks on the boards' own result stay as they are."""
     if share.state != "used":
         return replace(solved, share=share)
+    estimate, board = solved.estimate, rig.board.to_board()
+    # Residuals of the boards under the extrinsics of both.
+    residuals = tuple(
+        capture_residual(share.T_cam_lidar, estimate.observations[each.capture], board, each.held_out_m)
+        for each in estimate.residuals
+    )
     return replace(
         solved,
-        estimate=fuse(solved.estimate, share, rig.board.to_board()),
+        estimate=replace(estimate, T_cam_lidar=share.T_cam_lidar, cov=share.cov, residuals=residuals),
         validation=replace(solved.validation, cov=share.cov, cov_used=share.cov),
         together=None,
         share=share,
@@ -356,13 +342,13 @@ def _judged(
     detections: Detections,
     solved: Sequence[_Solved],
     links: Sequence[_Link],
-    exchanged: Sequence[Finding],
     k: int,
 ) -> Calibration:
     """Judge the extrinsics of index k and assemble their result."""
     own, estimate, validation = solved[k], solved[k].estimate, solved[k].validation
-    mine = [link for link in links if k in link[:2]]
-    others = [*exchanged, *(finding for *_, findings in mine for finding in findings)]
+    mine = [link for link in links if k in link.members]
+    others = [finding for link in mine for finding in link.exchanged]
+    others += [finding for link in mine for finding in link.contradictions]
     if own.share is not None:
         others += share_findings(own.share)
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
@@ -377,7 +363,9 @@ def _judged(
     refused = dict(own.refused)
     for name, why in estimate.refused.items():
         refused |= dict.fromkeys(estimate.captures_of([name]), why)
-    lens = rig.cameras[own.camera].to_intrinsics() if estimate.lens is None else estimate.lens.intrinsics
+    lens = None if estimate.lens is None else estimate.lens.intrinsics
+    scale = estimate.diagnostics.camera_scale
+    square_m = rig.board.square_m * (2 - scale if np.isfinite(scale) else 1.0)
     # The scene moves extrinsics, not the lens.
     is_of_boards = own.share is None or own.share.state != "used"
     joint = validation.cov_with_lens if is_of_boards else validation.cov
@@ -402,10 +390,19 @@ def _judged(
         diagnostics=diagnostics,
         channel_results=estimate.channels,
         method=estimate.method,
-        uncertainty=point_uncertainties(estimate.T_cam_lidar, joint, lens),
-        **_lens_of(estimate, rig),
+        uncertainty=point_uncertainties(
+            estimate.T_cam_lidar, joint, lens or rig.cameras[own.camera].to_intrinsics()
+        ),
+        intrinsics=lens,
+        intrinsics_cov=None if estimate.lens is None else estimate.lens.estimate.cov,
+        intrinsics_cross_cov=None if lens is None else estimate.cov_with_lens,
+        square_m=None if lens is None else square_m,
         estimated_with=estimate.estimated_with,
-        other_cameras=tuple(_other_camera(solved, link, k) for link in mine),
+        other_cameras=tuple(
+            _other_camera(solved, k, next(i for i in link.members if i != k), link.pair)
+            for link in mine
+            if link.pair is not None
+        ),
         scene_share=own.share,
         board_distances_m=tuple(np.quantile(distances_m, (0.1, 0.9)).tolist()),
         weakest=find_weakest(validation.cov, estimate.lever_m),
@@ -415,26 +412,10 @@ def _judged(
     )
 
 
-def _lens_of(estimate: CalibrationEstimate, rig: Rig) -> dict[str, Any]:
-    """Give the intrinsics and squares that belong to the extrinsics, with their covariance."""
-    if estimate.lens is None:
-        return {}
-    stretched = (
-        1.0 if not np.isfinite(estimate.diagnostics.camera_scale) else 2 - estimate.diagnostics.camera_scale
-    )
-    return {
-        "intrinsics": estimate.lens.intrinsics,
-        "intrinsics_cov": estimate.lens.estimate.cov,
-        "intrinsics_cross_cov": estimate.cov_with_lens,
-        "square_m": rig.board.square_m * stretched,
-    }
-
-
-def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera:
-    """State the pose of the other camera of a link relative to the camera of index k."""
-    first, second, pair, _ = link
-    own, other = solved[k], solved[first if k == second else second]
-    T, J = relative_pose(own.T_cam_lidar, other.T_cam_lidar)
+def _other_camera(solved: Sequence[_Solved], k: int, other_k: int, pair: CameraPair) -> OtherCamera:
+    """State the pose of another camera relative to the camera of index k."""
+    own, other = solved[k], solved[other_k]
+    T, J = relative_pose(own.estimate.T_cam_lidar, other.estimate.T_cam_lidar)
     cov = None
     if own.together is not None and own.together is other.together:
         # Widened like both extrinsics.
@@ -450,7 +431,7 @@ def _other_camera(solved: Sequence[_Solved], link: _Link, k: int) -> OtherCamera
         n_captures=len(pair.captures),
         T_cam_other=T,
         cov=cov,
-        T_cam_other_pictures=seen if seen is None or k == second else invert(seen),
+        T_cam_other_pictures=seen if seen is None or k > other_k else invert(seen),
         apart_rotation_deg=apart_deg,
         apart_translation_m=apart_m,
         board_rms_m=pair.board_rms_m,

@@ -1,18 +1,14 @@
 """Edges of the scene beside the boards: an independent opinion on extrinsics, or part of one estimate."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.calibrate import CalibrationEstimate
-from lce_rig.calibrate.result import capture_residual
-from lce_rig.core.board import Board
 from lce_rig.core.calibration import (
     AxisOpinion,
     Calibration,
-    Extrinsics,
     OpinionState,
     SceneOpinion,
     SceneShare,
@@ -40,9 +36,6 @@ _STATES: dict[State, OpinionState] = {
 _KNOWN_SHARE = 0.02  # of the boards' variance that the scene must remove in a direction to have a say in it
 _CHANCE = 0.01  # of a scene that agrees with the boards to be refused
 
-Sharpen = Callable[[Extrinsics], SceneShare]
-"""Asks the scene about extrinsics that boards gave."""
-
 
 def hear_scene(session: Session, detections: Detections, calibration: Calibration) -> SceneOpinion:
     """Compare extrinsics with the edges of the scene in some captures of a session, spread over it.
@@ -59,7 +52,7 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
 
 
 def scene_views(
-    session: Session, detections: Detections, extrinsics: Extrinsics, n_most: int
+    session: Session, detections: Detections, extrinsics: Calibration, n_most: int
 ) -> list[SceneView]:
     """Find the edges of the scene in captures of a session, spread over it, without those at the board.
 
@@ -102,7 +95,7 @@ def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibr
     return SceneOpinion(drift.n_captures, drift.n_edges, axes)
 
 
-def sharpen(sessions: Sequence[Session], found: Sequence[Detections], by_boards: Extrinsics) -> SceneShare:
+def sharpen(sessions: Sequence[Session], found: Sequence[Detections], by_boards: Calibration) -> SceneShare:
     """Add what the edges of the scene tell to extrinsics that boards gave.
 
     Args:
@@ -120,7 +113,7 @@ def sharpen(sessions: Sequence[Session], found: Sequence[Detections], by_boards:
     return share_of(views, lens, by_boards)
 
 
-def share_of(views: Sequence[SceneView], lens: Intrinsics, by_boards: Extrinsics) -> SceneShare:
+def share_of(views: Sequence[SceneView], lens: Intrinsics, by_boards: Calibration) -> SceneShare:
     """Estimate extrinsics from boards and scene, and test whether the two agree.
 
     Errors of the profile's lens and board (C) move all extrinsics found with it: the scene does not reduce
@@ -169,27 +162,6 @@ def _whitened(cov: Array, root: Array) -> Array:
     """Express a covariance (6, 6) in units of L L^T, with L = `root`."""
     scaled = np.linalg.solve(root, np.linalg.solve(root, cov).T)
     return np.asarray(0.5 * (scaled + scaled.T), dtype=np.float64)
-
-
-def fuse(by_boards: CalibrationEstimate, share: SceneShare, board: Board) -> CalibrationEstimate:
-    """Replace the extrinsics by those of boards and scene; residuals are those of the boards under them.
-
-    Args:
-        by_boards: the boards' own.
-        share: of the scene.
-        board: its size.
-    """
-    T, observations = share.T_cam_lidar, by_boards.observations
-    residuals = tuple(
-        capture_residual(T, observations[each.capture], board, each.held_out_m)
-        for each in by_boards.residuals
-    )
-    return replace(
-        by_boards,
-        T_cam_lidar=T,
-        cov=share.cov,
-        residuals=residuals,
-    )
 
 
 def by_boards(calibration: Calibration) -> Calibration:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from lce_rig.core import velodyne
-from lce_rig.core.calibration import Extrinsics
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
@@ -74,12 +74,12 @@ class Rig(Settings):
     calibration: CalibrationSettings = CalibrationSettings()
     verdict: VerdictSettings = VerdictSettings()
 
-    def lens_of(self, extrinsics: Extrinsics) -> Intrinsics:
+    def lens_of(self, extrinsics: Calibration) -> Intrinsics:
         """Return the intrinsics that belong to extrinsics: their own, else the profile's."""
         own = extrinsics.intrinsics
         return self.cameras[extrinsics.camera].to_intrinsics() if own is None else own
 
-    def with_lenses(self, extrinsics: Sequence[Extrinsics]) -> "Rig":
+    def with_lenses(self, extrinsics: Sequence[Calibration]) -> "Rig":
         """Replace the cameras' intrinsics by those that belong to extrinsics; the first of a camera count."""
         cameras = dict(self.cameras)
         for each in reversed(extrinsics):

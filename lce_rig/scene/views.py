@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.calibration import Extrinsics
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, transform
@@ -25,7 +25,7 @@ _BOARD_MARGIN_RAD = 0.04  # Extrinsics may be off by as much.
 _EVENTS_NEAR_RAD = 0.06  # as far as the score is searched
 
 
-def build_view(rig: Rig, extrinsics: Extrinsics, name: str, image: Image | Events, scan: Scan) -> SceneView:
+def build_view(rig: Rig, extrinsics: Calibration, name: str, image: Image | Events, scan: Scan) -> SceneView:
     """Find the edges of one capture's scan, and of its image or of events about the scan."""
     lidar, lens = rig.lidars[extrinsics.lidar], rig.lens_of(extrinsics)
     edges = find_depth_edges(scan, Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad))
@@ -38,7 +38,7 @@ def build_view(rig: Rig, extrinsics: Extrinsics, name: str, image: Image | Event
 
 
 def without_board(
-    view: SceneView, found: ImageBoard | Refusal, rig: Rig, extrinsics: Extrinsics
+    view: SceneView, found: ImageBoard | Refusal, rig: Rig, extrinsics: Calibration
 ) -> SceneView:
     """Leave out the edges at and near the board, if the image shows one."""
     return replace(
@@ -47,7 +47,7 @@ def without_board(
 
 
 def is_apart_from_board(
-    points: Array, found: ImageBoard | Refusal, rig: Rig, extrinsics: Extrinsics
+    points: Array, found: ImageBoard | Refusal, rig: Rig, extrinsics: Calibration
 ) -> NDArray[np.bool_]:
     """Find which points (N, 3) of the LiDAR's frame lie apart from the board in an image; all without one."""
     if isinstance(found, Refusal):
