@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from lce_rig.session import Capture, Session, check_capture
 from lce_rig.session.durable import load_arrays, store_arrays
 
 Key = tuple[str, str]
+_ImageJob = tuple[Capture, str, str]
 _Found = TypeVar("_Found", ImageDetection, LidarDetection, Image | Refusal)
 
 
@@ -51,17 +52,14 @@ def detect(
         ProfileError: a network that the profile names cannot be used.
     """
     finder = _Finder(session, event_image)
-    held = finder.held(session.captures)
-    scan_jobs = [(each.capture, lidar) for each in held for lidar in each.lidars]
-    image_jobs = [(each.capture, camera, channel) for each in held for camera, channel in each.images]
-    event_jobs = [(each.capture, camera, channel) for each in held for camera, channel in each.events]
+    scan_jobs, image_jobs, event_jobs = finder.jobs(session.captures)
     n_scans, total = len(scan_jobs), len(scan_jobs) + len(image_jobs) + len(event_jobs)
     images: dict[Key, dict[str, ImageDetection]] = {}
     lidars: dict[str, dict[str, LidarDetection]] = {}
 
-    def find_in_events(job: tuple[Capture, str, str]) -> ImageDetection:
+    def find_in_events(job: _ImageJob) -> ImageDetection:
         name = job[0].name
-        return finder.events(*job, scans={lidar: by[name] for lidar, by in lidars.items() if name in by})
+        return finder.events(*job, {lidar: by[name] for lidar, by in lidars.items() if name in by})
 
     def counted(results: Iterable[_Found], n_before: int, total: int) -> Iterator[_Found]:
         for n_done, result in enumerate(results, start=n_before + 1):
@@ -79,11 +77,11 @@ def detect(
         for (capture, camera, channel), image in zip([*image_jobs, *event_jobs], seen, strict=True):
             images.setdefault((camera, channel), {})[capture.name] = image
         detections = Detections(images, lidars)
+        by_name = {capture.name: capture for capture, _ in scan_jobs}
         again = [
-            (each.capture, lidar, poses)
+            (by_name[name], lidar, poses)
             for lidar, expected in expected_poses(session.rig, detections).items()
-            for each in held
-            if (poses := expected.get(each.capture.name)) is not None
+            for name, poses in expected.items()
         ]
         if again:
             begin(progress, "searching about predicted places")
@@ -110,16 +108,7 @@ def event_picture(
     """
     finder = _Finder(session, event_image)
     scans = {lidar: finder.scan(capture, lidar) for lidar in capture.lidars}
-    return finder.picture(capture, camera, channel, scans=scans)
-
-
-class _Held(NamedTuple):
-    """What a capture holds: images and raw events by (camera, channel), and scans by LiDAR."""
-
-    capture: Capture
-    images: list[Key]
-    events: list[Key]
-    lidars: list[str]
+    return finder.picture(capture, camera, channel, scans)
 
 
 class _Finder:
@@ -131,25 +120,31 @@ class _Finder:
         self._digest = detection_digest(session.rig)
         self._event_digests: dict[Key, str] = {}
 
-    def held(self, captures: list[Capture]) -> list[_Held]:
-        """List what each capture holds.
+    def jobs(
+        self, captures: Sequence[Capture]
+    ) -> tuple[list[tuple[Capture, str]], list[_ImageJob], list[_ImageJob]]:
+        """List the scans, the images and the raw events to search.
 
         A capture with a damaged manifest, or with sensors that the rig lacks, counts as holding the same as
         the others, so that every pair reports it.
         """
-        known: dict[str, _Held] = {}
+        held: dict[str, tuple[list[str], list[Key], list[Key]]] = {}
         for capture in captures:
             with suppress(SessionError):
                 made_here = event_channels(self._session.rig, capture, self._event_image)
                 stored = [key for key in capture.image_keys if key not in made_here]
-                known[capture.name] = _Held(capture, stored, made_here, capture.lidars)
-        if captures and not known:
+                held[capture.name] = capture.lidars, stored, made_here
+        if captures and not held:
             check_capture(self._session.rig, captures[0])  # raises the manifest's error
-        every = list(known.values())
-        images = sorted({key for each in every for key in each.images})
-        events = sorted({key for each in every for key in each.events} - set(images))
-        lidars = sorted({lidar for each in every for lidar in each.lidars})
-        return [known.get(capture.name, _Held(capture, images, events, lidars)) for capture in captures]
+        lidars = sorted({lidar for own, _, _ in held.values() for lidar in own})
+        images = sorted({key for _, own, _ in held.values() for key in own})
+        events = sorted({key for _, _, own in held.values() for key in own} - set(images))
+        wanted = [(capture, held.get(capture.name, (lidars, images, events))) for capture in captures]
+        return (
+            [(capture, lidar) for capture, (own, _, _) in wanted for lidar in own],
+            [(capture, *key) for capture, (_, own, _) in wanted for key in own],
+            [(capture, *key) for capture, (_, _, own) in wanted for key in own],
+        )
 
     def image(self, capture: Capture, camera: str, channel: str) -> ImageDetection:
         """Find the board in an image that the capture holds."""
@@ -179,34 +174,67 @@ class _Finder:
         return self._remembered(self._digest, capture, f"{lidar}.at-{where}", find)
 
     def events(
-        self, capture: Capture, camera: str, channel: str, *, scans: Mapping[str, LidarDetection]
+        self, capture: Capture, camera: str, channel: str, scans: Mapping[str, LidarDetection]
     ) -> ImageDetection:
-        """Find the board in raw events, and keep the reconstructed image."""
+        """Find the board in raw events, and keep the reconstructed image.
+
+        Raises:
+            ProfileError: the network cannot be used.
+        """
         digest = self._event_digest(camera, channel)
 
         def find() -> ImageDetection:
-            seen = see_events(self._session, capture, camera, channel, scans, self._event_image)
-            self._keep(_cache_key(digest, capture, f"{camera}.{channel}.picture"), seen.picture)
-            return seen.board
+            sighting = self._see(capture, camera, channel, scans)
+            self._keep(_cache_key(digest, capture, f"{camera}.{channel}.picture"), sighting.picture)
+            return sighting.board
 
         return self._remembered(digest, capture, f"{camera}.{channel}", find)
 
     def picture(
-        self, capture: Capture, camera: str, channel: str, *, scans: Mapping[str, LidarDetection]
+        self, capture: Capture, camera: str, channel: str, scans: Mapping[str, LidarDetection]
     ) -> Image | Refusal:
-        """Return the image reconstructed from raw events."""
+        """Return the image reconstructed from raw events; raises as `events`."""
 
         def find() -> Image | Refusal:
-            return see_events(self._session, capture, camera, channel, scans, self._event_image).picture
+            return self._see(capture, camera, channel, scans).picture
 
         digest = self._event_digest(camera, channel)
         return self._remembered(digest, capture, f"{camera}.{channel}.picture", find)
 
+    def _see(
+        self, capture: Capture, camera: str, channel: str, lidars: Mapping[str, LidarDetection]
+    ) -> EventSighting:
+        """Reconstruct an image of a capture's events for the LiDAR's time of the board, and find it there."""
+        from lce_rig.detect.events.figures import sweep_time_s
+
+        rig, events = self._session.rig, capture.events(camera)
+        stamp_ns = picture_stamp_ns(rig, capture, camera, channel, lidars)
+        if stamp_ns is None:
+            stamp_ns = int(events.t_ns[-1]) if len(events) else 0
+        boards = [(name, found[0]) for name, found in lidars.items() if isinstance(found, list) and found]
+        settings = rig.cameras[camera].channels[channel].reconstruction
+        return find_event_board(
+            events,
+            stamp_ns,
+            reconstructor_for(settings, channel, self._event_image),
+            rig.board.to_board(),
+            rig.cameras[camera].to_intrinsics(),
+            rig.quality,
+            sweep_s=sweep_time_s(boards[0][1], 1 / rig.lidars[boards[0][0]].rate_hz) if boards else None,
+        )
+
     def _event_digest(self, camera: str, channel: str) -> str:
+        """Hash the inputs of images from a channel's events besides the capture, to 12 digits."""
+        from lce_rig.detect.events.reconstruct import model_bytes
+
         if (camera, channel) not in self._event_digests:
-            self._event_digests[camera, channel] = event_digest(
-                self._session, camera, channel, self._event_image, self._digest
-            )
+            stated = self._session.rig.cameras[camera].channels[channel].reconstruction
+            settings = stated or ReconstructionSettings()
+            settings = settings.model_copy(update={"method": self._event_image or settings.method})
+            digest = hashlib.sha256(f"{self._digest} {settings.model_dump_json()}".encode())
+            if settings.method == "network":
+                digest.update(model_bytes(None if settings.model is None else Path(settings.model)))
+            self._event_digests[camera, channel] = digest.hexdigest()[:12]
         return self._event_digests[camera, channel]
 
     def _remembered(
@@ -263,45 +291,6 @@ def event_channels(rig: Rig, capture: Capture, event_image: EventImage | None) -
     ]
 
 
-def see_events(
-    session: Session,
-    capture: Capture,
-    camera: str,
-    channel: str,
-    lidars: Mapping[str, LidarDetection],
-    event_image: EventImage | None,
-) -> EventSighting:
-    """Reconstruct an image of a capture's events for the LiDAR's time of the board, and find the board in it.
-
-    Args:
-        session: its profile gives the method.
-        capture: holds the camera's events.
-        camera, channel: the image's camera and channel.
-        lidars: detections in the capture's scans, by LiDAR.
-        event_image: replaces the profile's method.
-
-    Raises:
-        ProfileError: the network cannot be used.
-        SessionError: the capture is damaged.
-    """
-    from lce_rig.detect.events.figures import sweep_time_s
-
-    rig, events = session.rig, capture.events(camera)
-    stamp_ns = picture_stamp_ns(rig, capture, camera, channel, lidars)
-    if stamp_ns is None:
-        stamp_ns = int(events.t_ns[-1]) if len(events) else 0
-    boards = [(name, found[0]) for name, found in lidars.items() if isinstance(found, list) and found]
-    return find_event_board(
-        events,
-        stamp_ns,
-        reconstructor_for(rig.cameras[camera].channels[channel].reconstruction, channel, event_image),
-        rig.board.to_board(),
-        rig.cameras[camera].to_intrinsics(),
-        rig.quality,
-        sweep_s=sweep_time_s(boards[0][1], 1 / rig.lidars[boards[0][0]].rate_hz) if boards else None,
-    )
-
-
 def picture_stamp_ns(
     rig: Rig, capture: Capture, camera: str, channel: str, lidars: Mapping[str, LidarDetection]
 ) -> int | None:
@@ -323,30 +312,6 @@ def picture_stamp_ns(
         own = rig.cameras[camera].channels[channel].timestamps.expected_offset_s
         return stamp_ns + seen_ns + round(1e9 * (settings.timestamps.expected_offset_s - own))
     return None
-
-
-def event_digest(
-    session: Session, camera: str, channel: str, event_image: EventImage | None, base: str
-) -> str:
-    """Name the cache by the inputs of images from events besides the capture.
-
-    Args:
-        session: its profile gives the method.
-        camera, channel: the images' camera and channel.
-        event_image: replaces the profile's method.
-        base: inputs of all detections.
-
-    Raises:
-        ProfileError: the network's file cannot be read.
-    """
-    from lce_rig.detect.events.reconstruct import model_bytes
-
-    settings = session.rig.cameras[camera].channels[channel].reconstruction or ReconstructionSettings()
-    settings = settings.model_copy(update={"method": event_image or settings.method})
-    digest = hashlib.sha256(f"{base} {settings.model_dump_json()}".encode())
-    if settings.method == "network":
-        digest.update(model_bytes(None if settings.model is None else Path(settings.model)))
-    return digest.hexdigest()[:12]
 
 
 def check_networks(rig: Rig) -> None:
