@@ -32,7 +32,7 @@ from lce_rig.detect.detection import Pair
 from lce_rig.export.reference import read_reference
 from lce_rig.judge.findings import consequences, weakest_words
 from lce_rig.pipeline.calibrate_sessions import require_unit
-from lce_rig.pipeline.result_files import UNION, Result, WrittenResult, new_result_parts
+from lce_rig.pipeline.result_files import UNION, Result, WrittenResult, result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import provenance_of
 
@@ -242,7 +242,7 @@ def calibrate(
     """
     paths = sessions or (Path("session"),)
     name = UNION if name is None and len(paths) > 1 else name
-    new_result_parts(name)
+    result_folder(Path(), name, is_new=True)
     if profile is not None:
         if len(paths) > 1:
             raise UsageError("--rig applies to one session", "Calibrate each session alone with it first.")

@@ -13,7 +13,7 @@ from lce_rig.fleet.deploy import deployment
 from lce_rig.fleet.deploy.deployment import Deployed, Plan, Standing
 from lce_rig.fleet.deploy.releases import ReleaseRecord
 from lce_rig.fleet.deploy.targets import find_target
-from lce_rig.pipeline.result_files import result_parts
+from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig.target_settings import TargetSettings
 
 
@@ -82,7 +82,7 @@ def deploy(
         return
     opened = lce.Session.open(session)
     target = find_target(target_name, targets, session, opened.rig)
-    result = opened.path.joinpath(*result_parts(name))
+    result = result_folder(opened.path, name)
     if dry_run:
         plan = deployment.plan(result, opened.rig, target, session=opened)
         _show_plan(plan, target, has_diff=diff, as_json=as_json)

@@ -11,7 +11,7 @@ from lce_rig.cli.options import session_argument, split_names
 from lce_rig.core.errors import UsageError
 from lce_rig.export import EXPORTS, export_formats, require_usable
 from lce_rig.export.urdf import read_robot, write_into_urdf
-from lce_rig.pipeline.result_files import RESULT, result_parts
+from lce_rig.pipeline.result_files import RESULT, result_folder
 
 
 def _list_formats(context: click.Context, _param: click.Parameter, is_asked: bool) -> None:
@@ -92,7 +92,7 @@ def export(
     if into is not None and (formats or tree) is not None:
         raise UsageError("--formats and --tree apply to --output only", "Omit them, or omit --into.")
     opened = lce.Session.open(session)
-    pairs = lce.read_result(opened.path.joinpath(*result_parts(name), RESULT)).pairs
+    pairs = lce.read_result(result_folder(opened.path, name) / RESULT).pairs
     if output is not None:
         robot = None if tree is None else read_robot(tree)
         output.mkdir(parents=True, exist_ok=True)

@@ -7,8 +7,8 @@ import click
 import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import session_argument
-from lce_rig.pipeline.viewing import capture_in_3d, view_of
-from lce_rig.show.overlays.view_3d import draw_picture, show_window
+from lce_rig.pipeline.result_files import RESULT, result_folder
+from lce_rig.show.overlays.view_3d import CameraIn3D, CaptureIn3D, draw_picture, show_window
 
 
 @click.command()
@@ -34,12 +34,15 @@ def view(session: Path, name: str | None, capture: str | None, output: Path | No
     Exits with 5 where there is no display, or Open3D cannot open a window.
     """
     opened = lce.Session.open(session)
-    cameras, calibrations = view_of(opened, name)
+    pairs = lce.read_result(result_folder(opened.path, name) / RESULT).pairs
+    # Cameras that share the first one's LiDAR.
+    calibrations = [c for c in pairs if c.lidar == pairs[0].lidar]
+    cameras = [CameraIn3D(opened.rig.lens_of(c), c.T_cam_lidar) for c in calibrations]
     captures = [each for each in opened.captures if calibrations[0].lidar in each.lidars]
     first = 0 if capture is None else captures.index(opened.capture(capture))
     if output is not None:
-        draw_picture(output, capture_in_3d(opened, captures[first], calibrations), cameras)
+        draw_picture(output, CaptureIn3D.of(opened, captures[first], calibrations), cameras)
         show.note(f"written: {output}")
         return
-    shown = [capture_in_3d(opened, each, calibrations) for each in captures]
+    shown = [CaptureIn3D.of(opened, each, calibrations) for each in captures]
     show_window(shown, cameras, first)

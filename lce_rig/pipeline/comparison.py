@@ -21,7 +21,7 @@ from lce_rig.pipeline.calibrate_sessions import (
     session_names,
 )
 from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, OTHER_BOARD, OUTDATED
-from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_parts, stored_results
+from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_folder, stored_results
 from lce_rig.session import Session
 from lce_rig.session.session import CAPTURES
 
@@ -66,7 +66,7 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
     stored = {each.name: each for each in stored_results(session)}
     listed = f"Its results: {', '.join(stored) or 'none'}."
     for name in names:
-        result_parts(name)
+        result_folder(session.path, name)
         if list(names).count(name) > 1:
             raise UsageError(f"result {name} is given twice")
         if name not in stored:
@@ -115,7 +115,7 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
     calibrated: list[str] = []
     troubles: list[Finding] = []
     for done, (label, session) in enumerate(sessions.items(), start=1):
-        where = session.path.joinpath(*result_parts(name))
+        where = result_folder(session.path, name)
         if (where / RESULT).exists() or name not in (None, CURRENT):
             saved = _read(session, where)
             results[label] = list(saved.pairs)

@@ -63,7 +63,7 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
         write_atomically(draft / DOCUMENT, json.dumps(content, indent=2) + "\n")
         keep_foreign(earlier, draft, lambda path: path.name in names)
 
-    with session.replacing(INTRINSICS, finish=finish) as draft:
+    with session.replacing(session.path / INTRINSICS, finish=finish) as draft:
         for one in measured:
             block, info, page = f"{one.camera}.yaml", f"camera_info_{one.camera}.yaml", f"{one.camera}.png"
             write_atomically(draft / block, profile_block(session.rig, one))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lce_rig.core.calibration import Calibration, Provenance, ResultFile, read_result
-from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError
+from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError, reading
 from lce_rig.core.findings import Finding
 from lce_rig.export import export_formats, is_export, remove_exports
 from lce_rig.session import Session
@@ -132,22 +132,20 @@ class Result:
                 unchanged.
             ResultRefusedError: a pose or covariance is not finite; the same.
         """
-        if folder is not None and not self._is_in_session(folder):
-            folder = Path(folder)
-            names, findings = self._write_into(folder, force=force)
-            page = self.write_report(folder) if report else None
-            return WrittenResult(tuple(folder / file for file in names), findings, page)
-        parts = self._parts(name)
-        place = self.session.path.joinpath(*parts)
-        previous = place / PREVIOUS
-        with self.session.replacing(*parts, finish=_keep_earlier) as draft:
-            names, findings = self._write_into(draft, force=force)
+        place, is_in_session = self._place(folder, name)
+        if is_in_session:
+            with self.session.replacing(place, finish=_keep_earlier) as draft:
+                names, findings = self._write_into(draft, force=force)
+        else:
+            names, findings = self._write_into(place, force=force)
+        page = self.write_report(folder, name=name) if report else None
+        has_previous = is_in_session and (place / PREVIOUS / RESULT).exists()
         return WrittenResult(
             tuple(place / file for file in names),
             findings,
-            self.write_report(name=name) if report else None,
-            previous if (previous / RESULT).exists() else None,
-            bool(_usable(previous)),
+            page,
+            place / PREVIOUS if has_previous else None,
+            has_previous and bool(_usable(place / PREVIOUS)),
         )
 
     def write_report(self, folder: Path | str | None = None, *, name: str | None = None) -> Path:
@@ -164,32 +162,30 @@ class Result:
 
         file = self.file()
         text = file.text()
-        is_elsewhere = folder is not None and not self._is_in_session(folder)
-        previous = self.session.path.joinpath(*self._parts(name), PREVIOUS)
-        has_previous = not is_elsewhere and bool(_usable(previous))
+        place, is_in_session = self._place(folder, name)
+        has_previous = is_in_session and bool(_usable(place / PREVIOUS))
         page = report_text(self.session, self.sessions, file, text, OVERLAYS, has_previous=has_previous)
-        if folder is not None and is_elsewhere:
-            write_atomically(Path(folder) / REPORT, page)
-            return Path(folder) / REPORT
-        parts = self._parts(name)
-        place = self.session.path.joinpath(*parts)
+        if not is_in_session:
+            write_atomically(place / REPORT, page)
+            return place / REPORT
 
         def finish(earlier: Path, draft: Path) -> None:
-            if _content(earlier / RESULT) != text.encode():
+            if result_content(earlier) != text.encode():
                 raise SessionError(
                     f"{place} was calibrated again while its report was drawn", "Run the command again."
                 )
             keep_foreign(earlier, draft, lambda path: path.name == REPORT)
 
-        with self.session.replacing(*parts, finish=finish) as draft:
+        with self.session.replacing(place, finish=finish) as draft:
             write_atomically(draft / REPORT, page)
         return place / REPORT
 
-    def _is_in_session(self, folder: Path | str) -> bool:
-        return Path(folder).resolve() == (self.session.path / CALIBRATION).resolve()
-
-    def _parts(self, name: str | None) -> tuple[str, ...]:
-        return new_result_parts(UNION if self.sessions and name is None else name)
+    def _place(self, folder: Path | str | None, name: str | None) -> tuple[Path, bool]:
+        """Give the folder to write, and whether it is the session's own, which is replaced in one step."""
+        root = self.session.path
+        if folder is not None and Path(folder).resolve() != (root / CALIBRATION).resolve():
+            return Path(folder), False
+        return result_folder(root, UNION if self.sessions and name is None else name, is_new=True), True
 
     def _write_into(self, folder: Path, *, force: bool) -> tuple[list[str], tuple[Finding, ...]]:
         """Write result.json and the exports of usable results.
@@ -209,33 +205,30 @@ class Result:
         return [RESULT, *(str(path.relative_to(folder)) for path in files)], tuple(findings)
 
 
-def result_parts(name: str | None) -> tuple[str, ...]:
-    """Give the path in a session of the result of a name; None is its main one, in calibration/.
+def result_folder(session: Path, name: str | None = None, *, is_new: bool = False) -> Path:
+    """Give the folder of a session's result; the result before that of a name is `NAME/previous`.
 
-    The result before that of a name is `NAME/previous`.
+    Args:
+        session: the session's folder.
+        name: of the result; None for the main one, in calibration/.
+        is_new: whether it is to be written.
 
     Raises:
-        UsageError: a name that no result can have.
+        UsageError: a name that no result, or no new one, can have.
     """
+    if is_new and name is not None and (name == CURRENT or name.rpartition("/")[2] == PREVIOUS):
+        raise UsageError(f"no new result can be named {name!r}", "Choose another name.")
     if name is None or name == CURRENT:
-        return (CALIBRATION,)
+        return session / CALIBRATION
     if name == PREVIOUS:
-        return (CALIBRATION, PREVIOUS)
+        return session / CALIBRATION / PREVIOUS
     folder, slash, rest = name.partition("/")
     if not SAFE_NAME.fullmatch(folder) or len(folder) > _LONGEST_NAME or (slash and rest != PREVIOUS):
         raise UsageError(
             f"{name!r} cannot name a result",
             f"Use up to {_LONGEST_NAME} letters, digits, dots, dashes and underscores, such as `events-ml`.",
         )
-    return (RESULTS, folder, PREVIOUS) if slash else (RESULTS, folder)
-
-
-def new_result_parts(name: str | None) -> tuple[str, ...]:
-    """Give the path in a session of a result that is to be written; raises as `result_parts`."""
-    parts = result_parts(name)
-    if name == CURRENT or parts[-1] == PREVIOUS:
-        raise UsageError(f"no new result can be named {name!r}", "Choose another name.")
-    return parts
+    return session / RESULTS / name
 
 
 def inputs_sha256(
@@ -257,13 +250,16 @@ def inputs_sha256(
         SessionError: a capture that was used is missing.
     """
     used = sorted({name for calibration in calibrations for name in calibration.captures_used})
-    if not sessions:
-        return _inputs(session, used)
-    return {
-        f"{name}/{path}": digest
-        for name, part in sessions.items()
-        for path, digest in _inputs(part, _of_session(name, used)).items()
-    }
+    digests = {}
+    for name, part in (sessions or {"": session}).items():
+        start = f"{name}/" if name else ""
+        digests[start + PROFILE] = hashlib.sha256((part.path / PROFILE).read_bytes()).hexdigest()
+        held = {capture.name: capture for capture in part.captures}
+        for own in _of_session(name, used):
+            # `Session.capture` raises where one is missing; it lists the folder each time.
+            capture = held.get(own) or part.capture(own)
+            digests[f"{start}{CAPTURES}/{own}/{MANIFEST}"] = capture.manifest_sha256
+    return digests
 
 
 def _of_session(name: str, captures: Iterable[str]) -> list[str]:
@@ -303,17 +299,6 @@ def as_named_in(session: Session, result: ResultFile) -> tuple[Calibration, ...]
     )
 
 
-def _inputs(session: Session, used: Sequence[str]) -> dict[str, str]:
-    profile = hashlib.sha256((session.path / PROFILE).read_bytes()).hexdigest()
-    held = {capture.name: capture for capture in session.captures}
-    # `Session.capture` raises where one is missing; it lists the folder each time.
-    manifests = {
-        f"{CAPTURES}/{name}/{MANIFEST}": (held.get(name) or session.capture(name)).manifest_sha256
-        for name in used
-    }
-    return {PROFILE: profile, **manifests}
-
-
 def _usable(folder: Path) -> set[str]:
     """Name the cameras and LiDARs with a result in a folder that did not fail."""
     with suppress(LceRigError):
@@ -340,7 +325,7 @@ def _keep_earlier(earlier: Path, draft: Path) -> None:
         return
     check_folder(earlier / PREVIOUS)
     keep_foreign(earlier, draft, lambda path: path.name == PREVIOUS or _is_of_a_result(path))
-    is_same = _content(earlier / RESULT) == _content(draft / RESULT)
+    is_same = result_content(earlier) == result_content(draft)
     for drawn in (REPORT, OVERLAYS):
         if is_same and (earlier / drawn).exists():
             copy_over(earlier / drawn, draft / drawn)
@@ -395,56 +380,42 @@ def stored_results(session: Session) -> list[StoredResult]:
         SessionError: their folders cannot be read.
     """
     root = session.path / RESULTS
-    try:
-        entries = sorted(entry.name for entry in root.iterdir()) if root.is_dir() else []
-    except OSError as error:
-        raise SessionError(f"{root} cannot be read: {error.strerror or error}") from error
-    names = [CURRENT, PREVIOUS]
-    for name in entries:
-        if SAFE_NAME.fullmatch(name):
-            names += [name, f"{name}/{PREVIOUS}"]
     results = []
-    for name in names:
-        folder = session.path.joinpath(*result_parts(name))
-        file, problem, written_s, is_outdated = None, "", 0.0, False
-        try:
-            written_s = (folder / RESULT).stat().st_mtime
-            file = read_result(folder / RESULT)
-        except (FileNotFoundError, NotADirectoryError):
-            continue
-        except OSError as error:
-            problem = f"{folder}: {error.strerror or error}"
-        except LceRigError as error:
-            problem = error.what
-        else:
+    with reading(root, SessionError):
+        entries = sorted(entry.name for entry in root.iterdir()) if root.is_dir() else []
+        named = [
+            name for entry in entries if SAFE_NAME.fullmatch(entry) for name in (entry, f"{entry}/{PREVIOUS}")
+        ]
+        for name in (CURRENT, PREVIOUS, *named):
+            folder = result_folder(session.path, name)
+            if not (folder / RESULT).exists():
+                continue
+            file, problem, is_outdated = None, "", False
             try:
-                sessions = {label: Session.open(session.path / path) for label, path in file.sessions.items()}
-                is_outdated = dict(file.inputs_sha256) != inputs_sha256(session, file.pairs, sessions)
-            except LceRigError:
+                file = read_result(folder / RESULT)
+            except LceRigError as error:
+                problem = error.what
+            if file is not None:
                 is_outdated = True
-        results.append(StoredResult(name, folder, file, problem, written_s, is_outdated))
+                with suppress(LceRigError):
+                    parts = {
+                        label: Session.open(session.path / path) for label, path in file.sessions.items()
+                    }
+                    is_outdated = dict(file.inputs_sha256) != inputs_sha256(session, file.pairs, parts)
+            written_s = (folder / RESULT).stat().st_mtime
+            results.append(StoredResult(name, folder, file, problem, written_s, is_outdated))
     return results
 
 
-def result_content(session: Session, name: str | None = None) -> bytes | None:
-    """Read a result.json of the session; None if there is none.
+def result_content(folder: Path) -> bytes | None:
+    """Read the result.json of a folder; None where there is no such file.
 
     Raises:
         SessionError: it cannot be read.
     """
-    path = session.path.joinpath(*result_parts(name), RESULT)
-    try:
-        return _content(path)
-    except OSError as error:
-        raise SessionError(f"{path} cannot be read: {error.strerror or error}") from error
+    with reading(folder / RESULT, SessionError):
+        return (folder / RESULT).read_bytes() if (folder / RESULT).is_file() else None
 
 
 def _is_of_a_result(path: Path) -> bool:
     return path.name in (RESULT, REPORT, OVERLAYS) or is_export(path)
-
-
-def _content(path: Path) -> bytes | None:
-    """Read a file; None if there is none, or if lce-rig did not write it: a folder, a pipe, too large."""
-    with suppress(FileNotFoundError, IsADirectoryError, ValueError):
-        return path.read_bytes()
-    return None

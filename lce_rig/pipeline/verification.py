@@ -27,7 +27,7 @@ from lce_rig.pipeline.result_files import (
     as_named_in,
     keep_foreign,
     result_content,
-    result_parts,
+    result_folder,
     stored_results,
 )
 from lce_rig.pipeline.witness import hear_scene
@@ -93,12 +93,13 @@ class Verification:
         if folder is not None:
             return self._draw(Path(folder), progress)
 
-        parts = (OVERLAYS,) if self.own_result is None else (*result_parts(self.name), OVERLAYS)
+        result = result_folder(session.path, self.name)
+        place = (session.path if self.own_result is None else result) / OVERLAYS
 
         def finish(earlier: Path, draft: Path) -> None:
-            if self.own_result is not None and result_content(session, self.name) != self.own_result:
+            if self.own_result is not None and result_content(result) != self.own_result:
                 raise SessionError(
-                    f"{session.path.joinpath(*parts[:-1])} was calibrated again while overlays were drawn",
+                    f"{result} was calibrated again while overlays were drawn",
                     f"Run `lce-rig verify {session.path}` again.",
                 )
             # Files that `verify` did not draw are kept, beside its images and in its folders.
@@ -113,9 +114,8 @@ class Verification:
                 if not (earlier / name).is_symlink():
                     keep_foreign(earlier / name, draft / name, is_overlay)
 
-        with session.replacing(*parts, finish=finish) as draft:
+        with session.replacing(place, finish=finish) as draft:
             drawn = self._draw(draft, progress)
-        place = session.path.joinpath(*parts)
         return tuple(each.moved(draft, place) for each in drawn)
 
     def _draw(self, base: Path, progress: Progress) -> tuple[SessionCheck, ...]:
@@ -240,7 +240,8 @@ def _extrinsics(
     session: Session, result: Result | ResultFile | None, name: str | None
 ) -> tuple[Sequence[Calibration], bytes | None]:
     """Return the extrinsics to check, and the content of the session's result.json if it holds them."""
-    content = result_content(session, name)
+    folder = result_folder(session.path, name)
+    content = result_content(folder)
     if result is None and content is None and name is not None:
         names = ", ".join(each.name for each in stored_results(session)) or "none"
         raise SessionError(f"{session.path} has no result {name!r}", f"Its results: {names}.")
@@ -249,7 +250,7 @@ def _extrinsics(
         content = content if is_own and saved.text().encode() == content else None
     else:
         is_own = result is None
-        saved = result or read_result(session.path.joinpath(*result_parts(name), RESULT))
+        saved = result or read_result(folder / RESULT)
         content = content if is_own else None
     calibrations = saved.pairs
     if saved.rig != session.rig.name or not calibrations:

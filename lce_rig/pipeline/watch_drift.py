@@ -19,7 +19,7 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.devices.reading import LiveSource
 from lce_rig.judge.board_drift import BoardDrift, watch_boards
 from lce_rig.pipeline.calibration import clocks_of
-from lce_rig.pipeline.result_files import RESULT, result_parts
+from lce_rig.pipeline.result_files import RESULT, result_folder
 from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, own_offset_ns
 from lce_rig.pipeline.verification import with_lenses_of
 from lce_rig.rig import Rig
@@ -214,7 +214,7 @@ def drift(
         raise SessionError("several recordings need the profile of their rig", "Name one with --rig.")
     else:
         session = Session.open(paths[0])
-        result = result or read_result(session.path.joinpath(*result_parts(None), RESULT))
+        result = result or read_result(result_folder(session.path) / RESULT)
         rig, notes = with_lenses_of(session.rig, profile)
         captures = SceneCaptures(rig, result, str(session.path))
         captures.take_session(session, progress)

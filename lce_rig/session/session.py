@@ -390,20 +390,19 @@ class Session:
 
     @contextmanager
     def replacing(
-        self, *parts: str, finish: Callable[[Path, Path], None] = lambda _old, _draft: None
+        self, folder: Path, finish: Callable[[Path, Path], None] = lambda _old, _draft: None
     ) -> Iterator[Path]:
         """Yield an empty folder that replaces one of the session's when the block ends.
 
         Readers find the earlier folder or the new one, complete, at any time.
 
         Args:
-            parts: of the folder's path in the session.
+            folder: to replace, in the session.
             finish: see `lce_rig.session.replacing`.
 
         Raises:
             SessionError: the disk is full or read-only; the earlier folder is untouched.
         """
-        folder = self.path.joinpath(*parts)
         try:
             with replacing(self.path, folder, finish) as draft:
                 yield draft

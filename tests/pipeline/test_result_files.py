@@ -167,7 +167,7 @@ def test_a_damaged_result_is_not_usable(folder, session):
 def test_a_folder_in_place_of_the_result_is_no_result_and_is_kept(session, folder):
     (folder / "result.json").mkdir(parents=True)
     (folder / "result.json" / "note").write_text("mine")
-    assert result_content(session) is None
+    assert result_content(folder) is None
     write(session, GOOD)
     assert (pose_in(folder) == GOOD.T_cam_lidar).all()
     assert (folder / "previous" / "result.json" / "note").read_text() == "mine"
@@ -183,7 +183,7 @@ def test_a_result_in_a_folder_elsewhere_leaves_the_session_as_it_is(session, tmp
     Result(session, (OTHER,)).write(tmp_path / "elsewhere", report=False)
     assert not (tmp_path / "elsewhere" / "report.html").exists()
     in_session = result.write(str(session.path / "calibration"))
-    assert result_content(session) == result.file().text().encode()
+    assert result_content(session.path / "calibration") == result.file().text().encode()
     assert in_session.files[0].parent == session.path / "calibration"
 
 

@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.errors import SourceError
+from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import Array, invert, pose, transform
 from lce_rig.judge.reach import outermost_pixels
+from lce_rig.scene.colouring import colour_points
+from lce_rig.session import Capture, Session
 from lce_rig.session.durable import write_atomically
 
 _WIDTH_PX, _HEIGHT_PX = 1600, 1000
@@ -43,6 +46,29 @@ class CaptureIn3D:
     points: NDArray[np.float32]
     colours: NDArray[np.uint8]
     is_seen: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, session: Session, capture: Capture, calibrations: Sequence[Calibration]) -> "CaptureIn3D":
+        """Colour the points of a capture; of several cameras, the first that sees a point gives its colour.
+
+        Raises:
+            SessionError: the capture is damaged, or has no scan of the LiDAR.
+        """
+        lidar = calibrations[0].lidar
+        if lidar not in capture.lidars:
+            raise SessionError(f"capture {capture.name} has no scan of {lidar}", "Choose another capture.")
+        scan = capture.scan(lidar)
+        colours, is_seen = np.zeros((len(scan.points), 3), np.uint8), np.zeros(len(scan.points), bool)
+        for c in calibrations:
+            for channel in c.channels:
+                if capture.has_image(c.camera, channel):
+                    pixels = capture.image(c.camera, channel).pixels
+                    own, is_own = colour_points(scan, pixels, c.T_cam_lidar, session.rig.lens_of(c))
+                    colours[is_own & ~is_seen] = own[is_own & ~is_seen]
+                    is_seen |= is_own
+        is_finite = np.isfinite(scan.points).all(axis=1)
+        points = scan.points[is_finite].astype(np.float32)
+        return cls(capture.name, points, colours[is_finite], is_seen[is_finite])
 
 
 @dataclass(frozen=True, eq=False)
