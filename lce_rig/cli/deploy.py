@@ -10,8 +10,8 @@ from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
 from lce_rig.core.errors import UsageError
 from lce_rig.fleet.deploy import deployment
-from lce_rig.fleet.deploy.deployment import Deployed, Plan, Standing
-from lce_rig.fleet.deploy.releases import ReleaseRecord
+from lce_rig.fleet.deploy.deployment import Deployed, Plan
+from lce_rig.fleet.deploy.releases import ReleaseRecord, TargetState, differences_in_words
 from lce_rig.fleet.deploy.targets import find_target
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig.target_settings import TargetSettings
@@ -102,7 +102,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
                 "current": _release(plan.state.current),
                 "new": plan.record,
                 "changed": dict(plan.changed),
-                "changed_there": dict(plan.changed_there),
+                "changed_there": dict(plan.state.changed),
                 "sensors": [
                     {
                         "camera": change.camera,
@@ -126,7 +126,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
         if change.moved is not None:
             how = f"moves by {change.moved[0]:.3f} deg, {1000 * change.moved[1]:.1f} mm"
         show.say(f"  {change.camera} and {change.lidar}: {how}")
-    _warn_of_changes(plan.changed_there)
+    _warn_of_changes(plan.state.changed)
     if plan.is_in_place:
         show.say("nothing to change: these very files are in place")
     for how in dict.fromkeys(plan.changed.values()):
@@ -144,15 +144,14 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
 _CHANGES = {"added": "new:", "missing": "removed:", "changed": "changed:"}
 
 
-def _show_standing(standing: Standing, target: TargetSettings, *, as_json: bool) -> None:
-    state = standing.state
+def _show_standing(state: TargetState, target: TargetSettings, *, as_json: bool) -> None:
     if as_json:
         show.print_json(
             {
                 "format_version": 1,
                 "to": target.to,
                 "current": _release(state.current),
-                "changed_there": dict(standing.changed),
+                "changed_there": dict(state.changed),
                 "is_pending": state.is_pending,
                 "releases": [_release(each) for each in state.releases],
             }
@@ -168,7 +167,7 @@ def _show_standing(standing: Standing, target: TargetSettings, *, as_json: bool)
         cells = (f"{kept.name}{mark}", kept.time, kept.by, kept.robot or "-", kept.date[:10] or "-")
         table.add_row(*map(show.escape, cells))
     show.print_table(table)
-    _warn_of_changes(standing.changed)
+    _warn_of_changes(state.changed)
     for kept in state.releases:
         if kept.reason:
             show.note(f"{kept.name} was forced: {kept.reason}")
@@ -178,8 +177,7 @@ def _show_standing(standing: Standing, target: TargetSettings, *, as_json: bool)
 
 def _warn_of_changes(changed: Any) -> None:
     if changed:
-        listed = ", ".join(f"{file} {how}" for file, how in changed.items())
-        show.warn(f"not as it was deployed: {listed}")
+        show.warn(f"not as it was deployed: {differences_in_words(changed)}")
 
 
 def _described(release: ReleaseRecord) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from lce_rig.core.errors import NotEnoughDataError, ProfileError, UsageError, reason_of
 from lce_rig.fleet.storage import Storage
@@ -53,6 +53,18 @@ class Entry(BaseModel):
     collector: str = ""
     site: str = ""
 
+    @field_validator("path")
+    @classmethod
+    def _is_a_pattern(cls, path: str) -> str:
+        parts, names = path.split("/"), _FIELD.findall(path)
+        if path.startswith("/") or ".." in parts or "\0" in path:
+            raise ValueError("not below the root")
+        if any("**" in part and part != "**" for part in parts):
+            raise ValueError("** beside other characters")
+        if len(names) > len(set(names) & set(_FIELDS)):
+            raise ValueError("fields are {robot}, {collector} and {site}, once each")
+        return path
+
     @property
     def glob(self) -> str:
         """The pattern without names of fields."""
@@ -66,8 +78,8 @@ class Entry(BaseModel):
             f"(?P<{part[1:-1]}>[^/]+?)" if _FIELD.fullmatch(part) else rules.get(part, re.escape(part))
             for part in parts
         )
-        found = re.fullmatch(pattern, path)
-        return {} if found is None else found.groupdict()
+        match = re.fullmatch(pattern, path)
+        return {} if match is None else match.groupdict()
 
 
 def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
@@ -118,44 +130,37 @@ def _entries(manifest: Storage, content: bytes) -> list[Entry]:
             documents = documents.get("sessions")
         if not isinstance(documents, list):
             raise TypeError("no list `sessions`")
-        entries = [Entry.model_validate(document) for document in documents]
+        return [Entry.model_validate(document) for document in documents]
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        key = ".".join(map(str, first["loc"]))
+        key, problem = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
         raise UsageError(
-            f"{manifest.url}: {key}: {first['msg']}; {first['input']!r:.60} given",
-            f"Keys: {', '.join(Entry.model_fields)}.",
+            f"{manifest.url}: {key}: {problem}; {first['input']!r:.60} given",
+            f"Keys: {', '.join(Entry.model_fields)}; see docs/fleets.md.",
         ) from None
     except Exception as error:  # csv, yaml and pydantic raise many kinds about odd text
         raise UsageError(
             f"{manifest.url} is not a manifest: {reason_of(error)}",
             "List entries with `path` below `sessions:`.",
         ) from error
-    for entry in entries:
-        parts, names = entry.path.split("/"), _FIELD.findall(entry.path)
-        unknown = sorted(set(names) - set(_FIELDS))
-        problem = (
-            "is not below the root"
-            if entry.path.startswith("/") or ".." in parts or "\0" in entry.path
-            else f"names no field {{{unknown[0]}}}; choose one of: {', '.join(_FIELDS)}"
-            if unknown
-            else "names a field twice"
-            if len(set(names)) < len(names)
-            else "has ** beside other characters"
-            if any("**" in part and part != "**" for part in parts)
-            else ""
-        )
-        if problem:
-            raise UsageError(f"{manifest.url}: path: {entry.path} {problem}", "See docs/fleets.md.")
-    return entries
 
 
 def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list[Job]:
-    """Find what the entries name; the first entry that matches a path counts."""
+    """Find what the entries name; the first entry that matches a path counts.
+
+    Raises:
+        ProfileError: an entry's profile does not exist; its path starts at the manifest's folder.
+    """
     jobs: dict[str, Job] = {}
     for entry in entries:
+        rig = entry.rig
+        if rig and "://" not in rig and not rig.startswith("/") and "." in rig:
+            rig = f"{manifest.url.rpartition('/')[0]}/{rig}"
+        if rig and "://" not in rig:
+            find_profile(rig)
+        elif rig and not Storage(rig).exists():
+            raise ProfileError(f"{manifest.url}: rig: {rig} does not exist", "Name a profile's file.")
         stated = entry.model_dump(include=set(_FIELDS))
-        rig = _profile_of(entry, manifest)
         for path in root.matching(entry.glob):
             if path not in jobs and path not in MANIFESTS:
                 read = entry.fields_of(path)
@@ -164,23 +169,6 @@ def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list
                     f"{root.url}/{path}", fallback_robot=path.partition("/")[0], rig=rig, **fields
                 )
     return list(jobs.values())
-
-
-def _profile_of(entry: Entry, manifest: Storage) -> str:
-    """Name the profile of an entry; paths start at the manifest's folder.
-
-    Raises:
-        ProfileError: there is no such profile.
-    """
-    rig = entry.rig
-    if rig and "://" not in rig and not rig.startswith("/") and "." in rig:
-        rig = f"{manifest.url.rpartition('/')[0]}/{rig}"
-    if "://" in rig:
-        if not Storage(rig).exists():
-            raise ProfileError(f"{manifest.url}: rig: {rig} does not exist", "Name a profile's file.")
-    elif rig:
-        find_profile(rig)
-    return rig
 
 
 def folder_name(text: str) -> str:

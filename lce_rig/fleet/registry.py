@@ -122,7 +122,7 @@ class Registry:
         """Read the rows of one result: none if it is no result, one with a cause if its files are damaged."""
         place = self.place / folder
         robot, _, name = folder.partition("/")
-        own = {"robot": robot, "folder": folder}
+        names = {"robot": robot, "folder": folder}
         content, result = (place / ROWS).read(), (place / RESULT).read()
         if content is None:
             return []
@@ -137,14 +137,14 @@ class Registry:
                     copy.write_bytes(result or b"")
                     saved = read_result(copy)
                 rows = with_pairs(rows, saved.pairs, saved.provenance.serials)
-            rows = [{**row, **own} for row in rows]
+            rows = [{**row, **names} for row in rows]
             as_table(rows)  # checks the types
             return rows
         except Exception as error:
             cause = DAMAGED(what=error.what if isinstance(error, LceRigError) else reason_of(error))
             date = f"{name[:4]}-{name[4:6]}-{name[6:11]}:{name[11:13]}:{name[13:16]}"
             known = {"source": place.url, "date": date if name[:1].isdigit() else None}
-            return [{**own, **known, "status": "failed", "cause": cause.code, "detail": cause.text}]
+            return [{**names, **known, "status": "failed", "cause": cause.code, "detail": cause.text}]
 
     def read_table(self, columns: Iterable[str] | None = None, where: str = "") -> Any:
         """Read the table, or some of its rows, as a `pyarrow.Table`.
@@ -197,7 +197,7 @@ class Registry:
         Raises:
             SessionError: the registry is a file, or cannot be written.
         """
-        if self.place.exists() and not self.place.is_folder():
+        if self.place.local is not None and self.place.local.is_file():
             raise SessionError(f"{self.place.url} is a file, not a registry", "Give a folder.")
         new = as_table(fresh)
         try:

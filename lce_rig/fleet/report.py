@@ -105,7 +105,11 @@ def history_of(table: Any) -> History:
     order = [(name, "ascending") for name in (*_SENSORS, "date", "folder")]
     rows = table.take(pa.array(_usable(table))).sort_by(order)
     n = len(rows)
-    same = {name: _is_repeated(rows[name]) for name in MOVED_COLUMNS[:10]}
+    # Whether each value equals the one before it; null equals null.
+    same: dict[str, NDArray[np.bool_]] = {}
+    for name in MOVED_COLUMNS[:10]:
+        codes = pc.fill_null(rows[name].combine_chunks().dictionary_encode().indices, -1).to_numpy()
+        same[name] = np.concatenate([np.zeros(min(n, 1), bool), codes[1:] == codes[:-1]])
     is_compared = np.logical_and.reduce([same[name] for name in _SENSORS]) if n else np.zeros(0, bool)
     for name in _SERIALS:
         is_known = rows[name].is_valid().to_numpy()
@@ -143,17 +147,8 @@ def _usable(table: Any) -> NDArray[np.intp]:
     return np.flatnonzero(is_usable)
 
 
-def _is_repeated(column: Any) -> NDArray[np.bool_]:
-    """Return whether each value equals the one before it; null equals null."""
-    codes = pc.fill_null(column.combine_chunks().dictionary_encode().indices, -1).to_numpy()
-    repeated = np.zeros(len(codes), bool)
-    repeated[1:] = codes[1:] == codes[:-1]
-    return repeated
-
-
 FORMAT_VERSION = 1
 Count = tuple[Any, int, int]
-_CAUSE_COLUMNS = ("robot", "status", "cause", "verdict", "findings", "severities")
 _AXES = tuple((f"{kind} {axis}", unit) for kind, unit in (("along", "m"), ("about", "deg")) for axis in "xyz")
 _MOST_ROWS, _MOST_DRAWINGS, _MOST_SESSIONS = 60, 12, 400
 _STATE_WORDS = {"moved": "moved", "steady": "steady", "cannot_tell": "cannot tell yet"}
@@ -186,8 +181,10 @@ class FleetReport:
         Raises:
             SessionError: the registry has no table, or it cannot be read.
         """
-        history = history_of(registry.read_table(MOVED_COLUMNS))
-        rows = registry.read_table(_CAUSE_COLUMNS).to_pylist()
+        table = registry.read_table((*MOVED_COLUMNS, "cause"))
+        history = history_of(table)
+        names = ("robot", "status", "cause", "verdict", "findings", "severities")
+        rows = table.select(names).to_pylist()
         results = [(row["verdict"] if row["status"] == "ok" else row["status"], row["robot"]) for row in rows]
         causes = [(("no result", row["cause"]), row["robot"]) for row in rows if row["cause"]]
         for row in rows:

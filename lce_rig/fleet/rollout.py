@@ -124,23 +124,19 @@ def newest_results(registry: Registry, where: str = "") -> dict[str, RobotState]
     by_robot: dict[str, list[Mapping[str, Any]]] = {}
     for row in registry.read_table(_COLUMNS, where).to_pylist():
         by_robot.setdefault(row["robot"], []).append(row)
-    return {robot: _newest(robot, by_robot[robot]) for robot in sorted(by_robot)}
-
-
-def _newest(robot: str, rows: list[Mapping[str, Any]]) -> RobotState:
-    last = max(rows, key=lambda row: (row["date"] or "", row["finished"] or "", row["folder"]))
-    state = RobotState(robot=robot, folder=last["folder"])
-    first, _, name = last["folder"].partition("/")
-    if first != robot or folder_name(robot) != robot or not _RESULT_FOLDER.fullmatch(name):
-        return state.model_copy(update={"state": "left_out", "detail": "its name or folder is not safe"})
-    for row in rows:
-        if row["folder"] != last["folder"]:
-            continue
-        if row["status"] != "ok":
-            return state.model_copy(update={"state": "left_out", "detail": f"no result: {row['cause']}"})
-        if row["verdict"] == "fail":
-            return state.model_copy(update={"state": "left_out", "detail": "verdict fail"})
-    return state
+    states = {}
+    for robot, rows in sorted(by_robot.items()):
+        last = max(rows, key=lambda row: (row["date"] or "", row["finished"] or "", row["folder"]))
+        first, _, name = last["folder"].partition("/")
+        newest = [row for row in rows if row["folder"] == last["folder"]]
+        why = next((f"no result: {row['cause']}" for row in newest if row["status"] != "ok"), "")
+        if first != robot or folder_name(robot) != robot or not _RESULT_FOLDER.fullmatch(name):
+            why = "its name or folder is not safe"
+        elif not why and any(row["verdict"] == "fail" for row in newest):
+            why = "verdict fail"
+        state = "left_out" if why else "waiting"
+        states[robot] = RobotState(robot=robot, folder=last["folder"], state=state, detail=why)
+    return states
 
 
 class FleetDeployment:
@@ -222,7 +218,7 @@ class FleetDeployment:
         except CommandError as error:
             current = None
             with suppress(LceRigError):
-                current = deployment.standing(target).state.current
+                current = deployment.standing(target).current
             releases = {} if current is None else {"release": current.name, "replaces": current.replaces}
             return state.ended("failed", error, **releases)
         except (LceRigError, OSError) as error:
@@ -248,7 +244,7 @@ class FleetDeployment:
     def _restore(self, state: RobotState, reason: str) -> RobotState:
         try:
             target = self._target_of(state.robot)
-            current = deployment.standing(target).state.current
+            current = deployment.standing(target).current
             if current is None or current.name != state.release:
                 now = "nothing" if current is None else current.name
                 return state.ended("not_rolled_back", f"{now} is in place by now, not {state.release}")

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from itertools import islice
 from typing import Any
 
 import dask
@@ -18,10 +17,8 @@ from lce_rig.core.progress import Progress, silent
 from lce_rig.fleet.findings import BUG, EXITED, OUT_OF_MEMORY, SIGNAL, TIMED_OUT, WORKER_LOST
 from lce_rig.fleet.jobs import Job
 from lce_rig.fleet.table import Row, Status
-from lce_rig.fleet.work import Settings, Used, first_row, publish, run_apart, without_result
+from lce_rig.fleet.work import Settings, first_row, publish, run_apart, without_result
 
-# Tasks that wait beside those that run: enough to keep workers busy, few enough for any scheduler.
-_WAITING_PER_THREAD, _FEWEST_TASKS = 4, 16
 # A session cannot kill its worker; a worker that died was killed from outside.
 _MOST_LOST_WORKERS = 100
 # The table is written again after so many times the time that it took; what is not in it is in the folders.
@@ -45,6 +42,17 @@ class FleetRun:
     statuses: Counter[str] = field(default_factory=Counter)
     causes: Counter[str] = field(default_factory=Counter)
     table: Any = None
+
+    def count(self, rows: Sequence[Row]) -> None:
+        """Count a session by its rows."""
+        if all(row["is_new"] for row in rows):
+            self.n_new += 1
+        else:
+            self.n_held += 1
+        worst = next((row for row in rows if row["status"] != "ok"), rows[0])
+        self.statuses[worst["status"]] += 1
+        if worst["status"] != "ok":
+            self.causes[worst["cause"]] += 1
 
 
 @contextmanager
@@ -72,14 +80,12 @@ def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) 
     settings = {
         "distributed.scheduler.allowed-failures": _MOST_LOST_WORKERS,
         "distributed.scheduler.worker-saturation": 1.0,
-        "distributed.scheduler.active-memory-manager.start": False,
         # Workers wait for processes: what Dask watches in them, up to a hundred times a second, is of no use.
         "distributed.worker.profile.enabled": False,
         "distributed.admin.tick.interval": "1s",
         "distributed.admin.system-monitor.interval": "2s",
         # Ctrl-C reaches all processes of a terminal; this one ends the workers.
         "distributed.worker.preload": ["import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"],
-        "distributed.admin.large-graph-warning-threshold": "1GB",
     }
     # Workers that end while their scheduler does are no news.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
@@ -117,30 +123,12 @@ def run_fleet(
     registry, run = settings.opened(), FleetRun()
     fresh: list[Row] = []
     run.table, due_s = registry.consolidate(), 0.0
-    waiting = iter(jobs)
-    by_key: dict[Any, Job] = {}
-
-    def send(job: Job) -> Any:
-        future = client.submit(run_job, job, settings, pure=False)
-        by_key[future.key] = job
-        return future
-
     try:
-        n_threads = sum(client.nthreads().values()) or 1
-        ahead = max(_FEWEST_TASKS, (1 + _WAITING_PER_THREAD) * n_threads)
-        futures = as_completed([send(job) for job in islice(waiting, ahead)])
-        for done, future in enumerate(futures, 1):
-            rows = _rows_of(future, by_key.pop(future.key), settings)
-            for following in islice(waiting, 1):
-                futures.add(send(following))
-            if all(row["is_new"] for row in rows):
-                run.n_new += 1
-            else:
-                run.n_held += 1
-            worst = next((row for row in rows if row["status"] != "ok"), rows[0])
-            run.statuses[worst["status"]] += 1
-            if worst["status"] != "ok":
-                run.causes[worst["cause"]] += 1
+        futures = client.map(run_job, jobs, settings=settings, pure=False)
+        job_by_key = {future.key: job for future, job in zip(futures, jobs, strict=True)}
+        for done, future in enumerate(as_completed(futures), 1):
+            rows = _rows_of(future, job_by_key[future.key], settings)
+            run.count(rows)
             fresh += rows
             if time.monotonic() > due_s:
                 start_s = time.monotonic()
@@ -191,4 +179,4 @@ def run_job(job: Job, settings: Settings) -> list[Row]:
     else:
         cause = EXITED(code=ended.exit_code, what=ended.detail)
     row = without_result(ended.known or first_row(job, settings), status, cause)
-    return publish(settings.opened(), [row], start_s, used=Used(ended.cpu_s, ended.peak_memory_mb))
+    return publish(settings.opened(), [row], start_s, used=(ended.cpu_s, ended.peak_memory_mb))

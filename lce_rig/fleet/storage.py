@@ -3,13 +3,12 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from fsspec.core import url_to_fs
 
-from lce_rig.core.errors import LceRigError, SessionError, SourceError, reason_of
+from lce_rig.core.errors import LceRigError, SourceError, reason_of
 from lce_rig.session.durable import write_atomically
 from lce_rig.session.replacing import copy_over
 
@@ -48,15 +47,11 @@ class Storage:
         """The last part of its address."""
         return self.url.rpartition("/")[2]
 
-    @cached_property
-    def _opened(self) -> tuple[Any, str]:
-        return url_to_fs(self.url)  # type: ignore[no-any-return]
-
     @contextmanager
     def reached(self) -> Iterator[tuple[Any, str]]:
         """Give the file system that fsspec has for the place, and the path there; see the class."""
         try:
-            yield self._opened
+            yield url_to_fs(self.url)
         except (LceRigError, *_ABSENT):
             raise
         except Exception as error:
@@ -72,11 +67,6 @@ class Storage:
         with self.reached() as (fs, path):
             return bool(fs.exists(path))
 
-    def is_folder(self) -> bool:
-        """Return whether it is a folder."""
-        with self.reached() as (fs, path):
-            return bool(fs.isdir(path))
-
     def read(self) -> bytes | None:
         """Read it as a file; None if there is none."""
         try:
@@ -88,12 +78,6 @@ class Storage:
     def write(self, content: bytes) -> None:
         """Write it as a file, in one step; raises SessionError, too: a full disk, no permission."""
         if self.local is not None:
-            try:
-                self.local.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise SessionError(
-                    f"{self.local.parent} cannot be made: {error.strerror or error}"
-                ) from error
             write_atomically(self.local, content)
             return
         with self.reached() as (fs, path):
@@ -121,14 +105,14 @@ class Storage:
 
         The folder itself is "". Folders whose names begin with a dot are left out.
         """
-        found = []
+        folders = []
         with self.reached() as (fs, path):
             for folder, inner, files in fs.walk(path):
                 if marker in files:
-                    found.append(str(folder).rstrip("/").removeprefix(path.rstrip("/")).lstrip("/"))
+                    folders.append(str(folder).rstrip("/").removeprefix(path.rstrip("/")).lstrip("/"))
                 for name in [name for name in inner if name.startswith(".") or marker in files]:
                     inner.pop(name) if isinstance(inner, dict) else inner.remove(name)
-        return sorted(found)
+        return sorted(folders)
 
     def matching(self, pattern: str) -> list[str]:
         """List files and folders that match a pattern of fsspec, by their path in it."""
@@ -144,9 +128,9 @@ class Storage:
                     target.local.parent.mkdir(parents=True, exist_ok=True)
                     self.local.rename(target.local)
                     return
-                names = self.files()
+                names, target_path = self.files(), url_to_fs(target.url)[1]
                 for name in names:
-                    fs.cp_file(f"{path}/{name}", f"{target._opened[1]}/{name}")
+                    fs.cp_file(f"{path}/{name}", f"{target_path}/{name}")
                 fs.rm([f"{path}/{name}" for name in names])
         except _ABSENT:
             return  # another run was faster

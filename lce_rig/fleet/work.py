@@ -19,11 +19,12 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import IO, Any, Literal, NamedTuple
+from typing import IO, Any, Literal
 
 import psutil  # type: ignore[import-untyped]
 
 import lce_rig as lce
+import lce_rig.fleet.findings as findings
 from lce_rig.core.calibration import DEFAULT_METHOD, MADE_BY, Method, Provenance, ResultFile
 from lce_rig.core.errors import (
     LceRigError,
@@ -35,7 +36,6 @@ from lce_rig.core.errors import (
     UsageError,
 )
 from lce_rig.core.findings import Finding, Kind
-from lce_rig.fleet import findings
 from lce_rig.fleet.jobs import Job, folder_name
 from lce_rig.fleet.registry import Registry, write_rows
 from lce_rig.fleet.storage import Storage
@@ -97,13 +97,6 @@ class Settings:
         return Registry(Storage.at(self.registry))
 
 
-class Used(NamedTuple):
-    """Processor time and memory that a session used."""
-
-    cpu_s: float
-    peak_memory_mb: float
-
-
 def work_order(arguments: Mapping[str, Any], tell: Callable[[Row], None]) -> list[Row]:
     """Run one session in this process, from the JSON values of its job and settings."""
     return work(Job(**arguments["job"]), Settings(**arguments["settings"]), tell)
@@ -124,26 +117,36 @@ def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]
     registry = settings.opened()
     row = first_row(job, settings)
     tell(row)
-    with TemporaryDirectory(prefix="lce-rig-") as scratch:
+    with TemporaryDirectory(prefix="lce-rig-") as folder:
+        scratch = Path(folder)
         try:
-            opened = _Opened.of(job, Path(scratch))
-            row = opened.row(job, row)
-            held = registry.found(row["robot"], opened.ending)
-            if held is not None:
-                rows = registry.rows(held)
-                if rows and all(
-                    (each.get("program"), each.get("method")) == (row["program"], row["method"])
-                    and (each.get("status") == "ok" or not settings.retry)
-                    for each in rows
-                ):
-                    return [{**each, "is_new": False} for each in rows]
+            rig, session, origin = _open(job, scratch)
+            ending = origin.session_sha256[:_HASH_DIGITS]
+            robot = folder_name(job.robot or origin.robot or job.fallback_robot or "unnamed")
+            row = _dated(row | {"robot": robot, "rig": rig.name}, origin, ending)
+            held = registry.found(robot, ending)
+            rows = [] if held is None else registry.rows(held)
+            if rows and all(
+                (each.get("program"), each.get("method")) == (row["program"], row["method"])
+                and (each.get("status") == "ok" or not settings.retry)
+                for each in rows
+            ):
+                return [{**each, "is_new": False} for each in rows]
             tell(row)
-            session = opened.session()
-            row = _dated(row, provenance_of([session]), opened.ending)
-            tell(row)
+            if session is None:
+                session = lce.collect_from(rig, scratch / Storage(job.source).name, scratch / "session")
+                row = _dated(row, provenance_of([session]), ending)
+                tell(row)
             return _calibrate(registry, session, row, settings, start_s)
         except (LceRigError, OSError) as error:
-            return publish(registry, [_failed(row, error, Path(scratch))], start_s)
+            if isinstance(error, OSError):
+                error = SourceError(f"{job.source} cannot be read: {error.strerror or error}")
+            kind = next(kind for error_type, kind in _KINDS if isinstance(error, error_type))
+            cause = error.finding if isinstance(error, NotEnoughDataError) else None
+            failed = without_result(row, "failed", cause or kind(what=error.what, hint=error.hint))
+            # Name files by where the session lies.
+            failed["detail"] = failed["detail"].replace(str(scratch / "session"), job.source)
+            return publish(registry, [failed], start_s)
 
 
 def first_row(job: Job, settings: Settings) -> Row:
@@ -161,71 +164,44 @@ def first_row(job: Job, settings: Settings) -> Row:
     }
 
 
-@dataclass(frozen=True)
-class _Opened:
-    """A session or recording, read as far as its fingerprint needs.
+def _open(job: Job, scratch: Path) -> tuple[Rig, Session | None, Provenance]:
+    """Copy a session or recording to a folder of this computer.
 
-    Attributes:
-        ending: the fingerprint of captures and profile, as at the end of its folder's name.
-        rig: the profile.
-        profile_sha256: of the session's rig.yaml.
-        provenance: of the session; None for a recording.
-        session: copies the rest, and opens it as a session.
+    Returns:
+        The profile; the session, None for a recording; its origin, of a recording the robot that the profile
+        names and the fingerprint of files and profile.
     """
-
-    ending: str
-    rig: Rig
-    provenance: Provenance | None
-    session: Callable[[], Session]
-
-    @classmethod
-    def of(cls, job: Job, scratch: Path) -> "_Opened":
-        source, copy = Storage.at(job.source), scratch / "session"
-        rig = None
-        if "://" in job.rig:
-            Storage(job.rig).fetch(scratch / "profile.yaml")
-            rig = load_rig(scratch / "profile.yaml")
-        elif job.rig:
-            rig = load_rig(job.rig)
-        if (source / MARKER).exists():
-            source.fetch(copy, without=_NOT_NEEDED)
-            if rig is not None:
-                own = load_rig(copy / PROFILE)
-                if own.name != rig.name:
-                    raise ProfileError(
-                        f"the manifest's profile is of rig {rig.name!r}, the session's of rig {own.name!r}",
-                        "Name the profile of the session's rig, or none.",
-                    )
-                replace_file(copy / PROFILE, dump_rig(rig).encode())
-            opened = Session.open(copy)
-            provenance = provenance_of([opened])
-            ending = provenance.session_sha256[:_HASH_DIGITS]
-            return cls(ending, opened.rig, provenance, lambda: opened)
-        if rig is None:
-            raise ProfileError(
-                f"{job.source} is not a session, and the manifest names no profile for it",
-                "Add `rig:` with a shipped name or a file to its entry.",
-            )
-        if not source.exists():
-            raise SourceError(f"{job.source} does not exist")
-        recording = scratch / source.name
-        source.fetch(recording)
-        files = sorted(path for path in recording.rglob("*") if path.is_file()) or [recording]
-        profile = scratch / PROFILE
-        profile.write_bytes(dump_rig(rig).encode())
-        return cls(
-            fingerprint([*files, profile])[:_HASH_DIGITS],
-            rig,
-            None,
-            lambda: lce.collect_from(rig, recording, copy),
+    source, copy = Storage.at(job.source), scratch / "session"
+    rig = None
+    if "://" in job.rig:
+        Storage(job.rig).fetch(scratch / "profile.yaml")
+        rig = load_rig(scratch / "profile.yaml")
+    elif job.rig:
+        rig = load_rig(job.rig)
+    if (source / MARKER).exists():
+        source.fetch(copy, without=_NOT_NEEDED)
+        if rig is not None:
+            replaced = load_rig(copy / PROFILE)
+            if replaced.name != rig.name:
+                raise ProfileError(
+                    f"the manifest's profile is of rig {rig.name!r}, the session's of rig {replaced.name!r}",
+                    "Name the profile of the session's rig, or none.",
+                )
+            replace_file(copy / PROFILE, dump_rig(rig).encode())
+        session = Session.open(copy)
+        return session.rig, session, provenance_of([session])
+    if rig is None:
+        raise ProfileError(
+            f"{job.source} is not a session, and the manifest names no profile for it",
+            "Add `rig:` with a shipped name or a file to its entry.",
         )
-
-    def row(self, job: Job, row: Row) -> Row:
-        """Add the robot, by the manifest, the profile or the first folder, and where the result goes."""
-        stated = self.rig.robot if self.provenance is None else self.provenance.robot
-        robot = folder_name(job.robot or stated or job.fallback_robot or "unnamed")
-        row = row | {"robot": robot, "rig": self.rig.name, "folder": f"{robot}/undated-{self.ending}"}
-        return row if self.provenance is None else _dated(row, self.provenance, self.ending)
+    if not source.exists():
+        raise SourceError(f"{job.source} does not exist")
+    recording, profile = scratch / source.name, scratch / PROFILE
+    source.fetch(recording)
+    files = sorted(path for path in recording.rglob("*") if path.is_file()) or [recording]
+    profile.write_bytes(dump_rig(rig).encode())
+    return rig, None, Provenance(rig.robot or "", session_sha256=fingerprint([*files, profile]))
 
 
 def _dated(row: Row, provenance: Provenance, ending: str) -> Row:
@@ -235,16 +211,6 @@ def _dated(row: Row, provenance: Provenance, ending: str) -> Row:
         "session_sha256": provenance.session_sha256,
         "folder": f"{row['robot']}/{compact}-{ending}",
     }
-
-
-def _failed(row: Row, error: LceRigError | OSError, scratch: Path) -> Row:
-    """Add the cause, with the names that files have where the session lies."""
-    if isinstance(error, OSError):
-        error = SourceError(f"{row['source']} cannot be read: {error.strerror or error}")
-    kind = next(kind for error_type, kind in _KINDS if isinstance(error, error_type))
-    cause = error.finding if isinstance(error, NotEnoughDataError) else None
-    failed = without_result(row, "failed", cause or kind(what=error.what, hint=error.hint))
-    return failed | {"detail": failed["detail"].replace(str(scratch / "session"), row["source"])}
 
 
 def without_result(row: Row, status: Status, cause: Finding) -> Row:
@@ -287,7 +253,7 @@ def publish(
     fill: Callable[[Path], None] = lambda _folder: None,
     *,
     saved: ResultFile | None = None,
-    used: Used | None = None,
+    used: tuple[float, float] | None = None,
 ) -> list[Row]:
     """Write a result's folder and return its rows.
 
@@ -297,16 +263,16 @@ def publish(
         start_s: begin of the work, on the monotonic clock.
         fill: writes the other files into the folder.
         saved: the result of the session; None if it has none.
-        used: by another process that did the work; None for this one.
+        used: processor time (s) and memory (MB) of the process that did the work; None for this one.
     """
     with registry.result(rows[0]["folder"]) as draft:
         fill(draft)
-        own = resource.getrusage(resource.RUSAGE_SELF)
-        used = used or Used(own.ru_utime + own.ru_stime, own.ru_maxrss / 1024)
+        spent_here = resource.getrusage(resource.RUSAGE_SELF)
+        cpu_s, memory_mb = used or (spent_here.ru_utime + spent_here.ru_stime, spent_here.ru_maxrss / 1024)
         spent = {
             "duration_s": round(time.monotonic() - start_s, 3),
-            "cpu_s": round(used.cpu_s, 3),
-            "peak_memory_mb": round(used.peak_memory_mb, 1),
+            "cpu_s": round(cpu_s, 3),
+            "peak_memory_mb": round(memory_mb, 1),
             "finished": datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
         }
         rows = [row | spent for row in rows]
@@ -427,17 +393,16 @@ def main() -> None:
         rows = function(order["arguments"], lambda row: print(json.dumps({"known": row}), file=messages))
         message: dict[str, Any] = {"rows": rows}
     except BaseException as error:
-        message = {"reason": "out_of_memory" if _is_of_memory(error) else "bug"}
+        causes = [error]
+        while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
+            causes.append(cause)
+        # OpenCV has an error of its own, C++ one that Python does not know.
+        is_of_memory = any(
+            isinstance(cause, MemoryError) or "Insufficient memory" in str(cause) or "bad_alloc" in str(cause)
+            for cause in causes
+        )
+        message = {"reason": "out_of_memory" if is_of_memory else "bug"}
         traceback.print_exc()
     print(json.dumps(message), file=messages, flush=True)
     sys.stderr.flush()
     os._exit(0 if "rows" in message else 1)
-
-
-def _is_of_memory(error: BaseException | None) -> bool:
-    while error is not None:
-        # OpenCV has an error of its own, C++ one that Python does not know.
-        if isinstance(error, MemoryError) or "Insufficient memory" in str(error) or "bad_alloc" in str(error):
-            return True
-        error = error.__cause__ or error.__context__
-    return False

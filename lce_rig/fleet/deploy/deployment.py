@@ -5,19 +5,17 @@ makes an earlier release current again. Each opens its own connections; nothing 
 """
 
 import difflib
-import getpass
 import json
 import shutil
-import socket
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
-from datetime import datetime, timedelta, timezone
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from lce_rig.core.calibration import MADE_BY, ResultFile, read_result
+from lce_rig.core.calibration import ResultFile, read_result
 from lce_rig.core.errors import (
     CommandError,
     LceRigError,
@@ -37,7 +35,6 @@ from lce_rig.fleet.deploy.place import (
     SAYS,
     STAGE,
     LostError,
-    OddFilesError,
     Place,
 )
 from lce_rig.fleet.deploy.releases import (
@@ -45,8 +42,10 @@ from lce_rig.fleet.deploy.releases import (
     TargetState,
     content_of,
     differences,
+    differences_in_words,
+    fetch,
     read_state,
-    set_sha256,
+    user_name,
 )
 from lce_rig.fleet.findings import (
     DEPLOY_FAILED,
@@ -87,26 +86,32 @@ class Plan:
         record: of the release that would be made.
         state: of the target now.
         changed: files that differ from the current release's: "changed", "missing", "added".
-        changed_there: current files that are not as they were deployed.
         sensors: changes of the extrinsics.
-        objections: a deployment is refused for them unless it is forced.
-        remarks: what the checks could not compare.
+        findings: objections, and notes of what could not be compared.
         diff: lines in which changed texts differ, as `diff -u` prints them.
     """
 
     record: ReleaseRecord
     state: TargetState
     changed: Mapping[str, str]
-    changed_there: Mapping[str, str]
     sensors: tuple[SensorChange, ...]
-    objections: tuple[Finding, ...]
-    remarks: tuple[Finding, ...] = ()
-    diff: tuple[str, ...] = ()
+    findings: tuple[Finding, ...]
+    diff: tuple[str, ...]
+
+    @property
+    def objections(self) -> tuple[Finding, ...]:
+        """Findings for which a deployment is refused unless it is forced."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
+
+    @property
+    def remarks(self) -> tuple[Finding, ...]:
+        """Findings that refuse nothing."""
+        return tuple(finding for finding in self.findings if finding.severity == "note")
 
     @property
     def is_in_place(self) -> bool:
         """Whether the target holds these very files already."""
-        return self.state.current is not None and not self.changed and not self.changed_there
+        return self.state.current is not None and not self.changed and not self.state.changed
 
 
 @dataclass(frozen=True)
@@ -128,13 +133,6 @@ class Deployed:
     output: str | None = None
     changed_there: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[Finding, ...] = ()
-
-
-class Standing(NamedTuple):
-    """A target's state, and the current files that are not as they were deployed, with how they differ."""
-
-    state: TargetState
-    changed: Mapping[str, str]
 
 
 def plan(result: Path, rig: Rig, target: TargetSettings, *, session: Session | None = None) -> Plan:
@@ -206,19 +204,26 @@ def deploy(
                 place.must_run(DISCARD, record.name)
             raise
     output = _run(place, target, record.name)
-    return Deployed(record, record.replaces, True, output, planned.changed_there, planned.remarks)
+    return Deployed(record, record.replaces, True, output, planned.state.changed, planned.remarks)
 
 
-def standing(target: TargetSettings) -> Standing:
+def standing(target: TargetSettings) -> TargetState:
     """Ask for the state of a target, and whether its current files are as they were deployed.
 
     Raises:
         TargetError: it cannot be reached or read.
     """
-    place = Place(target)
-    state = read_state(place)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
-        return Standing(state, _changed_there(place, state, Path(folder) / "deployed"))
+        return _standing(Place(target), Path(folder) / "deployed")
+
+
+def _standing(place: Place, folder: Path) -> TargetState:
+    """Ask for the state, and copy the current files to a new folder."""
+    state = read_state(place)
+    if state.current is None:
+        folder.mkdir()
+        return state
+    return replace(state, changed=fetch(place, state.current, folder))
 
 
 def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "") -> Deployed:
@@ -240,16 +245,15 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
     wanted = state.current.replaces if name is None else name
     release = state.named(wanted)
     if release is None:
-        others = ", ".join(each.name for each in state.releases if each.name != state.current.name)
+        others = ", ".join(kept.name for kept in state.releases if kept.name != state.current.name)
         hint = f"`--release NAME` restores another one: {others}" if others else "No other one is there."
         what = f"there is no release {wanted}" if wanted else "the current release is the first"
         raise TargetError(f"{place.label}: {what}", hint)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
-        place.get(f"releases/{release.name}", Path(folder) / "release")
-        wrong = differences(content_of(Path(folder) / "release"), release.files)
+        wrong = fetch(place, release, Path(folder) / "release")
     if wrong:
         raise TargetError(
-            f"{place.label}: release {release.name} is not as it was deployed: {_listed(wrong)}",
+            f"{place.label}: release {release.name} is not as it was deployed: {differences_in_words(wrong)}",
             "Name another release, or deploy its session again.",
         )
     replaces = state.current.name
@@ -262,10 +266,9 @@ def _plan(
     result: Path, rig: Rig, target: TargetSettings, session: Session | None, place: Place, folder: Path
 ) -> Plan:
     """Write the new files to folder/new, fetch the current ones to folder/deployed, and compare."""
-    state = read_state(place)
     new, deployed = folder / "new", folder / "deployed"
     saved = _stage(result, rig, target, session, new)
-    changed_there = _changed_there(place, state, deployed)
+    state = _standing(place, deployed)
     files = content_of(new)
     before, after = _extrinsics(deployed), _extrinsics(new)
     sensors = [
@@ -277,29 +280,20 @@ def _plan(
         for key in dict.fromkeys([*after, *before])
     ]
     changed = differences(files, {} if state.current is None else state.current.files)
-    return Plan(
-        _record(saved, files, state),
-        state,
-        changed,
-        changed_there,
-        tuple(sensors),
-        tuple(_objections(saved, target, state.current)),
-        tuple(_remarks(saved, state.current)),
-        tuple(_text_changes(deployed, new, changed)),
-    )
-
-
-def _text_changes(earlier: Path, new: Path, changed: Mapping[str, str]) -> list[str]:
-    """List the lines in which texts differ, as `diff -u` does; new and removed texts whole."""
+    # Lines as `diff -u` prints them; new and removed texts whole, other files not at all.
     lines: list[str] = []
     for name in changed:
         with suppress(OSError, ValueError):
-            before, after = (
+            before_text, after_text = (
                 path.read_text("utf-8").splitlines() if path.is_file() else []
-                for path in (earlier / name, new / name)
+                for path in (deployed / name, new / name)
             )
-            lines += difflib.unified_diff(before, after, f"deployed/{name}", f"new/{name}", lineterm="")
-    return lines
+            lines += difflib.unified_diff(
+                before_text, after_text, f"deployed/{name}", f"new/{name}", lineterm=""
+            )
+    findings = _compare(saved, target, state.current)
+    record = ReleaseRecord.of(saved, files, state)
+    return Plan(record, state, changed, tuple(sensors), tuple(findings), tuple(lines))
 
 
 def _stage(
@@ -328,75 +322,26 @@ def _stage(
     return saved
 
 
-def _record(saved: ResultFile, files: Mapping[str, str], state: TargetState) -> ReleaseRecord:
-    time = datetime.now(timezone.utc).replace(microsecond=0)
-    # In order of time, even if this computer's clock is behind that of an earlier deployment.
-    newest = max((each.name[:16] for each in state.releases), default="")
-    if f"{time:%Y%m%dT%H%M%SZ}" <= newest:
-        time = datetime.strptime(newest, "%Y%m%dT%H%M%SZ").replace(tzinfo=timezone.utc) + timedelta(seconds=1)
+def _compare(saved: ResultFile, target: TargetSettings, current: ReleaseRecord | None) -> list[Finding]:
+    """List objections to a deployment, and note where no date tells which captures are older."""
     origin = saved.provenance
-    return ReleaseRecord(
-        name=f"{time:%Y%m%dT%H%M%SZ}-{set_sha256(files)[:8]}",
-        time=f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
-        by=_user(),
-        made_by=MADE_BY,
-        replaces="" if state.current is None else state.current.name,
-        files=dict(files),
-        robot=origin.robot,
-        serials=dict(origin.serials),
-        date=origin.date or "",
-        session_sha256=origin.session_sha256,
-        verdicts={f"{c.camera} and {c.lidar}": c.verdict for c in saved.pairs},
-    )
-
-
-def _user() -> str:
-    with suppress(OSError, KeyError):
-        return f"{getpass.getuser()}@{socket.gethostname()}"
-    return ""
-
-
-def _listed(wrong: Mapping[str, str]) -> str:
-    return ", ".join(f"{file} {how}" for file, how in wrong.items())
-
-
-def _objections(saved: ResultFile, target: TargetSettings, current: ReleaseRecord | None) -> list[Finding]:
-    """List the objections to a deployment."""
-    origin = saved.provenance
-    objections = [DEPLOY_FAILED(f"{c.camera} and {c.lidar}") for c in saved.pairs if c.verdict == "fail"]
+    findings = [DEPLOY_FAILED(f"{c.camera} and {c.lidar}") for c in saved.pairs if c.verdict == "fail"]
     robots = {robot for robot in (target.robot, None if current is None else current.robot) if robot}
     for robot in sorted(robots - {origin.robot}) if origin.robot else ():
-        objections.append(DEPLOY_OTHER_ROBOT(robot=origin.robot, there=robot))
+        findings.append(DEPLOY_OTHER_ROBOT(robot=origin.robot, there=robot))
     if current is None:
-        return objections
+        return findings
     for sensor, serial in sorted(origin.serials.items()):
         there = current.serials.get(sensor, serial)
         if there != serial:
-            objections.append(DEPLOY_OTHER_SERIAL(sensor, serial=serial, there=there))
-    if origin.date and current.date and origin.date < current.date:
-        objections.append(DEPLOY_OLDER(date=origin.date, there=current.date))
-    return objections
-
-
-def _remarks(saved: ResultFile, current: ReleaseRecord | None) -> list[Finding]:
-    """Say where no date tells which captures are older."""
-    origin = saved.provenance
-    if current is None or (origin.date and current.date) or origin.session_sha256 == current.session_sha256:
-        return []
-    return [DEPLOY_UNDATED(date=origin.date_words or "unknown", there=current.date or "unknown")]
-
-
-def _changed_there(place: Place, state: TargetState, folder: Path) -> dict[str, str]:
-    """Fetch the current files, and list those that are not as they were deployed."""
-    if state.current is not None:
-        try:
-            place.get(f"releases/{state.current.name}", folder)
-            return differences(content_of(folder), state.current.files)
-        except OddFilesError as error:
-            folder.mkdir()
-            return dict.fromkeys(error.names, "no plain file")
-    folder.mkdir()
-    return {}
+            findings.append(DEPLOY_OTHER_SERIAL(sensor, serial=serial, there=there))
+    if origin.date and current.date:
+        if origin.date < current.date:
+            findings.append(DEPLOY_OLDER(date=origin.date, there=current.date))
+    elif origin.session_sha256 != current.session_sha256:
+        there = current.date or "unknown"
+        findings.append(DEPLOY_UNDATED(date=origin.date_words or "unknown", there=there))
+    return findings
 
 
 def _extrinsics(folder: Path) -> dict[tuple[str, str], Array]:
@@ -407,19 +352,13 @@ def _extrinsics(folder: Path) -> dict[tuple[str, str], Array]:
 
 def _write(place: Place, record: ReleaseRecord, folder: Path) -> None:
     """Copy the new files into a release and read them back."""
-    name = f"releases/{record.name}"
     place.must_run(STAGE, record.name, content=record.line().encode())
-    place.put(folder / "new", name)
-    try:
-        place.get(name, folder / "back")
-        wrong = differences(content_of(folder / "back"), record.files)
-    except LostError:
-        raise
-    except TargetError as error:
-        raise TargetError(f"{place.label}: new files cannot be read back: {error.what}", _OTHER) from error
+    place.put(folder / "new", f"releases/{record.name}")
+    wrong = fetch(place, record, folder / "back")
     if wrong or (folder / "back" / RECORD).read_bytes() != record.line().encode():
         raise TargetError(
-            f"{place.label}: files read back differently: {_listed(wrong) or RECORD}", "Check the disk there."
+            f"{place.label}: files read back differently: {differences_in_words(wrong) or RECORD}",
+            "Check the disk there.",
         )
 
 
@@ -436,7 +375,7 @@ def _commit(
         "action": action,
         "release": release.name,
         "replaces": expected,
-        "by": _user(),
+        "by": user_name(),
         "robot": release.robot,
         "session_sha256": release.session_sha256,
         "reason": reason or release.reason,

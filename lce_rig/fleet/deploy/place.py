@@ -47,7 +47,7 @@ _SSH = {"BatchMode": "yes", "ConnectTimeout": "10", "ServerAliveInterval": "5", 
 _HINTS = {
     LOCKED: "Wait for the other deployment to end.",
     NOT_OURS: "Move it away, or name another folder in `to`.",
-    NO_RELEASE: "`--status` lists the releases.",
+    NO_RELEASE: "Another deployment has removed it: look at `--status`, then run the same command again.",
 }
 _NAMED = "[0-9]" * 8 + "T" + "[0-9]" * 6 + "Z-" + "[0-9a-f]" * 8
 
@@ -213,18 +213,6 @@ class LostError(TargetError):
     """The connection was lost, or there never was one."""
 
 
-class OddFilesError(TargetError):
-    """A release holds links, devices or very large files, which are not read.
-
-    Attributes:
-        names: of the first of them, in the release.
-    """
-
-    def __init__(self, label: str, names: Sequence[str]) -> None:
-        super().__init__(f"{label}: {names[0]} is no plain file, or too large", "Remove it there.")
-        self.names = names
-
-
 class Ran(NamedTuple):
     """A program that ended: its exit code, and the last `MAX_OUTPUT` bytes of both outputs."""
 
@@ -256,10 +244,17 @@ def run_bounded(words: Sequence[str], timeout_s: float, content: bytes = b"") ->
             bufsize=0,
             start_new_session=True,
         )
+
+    def keep_end(pipe: IO[bytes], kept: bytearray) -> None:
+        with pipe:
+            while chunk := pipe.read(1 << 16):
+                kept += chunk
+                del kept[:-MAX_OUTPUT]
+
     kept = bytearray(), bytearray()
     assert process.stdout is not None and process.stderr is not None
     pipes = ((process.stdout, kept[0]), (process.stderr, kept[1]))
-    threads = [Thread(target=_keep_end, args=each, daemon=True) for each in pipes]
+    threads = [Thread(target=keep_end, args=pipe, daemon=True) for pipe in pipes]
     for thread in threads:
         thread.start()
     deadline_s = time.monotonic() + timeout_s
@@ -273,13 +268,6 @@ def run_bounded(words: Sequence[str], timeout_s: float, content: bytes = b"") ->
             # A process in the background may hold the pipe open.
             thread.join(max(1.0, min(5.0, deadline_s - time.monotonic())))
     return Ran(process.returncode, *(bytes(each).decode(errors="replace") for each in kept))
-
-
-def _keep_end(pipe: IO[bytes], kept: bytearray) -> None:
-    with pipe:
-        while chunk := pipe.read(1 << 16):
-            kept += chunk
-            del kept[:-MAX_OUTPUT]
 
 
 class Place:
@@ -344,20 +332,23 @@ class Place:
             files = sorted(map(str, folder.iterdir()))
             self._scp(*files, f"{self._host}:{self.path}/{name}/")
 
-    def get(self, name: str, folder: Path) -> None:
+    def get(self, name: str, folder: Path) -> list[str]:
         """Copy a folder of this name there, of plain files, to a new one here.
 
+        Returns:
+            The first of its entries that are no plain files, or too large; then nothing is copied.
+
         Raises:
-            OddFilesError: it holds something else.
             TargetError: it cannot be reached or read.
         """
         odd = [line.removeprefix("./") for line in self.must_run(_ODD, name).splitlines() if line[:1] == "."]
         if odd:
-            raise OddFilesError(f"{self.label}: {name}", odd)
-        if self._host is None:
+            folder.mkdir()
+        elif self._host is None:
             self._copy(Path(self.path) / name, folder)
         else:
             self._scp(f"{self._host}:{self.path}/{name}", str(folder))
+        return odd
 
     def _copy(self, source: Path, target: Path) -> None:
         try:

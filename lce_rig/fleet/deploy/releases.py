@@ -1,16 +1,23 @@
 """Releases at a target, each a set of files with a record of their origin."""
 
+import getpass
 import hashlib
 import json
+import socket
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from lce_rig.core.calibration import MADE_BY, ResultFile
 from lce_rig.core.errors import TargetError
 from lce_rig.fleet.deploy.place import RECORD, SAYS, STATE, USED, Place
+
+_COMPACT = "%Y%m%dT%H%M%SZ"
 
 
 class ReleaseRecord(BaseModel):
@@ -47,6 +54,30 @@ class ReleaseRecord(BaseModel):
     session_sha256: str = ""
     verdicts: dict[str, str] = Field(default_factory=dict)
 
+    @classmethod
+    def of(cls, saved: ResultFile, files: Mapping[str, str], state: "TargetState") -> "ReleaseRecord":
+        """Describe the next release at a target, of these files with their SHA-256."""
+        now = datetime.now(timezone.utc)
+        # In order of time, even if this computer's clock is behind that of an earlier deployment.
+        newest = max((release.name[:16] for release in state.releases), default="")
+        compact = f"{now:{_COMPACT}}"
+        if compact <= newest:
+            compact = f"{datetime.strptime(newest, _COMPACT) + timedelta(seconds=1):{_COMPACT}}"
+        origin = saved.provenance
+        return cls(
+            name=f"{compact}-{set_sha256(files)[:8]}",
+            time=f"{now:%Y-%m-%dT%H:%M:%SZ}",
+            by=user_name(),
+            made_by=MADE_BY,
+            replaces="" if state.current is None else state.current.name,
+            files=dict(files),
+            robot=origin.robot,
+            serials=dict(origin.serials),
+            date=origin.date or "",
+            session_sha256=origin.session_sha256,
+            verdicts={f"{c.camera} and {c.lidar}": c.verdict for c in saved.pairs},
+        )
+
     @property
     def set_sha256(self) -> str:
         """Fingerprint of all files with their names."""
@@ -65,11 +96,13 @@ class TargetState:
         current: read by robot software; None before the first deployment.
         releases: all that are kept, the newest first.
         pending: the release whose command has not succeeded yet; "" where none is pending.
+        changed: current files that are not as they were deployed, and how they differ, where it was asked.
     """
 
     current: ReleaseRecord | None = None
     releases: tuple[ReleaseRecord, ...] = ()
     pending: str = ""
+    changed: Mapping[str, str] = field(default_factory=dict)
 
     def named(self, name: str) -> ReleaseRecord | None:
         """Find a release."""
@@ -114,6 +147,27 @@ def read_state(place: Place) -> TargetState:
     return TargetState(state.named(current), state.releases, pending)
 
 
+def fetch(place: Place, release: ReleaseRecord, folder: Path) -> dict[str, str]:
+    """Copy a release to a new folder here.
+
+    Returns:
+        Its files that are not as they were deployed: "changed", "missing", "added" or "no plain file" by
+        path. With links, devices or very large files among them nothing is copied.
+
+    Raises:
+        TargetError: the target cannot be reached, or has no such release.
+    """
+    odd = place.get(f"releases/{release.name}", folder)
+    return dict.fromkeys(odd, "no plain file") if odd else differences(content_of(folder), release.files)
+
+
+def user_name() -> str:
+    """Name the user and this computer; "" if the system has no name for them."""
+    with suppress(OSError, KeyError):
+        return f"{getpass.getuser()}@{socket.gethostname()}"
+    return ""
+
+
 def content_of(folder: Path) -> dict[str, str]:
     """Fingerprint the files of a set by their path; the record and mark of a release are not part of it.
 
@@ -147,3 +201,8 @@ def differences(files: Mapping[str, str], expected: Mapping[str, str]) -> dict[s
         name: "missing" if name not in files else "added" if name not in expected else "changed"
         for name in names
     }
+
+
+def differences_in_words(changes: Mapping[str, str]) -> str:
+    """List what `differences` gave in one line."""
+    return ", ".join(f"{name} {how}" for name, how in changes.items())

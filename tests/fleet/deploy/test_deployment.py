@@ -42,8 +42,8 @@ def test_a_result_is_deployed_asked_for_replaced_and_restored_byte_for_byte(
     second = deploy(result("b", 0.15), rig, target)
     assert second.replaces == first.release.name and content_of(robot / "current") != deployed
     found = standing(target)
-    assert found.state.current == second.release and not found.changed
-    assert [each.name for each in found.state.releases] == [second.release.name, first.release.name]
+    assert found.current == second.release and not found.changed
+    assert [each.name for each in found.releases] == [second.release.name, first.release.name]
     back = rollback(target, reason="it was better")
     assert back.release == first.release and content_of(robot / "current") == deployed
     assert [(entry["action"], entry["release"]) for entry in log_of(robot)] == [
@@ -68,7 +68,7 @@ def test_the_same_files_are_deployed_once(
     # Also where somebody has changed a file there: then it is deployed anew.
     (robot / "current" / "extrinsics.yaml").write_text("mine")
     assert standing(local).changed == {"extrinsics.yaml": "changed"}
-    assert plan(folder, rig, local).changed_there == {"extrinsics.yaml": "changed"}
+    assert plan(folder, rig, local).state.changed == {"extrinsics.yaml": "changed"}
     anew = deploy(folder, rig, local)
     assert anew.is_new and anew.changed_there == {"extrinsics.yaml": "changed"}
     assert standing(local).changed == {} and not deploy(folder, rig, local).changed_there
@@ -113,7 +113,7 @@ def test_what_does_not_belong_there_is_refused_unless_a_reason_is_written_down(
         deploy(folder, rig, local)
     assert content_of(robot / "current") == before
     forced = deploy(folder, rig, local, reason="the LiDAR was replaced").release
-    assert standing(local).state.current == forced
+    assert standing(local).current == forced
     assert (forced.forced, forced.reason) == ([code], "the LiDAR was replaced")
     assert (log_of(robot)[-1]["forced"], log_of(robot)[-1]["reason"]) == ([code], forced.reason)
 
@@ -158,11 +158,11 @@ def test_a_command_that_fails_is_told_with_output_and_code_and_runs_again(
         deploy(folder, rig, failing)
     assert "rles.urdf" in caught.value.hint and "not today" in caught.value.hint
     found = standing(failing)
-    assert found.state.is_pending and not found.changed
+    assert found.is_pending and not found.changed
     (robot / "ready").touch()
     again = deploy(folder, rig, failing)
     assert not again.is_new and "not today" in (again.output or "")
-    assert not standing(failing).state.is_pending
+    assert not standing(failing).is_pending
     assert deploy(folder, rig, failing).output is None
     assert [entry.get("exit") for entry in log_of(robot)] == [None, 3, 0]
 
@@ -201,7 +201,7 @@ def test_files_that_the_disk_does_not_give_back_are_not_made_current(
 
     with pytest.raises(TargetError, match=r"rles\.urdf"):
         deploy(result("b", 0.15), rig, local, place=Meanwhile(local, damage))
-    assert standing(local).state.current == first
+    assert standing(local).current == first
     deploy(result("c", 0.2), rig, local)
     assert sorted(entry.name for entry in robot.glob(".*")) == [".lock"]
 
@@ -263,9 +263,60 @@ def test_only_own_releases_are_removed_and_only_after_the_switch(
     with pytest.raises(ResultRefusedError):
         deploy(result("failed", 0.13, verdict="fail"), rig, few)
     assert tree(robot) == before
-    assert [release.name for release in standing(few).state.releases] == [first.name]
+    assert [release.name for release in standing(few).releases] == [first.name]
     names = [deploy(result(f"{k}", 0.2 + 0.01 * k), rig, few).release.name for k in range(3)]
     assert sorted(path.name for path in (robot / "releases").iterdir()) == sorted([*others, *names[1:]])
+
+
+def test_the_release_before_stays_where_few_are_kept_and_one_was_rolled_back(
+    result: Result, rig: Rig, local: TargetSettings, robot: Path
+) -> None:
+    few = with_settings(local, keep=2)
+    first, _ = (deploy(result(name, x_m), rig, few).release for name, x_m in (("a", 0.1), ("b", 0.2)))
+    rollback(few)
+    third = deploy(result("c", 0.3), rig, few).release
+    assert [release.name for release in standing(few).releases] == [third.name, first.name]
+    assert rollback(few).release == first
+
+
+def test_releases_are_named_in_order_where_the_clock_was_set_back(
+    result: Result, rig: Rig, local: TargetSettings, robot: Path
+) -> None:
+    early = deploy(result("a"), rig, local).release
+    late = early.model_copy(update={"name": f"20990101T000000Z-{early.name[-8:]}"})
+    (robot / "releases" / early.name).rename(robot / "releases" / late.name)
+    (robot / "releases" / late.name / RECORD).write_text(late.line())
+    (robot / "current").unlink()
+    (robot / "current").symlink_to(f"releases/{late.name}")
+    new = deploy(result("b", 0.15), rig, local).release
+    assert new.name > late.name and new.replaces == late.name
+    assert standing(local).releases == (new, late)
+
+
+TOOLS = ("cat", "flock", "head", "ln", "mkdir", "mv", "readlink", "rm", "sync")
+
+
+class Toolless(Place):
+    """A robot without flock and timeout."""
+
+    tools: Path
+
+    def command(self, script: str, *arguments: str) -> list[str]:
+        return ["env", f"PATH={self.tools}", *super().command(script, *arguments)]
+
+
+def test_a_robot_without_flock_is_deployed_to(
+    result: Result, rig: Rig, local: TargetSettings, robot: Path, tmp_path: Path
+) -> None:
+    place = Toolless(with_settings(local, run="true"))
+    place.tools = tmp_path / "tools"
+    place.tools.mkdir()
+    for name in ("sh", *TOOLS, "cut", "du", "find", "tail", "true"):
+        if name != "flock":
+            (place.tools / name).symlink_to(str(shutil.which(name)))
+    for name, x_m in (("a", 0.1), ("b", 0.2)):
+        assert deploy(result(name, x_m), rig, with_settings(local, run="true"), place=place).is_new
+    assert not (robot / ".lock").exists() and not standing(local).changed
 
 
 def test_a_release_with_a_link_to_an_endless_device_is_named_and_replaced(
@@ -288,15 +339,12 @@ def test_the_output_and_the_time_of_a_command_are_bounded(
     with pytest.raises(CommandError) as caught:
         deploy(result("a"), rig, endless)
     assert len(str(caught.value)) < 10_000
-    assert standing(endless).state.is_pending
+    assert standing(endless).is_pending
 
 
 def test_the_command_gets_the_robot_as_an_argument(result: Result, rig: Rig, local: TargetSettings) -> None:
     named = with_settings(local, robot="kestrel", run='echo "for $1"')
     assert deploy(result("a"), rig, named).output == "for kestrel\n"
-
-
-TOOLS = ("cat", "flock", "head", "ln", "mkdir", "mv", "readlink", "rm", "sync")
 
 
 class Failing(Place):
@@ -329,7 +377,7 @@ def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(
     sound = Failing(settings, tmp_path / "sound", 0)
     for folder in (*folders, folders[0]):
         deploy(folder, rig, settings, place=sound)
-    sets = {set_sha256(standing(settings).state.releases[k].files) for k in (0, 1)}
+    sets = {set_sha256(standing(settings).releases[k].files) for k in (0, 1)}
     n_new = n_old = 0
     for n in range(1, 100):
         before = content_of(robot / "current")
