@@ -1,6 +1,5 @@
 """How attached sensors are read: in order, with the reason of the end, and again when they are back."""
 
-import threading
 import time
 
 import pytest
@@ -63,29 +62,6 @@ def test_nothing_for_too_long_is_an_error_with_a_hint() -> None:
     with Script(silence_s=0.1) as source, pytest.raises(SourceError) as caught:
         counts(source)
     assert caught.value.hint == HINT
-
-
-def test_stopping_ends_the_samples_without_error() -> None:
-    source = Script([pulse(0)])
-    taken: list[int] = []
-    taker = threading.Thread(target=lambda: taken.extend(counts(source)))
-    with source:
-        taker.start()
-        while source.status().n_samples == 0:
-            time.sleep(0.005)
-    taker.join()
-    assert taken == [0]
-
-
-def test_reading_can_begin_anew() -> None:
-    source = Script([pulse(0)], SourceError("gone"), [pulse(1)], silence_s=0.1)
-    for expected in (0, 1):
-        with source:
-            came = []
-            with pytest.raises(SourceError):
-                came.extend(source.samples())
-            assert [sample.count for sample in came if isinstance(sample, Pulse)] == [expected]
-            assert source.status().n_samples == 1
 
 
 def test_what_nobody_takes_is_dropped_oldest_first_and_counted() -> None:

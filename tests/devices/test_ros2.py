@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib.util import find_spec
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -118,14 +117,6 @@ def test_images_and_scans_of_topics_come_as_from_a_bag(rig: Rig) -> None:
     assert [each.code for each in camera.problems] == ["stream.messages_skipped"]
     assert camera.n_lost == camera.problems[0].figures["n"] >= 1
     assert statuses["lidar"].n_lost == 0 and POINTS in statuses["lidar"].device
-
-
-@pytest.mark.usefixtures("graph")
-def test_a_topic_is_left_and_joined_again(rig: Rig) -> None:
-    source = Ros2Source("cam", rig.cameras["cam"])
-    for _ in range(2):
-        with source:
-            assert len(list(islice(source.samples(), 3))) == 3
 
 
 def refusal(source: Ros2Source) -> SourceError:

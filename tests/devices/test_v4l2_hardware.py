@@ -73,12 +73,6 @@ def test_a_running_camera_is_busy_for_others() -> None:
         assert "fuser -v" in caught.value.hint
 
 
-def test_a_size_that_it_does_not_have_is_refused() -> None:
-    odd = camera().model_copy(update={"resolution_px": (642, 362)})
-    with pytest.raises(SourceError, match="642x362"), V4l2Source("cam", odd):
-        pass
-
-
 @pytest.mark.parametrize(
     ("controls", "hint"),
     [
@@ -127,34 +121,6 @@ def test_all_formats_show_the_same_picture(vivid: None) -> None:
             # Coarse chroma mixes the colours beside an edge of the bars.
             assert np.median(apart) <= 4, code
             assert np.mean(apart > 4) <= 0.05, code
-
-
-def test_lost_pictures_are_counted(vivid: None) -> None:
-    with V4l2Source("cam", camera(VIVID | {"percentage_of_dropped_buffers": 40})) as source:
-        images = take(source, 20)
-        counts = [image.count for image in images if image.count is not None]
-        n_missing = counts[-1] - counts[0] + 1 - len(counts)
-        assert source.status().n_lost >= n_missing > 0
-    camera_again = camera({"percentage_of_dropped_buffers": 0})
-    with V4l2Source("cam", camera_again):
-        pass
-
-
-def test_the_flag_of_a_start_of_exposure_is_believed(vivid: None) -> None:
-    with V4l2Source("cam", camera(VIVID)) as source:
-        take(source, 2)
-        told = source.status().clock
-        assert told is not None
-        assert (told.finding.figures["mark"], told.finding.figures["clock"]) == (
-            "start_of_exposure",
-            "monotonic",
-        )
-
-
-def test_stamps_in_the_future_are_not_trusted(vivid: None) -> None:
-    with V4l2Source("cam", camera({"timestamp_source": 0}, frame_rate_hz=5.0)) as source:
-        take(source, 3)
-        assert any(problem.family == "clock" for problem in source.status().problems)
 
 
 def test_a_camera_without_pulses_falls_silent(vivid: None) -> None:

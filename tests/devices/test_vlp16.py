@@ -233,7 +233,7 @@ def test_packets_of_another_address_are_named(lidar: LidarSettings) -> None:
 
 def test_rubbish_on_the_port_is_counted_and_named(lidar: LidarSettings) -> None:
     rubbish = [SensorPacket(velodyne.DATA_PORT, T0_NS, b"hello")] * 7
-    assert "7 data packets" in explain(lidar, rubbish).what
+    assert "7 damaged packets" in explain(lidar, rubbish).what
 
 
 def test_a_port_that_another_program_holds_is_named(lidar: LidarSettings) -> None:

@@ -94,16 +94,6 @@ def test_types_that_differ_by_firmware_do_not_matter() -> None:
     assert find_problems(report, settings()) == []
 
 
-@pytest.mark.parametrize(
-    "nonsense", [{}, {"gps": 3, "motor": [], "rpm": None, "host": "x", "fov": {"start": {}}}]
-)
-def test_pages_that_say_nothing_of_use_give_an_empty_report(nonsense: dict[str, Any]) -> None:
-    with serving({"info": nonsense, "status": nonsense, "settings": nonsense}) as web:
-        report = web.read()
-    assert report.rotor_hz is None and report.data_port is None and report.pps == ""
-    assert find_problems(report, settings()) == []
-
-
 @pytest.mark.parametrize("body", [b"<html>router</html>", b"[1, 2]", b"\xff\xfe", b"", b"[" * 100_000])
 def test_another_device_at_the_address_is_told_from_a_sensor(body: bytes) -> None:
     with (

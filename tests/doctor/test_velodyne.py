@@ -5,8 +5,6 @@ from typing import Any
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Finding
-from lce_rig.devices.reading import ClockState
 from lce_rig.devices.velodyne_web import WebReport
 from lce_rig.doctor.checks import check_pps, check_settings
 from lce_rig.rig import Rig
@@ -40,13 +38,6 @@ def test_a_sensor_without_pulses_is_judged_by_what_the_profile_promises(
     line = look(check_pps, examination(seen, rig=with_timestamps(**timestamps)), "lidar")
     assert line is not None and line.severity == severity
     assert codes(line)[:2] == ["clock.pulse", "clock.pps_not_locked"]
-
-
-def test_without_position_packets_the_web_page_tells_of_the_pulse() -> None:
-    seen = lidar(clock=ClockState(Finding("clock.no_position_packets", "warning")))
-    line = look(check_pps, examination(seen, web={"lidar": WebReport(pps="locked")}), "lidar")
-    assert line is not None and line.findings[0].figures["pps"] == "locked"
-    assert "clock.no_position_packets" in codes(line)
 
 
 def test_settings_that_differ_from_the_profile_are_named_once() -> None:

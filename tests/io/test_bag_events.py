@@ -6,17 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image, Sample, Scan, Stream, join_events
+from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.events.prophesee import EVT3, WordDecoder
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import open_bag_writer
-from lce_rig.io.ros.event_messages import PacketDecoder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.rig_time import rig_time_ns
 from tests.io.events import encoders
-from tests.io.events.bags import parsed, write_packet_bag
+from tests.io.events.bags import write_packet_bag
 from tests.io.events.encoders import listed
 from tests.notes import has_note
 
@@ -154,31 +152,3 @@ def test_events_that_count_from_the_sensors_start_are_tied_to_the_host_by_their_
     assert 0 <= stamps_ns[0] - T0_NS <= 5_000_000 and span is not None and span[0] == stamps_ns[0]
     assert np.array_equal(np.diff(stamps_ns) % 1000, np.zeros(len(stamps_ns) - 1))
     assert has_note(recording.notes, "sensor's start", "added")
-
-
-def test_pictures_stamped_at_the_start_of_an_exposure_that_is_not_told_are_said(
-    tmp_path: Path, rig: Rig
-) -> None:
-    path = record(tmp_path / "r.bag", rig, [picture(0), sweep(0)])
-    davis = rig.cameras["davis"]
-    frames = davis.channels["frames"]
-    timestamps = frames.timestamps.model_copy(update={"reference": "start"})
-    channels = {**davis.channels, "frames": frames.model_copy(update={"timestamps": timestamps})}
-    start = rig.model_copy(update={"cameras": {"davis": davis.model_copy(update={"channels": channels})}})
-    for profile, is_said in ((rig, False), (start, True)):
-        recording = opened(path, profile)
-        assert [s.stamp_ns for s in recording.samples() if isinstance(s, Image)] == [picture(0).stamp_ns]
-        assert has_note(recording.notes, "its start", "used") == is_said
-
-
-def test_a_packet_whose_words_hold_many_events_each_is_decoded_in_pieces() -> None:
-    rng = np.random.default_rng(0)
-    words = np.tile(np.array([0x8000, 0x6001, 0x0005, 0x3000, 0x4FFF, 0x4FFF, 0x50FF], "<u2"), 40_000)
-    words[1::7] = 0x6000 | np.sort(rng.integers(0, 4096, 40_000))
-    decoder = PacketDecoder()
-    packet = parsed(encoders.packet(words.tobytes(), "evt3", is_ros1=True), True)
-    pieces = [*decoder.decode(packet), *decoder.finish()]
-    whole = WordDecoder(EVT3).decode(words.astype(np.uint16))
-    assert len(pieces) > 2 and max(map(len, pieces)) < len(whole) / 2
-    together = join_events(pieces)
-    assert np.array_equal(together.t_ns, whole.t_ns) and np.array_equal(together.x, whole.x)

@@ -12,7 +12,7 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.io import SourceOptions, open_recording
+from lce_rig.io import open_recording
 from lce_rig.io.ros.bag_recorder import BagRecorder, FolderRecorder
 from lce_rig.rig import Rig, load_rig
 
@@ -64,13 +64,6 @@ def test_stamps_mark_the_firing_that_the_profile_says(tmp_path: Path, has_times:
     given = sweep(3) if has_times else replace(sweep(3), offset_ns=None)
     _, (found,) = read(record(tmp_path / "r.bag", rig, [picture(0), given]), rig)
     assert found.stamp_ns == pytest.approx(given.stamp_ns, abs=4 if has_times else 0)
-
-
-def test_a_profile_without_topics_gets_some_of_its_sensors_names(tmp_path: Path, rles: Rig) -> None:
-    lidar = rles.lidars["lidar"].model_copy(update={"topic": None})
-    rig = rles.model_copy(update={"lidars": {"lidar": lidar}})
-    path = record(tmp_path / "r.bag", rig, [sweep(0), picture(0), sweep(1)])
-    assert len(read(path, rig, SourceOptions(topics={"lidar": "/lidar/points"}))[1]) == 2
 
 
 @pytest.mark.parametrize("path", ["no/folder/r.bag", "file/r"])

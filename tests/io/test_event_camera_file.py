@@ -58,11 +58,6 @@ def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path: 
     assert recording.streams[FRAME_STREAM] == (images[0].stamp_ns, images[-1].stamp_ns)
 
 
-def test_an_exposure_that_the_file_does_not_tell_is_said(tmp_path: Path, rig: Rig) -> None:
-    recording = opened(write_davis(tmp_path / "a.aedat4", PIECES, [RawFrame(T0_US, 0, GREY)]), rig)
-    assert has_note(recording.notes, "no exposure")
-
-
 def test_frames_alone_are_a_recording_too(tmp_path: Path, rig: Rig) -> None:
     recording = opened(write_davis(tmp_path / "a.aedat4", [], FRAMES), rig)
     assert set(recording.streams) == {FRAME_STREAM} and len(images_of(recording)) == 5

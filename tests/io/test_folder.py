@@ -54,12 +54,6 @@ def test_names_that_are_times_become_stamps(make_folder, rig):
     assert has_note(recording.notes[:1], "sorted order", "0.117 s")
 
 
-def test_what_is_left_unpaired_is_listed(make_folder, rig):
-    path = make_folder([f"{k:05d}" for k in range(11)], [f"{k:05d}" for k in range(1, 11)])
-    recording = open_recording(path, rig)
-    assert len(recording.pairs) == 10 and has_note(recording.notes[1:2], "without", "00000.png")
-
-
 def test_the_same_files_have_the_same_key_wherever_they_lie(make_folder, rig, tmp_path):
     path = make_folder()
     keys = [files.key() for files in open_recording(path, rig).pairs]
@@ -97,12 +91,6 @@ def test_two_folders_of_clouds_without_telling_names_are_not_guessed(make_folder
     make_folder(names=("img", "two"))
     with pytest.raises(SourceError):
         open_recording(path, rig)
-
-
-def test_raw_clouds_beside_cut_ones_are_mentioned(make_folder, rig):
-    path = make_folder()
-    make_folder(names=("img", "raw_pcd"))
-    assert has_note(open_recording(path, rig).notes, "from pcd/", "not from", "raw_pcd")
 
 
 TWO = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
@@ -158,15 +146,6 @@ def test_a_damaged_file_spoils_its_own_pair_only(make_folder, rig, name):
     recording.pairs[0].read()
     with pytest.raises(SourceError, match=name.replace("/", ".*")):
         recording.pairs[1].read()
-
-
-def test_no_time_and_no_returns_are_said(make_folder, rig, room):
-    path = make_folder()
-    cloud = room[["x", "y", "z", "intensity", "ring"]].copy()
-    cloud["x"][:7] = np.nan
-    (path / "pcd" / "00000.pcd").write_bytes(encode_pcd(cloud))
-    notes = open_recording(path, rig).pairs[0].read()[2]
-    assert len(notes) == 2 and "no time" in notes[0] and has_note(notes[1:], "00000.pcd", "7 points")
 
 
 @pytest.mark.dataset

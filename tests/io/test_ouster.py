@@ -109,19 +109,6 @@ def test_a_pcap_gives_one_scan_a_frame(tmp_path: Path, rig: Rig, profile: str) -
     assert scan.offset_ns.max() == pytest.approx(10**8, rel=0.01)
 
 
-@pytest.mark.parametrize(("changes", "n"), [({}, 2), ({"min_range_m": 4.5}, 0), ({"max_range_m": 3.5}, 0)])
-def test_ranges_beyond_the_profiles_limits_give_no_points(
-    tmp_path: Path, rig: Rig, changes: dict[str, float], n: int
-) -> None:
-    write_pcap(tmp_path / "drive.pcap", write_metadata(tmp_path / "drive.json", "LEGACY"), 2.25, 4.0)
-    lidars = {name: lidar.model_copy(update=changes) for name, lidar in rig.lidars.items()}
-    recording = OusterRecording(
-        tmp_path / "drive.pcap", rig.model_copy(update={"lidars": lidars}), SourceOptions()
-    )
-    scans = [scan for scan in recording.samples() if isinstance(scan, Scan) and len(scan.points)]
-    assert len(scans) == n
-
-
 def test_what_is_missing_or_not_read_is_named(tmp_path: Path, rig: Rig) -> None:
     path = tmp_path / "drive.pcap"
     write_pcap(path, write_metadata(tmp_path / "drive.json", "LEGACY"), 0.1)

@@ -180,12 +180,6 @@ def test_arrivals_that_waited_do_not_shift_stamps() -> None:
     assert late_ns.min() > -1000 and late_ns[1:].max() < 300_000
 
 
-def test_a_board_that_fakes_gps_is_good_enough() -> None:
-    stream = stream_of()
-    push(stream, packets_of(room_scans(2), clock=Vlp16Clock(is_valid=False)))
-    assert stream.clock.is_utc
-
-
 def test_position_packets_that_lack_or_stop_end_the_trust(packets: list[SensorPacket]) -> None:
     stream = stream_of()
     assert len(push(stream, only_data(packets))) == 5

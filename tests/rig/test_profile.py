@@ -30,10 +30,6 @@ def refusal(*edits: tuple[str, str]) -> str:
     return str(caught.value)
 
 
-def line_of(text: str) -> int:
-    return RLFS[: RLFS.index(text)].count("\n") + 1
-
-
 def test_shipped_profiles_carry_the_published_numbers() -> None:
     rlfs, rles, sss = load_rig("rlfs"), load_rig("rles"), load_rig("sss")
     assert rlfs.cameras["cam"].to_intrinsics().fx_px == 897.4566
@@ -50,16 +46,6 @@ def test_nominal_pose_puts_the_lidars_forward_axis_before_the_camera() -> None:
     assert entry is not None
     np.testing.assert_allclose(entry.to_matrix()[:3, :3], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(entry.to_matrix()[:3, 3], [0.126, -0.065, -0.080])
-
-
-def test_the_first_channel_of_a_kind_is_found_or_there_is_none() -> None:
-    davis = load_rig("rles").cameras["davis"]
-    assert (davis.first_channel("frames"), davis.first_channel("events")) == ("frames", "events")
-    second = dict(davis.channels, cleaned=davis.channels["frames"])
-    assert davis.model_copy(update={"channels": second}).first_channel("frames") == "frames"
-    backwards = dict(reversed(second.items()))
-    assert davis.model_copy(update={"channels": backwards}).first_channel("frames") == "cleaned"
-    assert load_rig("rlfs").cameras["cam"].first_channel("events") is None
 
 
 @pytest.mark.parametrize(
@@ -159,14 +145,6 @@ def test_every_way_to_write_a_nominal_rotation_gives_the_same_pose(phi: tuple[fl
         entry = parse_rig(head + text + tail).nominal("cam", "lidar")
         assert entry is not None
         np.testing.assert_allclose(entry.to_matrix()[:3, :3], exp_so3(np.array(phi)), atol=1e-9)
-
-
-def test_roll_pitch_yaw_turn_about_fixed_axes() -> None:
-    text = RLFS.replace("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]", "rpy_deg: [90, 0, 90]")
-    entry = parse_rig(text).nominal("cam", "lidar")
-    assert entry is not None
-    # Rz(90) Rx(90): x turns to y; y turns to z, which Rz leaves.
-    np.testing.assert_allclose(entry.to_matrix()[:3, :2], [[0, 0], [1, 0], [0, 1]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -274,20 +252,6 @@ def test_a_reconstruction_that_cannot_be_meant_is_named_with_its_line(block: str
     with pytest.raises(ProfileError) as caught:
         parse_rig(text, "mine.yaml")
     assert f"mine.yaml:{line}: cameras.davis.channels.events.reconstruction.{key}: " in str(caught.value)
-
-
-def test_frames_are_not_reconstructed() -> None:
-    with pytest.raises(ProfileError) as caught:
-        parse_rig(with_block("{method: network}", "        kind: frames\n"))
-    assert "channels.frames.reconstruction:" in str(caught.value)
-
-
-def test_a_sync_board_needs_a_device_and_little_else() -> None:
-    rig = parse_rig(RLFS + SYNC)
-    assert rig.sync is not None and parse_rig(RLFS).sync is None
-    assert (rig.sync.type, rig.sync.device, rig.sync.port_baud) == ("lce1", "/dev/ttyACM0", 115200)
-    assert (rig.sync.triggers["cam"].phase_us, rig.sync.triggers["cam"].pulse_us) == (0, 100)
-    assert parse_rig(dump_rig(rig)) == rig
 
 
 @pytest.mark.parametrize(

@@ -98,13 +98,6 @@ def test_a_fifth_of_false_edges_does_not_move_the_line():
         assert abs(device.error_sigmas(model, model.anchor_ns)) < 4
 
 
-def test_exact_readings_are_known_no_better_than_their_resolution():
-    stamps = np.arange(10, dtype=np.int64) * S
-    model = fit_clock(TimePairs.from_edges(stamps, stamps + START_NS), "edges")
-    assert model.convert(int(stamps[3])) == START_NS + 3 * S
-    assert model.sigma_ns(model.anchor_ns) == pytest.approx(1000 / np.sqrt(12) / np.sqrt(10))
-
-
 def test_too_few_readings_make_no_model():
     pairs = edges(np.random.default_rng(0), Device(0.0), n=3)
     assert fit_clock(pairs, "edges") is None

@@ -139,15 +139,6 @@ def test_two_event_cameras_get_a_stretch_each(rig: Rig) -> None:
     ]
 
 
-def test_events_from_before_the_clocks_were_set_back_are_forgotten(rig: Rig) -> None:
-    before = [scan(9000), image(9050), *packets(stream(8000, 9500, 1000), [500])]
-    after = [*packets(stream(0, 2000, 1000), range(100, 1000, 100)), scan(1000), image(1050)]
-    ordered = [*sorted(before, key=lambda s: rig_time_ns(s, rig) or 0), image(0), *after, image(2000)]
-    frames = list(pair_by_time(ordered, rig, Losses()))
-    assert frames[-1].time_ns == T0_NS + 1050 * MS
-    assert frames[-1].events[0].events.t_ns[-1] < T0_NS + 2000 * MS
-
-
 def test_memory_holds_some_seconds_of_a_long_stream_also_while_the_lidar_is_silent(rig: Rig) -> None:
     def samples(n_packets: int) -> Iterator[Sample]:
         for k in range(n_packets):

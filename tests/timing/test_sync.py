@@ -9,7 +9,7 @@ from lce_rig.rig import load_rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import TimePairs, fit_clock
 from lce_rig.timing.rig_clock import CommonClock, judge_sync, pair_times
-from lce_rig.timing.scan_pairing import Frame, pair_by_time
+from lce_rig.timing.scan_pairing import pair_by_time
 
 MS, S = 1_000_000, 1_000_000_000
 UTC_NS = 1_753_000_000 * S
@@ -56,12 +56,6 @@ def test_pairs_are_found_on_the_common_clock_and_say_how_far_apart_they_are(rlfs
         assert abs(pair["difference_s"] - 0.007) < 4 * pair["sigma_s"] < 0.001
         assert pair["tolerance_s"] == 0.05
         assert "-49.6 ppm" in pair["clock"] and "PPS" in pair["clock"]
-
-
-def test_a_pair_without_clock_models_says_so(rlfs):
-    frame = Frame(UTC_NS, (image(UTC_NS + 2 * MS),), (scan(UTC_NS - 50 * MS),))
-    (pair,) = pair_times(frame, rlfs, CommonClock())
-    assert (pair["difference_s"], pair["sigma_s"], pair["tolerance_s"]) == (0.002, None, 0.05)
 
 
 def test_every_kind_of_sample_is_placed_and_untied_ones_left_as_they_are():

@@ -90,15 +90,6 @@ def test_events_before_the_first_stamp_are_left_out_and_counted() -> None:
         assert decoder.n_untimed == 2
 
 
-def test_words_of_no_known_code_are_counted_and_passed_over() -> None:
-    truth = listed(random_events(50, 3))
-    words = np.frombuffer(encoders.evt3(truth), "<u2")
-    decoder = WordDecoder(EVT3)
-    events = decoder.decode(np.concatenate((np.array([1 << 12, 11 << 12, 14 << 12], "<u2"), words)))
-    assert columns_listed(events) == truth
-    assert decoder.n_unknown == 2
-
-
 @pytest.mark.parametrize("is_ros1", [True, False])
 @pytest.mark.parametrize("encoding", ["evt3", "libcaer", "libcaer_cmp", "mono"])
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 60))

@@ -96,14 +96,6 @@ def test_events_of_another_camera_are_refused(tmp_path: Path, name: str) -> None
         list(open_events(tmp_path / name, sensor="davis", resolution=(240, 180)))
 
 
-def test_a_file_of_no_declared_resolution_takes_its_extent_and_says_so(tmp_path: Path) -> None:
-    write_dsec(tmp_path / "a.h5", EVENTS)
-    recording = open_events(tmp_path / "a.h5")
-    assert recording.resolution_px == (346, 260)
-    assert any("346x260, the extent" in note for note in recording.notes)
-    assert not open_events(tmp_path / "a.h5", resolution=(346, 260)).notes
-
-
 def test_dv_processing_reads_what_is_written(tmp_path: Path) -> None:
     dv = pytest.importorskip("dv_processing")
     write_aedat4(
@@ -137,13 +129,6 @@ def test_what_dv_processing_writes_is_read(tmp_path: Path) -> None:
         assert everything(open_events(path)) == listed(few)
 
 
-def test_a_writer_that_was_killed_leaves_a_readable_file(tmp_path: Path) -> None:
-    with Aedat4Writer(tmp_path / "a.aedat4", (346, 260)) as writer:
-        writer.write(EVENTS)
-        writer._file.flush()
-        assert everything(open_events(tmp_path / "a.aedat4")) == listed(EVENTS)
-
-
 def test_a_damaged_packet_costs_only_itself(tmp_path: Path) -> None:
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     data = bytearray((tmp_path / "a.aedat4").read_bytes())
@@ -154,15 +139,6 @@ def test_a_damaged_packet_costs_only_itself(tmp_path: Path) -> None:
     recording = open_events(tmp_path / "a.aedat4")
     assert everything(recording) == listed(EVENTS)[:8192] + listed(EVENTS)[16384:]
     assert has_note(recording.notes, "1 broken packets", "packet 1")
-
-
-def test_a_torn_word_of_a_raw_file_is_said(tmp_path: Path) -> None:
-    write_raw(tmp_path / "a.raw", EVENTS)
-    with (tmp_path / "a.raw").open("ab") as file:
-        file.write(b"\x01")
-    recording = open_events(tmp_path / "a.raw")
-    assert len(everything(recording)) == len(EVENTS)
-    assert has_note(recording.notes, "torn", "last word")
 
 
 @pytest.mark.parametrize(
@@ -192,15 +168,6 @@ def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path:
     recording = open_events(tmp_path / "a.txt", resolution=(346, 260))
     assert everything(recording) == listed(few)
     assert has_note(recording.notes, "3 broken lines", "line 41", "'1 2 3'")
-
-
-def test_hdf5_of_another_layout_is_refused(tmp_path: Path) -> None:
-    import h5py
-
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["davis/left/events"] = np.zeros((3, 4))
-    with pytest.raises(SourceError, match="events/t"):
-        open_events(tmp_path / "a.h5")
 
 
 def test_hdf5_compressed_by_a_plugin_is_read(tmp_path: Path) -> None:
