@@ -73,14 +73,16 @@ def _row(kind: Kind) -> str:
 def _figures(template: Template) -> list[str]:
     """Name the figures of a template; those of a function stand in its docstring, as {name}."""
     text = template if isinstance(template, str) else template.__doc__ or ""
-    return [name for _, name, _, _ in string.Formatter().parse(text) if name and name != "subject"]
+    names = [name for _, name, _, _ in string.Formatter().parse(text) if name]
+    return [name for name in names if name not in ("subject", "session")]
 
 
 def _shown(template: Template) -> str:
     """Show a template with the names of its figures in place of their values."""
     text = template if isinstance(template, str) else (template.__doc__ or "").splitlines()[0].rstrip(".")
     return "".join(
-        before + (f"*{name}*" if name else "") for before, name, _, _ in string.Formatter().parse(text)
+        before + ("SESSION" if name == "session" else f"*{name}*" if name else "")
+        for before, name, _, _ in string.Formatter().parse(text)
     )
 
 

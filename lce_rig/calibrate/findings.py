@@ -29,12 +29,12 @@ def _elsewhere(finding: Finding) -> str:
 FEW_CAPTURES = Kind(
     "shortage.few_captures",
     "{n_captures} captures show the board in both sensors (minimum {n_needed})",
-    "add captures: ten or more, with the board at different places and tilts",
+    "add captures with the board at other places and tilts",
     severity="warning",
 )
 FEW_AGREE = Kind(
     "shortage.few_agree",
-    "only {n_agreeing} of {n_captures} captures agree with one set of extrinsics (minimum {n_needed})",
+    "only {n_agreeing} of {n_captures} captures agree with one set of extrinsics",
     "check the board's size, the intrinsics and the pairing of images with scans; add captures",
     severity="warning",
 )

@@ -27,7 +27,7 @@ from lce_rig.core.calibration import (
 )
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.geometry import Array, sigma_sizes
-from lce_rig.core.phrasing import motion_words, of_session
+from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
 from lce_rig.export.reference import read_reference
 from lce_rig.judge.findings import consequences, weakest_words
@@ -390,7 +390,7 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
         follows = "follows: " if finding.code in following else ""
         lines.append(f"  [{colour}]{follows}{show.escape(finding.text)}[/]")
         if finding.advice and not follows and (is_explained or finding is causes[0]):
-            lines.append(f"    -> {show.escape(of_session(finding.advice, path))}")
+            lines.append(f"    -> {show.escape(finding.advice_at(path))}")
     if len(causes) > _N_REASONS and not is_explained:
         lines.append(f"  {show.counted(len(causes) - _N_REASONS, 'more reason')}: --explain, or report.html")
     if is_explained or not has_failed:

@@ -13,7 +13,6 @@ from lce_rig.cli import show
 from lce_rig.cli.options import event_image_option, explain_option, json_option, session_argument
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.phrasing import of_session
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.lidar.search import plane_limit_m
@@ -71,8 +70,7 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool, event
                 show.print_lines(_limits(opened.rig, detections, pair, refused))
             names, needed = detections.captures(pair), opened.rig.quality.min_captures
             show.print_lines(_head(pair, names, refused, needed))
-            causes = _causes(names, refused, plates[pair], is_whole=explain)
-            show.print_lines([of_session(line, str(session)) for line in causes])
+            show.print_lines(_causes(names, refused, plates[pair], str(session), is_whole=explain))
             show.print_lines(_repeated(placements[pair], is_whole=explain))
     n_usable = max(len(detections.captures(pair)) - len(refused) for pair, refused in refusals.items())
     if n_usable >= opened.rig.quality.min_captures:
@@ -190,7 +188,12 @@ def _head(pair: Pair, names: Sequence[str], refused: Mapping[str, Refusal], need
 
 
 def _causes(
-    names: Sequence[str], refused: Mapping[str, Refusal], plates: Sequence[Finding], *, is_whole: bool
+    names: Sequence[str],
+    refused: Mapping[str, Refusal],
+    plates: Sequence[Finding],
+    session: str,
+    *,
+    is_whole: bool,
 ) -> list[str]:
     """List refused captures, those with one cause and action together; a cause of the whole session first.
 
@@ -198,16 +201,17 @@ def _causes(
         names: of all captures.
         refused: by name.
         plates: what is wrong with the plate's size in all scans.
+        session: path, for the commands of actions.
         is_whole: whether to list every capture with its figures.
     """
     lines = []
     for finding in plates:
         colour = "red" if finding.severity == "error" else "yellow"
-        lines += show.cause_lines(finding.text, finding.advice, colour)
+        lines += show.cause_lines(finding.text, finding.advice_at(session), colour)
     groups: dict[tuple[str, str], list[str]] = {}
     for name in names:
         if name in refused:
-            groups.setdefault((refused[name].code, refused[name].advice), []).append(name)
+            groups.setdefault((refused[name].code, refused[name].advice_at(session)), []).append(name)
     for (_, advice), captures in sorted(groups.items(), key=lambda group: -len(group[1])):
         stage, texts = refused[captures[0]].stage, [refused[name].text for name in captures]
         if len(set(texts)) == 1:

@@ -8,7 +8,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.collect_live import run_live, show_next
-from lce_rig.cli.options import FiniteRange, require_sensors, rig_option, robot_option, session_argument
+from lce_rig.cli.options import FiniteRange, require_sensors, robot_option
 from lce_rig.cli.simulate import require_kind
 from lce_rig.collect import CollectOptions
 from lce_rig.collect.live.guide import predict
@@ -33,9 +33,17 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 
 
 @click.command()
-@rig_option
+@click.option(
+    "--rig",
+    "rig_name",
+    metavar="NAME|FILE",
+    help="Set the rig profile: a shipped name or a file [default: that of an existing SESSION].",
+)
 @robot_option
-@session_argument
+@click.argument("session", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), metavar="SESSION", help="Name the session, as SESSION."
+)
 @click.option(
     "--from",
     "paths",
@@ -92,9 +100,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 )
 @click.option(
     "--captures",
-    # Earlier names of this option.
-    "--frames",
-    "--max-captures",
+    "--frames",  # Its earlier name.
     "n_wanted",
     type=click.IntRange(1),
     metavar="N",
@@ -129,9 +135,10 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 @click.option("--simulated", is_flag=True, help="Live: collect from a simulated rig with a simulated person.")
 @click.option("--seed", type=click.IntRange(0), help="Set the seed of the simulated rig  [default: 0]")
 def collect(
-    rig_name: str,
+    rig_name: str | None,
     robot: str | None,
-    session: Path,
+    session: Path | None,
+    output: Path | None,
     paths: tuple[Path, ...],
     pair: Any,
     pair_tolerance: float | None,
@@ -156,7 +163,19 @@ def collect(
     recordings, such as --from lidar.bag --from events.aedat4, are joined: each adds a sensor to those before
     it. Run the command again to continue; existing captures are not repeated.
     """
-    rig = load_rig(rig_name).of_robot(robot)
+    if session is not None and output is not None:
+        raise UsageError(f"SESSION is named twice: {session} and {output}", "Omit one of them.")
+    session = session or output or Path("session")
+    if rig_name is not None:
+        rig = load_rig(rig_name)
+    elif (session / MARKER).exists():
+        rig = Session.open(session).rig
+    else:
+        raise UsageError(
+            f"{session} is a new session: its rig is missing",
+            "Add --rig NAME|FILE: one of `lce-rig rigs list`, or a file of `lce-rig rigs new NAME`.",
+        )
+    rig = rig.of_robot(robot)
     if not paths:
         _refuse_options(_OF_RECORDINGS, "applies to recordings only", "Add --from, or omit this option.")
 
@@ -191,9 +210,9 @@ def collect(
     show_next(session, rig, predict(Session.open(session)), n_captures)
 
 
-def _keep_text(session: Path, rig_name: str) -> None:
+def _keep_text(session: Path, rig_name: str | None) -> None:
     """Keep the profile's comments in the session, for the profiles that are made from it."""
-    if (session / MARKER).exists():
+    if rig_name is not None and (session / MARKER).exists():
         Session.open(session).keep_text(read_profile(find_profile(rig_name)))
 
 

@@ -8,7 +8,7 @@ import click
 from lce_rig.cli import show
 from lce_rig.cli.options import cameras_option, explain_option, require_sensors, session_argument, split_names
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
-from lce_rig.core.phrasing import as_line, of_session
+from lce_rig.core.phrasing import as_line
 from lce_rig.judge.intrinsics_check import describe as figures_of
 from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
 from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
@@ -79,7 +79,7 @@ def intrinsics(
     else:
         for one in measured:
             is_followed = save_profile is not None and one.judgement.code == "intrinsics.better"
-            advice = "" if is_followed else of_session(one.judgement.advice, str(session))
+            advice = "" if is_followed else one.judgement.advice_at(str(session))
             show.print_lines(_lines(one, advice, is_explained=explain))
             if explain:
                 show.print_table(_table(one))

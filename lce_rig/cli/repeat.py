@@ -71,7 +71,7 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as
         )
     else:
         for comparison in compared.comparisons:
-            show.print_lines(_lines(comparison))
+            show.print_lines(_lines(comparison, str(sessions[0])))
             if explain:
                 show.print_table(_deviations(comparison))
                 show.print_table(_differences(comparison))
@@ -107,7 +107,7 @@ def _differences(comparison: Repeatability) -> Any:
     return table
 
 
-def _lines(comparison: Repeatability) -> list[str]:
+def _lines(comparison: Repeatability, session: str) -> list[str]:
     """State whether the sessions agree, the mean extrinsics, and the spread with the reported one."""
     c = comparison
     scatter = ""
@@ -116,7 +116,8 @@ def _lines(comparison: Repeatability) -> list[str]:
     shared = "" if c.are_independent else ", at least: the results share captures"
     colour = "green" if c.agrees else "red"
     lines = [f"[bold]{_sensors(c)}[/]: [{colour}]{show.escape(as_line(c.finding.text))}[/]"]
-    lines += [f"  -> {show.escape(as_line(c.finding.advice))}"] if c.finding.advice else []
+    advice = c.finding.advice_at(session)
+    lines += [f"  -> {show.escape(as_line(advice))}"] if advice else []
     return [
         *lines,
         "  mean T_cam_lidar (p_cam = R p_lidar + t)",

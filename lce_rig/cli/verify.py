@@ -11,7 +11,6 @@ from lce_rig.cli.calibrate import exit_by_verdict, scene_texts
 from lce_rig.cli.options import event_image_option, explain_option, json_option, session_argument
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.findings import worst
-from lce_rig.core.phrasing import of_session
 from lce_rig.detect.detection import Pair
 from lce_rig.judge.findings import consequences
 from lce_rig.judge.session_check import SessionCheck
@@ -110,13 +109,13 @@ def _lines(checked: SessionCheck, session: str, *, is_explained: bool) -> list[s
     opinion = {"note": "agree with", "warning": "fit poorly", "error": "contradict"}[worst(doubts)]
     lines = [f"[bold]{checked.pair}[/]: [{colour}]the captures {opinion} the extrinsics[/]"]
     for finding in doubts:
-        lines += show.cause_lines(finding.text, of_session(finding.advice, session), colour)
+        lines += show.cause_lines(finding.text, finding.advice_at(session), colour)
     if c.verdict != "pass":
         lines[0] += f", [{show.COLOURS[c.verdict]}]whose verdict is {c.verdict.upper()}[/]"
         following = consequences(c.findings)
         causes = [each for each in c.findings if each.severity != "note" and each.code not in following]
         for cause in causes if is_explained else causes[:1]:
-            advice = of_session(cause.advice, session)
+            advice = cause.advice_at(session)
             lines += show.cause_lines(cause.text, advice, show.COLOURS[c.verdict])
     if checked.metrics is not None:
         m = checked.metrics

@@ -9,8 +9,9 @@ and called with its figures: `TOO_DARK("camera", grey_99=12.0)` is a `Finding`,
 """
 
 import math
+import shlex
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, cast
 
 from lce_rig.core.phrasing import fill
@@ -32,7 +33,8 @@ class Kind:
     Args:
         code: "family.name"; stable, listed in docs/findings.md.
         text: the fact, without an action: a template over subject and figures ({rms_m:mm}, {share:percent}),
-            or a function of the finding, whose docstring is then the template shown in the docs.
+            or a function of the finding, whose docstring is then the template shown in the docs. {session} is
+            the session's path where it is known, in commands.
         action: the action, in the imperative; "" for none.
         severity: the usual one.
         actions: alternative actions, by the name that `Finding.action` gives.
@@ -116,6 +118,14 @@ class Finding:
         kind = KINDS[self.code]
         return self._render(kind.actions[self.action] if self.action else kind.action)
 
+    def advice_at(self, session: str) -> str:
+        """Return the action in words, with the path of the session for which its commands are."""
+        placed = replace(self, figures={**self.figures, "session": shlex.quote(session)}, stored=None)
+        try:
+            return placed.advice
+        except (KeyError, TypeError, ValueError, AssertionError):
+            return self.advice  # from a file of another version, with other figures
+
     @property
     def sentence(self) -> str:
         """Fact and action in one line."""
@@ -137,7 +147,7 @@ class Finding:
     def _render(self, template: Template) -> str:
         if callable(template):
             return template(self)
-        return fill(template, {"subject": self.subject, **self.figures})
+        return fill(template, {"subject": self.subject, "session": "SESSION", **self.figures})
 
 
 @dataclass(frozen=True)

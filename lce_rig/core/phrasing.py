@@ -2,7 +2,6 @@
 
 import math
 import re
-import shlex
 import string
 from collections.abc import Mapping
 from typing import Any
@@ -111,14 +110,6 @@ def figures_apart(value: float, limit: float) -> tuple[str, str]:
         if texts[0] != texts[1]:
             break
     return texts[0], texts[1]
-
-
-def of_session(text: str, path: str) -> str:
-    """Put a session's path into the commands that a text advises: `lce-rig check SESSION`."""
-    return _COMMAND.sub(lambda command: re.sub(r"\bSESSION\b", lambda _: shlex.quote(path), command[0]), text)
-
-
-_COMMAND = re.compile(r"`lce-rig [^`]*`")
 
 
 def as_line(text: str) -> str:

@@ -44,7 +44,9 @@ WORKER_LOST = Kind(
 )
 
 DEPLOY_FAILED = Kind(
-    "deploy.failed", "the calibration of {subject} failed", "Collect again, see `lce-rig calibrate SESSION`."
+    "deploy.failed",
+    "the calibration of {subject} failed",
+    "Collect again, see `lce-rig calibrate {session}`.",
 )
 DEPLOY_OTHER_ROBOT = Kind(
     "deploy.other_robot",

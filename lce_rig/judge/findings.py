@@ -46,8 +46,8 @@ _APART = "{rotation_deg:deg}, {translation_m:mm}"
 _LENS = "check that the intrinsics belong to this lens and that the board is flat"
 _NEAR = {"near": "check the squares' size and the focal length, and that the board is flat"}
 _CORNERS_TOO = "collect captures with the board in all four corners of the image, tilted by 30 to 45 deg"
-_SAVE = "Write a profile with the session's intrinsics: `lce-rig intrinsics SESSION --save-profile FILE`"
-_LOOK = "`lce-rig drift SESSION -o FOLDER` draws the edges"
+_SAVE = "Write a profile with the session's intrinsics: `lce-rig intrinsics {session} --save-profile FILE`"
+_LOOK = "`lce-rig drift {session} -o FOLDER` draws the edges"
 _STILL = "hold the board still, check board size and intrinsics"
 _RANGES = (
     "measure the LiDAR's constant range errors, which alone exceed the target, correct them in its driver "
@@ -178,7 +178,7 @@ def _collect_first(finding: Finding) -> str:
     """Collect in all four corners, as {covered}, {image_sigma_px}, {limit_px} say; then run intrinsics."""
     return (
         f"check whether lens, focus or resolution were changed. {as_line(_reach(finding))} "
-        f"{as_line(_CORNERS_TOO)} Then run `lce-rig intrinsics SESSION --save-profile FILE`"
+        f"{as_line(_CORNERS_TOO)} {fill(_SAVE, {'session': 'SESSION', **finding.figures})}"
     )
 
 
@@ -351,7 +351,7 @@ SENSORS_DISAGREE = Kind(
 FEW_USED = Kind(
     "verdict.few_used",
     "{n_used} of {n_captures} captures could be used",
-    "run `lce-rig check SESSION` for the causes",
+    "run `lce-rig check {session}` for the causes",
     severity="warning",
 )
 FEW_PLACEMENTS = Kind(
@@ -381,7 +381,7 @@ INTRINSICS_BETTER = Kind(
     "intrinsics.better",
     "the session determines the intrinsics better than the profile: it covers {covered:percent} of the image "
     "and determines pixels near its border to {image_sigma_px:.2f} px (limit {limit_px:.2f} px)",
-    "write them into one: `lce-rig intrinsics SESSION --save-profile FILE`",
+    "write them into one: `lce-rig intrinsics {session} --save-profile FILE`",
     severity="note",
 )
 INTRINSICS_FIT = Kind(
@@ -514,7 +514,7 @@ RESULTS_DISAGREE = Kind(
     "results.disagree",
     "{first} and {second} of {camera} and {lidar} disagree: results differ by up to {rotation_deg:3deg} and "
     "{translation_m:1mm}, more than their uncertainties allow",
-    "compare the overlays of both (`lce-rig verify SESSION --name NAME`) and collect more captures",
+    "compare the overlays of both (`lce-rig verify {session} --name NAME`) and collect more captures",
 )
 REPEAT_AGREE = Kind("repeat.agree", _agree, severity="note")
 REPEAT_DISAGREE = Kind(

@@ -1,5 +1,6 @@
 """Compare the calibrations of one rig in several sessions."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -80,7 +81,8 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
     results = {name: list(_read(session, stored[name].folder).pairs) for name in chosen}
     comparisons, lonely = compare_sensors(results, are_independent=False)
     failures = _require_some(comparisons, results, "results")
-    outdated = [OUTDATED(name) for name in chosen if stored[name].is_outdated]
+    path = shlex.quote(str(session.path))
+    outdated = [OUTDATED(name, session=path) for name in chosen if stored[name].is_outdated]
     return Repeat(session.rig.name, comparisons, (), (*outdated, *lonely, *failures))
 
 

@@ -28,7 +28,7 @@ NO_AGREEMENT = Kind(
 OUTDATED = Kind(
     "results.outdated",
     "{subject}: the profile or the captures that it used have changed since",
-    "run `lce-rig calibrate SESSION` again with the same options",
+    "run `lce-rig calibrate {session}` again with the same options",
     severity="warning",
 )
 FAILED = Kind(

@@ -16,7 +16,7 @@ from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import crop_to_intrinsics
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
-from lce_rig.lens.calibrate_lens import MIN_CAPTURES, Choice, choose_model, estimate_intrinsics
+from lce_rig.lens.calibrate_lens import Choice, choose_model, estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of, lens_errors
 from lce_rig.lens.lens_coverage import find_weaknesses
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
@@ -128,7 +128,7 @@ def measure_intrinsics(
     start = _at_size_of_images(given, jobs, camera)
     seen_in_events = _seen_in_events(session, camera, chosen, {channel for _, channel in jobs})
     found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
-    if _n_captures(found) < MIN_CAPTURES:
+    if _n_captures(found) < rig.quality.min_captures:
         width, height, focal = start.width_px, start.height_px, _GUESSED_FOCAL * start.width_px
         start = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, start.model)
         found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
@@ -258,13 +258,13 @@ def _fit(
     Raises:
         NotEnoughDataError: too few captures show one; the most frequent causes are named.
     """
-    if _n_captures(found) < MIN_CAPTURES:
+    n_needed = rig.quality.min_captures
+    if _n_captures(found) < n_needed:
         causes = Counter(why.text for why in found.values() if isinstance(why, Refusal))
         hint = "\n".join(f"{count} x {cause}" for cause, count in causes.most_common(3))
         n, total = _n_captures(found), len({name for name, _ in found})
         raise NotEnoughDataError(
-            f"camera {camera}: the board is in {n} of {total} captures, intrinsics need {MIN_CAPTURES} at "
-            "least and 15 for a good result",
+            f"camera {camera}: the board is in {n} of {total} captures (minimum {n_needed})",
             hint or "collect captures with images of the board first",
         )
     views = [

@@ -14,6 +14,12 @@ DRIFTING_CLOCK = Kind(
     "{subject}: the sensor's own clock without sync drifts away from the others",
     severity="warning",
 )
+ODD_RATE = Kind(
+    "profile.odd_rate",
+    "{subject}: {rate_hz:g} revolutions per second; spinning LiDARs turn 5 to 20 times",
+    "enter the LiDAR's own rate, not that of the recorded scans",
+    severity="warning",
+)
 UNKNOWN_MODEL = Kind(
     "profile.unknown_model",
     "{subject}: the beams of {value} are not known: recordings can be calibrated, live guidance and "

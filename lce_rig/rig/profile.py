@@ -14,6 +14,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.findings import (
     DRIFTING_CLOCK,
+    ODD_RATE,
     OTHER_DRIVER,
     SHARED,
     SWAPPED_SIDES,
@@ -34,6 +35,7 @@ from lce_rig.rig.target_settings import OutputFormat, TargetSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 _MOST_SENSORS, _MOST_TARGETS = 64, 256
+_USUAL_RATE_HZ = 4.0, 40.0
 
 
 class Rig(Settings):
@@ -204,6 +206,8 @@ class Rig(Settings):
             if value is not None and first.setdefault((kind, value), key) != key:
                 yield SHARED(key, value=value, other=first[kind, value])
         for name, lidar in self.lidars.items():
+            if not _USUAL_RATE_HZ[0] <= lidar.rate_hz <= _USUAL_RATE_HZ[1]:
+                yield ODD_RATE(f"lidars.{name}.rate_hz", rate_hz=lidar.rate_hz)
             if lidar.data_sheet() is None:
                 yield UNKNOWN_MODEL(f"lidars.{name}.model", value=lidar.model)
             if lidar.driver.type == "vlp16" and velodyne.product_of(lidar.model) is None:

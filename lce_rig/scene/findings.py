@@ -3,7 +3,7 @@
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.phrasing import fill
 
-_BOARD = "collect a session with the board and run `lce-rig calibrate SESSION`"
+_BOARD = "collect a session with the board and calibrate it"
 _FASTEN = f"fasten the sensors, {_BOARD}"
 _RECORD = "record where upright edges of furniture, doors or people stand before something farther away"
 

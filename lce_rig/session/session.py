@@ -132,6 +132,8 @@ class Session:
     def resume(cls, path: Path | str, rig: Rig) -> "Session":
         """Continue the session of this rig in a folder, or start one there.
 
+        A session without captures takes the profile, whatever it differs in.
+
         Raises:
             SessionError: as `create` and `open`, or the session belongs to another rig.
         """
@@ -140,15 +142,17 @@ class Session:
             return cls.create(path, rig)
         session = cls.open(path, writable=True)
         differing = differing_keys(session.rig, rig)
-        if differing:
+        is_replaced = bool(differing) and not session.captures and not session.rejected
+        if differing and not is_replaced:
             session.close()
             hint = "Collect into another folder, or use the profile in the session (its rig.yaml)."
             raise _of_another_rig(session, rig, differing, hint)
         # What may differ: addresses of attached sensors, the robot, serial numbers.
-        adopted = keep_identity(session.rig, rig)
+        adopted = rig if is_replaced else keep_identity(session.rig, rig)
         if adopted != session.rig:
             try:
                 replace_file(path / PROFILE, dump_rig(adopted).encode())
+                replace_file(path / MARKER, marker_of(adopted))
             except OSError as error:
                 session.close()
                 raise _not_writable(path, error) from error

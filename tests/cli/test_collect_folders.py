@@ -70,6 +70,16 @@ def test_what_does_not_tell_whose_pictures_they_are_is_refused(lce_rig, folders,
     assert not (tmp_path / "session").exists()
 
 
-@pytest.mark.parametrize("name", ["--captures", "--frames", "--max-captures"])
+def test_a_session_is_named_by_output_too_and_continues_with_its_own_profile(lce_rig, folders, tmp_path):
+    session = tmp_path / "session"
+    first = ["--from", folders[0], "--camera", "left"]
+    assert lce_rig("collect", *first, "-o", session).code == 2, "a new session needs a rig"
+    assert lce_rig("collect", "--rig", TWO, *first, "-o", session).code == 0
+    assert lce_rig("collect", session, "--from", folders[1], "--camera", "right").code == 0
+    assert cameras_held(session) == [("left", 100), ("right", 101)]
+    assert lce_rig("collect", session, "-o", session, *first).code == 2
+
+
+@pytest.mark.parametrize("name", ["--captures", "--frames"])
 def test_earlier_names_of_the_number_of_captures_go_on(name):
     assert collect.make_context("collect", ["--rig", "rlfs", name, "4"]).params["n_wanted"] == 4

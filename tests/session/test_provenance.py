@@ -103,8 +103,9 @@ def test_a_session_without_times_has_no_date_but_tells_when_it_was_imported(
     assert (origin.date, origin.imported, origin.date_words) == (None, None, "")
 
 
-def test_a_robot_is_named_later_and_not_renamed(rig: Rig, tmp_path: Path) -> None:
-    Session.create(tmp_path / "a", rig).close()
+def test_a_robot_is_named_later_and_not_renamed(rig: Rig, tmp_path: Path, samples: Any) -> None:
+    with Session.create(tmp_path / "a", rig) as session:
+        session.add_capture(*samples(0), {})
     Session.resume(tmp_path / "a", rig.of_robot("kestrel")).close()
     Session.resume(tmp_path / "a", rig).close()
     assert Session.open(tmp_path / "a").rig.robot == "kestrel"

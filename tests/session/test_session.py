@@ -48,8 +48,9 @@ def test_a_session_is_continued_after_the_last_capture(tmp_path, rig, samples):
     assert [c.name for c in session.captures] == ["000000", "000001", "000002"]
 
 
-def test_a_session_of_another_rig_is_refused_with_the_keys_that_differ(tmp_path, rig):
-    Session.create(tmp_path / "s", rig).close()
+def test_a_session_of_another_rig_is_refused_with_the_keys_that_differ(tmp_path, rig, samples):
+    with Session.create(tmp_path / "s", rig) as session:
+        session.add_capture(*samples(0), {})
     text = dump_rig(rig).replace("square_m: 0.07", "square_m: 0.06")
     (tmp_path / "other.yaml").write_text(text)
     with pytest.raises(SessionError, match=r"board\.square_m"):
@@ -57,6 +58,12 @@ def test_a_session_of_another_rig_is_refused_with_the_keys_that_differ(tmp_path,
     with pytest.raises(SessionError):
         Session.resume(tmp_path / "s", load_rig("rles"))
     Session.resume(tmp_path / "s", rig).close()
+
+
+def test_a_session_without_captures_takes_another_profile(tmp_path, rig):
+    Session.create(tmp_path / "s", rig).close()
+    Session.resume(tmp_path / "s", load_rig("rles")).close()
+    assert Session.open(tmp_path / "s").rig == load_rig("rles")
 
 
 def test_a_session_goes_on_when_a_sensor_is_reached_otherwise(tmp_path, rig, samples):

@@ -301,8 +301,12 @@ class Precision:
 
 
 def few_captures_factor(n_captures: int) -> float:
-    """Compute by what a calibration multiplies the covariance of scatter because captures are few."""
-    return max((n_captures - 1) / max(n_captures - N_UNKNOWNS - 2, 2), 1.0)
+    """Compute by what a calibration multiplies the covariance of scatter because captures are few.
+
+    Fewer than `N_UNKNOWNS` + 4 captures hardly tell their own scatter: they count as badly as that many.
+    """
+    n = max(n_captures, N_UNKNOWNS + 4)
+    return (n - 1) / (n - N_UNKNOWNS - 2)
 
 
 def combine(held: Evidence, errors: ErrorModel) -> Precision:

@@ -85,8 +85,6 @@ def _places(view: SensorPlace, T_cam_board: Array) -> Array:
     return np.column_stack([pixels, np.log(np.linalg.norm(centre, axis=1))])
 
 
-#: Fewer captures hardly tell their own scatter (below 7 unknowns + 4 its correction has no meaning).
-FEWEST_FOR_ENOUGH = 11
 #: The target counts as met when the calibration is predicted to state this share of it.
 ENOUGH_SHARE = 0.9
 #: A placement that brings less than this share of what the best one would adds nothing.
@@ -185,7 +183,7 @@ class Planner:
         wanted = None if best is None else self.candidates[best]
         rotation, translation = sigmas(now.cov)
         stated_rotation, stated_translation = sigmas(now.claimed(len(held)))
-        n_least = max(FEWEST_FOR_ENOUGH, model.limits.min_captures)
+        n_least = model.limits.min_captures
         worse = max(stated_rotation / model.target_sigma_rad, stated_translation / model.target_sigma_m)
         return Guidance(
             n_captures=len(held),

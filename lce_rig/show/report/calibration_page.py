@@ -15,7 +15,7 @@ from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
-from lce_rig.core.phrasing import as_line, of_session, significant
+from lce_rig.core.phrasing import as_line, significant
 from lce_rig.detect.detection import Pair
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words, weakest_words
@@ -280,8 +280,8 @@ def _others(c: Calibration, severity: str = "warning") -> str:
 
 def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
     """List the next steps, the most urgent first: the findings' actions, then the checks before use."""
-    asked = [finding.advice for finding in sorted(c.findings, key=lambda f: f.severity != "error")]
-    steps = [as_line(of_session(text, folder)) for text in dict.fromkeys(asked) if text]
+    asked = [finding.advice_at(folder) for finding in sorted(c.findings, key=lambda f: f.severity != "error")]
+    steps = [as_line(text) for text in dict.fromkeys(asked) if text]
     if c.verdict == "fail":
         earlier = " The last usable result is in `previous/`." if has_previous else ""
         return [*steps, f"Then run `lce-rig calibrate {shlex.quote(folder)}` again.{earlier}"]

@@ -61,19 +61,19 @@ def test_it_says_why_it_goes_on_and_for_how_long_until_there_are_enough() -> Non
     modest = rig().calibration.model_copy(update={"target_sigma_deg": 5.0, "target_sigma_m": 0.5})
     (guide,) = make_guides(rig().model_copy(update={"calibration": modest}))
     assert guide.explain() is None and guide.predict() is None, "before the first capture nothing is known"
-    for k in range(11):
+    for k in range(6):
         guide.plan(None, float(k))
         why = guide.explain()
         if k >= 2:
             assert why is not None and why.code == "guide.continues"
-            assert (why.figures["n_more"], why.figures["n_least"]) == (11 - k, 11)
+            assert (why.figures["n_more"], why.figures["n_least"]) == (6 - k, 6)
         assert guide.wanted is not None
         guide.add(f"{k:06d}", guide.wanted)
-    guide.plan(None, 11.0)
+    guide.plan(None, 6.0)
     assert guide.explain() is None
     predicted = guide.predict()
     assert predicted is not None and predicted.figures["is_enough"] is True
-    assert predicted.figures["n_captures"] == 11
+    assert predicted.figures["n_captures"] == 6
 
 
 def test_what_more_captures_cannot_reach_is_said_without_their_number() -> None:
