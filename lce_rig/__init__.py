@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lce_rig.calibrate import CalibrateOptions
-    from lce_rig.collect import CollectOptions
+    from lce_rig.collect.offline import CollectOptions
     from lce_rig.core.calibration import Calibration, ResultFile, read_result
     from lce_rig.core.data import Events, Image, Scan
     from lce_rig.core.errors import (

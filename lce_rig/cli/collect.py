@@ -10,8 +10,8 @@ from lce_rig.cli import show
 from lce_rig.cli.collect_live import run_live, show_next
 from lce_rig.cli.options import FiniteRange, require_sensors, robot_option
 from lce_rig.cli.simulate import require_kind
-from lce_rig.collect import CollectOptions
 from lce_rig.collect.live.guide import predict
+from lce_rig.collect.offline import CollectOptions
 from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.io import open_recordings
 from lce_rig.io.folder.folder import FolderRecording

@@ -1,5 +1,1 @@
-"""From recordings to a session of captures, unattended."""
-
-from lce_rig.collect.offline import CollectOptions, CollectReport, collect
-
-__all__ = ["CollectOptions", "CollectReport", "collect"]
+"""From recordings and attached sensors to a session of captures."""

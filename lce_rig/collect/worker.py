@@ -47,6 +47,7 @@ class Worker:
         """
         self._name, self._made, self._nice = name, (make, arguments), nice
         self._process: BaseProcess | None = None
+        self._is_closed = False
         self._lock = threading.Lock()
 
     def __enter__(self) -> "Worker":
@@ -57,7 +58,8 @@ class Worker:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the process at once."""
+        """End the process at once; a call that waits raises SourceError."""
+        self._is_closed = True
         if self._process is not None:
             self._connection.close()
             self._process.terminate()
@@ -90,6 +92,8 @@ class Worker:
         return self._connection.recv()
 
     def _start(self) -> None:
+        if self._is_closed:
+            raise SourceError(f"the process `{self._name}` was ended")
         # A forked process would share locks of this one's threads.
         context = get_context("spawn")
         ours, theirs = context.Pipe()

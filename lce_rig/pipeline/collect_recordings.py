@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lce_rig.collect import CollectOptions, CollectReport, collect
+from lce_rig.collect.offline import CollectOptions, CollectReport, collect
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.losses import Losses
 from lce_rig.core.progress import Progress, silent

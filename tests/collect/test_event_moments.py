@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.collect import CollectReport, collect
+from lce_rig.collect.offline import CollectReport, collect
 from lce_rig.core.data import Events, Image, Sample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import rotation_angle

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from lce_rig.collect import CollectOptions, collect
+from lce_rig.collect.offline import CollectOptions, collect
 from lce_rig.io import open_recording
 from lce_rig.rig import dump_rig, parse_rig
 from lce_rig.session import Session

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.collect import CollectOptions, collect
+from lce_rig.collect.offline import CollectOptions, collect
 from lce_rig.core.errors import SourceError
 from lce_rig.core.files import encode_pcd
 from lce_rig.io import open_recording
@@ -110,7 +110,7 @@ def test_the_cap_is_kept_and_what_is_left_out_is_counted(tmp_path, folder, rig):
 
 COLLECTOR = """
 import sys
-from lce_rig.collect import collect
+from lce_rig.collect.offline import collect
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.io import open_recording

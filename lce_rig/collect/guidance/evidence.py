@@ -309,19 +309,23 @@ def few_captures_factor(n_captures: int) -> float:
     return (n - 1) / (n - N_UNKNOWNS - 2)
 
 
-def combine(held: Evidence, errors: ErrorModel) -> Precision:
-    """Predict (6, 6) from all placements together, equation (1) of `evidence`."""
-    return _precision(held.hessian.sum(axis=0), held.noise.sum(axis=0), held.drift.sum(axis=0), errors)
+def combine(held: Evidence, errors: ErrorModel, more: Evidence | None = None) -> Precision:
+    """Predict (6, 6) from all placements together, equation (1) of `evidence`.
 
-
-def combine_with_each(held: Evidence, more: Evidence, errors: ErrorModel) -> Precision:
-    """Predict (N, 6, 6) from the placements held and one more, each of N others in turn."""
-    return _precision(
-        held.hessian.sum(axis=0) + more.hessian,
-        held.noise.sum(axis=0) + more.noise,
-        held.drift.sum(axis=0) + more.drift,
-        errors,
-    )
+    Args:
+        held: the placements.
+        errors: of the sensors.
+        more: N further placements: each in turn beside those held gives (N, 6, 6).
+    """
+    hessian, noise, drift = held.hessian.sum(axis=0), held.noise.sum(axis=0), held.drift.sum(axis=0)
+    if more is not None:
+        hessian, noise, drift = hessian + more.hessian, noise + more.noise, drift + more.drift
+    prior = np.diag(np.repeat([_PRIOR_SIGMA_M, _PRIOR_SIGMA_RAD, errors.edge_shift_m], [3, 3, 1]) ** -2.0)
+    inverse = symmetric_inverse(hessian + prior)
+    # The prior's own error counts where captures leave a direction open.
+    scatter = inverse @ (noise + prior) @ inverse
+    lasers, offset = systematic_covariances(inverse @ drift, errors.laser_bias_m, errors.range_offset_m)
+    return Precision(scatter[..., :6, :6], lasers[..., :6, :6], offset[..., :6, :6])
 
 
 def sigmas(cov: Array) -> tuple[Array, Array]:
@@ -343,12 +347,3 @@ def shortfall(model: SensorModel, cov: Array) -> Array:
     """
     rotation, translation = sigmas(cov)
     return np.asarray(np.hypot(rotation / model.target_sigma_rad, translation / model.target_sigma_m))
-
-
-def _precision(hessian: Array, noise: Array, drift: Array, errors: ErrorModel) -> Precision:
-    prior = np.diag(np.repeat([_PRIOR_SIGMA_M, _PRIOR_SIGMA_RAD, errors.edge_shift_m], [3, 3, 1]) ** -2.0)
-    inverse = symmetric_inverse(hessian + prior)
-    # The prior's own error counts where captures leave a direction open.
-    scatter = inverse @ (noise + prior) @ inverse
-    lasers, offset = systematic_covariances(inverse @ drift, errors.laser_bias_m, errors.range_offset_m)
-    return Precision(scatter[..., :6, :6], lasers[..., :6, :6], offset[..., :6, :6])

@@ -11,7 +11,6 @@ from lce_rig.collect.guidance.evidence import (
     Evidence,
     Precision,
     combine,
-    combine_with_each,
     few_captures_factor,
     shortfall,
     sigmas,
@@ -170,7 +169,7 @@ class Planner:
         model = self.view.model
         evidence = self._weigh(held)
         now = combine(evidence, model.errors)
-        after = combine_with_each(evidence, self._evidence, model.errors)
+        after = combine(evidence, model.errors, self._evidence)
         cost = shortfall(model, after.improvable)
         if present is not None:
             # Add the way in m and the turn in rad.
@@ -239,7 +238,7 @@ class Planner:
         placements = np.stack([present, wanted])
         model, evidence = self.view.model, self._weigh(held)
         now = shortfall(model, combine(evidence, model.errors).improvable)
-        after = combine_with_each(evidence, self._weigh(placements), model.errors)
+        after = combine(evidence, model.errors, self._weigh(placements))
         gain, best = np.asarray(1 - shortfall(model, after.improvable) / now)
         if best < LEAST_GAIN or gain >= LEAST_SHARE * best:
             return None

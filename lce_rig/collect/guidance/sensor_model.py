@@ -102,35 +102,35 @@ class SensorModel:
     target_sigma_m: float
     errors: ErrorModel = field(default_factory=ErrorModel)
 
+    @classmethod
+    def of(cls, rig: Rig, camera: str, lidar: str) -> "SensorModel":
+        """Build the model of a pair of sensors from a profile.
 
-def model_sensors(rig: Rig, camera: str, lidar: str) -> SensorModel:
-    """Build the model of a pair of sensors from a profile.
-
-    Raises:
-        ProfileError: the beams of the LiDAR's model are not known.
-    """
-    settings = rig.lidars[lidar]
-    sheet = settings.data_sheet()
-    if sheet is None:
-        names = ", ".join(sheet.name for sheet in DATA_SHEETS)
-        raise ProfileError(
-            f"lidars.{lidar}.model: no guidance for {settings.model}, its beams are not known",
-            f"set elevations_deg, collect without guidance, or use one of {names}",
+        Raises:
+            ProfileError: the beams of the LiDAR's model are not known.
+        """
+        settings = rig.lidars[lidar]
+        sheet = settings.data_sheet()
+        if sheet is None:
+            names = ", ".join(sheet.name for sheet in DATA_SHEETS)
+            raise ProfileError(
+                f"lidars.{lidar}.model: no guidance for {settings.model}, its beams are not known",
+                f"set elevations_deg, collect without guidance, or use one of {names}",
+            )
+        return cls(
+            board=rig.board.to_board(),
+            lens=rig.cameras[camera].to_intrinsics(),
+            elevations_rad=sheet.rings_rad,
+            azimuth_step_rad=sheet.step_rad(settings.rate_hz),
+            limits=rig.quality,
+            target_sigma_rad=float(np.radians(rig.calibration.target_sigma_deg)),
+            target_sigma_m=rig.calibration.target_sigma_m,
+            errors=ErrorModel(
+                range_m=sheet.range_sigma_m,
+                laser_bias_m=settings.laser_bias_sigma_m,
+                range_offset_m=settings.range_offset_sigma_m,
+            ),
         )
-    return SensorModel(
-        board=rig.board.to_board(),
-        lens=rig.cameras[camera].to_intrinsics(),
-        elevations_rad=sheet.rings_rad,
-        azimuth_step_rad=sheet.step_rad(settings.rate_hz),
-        limits=rig.quality,
-        target_sigma_rad=float(np.radians(rig.calibration.target_sigma_deg)),
-        target_sigma_m=rig.calibration.target_sigma_m,
-        errors=ErrorModel(
-            range_m=sheet.range_sigma_m,
-            laser_bias_m=settings.laser_bias_sigma_m,
-            range_offset_m=settings.range_offset_sigma_m,
-        ),
-    )
 
 
 def outline_px(model: SensorModel, T_cam_board: Array) -> Array:
@@ -183,6 +183,21 @@ class SensorPlace:
     def upright(cls, model: SensorModel, T_cam_lidar: Array) -> "SensorPlace":
         """Take the LiDAR's z axis for the vertical, as spinning LiDARs stand upright."""
         return cls(model, T_cam_lidar, np.asarray(T_cam_lidar[:3, 2]))
+
+    @classmethod
+    def nominal(cls, rig: Rig, camera: str, lidar: str) -> "SensorPlace":
+        """Take the profile's nominal extrinsics.
+
+        Raises:
+            ProfileError: it has none, or the beams of the LiDAR's model are not known.
+        """
+        nominal = rig.nominal(camera, lidar)
+        if nominal is None:
+            raise ProfileError(
+                f"rig {rig.name!r} has no nominal extrinsics of {camera} and {lidar}",
+                "Add them under nominal_extrinsics.",
+            )
+        return cls.upright(SensorModel.of(rig, camera, lidar), nominal.to_matrix())
 
 
 def spread_candidates(view: SensorPlace, n_places: int) -> Array:

@@ -4,9 +4,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
 
 import numpy as np
 
@@ -37,82 +37,69 @@ class Learning:
         self._guides = guides
         self._min_captures = rig.quality.min_captures
         self._worker = Worker("calibrate captures", _Teacher, rig, nice=_NICE)
+        self._caller = ThreadPoolExecutor(1, "learn from captures")
+        self._lock = threading.Lock()
         self._candidates: dict[int, list[Observation]] = {k: [] for k in range(len(guides))}
         self._due: deque[int] = deque()
-        self._taught: deque[tuple[Guide, Planner | None]] = deque()
+        self._running: tuple[int, Future[Planner | None]] | None = None
         self._problem = ""
-        self._changed = threading.Condition()
-        self._is_closing = False
-        self._thread = threading.Thread(target=self._run, name="learn from captures", daemon=True)
+        self._is_open = True
 
     def __enter__(self) -> "Learning":
-        self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End, without waiting for a calibration."""
-        with self._changed:
-            self._is_closing = True
-            self._changed.notify()
+        self._is_open = False
         self._worker.__exit__(None, None, None)
-        self._thread.join()
+        self._caller.shutdown(cancel_futures=True)
 
     def show(self, name: str, detection: BoardDetection) -> None:
         """Take a capture's detection; returns at once."""
-        with self._changed:
+        with self._lock:
             for k, guide in enumerate(self._guides):
                 if guide.sees(detection):
                     image, scans = detection.images[guide.key], detection.lidars[guide.lidar]
                     self._candidates[k].append(Observation.of(name, image, scans))
                     if len(self._candidates[k]) >= self._min_captures and k not in self._due:
                         self._due.append(k)
-            self._changed.notify()
 
     def forget(self, name: str) -> None:
         """Forget a capture; returns at once, and the remaining ones are calibrated again."""
-        with self._changed:
+        with self._lock:
             for k, candidates in self._candidates.items():
                 left = [candidate for candidate in candidates if candidate.capture != name]
                 if len(left) < len(candidates):
                     self._candidates[k] = left
                     if k not in self._due:
                         self._due.append(k)
-            self._changed.notify()
 
     def teach(self) -> None:
-        """Pass the planners learned since the last call to their guides."""
-        with self._changed:
-            taught = list(self._taught)
-            self._taught.clear()
-        for guide, planner in taught:
-            guide.adopt(planner)
+        """Pass what was learned since the last call to its guide, and begin to learn what came since."""
+        with self._lock:
+            if self._running is not None and self._running[1].done():
+                k, learned = self._running
+                self._running, planner = None, None
+                try:
+                    planner = learned.result()
+                except Exception as error:  # Captures are safe even if a calibration fails.
+                    self._problem = f"guidance does not learn from captures: {error}" if self._is_open else ""
+                # Where captures came, or were taken back, meanwhile, it is due again.
+                if k not in self._due:
+                    self._guides[k].adopt(planner)
+            if self._running is None and self._due and self._is_open:
+                k = self._due.popleft()
+                candidates = list(self._candidates[k])
+                if len(candidates) >= self._min_captures:
+                    self._running = k, self._caller.submit(self._worker.call, "learn", k, candidates)
+                else:
+                    self._guides[k].adopt(None)
 
     def notes(self) -> list[str]:
         """Say what went wrong."""
         return [self._problem] if self._problem else []
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._due or self._is_closing)
-                if self._is_closing:
-                    return
-                k = self._due.popleft()
-                candidates = list(self._candidates[k])
-            planner: Planner | None = None
-            try:
-                if len(candidates) >= self._min_captures:
-                    planner = self._worker.call("learn", k, candidates)
-            except Exception as error:  # Captures are safe even if a calibration fails.
-                if self._is_closing:
-                    return
-                self._problem = f"guidance does not learn from captures: {error}"
-            with self._changed:
-                # Captures that came, or were taken back, meanwhile: it is due again.
-                if k not in self._due:
-                    self._taught.append((self._guides[k], planner))
 
 
 class _Teacher:
@@ -134,22 +121,6 @@ class _Teacher:
         )
 
 
-class Task(NamedTuple):
-    """One capture to be written.
-
-    Attributes:
-        moment: the board in its frame, whose images are stored.
-        events: stretches of events that are stored.
-        meta: the origin of the capture.
-        asked_s: time.monotonic() of the decision.
-    """
-
-    moment: CaptureMoment
-    events: Sequence[EventCut]
-    meta: Mapping[str, object]
-    asked_s: float
-
-
 class CaptureWriter:
     """Writes captures one after the other, and takes them back in the same order.
 
@@ -163,20 +134,44 @@ class CaptureWriter:
         self.session = session
         self.learning = learning
         self._done: deque[tuple[str, float | None]] = deque()
-        self._sink: Sink[Task | str] = disk.add(session.path, self._write, is_vital=True)
+        # Captures are stored and rejected in the order of the requests.
+        self._sink: Sink[Callable[[], None]] = disk.add(session.path, lambda step: step(), is_vital=True)
 
     @property
     def is_busy(self) -> bool:
         """Whether a capture is not on the disk, or not taken back, yet."""
         return self._sink.n_waiting > 0
 
-    def keep(self, task: Task) -> None:
-        """Have a capture written; returns at once."""
-        self._sink.put(task)
+    def keep(self, moment: CaptureMoment, events: Sequence[EventCut], meta: Mapping[str, object]) -> None:
+        """Have a capture written; returns at once.
+
+        Args:
+            moment: the board in its frame, whose images are stored.
+            events: stretches of events that are stored.
+            meta: the origin of the capture.
+        """
+        asked_s = time.monotonic()
+
+        def store() -> None:
+            detection, frame = moment.detection, moment.detection.frame
+            whole = {**meta, **moment.figures, **pose_figures(detection.poses)}
+            cuts = [cut.events for cut in events]
+            name = self.session.add_capture(frame.images, frame.scans, whole, cuts)
+            self._done.append((name, time.monotonic() - asked_s))
+            # The capture is safe: the rest delays nothing.
+            self.learning.show(name, detection)
+
+        self._sink.put(store)
 
     def take_back(self, name: str) -> None:
         """Reject a capture, which may still wait to be written; returns at once."""
-        self._sink.put(name)
+
+        def reject() -> None:
+            self.session.reject(name, "taken back while collecting")
+            self.learning.forget(name)
+            self._done.append((name, None))
+
+        self._sink.put(reject)
 
     def take(self) -> list[tuple[str, float | None]]:
         """Return the captures saved or taken back since the last call, by name.
@@ -191,21 +186,6 @@ class CaptureWriter:
         if failure is not None and not done:
             raise failure
         return done
-
-    def _write(self, task: Task | str) -> None:
-        """Store or reject, in the order of the requests: a capture is stored before it is taken back."""
-        if isinstance(task, str):
-            self.session.reject(task, "taken back while collecting")
-            self.learning.forget(task)
-            self._done.append((task, None))
-            return
-        detection, frame = task.moment.detection, task.moment.detection.frame
-        meta = {**task.meta, **task.moment.figures, **pose_figures(detection.poses)}
-        events = [cut.events for cut in task.events]
-        name = self.session.add_capture(frame.images, frame.scans, meta, events)
-        self._done.append((name, time.monotonic() - task.asked_s))
-        # The capture is safe: the rest delays nothing.
-        self.learning.show(name, detection)
 
 
 def record_streams(

@@ -7,8 +7,8 @@ captures (`CaptureWriter`); this loop alone decides and tells the views. Process
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from lce_rig.collect.live.capture_triggers import (
     narrate_refused,
     narrate_unseen,
 )
-from lce_rig.collect.live.capture_writer import CaptureWriter, Learning, Task, record_streams
+from lce_rig.collect.live.capture_writer import CaptureWriter, Learning, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, count_in, make_guides
 from lce_rig.collect.live.monitor import Monitor
@@ -40,6 +40,8 @@ from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock, pair_times
 
 _WAIT_S = 0.1
+# Threads that read sensors ask for the interpreter often and briefly, the loop holds it for long: at Python's
+# 5 ms guidance would be slower by a third.
 _TURN_S = 0.0005
 _NOVEL_M, _NOVEL_DEG = 0.15, 10.0
 # A board that has not moved, as far as its pose is known.
@@ -76,12 +78,14 @@ def collect_live(
     for capture in session.captures:
         count_in(capture, session, guides)
     # Leaving closes in turn: nothing new comes, then what was decided is written.
-    with DiskWriter() as disk:
+    with DiskWriter() as disk, ExitStack() as stack:
+        stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(_TURN_S)
         record, recorded = None, None
         if record_to is not None:
             record, recorded = record_streams(record_to, rig, sources, disk)
         search = BoardSearch(rig)
-        with _swift_turns(), search, Learning(rig, guides) as learning:
+        with search, Learning(rig, guides) as learning:
             keeper = CaptureWriter(session, learning, disk)
             clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
             with AttachedSensors(sources) as sensors, FrameFeed(rig, sensors, clock, board, record) as feed:
@@ -94,21 +98,6 @@ def collect_live(
         report.n_recorded, report.recording_error = recorded.n_written, recorded.failure
         report.notes += [finding.sentence for finding in recorded.findings()]
     return report
-
-
-@contextmanager
-def _swift_turns() -> Iterator[None]:
-    """Let threads wait for the interpreter half a millisecond at most.
-
-    Those that read sensors ask for it often and briefly, the loop holds it for long: guidance would be slower
-    by a third at Python's 5 ms.
-    """
-    before_s = sys.getswitchinterval()
-    sys.setswitchinterval(_TURN_S)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before_s)
 
 
 def _time_s(detection: BoardDetection) -> float:
@@ -261,7 +250,7 @@ class _Loop:
         statuses = self._sensors.statuses()
         serials = {name: status.serial for name, status in statuses.items() if status.serial}
         meta |= {SERIALS: serials} if serials else {}
-        self._keeper.keep(Task(moment, gate.events_of(moment), meta, time.monotonic()))
+        self._keeper.keep(moment, gate.events_of(moment), meta)
         name = f"{self._number:06d}"
         self._number += 1
         self._asked.append(_Asked(name, frame.time_ns, detection.poses))
@@ -276,23 +265,20 @@ class _Loop:
         """Captures in the session that are safe and were not taken back."""
         return self._n_before + len(self.report.captured)
 
-    def _take_back(self, asked: TakeBack) -> None:
-        """Take the last capture back, whether it is on the disk yet or not."""
-        last = self._asked[-1].name if self._asked else ""
-        if not last:
-            self._monitor.cue("refused", "nothing to take back: no capture in this run")
-        if not last or asked.name not in ("", last):
-            return  # A tap that came late, or twice, means no other capture.
-        taken = self._asked.pop()
-        self._keeper.take_back(last)
-        self.report.captured = [name for name in self.report.captured if name != last]
-        for guide in self._guides:
-            guide.remove(last)
-        self._find_gate().forget_capture(taken.time_ns)
-
     def _obey(self, key: Key | TakeBack | None) -> None:
         if isinstance(key, TakeBack):
-            self._take_back(key)
+            last = self._asked[-1].name if self._asked else ""
+            if not last:
+                self._monitor.cue("refused", "nothing to take back: no capture in this run")
+            if not last or key.name not in ("", last):
+                return  # A tap that came late, or twice, means no other capture.
+            # The capture may be on the disk yet or not.
+            taken = self._asked.pop()
+            self._keeper.take_back(last)
+            self.report.captured = [name for name in self.report.captured if name != last]
+            for planned in self._guides:
+                planned.remove(last)
+            self._find_gate().forget_capture(taken.time_ns)
             return
         guide = None if self._last is None else self._active_guide(self._last)
         if key == "next" and guide is not None:

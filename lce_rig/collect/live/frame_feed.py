@@ -127,23 +127,19 @@ class FrameFeed:
             if not isinstance(error, LceRigError):
                 raise
 
-    def _refresh_clock(self) -> None:
-        """Update the clock from the sensors and the sync board, and set the board's trigger rates."""
-        if time.monotonic() - self._refreshed_s < _REFRESH_S:
-            return
-        self._refreshed_s = time.monotonic()
-        states = {name: status.clock for name, status in self.sensors.statuses().items()}
-        locked = [name for name, state in states.items() if state is not None and state.is_utc]
-        board = self._board
-        host, utc = (None, None) if board is None else (board.host_clock, board.utc_clock)
-        self.clock.refresh(host, utc, locked)
-        if board is not None and self.clock.needs_slow_triggers != self._is_slow:
-            self._is_slow = not self._is_slow
-            board.start_triggers(SLOW_TRIGGERS_HZ if self._is_slow else None)
-
     def _samples(self) -> Iterator[Sample]:
+        """Yield samples on the rig's clock, which follows the sensors and the sync board."""
+        board = self._board
         while not self._stop.is_set():
-            self._refresh_clock()
+            if time.monotonic() - self._refreshed_s > _REFRESH_S:
+                self._refreshed_s = time.monotonic()
+                states = {name: status.clock for name, status in self.sensors.statuses().items()}
+                locked = [name for name, state in states.items() if state is not None and state.is_utc]
+                host, utc = (None, None) if board is None else (board.host_clock, board.utc_clock)
+                self.clock.refresh(host, utc, locked)
+                if board is not None and self.clock.needs_slow_triggers != self._is_slow:
+                    self._is_slow = not self._is_slow
+                    board.start_triggers(SLOW_TRIGGERS_HZ if self._is_slow else None)
             came = self.sensors.take(_WAIT_S)
             if came is None:
                 continue

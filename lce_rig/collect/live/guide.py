@@ -14,7 +14,7 @@ from lce_rig.collect.findings import (
 )
 from lce_rig.collect.guidance.instructions import Kind, instruct, is_there
 from lce_rig.collect.guidance.planner import ENOUGH_SHARE, Coverage, Guidance, Planner, measure_coverage
-from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace, model_sensors, outline_px
+from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace, outline_px
 from lce_rig.collect.placement_dedupe import capture_poses
 from lce_rig.core.errors import LceRigError, ProfileError
 from lce_rig.core.findings import Finding, Refusal
@@ -56,7 +56,7 @@ class Guide:
         self._planner: Planner | None = None
         self._model: SensorModel | None = None
         try:
-            self._model = model_sensors(rig, key[0], lidar)
+            self._model = SensorModel.of(rig, key[0], lidar)
         except ProfileError as error:
             self.problem = GUIDE_NO_BEAMS(lidar, cause=error.what)
             self._at_first: tuple[Planner | None, Finding | None] = None, self.problem

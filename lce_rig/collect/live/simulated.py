@@ -18,7 +18,7 @@ import numpy as np
 
 from lce_rig.collect.findings import CLOCK_SIMULATED
 from lce_rig.collect.guidance.instructions import HeldPose, build_pose, describe_pose, instruct
-from lce_rig.collect.guidance.sensor_model import SensorPlace, model_sensors
+from lce_rig.collect.guidance.sensor_model import SensorPlace
 from lce_rig.collect.live.state import LiveState
 from lce_rig.collect.worker import start_without_interrupts
 from lce_rig.core.data import Image, Scan
@@ -115,7 +115,8 @@ class SimulatedRig:
         self._simulated_s = 0.0
         self._by_sensor = {name: SimulatedSource(name) for name in [*framed, *rig.lidars]}
         self._counted = next(iter(rig.lidars))
-        self._views = {name: _view(rig, name, self._counted) for name in framed}
+        # People see the rig as its drawing has it: they do not know the true extrinsics.
+        self._views = {name: SensorPlace.nominal(rig, name, self._counted) for name in framed}
         self._sent_s = -1e9
         self._last: tuple[int, bytes] | None = None
         self._changed_s = 0.0
@@ -188,17 +189,6 @@ class SimulatedRig:
             self._by_sensor[sample.sensor].put(sample)
             if sample.sensor == self._counted:
                 self._simulated_s += self._period_s
-
-
-def _view(rig: Rig, camera: str, lidar: str) -> SensorPlace:
-    """Look through a camera as the drawing has it: people do not know the true extrinsics."""
-    nominal = rig.nominal(camera, lidar)
-    if nominal is None:
-        raise ProfileError(
-            f"rig {rig.name!r} has no nominal extrinsics of {camera} and {lidar}, which its simulation needs",
-            "Add them under nominal_extrinsics.",
-        )
-    return SensorPlace.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
 
 
 def _simulate(connection: Connection, rig: Rig, seed: int, views: Mapping[str, SensorPlace]) -> None:

@@ -14,7 +14,6 @@ from lce_rig.collect.guidance.sensor_model import (
     NEAREST_M,
     SensorPlace,
     is_reachable,
-    model_sensors,
     outline_px,
 )
 from lce_rig.core.geometry import perturb
@@ -33,8 +32,7 @@ def planner():
 @pytest.mark.parametrize(("profile", "camera"), [("rlfs", "cam"), ("rles", "davis")])
 def test_the_guide_names_the_distances_that_are_asked_for(profile, camera):
     rig = load_rig(profile)
-    nominal = rig.nominal(camera, "lidar" if "lidar" in rig.lidars else next(iter(rig.lidars)))
-    view = SensorPlace.upright(model_sensors(rig, camera, nominal.lidar), nominal.to_matrix())
+    view = SensorPlace.nominal(rig, camera, next(iter(rig.lidars)))
     distance_m = np.linalg.norm(Planner(view).candidates[:, :3, 3], axis=1)
     near_m, far_m = distance_m.min(), distance_m.max()
     limits = rig.quality

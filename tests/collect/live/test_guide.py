@@ -8,7 +8,7 @@ import pytest
 
 from lce_rig.collect.guidance.instructions import HeldPose, build_pose
 from lce_rig.collect.guidance.planner import MIN_MOVE_M, MIN_TURN_DEG
-from lce_rig.collect.guidance.sensor_model import SensorPlace, model_sensors
+from lce_rig.collect.guidance.sensor_model import SensorPlace
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.simulated import Person
 from lce_rig.core.geometry import Array, rotation_angle
@@ -196,7 +196,8 @@ def follow_guide(
         can_be_held: tells where nothing is in the way of T_cam_board (4, 4).
         patience_s: simulated time without a capture after which it ends.
     """
-    guide, view = make_guides(rig)[0], first_view(rig)
+    guide = make_guides(rig)[0]
+    view = SensorPlace.nominal(rig, guide.key[0], guide.lidar)
     person, rng, walk = person or Person(), np.random.default_rng(seed), Followed()
     present = build_pose(view, HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0))
     captured_s = 0.0
@@ -216,14 +217,6 @@ def follow_guide(
         walk.captured.append(present)
         captured_s = walk.simulated_s
     return walk
-
-
-def first_view(rig: Rig) -> SensorPlace:
-    """Look through a rig's first camera as its drawing has it."""
-    camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
-    nominal = rig.nominal(camera, lidar)
-    assert nominal is not None
-    return SensorPlace.upright(model_sensors(rig, camera, lidar), nominal.to_matrix())
 
 
 def _ask(guide: Guide, present: Array, walk: Followed) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.guidance.instructions import HeldPose, build_pose
-from lce_rig.collect.guidance.sensor_model import SensorPlace, model_sensors
+from lce_rig.collect.guidance.sensor_model import SensorPlace
 from lce_rig.collect.live.simulated import WALK_MPS, Person, Walker
 from lce_rig.core.geometry import Array, invert
 from lce_rig.simulate import SimulationOptions
@@ -19,9 +19,7 @@ def scene() -> LiveScene:
 
 @pytest.fixture
 def view() -> SensorPlace:
-    nominal = rig().nominal("davis", "lidar")
-    assert nominal is not None
-    return SensorPlace.upright(model_sensors(rig(), "davis", "lidar"), nominal.to_matrix())
+    return SensorPlace.nominal(rig(), "davis", "lidar")
 
 
 def walk(scene: LiveScene, view: SensorPlace, wanted: HeldPose) -> tuple[Array, float]:
