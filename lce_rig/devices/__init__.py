@@ -42,7 +42,7 @@ def source_of(rig: Rig, sensor: str) -> LiveSource:
     """Build the source of one sensor; it opens with its `with` block.
 
     Raises:
-        SourceError: its driver's type is unknown, or belongs to another kind of sensor.
+        SourceError: its driver's type belongs to another kind of sensor.
     """
     module, name = LIVE[driver_of(rig, sensor)].split(":")
     make: Any = getattr(import_module(module), name)
@@ -71,7 +71,7 @@ def driver_of(rig: Rig, sensor: str) -> str:
     if wanted in known:
         return str(wanted)
     if driver.type is not None:
-        what = f"{kind} {sensor!r}: driver.type {driver.type!r} is unknown, or not for a {kind}"
+        what = f"{kind} {sensor!r}: driver.type {driver.type!r} is not for a {kind}"
         raise SourceError(what, f"It can be {', '.join(known)}.")
     what = f"{kind} {sensor!r}: no driver goes with model {model!r}"
     raise SourceError(what, f"Set driver.type to one of {', '.join(known)} if it talks like one of these.")

@@ -2,14 +2,13 @@
 
 from typing import Annotated
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from lce_rig.core.board import Board
-from lce_rig.rig.settings import Figure, Positive, Settings, problem
+from lce_rig.rig.settings import Figure, Settings, problem
 
-_MAX_SQUARE_M = 1.0
-_MAX_PLATE_M = 5.0
-# Beyond this the figure is in millimetres.
+# Beyond these the figure is in millimetres.
+_Side = Annotated[float, Field(ge=0.005, le=5)]
 _Deviation = Annotated[float, Field(ge=0, le=0.2)]
 
 
@@ -29,24 +28,14 @@ class BoardSettings(Settings):
     """
 
     inner_corners: tuple[Annotated[int, Field(ge=2, le=100)], Annotated[int, Field(ge=2, le=100)]]
-    square_m: Positive
-    width_m: Positive
-    height_m: Positive
+    square_m: Annotated[float, Field(ge=0.001, le=1)]
+    width_m: _Side
+    height_m: _Side
     pattern_offset_m: tuple[Figure, Figure] = (0.0, 0.0)
     square_sigma_m: _Deviation | None = None
     pattern_offset_sigma_m: _Deviation = 0.003
     plate_sigma_m: _Deviation = 0.002
     bow_sigma_m: _Deviation = 0.001
-
-    @field_validator("square_m")
-    @classmethod
-    def _square_is_in_metres(cls, value: float) -> float:
-        return _require_metres(value, _MAX_SQUARE_M)
-
-    @field_validator("width_m", "height_m")
-    @classmethod
-    def _plate_is_in_metres(cls, value: float) -> float:
-        return _require_metres(value, _MAX_PLATE_M)
 
     @model_validator(mode="after")
     def _pattern_fits_on_plate(self) -> "BoardSettings":
@@ -60,13 +49,8 @@ class BoardSettings(Settings):
             f"the pattern of {cols + 1}x{rows + 1} squares of {1e3 * self.square_m:g} mm is "
             f"{width:.3g} x {height:.3g} m and does not fit on a plate {self.width_m:g} x {self.height_m:g} m"
         )
-        x, y = self.pattern_offset_m
-        if max(abs(x), abs(y)) > self.width_m + self.height_m:
-            raise problem(
-                f"{x:g}, {y:g} m is beside the plate; {x / 1e3:g}, {y / 1e3:g} if these are millimetres",
-                "pattern_offset_m",
-            )
         if offset_x or offset_y:
+            x, y = self.pattern_offset_m
             what += f" with its centre {x:g}, {y:g} m from the plate's"
         if width + offset_y <= self.height_m + 1e-3 and height + offset_x <= self.width_m + 1e-3:
             what += "; swap width_m and height_m, or inner_corners [cols, rows]"
@@ -78,15 +62,3 @@ class BoardSettings(Settings):
         """Build the board for the algorithms."""
         cols, rows = self.inner_corners
         return Board(cols, rows, self.square_m, self.width_m, self.height_m, self.pattern_offset_m)
-
-
-def _require_metres(value: float, limit: float) -> float:
-    if limit / 1000 <= value <= limit:
-        return value
-    if value < limit:
-        raise problem(f"{value:g} m is smaller than any board (minimum {limit / 1000:g} m)")
-    for unit, factor in (("centimetres", 1e-2), ("millimetres", 1e-3)):
-        # A square is never below 5 mm and a plate never below 5 cm, which distinguishes mm from cm.
-        if limit / 200 <= value * factor <= limit and (unit == "millimetres" or value < 10):
-            raise problem(f"{value:g} looks like {unit}: write {value * factor:.3f} (m)")
-    raise problem(f"{value:g} m is larger than any board (limit {limit:g} m)")

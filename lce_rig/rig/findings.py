@@ -28,18 +28,6 @@ UNKNOWN_MODEL = Kind(
     "`lce-rig rigs new NAME --lidar other --from RECORDING`",
     severity="warning",
 )
-OTHER_DRIVER = Kind(
-    "profile.other_driver",
-    "{subject}: {value} reads Velodynes, and the model is {model}",
-    "remove the driver block, or correct the model",
-    severity="warning",
-)
-UNKNOWN_DRIVER = Kind(
-    "profile.unknown_driver",
-    "{subject}: there is no driver {value}",
-    "choose one of: {known}",
-    severity="warning",
-)
 SHARED = Kind(
     "profile.shared",
     "{subject}: {value} equals {other}, but two sensors cannot share it",

@@ -20,8 +20,6 @@ from lce_rig.rig.settings import PATTERNS
 KeyPath = tuple[str | int, ...]
 BAD_SCALARS = (ValueError, ArithmeticError, LookupError, AttributeError, TypeError)
 """Errors of PyYAML for a scalar that contradicts its tag: `!!bool x`, `!!int ""`, `!!timestamp x`."""
-# A profile has a page or two. Parsing 100 kB of YAML takes a second.
-_MAX_BYTES = 1 << 18
 _SUFFIXES = (".yaml", ".yml")
 # The words of pydantic's messages, and those of ours.
 _REWORDED = (
@@ -87,11 +85,9 @@ def read_profile(path: Path) -> str:
     """Read the text of a profile's file.
 
     Raises:
-        ProfileError: it cannot be read, is not text, or is too large.
+        ProfileError: it cannot be read, or is not text.
     """
     with reading(path, ProfileError):
-        if path.stat().st_size > _MAX_BYTES:
-            raise ValueError("it is too large to be a rig profile")
         return path.read_text(encoding="utf-8")
 
 

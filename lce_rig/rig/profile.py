@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from lce_rig.core import velodyne
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import UsageError
@@ -15,16 +14,12 @@ from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.findings import (
     DRIFTING_CLOCK,
     ODD_RATE,
-    OTHER_DRIVER,
     SHARED,
     SWAPPED_SIDES,
-    UNKNOWN_DRIVER,
     UNKNOWN_MODEL,
 )
 from lce_rig.rig.poses import Mount, NominalExtrinsic
 from lce_rig.rig.sensors import (
-    CAMERA_DRIVERS,
-    LIDAR_DRIVERS,
     CameraSettings,
     ChannelSettings,
     LidarSettings,
@@ -210,17 +205,6 @@ class Rig(Settings):
                 yield ODD_RATE(f"lidars.{name}.rate_hz", rate_hz=lidar.rate_hz)
             if lidar.data_sheet() is None:
                 yield UNKNOWN_MODEL(f"lidars.{name}.model", value=lidar.model)
-            if lidar.driver.type == "vlp16" and velodyne.product_of(lidar.model) is None:
-                yield OTHER_DRIVER(f"lidars.{name}.driver.type", value="vlp16", model=lidar.model)
-        drivers: list[tuple[str, str | None, tuple[str, ...]]] = [
-            (f"lidars.{n}", lidar.driver.type, LIDAR_DRIVERS) for n, lidar in self.lidars.items()
-        ]
-        drivers += [
-            (f"cameras.{n}", camera.driver.type, CAMERA_DRIVERS) for n, camera in self.cameras.items()
-        ]
-        for key, value, names in drivers:
-            if value is not None and value not in names:
-                yield UNKNOWN_DRIVER(f"{key}.driver.type", value=value, known=", ".join(names))
 
     def nominal(self, camera: str, lidar: str) -> NominalExtrinsic | None:
         """Find the CAD pose of a pair of sensors; None if the profile has none."""

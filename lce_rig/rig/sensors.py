@@ -84,7 +84,7 @@ class DriverSettings(Settings):
         controls: settings passed to the driver unchanged.
     """
 
-    type: Name | None = None
+    type: Literal["vlp16", "v4l2", "command", "davis", "ros2"] | None = None
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
     address: Text | None = None
     device: Text | None = None

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 _NAME = r"^[a-z][a-z0-9_]*$"
@@ -28,15 +28,7 @@ TopicName = Annotated[str, Field(pattern=_TOPIC, max_length=256)]
 # All figures of a rig lie within; their squares and quotients stay far from overflow.
 _SMALLEST, _LARGEST = 1e-6, 1e6
 Text = Annotated[str, Field(max_length=1000)]
-
-
-def _not_tiny(value: float) -> float:
-    if value < _SMALLEST:
-        raise problem(f"{value:g} is too small (minimum {_SMALLEST:g})")
-    return value
-
-
-Positive = Annotated[float, Field(gt=0, le=_LARGEST), AfterValidator(_not_tiny)]
+Positive = Annotated[float, Field(ge=_SMALLEST, le=_LARGEST)]
 NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
 Figure = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
 Row = tuple[Figure, Figure, Figure]

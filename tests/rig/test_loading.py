@@ -98,7 +98,6 @@ def test_a_missing_file_or_a_folder_is_no_profile(name: str) -> None:
         (b"[" * 500, ""),
         (b"name: 2026-13-45\n", ""),
         (b"name: !!bool x\n", ""),
-        (b"a: 1\n" * 200_000, ""),
     ],
 )
 def test_what_is_no_profile_is_refused_with_its_place(tmp_path: Path, content: bytes, place: str) -> None:
