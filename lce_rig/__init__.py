@@ -91,7 +91,7 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
 
 _HOMES = {
     "lce_rig.calibrate": ("CalibrateOptions",),
-    "lce_rig.collect": ("CollectOptions",),
+    "lce_rig.collect.offline": ("CollectOptions",),
     "lce_rig.core.calibration": ("Calibration", "ResultFile", "read_result"),
     "lce_rig.core.data": ("Events", "Image", "Scan"),
     "lce_rig.core.errors": tuple(name for name in __all__ if name.endswith("Error")),
