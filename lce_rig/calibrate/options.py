@@ -82,6 +82,7 @@ class EstimateSettings(CalibrateOptions):
     Attributes:
         laser_bias_sigma_m: standard deviation a priori of the lasers' range offsets about their mean.
         range_offset_sigma_m: standard deviation a priori of that mean, the offset common to all ranges.
+        has_rings: whether the LiDAR scans in rings.
         known: constant errors of the LiDAR that were measured before; None if there are none.
         tolerances: of the profile's lens and board; None takes both as exact.
         lens: of the session, which `estimate_extrinsics` fits first where there are tolerances.
@@ -89,6 +90,7 @@ class EstimateSettings(CalibrateOptions):
 
     laser_bias_sigma_m: float = 0.0
     range_offset_sigma_m: float = 0.0
+    has_rings: bool = True
     known: KnownLidar | None = None
     tolerances: Tolerances | None = None
     lens: SessionLens | None = None
@@ -104,6 +106,7 @@ class EstimateSettings(CalibrateOptions):
             options.seed,
             laser_bias_sigma_m=lidar.laser_bias_sigma_m,
             range_offset_sigma_m=lidar.range_offset_sigma_m,
+            has_rings=lidar.has_rings,
             known=KnownLidar.of(lidar.intrinsics),
             tolerances=tolerances,
         )

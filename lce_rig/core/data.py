@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 MAX_TIME_NS = 1 << 62
 """No valid timestamp is so far from zero: year 2116 on clocks counted from 1970. Differences fit 64 bits."""
+NO_RING = -1
+"""Ring of every point of a LiDAR that scans in no rings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class Scan:
         stamp_ns: first firing, device time; None if the recording carries no time.
         points: (N, 3) float32 m, frame lidar (x forward, y left, z up); finite, no zero ranges.
         intensity: (N,) float32; zeros where the recording has none.
-        ring: (N,) int16, 0 = lowest elevation.
+        ring: (N,) int16, 0 = lowest elevation; `NO_RING` throughout without rings.
         offset_ns: (N,) int64 firing time after stamp_ns; None if the recording carries none.
         host_ns: arrival at the host; None if unknown.
     """

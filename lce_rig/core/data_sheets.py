@@ -1,4 +1,4 @@
-"""What makers publish of their spinning LiDARs: beams, timing, noise. The only place with such figures.
+"""What makers publish of their LiDARs: beams, timing, noise. The only place with such figures.
 
 The table is `data_sheets.json`, an object of `DataSheet`'s attributes for each model. The simulator, the
 guidance, a profile's defaults and `lce-rig rigs new` read it. Every entry names where its figures are
@@ -10,7 +10,7 @@ replaces them.
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,12 +19,12 @@ from lce_rig.core.geometry import Array
 
 @dataclass(frozen=True)
 class DataSheet:
-    """One model of a spinning LiDAR.
+    """One model of a LiDAR.
 
     Attributes:
         name: the maker's.
         source: where the figures are from.
-        elevations_deg: of each laser, in firing order.
+        elevations_deg: of each laser, in firing order; empty without rings.
         sequence_ns: time between two firings of one laser; None where the maker fixes `columns` instead.
         columns: firings of each laser per revolution, where they do not depend on the rate.
         firing_ns: time between two groups of lasers of one sequence.
@@ -44,6 +44,10 @@ class DataSheet:
         rim_m: by how much further than half of that width an edge still returns, at least; the VLP-16's is
             from recorded boards, whose returns reach 9 to 10 mm beyond a border.
         exit_m: size of the beam at its exit, horizontal and vertical, as the simulator spreads its energy.
+        pattern: how its beams sweep the field of view: in "rings", as a "rosette", as the "mid360" does, or
+            in any other way ("any").
+        fov_deg: width of the field of view, and its lowest and highest elevation.
+        points_hz: returns per second, of LiDARs without rings.
         aliases: other names.
         estimated: attributes that no maker publishes: typical values, or those of a like model.
     """
@@ -68,8 +72,16 @@ class DataSheet:
     divergence_rad: tuple[float, float] = (0.003, 0.003)
     rim_m: float = 0.0
     exit_m: tuple[float, float] = (0.010, 0.010)
+    pattern: Literal["rings", "rosette", "mid360", "any"] = "rings"
+    fov_deg: tuple[float, float, float] = (360.0, -90.0, 90.0)
+    points_hz: int = 0
     aliases: tuple[str, ...] = ()
     estimated: tuple[str, ...] = ()
+
+    @property
+    def has_rings(self) -> bool:
+        """Whether its beams sweep cones about its axis."""
+        return self.pattern == "rings"
 
     @property
     def n_rings(self) -> int:
@@ -121,7 +133,7 @@ def find_data_sheet(model: str) -> DataSheet | None:
 
 def _plain(name: str) -> str:
     word = "".join(c for c in name.lower() if c.isalnum())
-    for maker in ("velodyne", "ouster", "hesai", "robosense"):
+    for maker in ("velodyne", "ouster", "hesai", "robosense", "livox"):
         word = word.removeprefix(maker)
     return word
 

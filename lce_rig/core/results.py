@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lce_rig.core.data import NO_RING
 from lce_rig.core.geometry import Array
 
 
@@ -191,6 +192,11 @@ class LidarBoard:
     quality: LidarQuality
     offset_ns: NDArray[np.int64] | None = None
     stamp_ns: int | None = None
+
+    @property
+    def has_rings(self) -> bool:
+        """Whether the LiDAR scans in rings; else `points` are means, `edge_points` places on the outline."""
+        return len(self.ring) == 0 or int(self.ring[0]) != NO_RING
 
     def figures(self) -> dict[str, float]:
         """List every figure of the quality by name, for tables and programs."""

@@ -15,6 +15,7 @@ from lce_rig.detect.events.search import find_in_reconstruction
 from lce_rig.detect.image.search import find_image_board, region_around
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board, track_lidar_board
+from lce_rig.detect.lidar.unstructured import find_unstructured_boards, look_for_unstructured_board
 from lce_rig.detect.limits_met import gate_image_board, gate_lidar_boards
 from lce_rig.rig import Rig
 
@@ -131,7 +132,8 @@ class BoardFinder:
 
     def search_scan(self, scan: Scan) -> ScanSearch:
         """Find the surfaces of the board's size in a whole scan."""
-        return self._compared(find_lidar_boards(scan, self.board, self._limits(scan.sensor)), scan)
+        find = find_lidar_boards if self.rig.lidars[scan.sensor].has_rings else find_unstructured_boards
+        return self._compared(find(scan, self.board, self._limits(scan.sensor)), scan)
 
     def follow_scan(self, scan: Scan, last: Sequence[LidarBoard]) -> ScanSearch:
         """Find surfaces near where they were in the scan before; lost ones are omitted.
@@ -140,6 +142,8 @@ class BoardFinder:
             scan: the next one of the same LiDAR.
             last: `boards` of the search before, at least one.
         """
+        if not self.rig.lidars[scan.sensor].has_rings:
+            return self.search_scan(scan)
         limits = self._limits(scan.sensor)
         tracked = [track_lidar_board(scan, self.board, previous, limits) for previous in last]
         boards = [result for result in tracked if isinstance(result, LidarBoard)]
@@ -148,18 +152,21 @@ class BoardFinder:
 
     def look_for(self, scan: Scan, T_lidar_board: Array) -> LidarBoard | Refusal:
         """Find the board in a scan about a predicted pose (4, 4)."""
-        found = look_for_board(scan, self.board, T_lidar_board, self._limits(scan.sensor))
+        look = look_for_board if self.rig.lidars[scan.sensor].has_rings else look_for_unstructured_board
+        found = look(scan, self.board, T_lidar_board, self._limits(scan.sensor))
         usable = self._compared(found if isinstance(found, Refusal) else [found], scan).usable
         return usable if isinstance(usable, Refusal) else usable[0]
 
     def _limits(self, sensor: str) -> Limits:
         lidar, quality = self.rig.lidars[sensor], self.rig.quality
+        sheet = lidar.data_sheet()
+        upright_rad = None if sheet is None or sheet.has_rings else sheet.divergence_rad[1]
         return Limits(
             rms_m=quality.max_thickness_m,
             min_rings=quality.min_rings,
             min_range_m=lidar.min_range_m,
             max_range_m=min(lidar.max_range_m, quality.max_distance_m),
-            beam=Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad),
+            beam=Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad, upright_rad),
         )
 
     def _compared(self, found: list[LidarBoard] | Refusal, scan: Scan) -> ScanSearch:

@@ -217,6 +217,16 @@ LIDAR_OUTLINE = Kind(
     "{hidden_share:percent} of the board occluded",
     "show the whole board, with nothing in front of it or at its edges",
 )
+LIDAR_OUT_OF_VIEW = Kind(
+    "lidar.out_of_view",
+    "{share:percent} of the board at {distance_m:.1f} m returned nothing: it reaches out of the LiDAR's view",
+    "move the board towards the middle of the LiDAR's field of view, or accumulate scans for longer",
+)
+LIDAR_TURNED = Kind(
+    "lidar.turned",
+    "plate at {distance_m:.1f} m: beams meet it at over {max_turn_deg:.0f} deg",
+    "turn the board towards the LiDAR",
+)
 LIDAR_OTHER_PLATE = Kind(
     "lidar.other_plate",
     "the plate nearest to the board's size is {width_m:.2f} x {height_m:.2f} m, at {distance_m:.1f} m; "

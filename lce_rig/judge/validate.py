@@ -218,7 +218,7 @@ def validate(
             for name in each.minority(estimate.used)
         }
         agreeing = [observation for observation in observations if observation.capture not in apart]
-        if len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
+        if lidar.has_rings and len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
             laser_angles = estimate_angles(agreeing, board, estimate.T_cam_lidar, lidar)
     contradictions = list(find_contradictions(estimate, nuisances, contrasts, rig))
     cov_agreed = widened_by**2 * estimate.cov + profile_covariance(known)

@@ -130,7 +130,7 @@ class LidarIntrinsicsSettings(Settings):
 
 
 class LidarSettings(Settings):
-    """One spinning LiDAR; where the profile is silent, the figures are those of the model's data sheet.
+    """One LiDAR; where the profile is silent, the figures are those of the model's data sheet.
 
     Attributes:
         model: maker's name of the model, or "other".
@@ -187,6 +187,12 @@ class LidarSettings(Settings):
         if sheet is None and self.elevations_deg is None:
             return None
         return (sheet or TYPICAL).with_rings(self.elevations_deg, self.columns)
+
+    @property
+    def has_rings(self) -> bool:
+        """Whether its beams sweep cones about its axis, as those of LiDARs of unknown models do."""
+        sheet = self.data_sheet()
+        return sheet is None or sheet.has_rings or self.elevations_deg is not None
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "LidarSettings":

@@ -11,11 +11,13 @@ from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsi
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.files import decode_pcd
 from lce_rig.core.findings import Refusal
+from lce_rig.core.geometry import difference
 from lce_rig.core.results import Observation
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.search import find_lidar_boards
-from lce_rig.io.folder.cloud import rings_from_elevation
-from lce_rig.rig import Rig, load_rig
+from lce_rig.io.folder.cloud import rings_from_elevation, to_scan
+from lce_rig.rig import Rig, load_rig, parse_rig
 
 pytestmark = pytest.mark.dataset
 
@@ -77,3 +79,41 @@ def test_random_halves_of_a_recording_agree(recordings):
     angle_deg, distance_m = np.sqrt(np.mean(np.square(differences), axis=0))
     assert angle_deg <= 0.25
     assert distance_m <= 0.008
+
+
+AVIA = """
+format_version: 1
+name: avia
+board: {inner_corners: [12, 8], square_m: 0.080, width_m: 1.08, height_m: 0.76}
+lidars: {lidar: {model: Avia, max_range_m: 12}}
+cameras:
+  cam:
+    resolution_px: [1920, 1080]
+    intrinsics:
+      fx_px: 1368.68
+      fy_px: 1370.67
+      cx_px: 954.813
+      cy_px: 566.002
+      distortion: [0.0359136, 0.953307, 0.00153321, -0.00157993]
+"""
+
+
+@pytest.mark.long
+def test_a_lidar_without_rings_finds_the_board_and_halves_agree(recordings):
+    rig = parse_rig(AVIA)
+    finder, lidar, seen = BoardFinder(rig), rig.lidars["lidar"], []
+    for path in sorted((recordings / "livox_avia" / "img").glob("*.jpg")):
+        image = finder.image(Image("cam", "frames", None, cv2.imread(str(path))))
+        cloud = decode_pcd((recordings / "livox_avia" / "pcd" / f"{path.stem}.pcd").read_bytes())
+        places = finder.scan(to_scan(cloud, "lidar", lidar, path.stem).scan)
+        if not isinstance(image, Refusal) and not isinstance(places, Refusal):
+            seen.append(Observation.of(path.stem, image, places))
+    assert len(seen) >= 18
+    settings = EstimateSettings(method="ml", range_offset_sigma_m=0.01, has_rings=False)
+    first, second = (fit_extrinsic(seen[k::2], rig.board.to_board(), settings) for k in (0, 1))
+    angle_deg, distance_m = error_to_reference(first.T_cam_lidar, second.T_cam_lidar)
+    assert angle_deg < 0.3 and distance_m < 0.015
+    apart = difference(first.T_cam_lidar, second.T_cam_lidar)
+    assert (
+        apart @ np.linalg.solve(first.cov + second.cov, apart) < 16.8
+    )  # 99 % of chi squared with 6 freedoms

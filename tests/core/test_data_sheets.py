@@ -13,12 +13,15 @@ from lce_rig.core.data_sheets import DATA_SHEETS, VLP_16, DataSheet, find_data_s
 @pytest.mark.parametrize("sheet", DATA_SHEETS, ids=lambda sheet: sheet.name)
 def test_every_model_is_whole_and_names_its_source(sheet: DataSheet) -> None:
     assert sheet.source
+    assert set(sheet.estimated) <= set(DataSheet.__dataclass_fields__)
+    if not sheet.has_rings:
+        assert sheet.n_rings == 0 and sheet.points_hz > 0 and sheet.fov_deg[1] < sheet.fov_deg[2]
+        return
     assert len(np.unique(sheet.elevations_deg)) == sheet.n_rings >= 16
     assert -90 <= min(sheet.elevations_deg) < max(sheet.elevations_deg) <= 90
     assert len(sheet.azimuths_deg) in (0, sheet.n_rings) and len(sheet.heights_mm) in (0, sheet.n_rings)
     assert (sheet.sequence_ns is None) != (sheet.columns is None)
     assert np.radians(0.05) < sheet.step_rad(10.0) < np.radians(0.5)
-    assert set(sheet.estimated) <= set(DataSheet.__dataclass_fields__)
     # Whatever fires in one sequence does so before the next begins.
     if sheet.sequence_ns is not None:
         assert (sheet.n_rings - 1) // sheet.n_at_once * sheet.firing_ns < sheet.sequence_ns

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.lib.recfunctions import drop_fields, rename_fields
 
+from lce_rig.core.data import NO_RING
 from lce_rig.core.errors import SourceError
 from lce_rig.io.folder.cloud import to_scan
 from lce_rig.rig import LidarSettings, TimestampSettings
@@ -145,10 +146,12 @@ def rosette(n: int = 20_000) -> np.ndarray:
     return cloud
 
 
-def test_lines_that_are_no_rings_are_refused_with_cause_and_advice():
+def test_lines_that_are_no_rings_are_read_where_the_model_has_none_and_else_refused():
     with pytest.raises(SourceError) as caught:
         to_scan(rosette(), "lidar", FIRST, "livox")
     assert "Livox" in caught.value.hint
+    scan = to_scan(rosette(), "lidar", FIRST.model_copy(update={"model": "Livox Mid-360"}), "livox").scan
+    assert len(scan.points) == len(rosette()) and set(scan.ring) == {NO_RING}
 
 
 def test_rings_in_a_tilted_frame_stay_rings(room):

@@ -137,6 +137,9 @@ def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     """Read the priors of constant errors and noise from the options."""
     offset_m = max(options.range_offset_sigma_m, _EXACT_M)
     priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
+    if not options.has_rings:
+        # No axis, so no lens beside it; beams are wider than those in rings, and more so one way.
+        priors = replace(priors, lateral_m=_EXACT_M, vertical_m=_EXACT_M, growth=0.002, plate_m=0.006)
     if options.tolerances is not None:
         # The effects of focal length and squares on the result contain what the scale does not absorb.
         focal_sigma = (

@@ -67,6 +67,8 @@ from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
 
+# Typical noise of a cell's mean without rings.
+_MEAN_M = 0.008
 # Half a beam's width, and what the outline found in the scan may be off by.
 _BORDER_M = 0.02
 # A ring end on an edge parallel to its ring has hardly a step, and determines the edge less accurately.
@@ -84,6 +86,8 @@ class StackedScans:
         rays: (N, 3) unit vectors, frame lidar.
         range_m: (N,).
         fields: (N, 3, 4) displacement by (4) and (5), per unit of lens (2) and bow (2).
+        weight: (F,) inverse of each capture's noise of a return, relative to others; 1 with rings. Without, a
+            "return" is the mean over a cell of the plate, whose noise was measured.
         end_capture, end_ring: (M,) of each ring end, ordered by capture.
         end_rays: (M, 3) unit vectors towards it.
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
@@ -98,6 +102,7 @@ class StackedScans:
     rays: Array
     range_m: Array
     fields: Array
+    weight: Array
     end_capture: Indices
     end_ring: Indices
     end_rays: Array
@@ -152,6 +157,7 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
         rays=points / range_m[:, None],
         range_m=range_m,
         fields=_fields(points, T_lidar_board[capture], board),
+        weight=np.array([1.0 if lidar.has_rings else _MEAN_M / lidar.sigma_m for lidar in boards]),
         end_capture=end_capture[sorted_ends],
         end_ring=end_ring[sorted_ends],
         end_rays=end_rays,
@@ -206,17 +212,14 @@ class RangeSums:
     """Sums of v v^T by capture and ring, at given board poses.
 
     Attributes:
-        sums: (F, L, 11, 11).
+        sums: (F, L, 11, 11), weighted by capture.
+        n_returns: (F, L) how many.
         by_pose: (F, 3, 6) derivative of the plane's three freedoms by the tangent of T_lidar_board.
     """
 
     sums: Array
+    n_returns: Array
     by_pose: Array
-
-    @property
-    def n_returns(self) -> Array:
-        """Number (F, L) of returns."""
-        return np.asarray(self.sums[..., RETURN["range"].start, RETURN["range"].start])
 
 
 def sum_ranges(scans: StackedScans, state: State) -> RangeSums:
@@ -238,13 +241,16 @@ def sum_ranges(scans: StackedScans, state: State) -> RangeSums:
     by_laser, by_fields = v[:, RETURN.span("range", "elevation")], v[:, RETURN.span("lens", "bow")]
     of_laser = np.einsum("ni,ni->n", by_laser, state.lasers.T[scans.ring])
     v[:, -1] = r + of_laser + by_fields @ state.fields - scans.range_m
+    v *= scans.weight[k, None]
     sums = np.zeros((scans.n_captures * len(scans.rings), RETURN.size, RETURN.size))
     bounds = np.flatnonzero(np.diff(scans.group, prepend=-1, append=-1))
     # A product of matrices for each ring: several times faster than sums of products of columns.
     sums[scans.group[bounds[:-1]]] = [v[a:b].T @ v[a:b] for a, b in pairwise(bounds.tolist())]
     K = freedoms_of_plane()
     by_pose = np.concatenate([K[:, :3] @ np.swapaxes(R, 1, 2), K[:, 3:] @ np.swapaxes(R, 1, 2)], axis=2)
-    return RangeSums(sums.reshape(scans.n_captures, len(scans.rings), RETURN.size, RETURN.size), by_pose)
+    n_returns = np.bincount(scans.group, minlength=len(sums)).astype(np.float64)
+    by_ring = scans.n_captures, len(scans.rings)
+    return RangeSums(sums.reshape(*by_ring, RETURN.size, RETURN.size), n_returns.reshape(by_ring), by_pose)
 
 
 def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tuple[Array, Array]:
@@ -254,12 +260,14 @@ def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tupl
 
         (I - k 1 1^T) / sigma^2,    k = sigma_ring^2 / (sigma^2 + n sigma_ring^2)
 
+    With weights w_i, sigma^2 I is diag(sigma^2 / w_i^2), and n the sum of their squares.
+
     Returns:
         The weighted sums (F, L, 11, 11) and the log (F,) of the covariance's determinant.
     """
     n = ranges.n_returns
-    total = sigma_m**2 + n * sigma_ring_m**2
     shared = ranges.sums[..., RETURN["range"].start, :]
+    total = sigma_m**2 + shared[..., RETURN["range"].start] * sigma_ring_m**2
     k = (sigma_ring_m**2 / total)[..., None, None]
     weighted = (ranges.sums - k * shared[..., :, None] * shared[..., None, :]) / sigma_m**2
     log_volume = np.where(n > 0, (n - 1) * np.log(sigma_m**2) + np.log(total), 0.0)
@@ -325,7 +333,7 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     anchors, normals = (of_edges[:, :2] for of_edges in board.edges())
     steps_m = (xy_next - xy) @ normals.T
     distances_m = np.sum(anchors * normals, axis=1) - xy @ normals.T + state.shifts[0] - steps_m / 2
-    edge = np.argmin(np.where(steps_m > 0, np.abs(distances_m), np.inf), axis=1)
+    edge = np.argmin(np.where(steps_m >= 0, np.abs(distances_m), np.inf), axis=1)
     outwards = normals[edge]
     inside_m = distance_inside(board, xy, edge)
     step_m = np.maximum(np.abs(np.sum((xy_next - xy) * outwards, axis=1)), _SHORTEST_STEP_M)

@@ -178,14 +178,21 @@ class Beam:
     Attributes:
         aperture_m: width of the beam where it leaves the sensor.
         divergence_rad: full angle by which it widens.
+        upright_rad: the same upwards; None for as much as sideways.
     """
 
     aperture_m: float = VLP_16.aperture_m
     divergence_rad: float = VLP_16.divergence_rad[0]
+    upright_rad: float | None = None
 
     def half_width_m(self, distance_m: Distance) -> Distance:
         """Compute half the width of the spot at a distance, or at each of several."""
         return (self.aperture_m + self.divergence_rad * distance_m) / 2
+
+    def widths_m(self, distance_m: float) -> Array:
+        """Compute the spot's width and height (2,) at a distance."""
+        upright_rad = self.divergence_rad if self.upright_rad is None else self.upright_rad
+        return self.aperture_m + np.array([self.divergence_rad, upright_rad]) * distance_m
 
 
 def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: int = 3) -> Array:

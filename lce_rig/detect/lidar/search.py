@@ -198,7 +198,7 @@ def find_lidar_boards(
             if measured.quality.n_rings >= CLEAR_RINGS and measured.quality.beyond_share < CLEAR_SHARE:
                 max_beyond = PATCH_SHARE
     if boards:
-        return _distinct(boards, board)
+        return distinct_boards(boards, board)
     return misses[0] if misses else no_plate(ordered, board, limits)
 
 
@@ -277,7 +277,7 @@ def _past_dark_squares(
     return refined if lost_share(scan, *refined) > LOST_SHARE else None
 
 
-def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
+def distinct_boards(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
     """Rank the candidates and drop those that overlap a better one."""
     distinct: list[LidarBoard] = []
     for candidate in sorted(found, key=lambda c: _penalty(c, board)):
@@ -291,7 +291,7 @@ def _distinct(found: list[LidarBoard], board: Board) -> list[LidarBoard]:
 def _penalty(found: LidarBoard, board: Board) -> float:
     """Rate a candidate in m: residual of outline and size, unobserved parts, other returns in its plane."""
     q = found.quality
-    penalty = q.template_m + 0.03 / q.n_rings + 0.15 * (q.width_sigma_m + q.height_sigma_m)
+    penalty = q.template_m + 0.03 / max(q.n_rings, 1) + 0.15 * (q.width_sigma_m + q.height_sigma_m)
     penalty += 0.05 * q.beyond_share
     for measured_m, sigma_m, wanted_m in (
         (q.width_m, q.width_sigma_m, board.width_m),

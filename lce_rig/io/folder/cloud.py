@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Scan
+from lce_rig.core.data import NO_RING, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import Array
 from lce_rig.rig import LidarSettings
@@ -28,8 +28,8 @@ _MOST_RINGS = 1024
 # A spinning laser stays within this, even seen from a frame that is tilted by 10 deg; a rosette does not.
 _MOST_THICKNESS_DEG, _N_DIRECTIONS = 1.0, 36
 _NO_RINGS_HINT = (
-    "Only spinning LiDARs can be calibrated: Livox and others that scan in no rings cannot. Of a spinning "
-    "one, give the point cloud with its ring field, in the LiDAR's own frame."
+    "Of a LiDAR that scans in no rings (Livox, solid state), name the model in the profile, or `model: "
+    "unstructured`. Of a spinning one, give the point cloud with its ring field, in the LiDAR's own frame."
 )
 NS_PER_UNIT = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
@@ -208,9 +208,12 @@ def to_scan(
     notes: list[str] = []
     if n_dropped:
         points, cloud = points[is_kept], cloud[is_kept]
-    ring = _ring(cloud, fields, points, where, notes)
+    if settings.has_rings:
+        ring = _ring(cloud, fields, points, where, notes)
+    else:
+        ring = np.full(len(points), NO_RING, dtype=np.int16)
     sheet, n_rings = settings.data_sheet(), len(np.unique(ring))
-    if sheet is not None and n_rings > sheet.n_rings:
+    if sheet is not None and sheet.has_rings and n_rings > sheet.n_rings:
         notes.append(f"{n_rings} rings, a {sheet.name} has {sheet.n_rings}: check lidars.{lidar}.model")
     offset_ns, stamp_ns = _times(cloud, fields, settings, stamp_ns, notes)
     name = _find(fields, INTENSITY_FIELDS)

@@ -1,0 +1,235 @@
+"""Fit a rectangle to rays about a plate, by the likelihood of returns on the plate and beside it.
+
+A ray that meets the plate's plane at u returns from the plate with the probability
+
+    P(u) = eps + (1 - 2 eps) prod_e Phi(-s_e(u) / w_e)                                                    (1)
+
+with s_e the distance beyond side e and w_e the blur across it: half the beam's width there and the noise of
+directions. Rays that return from behind, or from nowhere, passed beside the plate; those that return from
+before it say nothing. The unknowns are the rectangle's place, turn, and the growth of its width and height,
+as beams wider than a point return from a plate that they only touch.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.geometry import Array
+from lce_rig.detect.lidar.template import Placement
+
+N_ANGLES = 9
+_OUTLIERS = 0.02
+# Rays farther from the border say nothing of its place.
+_BAND_M = 0.10
+# Blurs of the first rounds, which catch a start that is off; wider ones for a plate that is only about there.
+_ANNEALED_M, _WIDE_M = (0.04, 0.02), (0.2, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.04)
+_FEW_RAYS, _MOST_RAYS = 800, 15_000
+_ROUNDS = 12
+STRIP_M = 0.07
+"""Length of border whose place is measured on its own."""
+_CORNER_M = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays that pierce a plate's plane, M of them.
+
+    Attributes:
+        uv: (M, 2) where they do, m.
+        is_on: (M,) whether they return from the plane; else they passed beside the plate.
+    """
+
+    uv: Array
+    is_on: NDArray[np.bool_]
+
+    def select(self, keep: NDArray[np.bool_]) -> "Rays":
+        """Keep the rays of a mask (M,)."""
+        return Rays(self.uv[keep], self.is_on[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A rectangle fitted to rays.
+
+    Attributes:
+        placement: with the nominal size; `error_m` is the mean of -ln P over the rays near the border.
+        growth_m: (2,) by how much half its width and half its height exceed the nominal ones.
+        cov: (5, 5) of u, v, angle and growth.
+    """
+
+    placement: Placement
+    growth_m: Array
+    cov: Array
+
+
+def fit_outline(
+    rays: Rays,
+    start: Placement,
+    blur_m: Callable[[Array], Array],
+    growth_m: tuple[Array, float],
+    annealed_m: tuple[float, ...] = _ANNEALED_M,
+) -> Outline | None:
+    """Maximise (1) over place, turn and growth by Fisher scoring.
+
+    Args:
+        rays: about the plate.
+        start: a few centimetres and degrees off at most.
+        blur_m: w for unit normals (..., 2) of the plane view.
+        growth_m: prior mean (2,) and standard deviation of the growth.
+        annealed_m: least blurs of the first rounds.
+
+    Returns:
+        The optimum, None if no ray is near the border.
+    """
+    rays = rays.select(np.abs(start.distance_m(rays.uv)) < _BAND_M + 3 * max(annealed_m))
+    rays = rays.select(np.arange(len(rays.uv)) % (1 + len(rays.uv) // _MOST_RAYS) == 0)
+    expected = np.array([0.0, 0.0, 0.0, *growth_m[0]])
+    x = expected + [start.u_m, start.v_m, start.angle_rad, 0.0, 0.0]
+    half = np.array(start.half_m)
+    prior = np.diag([0.0, 0.0, 0.0, 1.0, 1.0]) / growth_m[1] ** 2
+    information, cost = prior, np.inf
+    for k in range(_ROUNDS):
+        least = annealed_m[k] if k < len(annealed_m) else 0.0
+        placement = Placement(x[0], x[1], x[2], (half[0] + x[3], half[1] + x[4]))
+        near = np.abs(placement.distance_m(rays.uv)) < max(_BAND_M, 3 * least)
+        if np.count_nonzero(near & rays.is_on) < 10:
+            return None
+        local = placement.local(rays.uv[near])
+        cosine, sine = np.cos(x[2]), np.sin(x[2])
+        blur = np.maximum(blur_m(np.array([[cosine, sine], [-sine, cosine]])), least)
+        p, slopes = _probability(local, half + x[3:], blur)
+        is_on = rays.is_on[near]
+        # By u, v, angle and growth; the shift is counted along the rectangle's axes.
+        by_x, by_y = slopes[:, 0] - slopes[:, 1], slopes[:, 2] - slopes[:, 3]
+        turned = by_x * local[:, 1] - by_y * local[:, 0]
+        J = np.column_stack(
+            [-by_x, -by_y, turned, -(slopes[:, 0] + slopes[:, 1]), -(slopes[:, 2] + slopes[:, 3])]
+        )
+        score = J.T @ np.where(is_on, 1 / p, -1 / (1 - p)) - prior @ (x - expected)
+        information = J.T @ (J / (p * (1 - p))[:, None]) + prior
+        step = np.linalg.solve(information + 1e-3 * np.eye(5), score)
+        step *= min(1.0, 0.05 / max(float(np.abs(step[:2]).max()), 1e-9))
+        x = x + [cosine * step[0] - sine * step[1], sine * step[0] + cosine * step[1], *step[2:]]
+        cost = float(np.mean(-np.log(np.where(is_on, p, 1 - p))))
+        if k > len(annealed_m) and np.abs(step).max() < 1e-4:
+            break
+    placement = Placement(float(x[0]), float(x[1]), float(x[2]), start.half_m, cost)
+    return Outline(placement, x[3:], np.asarray(np.linalg.inv(information), dtype=np.float64))
+
+
+def register_rays(rays: Rays, half_m: tuple[float, float], n_best: int = 2) -> list[Placement]:
+    """Fit the rectangle from all angles about the origin and keep the placements that fit best, best first.
+
+    `error_m` is the share of rays that contradict a placement, per return on the plate.
+
+    Args:
+        rays: about a plate whose middle is near the origin.
+        half_m: half width and half height.
+        n_best: how many to return.
+    """
+    radius_m = 1.25 * float(np.hypot(*half_m))
+    about = rays.select((rays.uv**2).sum(axis=1) < radius_m**2)
+    few = about.select(np.arange(len(about.uv)) % (1 + len(about.uv) // _FEW_RAYS) == 0)
+    placements = []
+    for angle in np.arange(N_ANGLES) * np.pi / N_ANGLES:
+        start = Placement(0.0, 0.0, float(angle), half_m)
+        fit = fit_outline(
+            few, start, lambda normals: np.full(len(normals), 0.03), (np.zeros(2), 1e-3), _WIDE_M
+        )
+        if fit is not None:
+            distance = fit.placement.distance_m(about.uv)
+            on = about.is_on & (distance < 0.15)
+            misses = np.count_nonzero(on & (distance > 0.02)) + np.count_nonzero(
+                ~about.is_on & (distance < -0.02)
+            )
+            share = float(misses / max(np.count_nonzero(on & (distance <= 0.02)), 1))
+            placements.append(replace(fit.placement, error_m=share))
+    return sorted(placements, key=lambda placement: placement.error_m)[:n_best]
+
+
+def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:
+    """Compute (1) for points (M, 2) in the rectangle's axes, and its derivative (M, 4) by each distance s_e.
+
+    Sides are right, left, top and bottom.
+    """
+    from scipy.special import ndtr
+
+    beyond = np.column_stack([local[:, 0], -local[:, 0], local[:, 1], -local[:, 1]]) - half[[0, 0, 1, 1]]
+    z = -beyond / blur[[0, 0, 1, 1]]
+    factors = ndtr(z)
+    inside = factors.prod(axis=1)
+    density = np.exp(-0.5 * z**2) / (np.sqrt(2 * np.pi) * blur[[0, 0, 1, 1]])
+    slopes = -(1 - 2 * _OUTLIERS) * inside[:, None] * density / np.maximum(factors, 1e-12)
+    return _OUTLIERS + (1 - 2 * _OUTLIERS) * inside, slopes
+
+
+@dataclass(frozen=True, eq=False)
+class Strips:
+    """Short pieces of the border, each measured on its own: K of them.
+
+    Attributes:
+        uv: (K, 2) their middles where the plate's returns end, m.
+        outwards: (K, 2) unit normals.
+        off_m: (K,) by how much farther out they lie than the fitted outline.
+        sigma_m: (K,) standard deviations.
+    """
+
+    uv: Array
+    outwards: Array
+    off_m: Array
+    sigma_m: Array
+
+
+def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> Strips:
+    """Measure where each piece of the border lies, by (1) with its own shift outwards.
+
+    Args:
+        rays: about the plate.
+        outline: fitted to them.
+        blur_m: as of `fit_outline`.
+    """
+    from scipy.special import ndtr
+
+    placement = outline.placement
+    half = np.array(placement.half_m) + outline.growth_m
+    local = placement.local(rays.uv)
+    cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
+    axes = np.array([[cosine, sine], [-sine, cosine]])
+    parts = []
+    for axis in (0, 1):
+        length = 2 * (half[1 - axis] - _CORNER_M)
+        n_strips = max(int(length / STRIP_M), 1)
+        width = length / n_strips
+        along = (local[:, 1 - axis] + length / 2) / width
+        blur = float(blur_m(axes[axis][None])[0])
+        for sign in (1.0, -1.0):
+            beyond = sign * local[:, axis] - half[axis]
+            use = (np.abs(beyond) < _BAND_M) & (along >= 0) & (along < n_strips)
+            strip, s, is_on = along[use].astype(np.intp), beyond[use], rays.is_on[use]
+            off = np.zeros(n_strips)
+            for _ in range(_ROUNDS):
+                z = (off[strip] - s) / blur
+                p = _OUTLIERS + (1 - 2 * _OUTLIERS) * ndtr(z)
+                slope = (1 - 2 * _OUTLIERS) * np.exp(-0.5 * z**2) / (np.sqrt(2 * np.pi) * blur)
+                information = np.bincount(strip, slope**2 / (p * (1 - p)), n_strips) + _BAND_M**-2
+                score = np.bincount(strip, slope * np.where(is_on, 1 / p, -1 / (1 - p)), n_strips)
+                step = (score - off * _BAND_M**-2) / information
+                off = np.clip(off + np.clip(step, -blur, blur), -_BAND_M, _BAND_M)
+            n_on = np.bincount(strip[is_on], minlength=n_strips)
+            n_beside = np.bincount(strip[~is_on], minlength=n_strips)
+            is_seen = (n_on >= 4) & (n_beside >= 4)
+            middle = (np.arange(n_strips) + 0.5) * width - length / 2
+            at = np.empty((n_strips, 2))
+            at[:, axis], at[:, 1 - axis] = sign * (half[axis] + off), middle
+            parts.append(
+                (
+                    (at @ axes + [placement.u_m, placement.v_m])[is_seen],
+                    np.tile(sign * axes[axis], (n_strips, 1))[is_seen],
+                    off[is_seen],
+                    information[is_seen] ** -0.5,
+                )
+            )
+    uv, outwards, off_m, sigma_m = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Strips(uv, outwards, off_m, sigma_m)

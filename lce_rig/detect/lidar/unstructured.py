@@ -1,0 +1,500 @@
+"""Find the board in a point cloud without rings: planes grown from neighbouring cells, and the outline."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.data import NO_RING, Scan
+from lce_rig.core.findings import Refusal
+from lce_rig.core.geometry import Array, pose
+from lce_rig.core.results import LidarBoard, LidarQuality
+from lce_rig.detect.findings import (
+    LIDAR_NO_PLATE,
+    LIDAR_NO_RETURNS,
+    LIDAR_NOT_WHERE_EXPECTED,
+    LIDAR_NOTHING_WHERE_EXPECTED,
+    LIDAR_OTHER_PLATE,
+    LIDAR_OUT_OF_VIEW,
+    LIDAR_OUTLINE,
+    LIDAR_TOO_FEW_POINTS,
+    LIDAR_TOUCHING,
+    LIDAR_TURNED,
+)
+from lce_rig.detect.lidar.measurement import fit_plane_to_ranges, median
+from lce_rig.detect.lidar.outline import (
+    STRIP_M,
+    Outline,
+    Rays,
+    Strips,
+    fit_outline,
+    measure_strips,
+    register_rays,
+)
+from lce_rig.detect.lidar.search import (
+    LOOK_TURN,
+    MARGIN_M,
+    MAX_SIZE_MISFIT,
+    STANDARD,
+    TOUCHING_SHARE,
+    Limits,
+    distinct_boards,
+    too_thick,
+)
+from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD
+from lce_rig.detect.lidar.template import Placement, plane_axes
+
+# Cells per short side of the board: of 7 cm for a plate of 0.76 m.
+_CELLS = 11.0
+# Accumulated point clouds hold millions of points: enough of them find the plates, all near one measure it.
+_MOST_SEARCHED, _MOST_MEASURED = 200_000, 40_000
+_MOST_PATCHES = 8
+_MIN_CELL_POINTS = 6
+_SAME_NORMAL = np.cos(np.radians(15.0))
+_NOISE_M = 0.012  # of a plane's returns, at most before the noise of the cloud itself is measured
+_SURROUND_M = 0.25
+_MIN_POINTS = 60
+# Directions of a rosette's beams err by about this much.
+_DIRECTION_RAD = 7e-4
+_HIDDEN_SHARE = 0.10
+# Share of the plate without any return from which it reaches out of the field of view.
+_DARK_SHARE = 0.08
+_BEHIND_M, _HIDES_M = 0.05, 0.08
+# Ranges of black and white squares, and of glare, differ by centimetres where beams meet them squarely.
+_LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
+# Share of rays that contradict the best placement, and growth of the outline: beyond, it is another plate.
+_MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
+# Cells of the plate for means of returns; their noise is never taken as less than this.
+_COARSE_M, _FINE_M, _LEAST_MEAN_M = 0.25, 0.10, 0.002
+_TOUCHED_SHARE = 0.2
+_STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Flat pieces of surface grown from neighbouring cells, K of them.
+
+    Attributes:
+        plane: (K, 4) as (n, d), n towards the LiDAR.
+        centre: (K, 3) m.
+        size_m: (K, 2) long and short side of the rectangle with the same second moments.
+    """
+
+    plane: Array
+    centre: Array
+    size_m: Array
+
+
+def find_unstructured_boards(
+    scan: Scan, board: Board, limits: Limits = STANDARD
+) -> list[LidarBoard] | Refusal:
+    """Find the plates of the board's size in a point cloud without rings, best first.
+
+    Args:
+        scan: one scan, or several of a still board together.
+        board: the outer size is what is looked for.
+        limits: without noise.
+    """
+    points = np.asarray(scan.points, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        range_m = np.linalg.norm(points, axis=1)
+        index = np.flatnonzero((range_m >= limits.min_range_m) & (range_m <= 2.5 * limits.max_range_m + 5))
+    if len(index) == 0:
+        return LIDAR_NO_RETURNS.refusal(n_points=len(points), min_range_m=limits.min_range_m)
+    searched = index[range_m[index] <= limits.max_range_m]
+    searched = searched[:: 1 + len(searched) // _MOST_SEARCHED]
+    patches = grow_patches(points[searched], min(board.width_m, board.height_m) / _CELLS)
+    board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
+    ratio = patches.size_m / board_m
+    misfit = np.abs(np.log(np.maximum(ratio, 1e-3))).sum(axis=1)
+    can_be = np.flatnonzero((ratio > [0.5, 0.35]).all(axis=1) & (ratio < [2.2, 1.9]).all(axis=1))
+    found: list[LidarBoard] = []
+    misses: list[tuple[float, Refusal]] = []
+    for k in can_be[np.argsort(misfit[can_be])][:_MOST_PATCHES]:
+        measured = measure_unstructured(points[index], board, patches.plane[k], patches.centre[k], limits)
+        if isinstance(measured, LidarBoard):
+            found.append(measured)
+        else:
+            misses.append((float(misfit[k]), measured))
+    if found:
+        return distinct_boards(found, board)
+    if misses:
+        return min(misses, key=lambda miss: miss[0])[1]
+    if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
+        best = int(np.argmin(misfit))
+        return _other_plate(patches.size_m[best], float(np.linalg.norm(patches.centre[best])), board)
+    wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
+    return LIDAR_NO_PLATE.refusal(**wanted, min_range_m=limits.min_range_m, max_range_m=limits.max_range_m)
+
+
+def _other_plate(size_m: Array, distance_m: float, board: Board) -> Refusal:
+    wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
+    width_m, height_m = size_m.tolist()
+    return LIDAR_OTHER_PLATE.refusal(width_m=width_m, height_m=height_m, distance_m=distance_m, **wanted)
+
+
+def look_for_unstructured_board(
+    scan: Scan, board: Board, T_lidar_board: Array, limits: Limits = STANDARD
+) -> LidarBoard | Refusal:
+    """Find the board about a predicted pose (4, 4), such as an image and extrinsics give."""
+    centre, normal = T_lidar_board[:3, 3], T_lidar_board[:3, 2]
+    away = np.linalg.norm(scan.points - centre.astype(np.float32), axis=1)
+    reach_m = np.hypot(board.width_m, board.height_m) / 2 + MARGIN_M
+    on = scan.points[away < reach_m]
+    on = on[np.abs((on - centre) @ normal) < MARGIN_M]
+    patches = grow_patches(on.astype(np.float64), min(board.width_m, board.height_m) / _CELLS)
+    points = np.asarray(scan.points, dtype=np.float64)
+    cause: Refusal | None = None
+    for k in range(min(len(patches.centre), 3)):
+        if abs(patches.plane[k, :3] @ normal) > LOOK_TURN:
+            measured = measure_unstructured(points, board, patches.plane[k], centre, limits)
+            if isinstance(measured, Refusal):
+                cause = cause or measured
+            elif np.linalg.norm(measured.T_lidar_board[:3, 3] - centre) < MARGIN_M:
+                return measured
+    if cause is not None:
+        return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
+    return LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=float(np.linalg.norm(centre)))
+
+
+def grow_patches(points: Array, cell_m: float) -> Patches:
+    """Join neighbouring cells of points (N, 3) that lie in one plane, the largest patch first.
+
+    Each cell's plane is that of its points and those of the cells about it.
+    """
+    from scipy.sparse import coo_array, eye_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    none = Patches(np.zeros((0, 4)), np.zeros((0, 3)), np.zeros((0, 2)))
+    if len(points) < _MIN_POINTS:
+        return none
+    sums = _sum_cells(points, cell_m)
+    centres = sums[:, 1:4] / sums[:, :1]
+    pairs = cKDTree(centres).query_pairs(1.8 * cell_m, output_type="ndarray")
+    n_cells = len(centres)
+    near = coo_array((np.ones(len(pairs)), pairs.T), shape=(n_cells, n_cells)).tocsr()
+    around = np.asarray((near + near.T + eye_array(n_cells)) @ sums, dtype=np.float64)
+    plane, eigenvalues = _planes(around)
+    thickness_m = np.sqrt(eigenvalues[:, 0])
+    flat = (around[:, 0] >= _MIN_CELL_POINTS) & (eigenvalues[:, 1] > (0.35 * cell_m) ** 2)
+    if not flat.any():
+        return none
+    flat &= thickness_m < 2.0 * _NOISE_M
+    i, j = pairs.T
+    apart = centres[j] - centres[i]
+    off = np.maximum(
+        np.abs(np.einsum("ij,ij->i", plane[i, :3], apart)), np.abs(np.einsum("ij,ij->i", plane[j, :3], apart))
+    )
+    joined = flat[i] & flat[j] & (off < 2.5 * _NOISE_M)
+    joined &= np.einsum("ij,ij->i", plane[i, :3], plane[j, :3]) > _SAME_NORMAL
+    graph = coo_array((np.ones(joined.sum()), pairs[joined].T), shape=(n_cells, n_cells))
+    n_patches, label = connected_components(graph, directed=False)
+    count = np.bincount(label)
+    large = np.flatnonzero(count >= 8)
+    large = large[np.argsort(-count[large], kind="stable")]
+    # Each cell counts alike: a rosette is densest in its middle.
+    alike = sums / sums[:, :1]
+    totals = np.zeros((n_patches, alike.shape[1]))
+    np.add.at(totals, label, alike)
+    totals = totals[large]
+    plane, eigenvalues = _planes(totals)
+    return Patches(plane, totals[:, 1:4] / totals[:, :1], np.sqrt(12 * eigenvalues[:, [2, 1]]))
+
+
+def _sum_cells(points: Array, cell_m: float) -> Array:
+    """Sum 1, p and p p^T of the points in each cell of space: (V, 10)."""
+    cells = np.floor(points / cell_m).astype(np.int64)
+    cells -= cells.min(axis=0)
+    extent = cells.max(axis=0) + 1
+    key = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    order = np.argsort(key, kind="stable")
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    x, y, z = points[order].T
+    columns = (np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+    return np.stack([np.add.reduceat(column, starts) for column in columns], axis=1)
+
+
+def _planes(sums: Array) -> tuple[Array, Array]:
+    """Fit planes (K, 4), n towards the LiDAR, to sums (K, 10); also the eigenvalues (K, 3), ascending."""
+    mean = sums[:, 1:] / sums[:, :1]
+    centre, second = mean[:, :3], mean[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
+    eigenvalues, vectors = np.linalg.eigh(second - centre[:, :, None] * centre[:, None, :])
+    normal = vectors[:, :, 0]
+    d = -np.einsum("ij,ij->i", normal, centre)
+    plane = np.concatenate([normal, d[:, None]], axis=1) * np.where(d < 0, -1.0, 1.0)[:, None]
+    return plane, np.maximum(eigenvalues, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Rays about a plate as they pierce its plane.
+
+    Attributes:
+        plane: (4,) as (n, d), n towards the LiDAR.
+        axes: (3, 2) of the plane.
+        origin: (3,) m.
+        points: (M, 3) their returns.
+        uv: (M, 2) where they pierce it.
+        height_m: (M,) of the returns over the plane.
+        tolerance_m: returns within it lie on the plane.
+        beam: widths of the beam, horizontal and vertical, at the origin, m.
+    """
+
+    plane: Array
+    axes: Array
+    origin: Array
+    points: Array
+    uv: Array
+    height_m: Array
+    tolerance_m: float
+    beam_m: Array
+
+    @classmethod
+    def of(cls, points: Array, plane: Array, centre: Array, tolerance_m: float, limits: Limits) -> "_View":
+        """Pierce a plane near a point by the rays of returns (N, 3)."""
+        origin, axes = centre - (centre @ plane[:3] + plane[3]) * plane[:3], plane_axes(plane[:3])
+        along = points @ plane[:3]
+        points, along = points[along < 0], along[along < 0]
+        uv = (points * (-plane[3] / along)[:, None] - origin) @ axes
+        beam_m = limits.beam.widths_m(float(np.linalg.norm(origin)))
+        return cls(plane, axes, origin, points, uv, along + plane[3], tolerance_m, beam_m)
+
+    @property
+    def is_on(self) -> NDArray[np.bool_]:
+        """Which rays return from the plane (M,)."""
+        return np.abs(self.height_m) <= self.tolerance_m
+
+    def half_beam_m(self, normals: Array) -> Array:
+        """Compute half the beam's width on the plane along unit normals (..., 2)."""
+        ray = self.origin / np.linalg.norm(self.origin)
+        level = np.cross([0.0, 0.0, 1.0], ray)
+        level /= max(float(np.linalg.norm(level)), 1e-9)
+        across = normals @ self.axes.T @ np.stack([level, np.cross(ray, level)], axis=1)
+        return np.asarray(np.linalg.norm(across * self.beam_m, axis=-1) / 2)
+
+    def blur_m(self, normals: Array) -> Array:
+        """Compute the border's blur for unit normals (..., 2): a quarter of the beam, noise of directions."""
+        distance_m = float(np.linalg.norm(self.origin))
+        return np.asarray(np.hypot(self.half_beam_m(normals) / 2, _DIRECTION_RAD * distance_m))
+
+    def growth_m(self, placement: Placement) -> tuple[Array, float]:
+        """Predict by how much half width and half height of a plate seem larger, and how well it is known."""
+        cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
+        expected = self.half_beam_m(np.array([[cosine, sine], [-sine, cosine]]))
+        return expected, float(expected.max()) / 2 + 0.005
+
+    def rays(self, half_m: tuple[float, float], placement: Placement | None = None) -> Rays:
+        """Sort rays into those that return from the plate and those that passed beside it.
+
+        Rays that return from before the plane, or just behind it where echoes of plate and background blend,
+        say nothing. Places without any return count as passed, unless they lie on a first placement.
+
+        Args:
+            half_m: half width and half height of the plate.
+            placement: where it is about; None if only its middle is known.
+        """
+        is_on = self.is_on
+        is_beside = self.height_m < -max(self.tolerance_m, _BEHIND_M)
+        n_on, radius_m = int(np.count_nonzero(is_on)), float(np.hypot(*half_m))
+        area = placement or Placement(0.0, 0.0, 0.0, (radius_m, radius_m))
+        n_due = n_on * float(np.prod(area.half_m) / np.prod(half_m))
+        empty, _ = _empty_places(self.uv, area, n_due)
+        if placement is not None:
+            empty = empty[placement.distance_m(empty) > 0]
+        uv = np.concatenate([self.uv[is_on], self.uv[is_beside], empty])
+        return Rays(uv, np.arange(len(uv)) < n_on)
+
+
+def _empty_places(uv: Array, placement: Placement, n_due: float) -> tuple[Array, float]:
+    """List cells (K, 2) on and about a placement that no ray pierced, nor their neighbours; also their size.
+
+    Cells are so large that four returns are due in each.
+    """
+    from scipy.ndimage import maximum_filter
+
+    half = np.array(placement.half_m)
+    cell_m = max(2 * float(np.sqrt(4 * half.prod() / max(n_due, 1.0))), 0.01)
+    n = np.ceil(2 * (half + 0.12) / cell_m).astype(np.intp)
+    cell = np.floor(placement.local(uv) / cell_m + n / 2).astype(np.intp)
+    cell = cell[((cell >= 0) & (cell < n)).all(axis=1)]
+    is_hit = np.bincount(cell[:, 0] * n[1] + cell[:, 1], minlength=int(n.prod())).reshape(n) > 0
+    empty = np.argwhere(~maximum_filter(is_hit, 3))
+    cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
+    at = ((empty + 0.5 - n / 2) * cell_m) @ np.array([[cosine, sine], [-sine, cosine]])
+    return at + [placement.u_m, placement.v_m], cell_m
+
+
+def measure_unstructured(
+    points: Array, board: Board, plane: Array, centre: Array, limits: Limits
+) -> LidarBoard | Refusal:
+    """Fit plane and outline to the rays about a patch, measure the board and check it against the limits.
+
+    Args:
+        points: (N, 3) returns.
+        board: nominal size.
+        plane: (4,) first guess.
+        centre: (3,) m, about the plate's middle.
+        limits: without noise.
+    """
+    distance_m = float(np.linalg.norm(centre))
+    if plane[3] < np.cos(MAX_INCIDENCE_RAD) * distance_m:
+        return LIDAR_TURNED.refusal(max_turn_deg=float(np.degrees(MAX_INCIDENCE_RAD)), distance_m=distance_m)
+    half_m = (board.width_m / 2, board.height_m / 2)
+    reach_m = 1.4 * float(np.hypot(*half_m)) + _SURROUND_M
+    cosine = 1.0 / np.hypot(1.0, reach_m / distance_m)
+    points = points[points @ (centre / distance_m) > cosine * np.linalg.norm(points, axis=1)]
+    points = points[:: 1 + len(points) // _MOST_MEASURED]
+    view = _View.of(points, plane, centre, 4 * _NOISE_M, limits)
+    starts = register_rays(view.rays(half_m), half_m) if np.count_nonzero(view.is_on) >= _MIN_POINTS else []
+    if starts and starts[0].error_m > _MOST_MISSES:
+        return _other_plate(np.array(half_m) * 2, distance_m, board)
+    outline: Outline | None = None
+    for _ in range(2):
+        rays = view.rays(half_m, starts[0])
+        fits = (fit_outline(rays, start, view.blur_m, view.growth_m(start)) for start in starts)
+        outline = min((fit for fit in fits if fit), key=lambda fit: fit.placement.error_m, default=None)
+        inside = np.zeros(0) if outline is None else view.is_on & (outline.placement.distance_m(view.uv) < 0)
+        if outline is None or np.count_nonzero(inside) < _MIN_POINTS:
+            return LIDAR_TOO_FEW_POINTS.refusal(
+                n_points=int(np.count_nonzero(inside)), min_points=_MIN_POINTS, closer_m=distance_m / 4
+            )
+        on_plate = view.points[inside]
+        scale_m = 1.4826 * median(np.abs(view.height_m[inside] - median(view.height_m[inside]))) + 0.001
+        plane = fit_plane_to_ranges(on_plate, view.plane, scale_m * distance_m / view.plane[3])
+        spread_m = 1.4826 * median(np.abs(on_plate @ plane[:3] + plane[3]))
+        tolerance_m = min(max(3.5 * spread_m, _LEAST_TOLERANCE_M), _MOST_TOLERANCE_M)
+        centre = view.origin + view.axes @ [outline.placement.u_m, outline.placement.v_m]
+        view = _View.of(points, plane, centre, tolerance_m, limits)
+        starts = [replace(outline.placement, u_m=0.0, v_m=0.0)]
+    outline = fit_outline(view.rays(half_m, starts[0]), starts[0], view.blur_m, view.growth_m(starts[0]))
+    if outline is None:
+        return LIDAR_TOO_FEW_POINTS.refusal(n_points=0, min_points=_MIN_POINTS, closer_m=distance_m / 4)
+    return _describe(view, board, outline, limits)
+
+
+def _describe(view: _View, board: Board, outline: Outline, limits: Limits) -> LidarBoard | Refusal:
+    """Check a fitted outline against the limits and sum up the board."""
+    placement = outline.placement
+    distance_m = float(np.linalg.norm(view.origin))
+    away = placement.distance_m(view.uv)
+    is_board = view.is_on & (away <= 0)
+    n_on = int(np.count_nonzero(is_board))
+    margin_m = 0.02 + float(outline.growth_m.max())
+    deep = away < -margin_m
+    beyond = float(np.count_nonzero(view.is_on & (away > margin_m) & (away < 0.15))) / max(n_on, 1)
+    hidden = float(np.mean(np.abs(view.height_m[deep]) > _HIDES_M)) if deep.any() else 1.0
+    dark, cell_m = _empty_places(view.uv, placement, n_on)
+    # A cell at the rim is dark only if its neighbours are: count what they hide of it.
+    n_dark = np.count_nonzero(placement.distance_m(dark) < 0)
+    dark_share = n_dark * cell_m**2 / (board.width_m * board.height_m)
+    sheet = view.height_m[deep & (np.abs(view.height_m) < 0.06)]
+    rms_m = float(np.sqrt(np.mean(sheet**2))) if len(sheet) else 0.0
+    if np.abs(outline.growth_m - view.growth_m(placement)[0]).max() > _MOST_GROWTH_M:
+        size_m = np.array([board.width_m, board.height_m]) + 2 * outline.growth_m
+        return _other_plate(size_m, distance_m, board)
+    if rms_m > _MOST_THICK_M:
+        return too_thick(sheet, _MOST_THICK_M)
+    if dark_share > _DARK_SHARE:
+        return LIDAR_OUT_OF_VIEW.refusal(distance_m=distance_m, share=float(dark_share))
+    if hidden > _HIDDEN_SHARE or beyond > TOUCHING_SHARE:
+        if beyond > TOUCHING_SHARE:
+            return LIDAR_TOUCHING.refusal(distance_m=distance_m, beyond_share=beyond)
+        return LIDAR_OUTLINE.refusal(
+            distance_m=distance_m, error_m=0.0, max_error_m=limits.template_m, hidden_share=hidden
+        )
+    rays = view.rays(placement.half_m, placement)
+    strips = measure_strips(rays, outline, view.blur_m)
+    # A strip that lies elsewhere than its neighbours shows what touches the border, or hides it.
+    is_good = (strips.sigma_m < _STRIP_SIGMA_M) & (
+        np.abs(strips.off_m) < np.hypot(_STRIP_OFF * strips.sigma_m, 0.015)
+    )
+    is_good &= ~_is_touched(view, strips)
+    edge_rms_m = float(np.sqrt(np.mean(strips.off_m[is_good] ** 2))) if is_good.any() else float("nan")
+    growth, size_sigma = outline.growth_m, 2 * np.sqrt(np.diag(outline.cov)[3:])
+    sigma_m = np.hypot(size_sigma, view.beam_m.max() / 2)
+    points, point_sigma_m = _average(view.points[is_board], placement.local(view.uv[is_board]), view.plane)
+    size_m = np.array([board.width_m, board.height_m]) + 2 * growth
+    quality = LidarQuality(
+        width_m=float(size_m[0]),
+        height_m=float(size_m[1]),
+        width_sigma_m=float(sigma_m[0]),
+        height_sigma_m=float(sigma_m[1]),
+        size_ratio=float(np.mean(size_m / [board.width_m, board.height_m])),
+        n_rings=0,
+        n_points=n_on,
+        n_ring_ends=int(np.count_nonzero(is_good)),
+        n_ring_ends_dropped=int(np.count_nonzero(~is_good)),
+        plane_rms_m=rms_m,
+        edge_rms_m=edge_rms_m,
+        template_m=edge_rms_m,
+        beyond_share=beyond,
+        distance_m=distance_m,
+        incidence_deg=float(np.degrees(np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0)))),
+        range_noise_m=rms_m,
+    )
+    inwards = view.half_beam_m(strips.outwards)[:, None] * strips.outwards
+    edge = view.origin + (strips.uv - inwards)[is_good] @ view.axes.T
+    # y points upwards where the rectangle leaves the choice.
+    direction = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
+    x = view.axes @ (-direction if direction[0] < 0 else direction)
+    normal = view.plane[:3]
+    R = np.stack([x, np.cross(normal, x), normal], axis=1)
+    none = np.zeros(len(edge))
+    return LidarBoard(
+        points=points,
+        ring=np.full(len(points), NO_RING, dtype=np.int16),
+        edge_points=edge,
+        edge_ring=np.full(len(edge), NO_RING, dtype=np.int16),
+        edge_side=none.astype(np.int8),
+        edge_behind_m=none + np.inf,
+        edge_echo=none,
+        azimuth_step_rad=0.0,
+        plane=view.plane,
+        sigma_m=point_sigma_m,
+        T_lidar_board=pose(R, view.origin + view.axes @ [placement.u_m, placement.v_m]),
+        quality=quality,
+    )
+
+
+def _is_touched(view: _View, strips: Strips) -> NDArray[np.bool_]:
+    """Return for each strip (K,) whether rays beyond it return from before the plane: a floor, a hand."""
+    from scipy.spatial import cKDTree
+
+    if not len(strips.uv):
+        return np.zeros(0, dtype=np.bool_)
+    beyond = strips.uv + strips.outwards * STRIP_M / 2
+    n_before, n_in_all = (
+        cKDTree(uv).query_ball_point(beyond, STRIP_M / 2, return_length=True)
+        if len(uv)
+        else np.zeros(len(beyond))
+        for uv in (view.uv[view.height_m > view.tolerance_m], view.uv)
+    )
+    return np.asarray(n_before > _TOUCHED_SHARE * n_in_all)
+
+
+def _average(points: Array, local: Array, plane: Array) -> tuple[Array, float]:
+    """Average the returns in cells of the plate; also the effective noise of one mean.
+
+    Errors of neighbouring returns are alike: they follow the squares, glare and incidence. The scatter of the
+    means in coarse cells, which is nearly independent, tells that of fine ones as if they were independent.
+
+    Args:
+        points: (N, 3) of the plate.
+        local: (N, 2) in its axes, m.
+        plane: (4,) fitted to them.
+    """
+    sigmas = []
+    for cell_m in (_COARSE_M, _FINE_M):
+        cells = np.floor(local / cell_m).astype(np.int64)
+        cells -= cells.min(axis=0)
+        _, cell = np.unique(cells[:, 0] * 1000 + cells[:, 1], return_inverse=True)
+        count = np.bincount(cell)
+        is_full = count >= max(3, 0.2 * float(np.median(count)))
+        means = np.stack([np.bincount(cell, column)[is_full] / count[is_full] for column in points.T], axis=1)
+        height = means @ plane[:3] + plane[3]
+        freedom = max(len(height) - 3, 1)
+        sigmas.append((len(height), float(np.sqrt(height @ height / freedom))))
+    (n_coarse, coarse_m), (n_fine, fine_m) = sigmas
+    return means, max(coarse_m * np.sqrt(n_fine / max(n_coarse, 1)), fine_m, _LEAST_MEAN_M)

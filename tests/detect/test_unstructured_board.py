@@ -1,0 +1,119 @@
+"""The board in point clouds without rings: where it is, what touches it, and what is not taken for it."""
+
+import numpy as np
+import pytest
+from scans import BOARD, Box, Plate, Shape, board_plate, outline_distance, person, place, room
+
+from lce_rig.core.data import NO_RING, Scan
+from lce_rig.core.findings import Refusal
+from lce_rig.core.geometry import Array, exp_so3, perturb, pose
+from lce_rig.core.results import LidarBoard
+from lce_rig.detect.lidar.measurement import Beam
+from lce_rig.detect.lidar.search import Limits
+from lce_rig.detect.lidar.unstructured import find_unstructured_boards, look_for_unstructured_board
+
+POINT_BEAM = Limits(beam=Beam(0.0, 0.0, 0.0))
+
+
+def accumulate(
+    shapes: list[Shape], sigma_m: float = 0.01, seed: int = 0, n: int = 120_000, fov_deg: float = 70.0
+) -> Scan:
+    """Cast rays in random directions of a cone ahead, as a rosette does in a while."""
+    rng = np.random.default_rng(seed)
+    across, turn = np.radians(fov_deg / 2) * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
+    rays = np.column_stack([np.cos(across), np.sin(across) * np.cos(turn), np.sin(across) * np.sin(turn)])
+    range_m = np.min([shape.ranges(rays) for shape in shapes], axis=0)
+    keep = np.isfinite(range_m)
+    points = rays[keep] * (range_m[keep] + sigma_m * rng.standard_normal(int(keep.sum())))[:, None]
+    points = points.astype(np.float32)
+    rings = np.full(len(points), NO_RING, dtype=np.int16)
+    return Scan("lidar", None, points, np.zeros(len(points), dtype=np.float32), rings)
+
+
+def best(found: list[LidarBoard] | Refusal) -> LidarBoard:
+    assert not isinstance(found, Refusal), found
+    return found[0]
+
+
+def assert_is_at(board: LidarBoard, T_lidar_board: Array, within_m: float = 0.008) -> None:
+    """Compare place and normal with the truth, and the edge points with the plate's true edges."""
+    assert np.linalg.norm(board.T_lidar_board[:3, 3] - T_lidar_board[:3, 3]) < within_m
+    assert np.degrees(np.arccos(min(1.0, board.plane[:3] @ T_lidar_board[:3, 2]))) < 0.4
+    assert len(board.edge_points) >= 12
+    assert np.sqrt(np.mean(outline_distance(board.edge_points, T_lidar_board) ** 2)) < 0.006
+
+
+@pytest.mark.parametrize("roll_deg", [0, 20, 45, 70])
+@pytest.mark.parametrize(("distance_m", "yaw_deg"), [(2, 0), (3, 40), (5, -30)])
+def test_board_is_found_however_it_hangs(distance_m: float, yaw_deg: float, roll_deg: float) -> None:
+    T = place(distance_m, 5, roll_deg, yaw_deg)
+    assert_is_at(
+        best(find_unstructured_boards(accumulate([board_plate(T), *room(13)]), BOARD, POINT_BEAM)), T
+    )
+
+
+def test_board_is_found_before_its_holder_and_on_the_floor_beside_a_box() -> None:
+    T = place(3, 5, 0, 20)
+    held = accumulate([board_plate(T), *person(T, 0.25), *room(13)])
+    assert_is_at(best(find_unstructured_boards(held, BOARD, POINT_BEAM)), T)
+    T = place(3, 5, 0, 20, z_m=-1.0 + BOARD.height_m / 2)
+    box = Box(pose(exp_so3(np.array([0, 0, 0.6])), np.array([3.2, 0.95, -0.6])), (0.4, 0.4, 0.8))
+    shapes = [board_plate(T), box, *room(13)]
+    assert_is_at(best(find_unstructured_boards(accumulate(shapes), BOARD, POINT_BEAM)), T, 0.02)
+
+
+def test_board_is_found_where_nothing_is_behind_it() -> None:
+    T = place(4, -5, 30)
+    scan = accumulate([board_plate(T), Box(pose(np.eye(3), np.array([3.0, 2.5, 0])), (1, 0.5, 2))])
+    board = best(find_unstructured_boards(scan, BOARD, POINT_BEAM))
+    assert np.linalg.norm(board.T_lidar_board[:3, 3] - T[:3, 3]) < 0.008
+    # Nothing tells where between the last return and the next ray the plate ends: such borders do not count.
+    assert len(board.edge_points) == 0
+
+
+def test_predicted_board_is_found_or_the_cause_is_named() -> None:
+    T = place(3, 5, 20)
+    off = perturb(T[None], np.array([[0.05, -0.03, 0.04, 0.05, 0.02, -0.05]]))[0]
+    scan = accumulate([board_plate(T), *room(13)])
+    found = look_for_unstructured_board(scan, BOARD, off, POINT_BEAM)
+    assert isinstance(found, LidarBoard)
+    assert_is_at(found, T)
+    elsewhere = look_for_unstructured_board(scan, BOARD, place(4, 25, 0), POINT_BEAM)
+    assert isinstance(elsewhere, Refusal) and elsewhere.code.startswith("lidar.not")
+
+
+def test_other_plates_are_refused_with_their_cause() -> None:
+    T = place(3, 5, 20)
+    W, H = BOARD.width_m, BOARD.height_m
+
+    def code_of(*shapes: Shape, fov_deg: float = 70.0) -> str:
+        found = find_unstructured_boards(accumulate([*shapes, *room(13)], fov_deg=fov_deg), BOARD, POINT_BEAM)
+        assert isinstance(found, Refusal)
+        return found.code
+
+    assert code_of(board_plate(T, scale=1.3)) == "lidar.other_plate"
+    # A sheet in its plane at one edge; a board that hides the lower third of it; the rim of the view.
+    beside = pose(T[:3, :3], T[:3, 3] + T[:3, 0] * (W / 2 + 0.1))
+    assert code_of(board_plate(T), Plate(beside, 0.2, H)) in ("lidar.touching", "lidar.other_plate")
+    before = pose(T[:3, :3], 0.7 * (T[:3, 3] - T[:3, 1] * H / 3))
+    assert code_of(board_plate(T), Plate(before, W, H / 4)) in ("lidar.outline", "lidar.other_plate")
+    assert code_of(board_plate(place(3, 14, 0)), fov_deg=30.0) in ("lidar.out_of_view", "lidar.other_plate")
+    assert code_of() in ("lidar.no_plate", "lidar.other_plate")
+
+
+def test_board_that_moved_while_scans_were_accumulated_is_refused() -> None:
+    parts = []
+    for k in range(4):
+        T = place(3 + 0.04 * k, 5 + 0.4 * k, 20)
+        parts.append(accumulate([board_plate(T), *room(13)], seed=k, n=30_000))
+    points = np.concatenate([part.points for part in parts])
+    rings = np.full(len(points), NO_RING, dtype=np.int16)
+    scan = Scan("lidar", None, points, np.zeros(len(points), dtype=np.float32), rings)
+    found = find_unstructured_boards(scan, BOARD, POINT_BEAM)
+    assert isinstance(found, Refusal)
+
+
+@pytest.mark.parametrize("n", [0, 5, 400])
+def test_few_points_are_no_board(n: int) -> None:
+    scan = accumulate([board_plate(place(3, 5, 20)), *room(13)], n=max(n, 1)).select(np.arange(n))
+    assert isinstance(find_unstructured_boards(scan, BOARD, POINT_BEAM), Refusal)
