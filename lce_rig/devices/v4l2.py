@@ -30,7 +30,7 @@ from lce_rig.devices.video_device import (
     serial_number,
     video_devices,
 )
-from lce_rig.rig import CameraSettings, DriverSettings
+from lce_rig.rig import CameraSettings, DriverSettings, FrameTimingSettings
 
 # Two buffers drop images as soon as the computer stalls for one; eight ride out a quarter of a second.
 N_BUFFERS = 8
@@ -61,8 +61,8 @@ CLOCKS = ("monotonic", "monotonic_raw", "tsc", "tsc_minus", "boottime", "realtim
 """Candidates, in the order in which equally good ones are taken."""
 
 
-class FrameTiming:
-    """How the rows of an image are exposed and read.
+def to_mid_ns(mark: Mark, timing: FrameTimingSettings, n_rows: int, exposure_us: float | None) -> int:
+    """Return the time from a timestamp's moment to the middle of the image's exposure.
 
     A row of a rolling shutter is exposed and then read; the next one follows a line time later. With rows 0
     to H-1, exposure e and line time l (0 for a global shutter), the middle row m = (H-1)/2 is half exposed at
@@ -73,29 +73,20 @@ class FrameTiming:
         t_trigger + delay   + m l + e/2                                                                    (4)
 
     Args:
-        settings: the camera's: line time and delay; its exposure goes before the camera's own.
+        mark: the moment.
+        timing: line time and delay.
         n_rows: H, of the image.
-        exposure_us: of a row, as the camera says; None where unknown, which counts as none.
-
-    Attributes:
-        exposure_us: of a row; None where unknown.
+        exposure_us: of a row; None where unknown, which counts as none.
     """
-
-    def __init__(self, settings: DriverSettings, n_rows: int, exposure_us: float | None = None) -> None:
-        self.exposure_us = settings.frame_timing.exposure_us or exposure_us
-        self._timing, self._n_rows = settings.frame_timing, n_rows
-
-    def to_mid_ns(self, mark: Mark) -> int:
-        """Return the time from a timestamp's moment to the middle of the exposure, (1) to (4)."""
-        half_us, line_us = 0.5 * (self.exposure_us or 0.0), self._timing.line_time_us
-        rows_us = 0.5 * (self._n_rows - 1) * line_us
-        if mark == "start_of_exposure":
-            return round(1000 * (rows_us + half_us))
-        if mark == "start_of_frame":
-            return round(1000 * (rows_us - half_us))
-        if mark == "end_of_frame":
-            return round(1000 * (rows_us - self._n_rows * line_us - half_us))
-        return round(1000 * (self._timing.trigger_delay_us + rows_us + half_us))
+    half_us, line_us = 0.5 * (exposure_us or 0.0), timing.line_time_us
+    rows_us = 0.5 * (n_rows - 1) * line_us
+    after_us = {
+        "start_of_exposure": rows_us + half_us,
+        "start_of_frame": rows_us - half_us,
+        "end_of_frame": rows_us - n_rows * line_us - half_us,
+        "trigger": timing.trigger_delay_us + rows_us + half_us,
+    }
+    return round(1000 * after_us[mark])
 
 
 def stamped_moment(settings: DriverSettings, flags: int, driver: str) -> Mark:
@@ -221,7 +212,7 @@ class V4l2Source(LiveSource):
         self._notes: list[Finding] = []
         self._device_in_words = self._serial = ""
         self._mark: Mark = "start_of_frame"
-        self._timing = FrameTiming(settings.driver, settings.resolution_px[1])
+        self._exposure_us = settings.driver.frame_timing.exposure_us
 
     def open(self) -> None:
         """Open, set up and start the camera.
@@ -269,7 +260,7 @@ class V4l2Source(LiveSource):
             delay_ms = self._clock.delay_ns * 1e-6
             moved = findings.MID_EXPOSURE(clock=self._clock.used, mark=self._mark, delay_ms=delay_ms)
             clock = ClockState(moved)
-            if self._timing.exposure_us is None:
+            if self._exposure_us is None:
                 problems.append(findings.EXPOSURE_UNKNOWN())
         return SourceStatus(
             self.sensor,
@@ -334,12 +325,13 @@ class V4l2Source(LiveSource):
         if time.monotonic() - self._exposure_read_s > _EXPOSURE_EVERY_S:
             self._read_exposure()
         self._mark = stamped_moment(self._settings.driver, frame.flags, self._device.driver)
-        stamp_ns = host_ns if utc_ns is None else utc_ns + self._timing.to_mid_ns(self._mark)
+        timing, n_rows = self._settings.driver.frame_timing, self._settings.resolution_px[1]
+        mid_ns = to_mid_ns(self._mark, timing, n_rows, self._exposure_us)
+        stamp_ns = host_ns if utc_ns is None else utc_ns + mid_ns
         return [Image(self.sensor, self._channel, stamp_ns, pixels, host_ns, frame.sequence)]
 
     def _read_exposure(self) -> None:
         """Ask for the exposure, which automatics may change at any time."""
         self._exposure_read_s = time.monotonic()
-        is_given = self._settings.driver.frame_timing.exposure_us is not None
-        exposure_us = None if is_given else read_exposure_us(self._device, self._known)
-        self._timing = FrameTiming(self._settings.driver, self._settings.resolution_px[1], exposure_us)
+        wanted_us = self._settings.driver.frame_timing.exposure_us
+        self._exposure_us = read_exposure_us(self._device, self._known) if wanted_us is None else wanted_us

@@ -6,7 +6,7 @@ and the board's answers. Without one everything stays on the computer's clock.
 """
 
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -52,104 +52,6 @@ class SyncVerdict(NamedTuple):
     def finding(self) -> Finding:
         """The verdict itself, without the reasons."""
         return findings.BOARDS_MUST_STAND() if self.reasons else findings.BOARDS_MAY_MOVE()
-
-
-class CommonClock:
-    """The rig's clock, and the models from the sensors' clocks to it.
-
-    Attributes:
-        models: by the sensor's name, from its clock to the rig's; what was placed before keeps its time.
-    """
-
-    def __init__(self, models: Mapping[str, ClockModel] | None = None) -> None:
-        self.models = dict(models or {})
-
-    def place(self, sample: LiveSample) -> LiveSample:
-        """Return a sample with its timestamps on the rig's clock; as it is where its sensor is not tied."""
-        model = self.models.get(sample.sensor)
-        if model is None:
-            return sample
-        if isinstance(sample, Events):
-            return replace(sample, t_ns=model.convert_all(sample.t_ns))
-        if sample.stamp_ns is None:
-            return sample
-        return replace(sample, stamp_ns=model.convert(sample.stamp_ns))
-
-    def sigma_ns(self, sensor: str, time_ns: int) -> float | None:
-        """Return a timestamp's standard deviation at a time of the rig's clock; None where not tied."""
-        model = self.models.get(sensor)
-        return None if model is None else model.inverse().sigma_ns(time_ns)
-
-
-def pair_times(frame: Frame, rig: Rig, clock: CommonClock) -> list[dict[str, object]]:
-    """Measure how far the images and further scans of a frame lie from its first scan.
-
-    Args:
-        frame: its samples' timestamps are on the rig's clock.
-        rig: says what to add to timestamps, and how far pairs may lie apart.
-        clock: how the timestamps came there.
-
-    Returns:
-        An entry of the capture's manifest for each: `stream` ("cam.frames", or a second LiDAR), `lidar`,
-        `difference_s` of its time minus the middle of the scan, `sigma_s` of that by the clock models, None
-        where a clock is not tied, `tolerance_s` of the profile, and the models in words, `clock`.
-    """
-    anchor, pairs = frame.scans[0], list[dict[str, object]]()
-    parts: list[Image | Scan] = [*frame.images, *frame.scans[1:]]
-    for part in parts:
-        if isinstance(part, Image):
-            stream, time_ns = f"{part.sensor}.{part.channel}", rig_time_ns(part, rig)
-        else:
-            stream, time_ns = part.sensor, middle_of_sweep_ns(part, rig)
-        if time_ns is None:
-            continue
-        sensors = (part.sensor, anchor.sensor)
-        sigmas = [clock.sigma_ns(sensor, frame.time_ns) for sensor in sensors]
-        known = [sigma for sigma in sigmas if sigma is not None]
-        sigma_ns = sum(sigma**2 for sigma in known) ** 0.5
-        words = [f"{sensor}: {clock.models.get(sensor) or 'its own timestamps'}" for sensor in sensors]
-        pair = {
-            "stream": stream,
-            "lidar": anchor.sensor,
-            "difference_s": round((time_ns - frame.time_ns) * 1e-9, 9),
-            "sigma_s": round(sigma_ns * 1e-9, 9) if len(known) == len(sigmas) else None,
-            "tolerance_s": round(tolerance_ns(part, anchor, rig)) * 1e-9,
-            "clock": "; ".join(words),
-        }
-        pairs.append(pair)
-    return pairs
-
-
-def judge_sync(rig: Rig, clock: CommonClock | None = None) -> SyncVerdict:
-    """Judge whether the sensors' times are good enough for boards that move.
-
-    A board that is carried moves by a metre in a second: the times must be known to within
-    quality.max_motion_m / (1 m/s).
-
-    Args:
-        rig: says which sensors are synchronised.
-        clock: how well they are; None where only the profile is known.
-    """
-    limit_ns = rig.quality.max_motion_m / BOARD_SPEED_MPS * 1e9
-    sensors = [(name, f"lidars.{name}", lidar.timestamps) for name, lidar in rig.lidars.items()]
-    for name, camera in rig.cameras.items():
-        for channel, settings in camera.channels.items():
-            sensors.append((name, f"cameras.{name}.channels.{channel}", settings.timestamps))
-    reasons: list[Finding] = []
-    for name, key, timestamps in sensors:
-        model = None if clock is None else clock.models.get(name)
-        reason: Finding | None = None
-        if timestamps.sync == "none":
-            reason = findings.NONE_IN_PROFILE(name, key=f"{key}.timestamps.sync")
-        elif clock is not None and model is None:
-            reason = findings.NOT_TIED(name)
-        elif model is not None and model.sigma_ns(model.last_ns) > limit_ns:
-            sigma_ms = model.sigma_ns(model.last_ns) / 1e6
-            reason = findings.TOO_UNCERTAIN(name, sigma_ms=sigma_ms, limit_ms=limit_ns / 1e6)
-        # Channels of one camera share its clock.
-        if reason is not None and reason not in reasons:
-            reasons.append(reason)
-    return SyncVerdict(tuple(reasons))
 
 
 class EdgeClock:
@@ -234,7 +136,7 @@ class RigClock:
     """Puts samples onto the rig's clock: the same while collecting and for `doctor`.
 
     Attributes:
-        common: the models from the sensors' clocks to the rig's.
+        models: by the sensor's name, from its clock to the rig's; what was placed before keeps its time.
     """
 
     def __init__(self, rig: Rig, *, has_board: bool, edge_cameras: Collection[str] = ()) -> None:
@@ -245,7 +147,7 @@ class RigClock:
             has_board: whether a sync board is there.
             edge_cameras: cameras that stamp the board's edges themselves.
         """
-        self.common = CommonClock()
+        self.models: dict[str, ClockModel] = {}
         self._rig = rig
         self._has_board = has_board
         self._host: ClockModel | None = None
@@ -280,8 +182,48 @@ class RigClock:
             if was_matching:
                 return [self._at_pulse(each.image, each.stamp_ns) for each in matched]
             # Until pulses are matched, the computer's clock must do.
-            return [self._place(sample)]
-        return [self._place(sample)]
+        return [self.place(sample)]
+
+    def place(self, sample: Sample) -> Sample:
+        """Return a sample with its timestamps on the rig's clock; as it is where its sensor is not tied."""
+        model = self.models.get(sample.sensor)
+        if model is None:
+            return sample
+        if isinstance(sample, Events):
+            return replace(sample, t_ns=model.convert_all(sample.t_ns))
+        return sample if sample.stamp_ns is None else replace(sample, stamp_ns=model.convert(sample.stamp_ns))
+
+    def pair_times(self, frame: Frame) -> list[dict[str, object]]:
+        """Measure how far the images and further scans of a placed frame lie from its first scan.
+
+        Returns:
+            An entry of the capture's manifest for each: `stream` ("cam.frames", or a second LiDAR), `lidar`,
+            `difference_s` of its time minus the middle of the scan, `sigma_s` of that by the clock models,
+            None where a clock is not tied, `tolerance_s` of the profile, and the models in words, `clock`.
+        """
+        anchor, pairs = frame.scans[0], list[dict[str, object]]()
+        parts: list[Image | Scan] = [*frame.images, *frame.scans[1:]]
+        for part in parts:
+            if isinstance(part, Image):
+                stream, time_ns = f"{part.sensor}.{part.channel}", rig_time_ns(part, self._rig)
+            else:
+                stream, time_ns = part.sensor, middle_of_sweep_ns(part, self._rig)
+            if time_ns is None:
+                continue
+            models = {sensor: self.models.get(sensor) for sensor in (part.sensor, anchor.sensor)}
+            sigmas = [each.inverse().sigma_ns(frame.time_ns) for each in models.values() if each is not None]
+            sigma_ns = sum(sigma**2 for sigma in sigmas) ** 0.5
+            words = [f"{sensor}: {model or 'its own timestamps'}" for sensor, model in models.items()]
+            pair = {
+                "stream": stream,
+                "lidar": anchor.sensor,
+                "difference_s": round((time_ns - frame.time_ns) * 1e-9, 9),
+                "sigma_s": round(sigma_ns * 1e-9, 9) if len(sigmas) == len(models) else None,
+                "tolerance_s": round(tolerance_ns(part, anchor, self._rig)) * 1e-9,
+                "clock": "; ".join(words),
+            }
+            pairs.append(pair)
+        return pairs
 
     def refresh(
         self, host_clock: ClockModel | None, utc_clock: ClockModel | None, locked: Collection[str]
@@ -332,10 +274,33 @@ class RigClock:
         ]
 
     def verdict(self) -> SyncVerdict:
-        """Judge whether boards must stand still while they are captured."""
+        """Judge whether boards must stand still while they are captured.
+
+        A board that is carried moves by a metre in a second: the times must be known to within
+        quality.max_motion_m / (1 m/s).
+        """
         if not self._has_board:
             return SyncVerdict((findings.NO_BOARD(),))
-        return judge_sync(self._rig, self.common)
+        rig, reasons = self._rig, list[Finding]()
+        limit_ns = rig.quality.max_motion_m / BOARD_SPEED_MPS * 1e9
+        sensors = [(name, f"lidars.{name}", lidar.timestamps) for name, lidar in rig.lidars.items()]
+        for name, camera in rig.cameras.items():
+            for channel, settings in camera.channels.items():
+                sensors.append((name, f"cameras.{name}.channels.{channel}", settings.timestamps))
+        for name, key, timestamps in sensors:
+            model = self.models.get(name)
+            reason: Finding | None = None
+            if timestamps.sync == "none":
+                reason = findings.NONE_IN_PROFILE(name, key=f"{key}.timestamps.sync")
+            elif model is None:
+                reason = findings.NOT_TIED(name)
+            elif model.sigma_ns(model.last_ns) > limit_ns:
+                sigma_ms = model.sigma_ns(model.last_ns) / 1e6
+                reason = findings.TOO_UNCERTAIN(name, sigma_ms=sigma_ms, limit_ms=limit_ns / 1e6)
+            # Channels of one camera share its clock.
+            if reason is not None and reason not in reasons:
+                reasons.append(reason)
+        return SyncVerdict(tuple(reasons))
 
     def _take_pulse(self, source: str, pulse: Pulse) -> list[Sample]:
         if source != BOARD:
@@ -361,16 +326,11 @@ class RigClock:
             return image
         return replace(image, stamp_ns=clock.convert(board_ns))
 
-    def _place(self, sample: Sample) -> Sample:
-        placed = self.common.place(sample)
-        assert not isinstance(placed, Pulse)
-        return placed
-
     def _tie(self, sensor: str, model: ClockModel | None) -> None:
         if model is None:
-            self.common.models.pop(sensor, None)
+            self.models.pop(sensor, None)
         else:
-            self.common.models[sensor] = model
+            self.models[sensor] = model
 
 
 def edge_line(rig: Rig, camera: str) -> str:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.v4l2 import FrameTiming, stamped_moment
+from lce_rig.devices.v4l2 import stamped_moment, to_mid_ns
 from lce_rig.rig import DriverSettings, FrameTimingSettings
 
 ROWS = st.integers(2, 1080)
@@ -26,20 +26,11 @@ def test_every_mark_leads_to_the_middle_of_the_middle_row(
         "end_of_frame": reads[-1] + line_time_ns,
     }
     frame = FrameTimingSettings(
-        exposure_us=exposure_ns / 1000 or None,
         line_time_us=line_time_ns / 1000,
         trigger_delay_us=delay_ns / 1000,
     )
-    timing = FrameTiming(DriverSettings(frame_timing=frame), n_rows)
     for mark, stamp in marks.items():
-        assert abs(stamp + timing.to_mid_ns(mark) - middle) <= 1  # type: ignore[arg-type]
-
-
-def test_the_profile_comes_before_the_camera() -> None:
-    settings = DriverSettings(frame_timing=FrameTimingSettings(exposure_us=8000, line_time_us=22.5))
-    assert FrameTiming(settings, 720, exposure_us=100).exposure_us == 8000
-    assert FrameTiming(DriverSettings(), 720, 100).exposure_us == 100
-    assert FrameTiming(DriverSettings(), 720).exposure_us is None
+        assert abs(stamp + to_mid_ns(mark, frame, n_rows, exposure_ns / 1000) - middle) <= 1  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def test_boards_may_move_where_every_clock_is_tied() -> None:
     exam = examination(lidar(clock=LOCKED), camera(), with_utc(sync_board()))
     line = look(check_sync, exam)
     assert line is not None and (line.severity, codes(line)) == ("note", ["sync.boards_may_move"])
-    model = tie(exam).common.models.get("cam")
+    model = tie(exam).models.get("cam")
     assert isinstance(model, ClockModel)
     assert model.convert(START_NS + S) == pytest.approx(START_NS + S, abs=1000)
 
@@ -141,13 +141,13 @@ def test_doctor_and_collect_agree_on_every_clock(sees_edges: bool) -> None:
     clock = RigClock(rig, has_board=True, edge_cameras=edge_cameras(rig))
     with AttachedSensors(sources) as sensors, FrameFeed(rig, sensors, clock, sources[-1]) as feed:
         until_s = time.monotonic() + 20.0
-        while str(clock.common.models.get("cam")) != str(examined.common.models.get("cam")):
+        while str(clock.models.get("cam")) != str(examined.models.get("cam")):
             assert time.monotonic() < until_s
             feed.take(0.05)
     assert clock.verdict() == examined.verdict()
     assert not clock.verdict().requires_still_boards
     for name in ("lidar", "cam"):
-        ours, theirs = examined.common.models.get(name), clock.common.models.get(name)
+        ours, theirs = examined.models.get(name), clock.models.get(name)
         assert ours is not None and theirs is not None
         for late_s in (0, 1, 4):
             stamp_ns = START_NS + late_s * S

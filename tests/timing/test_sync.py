@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image, Pulse, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.losses import Losses
 from lce_rig.rig import load_rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import TimePairs, fit_clock
-from lce_rig.timing.rig_clock import CommonClock, judge_sync, pair_times
+from lce_rig.timing.rig_clock import RigClock
 from lce_rig.timing.scan_pairing import pair_by_time
 
 MS, S = 1_000_000, 1_000_000_000
@@ -40,9 +40,15 @@ def rlfs():
     return load_rig("rlfs")
 
 
+def clock_of(rig, **models):
+    clock = RigClock(rig, has_board=True)
+    clock.models.update(models)
+    return clock
+
+
 def test_pairs_are_found_on_the_common_clock_and_say_how_far_apart_they_are(rlfs):
     model, stamp_of = fitted()
-    clock = CommonClock({"cam": model, "lidar": ClockModel.identity(1000.0, "PPS locked")})
+    clock = clock_of(rlfs, cam=model, lidar=ClockModel.identity(1000.0, "PPS locked"))
     true_ns = [UTC_NS + 5 * S + k * 100 * MS for k in range(10)]
     samples = []
     for time_ns in true_ns:
@@ -51,33 +57,32 @@ def test_pairs_are_found_on_the_common_clock_and_say_how_far_apart_they_are(rlfs
     frames = list(pair_by_time(placed, rlfs, Losses()))
     assert len(frames) == 10
     for frame in frames:
-        (pair,) = pair_times(frame, rlfs, clock)
+        (pair,) = clock.pair_times(frame)
         assert (pair["stream"], pair["lidar"]) == ("cam.frames", "lidar")
         assert abs(pair["difference_s"] - 0.007) < 4 * pair["sigma_s"] < 0.001
         assert pair["tolerance_s"] == 0.05
         assert "-49.6 ppm" in pair["clock"] and "PPS" in pair["clock"]
 
 
-def test_every_kind_of_sample_is_placed_and_untied_ones_left_as_they_are():
+def test_every_kind_of_sample_is_placed_and_untied_ones_left_as_they_are(rlfs):
     model, stamp_of = fitted(noise_ns=0.0)
-    clock = CommonClock({"cam": model})
+    clock = clock_of(rlfs, cam=model)
     stamps = np.array([stamp_of(UTC_NS + k * S) for k in range(5)])
     none = np.zeros(5, np.uint16)
     events = Events("cam", stamps, none, none, none.astype(bool), 4, 4)
     assert np.abs(clock.place(events).t_ns - UTC_NS - np.arange(5) * S).max() < 2000
-    assert abs(clock.place(Pulse("cam", int(stamps[2]), 7, 9)).stamp_ns - UTC_NS - 2 * S) < 2000
-    assert clock.place(Pulse("other", 5, 7, 9)).stamp_ns == 5
+    assert abs(clock.place(image(int(stamps[2]))).stamp_ns - UTC_NS - 2 * S) < 2000
+    assert clock.place(image(5, "other")).stamp_ns == 5
     assert clock.place(image(None)).stamp_ns is None
     clock.models.pop("cam")
-    assert clock.place(events) is events and clock.sigma_ns("cam", UTC_NS) is None
+    assert clock.place(events) is events
 
 
 def test_a_rig_with_hardware_sync_and_good_clocks_may_move_its_board(rlfs):
-    clock = CommonClock({"cam": fitted()[0], "lidar": ClockModel.identity(1000.0, "PPS locked")})
-    verdict = judge_sync(rlfs, clock)
+    clock = clock_of(rlfs, cam=fitted()[0], lidar=ClockModel.identity(1000.0, "PPS locked"))
+    verdict = clock.verdict()
     assert not verdict.requires_still_boards
     assert (verdict.finding.code, verdict.reasons) == ("sync.boards_may_move", ())
-    assert not judge_sync(rlfs).requires_still_boards
 
 
 def test_a_rig_without_hardware_sync_needs_still_boards_and_says_why(rlfs):
@@ -85,7 +90,9 @@ def test_a_rig_without_hardware_sync_needs_still_boards_and_says_why(rlfs):
     frames = camera.channels["frames"]
     free = frames.model_copy(update={"timestamps": frames.timestamps.model_copy(update={"sync": "none"})})
     cameras = {"cam": camera.model_copy(update={"channels": {"frames": free}})}
-    verdict = judge_sync(rlfs.model_copy(update={"cameras": cameras}))
+    verdict = clock_of(
+        rlfs.model_copy(update={"cameras": cameras}), lidar=ClockModel.identity(1000.0, "")
+    ).verdict()
     assert verdict.requires_still_boards
     (reason,) = verdict.reasons
     assert (reason.code, reason.subject) == ("sync.none_in_profile", "cam")
@@ -95,7 +102,7 @@ def test_a_rig_without_hardware_sync_needs_still_boards_and_says_why(rlfs):
 
 def test_clocks_that_are_not_tied_or_known_too_loosely_need_still_boards(rlfs):
     loose = ClockModel.identity(25e6, "arrivals of packets")
-    verdict = judge_sync(rlfs, CommonClock({"lidar": loose}))
+    verdict = clock_of(rlfs, lidar=loose).verdict()
     assert [(found.code, found.subject) for found in verdict.reasons] == [
         ("sync.too_uncertain", "lidar"),
         ("sync.not_tied", "cam"),

@@ -37,7 +37,7 @@ from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
-from lce_rig.timing.rig_clock import RigClock, pair_times
+from lce_rig.timing.rig_clock import RigClock
 
 _WAIT_S = 0.1
 # Threads that read sensors ask for the interpreter often and briefly, the loop holds it for long: at Python's
@@ -240,7 +240,7 @@ class _Loop:
     def _capture(self, moment: CaptureMoment) -> None:
         detection, gate = moment.detection, self._find_gate()
         frame = detection.frame
-        pairs = pair_times(frame, self._rig, self._clock.common)
+        pairs = self._clock.pair_times(frame)
         verdict = self._clock.verdict()
         meta: dict[str, object] = {
             "source": {"key": f"live:{frame.time_ns}", "label": f"live, at {frame.time_ns} ns"},
