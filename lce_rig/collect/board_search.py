@@ -130,25 +130,24 @@ class RestingTracker(BoardTracker):
         worth, are_moving = [], []
         for image in frame.images:
             key = (image.sensor, image.channel)
-            if key not in glances or self._is_worthwhile(key, frame.time_ns):
+            glance, seen = glances.get(key), self._seen.get(key)
+            if glance is None:
+                worth.append(image)
+                continue
+            if seen is not None:
+                scale = glance.small.shape[1] / self.rig.cameras[key[0]].resolution_px[0]
+                is_worthwhile = glance.rests_within(seen.corners_px * scale)
+            else:
+                is_worthwhile = _has_come_to_rest(glance, self._searched.get(key), frame.time_ns, _BLIND_S)
+            if is_worthwhile:
+                self._searched[key] = frame.time_ns, glance
                 worth.append(image)
                 continue
             # An image may be skipped because something moves in it, or because nothing is new.
-            is_same = _is_same(glances[key].small, self._searched[key][1].small)
-            are_moving.append(key in self._seen or int(np.sum(~is_same)) >= _BOARD_PX)
+            is_same = _is_same(glance.small, self._searched[key][1].small)
+            are_moving.append(seen is not None or int(np.sum(~is_same)) >= _BOARD_PX)
         detection = self.sight_in_images(replace(frame, images=tuple(worth)))
         return replace(_without_samples(detection), is_moving=not worth and any(are_moving))
-
-    def _is_worthwhile(self, key: ImageKey, time_ns: int) -> bool:
-        glance, seen = self._glances[key], self._seen.get(key)
-        if seen is not None:
-            scale = glance.small.shape[1] / self.rig.cameras[key[0]].resolution_px[0]
-            is_worthwhile = glance.rests_within(seen.corners_px * scale)
-        else:
-            is_worthwhile = _has_come_to_rest(glance, self._searched.get(key), time_ns, _BLIND_S)
-        if is_worthwhile:
-            self._searched[key] = time_ns, glance
-        return is_worthwhile
 
     def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
         if not super()._is_thorough_due(key, time_ns, was_seen=was_seen):

@@ -7,12 +7,12 @@ import numpy as np
 
 from lce_rig.calibrate.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
 from lce_rig.collect.findings import IMAGE_NONE, LIDAR_ELSEWHERE, LIDAR_NONE
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, invert
 from lce_rig.core.losses import Losses
 from lce_rig.core.results import ImageBoard, LidarBoard
-from lce_rig.detect.finder import BoardFinder, ImageSearch
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import NOT_SEEN_AT_ONCE
 from lce_rig.rig import Rig
 from lce_rig.rig.poses import NominalExtrinsic
@@ -113,13 +113,16 @@ class BoardTracker:
         unfit: dict[ImageKey, Refusal] = {}
         for image in frame.images:
             key = (image.sensor, image.channel)
-            search = self._find_in_image(image, key, frame.time_ns)
-            if search is None:
+            last = self._seen.pop(key, None)
+            if last is None and not _is_due(self._searched_ns, key, frame.time_ns, self.search_interval_s):
                 continue
+            is_thorough = self._is_thorough_due(key, frame.time_ns, was_seen=last is not None)
+            search = self.finder.search_image(image, last, is_thorough=is_thorough)
             if isinstance(search.board, Refusal):
-                unseen[key] = search.board
+                if search.board is not NOT_SEEN_AT_ONCE:
+                    unseen[key] = search.board
                 continue
-            images[key] = search.board
+            images[key] = self._seen[key] = search.board
             if isinstance(search.usable, Refusal):
                 unfit[key] = search.usable
         return BoardDetection(frame, images, {}, unseen, {}, unfit)
@@ -188,18 +191,6 @@ class BoardTracker:
                 if misfit <= 1 or (camera, lidar) not in self._are_proved:
                     return None
         return elsewhere
-
-    def _find_in_image(self, image: Image, key: ImageKey, time_ns: int) -> ImageSearch | None:
-        last = self._seen.pop(key, None)
-        if last is None and not _is_due(self._searched_ns, key, time_ns, self.search_interval_s):
-            return None
-        is_thorough = self._is_thorough_due(key, time_ns, was_seen=last is not None)
-        search = self.finder.search_image(image, last, is_thorough=is_thorough)
-        if search.board is NOT_SEEN_AT_ONCE:
-            return None
-        if isinstance(search.board, ImageBoard):
-            self._seen[key] = search.board
-        return search
 
     def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard] | Refusal:
         known = self._candidates.get(scan.sensor, [])

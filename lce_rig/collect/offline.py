@@ -80,6 +80,10 @@ class CollectReport:
     n_missing: int = 0
     has_events: bool = False
 
+    def note(self, notes: Iterable[str]) -> None:
+        """Keep notes, each once."""
+        self.notes.extend(note for note in notes if note not in self.notes)
+
 
 def collect(
     session: Session,
@@ -100,7 +104,7 @@ def collect(
     """
     collector = _Collector(session, options or CollectOptions(), progress or (lambda *_: None))
     for recording in join_recordings(recordings, session.rig):
-        collector.note(recording.notes)
+        collector.report.note(recording.notes)
         try:
             if isinstance(recording, FolderRecording):
                 collector.take_pairs(recording)
@@ -109,7 +113,7 @@ def collect(
         except SourceError as error:
             collector.report.errors.append(error)
         finally:
-            collector.note(recording.notes)
+            collector.report.note(recording.notes)
     return collector.finish()
 
 
@@ -147,7 +151,7 @@ class _Collector:
                     message = self._count_known(files.label, self._names_by_key[key])
                 else:
                     images, scan, notes = files.read()
-                    self.note(notes)
+                    self.report.note(notes)
                     message = self._store(key, files.label, images, (scan,), {})
             except SourceError as error:
                 failures.append(error)
@@ -155,7 +159,7 @@ class _Collector:
                 message = f"{files.label} refused: {error.what}"
             self._progress(done + 1, len(recording.pairs), message)
         if n_left_out:
-            self.note(
+            self.report.note(
                 [f"{n_left_out} pairs left out: the session holds {self._n_captures} captures, as wanted"]
             )
         if failures and len(failures) == len(recording.pairs):
@@ -186,7 +190,7 @@ class _Collector:
         cameras = {camera for camera, _ in reconstructed}
         for moment in self._moments(recording, torn, cameras, has_events=bool(events)):
             if self._is_enough():
-                self.note(["stopped early: the session has as many captures as wanted"])
+                self.report.note(["stopped early: the session has as many captures as wanted"])
                 break
             # The capture keeps the events instead of the images reconstructed from them.
             images = moment.detection.frame.images
@@ -229,10 +233,6 @@ class _Collector:
                 losses.add(confirmed)
             else:
                 yield confirmed
-
-    def note(self, notes: Iterable[str]) -> None:
-        """Keep notes, each once."""
-        self.report.notes.extend(note for note in notes if note not in self.report.notes)
 
     def finish(self) -> CollectReport:
         """Close the books.

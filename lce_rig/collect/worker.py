@@ -88,7 +88,19 @@ class Worker:
     def _ask(self, method: str, arguments: tuple[object, ...]) -> object:
         if self._process is None:
             self._start()
-        self._connection.send(_pack((method, arguments), self._shared))
+        # The content of arrays goes through shared memory where it fits; spans say where each lies.
+        buffers: list[pickle.PickleBuffer] = []
+        data = pickle.dumps((method, arguments), protocol=5, buffer_callback=buffers.append)
+        spans, end = _Spans(), 0
+        for buffer in buffers:
+            raw = buffer.raw()
+            if end + raw.nbytes > len(self._shared):
+                data, spans = pickle.dumps((method, arguments), protocol=5), []
+                break
+            self._shared[end : end + raw.nbytes] = raw
+            spans.append((end, end + raw.nbytes))
+            end += raw.nbytes
+        self._connection.send((data, spans))
         return self._connection.recv()
 
     def _start(self) -> None:
@@ -137,21 +149,6 @@ def _plain_surroundings() -> Iterator[None]:
                     del os.environ[name]
                 else:
                     os.environ[name] = value
-
-
-def _pack(request: object, shared: memoryview) -> tuple[bytes, _Spans]:
-    """Pickle a request, its arrays' content into shared memory where they fit; gives where each lies."""
-    buffers: list[pickle.PickleBuffer] = []
-    data = pickle.dumps(request, protocol=5, buffer_callback=buffers.append)
-    spans, end = _Spans(), 0
-    for buffer in buffers:
-        raw = buffer.raw()
-        if end + raw.nbytes > len(shared):
-            return pickle.dumps(request, protocol=5), []
-        shared[end : end + raw.nbytes] = raw
-        spans.append((end, end + raw.nbytes))
-        end += raw.nbytes
-    return data, spans
 
 
 def _serve(

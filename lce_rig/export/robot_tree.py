@@ -342,7 +342,16 @@ def _placed(
 ) -> tuple[RobotTree, list[JointChange]]:
     """Put the other sensor of a calibration where it belongs, beside the one that is placed."""
     lidar, camera = rig.lidars[calibration.lidar].frame, rig.cameras[calibration.camera]
-    optical = _optical(tree, camera.frame, camera.optical_frame)
+    # The robot's own optical frame, or the standard rotation.
+    T_body_optical = T_BODY_OPTICAL
+    if camera.optical_frame in tree.frames:
+        if camera.frame not in tree.frames or camera.frame not in tree.chain(camera.optical_frame):
+            raise SessionError(
+                f"{tree.source}: {camera.optical_frame} is not below {camera.frame}",
+                f"Name the frame above {camera.optical_frame} as this camera's `frame` in the profile.",
+            )
+        T_body_optical = tree.find_pose(camera.frame, camera.optical_frame)
+    optical = Joint(camera.frame, camera.optical_frame, T_body_optical, is_optical=True)
     T_lidar_body = invert(calibration.T_cam_lidar) @ invert(optical.T_parent_child)
     if anchor == lidar:
         joint = _place(tree, lidar, camera.frame, T_lidar_body)
@@ -355,18 +364,6 @@ def _placed(
         changes.append(JointChange(optical, None))
         tree = tree.with_joint(optical)
     return tree, changes
-
-
-def _optical(tree: RobotTree, body: str, optical: str) -> Joint:
-    """Find the joint of a camera's optical frame: the robot's own, or the standard rotation."""
-    if optical not in tree.frames:
-        return Joint(body, optical, T_BODY_OPTICAL, is_optical=True)
-    if body not in tree.frames or body not in tree.chain(optical):
-        raise SessionError(
-            f"{tree.source}: {optical} is not below {body}",
-            f"Name the frame above {optical} as this camera's `frame` in the profile.",
-        )
-    return Joint(body, optical, tree.find_pose(body, optical), is_optical=True)
 
 
 def _place(tree: RobotTree, anchor: str, child: str, T_anchor_child: Array) -> Joint:

@@ -101,22 +101,18 @@ def export_mcap(job: ExportJob) -> list[Path]:
             for image in images:
                 shown.add(image.sensor)
                 image = image if image.stamp_ns is not None else replace(image, stamp_ns=time_ns)
-                _write_image(topics, image, time_ns, job)
+                topic = image_topic(job, image.sensor, image.channel)
+                frame = job.rig.cameras[image.sensor].optical_frame
+                data = encode_image(image, frame, False, topics.counts[topic])
+                topics.write(topic, IMAGE_TYPE, time_ns, data)
+                info = _camera_info(job, image.sensor, image.stamp_ns or 0)
+                topics.write(f"{topic.rpartition('/')[0]}/camera_info", _INFO_TYPE, time_ns, info)
             for calibration in job.chosen:
                 _write_projected(topics, calibration, scans, images, time_ns, limits_m, job)
     for name in dict.fromkeys(c.camera for c in job.chosen):
         if name not in shown:
             job.findings.append(NO_IMAGES(name, format="mcap"))
     return sorted(folder.iterdir())
-
-
-def _write_image(topics: _Topics, image: Image, time_ns: int, job: ExportJob) -> None:
-    camera = job.rig.cameras[image.sensor]
-    topic = image_topic(job, image.sensor, image.channel)
-    data = encode_image(image, camera.optical_frame, False, topics.counts[topic])
-    topics.write(topic, IMAGE_TYPE, time_ns, data)
-    info = _camera_info(job, image.sensor, image.stamp_ns or 0)
-    topics.write(f"{topic.rpartition('/')[0]}/camera_info", _INFO_TYPE, time_ns, info)
 
 
 def image_topic(job: ExportJob, camera: str, channel: str) -> str:

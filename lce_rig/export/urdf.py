@@ -216,7 +216,19 @@ def _edited(text: bytes, changes: Sequence[JointChange], tree: RobotTree) -> byt
         joint = change.joint
         if joint.child in tree.above:
             start, end = places[tree.above[joint.child].name]
-            edits.append(_origin_edit(text, start, end, joint))
+            # Comments are no origins.
+            blanked = re.sub(
+                rb"<!--.*?-->", lambda comment: b" " * len(comment.group()), text[start:end], flags=re.S
+            )
+            old, new = _ORIGIN.search(blanked), origin(joint).encode()
+            if old is None:
+                tag = _TAG.match(blanked)
+                assert tag is not None
+                edits.append((start + tag.end(), start + tag.end(), b"\n    " + new))
+            else:
+                if not old.group().endswith(b"/>"):
+                    new = new.removesuffix(b"/>") + b">"
+                edits.append((start + old.start(), start + old.end(), new))
         else:
             added += [f"  <link name={quoteattr(joint.child)}/>", *joint_lines(joint)]
     if added:
@@ -249,17 +261,3 @@ def _find_joints(text: bytes) -> dict[str, tuple[int, int]]:
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.Parse(text, True)
     return places
-
-
-def _origin_edit(text: bytes, start: int, end: int, joint: Joint) -> tuple[int, int, bytes]:
-    """Replace the origin of a joint, or put one behind its opening tag; comments are no origins."""
-    blanked = re.sub(rb"<!--.*?-->", lambda comment: b" " * len(comment.group()), text[start:end], flags=re.S)
-    old = _ORIGIN.search(blanked)
-    if old is None:
-        tag = _TAG.match(blanked)
-        assert tag is not None
-        return start + tag.end(), start + tag.end(), b"\n    " + origin(joint).encode()
-    new = origin(joint).encode()
-    if not old.group().endswith(b"/>"):
-        new = new.removesuffix(b"/>") + b">"
-    return start + old.start(), start + old.end(), new

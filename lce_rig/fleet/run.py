@@ -14,9 +14,9 @@ from distributed import Client, KilledWorker, LocalCluster, as_completed
 
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.progress import Progress, silent
-from lce_rig.fleet.findings import BUG, EXITED, OUT_OF_MEMORY, SIGNAL, TIMED_OUT, WORKER_LOST
+from lce_rig.fleet.findings import WORKER_LOST
 from lce_rig.fleet.jobs import Job
-from lce_rig.fleet.table import Row, Status
+from lce_rig.fleet.table import Row
 from lce_rig.fleet.work import Settings, first_row, publish, run_apart, without_result
 
 # A session cannot kill its worker; a worker that died was killed from outside.
@@ -167,16 +167,6 @@ def run_job(job: Job, settings: Settings) -> list[Row]:
     ended = run_apart("lce_rig.fleet.work:work_order", order, *limits)
     if ended.rows is not None:
         return ended.rows
-    status: Status = "crashed"
-    if ended.reason == "timed_out":
-        status, cause = "timed_out", TIMED_OUT(limit_s=settings.time_limit_s)
-    elif ended.reason == "out_of_memory" or "std::bad_alloc" in ended.detail:  # C++ without memory
-        status, cause = "out_of_memory", OUT_OF_MEMORY(limit_mb=settings.memory_limit_mb)
-    elif ended.reason == "bug":
-        cause = BUG(what=ended.detail)
-    elif ended.exit_code < 0:
-        cause = SIGNAL(signal=-ended.exit_code, what=ended.detail)
-    else:
-        cause = EXITED(code=ended.exit_code, what=ended.detail)
+    status, cause = ended.cause(*limits)
     row = without_result(ended.known or first_row(job, settings), status, cause)
     return publish(settings.opened(), [row], start_s, used=(ended.cpu_s, ended.peak_memory_mb))

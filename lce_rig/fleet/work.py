@@ -310,6 +310,18 @@ class Ended:
     cpu_s: float
     peak_memory_mb: float
 
+    def cause(self, time_limit_s: float, memory_limit_mb: float) -> tuple[Status, Finding]:
+        """Say why there are no rows, as a status and a finding."""
+        if self.reason == "timed_out":
+            return "timed_out", findings.TIMED_OUT(limit_s=time_limit_s)
+        if self.reason == "out_of_memory" or "std::bad_alloc" in self.detail:  # C++ without memory
+            return "out_of_memory", findings.OUT_OF_MEMORY(limit_mb=memory_limit_mb)
+        if self.reason == "bug":
+            return "crashed", findings.BUG(what=self.detail)
+        if self.exit_code < 0:
+            return "crashed", findings.SIGNAL(signal=-self.exit_code, what=self.detail)
+        return "crashed", findings.EXITED(code=self.exit_code, what=self.detail)
+
 
 def run_apart(call: str, arguments: Mapping[str, Any], time_limit_s: float, memory_limit_mb: float) -> Ended:
     """Run a function in a process of its own and wait for its end.

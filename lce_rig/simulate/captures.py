@@ -181,13 +181,20 @@ def simulate_captures(
         LceRigError: no place for the board is seen by the camera and the LiDAR.
     """
     stage = set_stage(rig, seed, options)
+    options = stage.options
     for index in range(n_captures):
         rng = stage.rng(index, PLACEMENT)
         T_world_board = stage.place(index, rng)
-        if stage.options.motion == "moving":
-            yield _moving_capture(stage, index, T_world_board)
-        else:
+        if options.motion == "still":
             yield capture_at(stage, index, T_world_board, rng)
+            continue
+        # The board passes its placement when the LiDAR scans it.
+        middle_ns = _middle_ns(stage, index)
+        trajectory = sway_board(T_world_board, middle_ns, options.hand, stage.rng(index, HAND))
+        # A camera that runs freely: its image nearest to the scan's middle, by its own timestamps.
+        phase_s = options.frame_every_s * stage.rng(index, PHASE).uniform(-0.5, 0.5)
+        exposed_ns = middle_ns + round(1e9 * (phase_s - options.frame_offset_s))
+        yield _capture(StagedBoard(stage, trajectory, stage.rng(index, CARRIER)), index, exposed_ns)
 
 
 def capture_at(
@@ -203,16 +210,6 @@ def capture_at(
     """
     board = StagedBoard(stage, hold_board(T_world_board), rng or stage.rng(index, CARRIER))
     return _capture(board, index, _middle_ns(stage, index))
-
-
-def _moving_capture(stage: Stage, index: int, T_world_board: Array) -> SimulatedCapture:
-    """Take one capture of a board that passes its placement when the LiDAR scans it."""
-    options, middle_ns = stage.options, _middle_ns(stage, index)
-    trajectory = sway_board(T_world_board, middle_ns, options.hand, stage.rng(index, HAND))
-    # A camera that runs freely: its image nearest to the scan's middle, by its own timestamps.
-    phase_s = options.frame_every_s * stage.rng(index, PHASE).uniform(-0.5, 0.5)
-    exposed_ns = middle_ns + round(1e9 * (phase_s - options.frame_offset_s))
-    return _capture(StagedBoard(stage, trajectory, stage.rng(index, CARRIER)), index, exposed_ns)
 
 
 def _middle_ns(stage: Stage, index: int) -> int:
@@ -311,13 +308,24 @@ class SimulatedRecording:
     end_ns: int
 
     def __iter__(self) -> Iterator[Image | Scan | Events]:
-        board = StagedBoard(self.stage, self.trajectory, self.stage.rng(OF_SESSION, CARRIER))
+        stage = self.stage
+        board = StagedBoard(stage, self.trajectory, stage.rng(OF_SESSION, CARRIER))
+        every_ns = round(1e9 * stage.options.frame_every_s)
+
+        def images(camera: str) -> Iterator[Image]:
+            for k, t_ns in enumerate(range(self.start_ns + every_ns // 2, self.end_ns, every_ns)):
+                yield board.take_image(camera, t_ns, (OF_SESSION, k))
+
+        def scans(lidar: str, period_ns: int) -> Iterator[Scan]:
+            for k, t_ns in enumerate(range(self.start_ns, self.end_ns - period_ns + 1, period_ns)):
+                yield board.take_scan(lidar, t_ns, (OF_SESSION, k))
+
         streams: list[Iterator[Image | Scan | Events]] = [
-            *(self._pictures(board, camera) for camera in self.stage.framed),
-            *(self._scans(board, lidar) for lidar in self.stage.models),
+            *map(images, stage.framed),
+            *(scans(lidar, model.period_ns) for lidar, model in stage.models.items()),
             *(
                 filter(len, board.take_events(camera, self.start_ns, self.end_ns, _PACKET_NS, (OF_SESSION,)))
-                for camera in self.stage.pixels
+                for camera in stage.pixels
             ),
         ]
         return merge(*streams, key=stamp_of)
@@ -328,16 +336,6 @@ class SimulatedRecording:
         Timestamps of images and events read `frame_offset_s` or `event_offset_s` more than that clock.
         """
         return np.asarray(invert(self.stage.T_world_sensor[sensor]) @ self.trajectory.at(t_ns))
-
-    def _pictures(self, board: StagedBoard, camera: str) -> Iterator[Image]:
-        every_ns = round(1e9 * self.stage.options.frame_every_s)
-        for k, t_ns in enumerate(range(self.start_ns + every_ns // 2, self.end_ns, every_ns)):
-            yield board.take_image(camera, t_ns, (OF_SESSION, k))
-
-    def _scans(self, board: StagedBoard, lidar: str) -> Iterator[Scan]:
-        period_ns = self.stage.models[lidar].period_ns
-        for k, t_ns in enumerate(range(self.start_ns, self.end_ns - period_ns + 1, period_ns)):
-            yield board.take_scan(lidar, t_ns, (OF_SESSION, k))
 
 
 def stamp_of(sample: Image | Scan | Events) -> int:

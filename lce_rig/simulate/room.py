@@ -92,7 +92,14 @@ def build_room(
         low, high, parts, obstacles = furnish(low, high, rng)
     parts = [*_shell(low, high), *parts]
     if decoy is not None and T_room_decoy is not None:
-        parts += _decoy(decoy, T_room_decoy)
+        plate = rectangle(decoy.width_m, decoy.height_m).moved(T_room_decoy)
+        foot = T_room_decoy[:3, 3] - 0.06 * T_room_decoy[:3, 2]
+        pole = cone((foot[0], foot[1], 0.02), foot, 0.015)
+        base = box((0.4, 0.4, 0.03), (foot[0], foot[1], 0.015))
+        parts += [
+            ("decoy plate", plate, PLATE, T_room_decoy),
+            _part("decoy stand", merge([pole, base]), _LEGS),
+        ]
     surfaces = [
         Surface(name, mesh.moved(T_world_room), material, T_world_room @ T_room_surface)
         for name, mesh, material, T_room_surface in parts
@@ -176,17 +183,6 @@ def _decoy_pose(rng: np.random.Generator) -> Array:
     facing = _turn_z(azimuth_rad + np.radians(rng.uniform(-15.0, 15.0))) @ np.array([-1.0, 0.0, 0.0])
     upright = np.stack([np.cross([0.0, 0.0, 1.0], facing), [0.0, 0.0, 1.0], facing], axis=1)
     return pose(upright @ _turn_z(np.radians(rng.uniform(35.0, 55.0))), at)
-
-
-def _decoy(board: Board, T_room_decoy: Array) -> list[Part]:
-    plate = rectangle(board.width_m, board.height_m).moved(T_room_decoy)
-    foot = T_room_decoy[:3, 3] - 0.06 * T_room_decoy[:3, 2]
-    pole = cone((foot[0], foot[1], 0.02), foot, 0.015)
-    base = box((0.4, 0.4, 0.03), (foot[0], foot[1], 0.015))
-    return [
-        ("decoy plate", plate, PLATE, T_room_decoy),
-        _part("decoy stand", merge([pole, base]), _LEGS),
-    ]
 
 
 _STEEL = Material((0.50, 0.50, 0.50), 0.5)

@@ -1,6 +1,6 @@
 """Bodies of the room: meshes of simple shapes, and materials for a camera and a LiDAR."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -61,47 +61,36 @@ def albedo(material: Material, points: Array, normals: Array) -> Array:
     u = np.where(facing == 0, points[:, 1], points[:, 0])
     v = points[rows, np.where(facing == 2, 1, 2)]
     colour = np.asarray(material.colour)
-    shade = np.asarray(_PRINTS[material.pattern](u, v))
+    shade = _printed(material.pattern, u, v)
     tint = shade if shade.ndim == 2 else shade[:, None]
     return np.asarray(np.clip(colour * tint, 0.0, 1.0))
 
 
-def _plain(u: Array, v: Array) -> Array:
-    return 0.90 + 0.07 * value_noise(1.3 * u, 1.3 * v) + 0.05 * value_noise(9 * u, 9 * v)
-
-
-def _cloth(u: Array, v: Array) -> Array:
-    return 0.75 + 0.35 * value_noise(14 * u, 6 * v) + 0.1 * value_noise(90 * u, 90 * v)
-
-
-def _wood(u: Array, v: Array) -> Array:
-    grain = value_noise(3 * u + 0.3 * value_noise(2 * u, 2 * v), 45 * v)
-    return 0.75 + 0.35 * grain
-
-
-def _tiles(u: Array, v: Array) -> Array:
+def _printed(pattern: Pattern, u: Array, v: Array) -> Array:
+    """Evaluate the shade (N,), or (N, 3) with colours, of a pattern at texture coordinates (N,) m."""
+    if pattern == "plain":
+        return 0.90 + 0.07 * value_noise(1.3 * u, 1.3 * v) + 0.05 * value_noise(9 * u, 9 * v)
+    if pattern == "cloth":
+        return 0.75 + 0.35 * value_noise(14 * u, 6 * v) + 0.1 * value_noise(90 * u, 90 * v)
+    if pattern == "wood":
+        return 0.75 + 0.35 * value_noise(3 * u + 0.3 * value_noise(2 * u, 2 * v), 45 * v)
+    if pattern == "panels":
+        is_joint = (np.mod(u, 0.6) < 0.015) | (np.mod(v, 0.6) < 0.015)
+        return np.where(is_joint, 0.6, 0.95 + 0.05 * value_noise(30 * u, 30 * v))
+    if pattern == "window":
+        # A façade across the street: floors and window bands under a bright sky.
+        band = (np.mod(v, 0.62) < 0.34) & (np.mod(u, 0.9) < 0.68)
+        front = np.where(band, 0.32 + 0.3 * value_noise(5 * u, 7 * v), 0.72)
+        is_frame = (np.mod(u + 0.02, 1.1) < 0.05) | (np.mod(v + 0.02, 1.4) < 0.05)
+        return np.where(is_frame, 0.12, np.where(v > 2.3, 1.0, front))
+    if pattern == "poster":
+        return _poster(u, v)
     size_m, joint_m = 0.8, 0.006
-    each = (
-        0.94
-        + 0.08
-        * _LATTICE[np.floor(u / size_m).astype(np.int64) % 64, np.floor(v / size_m).astype(np.int64) % 64]
-    )
+    row, column = (np.floor(axis / size_m).astype(np.int64) % 64 for axis in (u, v))
+    tile = 0.94 + 0.08 * _LATTICE[row, column]
     stain = 0.82 + 0.2 * value_noise(0.9 * u + 7, 0.9 * v) + 0.06 * value_noise(25 * u, 25 * v)
     is_joint = (np.mod(u, size_m) < joint_m) | (np.mod(v, size_m) < joint_m)
-    return np.where(is_joint, 0.45, each * np.minimum(stain, 1.05))
-
-
-def _panels(u: Array, v: Array) -> Array:
-    is_joint = (np.mod(u, 0.6) < 0.015) | (np.mod(v, 0.6) < 0.015)
-    return np.where(is_joint, 0.6, 0.95 + 0.05 * value_noise(30 * u, 30 * v))
-
-
-def _window(u: Array, v: Array) -> Array:
-    """A façade across the street: floors and window bands under a bright sky."""
-    band = (np.mod(v, 0.62) < 0.34) & (np.mod(u, 0.9) < 0.68)
-    front = np.where(band, 0.32 + 0.3 * value_noise(5 * u, 7 * v), 0.72)
-    is_frame = (np.mod(u + 0.02, 1.1) < 0.05) | (np.mod(v + 0.02, 1.4) < 0.05)
-    return np.where(is_frame, 0.12, np.where(v > 2.3, 1.0, front))
+    return np.where(is_joint, 0.45, tile * np.minimum(stain, 1.05))
 
 
 def _poster(u: Array, v: Array) -> Array:
@@ -116,17 +105,6 @@ def _poster(u: Array, v: Array) -> Array:
     graph = 0.5 + 0.6 * value_noise(40 * x, 40 * y)
     shade = np.where(figure[:, None], tints[index % 4] * graph[:, None], shade)
     return np.where((y > 0.86)[:, None], np.array([0.55, 0.28, 0.12]), shade)
-
-
-_PRINTS: dict[Pattern, Callable[[Array, Array], Array]] = {
-    "plain": _plain,
-    "tiles": _tiles,
-    "panels": _panels,
-    "poster": _poster,
-    "wood": _wood,
-    "cloth": _cloth,
-    "window": _window,
-}
 
 
 def checker(
