@@ -9,10 +9,7 @@ def _loss(name: str, text: str) -> Kind:
 
 BROKEN_PACKETS = _loss("broken_packets", "{n} broken packets skipped (first: {where})")
 TORN_END = _loss("torn_end", "{n} torn ends of the file skipped (first: {where})")
-TRIGGER_PACKETS = _loss("trigger_packets", "{n} packets of triggers skipped")
-EVENTS_UNTIMED = _loss("events_untimed", "{n} events before the first timestamp skipped")
 TIME_WORDS_REPAIRED = _loss("time_words_repaired", "{n} inconsistent time words repaired")
-UNKNOWN_WORDS = _loss("unknown_words", "{n} words of no known code skipped")
 PACKETS_LOST = _loss("packets_lost", "{n} packets lost in recording (first: {where})")
 BAG_TORN = _loss("bag_torn", "{n} places where the bag is torn (first: {where})")
 EVENTS_BEFORE_CLOCK_SET = _loss(
@@ -22,7 +19,6 @@ EVENTS_STRAY = _loss("events_stray", "{n} events with stray timestamps skipped (
 EVENTS_SORTED = _loss("events_sorted", "{n} places where timestamps decrease by up to 20 ms, sorted")
 EVENTS_OFF_SENSOR = _loss("events_off_sensor", "{n} events off the sensor skipped (first: {where})")
 BROKEN_LINES = _loss("broken_lines", "{n} broken lines skipped (first: {where})")
-TORN_WORD = _loss("torn_word", "{n} bytes of a torn last word skipped")
 FRAMES_OUT_OF_ORDER = _loss("frames_out_of_order", "{n} out of order skipped")
 POINTS_WITHOUT_RETURN = _loss("points_without_return", "{n} points without a return")
 SENT_TWICE = _loss("sent_twice", "{n} sent twice (equal timestamps)")

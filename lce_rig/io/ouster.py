@@ -24,7 +24,6 @@ from lce_rig.io.network import PcapFile
 from lce_rig.io.protocol import SourceOptions, Span, choose_lidar, fingerprint
 from lce_rig.rig import LidarSettings, Rig
 
-_MAX_PIXELS, _MAX_COLUMNS = 512, 4096
 # A scan with more of its columns lost is not worth looking at.
 _MIN_COVERAGE = 0.5
 _N_SURVEYED, _MAX_SHOWN = 5000, 6
@@ -145,9 +144,9 @@ def read_metadata(path: Path) -> OusterMetadata:
             np.radians(np.array(document[key], np.float64))
             for key in ("beam_altitude_angles", "beam_azimuth_angles")
         )
-        if not altitude.shape == azimuth.shape == (n,) or not 1 <= n <= _MAX_PIXELS:
+        if not altitude.shape == azimuth.shape == (n,) or n < 1:
             raise ValueError(f"angles of {altitude.shape} beams for {n} pixels of a column")
-        if not 1 <= n_columns <= _MAX_COLUMNS or not 1 <= columns_per_packet <= n_columns:
+        if not 1 <= columns_per_packet <= n_columns:
             raise ValueError(f"{n_columns} columns of a frame")
         T_sensor_lidar = _matrix(document.get("lidar_to_sensor_transform", np.diag([-1, -1, 1, 1])))
         if "beam_to_lidar_transform" in document:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading, reason_of
@@ -34,11 +33,8 @@ class Hdf5Events(EventStream):
         self._path = path
         self.notes: list[str] = []
         with _open(path) as file:
-            lengths = [len(_column(file, name)) for name in _COLUMNS]
-            self._n_events = min(lengths)
-            if self._n_events < max(lengths):
-                sizes = ", ".join(f"{n} {length}" for n, length in zip(_COLUMNS, lengths, strict=True))
-                self.notes.append(f"{path.name}: columns of unequal length ({sizes}); the shortest is used")
+            # Columns of a torn file differ in length.
+            self._n_events = min(len(_column(file, name)) for name in _COLUMNS)
             width, height = _number(file, "width"), _number(file, "height")
             self.resolution_px = (width, height) if width and height else None
             self._offset_us = _number(file, "t_offset") or 0
@@ -54,21 +50,18 @@ class Hdf5Events(EventStream):
             for begin in range(0, self._n_events, _BLOCK_EVENTS):
                 end = min(begin + _BLOCK_EVENTS, self._n_events)
                 try:
-                    block = [np.asarray(column[begin:end]) for column in columns]
-                    yield self._to_columns(block)
+                    t_us, x, y, polarity = (np.asarray(column[begin:end]) for column in columns)
+                    if t_us.dtype.kind == "f" and np.any(t_us % 1):
+                        raise ValueError("events/t holds fractions, not whole microseconds")
+                    # Pixels beyond 16 bits stay off any sensor.
+                    x, y = (np.where((c >= 0) & (c < 1 << 16), c, (1 << 16) - 1) for c in (x, y))
+                    pixels = x.astype(np.uint16), y.astype(np.uint16)
+                    yield EventColumns(to_ns(t_us, self._offset_us), *pixels, polarity > 0)
                 except (OSError, RuntimeError, ValueError) as error:
                     if not begin:
                         raise
                     losses.add(findings.TORN_END(where=f"event {begin}: {reason_of(error)}"))
                     return
-
-    def _to_columns(self, block: list[NDArray[Any]]) -> EventColumns:
-        t_us, x, y, polarity = block
-        if t_us.dtype.kind == "f" and np.any(t_us % 1):
-            raise ValueError("events/t holds fractions, not whole microseconds")
-        # Pixels beyond 16 bits stay off any sensor.
-        x, y = (np.where((c >= 0) & (c < 1 << 16), c, (1 << 16) - 1).astype(np.uint16) for c in (x, y))
-        return EventColumns(to_ns(t_us, self._offset_us), x, y, polarity > 0)
 
 
 @contextmanager

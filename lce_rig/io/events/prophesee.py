@@ -65,38 +65,27 @@ class WrappingCounter:
 
 
 class Evt2Decoder:
-    """Decodes EVT2, block by block.
+    """Decodes EVT2, block by block; events before any timestamp are skipped.
 
     Attributes:
-        n_untimed: events before any timestamp, skipped.
-        n_unknown: words of no known code, skipped.
         clock: the high part of the time: 28 bits of 64 us.
     """
 
-    _OFF, _ON, _TIME_HIGH = 0, 1, 8
-    _KNOWN = (_OFF, _ON, _TIME_HIGH, 0xA, 0xE, 0xF)
+    _ON, _TIME_HIGH = 1, 8
 
     def __init__(self) -> None:
-        self.n_untimed = self.n_unknown = 0
         self.clock = WrappingCounter(28, 1 << 10)
         self._state = np.empty(0, np.uint32)
-
-    @property
-    def n_repaired(self) -> int:
-        """Time words that did not fit those around them and were replaced by the one before."""
-        return self.clock.n_repaired
 
     def decode(self, words: NDArray[np.uint32]) -> EventColumns:
         """Decode a block of words (N,)."""
         words = np.concatenate((self._state, words))
         code = words >> 28
-        self.n_unknown += int(np.count_nonzero(~np.isin(code, self._KNOWN)))
         at_high = np.flatnonzero(code == self._TIME_HIGH)
         high = _held(at_high, self.clock.unwrap((words[at_high] & 0xFFFFFFF).astype(np.int64)), len(words))
         self._state = words[at_high[-1:]]
         emitting = np.flatnonzero(code <= self._ON)
         n_untimed = int(np.searchsorted(emitting, at_high[0])) if len(at_high) else len(emitting)
-        self.n_untimed += n_untimed
         emitting = emitting[n_untimed:]
         event = words[emitting]
         t_us = (high[emitting] << 6) | ((event >> 22) & 0x3F)
@@ -114,7 +103,6 @@ class WordLayout:
         single: one event at the other coordinate.
         base: first coordinate and polarity of the vectors that follow.
         vectors: number of bits by code of vector.
-        known: other codes that may occur and are skipped.
         is_line_x: the shared coordinate is the column.
     """
 
@@ -124,39 +112,27 @@ class WordLayout:
     single: int
     base: int
     vectors: Mapping[int, int]
-    known: frozenset[int]
     is_line_x: bool
 
 
-EVT3 = WordLayout(8, 6, 0, 2, 3, {4: 12, 5: 8}, frozenset({7, 9, 10, 14, 15}), is_line_x=False)
-LIBCAER_CMP = WordLayout(0, 1, 2, 3, 4, {5: 8}, frozenset(), is_line_x=True)
+EVT3 = WordLayout(8, 6, 0, 2, 3, {4: 12, 5: 8}, is_line_x=False)
+LIBCAER_CMP = WordLayout(0, 1, 2, 3, 4, {5: 8}, is_line_x=True)
 
 
 class WordDecoder:
-    """Decodes a stream of 16-bit words, block by block.
+    """Decodes a stream of 16-bit words, block by block; events before any timestamp are skipped.
 
     Attributes:
-        n_untimed: events before any timestamp, skipped.
-        n_unknown: words of no known code, skipped.
         clock: the high part of the time: 12 bits of 4.096 ms.
     """
 
     def __init__(self, layout: WordLayout) -> None:
-        self.n_untimed = self.n_unknown = 0
         self.clock = WrappingCounter(12, 10)
         self._layout = layout
         self._time = self._place = np.empty(0, np.uint16)
-        # By code: the bits of a vector, 0 of other words; whether the code is unknown.
+        # By code: the bits of a vector, 0 of other words.
         self._n_bits = np.zeros(16, np.int64)
         self._n_bits[list(layout.vectors)] = list(layout.vectors.values())
-        self._is_unknown = np.ones(16, np.bool_)
-        named = (layout.time_high, layout.time_low, layout.line, layout.single, layout.base)
-        self._is_unknown[[*named, *layout.vectors, *layout.known]] = False
-
-    @property
-    def n_repaired(self) -> int:
-        """Time words that did not fit those around them and were replaced by the one before."""
-        return self.clock.n_repaired
 
     def start_packet(self) -> None:
         """Begin a packet that counts its time from zero."""
@@ -169,7 +145,6 @@ class WordDecoder:
         layout = self._layout
         words = np.concatenate((self._time, self._place, words))
         code, payload = (words >> 12).astype(np.uint8), (words & 0xFFF).astype(np.int64)
-        self.n_unknown += int(np.count_nonzero(self._is_unknown[code]))
         at_high, at_low, at_line, at_base = (
             np.flatnonzero(code == c) for c in (layout.time_high, layout.time_low, layout.line, layout.base)
         )
@@ -189,7 +164,6 @@ class WordDecoder:
         # A timestamp needs its low part after its high one.
         timed = at_low[at_low > at_high[0]] if len(at_high) else at_low[:0]
         n_untimed = int(np.searchsorted(word, timed[0])) if len(timed) else len(word)
-        self.n_untimed += n_untimed
         word, bit = word[n_untimed:], bit[n_untimed:]
 
         if len(words):
@@ -259,14 +233,9 @@ class PropheseeEvents(EventStream):
         with reading(self._path), self._path.open("rb") as file:
             file.seek(self._begin)
             while block := file.read(_BLOCK_BYTES):
-                n_torn = len(block) % dtype.itemsize
                 words: NDArray[Any] = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
                 yield decoder.decode(words)
-                if n_torn:
-                    losses.add(findings.TORN_WORD(), n_torn)
-        losses.add(findings.EVENTS_UNTIMED(), decoder.n_untimed)
-        losses.add(findings.TIME_WORDS_REPAIRED(), decoder.n_repaired)
-        losses.add(findings.UNKNOWN_WORDS(), decoder.n_unknown)
+        losses.add(findings.TIME_WORDS_REPAIRED(), decoder.clock.n_repaired)
 
 
 def _read_header(file: BinaryIO) -> dict[str, str]:

@@ -100,7 +100,6 @@ class PacketDecoder:
         self._compressed = WordDecoder(LIBCAER_CMP)
         self._waiting: list[EventPacket] = []
         self._n_waiting_bytes = 0
-        self._n_trigger_packets = 0
 
     def decode(self, packet: EventPacket) -> Iterator[EventColumns]:
         """Yield the events that are decoded by now: small EVT3 packets are decoded together, later.
@@ -132,9 +131,7 @@ class PacketDecoder:
                 # The driver's time base has nanoseconds of its own start; the codec drops them, and so do we.
                 base_ns = packet.time_base_ns // NS_PER_US * NS_PER_US
                 yield replace(events, t_ns=events.t_ns + base_ns, host_ns=packet.head.stamp_ns)
-        elif packet.encoding == "trigger":
-            self._n_trigger_packets += 1
-        else:
+        elif packet.encoding != "trigger":
             raise ValueError(f"encoding {packet.encoding!r} is none of {', '.join(ENCODINGS)}")
 
     def finish(self) -> Iterator[EventColumns]:
@@ -148,13 +145,10 @@ class PacketDecoder:
                 yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
                 host_ns = None
 
-    def account(self, losses: Losses) -> None:
-        """Count the packets that were skipped, and the words that could not be decoded."""
-        losses.add(findings.TRIGGER_PACKETS(), self._n_trigger_packets)
-        losses.add(findings.EVENTS_UNTIMED(), self._evt3.n_untimed)
-        n_repaired = self._evt3.n_repaired + self._compressed.n_repaired
-        losses.add(findings.TIME_WORDS_REPAIRED(), n_repaired)
-        losses.add(findings.UNKNOWN_WORDS(), self._evt3.n_unknown + self._compressed.n_unknown)
+    @property
+    def n_repaired(self) -> int:
+        """Time words that did not fit those around them and were replaced by the one before."""
+        return self._evt3.clock.n_repaired + self._compressed.clock.n_repaired
 
 
 def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
@@ -232,7 +226,7 @@ class BagEvents(EventStream):
                 losses.add(lost, packet.number - last_number - 1)
             last_number = packet.number
         yield from decoder.finish()
-        decoder.account(losses)
+        losses.add(findings.TIME_WORDS_REPAIRED(), decoder.n_repaired)
 
     def _check_size(self, head: EventHead) -> None:
         if self.resolution_px and (head.width_px, head.height_px) != self.resolution_px:

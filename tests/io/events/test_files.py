@@ -163,11 +163,14 @@ def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path:
     few = EVENTS.select(slice(0, 100))
     write_text(tmp_path / "a.txt", few, with_size=False)
     lines = (tmp_path / "a.txt").read_text().splitlines()
-    lines[40:40] = ["1 2 3", "# a comment", "nan 1 1 1", "what is this?"]
-    (tmp_path / "a.txt").write_text("\n".join(lines))
+    lines[40:40] = ["# a comment", "nan 1 1 1", "1 -1 1 1"]
+    (tmp_path / "a.txt").write_text("\n".join(lines) + "\n1700000000.1 3")
     recording = open_events(tmp_path / "a.txt", resolution=(346, 260))
     assert everything(recording) == listed(few)
-    assert has_note(recording.notes, "3 broken lines", "line 41", "'1 2 3'")
+    assert has_note(recording.notes, "2 broken lines") and has_note(recording.notes, "1 torn", "line 104")
+    (tmp_path / "a.txt").write_text("\n".join([*lines, "what is this?", ""]))
+    with pytest.raises(SourceError, match=r"a\.txt"):
+        everything(open_events(tmp_path / "a.txt", resolution=(346, 260)))
 
 
 def test_hdf5_compressed_by_a_plugin_is_read(tmp_path: Path) -> None:
