@@ -32,6 +32,8 @@ _MIN_SHARE = 3
 _N_LOTS = 400
 # Median of the chi-squared distribution with six degrees of freedom.
 MEDIAN_CHI2 = 5.348
+# Its third quartile, which a capture exceeds that agrees with the others in one case of four.
+_EACH_CHI2 = 7.841
 # Differences beyond this many limits fail.
 _FAIL = 2.0
 # Groups of captures: of fewer placements none are looked for, and a group has this share of them at least.
@@ -117,17 +119,18 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
     n_placements = len(expansion.groups)
     if n_placements < _MIN_PLACEMENTS:
         return ()
-    order = np.argsort(np.random.default_rng(seed).random((_N_LOTS, n_placements)), axis=1)
-    by_lot, _ = _chi2(expansion, (order < n_placements // 2) @ expansion.groups)
-    unit = max(float(np.median(by_lot)) / MEDIAN_CHI2, 1e-12)
+    every = np.ones(len(expansion.gradients))
+    unit = _noise(expansion, every, seed)
     x, y, z = centres.T
     # The capture from which on the results differ most, corrected for the number of captures tried.
-    n = len(expansion.gradients)
+    n = len(every)
     cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
     chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
     best = int(np.argmax(chi2))
-    chance = min(len(cuts) * _tail(chi2[best] / unit), 1.0)
-    found = [make_contrast("before", "after", apart[best], chance, int(cuts[best]))]
+    changes = [(float(chi2[best]) / unit, apart[best], int(cuts[best]))]
+    changes += [_change_at_end(expansion, cut, seed) for cut in (2, n - 2)]
+    surprise, tangent, cut = max(changes, key=lambda change: change[0])
+    found = [make_contrast("before", "after", tangent, min((len(cuts) + 2) * _tail(surprise), 1.0), cut)]
     for first, second, key in (
         ("near", "far", np.linalg.norm(centres, axis=1)),
         ("left", "right", x / z),
@@ -137,6 +140,35 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
         chi2, apart = _chi2(expansion, is_first)
         found.append(make_contrast(first, second, apart[0], _tail(chi2[0] / unit), int(is_first.sum())))
     return tuple(found)
+
+
+def _change_at_end(expansion: Quadratics, cut: int, seed: int) -> tuple[float, Array, int]:
+    """Compare the first or last two captures with the others, in units of the noise of the others.
+
+    After a sensor moved each of the two differs from the others; of an outlier and a sound capture one does.
+
+    Returns:
+        Their squared distance, 0 where one of them agrees with the others; the tangent (6,) from after to
+        before; the cut.
+    """
+    n = len(expansion.gradients)
+    is_first = (np.arange(n) < cut).astype(np.float64)
+    is_end = is_first if 2 * cut < n else 1 - is_first
+    unit = _noise(expansion, 1 - is_end, seed)
+    (surprise,), (apart,) = _chi2(expansion, is_first[None])
+    alone = np.eye(n)[is_end > 0]
+    each = [float(_chi2(expansion, one[None], 1 - is_end + one)[0][0]) / unit for one in alone]
+    is_change = min(each) > _EACH_CHI2 and len(np.unique(expansion.placement[is_end > 0])) == 2
+    return float(surprise) / unit if is_change else 0.0, apart, cut
+
+
+def _noise(expansion: Quadratics, among: Array, seed: int) -> float:
+    """Measure by random halves the noise of captures (F,), of which `among` is 1, in units of their cost."""
+    groups = expansion.groups * among
+    groups = groups[groups.any(axis=1)]
+    order = np.argsort(np.random.default_rng(seed).random((_N_LOTS, len(groups))), axis=1)
+    by_lot, _ = _chi2(expansion, (order < len(groups) // 2) @ groups, among)
+    return max(float(np.median(by_lot)) / MEDIAN_CHI2, 1e-12)
 
 
 def find_groups(expansion: Quadratics, seed: int = 0) -> tuple[Contrast, ...]:
@@ -233,12 +265,13 @@ def _tail(chi2: float) -> float:
     return float(chdtrc(6, chi2))
 
 
-def _chi2(expansion: Quadratics, shares: Array) -> tuple[Array, Array]:
-    """Compare subsets (B, F) with the rest: squared distance (B,) in units of noise, tangents (B, 6)."""
+def _chi2(expansion: Quadratics, shares: Array, among: Array | None = None) -> tuple[Array, Array]:
+    """Compare subsets (B, F) with the rest of those `among` (F,): squared distances (B,), tangents (B, 6)."""
+    among = np.ones(len(expansion.gradients)) if among is None else among
     H_first = np.tensordot(shares, expansion.hessians, axes=1)
     g_first = shares @ expansion.gradients
-    H_rest = expansion.hessians.sum(axis=0) - H_first
-    g_rest = expansion.gradients.sum(axis=0) - g_first
+    H_rest = np.tensordot(among, expansion.hessians, axes=1) - H_first
+    g_rest = among @ expansion.gradients - g_first
     # A subset of few captures may leave a direction undetermined; a floor of 1 m and 1 rad keeps it finite.
     floor = np.eye(6)
     C_first, C_rest = np.linalg.inv(H_first + floor), np.linalg.inv(H_rest + floor)

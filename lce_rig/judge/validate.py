@@ -22,6 +22,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import (
     KnownBetter,
+    azimuth_covariance,
     find_contradictions,
     known_better,
     list_contributions,
@@ -136,9 +137,10 @@ class Validation:
         cov: (6, 6) to report: the estimate's, widened if resampling spreads it farther, with errors of the
             profile and what checks contradict.
         cov_agreed: (6, 6) the same without what checks contradict.
-        cov_with_lens: (6 + P, 6 + P) of extrinsics and the session's intrinsics, as `cov`.
-        cov_used: (6, 6) of extrinsics that are used with these intrinsics, as `cov`.
-        cov_shared: (6, 6) the part of it from errors of the profile's board.
+        cov_with_lens: (6 + P, 6 + P) of extrinsics and the session's intrinsics, as `cov`, for point clouds
+            with the azimuths of the session's driver.
+        cov_used: (6, 6) of extrinsics that are used with these intrinsics and point clouds.
+        cov_shared: (6, 6) the part of `cov` from errors of the profile's board and LiDAR.
         contributions: its causes, the largest first.
         known_better: what the session's boards determine better than the profile.
         widened_by: factor by which the standard deviations were widened; 1 if they were not.
@@ -221,17 +223,19 @@ def validate(
         if lidar.has_rings and len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
             laser_angles = estimate_angles(agreeing, board, estimate.T_cam_lidar, lidar)
     contradictions = list(find_contradictions(estimate, nuisances, contrasts, rig))
-    cov_agreed = widened_by**2 * estimate.cov + profile_covariance(known)
+    azimuths = azimuth_covariance(estimate.T_cam_lidar, lidar.azimuth_offset_sigma_rad)
+    cov_agreed = widened_by**2 * estimate.cov + azimuths + profile_covariance(known)
     cov = cov_agreed + sum(each.cov for each in contradictions)
-    joint = joint_covariance(estimate, cov)
+    # Extrinsics are used with clouds of the same driver, whose azimuths have the same error.
+    joint = joint_covariance(estimate, cov - azimuths)
     return Validation(
         cov=cov,
         cov_agreed=cov_agreed,
         cov_with_lens=joint,
         cov_used=effective_covariance(estimate, joint),
         # Each session has fitted its own lens.
-        cov_shared=profile_covariance([each for each in known if each.source != "intrinsics"]),
-        contributions=list_contributions(estimate.diagnostics, widened_by, known, contradictions),
+        cov_shared=azimuths + profile_covariance([each for each in known if each.source != "intrinsics"]),
+        contributions=list_contributions(estimate.diagnostics, widened_by, azimuths, known, contradictions),
         known_better=known_better(estimate, nuisances),
         widened_by=widened_by,
         remark=remark,

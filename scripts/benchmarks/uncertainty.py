@@ -174,11 +174,11 @@ def _runs_in_error(
     rig = load_rig(case.rig)
     for seed in range(n_seeds):
         session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
-        profile, found, lens = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
+        profile, found, lens, turn = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
         options = CalibrateOptions(method=method, n_draws=0)
         (calibration,), _ = calibrate_detections(profile, found, options)
         error = difference(calibration.T_cam_lidar, session.T_cam_lidar)
-        point_px = _point_error_px(calibration, session.T_cam_lidar, lens)
+        point_px = _point_error_px(calibration, session.T_cam_lidar @ invert(turn), lens)
         (claimed_px,) = (u.centre_px for u in calibration.uncertainty if u.distance_m == _POINT_M)
         yield JudgedRun(error, calibration.cov, calibration.verdict, point_px, claimed_px)
 

@@ -2,12 +2,15 @@
 
 import json
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import EstimateSettings, error_to_reference, fit_extrinsic
+from lce_rig.calibrate import CalibrateOptions, EstimateSettings, error_to_reference, fit_extrinsic
+from lce_rig.calibrate.tolerances import Tolerances
+from lce_rig.core.calibration import Method
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.files import decode_pcd
 from lce_rig.core.findings import Refusal
@@ -17,6 +20,7 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.search import find_lidar_boards
 from lce_rig.io.folder.cloud import rings_from_elevation, to_scan
+from lce_rig.judge.validate import validate
 from lce_rig.rig import Rig, load_rig, parse_rig
 
 pytestmark = pytest.mark.dataset
@@ -64,6 +68,22 @@ def test_the_extrinsic_is_near_the_reference(recordings, recording, profile, n_c
     assert distance_m <= max_m
     assert len(estimate.used) >= n_captures
     assert estimate.certificate.is_optimal
+
+
+@pytest.mark.parametrize("method", get_args(Method))
+def test_the_claim_holds_the_exact_reference_of_a_simulator_that_labels_azimuths_beside_its_beams(
+    recordings, method
+):
+    """Its clouds lie on azimuths (k + 1/2) 360 / 1874 deg, its rays on multiples of 360 / 1874 deg."""
+    rig, folder = load_rig("sss"), recordings / "sss_noise15mm"
+    (camera,), (lidar,) = rig.cameras.values(), rig.lidars.values()
+    settings = EstimateSettings.of(CalibrateOptions(method), lidar, Tolerances.of(camera, rig.board))
+    estimate = fit_extrinsic(detect(folder, rig), rig.board.to_board(), settings)
+    cov = validate(estimate, rig, lidar, camera.to_intrinsics()).cov
+    reference = np.array(json.loads((folder / "reference.json").read_text())["T_cam_lidar"])
+    error = difference(estimate.T_cam_lidar, reference)
+    assert np.degrees(np.linalg.norm(error[3:])) > 0.08
+    assert error @ np.linalg.solve(cov, error) < 16.8  # 99 % of the chi-squared distribution
 
 
 def test_random_halves_of_a_recording_agree(recordings):
