@@ -24,7 +24,7 @@ from lce_rig.simulate import (
     simulate_captures,
     simulate_recording,
 )
-from lce_rig.simulate.captures import stamp_of
+from lce_rig.simulate.sampling import stamp_of
 
 TRUTH = "truth.json"
 _CAPTURES, _DURATION_S = 30, 20.0

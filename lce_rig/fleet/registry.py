@@ -27,7 +27,7 @@ from lce_rig.fleet.table import (
     Row,
     as_table,
     chosen_rows,
-    merged,
+    in_order,
     read_table,
     table_bytes,
     with_pairs,
@@ -221,7 +221,7 @@ class Registry:
         outdated = finished["folder"].slice(0, n).filter(pc.equal(sources[:n], sources[1:])).to_pylist()
         for folder in outdated:
             self.set_aside(folder)
-        table = merged([_without(table, pa.array(outdated, pa.string()))])
+        table = in_order(_without(table, pa.array(outdated, pa.string())))
         self.write_table(table)
         return table
 

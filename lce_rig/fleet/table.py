@@ -139,10 +139,9 @@ def as_table(rows: Iterable[Row]) -> Any:
     return pa.Table.from_pylist(list(rows), schema=SCHEMA)
 
 
-def merged(tables: Sequence[Any]) -> Any:
-    """Put tables one below the other, by robot, camera, LiDAR and date."""
-    whole = pa.concat_tables(tables) if tables else SCHEMA.empty_table()
-    return whole.sort_by([(name, "ascending") for name in ("robot", "camera", "lidar", "date", "folder")])
+def in_order(table: Any) -> Any:
+    """Sort a table by robot, camera, LiDAR and date."""
+    return table.sort_by([(name, "ascending") for name in ("robot", "camera", "lidar", "date", "folder")])
 
 
 def table_bytes(table: Any) -> bytes:

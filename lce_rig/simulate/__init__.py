@@ -1,6 +1,7 @@
 """The simulated rig: captures of any profile with exact truth, errors and clutter like real ones."""
 
-from lce_rig.simulate.captures import (
+from lce_rig.simulate.options import CameraNoise, EventNoise, HandMotion, LidarNoise, SimulationOptions
+from lce_rig.simulate.sampling import (
     SimulatedCapture,
     SimulatedRecording,
     board_time_ns,
@@ -9,7 +10,6 @@ from lce_rig.simulate.captures import (
     simulate_captures,
     simulate_recording,
 )
-from lce_rig.simulate.options import CameraNoise, EventNoise, HandMotion, LidarNoise, SimulationOptions
 from lce_rig.simulate.stage import rig_truth, truth_extrinsics
 
 __all__ = [

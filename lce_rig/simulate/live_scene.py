@@ -11,7 +11,7 @@ from lce_rig.rig import Rig
 from lce_rig.simulate.image_rendering import develop, focus, glance, render_radiance, shot_noise_e
 from lce_rig.simulate.lidar import Sweep, sweep_again, sweep_scene
 from lce_rig.simulate.options import SimulationOptions
-from lce_rig.simulate.poses import between, can_be_held, count_rings
+from lce_rig.simulate.placements import between, can_be_held, count_rings
 from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, OF_SESSION, set_stage

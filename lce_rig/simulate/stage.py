@@ -16,7 +16,7 @@ from lce_rig.simulate.backdrop import Backdrop, build_backdrop
 from lce_rig.simulate.event_camera import EventPixels, draw_pixels
 from lce_rig.simulate.lidar import LidarModel, Sweep, measure_sweep
 from lce_rig.simulate.options import LidarNoise, SimulationOptions
-from lce_rig.simulate.poses import CameraView, place_board
+from lce_rig.simulate.placements import CameraView, place_board
 from lce_rig.simulate.room import LIDAR_HEIGHT_M, Room, build_room
 
 # Independent streams of random numbers, so that more captures or another camera change nothing else.

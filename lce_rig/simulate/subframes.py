@@ -17,7 +17,7 @@ from lce_rig.simulate.backdrop import Backdrop, irradiance, pixel_rays, reached
 from lce_rig.simulate.event_camera import EventCamera
 from lce_rig.simulate.image_rendering import sensor_gain
 from lce_rig.simulate.options import CameraNoise
-from lce_rig.simulate.poses import Trajectory
+from lce_rig.simulate.placements import Trajectory
 from lce_rig.simulate.scene import PLATE, PLATE_BACK, PRINT_ALBEDO, Hits, Scene
 
 GREY = np.array([0.114, 0.587, 0.299])

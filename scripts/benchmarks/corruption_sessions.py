@@ -19,8 +19,8 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
-from lce_rig.simulate.captures import capture_at
-from lce_rig.simulate.poses import can_be_held, count_rings, seen_share
+from lce_rig.simulate.placements import can_be_held, count_rings, seen_share
+from lce_rig.simulate.sampling import capture_at
 from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage
 
 SEED = 0

@@ -18,7 +18,7 @@ from lce_rig.core.geometry import perturb
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.report import MOVED_COLUMNS, history_of
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import SCHEMA, TABLE, as_table, merged, table_bytes
+from lce_rig.fleet.table import SCHEMA, TABLE, as_table, in_order, table_bytes
 
 _FEW_ROBOTS, _FEW_SESSIONS = 10, 30
 _TABLE_ROWS = 1_000_000
@@ -189,7 +189,7 @@ def large_table(n_rows: int) -> Any:
     for name, values in columns.items():
         index = SCHEMA.get_field_index(name)
         table = table.set_column(index, SCHEMA.field(name), pa.array(values, SCHEMA.field(name).type))
-    return merged([table])
+    return in_order(table)
 
 
 def bench_table(folder: Path) -> None:

@@ -16,9 +16,9 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session.durable import load_arrays, store_arrays
 from lce_rig.simulate import LidarNoise, SimulationOptions
-from lce_rig.simulate.captures import StagedBoard
 from lce_rig.simulate.lidar import measure_sweep, sweep_scene
-from lce_rig.simulate.poses import hold_board
+from lce_rig.simulate.placements import hold_board
+from lce_rig.simulate.sampling import StagedBoard
 from lce_rig.simulate.stage import IMAGE, PLACEMENT, SCAN, Stage, set_stage, truth_extrinsics
 
 #: Range noise by level, m.

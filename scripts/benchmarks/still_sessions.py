@@ -21,8 +21,8 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import board_from_pose
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
-from lce_rig.simulate.captures import StagedBoard
-from lce_rig.simulate.poses import hold_board
+from lce_rig.simulate.placements import hold_board
+from lce_rig.simulate.sampling import StagedBoard
 from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage, truth_extrinsics
 
 # The camera's backdrop is not needed: the smaller it is, the sooner it is done.

@@ -15,8 +15,8 @@ from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
 from lce_rig.show.overlays.overlay import camera_part, draw_overlay
-from lce_rig.simulate.captures import capture_at
 from lce_rig.simulate.options import SimulationOptions
+from lce_rig.simulate.sampling import capture_at
 from lce_rig.simulate.stage import Stage, set_stage
 
 _SAME_M = 0.3

@@ -6,7 +6,7 @@ from functools import cache
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import HandMotion, LidarNoise, SimulatedRecording, SimulationOptions, simulate_recording
-from lce_rig.simulate.captures import stamp_of
+from lce_rig.simulate.sampling import stamp_of
 
 DURATION_S = 1.8
 # What comes before is there for its events only.

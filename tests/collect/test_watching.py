@@ -82,13 +82,6 @@ def test_single_shots_of_a_recording_are_moments_and_passing_samples_are_not() -
     assert not list(find_moments(seen, StillnessGate(watcher.finder.board, 0.01)))
 
 
-def test_candidates_beyond_the_profiles_limits_are_no_board_in_the_scan() -> None:
-    watcher = BoardTracker(strict(min_points=100_000), 0.3)
-    detection = see(watcher, 0, 0.0)
-    assert detection.images and not detection.lidars and not detection.is_usable
-    assert detection.unscanned["lidar"].figures["min_points"] == 100_000
-
-
 def test_live_and_offline_take_the_same_boards() -> None:
     for limits in ({}, {"max_distance_m": 3.0}, {"max_tilt_deg": 20.0}, {"min_rings": 8}):
         profile = strict(**limits)

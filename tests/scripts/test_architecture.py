@@ -1,5 +1,5 @@
 import pytest
-from draw_architecture import PICTURE, draw, imports, layers, reduced
+from draw_architecture import PICTURE, draw, layers
 
 
 @pytest.mark.long
@@ -11,12 +11,3 @@ def test_the_picture_shows_the_imports_as_they_are() -> None:
 def test_every_room_stands_in_a_layer() -> None:
     rooms = {path.parent.name for path in (PICTURE.parents[2] / "lce_rig").glob("*/__init__.py")}
     assert rooms == {room.partition(".")[0] for row in layers() for room in row}
-
-
-def test_an_import_that_others_imply_has_no_arrow() -> None:
-    assert reduced({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == {"a": {"b"}, "b": {"c"}, "c": set()}
-
-
-def test_imports_are_found_in_the_code() -> None:
-    found = imports(["cli", "pipeline", "core"])
-    assert "pipeline" in found["cli"] and not found["core"]

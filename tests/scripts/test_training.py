@@ -42,16 +42,6 @@ def random_light(generator, n=2):
     return 0.05 + 0.9 * torch.rand(n, 1, SIZE, SIZE, generator=generator)
 
 
-def test_no_pixel_stays_further_than_its_threshold_from_its_last_event():
-    generator = torch.Generator().manual_seed(1)
-    pixels = quiet_pixels(2)
-    pixels.start(random_light(generator))
-    for _ in range(6):
-        pixels.expose(random_light(generator), generator)
-        left = pixels.level - pixels.memory
-        assert (left < pixels.on * 1.001).all() and (left > -pixels.off * 1.001).all()
-
-
 def test_sums_over_an_interval_equal_those_of_its_events_one_by_one():
     generator = torch.Generator().manual_seed(2)
     pixels = quiet_pixels(1)
@@ -106,13 +96,6 @@ def test_streams_repeat_with_their_seed_and_differ_with_another():
         assert all(torch.isfinite(part).all() for window in windows for part in window)
 
 
-def test_counted_windows_reach_rates_from_sparse_to_dense():
-    stream = EventStream(24, 32, 7, CPU)
-    hits = [(stream.window()[0] != 0).any(1).float().mean((1, 2)) for _ in range(16)]
-    rate = torch.stack(hits[8:]).mean(0)
-    assert rate.min() < 0.05 and rate.max() > 0.3
-
-
 def test_the_loss_is_zero_for_the_truth_alone():
     truth = torch.rand(2, 1, 32, 32, generator=torch.Generator().manual_seed(8))
     weights = torch.ones_like(truth)
@@ -135,27 +118,6 @@ def test_the_exported_file_computes_what_the_network_computes(tmp_path):
         with torch.no_grad():
             expected, *expected_states = network(torch.from_numpy(voxels)[None], *expected_states)
         np.testing.assert_allclose(picture, expected[0, 0].numpy(), atol=1e-4)
-
-
-class FullResolutionNetwork(torch.nn.Module):
-    """The shape of FireNet: both states at full resolution."""
-
-    def __init__(self):
-        super().__init__()
-        self.first, self.second = (torch.nn.Conv2d(n, 8, 3, padding=1) for n in (3 + 8, 16))
-
-    def forward(self, voxels, first, second):
-        first = torch.tanh(self.first(torch.cat([voxels, first], 1)))
-        second = torch.tanh(self.second(torch.cat([first, second], 1)))
-        return second.mean(1, keepdim=True), first, second
-
-
-def test_a_network_of_other_shape_exported_by_the_recipe_is_accepted(tmp_path):
-    export_recurrent(FullResolutionNetwork(), [(8, 1), (8, 1)], tmp_path / "fire.onnx", n_bins=3)
-    model = ReconstructionModel(tmp_path / "fire.onnx")
-    assert (model.n_bins, [state.divisor for state in model.states]) == (3, [1, 1])
-    picture, _ = model.step(np.ones((3, 21, 33), np.float32), model.initial_states(21, 33))
-    assert picture.shape == (21, 33)
 
 
 class PairedStatesNetwork(torch.nn.Module):

@@ -10,7 +10,7 @@ from lce_rig.simulate.image_rendering import expose, render_radiance
 from lce_rig.simulate.lidar import sweep_again, sweep_scene
 from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.options import LidarNoise, SimulationOptions
-from lce_rig.simulate.poses import between
+from lce_rig.simulate.placements import between
 from lce_rig.simulate.room import Room, build_carrier
 from lce_rig.simulate.scene import Scene
 

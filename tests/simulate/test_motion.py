@@ -7,7 +7,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import Array, difference, exp_so3, invert, pose
 from lce_rig.simulate.options import HandMotion, LidarNoise
-from lce_rig.simulate.poses import Trajectory, carry_board, sway_board
+from lce_rig.simulate.placements import Trajectory, carry_board, sway_board
 from lce_rig.simulate.scene import Raycaster, Scene
 
 from .conftest import VLP16, board_before_lidar, simulate_scan

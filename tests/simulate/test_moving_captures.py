@@ -18,7 +18,7 @@ from lce_rig.simulate import (
     simulate_captures,
     truth_extrinsics,
 )
-from lce_rig.simulate.captures import StagedBoard
+from lce_rig.simulate.sampling import StagedBoard
 from lce_rig.simulate.stage import PLACEMENT, set_stage
 
 from .conftest import PERFECT, QUIET_EVENTS, make_rig

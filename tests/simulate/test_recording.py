@@ -7,7 +7,7 @@ from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import invert, transform
 from lce_rig.rig import Rig
 from lce_rig.simulate import HandMotion, SimulatedRecording, SimulationOptions, simulate_recording
-from lce_rig.simulate.captures import stamp_of
+from lce_rig.simulate.sampling import stamp_of
 
 from .test_moving_captures import found_corners, moving_rig
 

@@ -8,7 +8,7 @@ from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.backdrop import Backdrop
 from lce_rig.simulate.image_rendering import render_radiance
 from lce_rig.simulate.options import Carrier
-from lce_rig.simulate.poses import Trajectory, hold_board
+from lce_rig.simulate.placements import Trajectory, hold_board
 from lce_rig.simulate.room import Room, build_carrier
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.subframes import GREY, MovingView

@@ -17,7 +17,7 @@ from lce_rig.simulate import (
     rig_truth,
     truth_extrinsics,
 )
-from lce_rig.simulate.poses import Trajectory, hold_board, sway_board
+from lce_rig.simulate.placements import Trajectory, hold_board, sway_board
 
 from .conftest import board_before_lidar, make_rig
 

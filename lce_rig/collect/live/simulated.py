@@ -28,7 +28,7 @@ from lce_rig.devices.reading import ClockState, Inbox, LiveSource, SourceStatus
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
-from lce_rig.simulate.poses import between
+from lce_rig.simulate.placements import between
 
 # For each camera: what it sees of the room is rendered first.
 START_S = 120.0

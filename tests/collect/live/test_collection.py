@@ -58,20 +58,6 @@ def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Pat
 
 
 @pytest.mark.long
-def test_a_session_is_continued_and_its_captures_count(tmp_path: Path) -> None:
-    path = tmp_path / "session"
-    show = Show(placements()[:2], each_s=2.0)
-    with show.running(), Session.create(path, rig()) as session:
-        collect_live(session, show.sources, replace(QUICK, n_wanted=2))
-    show = Show(placements(), each_s=2.0)
-    with show.running(), Session.resume(path, rig()) as session:
-        report = collect_live(session, show.sources, replace(QUICK, n_wanted=3))
-        assert report.captured == ["000002"]
-        pixels = session.captures[2].image("davis", "frames").pixels
-    assert any(np.array_equal(pixels, placements()[k].images[0].pixels) for k in (2, 3))
-
-
-@pytest.mark.long
 def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path: Path) -> None:
     asked: list[Key | None] = [None] * 15 + ["next", "capture"] + [None] * 25 + ["stop"]
     states: list[LiveState] = []

@@ -1,7 +1,6 @@
 """Sensors, clocks and disks that fail while `lce-rig collect` runs: it goes on where it can."""
 
 import os
-import re
 import resource
 import time
 from collections.abc import Callable
@@ -54,7 +53,7 @@ def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
         rig.tell("loss 0.3")
-        time.sleep(1.0)
+        collecting.wait_for("% of the packets lost")
         rig.tell("loss 0")
         time.sleep(0.2)
         rig.tell("pause 5")
@@ -79,30 +78,6 @@ def test_a_lidar_that_is_gone_for_a_minute_is_an_error_of_the_command(wire: Star
         assert collecting.wait(180) == 5
     assert len(errors(collecting.said)) == 1 and "lidar: " in errors(collecting.said)[0]
     assert journal_of(tmp_path / "session")[-1]["ending"] == "lost"
-    check_whole(tmp_path / "session")
-
-
-@pytest.mark.long
-def test_losses_of_the_network_are_counted_and_shown_and_collection_goes_on(
-    wire: Start, tmp_path: Path
-) -> None:
-    rig = wire()
-    with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
-        collecting.wait_for_captures(1)
-        rig.tell("loss 0.3")
-        collecting.wait_for("% of the packets lost")
-        time.sleep(2.0)
-        rig.tell("loss 0")
-        n_before = collecting.n_captures
-        collecting.wait_for_captures(n_before + 1)
-        assert collecting.end() == 0
-    n_withheld = rig.stop()["withheld"]
-    found = re.search(r"dropped: .*lidar (\d+)", collecting.said)
-    assert n_withheld > 300 and found is not None
-    # Losses are counted by the azimuths between packets: a long gap may be one packet off.
-    # A busy computer may lose some itself.
-    assert 0.97 * n_withheld <= int(found[1]) < 1.2 * n_withheld
-    assert journal_of(tmp_path / "session")[0]["lost"]["lidar"] == int(found[1])
     check_whole(tmp_path / "session")
 
 

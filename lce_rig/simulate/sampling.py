@@ -16,7 +16,7 @@ from lce_rig.simulate.event_camera import EventCamera
 from lce_rig.simulate.image_rendering import expose, render_radiance
 from lce_rig.simulate.lidar import sweep_scene
 from lce_rig.simulate.options import SimulationOptions
-from lce_rig.simulate.poses import Trajectory, carry_board, hold_board, sway_board
+from lce_rig.simulate.placements import Trajectory, carry_board, hold_board, sway_board
 from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import (
