@@ -1,11 +1,13 @@
-"""Mid exposure from any mark: against rows exposed one by one."""
+"""Mid exposure from any mark, against rows exposed one by one; and which clock made a timestamp."""
+
+import time
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.v4l2 import stamped_moment, to_mid_ns
+from lce_rig.devices.v4l2 import CLOCKS, StampClock, choose_clock, read_clocks, stamped_moment, to_mid_ns
 from lce_rig.rig import DriverSettings, FrameTimingSettings
 
 ROWS = st.integers(2, 1080)
@@ -47,3 +49,68 @@ def test_the_mark_comes_from_profile_flags_and_driver(
 ) -> None:
     settings = DriverSettings(frame_timing=FrameTimingSettings(mark=mark))  # type: ignore[arg-type]
     assert stamped_moment(settings, flags, driver) == moment
+
+
+MS = 1_000_000
+# As read on a rig: UTC, time since boot with a night of suspend, and Jetson's counter 29 s ahead of raw time.
+NOW = {
+    "monotonic": 8_000_000 * MS,
+    "monotonic_raw": 8_000_450 * MS,
+    "tsc": 8_029_450 * MS,
+    "tsc_minus": 7_971_450 * MS,
+    "boottime": 36_000_000 * MS,
+    "realtime": 1_763_733_600_000 * MS,
+}
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+@pytest.mark.parametrize("age_ms", [0, 12, 199])
+def test_the_clock_of_the_stamps_is_found(clock: str, age_ms: int) -> None:
+    assert choose_clock(NOW[clock] - age_ms * MS, NOW) == (clock, 0)
+
+
+@pytest.mark.parametrize(
+    ("age_ms", "apart_ms", "chosen"),
+    [(age_ms, 0, (None, 0)) for age_ms in (-1, 201, 5000, -29_000)]
+    + [(20, 1, ("monotonic", MS)), (20, 40, ("monotonic", 40 * MS))],
+)
+def test_clocks_that_fit_and_differ_are_told_from_none(
+    age_ms: int, apart_ms: int, chosen: tuple[str | None, int]
+) -> None:
+    now = NOW | ({"monotonic_raw": NOW["monotonic"] + apart_ms * MS} if apart_ms else {})
+    assert choose_clock(NOW["monotonic"] - age_ms * MS, now) == chosen
+
+
+@pytest.mark.parametrize("clock", ["monotonic", "realtime"])
+def test_a_stamp_of_this_computers_clock_becomes_utc(clock: str) -> None:
+    before_ns, stamp_ns, after_ns = time.time_ns(), read_clocks()[clock], time.time_ns()
+    stamps = StampClock()
+    utc_ns = stamps.to_utc_ns(stamp_ns)
+    assert utc_ns is not None
+    # The clocks are read one after the other: 50 us cover what that takes on a busy computer.
+    assert before_ns - 50_000 <= utc_ns <= after_ns + 50_000
+    assert stamps.problems() == []
+
+
+def test_stamps_that_fit_no_clock_give_none_and_a_problem() -> None:
+    stamps = StampClock()
+    assert stamps.to_utc_ns(read_clocks()["monotonic"] + 3600 * 1000 * MS) is None
+    (problem,) = stamps.problems()
+    assert problem.code == "clock.none_fits"
+    assert "monotonic -3600000 ms" in str(problem.figures["ages"])
+
+
+def test_stamps_that_leave_their_clock_are_followed() -> None:
+    stamps = StampClock()
+    stamps.to_utc_ns(read_clocks()["monotonic"])
+    stamps.to_utc_ns(read_clocks()["realtime"])
+    assert stamps.used == "realtime" and stamps.problems() == []
+
+
+@pytest.mark.parametrize("clock", ["realtime", "tsc"])
+def test_a_clock_set_by_hand_that_does_not_fit_or_is_missing_is_not_used(clock: str) -> None:
+    stamps = StampClock(clock)
+    assert stamps.to_utc_ns(read_clocks()["monotonic"] - 40_000 * MS) is None
+    assert stamps.used is None
+    (problem,) = stamps.problems()
+    assert problem.code == "clock.none_fits"

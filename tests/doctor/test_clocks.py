@@ -1,22 +1,18 @@
 """Clocks: offsets and drifts are recovered, and boards may move only where every clock is tied."""
 
-import time
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from lce_rig.collect.live.frame_feed import FrameFeed
-from lce_rig.core.data import LiveSample, Pulse
+from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices import edge_cameras
-from lce_rig.devices.reading import AttachedSensors, ClockState, LiveSource, SourceStatus
+from lce_rig.devices.reading import ClockState
 from lce_rig.doctor.checks import check_clock, check_edges, check_sync, tie
 from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
 from lce_rig.timing.clock import ClockModel
-from lce_rig.timing.rig_clock import RigClock
 
 from .observed import LOCKED, START_NS, S, camera, codes, examination, lidar, look, make_rig, sync_board
 
@@ -25,12 +21,6 @@ def with_utc(board: ObservedSensor) -> ObservedSensor:
     """The board knows UTC, which the computer has exactly."""
     assert board.host_clock is not None
     return replace(board, utc_clock=board.host_clock)
-
-
-def v4l2_rig() -> Rig:
-    document = make_rig().model_dump()
-    document["cameras"]["cam"]["driver"] = {"type": "v4l2", "device": "/dev/video0"}
-    return Rig.model_validate(document)
 
 
 def davis_rig() -> Rig:
@@ -102,54 +92,3 @@ def test_doubts_of_a_driver_about_its_clock_stand_in_its_line() -> None:
     line = look(check_clock, examination(camera(clock=arrival, problems=(problem,))), "cam")
     assert line is not None and line.severity == "warning"
     assert codes(line) == ["clock.arrival", "clock.missing"]
-
-
-class Replayed(LiveSource):
-    """A device that sends what was observed of one."""
-
-    def __init__(self, seen: ObservedSensor) -> None:
-        super().__init__(seen.sensor, seen.sensor, 60.0, n_slots=4096)
-        self.host_clock, self.utc_clock = seen.host_clock, seen.utc_clock
-        self._seen = seen
-        self.left: list[LiveSample] = []
-
-    def open(self) -> None:
-        self.left = sorted([*self._seen.pulses, *self._seen.frames], key=lambda each: each.host_ns or 0)
-
-    def read(self) -> list[LiveSample]:
-        time.sleep(0.01)
-        came, self.left = self.left, []
-        return came
-
-    def close(self) -> None:
-        self.left = []
-
-    def describe(self) -> SourceStatus:
-        assert self._seen.status is not None
-        return self._seen.status
-
-    def start_triggers(self, rate_hz: float | None = None) -> None:
-        raise AssertionError("pulses at these rates are told apart")
-
-
-@pytest.mark.parametrize("sees_edges", [True, False])
-def test_doctor_and_collect_agree_on_every_clock(sees_edges: bool) -> None:
-    rig, eye = (davis_rig(), davis()) if sees_edges else (v4l2_rig(), camera())
-    seen = lidar(clock=LOCKED), eye, with_utc(sync_board(4.0))
-    examined = tie(examination(*seen, rig=rig))
-    sources = [Replayed(each) for each in seen]
-    clock = RigClock(rig, has_board=True, edge_cameras=edge_cameras(rig))
-    with AttachedSensors(sources) as sensors, FrameFeed(rig, sensors, clock, sources[-1]) as feed:
-        until_s = time.monotonic() + 20.0
-        while str(clock.models.get("cam")) != str(examined.models.get("cam")):
-            assert time.monotonic() < until_s
-            feed.take(0.05)
-    assert clock.verdict() == examined.verdict()
-    assert not clock.verdict().requires_still_boards
-    for name in ("lidar", "cam"):
-        ours, theirs = examined.models.get(name), clock.models.get(name)
-        assert ours is not None and theirs is not None
-        for late_s in (0, 1, 4):
-            stamp_ns = START_NS + late_s * S
-            assert ours.convert(stamp_ns) == theirs.convert(stamp_ns)
-            assert ours.sigma_ns(stamp_ns) == theirs.sigma_ns(stamp_ns)

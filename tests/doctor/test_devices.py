@@ -1,12 +1,14 @@
-"""Devices and their streams: what is absent, slow, lost or stopped has a line that says so."""
+"""The computer, devices and their streams: what is absent, slow, lost or stopped has a line that says so."""
+
+from pathlib import Path
 
 import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices.velodyne_web import WebReport
-from lce_rig.doctor.checks import check_device, check_stream, wanted_rate_hz
-from lce_rig.doctor.observing import ObservedSensor
+from lce_rig.doctor.checks import check_computer_clock, check_device, check_disk, check_stream, wanted_rate_hz
+from lce_rig.doctor.observing import Examination, ObservedSensor
 from lce_rig.rig import load_rig
 
 from .observed import S, camera, codes, examination, lidar, look, make_rig
@@ -94,3 +96,25 @@ def test_the_wanted_rate_is_the_triggers_the_drivers_or_the_davis_own() -> None:
     assert wanted_rate_hz(make_rig(), "lidar", "vlp16") == 10
     assert wanted_rate_hz(make_rig(sync=None), "cam", "command") is None
     assert wanted_rate_hz(load_rig("rles"), "davis", "davis") == 25
+
+
+def test_the_disk_of_a_folder_that_is_not_there_yet_is_measured_and_left_clean(tmp_path: Path) -> None:
+    line = look(check_disk, Examination(make_rig(), tmp_path / "not" / "yet"))
+    assert line is not None
+    disk = line.findings[0]
+    assert disk.figure("write_mbps") > 0 and disk.figure("free_mb") > 0
+    assert disk.figures["folder"] == str(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_is_red() -> None:
+    line = look(check_disk, Examination(make_rig(), Path("/proc")))
+    assert line is not None
+    assert line.severity == "error" and codes(line) == ["computer.disk_not_writable"]
+
+
+def test_the_clock_is_judged_by_the_kernel() -> None:
+    line = look(check_computer_clock, Examination(make_rig()))
+    assert line is not None
+    code = "computer.clock" if line.severity == "note" else "computer.clock_not_synchronised"
+    assert codes(line) == [code] and (line.severity == "note") == ("max_error_ms" in line.figures)

@@ -14,7 +14,6 @@ from lce_rig.io.ros.bag_recorder import open_bag_writer
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.rig_time import rig_time_ns
 from tests.io.events import encoders
-from tests.io.events.bags import write_packet_bag
 from tests.io.events.encoders import listed
 from tests.notes import has_note
 
@@ -131,24 +130,3 @@ def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path: Pa
     with pytest.raises(SourceError, match="/davis/events") as caught:
         opened(write(tmp_path / "b.bag", False), rig)
     assert has_note([caught.value.hint], "/davis/events", "EventArray, 0")
-
-
-def test_events_that_count_from_the_sensors_start_are_tied_to_the_host_by_their_arrivals(
-    tmp_path: Path, rig: Rig
-) -> None:
-    """EVT3 stamps begin at zero; packets arrive 2 ms late or more, and the least delay counts."""
-    rng = np.random.default_rng(0)
-    messages = []
-    for k in range(60):
-        first_us = 5_000_000 + 20_000 * k
-        truth = [(first_us + 100 * j, j, k, True) for j in range(20)]
-        host_ns = T0_NS + 20_000_000 * k + 2_000_000 + int(rng.integers(0, 3_000_000)) * (k != 30)
-        data = encoders.packet(encoders.evt3(truth), "evt3", is_ros1=True, number=k, stamp_ns=host_ns)
-        messages.append(("/davis/events", host_ns, data))
-    # Packets are decoded many at a time; each of these is large enough to be one.
-    recording = opened(write_packet_bag(tmp_path / "r.bag", messages), rig, is_part=True)
-    ((_, span),) = recording.streams.items()
-    stamps_ns = np.concatenate([s.t_ns for s in recording.samples() if isinstance(s, Events)])
-    assert 0 <= stamps_ns[0] - T0_NS <= 5_000_000 and span is not None and span[0] == stamps_ns[0]
-    assert np.array_equal(np.diff(stamps_ns) % 1000, np.zeros(len(stamps_ns) - 1))
-    assert has_note(recording.notes, "sensor's start", "added")

@@ -109,20 +109,6 @@ def test_a_frame_waits_for_its_events_but_not_for_ever(rig: Rig) -> None:
     assert earliest.time_ns == T0_NS + 1050 * MS and next(taken).stamp_ns < T0_NS + 2500 * MS
 
 
-def test_the_profiles_offset_of_the_events_is_applied(rig: Rig) -> None:
-    davis = rig.cameras["davis"]
-    channel = davis.channels["events"]
-    timestamps = channel.timestamps.model_copy(update={"expected_offset_s": -0.5})
-    channels = {**davis.channels, "events": channel.model_copy(update={"timestamps": timestamps})}
-    shifted = rig.model_copy(update={"cameras": {"davis": davis.model_copy(update={"channels": channels})}})
-    events = stream(0, 3000, 4000)
-    ahead = replace(events, t_ns=events.t_ns + 500 * MS)
-    (frame,) = frames_of([*packets(ahead, range(100, 4000, 100)), scan(1300), image(1350)], shifted)
-    (cut,) = frame.events
-    own = ahead.between(T0_NS + 600 * MS, T0_NS + 2050 * MS)
-    assert np.array_equal(cut.events.t_ns, own.t_ns) and cut.offset_ns == -500 * MS
-
-
 def test_two_event_cameras_get_a_stretch_each(rig: Rig) -> None:
     both = rig.model_copy(update={"cameras": {"davis": rig.cameras["davis"], "right": rig.cameras["davis"]}})
     left, right = stream(0, 3000, 2000, 1), replace(stream(0, 3000, 2000, 2), sensor="right")
