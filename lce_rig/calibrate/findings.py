@@ -15,6 +15,12 @@ def _undetermined(finding: Finding) -> str:
     )
 
 
+def _tilt(finding: Finding) -> str:
+    """{where}, or: add captures with the board tilted by 20 deg or more to all sides."""
+    where = finding.figures.get("where")
+    return str(where or "add captures with the board tilted by 20 deg or more to all sides")
+
+
 def _elsewhere(finding: Finding) -> str:
     """Best of {n_candidates} candidates: {distance_m}, {rotation_deg} from where the image has the board."""
     n, distance_m = finding.figures["n_candidates"], finding.figure("distance_m")
@@ -35,22 +41,20 @@ FEW_CAPTURES = Kind(
 FEW_AGREE = Kind(
     "shortage.few_agree",
     "only {n_agreeing} of {n_captures} captures agree with one set of extrinsics",
-    "check the board's size, the intrinsics and the pairing of images with scans; add captures",
+    "check board size, intrinsics, and the pairing of images with scans",
     severity="warning",
 )
 UNDETERMINED = Kind(
     "shortage.undetermined",
     _undetermined,
-    "add captures with the board tilted by 20 deg or more, left and right as well as up and down",
+    _tilt,
     severity="warning",
 )
 ELSEWHERE = Kind(
     "pair.elsewhere",
     _elsewhere,
-    "come closer or tilt the board more, so that both sensors see its tilt well",
-    actions={
-        "hold_still": "hold the board still, and 20 cm or more clear of walls, pillars and other things"
-    },
+    "come closer or tilt the board more",
+    actions={"hold_still": "hold the board still, 20 cm or more clear of walls and other things"},
 )
 TWO_PLACES = Kind(
     "pair.two_places",
@@ -61,5 +65,5 @@ OUTLIER = Kind(
     "calibrate.outlier",
     "outlier: plane {plane_m:mm}, edges {edges_m:mm} rms from the other captures' prediction "
     "(median {plane_median_m:mm}, {edges_median_m:mm})",
-    "hold the board still while capturing, with nothing in front of it or close behind its rim",
+    "hold the board still, with nothing in front of it or close behind it",
 )

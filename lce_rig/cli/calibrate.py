@@ -18,6 +18,7 @@ from lce_rig.cli.options import (
     robot_option,
     split_names,
 )
+from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.core.calibration import (
     DEFAULT_METHOD,
     AxisOpinion,
@@ -26,11 +27,12 @@ from lce_rig.core.calibration import (
     SceneOpinion,
 )
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
+from lce_rig.core.files import read_json
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
 from lce_rig.export.reference import read_reference
-from lce_rig.judge.findings import consequences, weakest_words
+from lce_rig.judge.findings import consequences, lacks_captures, weakest_words
 from lce_rig.pipeline.calibrate_sessions import require_unit
 from lce_rig.pipeline.result_files import UNION, Result, WrittenResult, result_folder
 from lce_rig.rig import find_profile, read_profile
@@ -277,16 +279,20 @@ def calibrate(
         with show.progress_bar("detecting") as progress:
             detections.append(lce.detect(each, event_image=event_image, progress=progress))
     with show.progress_bar("calibrating") as progress:
-        result = lce.calibrate(
-            opened,
-            detections,
-            options=lce.CalibrateOptions(method),
-            cameras=cameras or None,
-            channels=channels,
-            reference=truth,
-            use_scene=use_scene,
-            progress=progress,
-        )
+        try:
+            result = lce.calibrate(
+                opened,
+                detections,
+                options=lce.CalibrateOptions(method),
+                cameras=cameras or None,
+                channels=channels,
+                reference=truth,
+                use_scene=use_scene,
+                progress=progress,
+            )
+        except NotEnoughDataError as error:
+            hint = f"{error.hint}\n{_collect_command(opened[0])}".strip()
+            raise NotEnoughDataError(error.what, hint, error.finding) from None
     for shortage in result.shortages:
         show.warn(str(NotEnoughDataError.of(shortage)))
     if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):
@@ -303,11 +309,28 @@ def calibrate(
     n_others, page = len(written.files) - 1, "" if no_report else ", report.html"
     others = f" and {n_others} for the robot" if n_others else ""
     show.note(f"  files        {written.files[0].parent}/: result.json{page}{others}")
-    if all(c.verdict != "fail" for c in result.pairs):
+    if any(finding.code == GUIDE_ADD.code for c in result.pairs for finding in c.findings):
+        show.note(f"  next         {_collect_command(opened[0])}")
+    elif all(c.verdict != "fail" for c in result.pairs):
         show.name_next("verify", paths[0], "" if name is None else f" --name {name}")
     exit_by_verdict(result.pairs, are_printed=not as_json)
     if lacking is not None:
         raise lacking
+
+
+def _collect_command(session: lce.Session) -> str:
+    """Write the command that adds captures to a session, from where its own come from."""
+    from lce_rig.cli.simulate import TRUTH
+
+    options = " --from RECORDING"
+    if (session.path / TRUTH).exists():
+        options = f" --simulated --seed {read_json(session.path / TRUTH).get('seed', 0)}"
+    elif any(
+        isinstance(source := capture.meta.get("source"), dict) and str(source.get("key")).startswith("live:")
+        for capture in session.captures
+    ):
+        options = ""
+    return show.command("collect", session.path, options)
 
 
 def _take_profile(path: Path, profile: str) -> None:
@@ -386,11 +409,15 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
     causes = [finding for finding in reasons if finding.code not in following]
     used = f"{len(c.captures_used)} of {c.n_captures} captures used"
     lines = [f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"]
+    plan = next((finding.advice for finding in c.findings if finding.code == GUIDE_ADD.code), "")
     for finding in reasons if is_explained else causes[:_N_REASONS]:
         follows = "follows: " if finding.code in following else ""
         lines.append(f"  [{colour}]{follows}{show.escape(finding.text)}[/]")
         if finding.advice and not follows and (is_explained or finding is causes[0]):
-            lines.append(f"    -> {show.escape(finding.advice_at(path))}")
+            advice = plan if plan and lacks_captures([finding]) else finding.advice_at(path)
+            lines.append(f"    -> {show.escape(advice)}")
+    if plan and not lacks_captures(causes[:1]):
+        lines.append(f"  -> {plan}")
     if len(causes) > _N_REASONS and not is_explained:
         lines.append(f"  {show.counted(len(causes) - _N_REASONS, 'more reason')}: --explain, or report.html")
     if is_explained or not has_failed:

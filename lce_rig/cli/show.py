@@ -1,6 +1,7 @@
 """Print to a terminal: tables, progress bars, notes. Results go to stdout, all else to stderr."""
 
 import json
+import shlex
 import shutil
 import sys
 import textwrap
@@ -78,9 +79,14 @@ def titled_lines(title: str, texts: Sequence[str]) -> list[str]:
 
 
 def name_next(verb: str, session: Path, options: str = "") -> None:
-    """Name the verb to type next on stderr; the default session goes without saying."""
-    chosen = "" if session == Path("session") else f" {session}"
-    note(f"  next         lce-rig {verb}{chosen}{options}")
+    """Name the verb to type next on stderr."""
+    note(f"  next         {command(verb, session, options)}")
+
+
+def command(verb: str, session: Path, options: str = "") -> str:
+    """Write a command; the default session goes without saying."""
+    chosen = "" if session == Path("session") else f" {shlex.quote(str(session))}"
+    return f"lce-rig {verb}{chosen}{options}"
 
 
 def warn(text: str) -> None:

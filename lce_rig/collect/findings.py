@@ -1,6 +1,25 @@
 """Why captures are not taken, why guidance is missing, and why a collection continues."""
 
-from lce_rig.core.findings import Kind
+from typing import Any
+
+from lce_rig.core.findings import Finding, Kind
+
+
+def _placements(finding: Finding) -> str:
+    """Add {n_captures} captures ({is_enough}: predicted to suffice): {placements}."""
+    groups = finding.figures["placements"]
+    assert isinstance(groups, tuple)
+    more = "" if finding.figures["is_enough"] else "+"
+    return f"add {finding.figures['n_captures']}{more} captures: {', '.join(map(_group, groups))}"
+
+
+def _group(group: Any) -> str:
+    n, distance_m, place, sides = group
+    text = f"{n} at {distance_m:g} m"
+    if sides:
+        return f"{text} tilted {'/'.join(sides) if len(sides) < 3 else 'all ways'}"
+    return f"{text} {place}".rstrip()
+
 
 GUIDE_NO_BEAMS = Kind("guide.no_beams", "no guidance: {cause}", severity="warning")
 GUIDE_NO_NOMINAL = Kind(
@@ -19,6 +38,9 @@ GUIDE_PREDICTED = Kind(
     "{subject}: predicted {rotation_deg:2deg} (target {target_deg:g}), {position_mm:.1f} mm "
     "(target {target_mm:g})",
     severity="note",
+)
+GUIDE_ADD = Kind(
+    "guide.add", "captures to add, where each reduces the uncertainty most", _placements, severity="note"
 )
 READ_EVENTS_NOT_BEGUN = Kind(
     "read.events_not_begun",
@@ -47,13 +69,13 @@ IMAGE_MADE_FEW_EVENTS = Kind(
     "image.made_few_events",
     "the board made few events at {speed_mps:.2f} m/s: {events_px:.1f} events/px in 1 s "
     "(minimum {min_events_px:g})",
-    "move it sideways slowly, about 10 cm/s, in one direction, and in better light",
+    "move it sideways in one direction, about 10 cm/s, in better light",
 )
 LIDAR_ELSEWHERE = Kind(
     "lidar.elsewhere",
     "best of {n_candidates} candidates in the scan: {distance_m:.2f} m, {rotation_deg:.0f} deg from the "
     "pose predicted by the image and the nominal extrinsics",
-    "hold the board clear of other things, where more of the LiDAR's rings meet it",
+    "hold the board clear of other things, where more rings meet it",
 )
 CALIBRATE_KNOWN_PLACEMENT = Kind(
     "calibrate.known_placement",

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 from lce_rig.core.findings import Finding, Kind, Stage
 
-MOVE_SLOWLY = "move the board sideways slowly, about 10 cm/s, from 1 s before the capture"
+MOVE_SLOWLY = "move the board sideways, about 10 cm/s, from 1 s before the capture"
+_CLOSER = "come closer, and move the board sideways at about 10 cm/s"
 _SLOWER = "move it slower, about 10 cm/s"
 _CORNERS = "{n_cols}x{n_rows} inner corners"
-_WHOLE = "show the whole pattern, uncovered; inner corners are where four squares meet, one less than squares"
-_UNCOVER = "uncover the whole pattern; if it has these corners, correct board.inner_corners in the profile"
+_WHOLE = "show the whole pattern; correct board.inner_corners (squares less one)"
+_UNCOVER = "uncover the whole pattern, or correct board.inner_corners in the profile"
 _FOCUS = "hold the board still, expose shorter, come closer, focus the lens"
-_LENS = "check the camera's intrinsics ({model} at {width_px}x{height_px} px) and that the board is flat"
+_LENS = "check the intrinsics ({width_px}x{height_px} px) and that the board is flat"
 _CLOCKS = "check that both sensors' clocks agree"
 _NO_FLICKER = "record in daylight or under lamps that do not flicker"
 _PLATE = "{board_width_m:.2f} x {board_height_m:.2f} m"
@@ -94,20 +95,20 @@ IMAGE_NO_BOARD = Kind(
     "image.no_board",
     "no board: " + _CORNERS + " expected, none detected (median grey {grey_50:.0f})",
     _WHOLE,
-    actions={"events": f"{_WHOLE}; {MOVE_SLOWLY}"},
+    actions={"events": "move the whole board sideways, or correct board.inner_corners"},
 )
 IMAGE_UNCLEAR = Kind(
     "image.unclear",
     "the corners are too unclear to measure (" + _CORNERS + " expected)",
     "hold the board still, closer and better lit",
-    actions={"events": f"{MOVE_SLOWLY}; come closer"},
+    actions={"events": _CLOSER},
 )
 IMAGE_CUT_OFF = Kind(
     "image.cut_off",
     "board cut off by the {side} border: not all of the " + _CORNERS + " detected",
     "move the board away from the {side} border",
 )
-IMAGE_PART = Kind("image.part", _other_grid, _UNCOVER, actions={"events": f"{MOVE_SLOWLY}; {_UNCOVER}"})
+IMAGE_PART = Kind("image.part", _other_grid, _UNCOVER)
 IMAGE_PART_OF_SMALL = Kind(
     "image.part_of_small",
     "squares of {square_px:.1f} px are too small (minimum {min_square_px:g} px): not all of the "
@@ -118,7 +119,7 @@ IMAGE_PART_OF_SMALL = Kind(
 IMAGE_OTHER_BOARD = Kind(
     "image.other_board",
     _other_grid,
-    "correct board.inner_corners in the profile: one less than squares along each side",
+    "correct board.inner_corners in the profile: squares less one, each way",
 )
 IMAGE_LOW_CONTRAST = Kind(
     "image.low_contrast",
@@ -131,7 +132,7 @@ IMAGE_NOT_SHARP = Kind(
     "too blurred: edges {edge_px:.1f} px wide on squares of {square_px:.1f} px "
     "(minimum {min_sharpness:g} edge widths per square)",
     _FOCUS,
-    actions={"events": f"{MOVE_SLOWLY}; come closer"},
+    actions={"events": _CLOSER},
 )
 IMAGE_NO_POSE = Kind("image.no_pose", "the corners fit no pose of the board in front of the camera", _LENS)
 IMAGE_MISFIT = Kind(
@@ -158,13 +159,13 @@ IMAGE_NO_EVENTS = Kind(
 IMAGE_FEW_EVENTS = Kind(
     "image.few_events",
     "too few events: {n_events} in the second before the image",
-    f"{MOVE_SLOWLY}; if it moved, uncover the lens",
+    "move the board sideways, about 10 cm/s, or uncover the lens",
 )
 IMAGE_FLICKER = Kind("image.flicker", _flicker, _NO_FLICKER)
 IMAGE_HOT_PIXELS = Kind(
     "image.hot_pixels",
     "{n_hot} hot pixels make {share:percent} of the events; the board makes too few",
-    f"{MOVE_SLOWLY}; let the camera cool down, or mask them in its driver",
+    "move the board, let the camera cool down, or mask them in its driver",
 )
 IMAGE_HARDLY_MOVED = Kind(
     "image.hardly_moved",
@@ -209,7 +210,7 @@ LIDAR_TOUCHING = Kind(
     "lidar.touching",
     "the board at {distance_m:.1f} m touches another surface: "
     "{beyond_share:percent} more returns in its plane",
-    "keep walls, tables and hands 0.2 m away from the board's edges and plane",
+    "keep walls, tables and hands 0.2 m away from the board",
 )
 LIDAR_OUTLINE = Kind(
     "lidar.outline",
@@ -220,7 +221,7 @@ LIDAR_OUTLINE = Kind(
 LIDAR_OUT_OF_VIEW = Kind(
     "lidar.out_of_view",
     "{share:percent} of the board at {distance_m:.1f} m returned nothing: it reaches out of the LiDAR's view",
-    "move the board towards the middle of the LiDAR's field of view, or accumulate scans for longer",
+    "move it to the middle of the LiDAR's view, or accumulate for longer",
 )
 LIDAR_TURNED = Kind(
     "lidar.turned",
@@ -231,12 +232,12 @@ LIDAR_OTHER_PLATE = Kind(
     "lidar.other_plate",
     "the plate nearest to the board's size is {width_m:.2f} x {height_m:.2f} m, at {distance_m:.1f} m; "
     "the board is " + _PLATE,
-    "check width_m and height_m of the board in the rig profile, or show the whole board",
+    "check the board's width_m and height_m, or show the whole board",
 )
 LIDAR_NO_PLATE = Kind(
     "lidar.no_plate",
     "no plate of the board's size (" + _PLATE + ") between {min_range_m:g} and {max_range_m:g} m",
-    "hold the board at that distance, in sight of the LiDAR, with nothing at its edges",
+    "hold the board there, in sight of the LiDAR, with nothing at its edges",
 )
 LIDAR_TOO_FEW_POINTS = Kind(
     "lidar.too_few_points",
@@ -292,7 +293,5 @@ IMAGE_SIZE_OTHER = Kind(
     "image.size_other",
     f"{_SIZES}: cannot be used",
     _OTHER_MODE,
-    actions={
-        "scaled": f"{_OTHER_MODE}; if the image is only scaled, multiply fx, fy, cx, cy by {{factor:.4g}}"
-    },
+    actions={"scaled": "multiply fx, fy, cx, cy by {factor:.4g} if the image is only scaled"},
 )

@@ -5,9 +5,7 @@ from functools import partial
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.phrasing import significant
 
-_RAISE_LIMIT = (
-    "raise the receive buffer limit, now {buffer_kib} KiB: sudo sysctl -w net.core.rmem_max=4194304"
-)
+_RAISE_LIMIT = "raise it: sudo sysctl -w net.core.rmem_max=4194304"
 
 _note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
 
@@ -58,7 +56,7 @@ PACKETS_LOST = _warning(
 COMPUTER_TOO_SLOW = _warning(
     "stream.computer_too_slow",
     "this computer was too slow for {n} packets",
-    f"close other programs, and {_RAISE_LIMIT}",
+    "close other programs, and see `lce-rig doctor --rig RIG`",
 )
 ROTOR_RATE = _warning(
     "stream.rotor_rate",
@@ -93,7 +91,9 @@ LINES_DROPPED_BY_BOARD = _warning(
     "close other programs",
 )
 BUFFER_SMALL = _warning(
-    "buffer.small", "the receive buffer holds {buffer_s:0ms} (minimum 250 ms)", _RAISE_LIMIT
+    "buffer.small",
+    "the receive buffer ({buffer_kib} KiB) holds {buffer_s:0ms} (minimum 250 ms)",
+    _RAISE_LIMIT,
 )
 
 ARRIVAL = _note("clock.arrival", "arrival at this computer, later than the exposure by an unknown time")

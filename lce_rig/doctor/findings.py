@@ -40,7 +40,7 @@ DISK_FULL = Kind(
 DISK_SLOW = Kind(
     "computer.disk_slow",
     "too slow (minimum 20 MB/s)",
-    "write to an SSD (-o FOLDER), and record no raw streams beside the captures",
+    "write to an SSD (-o FOLDER), without --record",
 )
 DISK_NOT_WRITABLE = Kind(
     "computer.disk_not_writable",
@@ -60,7 +60,7 @@ RATE = _note("stream.rate", _rate)
 RATE_OFF = _warning(
     "stream.rate_off",
     _rate,
-    "long exposures slow a camera down: set rate and exposure, or correct the profile",
+    "set rate and exposure (long ones slow down), or correct the profile",
     actions={
         "rotor": "set rpm {expected_rpm:.0f} on its web page, or rate_hz in the profile",
         "trigger": "set its trigger mode in driver.controls, and check the line",
@@ -92,7 +92,7 @@ PULSE = _note("clock.pulse", _pulse)
 WITHOUT_PULSES = _note(
     "clock.without_pulses",
     "timestamps by arrival need still boards",
-    "without hardware, set lidars.*.timestamps sync: none, clock: host, and hold boards still",
+    "without it: lidars.*.timestamps clock: host, sync: none, still boards",
 )
 NO_TIMESTAMPS = _note("clock.no_timestamps", "no timestamps yet")
 EDGES_FITTED = _note(
@@ -117,6 +117,6 @@ FRAMES_OF_PULSES = _note("pulses.frames", "{n_frames} images of {n_pulses} pulse
 UNEQUAL = Kind(
     "pulses.unequal",
     "image and pulse counts differ",
-    "make every pulse trigger one image: set the camera's trigger mode in driver.controls, check the line",
+    "set the camera's trigger mode in driver.controls, check the line",
 )
 DELAY = _note("pulses.delay", "delay {delay_ms:.2f} +- {delay_scatter_ms:.2f} ms")

@@ -85,7 +85,7 @@ POSITION_PACKETS_STOPPED = Kind(
 PPS_NOT_LOCKED = Kind(
     "clock.pps_not_locked",
     f"{_BY_ARRIVAL}PPS is {{pps}}",
-    "check the pulse at the LiDAR's interface box: 1 Hz, 3 to 15 V, rising edge",
+    "check the pulse at the interface box: 1 Hz, 3 to 15 V, rising edge",
     severity="warning",
 )
 NO_NMEA = Kind(

@@ -6,7 +6,7 @@ from typing import Literal
 
 from lce_rig.core.calibration import WeakestMotion
 from lce_rig.core.findings import Finding, Kind, Severity, worst
-from lce_rig.core.phrasing import as_line, figures_apart, fill
+from lce_rig.core.phrasing import figures_apart, fill
 
 Verdict = Literal["pass", "marginal", "fail"]
 SURPRISING_CHI2 = 16.81
@@ -41,30 +41,29 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.channels_differ": _OF_SIGMAS,
 }
 """What follows from a cause, the causes that explain most first."""
+_LACKS = {
+    ("verdict.few_placements", ""),
+    ("verdict.rotation_uncertain", ""),
+    ("verdict.translation_uncertain", ""),
+    ("verdict.not_certified", ""),
+    ("verdict.held_out", ""),
+    ("verdict.control", ""),
+}
+"""Code and action of findings against which more captures help."""
 _VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}
 _APART = "{rotation_deg:deg}, {translation_m:mm}"
 _LENS = "check that the intrinsics belong to this lens and that the board is flat"
 _NEAR = {"near": "check the squares' size and the focal length, and that the board is flat"}
-_CORNERS_TOO = "collect captures with the board in all four corners of the image, tilted by 30 to 45 deg"
-_SAVE = "Write a profile with the session's intrinsics: `lce-rig intrinsics {session} --save-profile FILE`"
-_LOOK = "`lce-rig drift {session} -o FOLDER` draws the edges"
+_CORNERS_TOO = "hold the board in all four corners of the image, tilted by 30 to 45 deg"
+_SAVE = "`lce-rig intrinsics {session} --save-profile FILE`"
+_LOOK = "(drawn by `lce-rig drift {session} -o FOLDER`)"
 _STILL = "hold the board still, check board size and intrinsics"
-_RANGES = (
-    "measure the LiDAR's constant range errors, which alone exceed the target, correct them in its driver "
-    "and lower range_offset_sigma_m and laser_bias_sigma_m in the profile, or put more rings on the board"
-)
-_MEASURE_LENS = (
-    "collect captures with the board in all four corners of the image, tilted by 30 to 45 deg, or enter "
-    "intrinsics that were measured well, with their standard deviations"
-)
+_RANGES = "measure the LiDAR's ranges, then lower range_offset_sigma_m"
 _MEASURE = {
     "resolve": "resolve what contradicts first: more captures do not reduce this",
-    "measure_intrinsics": _MEASURE_LENS,
+    "measure_intrinsics": _CORNERS_TOO,
     "measure_square_size": "measure across all squares, divide, and enter square_m and square_sigma_m",
-    "measure_pattern_offset": (
-        "measure the pattern's margins on all four sides of the plate, and enter pattern_offset_m and "
-        "pattern_offset_sigma_m"
-    ),
+    "measure_pattern_offset": "measure the pattern's margins, and enter pattern_offset(_sigma)_m",
     "measure_plate_size": "measure the plate, and enter width_m, height_m and plate_sigma_m",
     "measure_board_bow": "lay a straight edge across the board, and enter bow_sigma_m",
 }
@@ -103,6 +102,13 @@ def consequences(findings: Iterable[Finding]) -> dict[str, str]:
     codes = [finding.code for finding in findings if finding.severity != "note"]
     causes = [code for code in _FOLLOWS if code in codes]
     return {code: cause for cause in reversed(causes) for code in codes if code in _FOLLOWS[cause]}
+
+
+def lacks_captures(findings: Iterable[Finding]) -> bool:
+    """Tell whether one of the causes against a result is that captures are too few, or too much alike."""
+    reasons = [finding for finding in findings if finding.severity != "note"]
+    following = consequences(reasons)
+    return any((each.code, each.action) in _LACKS and each.code not in following for each in reasons)
 
 
 def by_cause(findings: Sequence[Finding]) -> tuple[Finding, ...]:
@@ -161,7 +167,7 @@ def _intrinsics(finding: Finding) -> str:
         larger = "larger" if percent > 0 else "smaller"
         parts.append(f"focal length {abs(percent):.1f} +- {sigma:.1f} % {larger}")
     if finding.severity == "note":
-        return f"the session's boards correct the profile's intrinsics: {'; '.join(parts[1:]) or parts[0]}"
+        return f"the boards correct the profile's intrinsics: {'; '.join(parts[1:]) or parts[0]}"
     how = "do not fit" if finding.severity == "error" else "fit only roughly"
     return f"the profile's intrinsics {how}: {'; '.join(parts)}"
 
@@ -173,14 +179,6 @@ def _reach(finding: Finding) -> str:
         sigma_text, limit_text = figures_apart(sigma_px, finding.figure("limit_px"))
         known = f"determines pixels near its border to {sigma_text} px (limit {limit_text} px)"
     return f"the session covers {100 * finding.figure('covered'):.0f} % of the image and {known}"
-
-
-def _collect_first(finding: Finding) -> str:
-    """Collect in all four corners, as {covered}, {image_sigma_px}, {limit_px} say; then run intrinsics."""
-    return (
-        f"check whether lens, focus or resolution were changed. {as_line(_reach(finding))} "
-        f"{as_line(_CORNERS_TOO)} {fill(_SAVE, {'session': 'SESSION', **finding.figures})}"
-    )
 
 
 def _scale(finding: Finding) -> str:
@@ -306,15 +304,15 @@ ROTATION_UNCERTAIN = Kind(
     "verdict.rotation_uncertain",
     "rotation standard deviation {sigma_deg:deg}, target {target_deg:deg} "
     "(x right, y down, z forward {by_axis_deg:.2g} deg)",
-    f"collect more captures; least determined: {_LEAST_ROTATION}",
-    actions={"measure_ranges": f"{_RANGES}; least determined: {_LEAST_ROTATION}", **_MEASURE},
+    "add captures; least determined: {weakest:motion}",
+    actions={"measure_ranges": _RANGES, **_MEASURE},
 )
 TRANSLATION_UNCERTAIN = Kind(
     "verdict.translation_uncertain",
     "translation standard deviation {sigma_m:1mm}, target {target_m:1mm} "
     "(x right, y down, z forward {by_axis_m:1mm})",
-    f"collect more captures; least determined: {_LEAST_TRANSLATION}",
-    actions={"measure_ranges": f"{_RANGES}; least determined: {_LEAST_TRANSLATION}", **_MEASURE},
+    "add captures; least determined: {weakest:motion}",
+    actions={"measure_ranges": _RANGES, **_MEASURE},
 )
 PLANE_RESIDUAL = Kind(
     "verdict.plane_residual",
@@ -342,7 +340,7 @@ PLANES_APART = Kind(
 CHANNELS_DIFFER = Kind(
     "verdict.channels_differ",
     "{first} and {second} of one camera differ by " + _APART + ", beyond their uncertainty",
-    "calibrate each alone (--channels) and find the captures that contradict it",
+    "calibrate each alone (--channels), find the captures that contradict",
 )
 SENSORS_DISAGREE = Kind(
     "verdict.sensors_disagree",
@@ -365,17 +363,17 @@ FAR_FROM_NOMINAL = Kind(
     "verdict.far_from_nominal",
     "{rotation_deg:1deg}, {translation_m:mm} from the nominal extrinsics "
     "(tolerance {tolerance_deg:g} deg, {tolerance_m:mm})",
-    "check nominal_extrinsics and the frames in the profile, and that these sensors were used",
+    "check nominal_extrinsics and frames in the profile, and the sensors used",
 )
 PLATE_SIZE = Kind("verdict.plate_size", _plate, "measure the plate")
 INTRINSICS = Kind(
     "verdict.intrinsics",
     _intrinsics,
-    "check whether lens or resolution were changed. " + _SAVE,
+    "if the lens was changed: " + _SAVE,
     actions={
-        "refocused": "check whether the lens was refocused. " + _SAVE,
-        "collect": _collect_first,
-        "weighed": "use the result's intrinsics with its extrinsics. " + _SAVE,
+        "refocused": "if it was refocused: " + _SAVE,
+        "collect": "cover the corners, then " + _SAVE,
+        "weighed": "use the result's, or " + _SAVE,
     },
 )
 INTRINSICS_BETTER = Kind(
@@ -436,7 +434,7 @@ LASER_OFFSET = Kind(
 LASER_ANGLES = Kind(
     "verdict.laser_angles",
     "the lasers' {angle}s differ from those of the scans by {rms_deg:deg} rms (limit {limit_deg:deg})",
-    "check the LiDAR's model and beam table in the driver that made the point clouds",
+    "check the LiDAR's model and beam table in its driver",
 )
 CAMERA_CHANGED = Kind(
     "verdict.camera_changed",
@@ -459,7 +457,7 @@ CAMERAS_SCATTER = Kind(
 CAMERAS_EXCHANGED = Kind(
     "verdict.cameras_exchanged",
     "{subject} are exchanged: each fits the profile's {fits} of the other",
-    "check which topic, port or file belongs to which camera, and collect again",
+    "check topics, ports or files of the cameras, and collect again",
 )
 CAMERAS_DIFFER = Kind(
     "verdict.cameras_differ",
@@ -479,11 +477,11 @@ MAY_BE_OFF = Kind(
 SCENE = Kind(
     "verdict.scene",
     _scene,
-    f"check the intrinsics, squares and plate. {_LOOK}",
+    f"check intrinsics and board {_LOOK}",
     actions={
-        "deployed": f"check whether a sensor has moved since. {_LOOK}",
-        "distances": f"measure the squares and check the focal length. {_LOOK}",
-        "times": f"hold the board still and check the image-scan matching. {_LOOK}",
+        "deployed": f"a sensor may have moved {_LOOK}",
+        "distances": f"check the squares {_LOOK}",
+        "times": f"hold boards still {_LOOK}",
     },
 )
 SCENE_USED = Kind(
@@ -497,7 +495,7 @@ SCENE_UNKNOWN = Kind(
 SCENE_NOT_USED = Kind(
     "verdict.scene_not_used",
     "the scene contradicts the boards and is not used: it would move them by " + _SCENE_CHANGE,
-    f"check the intrinsics and the board's size. {_LOOK}",
+    f"check intrinsics and board {_LOOK}",
     severity="warning",
 )
 ELSEWHERE = Kind(
@@ -515,7 +513,7 @@ RESULTS_DISAGREE = Kind(
     "results.disagree",
     "{first} and {second} of {camera} and {lidar} disagree: results differ by up to {rotation_deg:3deg} and "
     "{translation_m:1mm}, more than their uncertainties allow",
-    "compare the overlays of both (`lce-rig verify {session} --name NAME`) and collect more captures",
+    "compare their overlays: `lce-rig verify {session} --name NAME`",
 )
 REPEAT_AGREE = Kind("repeat.agree", _agree, severity="note")
 REPEAT_DISAGREE = Kind(

@@ -14,17 +14,20 @@ from itertools import combinations
 from pathlib import Path
 
 from lce_rig.calibrate import CalibrateOptions
+from lce_rig.collect.guidance.more_captures import plan_captures
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection
 from lce_rig.export.reference import Reference
+from lce_rig.judge.findings import lacks_captures
 from lce_rig.judge.repeatability import Repeatability, compare_calibrations
 from lce_rig.judge.verdict import with_opinion
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.findings import MOVED, ONLY_ONE
+from lce_rig.pipeline.matching import boards_in
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.witness import by_boards, hear_scene, sharpen
 from lce_rig.session import Session
@@ -76,9 +79,10 @@ def calibrate(
     if is_union:
         begin(progress, "calibrating each session alone")
     comparisons = _require_unmoved(named, by_name, options, cameras, channels) if is_union else ()
+    joined = join_detections(by_name) if is_union else detections[0]
     pairs, shortages = calibrate_detections(
         sessions[0].rig,
-        join_detections(by_name) if is_union else detections[0],
+        joined,
         options,
         cameras=cameras,
         channels=channels,
@@ -97,7 +101,13 @@ def calibrate(
         )
         opinion = hear_scene(named[name], by_name[name], by_boards(c))
         agreement = agreements.get((c.camera, c.lidar), ())
-        judged.append(with_opinion(replace(c, findings=(*c.findings, *agreement)), opinion))
+        c = with_opinion(replace(c, findings=(*c.findings, *agreement)), opinion)
+        if lacks_captures(c.findings):
+            plan = plan_captures(
+                sessions[0].rig, c.camera, c.lidar, boards_in(joined, *sensors, c.captures_used), c
+            )
+            c = replace(c, findings=(*c.findings, *plan))
+        judged.append(c)
     return Result(sessions[0], tuple(judged), tuple(shortages), named if is_union else {})
 
 

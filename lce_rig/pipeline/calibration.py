@@ -19,10 +19,12 @@ from lce_rig.calibrate import (
     EstimateSettings,
     estimate_extrinsics,
 )
+from lce_rig.calibrate.findings import UNDETERMINED
 from lce_rig.calibrate.observability import find_weakest
 from lce_rig.calibrate.result import capture_residual, error_to_reference
 from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.tolerances import Tolerances
+from lce_rig.collect.guidance.more_captures import plan_captures
 from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal
@@ -40,7 +42,7 @@ from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, share_findings
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE
-from lce_rig.pipeline.matching import candidates_of
+from lce_rig.pipeline.matching import boards_in, candidates_of
 from lce_rig.rig import Rig
 
 
@@ -151,6 +153,11 @@ def calibrate_detections(
         except NotEnoughDataError as error:
             shortage = error.finding or SHORTAGE(text=error.what, advice=error.hint)
             sensors = f"{pairs[0].camera} and {pairs[0].lidar}"
+            if shortage.code in (FEW_DETECTED.code, UNDETERMINED.code):
+                held = boards_in(detections, pairs[0].camera, pairs[0].lidar)
+                plan = plan_captures(rig, pairs[0].camera, pairs[0].lidar, held)
+                where = next((each.advice for each in plan), "")
+                shortage = replace(shortage, figures={**shortage.figures, "where": where})
             shortages.append(shortage if shortage.subject else replace(shortage, subject=sensors))
     if not alone and not shortages:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""

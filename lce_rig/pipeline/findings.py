@@ -4,13 +4,15 @@ from lce_rig.core.findings import Finding, Kind
 
 
 def _commonest(finding: Finding) -> str:
-    """The commonest of {causes} of refusal with their counts, and how many captures {n_needed} lacks."""
+    """The commonest of {causes} of refusal with their counts, and {where} to hold the board."""
     causes = finding.figures["causes"]
     assert isinstance(causes, tuple)
     lines = [f"{cause[0]} x {cause[2]}" for cause in causes if isinstance(cause, tuple)]
-    n_missing = int(finding.figure("n_needed") - finding.figure("n_detected"))
-    more = f"collect at least {n_missing} more, with the board at other places and tilts"
-    return "\n".join([*lines, more])
+    if finding.figures["n_detected"] or not lines:
+        n_missing = int(finding.figure("n_needed") - finding.figure("n_detected"))
+        more = f"add {n_missing} captures or more, with the board at other places and tilts"
+        lines.append(str(finding.figures.get("where") or more))
+    return "\n".join(lines)
 
 
 FEW_DETECTED = Kind(
@@ -23,7 +25,7 @@ SHORTAGE = Kind("shortage.text", "{text}", "{advice}", severity="warning")
 NO_AGREEMENT = Kind(
     "pair.no_agreement",
     "no three of {n_captures} captures agree with one set of extrinsics",
-    "check the board's size, the intrinsics and the pairing of images with scans",
+    "check board size, intrinsics, and the pairing of images with scans",
 )
 OUTDATED = Kind(
     "results.outdated",
@@ -47,10 +49,8 @@ MOVED = Kind(
     "union.moved",
     "the extrinsics of {camera} and {lidar} from {first} and {second} differ by {rotation_deg:3deg} and "
     "{translation_m:1mm}, more than their uncertainties allow (chance {p:.2g})",
-    "the sensors were moved in between, or one of the sessions is wrong: calibrate them separately",
-    actions={
-        "odd_one": "leave out {odd_one}: the sensors were moved, or the session is wrong; the others agree"
-    },
+    "calibrate them separately: a sensor was moved, or one session is wrong",
+    actions={"odd_one": "leave out {odd_one}, where a sensor was moved; the others agree"},
 )
 OTHER_PROFILE = Kind(
     "verify.other_profile",

@@ -1,6 +1,8 @@
 """Which captures show the board to both sensors, and in which the sensors agree on its place."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
 
 from lce_rig.calibrate.consensus import Consensus, camera_poses, find_consensus
 from lce_rig.core.errors import NotEnoughDataError
@@ -24,6 +26,18 @@ def candidates_of(detections: Detections, pair: Pair) -> tuple[list[Observation]
         else:
             candidates.append(Observation.of(name, image, lidar, detections.session_of.get(name, "")))
     return candidates, refused
+
+
+def boards_in(
+    detections: Detections, camera: str, lidar: str, captures: Collection[str] | None = None
+) -> Array:
+    """Stack the board's poses T_cam_board (N, 4, 4) in captures that both sensors see; in all if None."""
+    poses: dict[str, Array] = {}
+    for pair in detections.pairs:
+        if (pair.camera, pair.lidar) == (camera, lidar):
+            poses |= {each.capture: each.image.T_cam_board for each in candidates_of(detections, pair)[0]}
+    chosen = [T for name, T in poses.items() if captures is None or name in captures]
+    return np.array(chosen).reshape(-1, 4, 4)
 
 
 def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:

@@ -24,8 +24,7 @@ UNKNOWN_MODEL = Kind(
     "profile.unknown_model",
     "{subject}: the beams of {value} are not known: recordings can be calibrated, live guidance and "
     "simulation need elevations_deg and columns",
-    "enter them and your LiDAR's noise (docs/rig-profiles.md: LiDAR models), or make a new profile with "
-    "`lce-rig rigs new NAME --lidar other --from RECORDING`",
+    "measure them: `lce-rig rigs new NAME --lidar other --from RECORDING`",
     severity="warning",
 )
 SHARED = Kind(

@@ -5,7 +5,7 @@ from lce_rig.core.phrasing import fill
 
 _BOARD = "collect a session with the board and calibrate it"
 _FASTEN = f"fasten the sensors, {_BOARD}"
-_RECORD = "record where upright edges of furniture, doors or people stand before something farther away"
+_RECORD = "record furniture, doors or people that stand before something farther off"
 
 STATES = {"unchanged": "no change seen", "changed": "changed", "unknown": "cannot tell"}
 """Words for the state of an axis."""
@@ -69,7 +69,7 @@ CHANGED = Kind("scene.changed", "the extrinsics do not fit the edges of the scen
 UNKNOWN = Kind(
     "scene.unknown",
     "the edges of the scene cannot tell: {unknown:motion}",
-    f"{_RECORD}, or {_BOARD}",
+    _RECORD,
     severity="warning",
 )
 FEW_EDGES = Kind(
@@ -88,7 +88,7 @@ CHANGED_WITH_BOARD = Kind(
 UNKNOWN_WITH_BOARD = Kind(
     "scene.unknown_with_board",
     "neither the scene nor the board can tell: {unknown:motion}",
-    f"{_RECORD}, or {_BOARD}",
+    _RECORD,
     severity="warning",
 )
 BOARD_CHANGED = Kind("scene.board_changed", _board_changed)
@@ -125,7 +125,7 @@ NO_FIRING_TIMES = Kind(
 CLOCKS_APART = Kind(
     "scene.clocks_apart",
     "while the rig moves, images of {subject} fit best {apart_s:+.2f} s from their timestamps",
-    "let the rig stand, or correct the clocks: `lce-rig doctor --rig RIG` measures them",
+    "let the rig stand, or correct the clocks (`lce-rig doctor --rig RIG`)",
     severity="warning",
 )
 CLOCKS_INSTEAD = Kind(
@@ -155,7 +155,7 @@ LARGE_SCATTER = Kind(
 FLAT = Kind(
     "scene.flat",
     "scene, {subject:motion}: no extrinsics along this axis fit the edges clearly",
-    "check that the result belongs to this rig and that the images are sharp and lit",
+    "check that the result is of this rig, and images sharp and lit",
     severity="warning",
 )
 NO_PEAK = Kind(

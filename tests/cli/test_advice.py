@@ -4,6 +4,7 @@ import ast
 import re
 import shlex
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import click
@@ -11,6 +12,7 @@ import pytest
 
 import lce_rig
 from lce_rig.cli.main import cli
+from lce_rig.core.findings import KINDS
 
 PACKAGE = Path(lce_rig.__file__).parent
 # In backticks up to the closing one, else up to the end of the sentence or of the text.
@@ -76,6 +78,17 @@ def _lacking(command: str) -> str:
         and not (isinstance(value := values.get(param.name or ""), str | tuple | list) and value)
     ]
     return ", ".join(missing)
+
+
+def test_an_action_takes_one_line_of_a_terminal() -> None:
+    for path in sorted(PACKAGE.glob("*/findings.py")):
+        import_module(f"lce_rig.{path.parent.name}.findings")
+    for kind in KINDS.values():
+        for action in (kind.action, *kind.actions.values()):
+            if isinstance(action, str):
+                # Indented by "    -> "; a figure takes about four characters.
+                filled = re.sub(r"{[^}]*}", "1.23", action.replace("{session}", "session"))
+                assert len(filled) <= 80 - 7, (kind.code, action)
 
 
 def test_commands_are_found() -> None:

@@ -1,0 +1,49 @@
+"""The plan of captures to add: as many as are missing, where they help, and none where nothing is known."""
+
+import numpy as np
+import pytest
+
+from lce_rig.collect.guidance.more_captures import plan_captures
+from lce_rig.collect.guidance.planner import Planner
+from lce_rig.collect.guidance.sensor_model import SensorPlace, model_sensors
+from lce_rig.core.geometry import Array
+from lce_rig.rig import Rig, load_rig
+
+
+def plan(rig: Rig, held: Array) -> dict:
+    (finding,) = plan_captures(rig, "cam", "lidar", held)
+    assert sum(group[0] for group in finding.figures["placements"]) == finding.figures["n_captures"]
+    assert len(f"    -> {finding.advice}") <= 80
+    return dict(finding.figures)
+
+
+@pytest.fixture(scope="module")
+def placements() -> Array:
+    """Placements that guidance itself would choose, the best first."""
+    rig = load_rig("rlfs")
+    view = SensorPlace.upright(model_sensors(rig, "cam", "lidar"), rig.nominal("cam", "lidar").to_matrix())
+    planner, held = Planner(view), np.zeros((0, 4, 4))
+    for _ in range(5):
+        held = np.concatenate([held, planner.guide(held).T_cam_board[None]])
+    return held
+
+
+def test_a_session_with_too_few_captures_gets_at_least_the_minimum(placements: Array) -> None:
+    rig = load_rig("rlfs")
+    for n in (0, 3, 5):
+        assert n + plan(rig, placements[:n])["n_captures"] >= rig.quality.min_captures
+
+
+def test_boards_that_face_one_way_are_followed_by_tilted_ones(placements: Array) -> None:
+    alike = np.repeat(placements[:1], 5, axis=0)
+    alike[:, :3, 3] *= np.linspace(0.7, 1.0, 5)[:, None]
+    assert any(group[3] for group in plan(load_rig("rlfs"), alike)["placements"])
+
+
+def test_a_plan_needs_no_nominal_extrinsics_but_the_beams_of_the_lidar(placements: Array) -> None:
+    rig = load_rig("rlfs").model_copy(update={"nominal_extrinsics": ()})
+    assert plan(rig, placements)["n_captures"] >= 1
+    unknown = rig.lidars["lidar"].model_copy(update={"model": "other"})
+    assert not plan_captures(
+        rig.model_copy(update={"lidars": {"lidar": unknown}}), "cam", "lidar", placements
+    )
