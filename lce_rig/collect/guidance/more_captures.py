@@ -7,7 +7,7 @@ import numpy as np
 from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.collect.guidance.instructions import describe_pose
 from lce_rig.collect.guidance.planner import ENOUGH_SHARE, LEANS_DEG, Planner
-from lce_rig.collect.guidance.sensor_model import SensorPlace, model_sensors
+from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Finding
@@ -39,7 +39,7 @@ def plan_captures(
         The plan; nothing where the LiDAR's beams are not known, or no new placement is left.
     """
     try:
-        model = model_sensors(rig, camera, lidar)
+        model = SensorModel.of(rig, camera, lidar)
     except ProfileError:
         return []
     nominal = rig.nominal(camera, lidar)

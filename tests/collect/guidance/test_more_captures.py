@@ -5,7 +5,7 @@ import pytest
 
 from lce_rig.collect.guidance.more_captures import plan_captures
 from lce_rig.collect.guidance.planner import Planner
-from lce_rig.collect.guidance.sensor_model import SensorPlace, model_sensors
+from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig, load_rig
 
@@ -21,7 +21,7 @@ def plan(rig: Rig, held: Array) -> dict:
 def placements() -> Array:
     """Placements that guidance itself would choose, the best first."""
     rig = load_rig("rlfs")
-    view = SensorPlace.upright(model_sensors(rig, "cam", "lidar"), rig.nominal("cam", "lidar").to_matrix())
+    view = SensorPlace.upright(SensorModel.of(rig, "cam", "lidar"), rig.nominal("cam", "lidar").to_matrix())
     planner, held = Planner(view), np.zeros((0, 4, 4))
     for _ in range(5):
         held = np.concatenate([held, planner.guide(held).T_cam_board[None]])
