@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
+from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SessionError, SourceError
@@ -17,6 +17,7 @@ from lce_rig.core.losses import Losses
 from lce_rig.core.progress import Progress
 from lce_rig.devices import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
+from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.io import open_recordings
 from lce_rig.io.folder.folder import FolderRecording
 from lce_rig.io.joining import join_recordings, require_sensors
@@ -176,7 +177,7 @@ class SceneCaptures:
         Raises:
             SourceError: a sensor cannot be opened.
         """
-        board = next((source for source in sources if isinstance(source, SyncTimes)), None)
+        board = next((source for source in sources if isinstance(source, SyncBoard)), None)
         clock = RigClock(self._rig, has_board=board is not None, edge_cameras=edge_cameras(self._rig))
         n_frames = 0
         with (

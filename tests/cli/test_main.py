@@ -93,7 +93,9 @@ def test_ctrl_c_while_onnxruntime_is_imported_is_not_taken_for_a_missing_package
     assert len(done.stderr.split("\n")) == 3 and done.stderr.startswith("\ninterrupted")
 
 
-@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(
+    "closed", [*(pytest.param(one, marks=pytest.mark.long) for one in ("<&-", ">&-", "2>&-")), "<&- >&- 2>&-"]
+)
 def test_closed_standard_streams_are_no_bug(closed, tmp_path):
     missing = f'collect --rig rles "{tmp_path}/none" --from "{tmp_path}/no"'
     line = f'exec "{sys.executable}" -m lce_rig {missing} {closed}'

@@ -83,7 +83,7 @@ def test_single_shots_of_a_recording_are_moments_and_passing_samples_are_not() -
 
 
 def test_live_and_offline_take_the_same_boards() -> None:
-    for limits in ({}, {"max_distance_m": 3.0}, {"max_tilt_deg": 20.0}, {"min_rings": 8}):
+    for limits in ({"max_distance_m": 3.0}, {"max_tilt_deg": 20.0, "min_rings": 8}):
         profile = strict(**limits)
         finder, watcher = BoardFinder(profile), BoardTracker(profile, 0.0)
         for k, capture in enumerate(placements()):

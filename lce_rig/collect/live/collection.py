@@ -26,7 +26,7 @@ from lce_rig.collect.live.capture_triggers import (
     narrate_unseen,
 )
 from lce_rig.collect.live.capture_writer import CaptureWriter, Learning, record_streams
-from lce_rig.collect.live.frame_feed import FrameFeed, SyncTimes
+from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, count_in, make_guides
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, LiveState, TakeBack
@@ -35,6 +35,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.devices import edge_cameras
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.reading import AttachedSensors, LiveSource
+from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.rig_clock import RigClock
@@ -73,7 +74,7 @@ def collect_live(
     """
     options = options or LiveOptions()
     rig = session.rig
-    board = next((source for source in sources if isinstance(source, SyncTimes)), None)
+    board = next((source for source in sources if isinstance(source, SyncBoard)), None)
     guides = make_guides(rig)
     for capture in session.captures:
         count_in(capture, session, guides)

@@ -4,42 +4,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import TracebackType
-from typing import Protocol, runtime_checkable
 
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.core.data import Sample
 from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.losses import Losses
 from lce_rig.devices.reading import AttachedSensors, Inbox
+from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig import Rig
-from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.rig_clock import SLOW_TRIGGERS_HZ, RigClock
 from lce_rig.timing.rig_time import event_channel
 from lce_rig.timing.scan_pairing import LIVE_NS, Frame, pair_by_time
 
 _WAIT_S = 0.1
 _REFRESH_S = 0.5
-
-
-@runtime_checkable
-class SyncTimes(Protocol):
-    """The clocks and triggers of a sync board."""
-
-    sensor: str
-
-    @property
-    def host_clock(self) -> ClockModel | None:
-        """The computer's time on the board's clock."""
-        ...
-
-    @property
-    def utc_clock(self) -> ClockModel | None:
-        """UTC on the board's clock."""
-        ...
-
-    def start_triggers(self, rate_hz: float | None = None) -> None:
-        """Let the pulses begin, at the profile's rates or at another one."""
-        ...
 
 
 class FrameFeed:
@@ -56,7 +34,7 @@ class FrameFeed:
         rig: Rig,
         sensors: AttachedSensors,
         clock: RigClock,
-        board: SyncTimes | None,
+        board: SyncBoard | None,
         record: Callable[[Sample], None] | None = None,
         *,
         are_events_enough: bool = False,

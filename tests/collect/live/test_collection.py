@@ -100,6 +100,7 @@ def test_captures_are_taken_back_one_by_one_and_nothing_is_lost_or_counted_twice
     assert sounds.count("taken_back") == 2 and sounds.count("captured") == 5
 
 
+@pytest.mark.long
 def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -126,6 +126,7 @@ def test_captures_appear_by_themselves_and_hold_what_was_sent(
     assert [entry["ending"] for entry in journal_of(session)] == ["frames", "frames"]
 
 
+@pytest.mark.long
 def test_a_collection_without_captures_ends_in_time_and_says_what_to_check(
     wire: Start, tmp_path: Path
 ) -> None:
