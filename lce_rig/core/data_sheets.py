@@ -16,6 +16,8 @@ import numpy as np
 
 from lce_rig.core.geometry import Array
 
+_LINE_DEG = 0.5
+
 
 @dataclass(frozen=True)
 class DataSheet:
@@ -90,11 +92,19 @@ class DataSheet:
 
     @property
     def rings_rad(self) -> Array:
-        """The elevation of each ring (L,), from the lowest."""
+        """The elevation of each ring (L,), from the lowest.
+
+        Without rings, that of lines about as far apart as returns, from which guidance predicts its figures.
+        """
+        if not self.has_rings:
+            low, high = self.fov_deg[1:]
+            return np.asarray(np.radians(np.linspace(low, high, max(int((high - low) / _LINE_DEG), 2))))
         return np.asarray(np.radians(np.sort(self.elevations_deg)))
 
     def step_rad(self, rate_hz: float) -> float:
         """Give the turn of the rotor between two firings of one laser."""
+        if not self.has_rings:
+            return float(np.radians(_LINE_DEG))
         if self.sequence_ns is None:
             return 2 * np.pi / (self.columns or 1)
         return 2 * np.pi * self.sequence_ns * 1e-9 * rate_hz

@@ -201,7 +201,7 @@ class Rig(Settings):
             if value is not None and first.setdefault((kind, value), key) != key:
                 yield SHARED(key, value=value, other=first[kind, value])
         for name, lidar in self.lidars.items():
-            if not _USUAL_RATE_HZ[0] <= lidar.rate_hz <= _USUAL_RATE_HZ[1]:
+            if lidar.has_rings and not _USUAL_RATE_HZ[0] <= lidar.rate_hz <= _USUAL_RATE_HZ[1]:
                 yield ODD_RATE(f"lidars.{name}.rate_hz", rate_hz=lidar.rate_hz)
             if lidar.data_sheet() is None:
                 yield UNKNOWN_MODEL(f"lidars.{name}.model", value=lidar.model)

@@ -1,4 +1,4 @@
-"""A spinning LiDAR: beam table, firing times, finite beams with mixed pixels, and the errors of real ones."""
+"""A LiDAR: beams or pattern, firing times, finite beams with mixed pixels, and the errors of real ones."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Scan
+from lce_rig.core.data import NO_RING, Scan
 from lce_rig.core.data_sheets import DataSheet
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.simulate.options import LidarNoise
@@ -144,9 +144,35 @@ _FIRINGS_PER_INSTANT = 256
 _MARGIN_RAD, _NEAREST_M = 0.04, 0.5
 
 
+# Of the two prisms of a rosette and of the Mid-360's rotor and mirror, in turns per second; no multiples.
+_PRISMS_HZ, _MID360_HZ = (121.67, -77.33), (10.37, 2311.7)
+_LINES = 4  # of a Mid-360: beams side by side in elevation
+_LINE_RAD = np.radians(0.7)
+
+
+def _pattern(sheet: DataSheet, starts_ns: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Aim the firings (N,) of a LiDAR without rings: azimuth and elevation, rad.
+
+    Two prisms turn the beam by half of the field's radius each: a rosette, densest in its middle. A Mid-360's
+    lines sweep elevation while its rotor turns. Neither repeats within minutes.
+    """
+    t_s = 1e-9 * starts_ns
+    width, low, high = np.radians(sheet.fov_deg)
+    if sheet.pattern == "rosette":
+        first, second = (2 * np.pi * hz * t_s for hz in _PRISMS_HZ)
+        across, up = (np.cos(first) + np.cos(second)) / 2, (np.sin(first) + np.sin(second)) / 2
+        return across * width / 2, (low + high) / 2 + up * (high - low) / 2
+    rotor, mirror = (hz * t_s for hz in _MID360_HZ)
+    up = np.abs(2 * np.mod(mirror, 1.0) - 1) * (high - low) + low
+    line = (np.arange(len(t_s)) % _LINES - (_LINES - 1) / 2) * _LINE_RAD
+    return np.pi - 2 * np.pi * np.mod(rotor, 1.0), np.clip(up + line, low, high)
+
+
 @dataclass(frozen=True, eq=False)
 class LidarModel:
-    """The geometry and timing of a spinning LiDAR at one rate.
+    """The geometry and timing of a LiDAR at one rate.
+
+    Of one without rings, each firing of a scan is a laser of its own.
 
     Attributes:
         name: of the model.
@@ -156,7 +182,8 @@ class LidarModel:
         origin_radius_m: distance of the optical centres from the axis, along the rotor's direction.
         starts_ns: (L,) when each laser fires after the first of its sequence.
         sequence_ns: time between two sequences.
-        period_ns: of one revolution.
+        period_ns: of one revolution, or of the scans that are accumulated.
+        pattern: as of the data sheet.
     """
 
     name: str
@@ -167,11 +194,19 @@ class LidarModel:
     starts_ns: NDArray[np.int64]
     sequence_ns: int
     period_ns: int
+    pattern: str = "rings"
 
     @classmethod
     def of(cls, sheet: DataSheet, rate_hz: float) -> "LidarModel":
         """Build the model of a data sheet at a rate."""
         n, period_ns = sheet.n_rings, round(1e9 / rate_hz)
+        if not sheet.has_rings:
+            starts_ns = (np.arange(round(sheet.points_hz / rate_hz)) * 1e9 / sheet.points_hz).astype(np.int64)
+            azimuth, elevation = _pattern(sheet, starts_ns)
+            height = np.zeros(len(starts_ns))
+            return cls(
+                sheet.name, elevation, azimuth, height, 0.0, starts_ns, period_ns, period_ns, sheet.pattern
+            )
         return cls(
             name=sheet.name,
             elevations_rad=np.radians(sheet.elevations_deg),
@@ -185,7 +220,9 @@ class LidarModel:
 
     @property
     def rings(self) -> NDArray[np.int16]:
-        """The rank of each laser's elevation (L,), 0 = lowest."""
+        """The rank of each laser's elevation (L,), 0 = lowest; `NO_RING` without rings."""
+        if self.pattern != "rings":
+            return np.full(len(self.elevations_rad), NO_RING, dtype=np.int16)
         return np.asarray(np.argsort(np.argsort(self.elevations_rad)), dtype=np.int16)
 
     @property
@@ -362,6 +399,10 @@ def _firings(
     model: LidarModel, rng: np.random.Generator
 ) -> tuple[NDArray[np.intp], NDArray[np.int64], Array]:
     """List laser, time after the first firing and azimuth of one revolution's firings."""
+    if model.pattern != "rings":
+        # A scan begins anywhere in the pattern; turning it a little makes another one of the same density.
+        turned_rad = model.azimuths_rad + np.radians(0.2) * rng.uniform(-1.0, 1.0)
+        return np.arange(len(model.starts_ns)), model.starts_ns, turned_rad
     n_lasers = len(model.elevations_rad)
     n_sequences = int(model.period_ns // model.sequence_ns)
     laser = np.tile(np.arange(n_lasers), n_sequences)

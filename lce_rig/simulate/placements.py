@@ -161,7 +161,12 @@ def seen_share(view: CameraView, board: Board, T_world_board: Array) -> float:
 
 
 def count_rings(view: CameraView, board: Board, T_world_board: Array) -> int:
-    """Count the LiDAR's rings with at least a few returns from the board."""
+    """Count the LiDAR's rings with at least a few returns from the board.
+
+    Without rings, a board that lies in the field of view, with a margin, counts as one with enough of them.
+    """
+    if view.model.pattern != "rings":
+        return _WANTED_RINGS if _is_in_view(view, board, T_world_board) else 0
     scene = Scene(Raycaster(()), (), board, T_world_board)
     outline = transform(invert(view.T_world_lidar) @ T_world_board, board.outline())
     azimuth = np.arctan2(outline[:, 1], outline[:, 0])
@@ -176,6 +181,18 @@ def count_rings(view: CameraView, board: Board, T_world_board: Array) -> int:
     hits = scene.cast_board(view.T_world_lidar[:3, 3], rays @ view.T_world_lidar[:3, :3].T)
     returns = (hits.surface >= 0).reshape(len(view.model.elevations_rad), -1).sum(axis=1)
     return int(np.sum(returns >= _RETURNS_PER_RING))
+
+
+def _is_in_view(view: CameraView, board: Board, T_world_board: Array) -> bool:
+    """Return whether the plate lies within the pattern of a LiDAR without rings."""
+    outline = transform(invert(view.T_world_lidar) @ T_world_board, 1.1 * board.outline())
+    azimuth, elevation = np.arctan2(outline[:, 1], outline[:, 0]), np.arctan2(outline[:, 2], outline[:, 0])
+    low, high = view.model.elevations_rad.min(), view.model.elevations_rad.max()
+    if view.model.pattern == "rosette":
+        half = np.ptp(view.model.azimuths_rad) / 2, (high - low) / 2
+        return bool(np.all(np.hypot(azimuth / half[0], (elevation - (low + high) / 2) / half[1]) < 0.95))
+    elevation = np.arctan2(outline[:, 2], np.hypot(outline[:, 0], outline[:, 1]))
+    return bool(np.all((elevation > low) & (elevation < high)))
 
 
 _N_SWAYS = 4

@@ -14,7 +14,7 @@ RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 
 
 def test_the_shipped_profiles_are_the_papers_and_one_for_each_kind_of_lidar() -> None:
-    assert set(shipped_profiles()) == {"rlfs", "rles", "sss", "os1_64", "os0_128", "xt32", "hdl32e"}
+    assert set(shipped_profiles()) == {"rlfs", "rles", "sss", "os1_64", "os0_128", "xt32", "hdl32e", "mid360"}
     assert all(load_rig(name).name == name for name in shipped_profiles())
 
 

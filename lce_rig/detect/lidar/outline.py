@@ -30,6 +30,7 @@ _ROUNDS = 12
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
 _CORNER_M = 0.04
+_OFFSETS_M, _LEAST_SIGMA_M = np.linspace(-0.05, 0.05, 41), 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +184,7 @@ class Strips:
 
 
 def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> Strips:
-    """Measure where each piece of the border lies, by (1) with its own shift outwards.
+    """Measure where each piece of the border lies, by the mean of its shift outwards under (1).
 
     Args:
         rays: about the plate.
@@ -208,15 +209,14 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
             beyond = sign * local[:, axis] - half[axis]
             use = (np.abs(beyond) < _BAND_M) & (along >= 0) & (along < n_strips)
             strip, s, is_on = along[use].astype(np.intp), beyond[use], rays.is_on[use]
-            off = np.zeros(n_strips)
-            for _ in range(_ROUNDS):
-                z = (off[strip] - s) / blur
-                p = _OUTLIERS + (1 - 2 * _OUTLIERS) * ndtr(z)
-                slope = (1 - 2 * _OUTLIERS) * np.exp(-0.5 * z**2) / (np.sqrt(2 * np.pi) * blur)
-                information = np.bincount(strip, slope**2 / (p * (1 - p)), n_strips) + _BAND_M**-2
-                score = np.bincount(strip, slope * np.where(is_on, 1 / p, -1 / (1 - p)), n_strips)
-                step = (score - off * _BAND_M**-2) / information
-                off = np.clip(off + np.clip(step, -blur, blur), -_BAND_M, _BAND_M)
+            # Where no ray comes near the border, it may lie anywhere between the rays on its two sides.
+            p = _OUTLIERS + (1 - 2 * _OUTLIERS) * ndtr((_OFFSETS_M[:, None] - s) / blur)
+            log_p = np.log(np.where(is_on, p, 1 - p))
+            total = np.stack([np.bincount(strip, row, n_strips) for row in log_p])
+            weight = np.exp(total - total.max(axis=0))
+            weight /= weight.sum(axis=0)
+            off = _OFFSETS_M @ weight
+            sigma_m = np.sqrt(np.maximum(_OFFSETS_M**2 @ weight - off**2, _LEAST_SIGMA_M**2))
             n_on = np.bincount(strip[is_on], minlength=n_strips)
             n_beside = np.bincount(strip[~is_on], minlength=n_strips)
             is_seen = (n_on >= 4) & (n_beside >= 4)
@@ -228,7 +228,7 @@ def measure_strips(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array
                     (at @ axes + [placement.u_m, placement.v_m])[is_seen],
                     np.tile(sign * axes[axis], (n_strips, 1))[is_seen],
                     off[is_seen],
-                    information[is_seen] ** -0.5,
+                    sigma_m[is_seen],
                 )
             )
     uv, outwards, off_m, sigma_m = (np.concatenate(part) for part in zip(*parts, strict=True))

@@ -60,7 +60,7 @@ _DIRECTION_RAD = 7e-4
 _HIDDEN_SHARE = 0.10
 # Share of the plate without any return from which it reaches out of the field of view.
 _DARK_SHARE = 0.08
-_BEHIND_M, _HIDES_M = 0.05, 0.08
+_BEHIND_M, _HIDES_M, _FOOT_M = 0.05, 0.08, 0.15
 # Ranges of black and white squares, and of glare, differ by centimetres where beams meet them squarely.
 _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
 # Share of rays that contradict the best placement, and growth of the outline: beyond, it is another plate.
@@ -289,7 +289,8 @@ class _View:
         """Sort rays into those that return from the plate and those that passed beside it.
 
         Rays that return from before the plane, or just behind it where echoes of plate and background blend,
-        say nothing. Places without any return count as passed, unless they lie on a first placement.
+        say nothing; but what a plate stands on, or touches, ends it. Places without any return count as
+        passed, unless they lie on a first placement.
 
         Args:
             half_m: half width and half height of the plate.
@@ -303,6 +304,8 @@ class _View:
         empty, _ = _empty_places(self.uv, area, n_due)
         if placement is not None:
             empty = empty[placement.distance_m(empty) > 0]
+            is_foot = (self.height_m > self.tolerance_m) & (self.height_m < _FOOT_M)
+            is_beside |= is_foot & (placement.distance_m(self.uv) > -0.01)
         uv = np.concatenate([self.uv[is_on], self.uv[is_beside], empty])
         return Rays(uv, np.arange(len(uv)) < n_on)
 
@@ -347,8 +350,11 @@ def measure_unstructured(
     points = points[points @ (centre / distance_m) > cosine * np.linalg.norm(points, axis=1)]
     points = points[:: 1 + len(points) // _MOST_MEASURED]
     view = _View.of(points, plane, centre, 4 * _NOISE_M, limits)
-    starts = register_rays(view.rays(half_m), half_m) if np.count_nonzero(view.is_on) >= _MIN_POINTS else []
-    if starts and starts[0].error_m > _MOST_MISSES:
+    n_on = int(np.count_nonzero(view.is_on))
+    starts = register_rays(view.rays(half_m), half_m) if n_on >= _MIN_POINTS else []
+    if not starts:
+        return LIDAR_TOO_FEW_POINTS.refusal(n_points=n_on, min_points=_MIN_POINTS, closer_m=distance_m / 4)
+    if starts[0].error_m > _MOST_MISSES:
         return _other_plate(np.array(half_m) * 2, distance_m, board)
     outline: Outline | None = None
     for _ in range(2):
@@ -415,7 +421,7 @@ def _describe(view: _View, board: Board, outline: Outline, limits: Limits) -> Li
     growth, size_sigma = outline.growth_m, 2 * np.sqrt(np.diag(outline.cov)[3:])
     sigma_m = np.hypot(size_sigma, view.beam_m.max() / 2)
     points, point_sigma_m = _average(view.points[is_board], placement.local(view.uv[is_board]), view.plane)
-    size_m = np.array([board.width_m, board.height_m]) + 2 * growth
+    size_m = np.array([board.width_m, board.height_m]) + 2 * (growth - view.growth_m(placement)[0])
     quality = LidarQuality(
         width_m=float(size_m[0]),
         height_m=float(size_m[1]),
@@ -459,7 +465,7 @@ def _describe(view: _View, board: Board, outline: Outline, limits: Limits) -> Li
 
 
 def _is_touched(view: _View, strips: Strips) -> NDArray[np.bool_]:
-    """Return for each strip (K,) whether rays beyond it return from before the plane: a floor, a hand."""
+    """Return for each strip (K,) whether something hides what is beyond: a hand, a box."""
     from scipy.spatial import cKDTree
 
     if not len(strips.uv):
@@ -469,7 +475,7 @@ def _is_touched(view: _View, strips: Strips) -> NDArray[np.bool_]:
         cKDTree(uv).query_ball_point(beyond, STRIP_M / 2, return_length=True)
         if len(uv)
         else np.zeros(len(beyond))
-        for uv in (view.uv[view.height_m > view.tolerance_m], view.uv)
+        for uv in (view.uv[view.height_m > _FOOT_M], view.uv)
     )
     return np.asarray(n_before > _TOUCHED_SHARE * n_in_all)
 
