@@ -257,7 +257,7 @@ def test_noise_on_its_input_is_survived_and_a_computer_that_does_not_read_costs_
         rng = random.Random(1)
         for command in [*(f"LCERT,{channel},900.0,0,100" for channel in range(4)), "LCEGO"]:
             os.write(descriptor, rng.randbytes(50) + b"\n" + write_sentence(command))
-        time.sleep(1.0)  # some thousand lines a second and nobody reads
+        time.sleep(2.0)  # some thousand lines a second and nobody reads
         reader, messages, end_s = LineReader(), [], time.monotonic() + 5
         while time.monotonic() < end_s:
             messages += reader.feed(os.read(descriptor, 4096))
