@@ -237,7 +237,7 @@ def test_our_live_source_and_the_firmware_understand_each_other(running):
         for pulse in board.samples():
             pulses += [pulse] if pulse.sensor == "cam" else []
             told += [pulse] if pulse.sensor == "pps" else []
-            if (len(told) >= 2 and len(pulses) > 50) or time.monotonic() > end_s:
+            if (len(told) >= 3 and len(pulses) > 50) or time.monotonic() > end_s:
                 break
         assert [pulse.count for pulse in pulses] == list(range(1, len(pulses) + 1))
         model, status = board.host_clock, board.status()
