@@ -11,26 +11,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import (
     BeforeValidator,
     Field,
-    GetPydanticSchema,
     PlainSerializer,
+    PlainValidator,
     TypeAdapter,
     ValidationError,
     WrapSerializer,
+    WrapValidator,
 )
-from pydantic_core import core_schema
-from typing_extensions import NotRequired, TypedDict
 
 import lce_rig
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
-from lce_rig.core.findings import Figure, Finding, Refusal, Severity, Stage
+from lce_rig.core.findings import Figure, Finding, Refusal
 from lce_rig.core.geometry import Array, parse_pose, sigma_sizes
 from lce_rig.core.results import Observation
 
@@ -39,109 +38,56 @@ _MOST = 1e100
 """Products of figures up to this one stay far from overflow."""
 
 
-def _kept_as(record: Any, read: Callable[[Any], Any], write: Callable[[Any], Any]) -> GetPydanticSchema:
-    """Keep a value in the file as a record: `read` makes the value of it, `write` the record."""
-    return GetPydanticSchema(
-        lambda _, schema_of: core_schema.no_info_after_validator_function(
-            read,
-            schema_of.generate_schema(record),
-            serialization=core_schema.plain_serializer_function_ser_schema(write),
-        )
-    )
-
-
-def _array(record: Any, read: Callable[[Any], Array] = np.array) -> GetPydanticSchema:
-    """Keep an array as lists of numbers with all their digits."""
-    return _kept_as(
-        record,
-        lambda rows: np.asarray(read(rows), dtype=np.float64),
-        lambda array: (array.astype(np.float64) + 0.0).tolist(),
-    )
-
-
-def _number(lowest: float, otherwise: float) -> GetPydanticSchema:
-    """Keep a number as null where it is not finite, and read null as `otherwise`."""
-    return _kept_as(
-        Annotated[float, Field(ge=lowest, le=_MOST)] | None,
-        lambda number: otherwise if number is None else number,
-        lambda number: float(number) if math.isfinite(number) else None,
-    )
+def _array(rows: Any) -> Array:
+    array = np.array(rows, dtype=np.float64)
+    if not (np.abs(array) <= _MOST).all():
+        raise ValueError("holds values that are no numbers")
+    return array
 
 
 def _pose(rows: Any) -> Array:
     parse_pose(rows)  # which also removes rounding: the file's own digits stay
-    return np.array(rows)
+    return _array(rows)
 
 
-def _covariance(rows: list[list[float]]) -> Array:
-    cov = np.array(rows)
-    if not np.allclose(cov, cov.T, rtol=1e-6, atol=1e-18):
-        raise ValueError("not symmetric")
+def _covariance(rows: Any) -> Array:
+    cov = _array(rows)
+    if cov.shape != (6, 6) or not np.allclose(cov, cov.T, rtol=1e-6, atol=1e-18):
+        raise ValueError("is no symmetric 6x6 matrix of numbers")
     if np.diag(cov).min() < 0:
         raise ValueError("a variance is negative")
     return cov
 
 
-_Six = Annotated[list[Annotated[float, Field(ge=-_MOST, le=_MOST)]], Field(min_length=6, max_length=6)]
-Pose = Annotated[Array, _array(Any, _pose)]
+def _record(record: Any) -> Any:
+    """Name what the file holds of a finding like its fields; refusals of earlier versions have fewer."""
+    if not isinstance(record, dict):
+        return record
+    code, stage = record.get("code", ""), record.get("stage")
+    if stage is not None and not code.startswith(f"{stage}."):
+        code = f"{stage}.text"
+    words = record.get("cause", record.get("text")), record.get("action")
+    return {"figures": {}, **record, "code": code, "action": record.get("action_code", ""), "stored": words}
+
+
+_LISTS = PlainSerializer(lambda array: (array.astype(np.float64) + 0.0).tolist())
+_NULL = PlainSerializer(lambda number: float(number) if math.isfinite(number) else None)
+_OR_NAN = WrapValidator(lambda number, check: math.nan if number is None else check(number))
+_OR_INF = WrapValidator(lambda number, check: math.inf if number is None else check(number))
+Pose = Annotated[Array, PlainValidator(_pose), _LISTS]
 """(4, 4), a rigid transform."""
-Covariance = Annotated[Array, _array(Annotated[list[_Six], Field(min_length=6, max_length=6)], _covariance)]
+Covariance = Annotated[Array, PlainValidator(_covariance), _LISTS]
 """(6, 6), tangent (translation m, rotation rad), axes of the camera."""
-Matrix = Annotated[Array, _array(list[list[Annotated[float, Field(ge=-_MOST, le=_MOST)]]])]
-"""(n, m)."""
-Tangent = Annotated[Array, _array(_Six)]
-"""(6,), translation m, rotation rad."""
-Number = Annotated[float, _number(-_MOST, math.nan)]
+Values = Annotated[Array, PlainValidator(_array), _LISTS]
+"""Of any shape."""
+Number = Annotated[float, Field(ge=-_MOST, le=_MOST), _OR_NAN, _NULL]
 """null in the file where it is not known."""
-Size = Annotated[float, _number(0.0, math.nan)]
+Size = Annotated[float, Field(ge=0, le=_MOST), _OR_NAN, _NULL]
 """A number that is not negative."""
 Count = Annotated[int, Field(ge=0)]
-
-
-class _FindingRecord(TypedDict):
-    code: str
-    severity: Severity
-    subject: str
-    figures: dict[str, Any]
-    action_code: str
-    text: str
-    action: str
-
-
-class _RefusalRecord(TypedDict):
-    """Files of earlier versions hold stage, cause and action only."""
-
-    stage: Stage
-    code: NotRequired[str]
-    figures: NotRequired[dict[str, Any]]
-    action_code: NotRequired[str]
-    cause: str
-    action: str
-
-
-def _figure(value: Any) -> Figure:
-    return tuple(map(_figure, value)) if isinstance(value, list) else value
-
-
-def _read_finding(record: _FindingRecord) -> Finding:
-    figures = {name: _figure(value) for name, value in record["figures"].items()}
-    kind = record["code"], record["severity"], record["subject"], figures, record["action_code"]
-    return Finding(*kind, stored=(record["text"], record["action"]))
-
-
-def _read_refusal(record: _RefusalRecord) -> Refusal:
-    code = record.get("code", "")
-    return Refusal(
-        code if code.startswith(f"{record['stage']}.") else f"{record['stage']}.text",
-        figures={name: _figure(value) for name, value in record.get("figures", {}).items()},
-        action=record.get("action_code", ""),
-        stored=(record["cause"], record["action"]),
-    )
-
-
-StoredFinding = Annotated[Finding, _kept_as(_FindingRecord, _read_finding, Finding.as_json)]
-StoredRefusal = Annotated[Refusal, _kept_as(_RefusalRecord, _read_refusal, Refusal.as_json)]
-_ANY, _IN_MEMORY = GetPydanticSchema(lambda *_: core_schema.any_schema()), Field(exclude=True)
+StoredFinding = Annotated[Finding, BeforeValidator(_record), PlainSerializer(Finding.as_json)]
+StoredRefusal = Annotated[Refusal, BeforeValidator(_record), PlainSerializer(Refusal.as_json)]
+_ANY, _IN_MEMORY = PlainValidator(lambda value: value), Field(exclude=True)
 """Of fields that the file does not keep."""
 
 
@@ -160,7 +106,7 @@ class Certificate:
     """
 
     is_optimal: bool
-    gap: Annotated[float, _number(0.0, math.inf)]
+    gap: Annotated[float, Field(ge=0, le=_MOST), _OR_INF, _NULL]
 
 
 @dataclass(frozen=True)
@@ -292,14 +238,7 @@ class CaptureResidual:
 
 
 Motion = Literal["translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z"]
-MOTIONS: tuple[Motion, ...] = (
-    "translation_x",
-    "translation_y",
-    "translation_z",
-    "rotation_x",
-    "rotation_y",
-    "rotation_z",
-)
+MOTIONS: tuple[Motion, ...] = get_args(Motion)
 """Motions along and about the camera's axes, in the order of a tangent (6,)."""
 
 
@@ -350,8 +289,8 @@ class SceneShare:
     cov: Covariance
     T_cam_lidar_boards: Pose
     cov_boards: Covariance
-    change: Tangent
-    change_sigma: Tangent
+    change: Values
+    change_sigma: Values
     surprise: Size
     n_directions: Count
 
@@ -470,7 +409,7 @@ class Calibration:
     verdict: Literal["pass", "marginal", "fail"]
     findings: tuple[StoredFinding, ...] = ()
     diagnostics: Annotated[
-        Diagnostics, _kept_as(dict[str, float | None], Diagnostics.of, Diagnostics.figures)
+        Diagnostics, PlainValidator(Diagnostics.of), PlainSerializer(Diagnostics.figures)
     ] = NO_DIAGNOSTICS
     channel_results: Annotated[tuple[ChannelResult, ...], Field(alias="channels")] = ()
     method: str = "paper"
@@ -480,8 +419,8 @@ class Calibration:
     cov_shared: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
     contributions: tuple[Contribution, ...] = ()
     intrinsics: Intrinsics | None = None
-    intrinsics_cov: Matrix | None = None
-    intrinsics_cross_cov: Matrix | None = None
+    intrinsics_cov: Values | None = None
+    intrinsics_cross_cov: Values | None = None
     square_m: Size | None = None
     scene_share: SceneShare | None = None
     scene: (
@@ -665,11 +604,10 @@ def read_result(path: Path | str) -> ResultFile:
         raise SessionError(f"{path}: there is no such file", "`lce-rig calibrate SESSION` writes it")
     again = "Run `lce-rig calibrate SESSION` again."
     with reading(path, SessionError, again):
-        data = path.read_bytes()
-    try:
-        return _file().validate_json(data)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"] if part != "metrics")
-        message = first["msg"].removeprefix("Value error, ")
-        raise SessionError(f"{path}: {key + ': ' if key else ''}{message}", again) from error
+        try:
+            return _file().validate_json(path.read_bytes())
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            key = ".".join(str(part) for part in first["loc"] if part != "metrics")
+            message = first["msg"].removeprefix("Value error, ")
+            raise SessionError(f"{path}: {key + ': ' if key else ''}{message}", again) from error

@@ -14,10 +14,12 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, cast
 
+from typing_extensions import TypeAliasType
+
 from lce_rig.core.phrasing import fill
 
 Severity = Literal["note", "warning", "error"]
-Figure = float | int | bool | str | None | tuple["Figure", ...]
+Figure = TypeAliasType("Figure", "float | int | bool | str | tuple[Figure, ...] | None")
 Stage = Literal["read", "image", "lidar", "pair", "calibrate"]
 STAGES: tuple[Stage, ...] = ("read", "image", "lidar", "pair", "calibrate")
 Template = str | Callable[["Finding"], str]

@@ -174,7 +174,7 @@ def pair_edit(**changes: Any) -> Edit:
         (pair_edit(cov=np.eye(3).tolist()), "pairs.0.cov"),
         (pair_edit(mpe_m=-1.0), "pairs.0.mpe_m"),
         (pair_edit(verdict="great"), "pairs.0.verdict"),
-        (pair_edit(captures_refused={"1": {"stage": "moon"}}), "pairs.0.captures_refused.1.stage"),
+        (pair_edit(captures_refused={"1": {"stage": "moon"}}), "pairs.0.captures_refused.1"),
         *(
             (lambda d, k=k: d["pairs"][0].pop(k), f"pairs.0.{k}")
             for k in REQUIRED
