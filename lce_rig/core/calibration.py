@@ -27,7 +27,7 @@ from pydantic import (
 
 import lce_rig
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.diagnostics import NO_DIAGNOSTICS, Diagnostics
+from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
 from lce_rig.core.findings import Figure, Finding, Refusal
 from lce_rig.core.geometry import Array, parse_pose, sigma_sizes
@@ -68,6 +68,10 @@ def _record(record: Any) -> Any:
         code = f"{stage}.text"
     words = record.get("cause", record.get("text")), record.get("action")
     return {"figures": {}, **record, "code": code, "action": record.get("action_code", ""), "stored": words}
+
+
+def _known(figures: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in figures.items() if value is not None}
 
 
 _LISTS = PlainSerializer(lambda array: (array.astype(np.float64) + 0.0).tolist())
@@ -408,9 +412,9 @@ class Calibration:
     egt_translation_m: Size | None = None
     verdict: Literal["pass", "marginal", "fail"]
     findings: tuple[StoredFinding, ...] = ()
-    diagnostics: Annotated[
-        Diagnostics, PlainValidator(Diagnostics.of), PlainSerializer(Diagnostics.figures)
-    ] = NO_DIAGNOSTICS
+    diagnostics: Annotated[Diagnostics, BeforeValidator(_known), PlainSerializer(Diagnostics.figures)] = (
+        field(default_factory=Diagnostics)
+    )
     channel_results: Annotated[tuple[ChannelResult, ...], Field(alias="channels")] = ()
     method: str = "paper"
     uncertainty: tuple[PointUncertainty, ...] = ()

@@ -105,11 +105,8 @@ _SMALLEST = 0.0001
 
 def figures_apart(value: float, limit: float) -> tuple[str, str]:
     """Print a figure and its limit with two significant digits, or as many as show that they differ."""
-    for digits in range(2, 2 + _MOST_DIGITS):
-        texts = [f"{x:.{digits}g}" if abs(x) < 10**digits else f"{x:.0f}" for x in (value, limit)]
-        if texts[0] != texts[1]:
-            break
-    return texts[0], texts[1]
+    texts = [(significant(value, 2 + more), significant(limit, 2 + more)) for more in range(_MOST_DIGITS)]
+    return next((each for each in texts if each[0] != each[1]), texts[-1])
 
 
 def as_line(text: str) -> str:

@@ -6,7 +6,7 @@ The sensors' constant errors are the same in every session, and more sessions do
 estimate of all captures they are common unknowns, and their part of the covariance stays.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -168,21 +168,25 @@ def require_same(
 
 def require_independent(sessions: Mapping[str, Session]) -> None:
     """Refuse sessions that share images or scans: a copy agrees with its original despite any error."""
-    hashes: dict[str, list[frozenset[str]]] = {}
+    hashes: dict[str, set[str]] = {name: set() for name in sessions}
     for name, session in sessions.items():
-        hashes[name] = []
         for capture in session.captures:
             # A damaged capture is reported when it is read.
             with suppress(SessionError):
-                hashes[name].append(capture.file_hashes)
-    for one, other in combinations(sessions, 2):
-        theirs = frozenset().union(*hashes[other])
-        n_shared = sum(not own.isdisjoint(theirs) for own in hashes[one])
-        if n_shared:
-            raise SessionError(
-                f"{one} and {other} share {n_shared} captures: they are not independent",
-                "Collect each session separately, with the board mounted again.",
-            )
+                hashes[name] |= capture.file_hashes
+    require_apart(hashes, "Collect each session separately, with the board mounted again.")
+
+
+def require_apart(contents: Mapping[str, Set[str]], hint: str) -> None:
+    """Refuse what holds the same samples, known by their hashes.
+
+    Raises:
+        SessionError: two of them share some.
+    """
+    for one, other in combinations(contents, 2):
+        if n_shared := len(contents[one] & contents[other]):
+            what = f"{one} and {other} share {n_shared} samples: they are not independent"
+            raise SessionError(what, hint)
 
 
 def join_detections(by_session: Mapping[str, Detections]) -> Detections:

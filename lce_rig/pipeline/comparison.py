@@ -1,10 +1,9 @@
 """Compare the calibrations of one rig in several sessions."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from lce_rig.judge.repeatability import Repeatability
 from lce_rig.pipeline.calibrate_sessions import (
     calibrate,
     compare_sensors,
+    require_apart,
     require_independent,
     require_same,
     session_names,
@@ -25,9 +25,6 @@ from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, OTHER_BOARD, OUTDA
 from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_folder, stored_results
 from lce_rig.session import Session
 from lce_rig.session.session import CAPTURES
-
-# Inputs of the extrinsics besides the captures; another lens is another camera.
-_SAME_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +105,7 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
     sessions = dict(zip(session_names(paths), (Session.open(path) for path in paths), strict=True))
     require_same(
         sessions,
-        lambda key: key.path[0] in ("cameras", "lidars") and not _SAME_SENSORS.isdisjoint(key.path[1:]),
+        lambda key: key.is_of_lens_or_model,
         "Put the same intrinsics into both (rig.yaml of the session) and calibrate again.",
     )
     require_independent(sessions)
@@ -148,7 +145,11 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
                     hashes.add(capture.manifest_sha256)
             captures[label] = frozenset(hashes)
         progress(done, len(sessions))
-    _require_apart(captures)
+    # The result of several sessions contains the captures of each.
+    require_apart(
+        {f"the result of {label}": held for label, held in captures.items()},
+        "Compare results of one session each (without --name), or of sessions that it does not contain.",
+    )
     first_name, first = next(iter(sessions.items()))
     other_boards = [
         OTHER_BOARD(label, first=first_name)
@@ -177,18 +178,6 @@ def _require_some(
         for c in own
         if c.verdict == "fail"
     ]
-
-
-def _require_apart(captures: Mapping[str, frozenset[str]]) -> None:
-    """Refuse results made from the same captures, as that of several sessions contains each of them."""
-    for one, other in combinations(captures, 2):
-        n_shared = len(captures[one] & captures[other])
-        if n_shared:
-            raise SessionError(
-                f"the results of {one} and {other} share {n_shared} captures: they are not independent",
-                "A result of several sessions contains the captures of each. Compare results of one session "
-                "each (without --name), or of sessions that it does not contain.",
-            )
 
 
 def _read(session: Session, folder: Path) -> ResultFile:

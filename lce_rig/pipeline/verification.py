@@ -38,9 +38,6 @@ from lce_rig.session.session import DEBUG, PROFILE
 from lce_rig.show.overlays.overlay import ImageWithEvents
 from lce_rig.show.overlays.overlay_files import draw_check, is_overlay
 
-# Keys of cameras and LiDARs that extrinsics depend on.
-_OF_SENSORS = frozenset({"intrinsics", "resolution_px", "model"})
-
 
 @dataclass(frozen=True, eq=False)
 class Verification:
@@ -207,10 +204,8 @@ def with_lenses_of(rig: Rig, profile: Rig | None) -> tuple[Rig, tuple[Finding, .
     """
     if profile is None:
         return rig, ()
-    cameras, changed = dict(rig.cameras), []
-    for key in differing_keys(profile, rig):
-        if key.path[0] == "board" or not _OF_SENSORS.isdisjoint(key.path[1:]):
-            changed.append(".".join(key.path))
+    cameras, keys = dict(rig.cameras), differing_keys(profile, rig)
+    changed = [key.name for key in keys if key.path[0] == "board" or key.is_of_lens_or_model]
     if profile.nominal_extrinsics != rig.nominal_extrinsics:
         changed.append("nominal_extrinsics")
     for name in cameras.keys() & profile.cameras.keys():

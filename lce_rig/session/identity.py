@@ -20,6 +20,7 @@ _IS_IDENTITY = re.compile(r"robot|(lidars|cameras)\.[^.]+\.serial").fullmatch
 _OF_THE_RIG = re.compile(
     r"name|robot|(lidars|cameras)\.[^.]+\.(serial|model)|cameras\.[^.]+\.channels\.[^.]+\.kind"
 ).fullmatch
+_OF_EXTRINSICS = frozenset({"intrinsics", "resolution_px", "model"})
 _ABSENT = "absent"
 MARKER = "session.json"
 
@@ -75,8 +76,18 @@ class DifferingKey(NamedTuple):
     theirs: Any
     ours: Any
 
+    @property
+    def name(self) -> str:
+        """Its path as one word."""
+        return ".".join(self.path)
+
+    @property
+    def is_of_lens_or_model(self) -> bool:
+        """Whether extrinsics depend on it: another lens is another camera."""
+        return self.path[0] in ("cameras", "lidars") and not _OF_EXTRINSICS.isdisjoint(self.path[1:])
+
     def __str__(self) -> str:
-        return f"{'.'.join(self.path)} {self.theirs} there, {self.ours} here"
+        return f"{self.name} {self.theirs} there, {self.ours} here"
 
 
 def differing_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
@@ -101,7 +112,7 @@ def foreign_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
     Board, intrinsics, limits and what else is measured or chosen may differ.
     """
     keys = differing_keys(theirs, ours)
-    named = [key for key in keys if _OF_THE_RIG(".".join(key.path))]
+    named = [key for key in keys if _OF_THE_RIG(key.name)]
     missing = [key for key in keys if not all(_has_place(rig, key.path) for rig in (theirs, ours))]
     return [*named, *(key for key in missing if key not in named)]
 
