@@ -19,15 +19,7 @@ from lce_rig.export.writing import number, numbers
 from lce_rig.judge.findings import verdict_of
 from lce_rig.pipeline.measure_intrinsics import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_foreign
-from lce_rig.rig import (
-    Rig,
-    find_profile,
-    load_rig,
-    parse_rig,
-    read_profile,
-    set_value,
-    shipped_profiles,
-)
+from lce_rig.rig import Rig, parse_rig, set_value
 from lce_rig.session import Session
 from lce_rig.session.durable import write_atomically
 from lce_rig.session.session import INTRINSICS
@@ -114,17 +106,13 @@ def save_profile(
         ResultRefusedError: the session determines none better than its profile; nothing is written.
         ProfileError: the intrinsics make no valid profile.
     """
-    if path.exists():
-        raise UsageError(
-            f"{path} exists already", "Choose another file; an existing profile is never overwritten."
-        )
     refused = [one for one in measured if one.judgement.code != "intrinsics.better" and not is_forced]
     measured = [one for one in measured if one not in refused]
     if not measured:
         why = "; ".join(f"{one.camera}: {one.judgement.text}" for one in refused)
         actions = dict.fromkeys(as_line(one.judgement.advice) for one in refused)
         raise ResultRefusedError(f"{path} not written. {why}", " ".join([*actions, _FORCE]))
-    text = profile_text(session)
+    text = session.profile_text()
     for one in measured:
         lens, block = one.intrinsics, f"cameras.{one.camera}"
         if (lens.width_px, lens.height_px) != session.rig.cameras[one.camera].resolution_px:
@@ -136,17 +124,21 @@ def save_profile(
         text = set_value(text, f"{block}.intrinsics.model", lens.model)
         text = set_value(text, f"{block}.intrinsics.distortion", numbers(lens.distortion))
     head = "".join(f"# {line}\n" for one in measured for line in _head(session.rig, one))
-    parse_rig(head + text, str(path))
-    write_atomically(path, head + text)
+    write_profile(head + text, path)
     return tuple(one.camera for one in measured)
 
 
-def profile_text(session: Session) -> str:
-    """Find the text of a session's profile with comments, as the session or this program holds it."""
-    rig = session.rig
-    if rig.name in shipped_profiles() and load_rig(rig.name) == rig:
-        return read_profile(find_profile(rig.name))
-    return session.profile_text()
+def write_profile(text: str, path: Path) -> None:
+    """Write the text of a valid profile to a new file.
+
+    Raises:
+        UsageError: the file exists already.
+        ProfileError: the profile is not valid.
+    """
+    if path.exists():
+        raise UsageError(f"{path} exists already", "Choose another file; existing files are kept.")
+    parse_rig(text, str(path))
+    write_atomically(path, text)
 
 
 def _head(rig: Rig, measured: MeasuredIntrinsics) -> list[str]:

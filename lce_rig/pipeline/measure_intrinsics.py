@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,6 @@ from lce_rig.core.progress import Progress, silent
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.detect.image.search import crop_to_intrinsics
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
 from lce_rig.lens.calibrate_lens import Choice, choose_model, estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of, lens_errors
@@ -40,7 +40,7 @@ class MeasuredIntrinsics:
     Attributes:
         camera: its name.
         channels: the channels whose images were used.
-        given: the profile's intrinsics, scaled to the images if their resolution differs.
+        given: the profile's intrinsics.
         estimate: the intrinsics from the boards.
         choice: the chosen model and why, if models were compared.
         check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
@@ -124,13 +124,28 @@ def measure_intrinsics(
     frames = tuple(name for name, settings in have.items() if settings.kind == "frames")
     chosen = tuple(dict.fromkeys(channels)) or frames or tuple(have)
     given = rig.cameras[camera].to_intrinsics()
-    jobs = _images(session, camera, chosen)
-    start = _at_size_of_images(given, jobs, camera)
-    seen_in_events = _seen_in_events(session, camera, chosen, {channel for _, channel in jobs})
+    jobs = []
+    for capture in session.captures:
+        # Every channel reports a capture with a damaged manifest.
+        held = [(camera, channel) for channel in chosen]
+        with suppress(SessionError):
+            held = capture.image_keys
+        jobs += [(capture, channel) for channel in chosen if (camera, channel) in held]
+    pictured = {channel for _, channel in jobs}
+    of_events = [name for name in chosen if have[name].kind == "events" and name not in pictured]
+    in_events = detect(session).images if of_events else {}
+    seen_in_events: dict[Key, ImageDetection] = {
+        (capture, channel): detection
+        for channel in of_events
+        for capture, detection in in_events.get((camera, channel), {}).items()
+    }
+    start = given
     found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
     if _n_captures(found) < rig.quality.min_captures:
-        width, height, focal = start.width_px, start.height_px, _GUESSED_FOCAL * start.width_px
-        start = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, start.model)
+        width, height = _size_px(camera, jobs) or (given.width_px, given.height_px)
+        focal, straight = _GUESSED_FOCAL * width, (0.0,) * len(given.distortion)
+        middle = (width - 1) / 2, (height - 1) / 2
+        start = Intrinsics(focal, focal, *middle, width, height, given.model, straight)
         found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
     estimate, choice = _fit(camera, found, rig, start, model)
     # Wrong intrinsics may have caused a detection to fail: board, pose or single corners.
@@ -168,39 +183,13 @@ def measure_intrinsics(
     )
 
 
-def _images(session: Session, camera: str, channels: Sequence[str]) -> list[tuple[Capture, str]]:
-    """List the images of the channels; every channel reports a capture with a damaged manifest."""
-    jobs = []
-    for capture in session.captures:
-        try:
-            held = capture.image_keys
-        except SessionError:
-            held = [(camera, channel) for channel in channels]
-        jobs += [(capture, channel) for channel in channels if (camera, channel) in held]
-    return jobs
-
-
-def _at_size_of_images(given: Intrinsics, jobs: Sequence[tuple[Capture, str]], camera: str) -> Intrinsics:
-    """Scale intrinsics to the size of the first readable image, if it differs."""
+def _size_px(camera: str, jobs: Sequence[tuple[Capture, str]]) -> tuple[int, int] | None:
+    """Measure the first readable image; None without any."""
     for capture, channel in jobs:
-        try:
-            image = capture.image(camera, channel)
-            crop_to_intrinsics(image, given)
-        except SessionError:
-            continue
-        except ProfileError:
-            height, width = image.pixels.shape[:2]
-            return replace(
-                given,
-                fx_px=given.fx_px * width / given.width_px,
-                fy_px=given.fy_px * width / given.width_px,
-                cx_px=(width - 1) / 2,
-                cy_px=(height - 1) / 2,
-                width_px=width,
-                height_px=height,
-            )
-        break
-    return given
+        with suppress(SessionError):
+            height, width = capture.image(camera, channel).pixels.shape[:2]
+            return width, height
+    return None
 
 
 def _look(
@@ -230,20 +219,6 @@ def _look(
             found[capture.name, channel] = detection
             progress(len(found), len(jobs))
     return found
-
-
-def _seen_in_events(
-    session: Session, camera: str, channels: Sequence[str], pictured: set[str]
-) -> dict[Key, ImageDetection]:
-    """List the session's detections in events, for channels without images."""
-    settings = session.rig.cameras[camera].channels
-    of_events = [name for name in channels if settings[name].kind == "events" and name not in pictured]
-    images = detect(session).images if of_events else {}
-    return {
-        (capture, channel): detection
-        for channel in of_events
-        for capture, detection in images.get((camera, channel), {}).items()
-    }
 
 
 def _n_captures(found: Mapping[Key, ImageDetection]) -> int:

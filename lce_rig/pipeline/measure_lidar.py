@@ -13,11 +13,10 @@ from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import detect
-from lce_rig.pipeline.intrinsics_files import profile_text
+from lce_rig.pipeline.intrinsics_files import write_profile
 from lce_rig.pipeline.matching import candidates_of
-from lce_rig.rig import parse_rig, set_value
+from lce_rig.rig import set_value
 from lce_rig.session import Session
-from lce_rig.session.durable import write_atomically
 
 # A laser's range must be known so much better than before for a profile to state it.
 _LEAST_GAIN = 2.0
@@ -108,8 +107,6 @@ def save_lidar(session: Session, lidar: str | None, errors: LidarErrors, path: P
     Raises:
         UsageError: the file exists already.
     """
-    if path.exists():
-        raise UsageError(f"{path} exists already", "Choose another file; existing files are kept.")
     name, known = lidar or next(iter(session.rig.lidars)), errors.found
     # Range m, azimuth deg and elevation deg of each laser, and their standard deviations.
     in_degrees = np.array([1.0, np.degrees(1.0), np.degrees(1.0)])
@@ -125,8 +122,6 @@ def save_lidar(session: Session, lidar: str | None, errors: LidarErrors, path: P
         f"lens_vertical_m_per_rad: {known.lens[1]:.5f}, lens_vertical_sigma_m_per_rad: "
         f"{known.lens_sigma[1]:.5f}, lasers: [{lasers}]}}"
     )
-    text = set_value(profile_text(session), block, values)
+    text = set_value(session.profile_text(), block, values)
     n = sum(errors.n_captures)
-    text = f"# intrinsics of LiDAR {name}, measured by {MADE_BY} from {n} captures\n" + text
-    parse_rig(text, str(path))
-    write_atomically(path, text)
+    write_profile(f"# intrinsics of LiDAR {name}, measured by {MADE_BY} from {n} captures\n" + text, path)

@@ -20,7 +20,7 @@ from typing import Any
 from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import LceRigError, SessionError, reading
-from lce_rig.rig import Rig, dump_rig, load_rig, parse_rig
+from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
 from lce_rig.session.capture import Capture, check_samples, event_channel
 from lce_rig.session.capture_files import content_hash, write_capture
 from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file, write_atomically
@@ -203,12 +203,14 @@ class Session:
             write_atomically(self.path / PROFILE_TEXT, text)
 
     def profile_text(self) -> str:
-        """Give the session's profile as its author wrote it, with comments; without it, every value."""
+        """Give the session's profile as its author wrote it, with comments; else every value of it."""
         with suppress(OSError, ValueError):
             text = (self.path / PROFILE_TEXT).read_text(encoding="utf-8")
             if self._says(text):
                 return text
-        return dump_rig(self.rig)
+        name = self.rig.name
+        is_shipped = name in shipped_profiles() and load_rig(name) == self.rig
+        return read_profile(find_profile(name)) if is_shipped else dump_rig(self.rig)
 
     def _says(self, text: str) -> bool:
         """Tell whether a profile's text is that of this session, but for the robot and serial numbers."""
