@@ -1,10 +1,11 @@
 """Files that survive a power failure, and the lock against a second writer."""
 
+import errno
 import fcntl
 import io
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,19 +44,35 @@ def replace_file(path: Path, data: bytes) -> None:
     flush_folder(path.parent)
 
 
-def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file of results, and its folder, so that it is there whole or not at all.
+@contextmanager
+def writing(path: Path, n_safe: int = 0) -> Iterator[None]:
+    """Turn a failure to write into one error with the action against it.
+
+    Args:
+        path: of the file or folder.
+        n_safe: captures before it, which are safe.
 
     Raises:
-        SessionError: a full disk, no permission.
+        SessionError: a full disk, no permission, or something in the file's place.
     """
     try:
+        yield
+    except OSError as error:
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            hint = "Move away what is in its place, or choose another folder."
+        elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+            hint = "Choose a folder that you may write to, or see to its permissions."
+        else:
+            hint = "Make room or choose another disk. The same command then goes on where it stopped."
+        safe = f" The {n_safe} captures before it are safe." if n_safe else ""
+        raise SessionError(f"{path} cannot be written: {error.strerror or error}", hint + safe) from error
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file, and its folder, so that it is there whole or not at all; raises as `writing`."""
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, content.encode() if isinstance(content, str) else content)
-    except OSError as error:
-        raise SessionError(
-            f"{path}: cannot be written: {error.strerror or error}", "Free space or choose another folder."
-        ) from error
 
 
 def store_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> bool:

@@ -31,37 +31,26 @@ def marker_of(rig: Rig) -> bytes:
     return (json.dumps(marker, indent=1) + "\n").encode()
 
 
-def check_marker(path: Path) -> None:
-    """Check that a folder is a session this version reads.
+def read_marker(path: Path) -> str:
+    """Read the name of the rig in session.json.
 
     Raises:
-        SessionError: it is not a session, is damaged, or was made by a newer version.
+        SessionError: the folder is not a session, it is damaged, or was made by a newer version.
     """
     if path.is_file():
         hint = "Give the session's folder. `lce-rig collect --rig RIG --from FILE` makes one of a recording."
         raise SessionError(f"{path} is a file, but a session is a folder", hint)
-    version = read_marker(path)["format_version"]
-    if version > FORMAT_VERSION:
-        raise SessionError(f"{path} was made by a newer lce-rig (format {version})", "Update lce-rig.")
-
-
-def read_marker(path: Path) -> dict[str, Any]:
-    """Read session.json in a session's folder; its `format_version` is a whole number.
-
-    Raises:
-        SessionError: there is none, or it is damaged.
-    """
     with reading(path / MARKER, SessionError):
-        try:
-            marker = read_json(path / MARKER)
-        except FileNotFoundError:
+        if not (path / MARKER).exists():
             hint = (
                 f"Make one with `lce-rig collect --rig RIG {path}` or `lce-rig simulate --rig rlfs {path}`."
             )
-            raise SessionError(f"{path} is not a session: it has no {MARKER}", hint) from None
-    if not isinstance(marker, dict) or type(marker.get("format_version")) is not int:
-        raise SessionError(f"{path / MARKER}: it has no format_version")
-    return marker
+            raise SessionError(f"{path} is not a session: it has no {MARKER}", hint)
+        marker = read_json(path / MARKER)
+        version, rig = marker["format_version"], marker["rig"]
+        if version > FORMAT_VERSION:
+            raise SessionError(f"{path} was made by a newer lce-rig (format {version})", "Update lce-rig.")
+    return str(rig)
 
 
 class DifferingKey(NamedTuple):

@@ -6,7 +6,6 @@ captures/.new-000012/, its files are flushed, the folder is renamed and its pare
 not at all, whenever the power goes. A rejected capture is its folder moved to rejected/.
 """
 
-import errno
 import json
 import re
 import shutil
@@ -23,11 +22,17 @@ from lce_rig.core.errors import LceRigError, SessionError, reading
 from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
 from lce_rig.session.capture import Capture, check_samples, event_channel
 from lce_rig.session.capture_files import content_hash, write_capture
-from lce_rig.session.durable import WriterLock, append_line, flush_folder, replace_file, write_atomically
+from lce_rig.session.durable import (
+    WriterLock,
+    append_line,
+    flush_folder,
+    replace_file,
+    write_atomically,
+    writing,
+)
 from lce_rig.session.identity import (
     MARKER,
     DifferingKey,
-    check_marker,
     differing_keys,
     foreign_keys,
     keep_identity,
@@ -74,7 +79,7 @@ class Session:
             raise SessionError(
                 f"{path} is a session already", "Choose another folder, or continue this session."
             )
-        try:
+        with writing(path):
             path.mkdir(parents=True, exist_ok=True)
             others = {entry.name for entry in path.iterdir()} - {PROFILE, LOCK, JOURNAL, CAPTURES}
             if any(not name.startswith((f".{PROFILE}.", f".{MARKER}.")) for name in others):
@@ -87,8 +92,6 @@ class Session:
             replace_file(path / PROFILE, dump_rig(rig).encode())
             # Last, because its presence is what makes the folder a session.
             replace_file(path / MARKER, marker_of(rig))
-        except OSError as error:
-            raise _not_writable(path, error) from error
         session = cls(path, rig, lock)
         session.journal("created", rig=rig.name, made_by=f"lce-rig {__version__}")
         return session
@@ -102,7 +105,7 @@ class Session:
                 it.
         """
         path = Path(path)
-        check_marker(path)
+        named = read_marker(path)
         with suppress(OSError):  # without permission to write, nothing was put aside
             recover(path)
         try:
@@ -111,7 +114,6 @@ class Session:
             raise SessionError(
                 f"{path / PROFILE}: the session's profile cannot be used: {error.what}", error.hint
             ) from error
-        named = read_marker(path).get("rig")
         if named != rig.name:
             raise SessionError(
                 f"{path}: {MARKER} is of rig {named!r}, {PROFILE} of rig {rig.name!r}",
@@ -119,13 +121,11 @@ class Session:
             )
         if not writable:
             return cls(path, rig, None)
-        try:
+        with writing(path):
             lock = _take_lock(path)
             (path / CAPTURES).mkdir(exist_ok=True)
             for draft in sorted((path / CAPTURES).glob(f"{DRAFT_PREFIX}*")):
                 shutil.rmtree(draft)
-        except OSError as error:
-            raise _not_writable(path, error) from error
         return cls(path, rig, lock)
 
     @classmethod
@@ -151,11 +151,11 @@ class Session:
         adopted = rig if is_replaced else keep_identity(session.rig, rig)
         if adopted != session.rig:
             try:
-                replace_file(path / PROFILE, dump_rig(adopted).encode())
-                replace_file(path / MARKER, marker_of(adopted))
-            except OSError as error:
+                write_atomically(path / PROFILE, dump_rig(adopted))
+                write_atomically(path / MARKER, marker_of(adopted))
+            except SessionError:
                 session.close()
-                raise _not_writable(path, error) from error
+                raise
             session.rig = adopted
         return session
 
@@ -181,14 +181,11 @@ class Session:
         if adopted == self.rig:
             return ""
         n = next(n for n in count(1) if not (self.path / f"rig-{n}.yaml").exists())
-        try:
-            # The earlier one first: stopped here, the session is as it was, with a copy of its profile.
-            for name, kept in ((PROFILE, f"rig-{n}.yaml"), (PROFILE_TEXT, f"profile-{n}.yaml")):
-                if (self.path / name).exists():
-                    replace_file(self.path / kept, (self.path / name).read_bytes())
-            replace_file(self.path / PROFILE, dump_rig(adopted).encode())
-        except OSError as error:
-            raise _not_writable(self.path, error) from error
+        # The earlier one first: stopped here, the session is as it was, with a copy of its profile.
+        for name, kept in ((PROFILE, f"rig-{n}.yaml"), (PROFILE_TEXT, f"profile-{n}.yaml")):
+            if (self.path / name).exists():
+                write_atomically(self.path / kept, (self.path / name).read_bytes())
+        write_atomically(self.path / PROFILE, dump_rig(adopted))
         self.rig = adopted
         self.journal("profile", earlier=f"rig-{n}.yaml")
         return f"rig-{n}.yaml"
@@ -294,13 +291,11 @@ class Session:
             raise SessionError(f"{new} blocks capture {name}", f"Move {new} out of the session.")
         # First, so that nothing moves where the disk is full.
         self.journal(event, capture=name, **fields)
-        try:
+        with writing(new):
             new.parent.mkdir(exist_ok=True)
             old.rename(new)
             flush_folder(new.parent)
             flush_folder(old.parent)
-        except OSError as error:
-            raise _not_writable(new, error) from error
 
     def find_duplicate(
         self, images: Iterable[Image], scans: Iterable[Scan], events: Iterable[Events] = ()
@@ -335,20 +330,19 @@ class Session:
         check_samples(self.rig, images, scans, events)
         recorded = [(event_channel(self.rig, stretch.sensor), stretch) for stretch in events]
         contents = self._contents()
-        captures = self.captures
         name = self.next_name
         folder = self.path / CAPTURES / name
         draft = folder.with_name(DRAFT_PREFIX + name)
         try:
-            draft.mkdir()
-            write_capture(draft, images, scans, meta, recorded)
-            draft.rename(folder)
-            flush_folder(folder.parent)
-        except (OSError, ValueError) as error:
+            with writing(folder, len(self.captures)):
+                draft.mkdir()
+                write_capture(draft, images, scans, meta, recorded)
+                draft.rename(folder)
+                flush_folder(folder.parent)
+        except ValueError as error:
+            raise SessionError(f"capture {name} cannot be stored: {error}") from error
+        finally:
             shutil.rmtree(draft, ignore_errors=True)
-            if isinstance(error, ValueError):
-                raise SessionError(f"capture {name} cannot be stored: {error}") from error
-            raise _not_writable(folder, error, len(captures)) from error
         contents.setdefault(Capture(folder).content_sha256, name)
         self.journal(CAPTURED, capture=name)
         return name
@@ -370,10 +364,8 @@ class Session:
         """
         now = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
         line = json.dumps({"time": now, "event": event, **fields}, sort_keys=True, default=str)
-        try:
+        with writing(self.path / JOURNAL, len(self.captures)):
             append_line(self.path / JOURNAL, line)
-        except OSError as error:
-            raise _not_writable(self.path / JOURNAL, error, len(self.captures)) from error
 
     def read_journal(self) -> list[dict[str, Any]]:
         """List the journal's entries; skip a line torn by a crash.
@@ -409,11 +401,8 @@ class Session:
         Raises:
             SessionError: the disk is full or read-only; the earlier folder is untouched.
         """
-        try:
-            with replacing(self.path, folder, finish) as draft:
-                yield draft
-        except OSError as error:
-            raise _not_writable(folder, error) from error
+        with writing(folder), replacing(self.path, folder, finish) as draft:
+            yield draft
 
     def _contents(self) -> dict[str, str]:
         if self._names_by_content is None:
@@ -480,15 +469,3 @@ def _take_lock(path: Path) -> WriterLock:
         raise SessionError(
             f"{path} is being written by {holder}", "Wait for it to end, or stop it."
         ) from None
-
-
-def _not_writable(path: Path, error: OSError, n_safe: int | None = None) -> SessionError:
-    safe = "" if not n_safe else f" The {n_safe} captures before it are safe."
-    if isinstance(error, (FileExistsError, NotADirectoryError)):
-        hint = "Move away what is in its place, or choose another folder."
-    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        hint = "Choose a folder that you may write to, or see to its permissions."
-    else:
-        hint = "Make room or choose another disk and run the same command again: it goes on where it stopped."
-    hint += safe
-    return SessionError(f"{path} cannot be written: {error.strerror or error}", hint)
