@@ -42,7 +42,7 @@ BODIES = {
 def test_clouds_of_every_encoding_are_read_exactly(encoding: str) -> None:
     read = decode_pcd(f"{HEAD}{encoding}\n".encode() + BODIES[encoding])
     assert read.dtype.names == CLOUD.dtype.names
-    assert read.tolist() == CLOUD.tolist()
+    assert read.tolist() == CLOUD.tolist() == decode_pcd(encode_pcd(read, ["made here"])).tolist()
 
 
 @pytest.mark.parametrize("encoding", BODIES)
@@ -50,11 +50,6 @@ def test_clouds_of_every_encoding_are_read_exactly(encoding: str) -> None:
 def test_damaged_clouds_are_read_or_refused(encoding: str, data: st.DataObject) -> None:
     with suppress(SourceError), reading("a.pcd"):
         assert decode_pcd(data.draw(damaged(f"{HEAD}{encoding}\n".encode() + BODIES[encoding]))).dtype.names
-
-
-def test_encoding_and_decoding_a_cloud_are_inverse() -> None:
-    cloud = np.array([(1.5, -2, 40000)], dtype=[("x", ">f8"), ("ring", "i2"), ("t", "<u4")])
-    assert decode_pcd(encode_pcd(cloud, ["made here"])).tolist() == cloud.tolist()
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])

@@ -10,7 +10,6 @@ from lce_rig.core.phrasing import figures_apart
 
 PACKAGE = Path(lce_rig.__file__).parent
 RINGS = Kind("t.rings", "{n} rings at {distance_m:.1f} m", "come {closer_m:1cm} closer")
-RMS = Kind("t.rms", lambda finding: f"rms of {finding.subject}", actions={"hold": "hold it still"})
 LIMIT = Kind(
     "t.limit", "error {error_m:mm} (limit {limit_m:mm}), tilt {tilt_deg:.0f} deg ({max_tilt_deg:g} deg)"
 )
@@ -46,12 +45,6 @@ def test_two_significant_digits_suffice_unless_figure_and_limit_agree_in_them() 
     assert figures_apart(0.2, 0.2) == ("0.2", "0.2")
 
 
-def test_the_action_named_by_the_finding_is_given() -> None:
-    found = RMS("000003", severity="warning", action="hold")
-    assert (found.text, found.advice, found.severity) == ("rms of 000003", "hold it still", "warning")
-    assert RMS("000003").advice == ""
-
-
 def test_a_finding_read_from_a_file_keeps_the_words_of_the_file() -> None:
     found = Finding("t.of_an_old_version", stored=("the text", "the action"))
     assert found.sentence == "the text: the action"
@@ -61,11 +54,6 @@ def test_the_worst_finding_decides_and_order_is_kept_otherwise() -> None:
     notes = [Finding("a", "note"), Finding("b", "error"), Finding("c", "warning"), Finding("d", "error")]
     assert worst(notes) == "error" and worst([]) == "note"
     assert [finding.code for finding in ranked(notes)] == ["b", "d", "c", "a"]
-
-
-def test_a_figure_asked_for_as_a_number_must_be_one() -> None:
-    with pytest.raises(TypeError):
-        Finding("a", figures={"axis": "x"}).figure("axis")
 
 
 def test_every_declared_kind_is_made_somewhere() -> None:

@@ -108,25 +108,17 @@ def test_the_same_result_again_keeps_overlays_and_the_previous_one(session, fold
     assert (pose_in(folder / "previous") == GOOD.T_cam_lidar).all()
 
 
-def test_what_the_user_put_there_stays(session, folder):
-    write(session, GOOD)
-    (folder / "notes.txt").write_text("on Tuesday")
-    (folder / "photos").mkdir()
-    (folder / "photos" / "rig.jpg").write_bytes(b"x")
-    write(session, OTHER)
-    write(session, FAILED)
-    assert (folder / "notes.txt").read_text() == "on Tuesday"
-    assert (folder / "photos" / "rig.jpg").read_bytes() == b"x"
-    assert "notes.txt" not in names(folder / "previous")
-
-
-def test_what_the_user_put_beside_the_previous_result_stays(session, folder):
+def test_what_the_user_put_beside_a_result_and_the_one_before_stays(session, folder):
     (folder / "previous").mkdir(parents=True)
-    (folder / "previous" / "notes.txt").write_text("on Tuesday")
+    (folder / "photos").mkdir()
+    notes = [folder / "photos" / "rig.txt", folder / "previous" / "notes.txt"]
+    for note in notes:
+        note.write_text("on Tuesday")
     assert write(session, GOOD).previous is None
     for result in (OTHER, GOOD, GOOD, FAILED):
         assert write(session, result).previous == folder / "previous"
-        assert (folder / "previous" / "notes.txt").read_text() == "on Tuesday"
+        assert [note.read_text() for note in notes] == ["on Tuesday"] * 2
+    assert "photos" not in names(folder / "previous")
 
 
 @pytest.mark.parametrize("name", ["calibration", "calibration/previous"])
@@ -156,12 +148,6 @@ def test_a_result_that_cannot_be_written_leaves_the_earlier_one(session, folder)
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     assert not list(session.path.glob(".new-*"))
-
-
-def test_a_damaged_result_is_not_usable(folder, session):
-    write(session, GOOD)
-    (folder / "result.json").write_text("{")
-    assert not write(session, OTHER).has_usable_previous
 
 
 def test_a_folder_in_place_of_the_result_is_no_result_and_is_kept(session, folder):

@@ -6,11 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
-from lce_rig.core.errors import SessionError
-from lce_rig.session.durable import write_atomically
-
 WRITER = """
 import sys
 from pathlib import Path
@@ -31,9 +26,3 @@ def test_a_writer_killed_at_any_moment_leaves_a_whole_file(tmp_path: Path) -> No
             pass
         os.kill(writer.pid, signal.SIGKILL)
     assert path.read_text(encoding="utf-8") in ("a" * 200_000, "b" * 200_000)
-
-
-def test_a_folder_that_cannot_be_written_is_a_session_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way", encoding="utf-8")
-    with pytest.raises(SessionError):
-        write_atomically(tmp_path / "file" / "result.json", "{}")

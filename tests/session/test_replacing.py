@@ -36,14 +36,6 @@ def contents(folder):
 
 
 @pytest.mark.parametrize("can_exchange", [True, False])
-def test_a_folder_is_made_and_then_replaced(tmp_path, can_exchange):
-    for text in ("one", "two"):
-        fill(tmp_path, text, can_exchange=can_exchange)
-        assert contents(tmp_path / "out") == {text}
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.parametrize("can_exchange", [True, False])
 def test_an_error_leaves_the_earlier_folder(tmp_path, can_exchange):
     fill(tmp_path, "one")
     with pytest.raises(ZeroDivisionError), replacing(tmp_path, tmp_path / "out") as draft:

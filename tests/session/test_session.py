@@ -35,19 +35,6 @@ def test_times_of_any_size_survive(tmp_path, rig, offsets):
     assert session.captures[0].scan("lidar").offset_ns.tolist() == offsets
 
 
-def test_the_profile_is_frozen_in_the_session(tmp_path, rig):
-    Session.create(tmp_path / "s", rig).close()
-    assert Session.open(tmp_path / "s").rig == rig
-    assert load_rig(tmp_path / "s" / "rig.yaml") == rig
-
-
-def test_a_session_is_continued_after_the_last_capture(tmp_path, rig, samples):
-    for seed in range(3):
-        with Session.resume(tmp_path / "s", rig) as session:
-            session.add_capture(*samples(seed), {})
-    assert [c.name for c in session.captures] == ["000000", "000001", "000002"]
-
-
 def test_a_session_of_another_rig_is_refused_with_the_keys_that_differ(tmp_path, rig, samples):
     with Session.create(tmp_path / "s", rig) as session:
         session.add_capture(*samples(0), {})
@@ -97,12 +84,6 @@ def test_only_one_writer_is_let_in_and_readers_always(tmp_path, rig, samples):
     with pytest.raises(SessionError):
         Session.open(tmp_path / "s").add_capture(*samples(0), {})
     first.close()
-    Session.resume(tmp_path / "s", rig).close()
-
-
-def test_a_lock_file_without_a_living_holder_is_no_lock(tmp_path, rig):
-    Session.create(tmp_path / "s", rig).close()
-    (tmp_path / "s" / ".lock").write_text("999999\n")
     Session.resume(tmp_path / "s", rig).close()
 
 
