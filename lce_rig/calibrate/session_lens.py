@@ -60,9 +60,11 @@ class SessionLens:
         variances, axes = np.linalg.eigh(cov / np.outer(sigma, sigma))
         return np.asarray((np.sqrt(np.maximum(variances, 0.0)) * axes).T * sigma)
 
-    def moves(self, T_cam_board: Array) -> Array:
-        """Compute how far each of `directions` moves fitted poses (F, 4, 4): (n, F, 6) tangents."""
-        return pose_moves(self.estimate, T_cam_board, self.directions)
+    def moves(self, observations: Sequence[Observation]) -> Array:
+        """Compute how far each of `directions` moves the fitted poses of F captures: (n, F, 6) tangents."""
+        corners_px = np.array([o.image.corners_px for o in observations])
+        poses = np.array([o.image.T_cam_board for o in observations])
+        return pose_moves(self.estimate, corners_px, poses, self.directions)
 
     def refit(self, observations: Sequence[Observation]) -> list[Observation]:
         """Fit the poses of observations anew with this lens and board."""
@@ -72,9 +74,9 @@ class SessionLens:
         first = fit_poses(self.estimate, corners_px, np.array([board.T_cam_board for board in boards]))
         starts = [b.T_cam_board if other is None else other for b, other in zip(boards, others, strict=True)]
         second = fit_poses(self.estimate, corners_px, np.array(starts))
-        n = corners_px.shape[1]
+        n_seen = np.isfinite(corners_px[..., 0]).sum(axis=1).tolist()
         refitted = []
-        for k, (observation, other) in enumerate(zip(observations, others, strict=True)):
+        for k, (observation, other, n) in enumerate(zip(observations, others, n_seen, strict=True)):
             (T, cost, H), (T_other, cost_other, H_other) = (
                 [part[k] for part in fit] for fit in (first, second)
             )

@@ -140,7 +140,7 @@ def vary(
     still = np.zeros((len(poses), 6))
     variants = []
     if lens is not None:
-        variants += [Variant("intrinsics", 1.0, move, board) for move in lens.moves(poses)]
+        variants += [Variant("intrinsics", 1.0, move, board) for move in lens.moves(observations)]
     # All squares larger by a fraction: boards are as much farther away. The pattern's centre on the plate.
     R, t = poses[:, :3, :3], poses[:, :3, 3]
     middle = R @ [*board.pattern_offset_m, 0.0]

@@ -19,6 +19,7 @@ __all__ = ["COMMANDS", "main", "run"]
 # runs, so that `lce-rig --help` stays instant.
 COMMANDS: dict[str, tuple[str, str]] = {
     "rigs": ("lce_rig.cli.rigs", "List, show, check and derive rig profiles."),
+    "board": ("lce_rig.cli.board", "Draw a board to print at scale, with its profile block."),
     "doctor": ("lce_rig.cli.doctor", "Check whether this computer and the sensors are fit to collect."),
     "simulate": ("lce_rig.cli.simulate", "Simulate a session or recording of a rig, with exact truth."),
     "collect": ("lce_rig.cli.collect", "Build a session, live and guided, or from recordings."),

@@ -27,6 +27,7 @@ from lce_rig.rig import (
     read_profile,
     shipped_profiles,
 )
+from lce_rig.rig.board_settings import board_block
 from lce_rig.session.durable import replace_file
 
 
@@ -58,9 +59,9 @@ def list_profiles(as_json: bool) -> None:
     table = show.plain_table("", "rig", "LiDARs", "cameras (channels)", "board", "description")
     for rig, summary in zip(profiles, summaries, strict=True):
         cameras = (f"{name} ({', '.join(channels)})" for name, channels in summary["cameras"].items())
-        cols, rows = rig.board.inner_corners
-        board = f"{cols}x{rows} corners, {1e3 * rig.board.square_m:g} mm"
-        table.add_row(rig.name, ", ".join(rig.lidars), ", ".join(cameras), board, rig.description)
+        board = rig.board.to_board()
+        pattern = f"{board.cols}x{board.rows} corners, {1e3 * board.square_m:g} mm"
+        table.add_row(rig.name, ", ".join(rig.lidars), ", ".join(cameras), pattern, rig.description)
     show.print_table(table)
     show.note(
         "for your own rig: lce-rig rigs new NAME --from rlfs, "
@@ -169,8 +170,10 @@ def _print_warnings(rig: Rig) -> None:
 )
 @click.option(
     "--board",
-    metavar="COLSxROWS,SQUARE,WIDTHxHEIGHT[,RIGHT,UP]",
-    help="Inner corners, square and plate in m, and how far the pattern is off the plate's centre.",
+    metavar="[TYPE:]COLSxROWS,SQUARE,...,WIDTHxHEIGHT[,RIGHT,UP]",
+    help="Inner corners, square and plate in m, and how far the pattern is off the plate's centre; also "
+    "charuco:9x7,0.07,0.0525,5X5_50,... (squares, marker, dictionary) and aprilgrid:4x3,0.13,0.3,... (tags, "
+    "tagSize, tagSpacing).",
 )
 @click.option(
     "--set",
@@ -237,6 +240,10 @@ def new_profile(
         origin = origin or "rlfs"
         parent = load_rig(origin)
         values = [*_sensor_settings(parent, lidar, cameras, intrinsics, board), *values]
+        if board is not None:
+            block = parent.board.model_dump(exclude_none=True, exclude_unset=True)
+            stale = block.keys() - board_block(parse_board(board)).keys() - {"type"}
+            removed = (*removed, *(f"board.{key}" for key in sorted(stale) if not key.endswith("sigma_m")))
         original = read_profile(find_profile(origin))
         text = derive_text(original, name, values, target, parent.name, removed)
     if output == "-":
@@ -299,8 +306,8 @@ def _sensor_settings(
             (f"{block}.{key}", f"{getattr(lens, key)}") for key in ("fx_px", "fy_px", "cx_px", "cy_px")
         ]
     if board is not None:
-        plate = parse_board(board)
-        values += [("board.inner_corners", f"[{plate.cols}, {plate.rows}]")]
-        values += [(f"board.{key}", f"{getattr(plate, key)}") for key in ("square_m", "width_m", "height_m")]
-        values += [("board.pattern_offset_m", f"{list(plate.pattern_offset_m)}")]
+        plate = board_block(parse_board(board))
+        values += [(f"board.{key}", f"{value}") for key, value in plate.items()]
+        if "type" not in plate and parent.board.type != "checkerboard":
+            values.append(("board.type", "checkerboard"))
     return values

@@ -50,7 +50,7 @@ class Glance:
 
     def rests_within(self, corners: Array) -> bool:
         """Check whether a board may be at rest where the last search found its corners (N, 2)."""
-        (u0, v0), (u1, v1) = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0)) + 1
+        (u0, v0), (u1, v1) = np.floor(np.nanmin(corners, axis=0)), np.ceil(np.nanmax(corners, axis=0)) + 1
         part = slice(max(int(v0), 0), max(int(v1), 1)), slice(max(int(u0), 0), max(int(u1), 1))
         spread = float(np.std(self.small[part]))
         changes = [float(np.std(self.small[part] - other[part])) for other in self.others]

@@ -124,7 +124,7 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
     for key, reference in middle.images.items():
         others = [s.images[key].corners_px for s in window if key in s.images]
         grid = reference.corners_px.reshape(board.rows, board.cols, 2)
-        square_px = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
+        square_px = float(np.nanmedian(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
         # The order may start at the other end of the pattern where it has no unique top.
         shift_px = max(
             min(_rms(corners - reference.corners_px), _rms(corners[::-1] - reference.corners_px))
@@ -141,7 +141,10 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
 
 
 def _rms(difference: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
+    """Measure the rms distance (N, 2) of corners that both images show; infinite where there are none."""
+    squares = np.sum(difference**2, axis=-1)
+    squares = squares[np.isfinite(squares)]
+    return float(np.sqrt(np.mean(squares))) if len(squares) else np.inf
 
 
 def _plane_motion_m(reference: LidarBoard, candidates: list[LidarBoard], max_motion_m: float) -> float:

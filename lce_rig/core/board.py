@@ -1,28 +1,36 @@
-"""The calibration board: a checkerboard printed on a larger rectangular plate."""
+"""The calibration board: a pattern printed on a larger rectangular plate."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
 
+BoardType = Literal["checkerboard", "charuco", "aprilgrid"]
+
 
 @dataclass(frozen=True)
 class Board:
-    """A checkerboard on a plate.
+    """A pattern on a plate: a checkerboard, a ChArUco board (OpenCV) or an AprilGrid (Kalibr).
 
     Frame board: origin at the centre of the plate, x along its width, y up along its height (as the pattern
         is
     looked at), z out of the pattern towards the viewer.
 
     Attributes:
-        cols: inner corners along the width.
-        rows: inner corners along the height.
-        square_m: side of one square.
+        cols: columns of corners along the width: of inner corners, or of the corners of tags.
+        rows: rows of corners along the height.
+        square_m: side of one square, or of one tag.
         width_m: outer width of the plate.
         height_m: outer height of the plate.
         pattern_offset_m: (x, y) of the pattern's centre from the plate's centre, frame board.
+        type: of the pattern.
+        marker_share: side of a ChArUco board's markers over that of its squares.
+        gap_share: gap between the tags of an AprilGrid over their side.
+        dictionary: of the markers, OpenCV's name without DICT_.
+        first_id: of the markers, at the top left of a ChArUco board and at the lower left of an AprilGrid.
     """
 
     cols: int
@@ -31,11 +39,44 @@ class Board:
     width_m: float
     height_m: float
     pattern_offset_m: tuple[float, float] = (0.0, 0.0)
+    type: BoardType = "checkerboard"
+    marker_share: float = 0.0
+    gap_share: float = 0.0
+    dictionary: str = ""
+    first_id: int = 0
+
+    @property
+    def has_markers(self) -> bool:
+        """Whether each corner is identified, so that the pattern may be hidden in part."""
+        return self.type != "checkerboard"
+
+    @property
+    def n_markers(self) -> int:
+        """Number of markers; half of a ChArUco board's squares have one."""
+        return (
+            self.cols * self.rows // 4 if self.type == "aprilgrid" else (self.cols + 1) * (self.rows + 1) // 2
+        )
+
+    @property
+    def summary(self) -> str:
+        """Name the pattern, such as "9x7 squares of 70 mm"."""
+        if self.type == "aprilgrid":
+            return f"{self.cols // 2}x{self.rows // 2} tags of {1e3 * self.square_m:g} mm"
+        return f"{self.cols + 1}x{self.rows + 1} squares of {1e3 * self.square_m:g} mm"
 
     @property
     def is_symmetric(self) -> bool:
         """Whether the pattern rotated by 180 deg gives the same image (squares add up to an even number)."""
-        return (self.cols + self.rows) % 2 == 0
+        return not self.has_markers and (self.cols + self.rows) % 2 == 0
+
+    @property
+    def pattern_size_m(self) -> tuple[float, float]:
+        """Width and height of the print: with the outer squares, or the small ones about an AprilGrid."""
+        if self.type != "aprilgrid":
+            return (self.cols + 1) * self.square_m, (self.rows + 1) * self.square_m
+        gap = self.gap_share
+        width, height = ((n // 2 * (1 + gap) + gap) * self.square_m for n in (self.cols, self.rows))
+        return width, height
 
     def corners(self) -> Array:
         """List the inner corners, row by row from the top left as the pattern is looked at.
@@ -43,10 +84,17 @@ class Board:
         Returns:
             (rows * cols, 3) in frame board, m.
         """
-        x = (np.arange(self.cols) - (self.cols - 1) / 2) * self.square_m + self.pattern_offset_m[0]
-        y = ((self.rows - 1) / 2 - np.arange(self.rows)) * self.square_m + self.pattern_offset_m[1]
+        x = self._places(self.cols) * self.square_m + self.pattern_offset_m[0]
+        y = self._places(self.rows)[::-1] * self.square_m + self.pattern_offset_m[1]
         grid_x, grid_y = np.meshgrid(x, y)
         return np.stack([grid_x.ravel(), grid_y.ravel(), np.zeros(grid_x.size)], axis=1)
+
+    def _places(self, n: int) -> Array:
+        """Place n columns or rows of corners about the pattern's centre, in squares or tags."""
+        place = np.arange(n, dtype=np.float64)
+        if self.type == "aprilgrid":
+            place = place // 2 * (1 + self.gap_share) + place % 2
+        return np.asarray(place - place[-1] / 2, dtype=np.float64)
 
     def outline(self) -> Array:
         """List the plate's four corners, counter-clockwise from the lower left as the pattern is looked at.

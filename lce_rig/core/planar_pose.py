@@ -51,7 +51,7 @@ def solve_planar_pose(
     start is refined by Levenberg-Marquardt in distorted pixels, so that any camera model is treated alike.
 
     Args:
-        corners_px: (N, 2) measured, N >= 4.
+        corners_px: (N, 2) measured, four or more; NaN where hidden.
         corners_board: (N, 3) with z = 0, frame board, m.
         intrinsics: the camera.
         starts: T_cam_board (4, 4) near one minimum, or near both, where an image shortly before gave them:
@@ -63,6 +63,7 @@ def solve_planar_pose(
     References:
         T. Collins, A. Bartoli: Infinitesimal plane-based pose estimation. IJCV 109 (2014).
     """
+    corners_px, corners_board = _seen(corners_px, corners_board)
     start = starts[0] if starts else _pose_from_homography(corners_board, intrinsics.unproject(corners_px))
     if start is None:
         return None
@@ -117,6 +118,7 @@ def refine_pose(
     Returns:
         T_cam_board (4, 4) at the minimum and its cost in px^2, infinite where the start projects nowhere.
     """
+    corners_px, corners_board = _seen(corners_px, corners_board)
     T, damping = T_cam_board, 1e-4
     residuals, J = _residuals_and_jacobian(T, corners_px, corners_board, intrinsics)
     cost = float(residuals @ residuals)
@@ -139,6 +141,12 @@ def refine_pose(
         if gain < 1e-9 * cost + 1e-20:
             break
     return T, cost
+
+
+def _seen(corners_px: Array, corners_board: Array) -> tuple[Array, Array]:
+    """Drop hidden corners."""
+    is_seen = np.isfinite(corners_px).all(axis=1)
+    return (corners_px, corners_board) if is_seen.all() else (corners_px[is_seen], corners_board[is_seen])
 
 
 def mirror_tilt(T_cam_board: Array, centre_board: Array) -> Array:

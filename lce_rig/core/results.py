@@ -102,7 +102,8 @@ class ImageBoard:
     """The board detected in one image.
 
     Attributes:
-        corners_px: (rows * cols, 2) in the order of `Board.corners()`.
+        corners_px: (rows * cols, 2) in the order of `Board.corners()`; NaN where hidden, of boards whose
+            markers name the corners.
         T_cam_board: (4, 4), the pose with the smaller reprojection error.
         cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
         T_cam_board_alternative: (4, 4) second local minimum; None if there is none in front of the camera.

@@ -121,6 +121,26 @@ IMAGE_OTHER_BOARD = Kind(
     _other_grid,
     "correct board.inner_corners in the profile: squares less one, each way",
 )
+IMAGE_OTHER_DICTIONARY = Kind(
+    "image.other_dictionary",
+    "no markers of {dictionary}, {n_seen} of {seen_dictionary}",
+    "correct board.dictionary in the profile",
+)
+IMAGE_OTHER_IDS = Kind(
+    "image.other_ids",
+    "markers with ids from {first_seen} to {last_seen} beside those of the board, {first_id} to {last_id}",
+    "correct board.squares or board.tags, and board.first_id; hide other boards",
+)
+IMAGE_OTHER_LAYOUT = Kind(
+    "image.other_layout",
+    "{n_fitting} of {n_markers} markers lie where the profile's board has them",
+    "correct board.squares, or board.tags and board.tag_spacing",
+)
+IMAGE_FEW_CORNERS = Kind(
+    "image.few_corners",
+    "{n_corners} corners are clear enough to measure (minimum {n_needed})",
+    "uncover more of the pattern, come closer",
+)
 IMAGE_LOW_CONTRAST = Kind(
     "image.low_contrast",
     "contrast too low: black and white differ by {contrast:.0f} grey values (minimum {min_contrast:.0f})",

@@ -162,7 +162,7 @@ def compare_with_given(
     from scipy.special import fdtrc
 
     given_px = distances_under(intrinsics, fitted.views, board)
-    corners_px = fitted.corners_px.reshape(-1, 2)
+    corners_px = fitted.corners_px
     difference = compare_lenses(intrinsics, fitted.intrinsics, corners_px, fitted.cov, fitted.model)
     turn = difference.turn_rad
     angle = float(np.linalg.norm(turn))

@@ -47,7 +47,7 @@ def effective_covariance(estimate: CalibrationEstimate, joint: Array) -> Array:
     if estimate.lens is None:
         return joint
     fitted = estimate.lens.estimate
-    turn = turn_of_lens(fitted.intrinsics, fitted.corners_px.reshape(-1, 2), fitted.model)
+    turn = turn_of_lens(fitted.intrinsics, fitted.corners_px, fitted.model)
     M = np.hstack([np.eye(6), np.vstack([np.zeros_like(turn), turn])])
     return np.asarray(M @ joint @ M.T)
 

@@ -152,7 +152,7 @@ def _fit_weighted(setup: Setup, state: LensState, channels: NDArray[np.str_]) ->
 def _variances(setup: Setup, state: LensState) -> Array:
     residuals = residuals_px(setup, state).reshape(len(setup.corners_px), -1)
     # If the start cannot project a board, the board gets no weight in this round.
-    variances = np.sum(residuals**2, axis=1) / (residuals.shape[1] - 6)
+    variances = np.sum(residuals**2, axis=1) / setup.dof
     return np.where(np.isfinite(variances), variances, 1e12)
 
 
@@ -163,15 +163,15 @@ def _usual(variances: Array, channels: NDArray[np.str_]) -> Array:
 
 def _weights(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> Array:
     variances = _variances(setup, state)
-    dof = 2 * setup.corners_px.shape[1] - 6
-    usual = _usual(variances, channels)
+    dof, usual = setup.dof, _usual(variances, channels)
     pooled = (dof * variances + _PRIOR_DOF * usual) / (dof + _PRIOR_DOF)
     return np.asarray(1 / (pooled + _SHARED_PX**2))
 
 
 def _distances(setup: Setup, state: LensState) -> Array:
     """Rms distance (K,) of each board's corners from their prediction, px."""
-    return np.asarray(np.sqrt(np.mean(np.sum(residuals_px(setup, state) ** 2, axis=2), axis=1)))
+    squares = np.sum(residuals_px(setup, state) ** 2, axis=(1, 2))
+    return np.asarray(np.sqrt(squares / (setup.dof / 2 + 3)))
 
 
 def _estimate(
@@ -209,7 +209,7 @@ def _estimate(
         print_rms_m=float(np.sqrt(2 * np.mean(state.shape[N_MODES:] ** 2))),
         views=views,
         T_cam_board=state.T_cam_board,
-        residuals_px=-residuals_px(setup, state),
+        residuals_px=-residuals_px(setup, state)[np.isfinite(setup.corners_px[..., 0])],
         held_out_px=_held_out(setup, state, weights, captures, n_folds),
         surprise=profile.surprise(state.lens) if has_prior else None,
         refused=refused,
@@ -261,7 +261,7 @@ def _scatter_ratio(setup: Setup, state: LensState, weights: Array, captures: NDA
     back = np.linalg.inv(L)
     cov = back.T @ back
     # The shared unknowns absorb part of the residuals.
-    n_residuals = len(weights) * (2 * setup.corners_px.shape[1] - 6)
+    n_residuals = float(setup.dof.sum())
     lost = float(np.vdot(cov, data))
     expected = cov @ data @ cov * (n_residuals / max(n_residuals - lost, 1.0))
     P = setup.model.size

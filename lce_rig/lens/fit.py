@@ -40,7 +40,8 @@ class Setup:
     """Measurements and model of a fit.
 
     Attributes:
-        corners_px: (K, N, 2) of K boards, in the order of `Board.corners()`.
+        corners_px: (K, N, 2) of K boards, in the order of `Board.corners()`; NaN where hidden, which gives
+            residuals and derivatives of zero.
         corners_board: (N, 3) nominal, m.
         shapes: (S, N, 3) displacement of the corners per unit of each shape parameter.
         mean: (P + S,) lens and shape a priori.
@@ -89,6 +90,20 @@ class Setup:
             shape_sigma = np.full(len(shapes), _EXACT_M) if prior.is_board_exact else shape_sigma
         information[P:, P:] = np.diag(shape_sigma**-2)
         return cls(corners_px, corners, shapes, mean, information, model)
+
+    @property
+    def dof(self) -> Array:
+        """Coordinates of each board's corners less its pose's (K,)."""
+        return np.asarray(np.isfinite(self.corners_px).sum(axis=(1, 2)) - 6)
+
+    def minus_measured(self, pixels: Array) -> Array:
+        """Subtract the measured corners from predicted ones (K, N, 2)."""
+        return np.where(np.isnan(self.corners_px), 0.0, pixels - self.corners_px)
+
+    def without_hidden(self, by_corner: Array) -> Array:
+        """Clear derivatives (K, N, 2, n) of hidden corners."""
+        hidden = np.isnan(self.corners_px)
+        return np.where(hidden[..., None], 0.0, by_corner) if hidden.any() else by_corner
 
     def select(self, keep: NDArray[np.bool_]) -> "Setup":
         """Keep some boards (K,)."""
@@ -178,7 +193,8 @@ def _project(setup: Setup, state: LensState) -> tuple[Array, Array, Array, Array
     """Compute residuals (K, N, 2), derivatives by point and lens, and the corners rotated into the camera."""
     turned, points = _in_camera(setup, state)
     pixels, by_point, by_lens = setup.model.project(state.lens, points)
-    return pixels - setup.corners_px, by_point, by_lens, turned
+    by_point, by_lens = setup.without_hidden(by_point), setup.without_hidden(by_lens)
+    return setup.minus_measured(pixels), by_point, by_lens, turned
 
 
 def _in_camera(setup: Setup, state: LensState) -> tuple[Array, Array]:
@@ -192,8 +208,9 @@ def _by_pose(setup: Setup, state: LensState) -> tuple[Array, Array]:
     """Compute residuals (K, 2 N) and their derivative (K, 2 N, 6) by the tangent of each pose."""
     turned, points = _in_camera(setup, state)
     pixels, by_point = setup.model.project_points(state.lens, points)
+    by_point = setup.without_hidden(by_point)
     J = np.concatenate([by_point, -by_point @ skew(turned)], axis=-1)
-    return (pixels - setup.corners_px).reshape(len(J), -1), J.reshape(len(J), -1, 6)
+    return setup.minus_measured(pixels).reshape(len(J), -1), J.reshape(len(J), -1, 6)
 
 
 def linearise(setup: Setup, state: LensState) -> tuple[Array, Array, Array]:
@@ -244,20 +261,19 @@ def fit_poses(estimate: IntrinsicsEstimate, corners_px: Array, starts: Array) ->
     return T, cost, np.asarray(np.swapaxes(J, 1, 2) @ J)
 
 
-def pose_moves(estimate: IntrinsicsEstimate, T_cam_board: Array, errors: Array) -> Array:
+def pose_moves(estimate: IntrinsicsEstimate, corners_px: Array, T_cam_board: Array, errors: Array) -> Array:
     """Compute how far fitted poses move with lens and board.
 
     Args:
         estimate: of both.
-        T_cam_board: (K, 4, 4) of boards.
+        corners_px: (K, N, 2) of boards.
+        T_cam_board: (K, 4, 4) of these.
         errors: (n, P + 15) added to lens and shape.
 
     Returns:
         (n, K, 6) tangents -(sum J^T J)^-1 sum J^T G error, with J and G the derivatives of the corners.
     """
-    setup, state = _of_estimate(
-        estimate, np.zeros((len(T_cam_board), *estimate.corners_board.shape[:1], 2)), T_cam_board
-    )
+    setup, state = _of_estimate(estimate, corners_px, T_cam_board)
     _, G, J = linearise(setup, state)
     Jt = np.swapaxes(J, 1, 2)
     return np.asarray(np.moveaxis(-np.linalg.solve(Jt @ J, Jt @ (G @ errors.T)), -1, 0))

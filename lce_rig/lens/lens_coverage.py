@@ -88,7 +88,7 @@ def reach(estimate: IntrinsicsEstimate) -> float:
     centre = np.array([i.cx_px, i.cy_px])
     ends = np.array([[u, v] for u in (0, i.width_px - 1) for v in (0, i.height_px - 1)])
     farthest = np.linalg.norm(ends - centre, axis=1).max()
-    return float(np.linalg.norm(estimate.corners_px.reshape(-1, 2) - centre, axis=1).max() / farthest)
+    return float(np.linalg.norm(estimate.corners_px - centre, axis=1).max() / farthest)
 
 
 def _tilts(estimate: IntrinsicsEstimate) -> list[str]:

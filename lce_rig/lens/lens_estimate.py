@@ -52,7 +52,7 @@ class IntrinsicsEstimate:
         print_rms_m: remaining displacement of single corners, rms.
         views: used in the estimate.
         T_cam_board: (K, 4, 4) of the views.
-        residuals_px: (K, N, 2) measured minus predicted.
+        residuals_px: (M, 2) of `corners_px`, measured minus predicted.
         held_out_px: (K,) rms distance of each view's corners under intrinsics fitted without its capture;
             NaN without folds.
         surprise: squared distance of the estimate from the profile's intrinsics, in the standard deviations
@@ -91,7 +91,7 @@ class IntrinsicsEstimate:
     @property
     def rms_px(self) -> float:
         """Rms distance of a corner from its prediction."""
-        return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=2))))
+        return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
 
     @property
     def held_out_rms_px(self) -> float:
@@ -100,5 +100,6 @@ class IntrinsicsEstimate:
 
     @property
     def corners_px(self) -> Array:
-        """Measured corners (K, N, 2)."""
-        return np.array([view.board.corners_px for view in self.views])
+        """Corners (M, 2) of all views, without hidden ones."""
+        corners_px = np.concatenate([view.board.corners_px for view in self.views])
+        return np.asarray(corners_px[np.isfinite(corners_px[:, 0])])

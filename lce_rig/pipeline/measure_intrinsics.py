@@ -79,7 +79,7 @@ class MeasuredIntrinsics:
         covariance lets pixels move where boards were seen.
         """
         estimate, lens = self.estimate, self.estimate.intrinsics
-        corners_px = estimate.corners_px.reshape(-1, 2)
+        corners_px = estimate.corners_px
         _, cov = lens_errors(lens, lens, corners_px, estimate.cov, estimate.model)
         focal, x, y, corner_px = np.sqrt(np.diag(cov)).tolist()
         return {
@@ -155,14 +155,14 @@ def measure_intrinsics(
         for key, board in found.items()
         if isinstance(board, Refusal)
         or board.reprojection_px > limit_px
-        or (board.quality is not None and board.quality.n_corners < len(board.corners_px))
+        or (board.quality is not None and board.quality.n_corners < np.isfinite(board.corners_px[:, 0]).sum())
     }
     if doubtful:
         again = [(capture, channel) for capture, channel in jobs if (capture.name, channel) in doubtful]
         found |= _look(rig, camera, again, estimate.intrinsics, limit_px, progress)
         estimate, choice = _fit(camera, found, rig, estimate.intrinsics, model)
     lens, target_deg = estimate.intrinsics, rig.calibration.target_sigma_deg
-    certainty = certainty_of(lens, estimate.corners_px.reshape(-1, 2), estimate.cov, estimate.model)
+    certainty = certainty_of(lens, estimate.corners_px, estimate.cov, estimate.model)
     check, difference = None, None
     if (given.width_px, given.height_px) == (lens.width_px, lens.height_px):
         check, difference = compare_with_given(estimate, given, rig.board.to_board())

@@ -7,8 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from lce_rig.core.board import Board
+from lce_rig.core.board import Board, BoardType
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import TYPICAL, find_data_sheet
@@ -19,12 +20,18 @@ from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.folder.decoding import DECODERS, read_cloud
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
 from lce_rig.rig import BoardSettings, LidarSettings
-from lce_rig.rig.loading import Document, dump_yaml, rig_from_document
+from lce_rig.rig.board_settings import KEYS_OF_TYPE, board_block
+from lce_rig.rig.loading import Document, dump_yaml, explain, rig_from_document
 
 _UNKNOWN_MODEL = "other"
 # A ring that sees one distance only has no height: 0.1 mrad against 15 mm.
 _HEIGHT_PRIOR = (1e-4 / 0.015) ** 2
-_BOARD = re.compile(r"(\d+)x(\d+),([^,x]+),([^,x]+)x([^,x]+)(?:,([^,x]+),([^,x]+))?")
+_PLATE = r"([^,x]+)x([^,x]+)(?:,([^,x]+),([^,x]+))?"
+_BOARDS: dict[BoardType, re.Pattern[str]] = {
+    "checkerboard": re.compile(rf"(?:checkerboard:)?(\d+)x(\d+),([^,x]+)(),{_PLATE}"),
+    "charuco": re.compile(rf"charuco:(\d+)x(\d+),([^,x]+),([^,]+,[^,]+),{_PLATE}"),
+    "aprilgrid": re.compile(rf"aprilgrid:(\d+)x(\d+),([^,x]+),([^,x]+),{_PLATE}"),
+}
 _SIZE = re.compile(r"(\d{1,5})x(\d{1,5})")
 _FAMILIES: dict[str, Literal["radtan", "equidistant"]] = {
     "radtan": "radtan",
@@ -37,6 +44,9 @@ _BOARD_SIGMAS = ("pattern_offset_sigma_m", "plate_sigma_m", "bow_sigma_m")
 _COMMENTS = {
     "board": "measure it; do not rely on the CAD model",
     "inner_corners": "where four squares meet: [along the width, along the height]",
+    "squares": "[along the width, along the height]",
+    "tags": "tagCols, tagRows of Kalibr",
+    "tag_spacing": "gap between tags over their side",
     "pattern_offset_m": "pattern's centre from the plate's centre: [right, up]",
     "square_sigma_m": "standard deviation of square_m",
     "pattern_offset_sigma_m": "of each coordinate of pattern_offset_m",
@@ -48,7 +58,12 @@ _COMMENTS = {
     "reference": "LiDAR: first_firing or last_firing; camera: mid_exposure or start",
     "sync": "hardware (shared pulse), ptp or none",
 }
-BOARD_FORM = "COLSxROWS,SQUARE,WIDTHxHEIGHT[,RIGHT,UP], lengths in m, such as 8x6,0.07,0.767x0.626"
+BOARD_FORM = (
+    "COLSxROWS,SQUARE,WIDTHxHEIGHT[,RIGHT,UP] of a checkerboard's inner corners, lengths in m, such as "
+    "8x6,0.07,0.767x0.626; charuco:COLSxROWS,SQUARE,MARKER,DICTIONARY,WIDTHxHEIGHT of squares, such as "
+    "charuco:9x7,0.07,0.0525,5X5_50,0.767x0.626; or aprilgrid:COLSxROWS,TAG,SPACING,WIDTHxHEIGHT of tags, "
+    "such as aprilgrid:4x3,0.13,0.3,0.767x0.626"
+)
 _ROUGH_LENS = (
     "Not measured yet? Rough ones will do: FX = FY = 0.8 times the width, CX and CY the image's middle, and "
     "zeros; `lce-rig intrinsics` measures them later from the same captures."
@@ -145,11 +160,7 @@ def new_profile(
 def _board(board: Board) -> dict[str, Any]:
     """List the board's settings, with the usual standard deviations."""
     return {
-        "inner_corners": [board.cols, board.rows],
-        "square_m": board.square_m,
-        "width_m": board.width_m,
-        "height_m": board.height_m,
-        "pattern_offset_m": list(board.pattern_offset_m),
+        **board_block(board),
         "square_sigma_m": float(f"{board.square_m / 1000:.2g}"),
         **{key: BoardSettings.model_fields[key].default for key in _BOARD_SIGMAS},
     }
@@ -241,20 +252,36 @@ def measure_beams(scan: Scan) -> tuple[list[float], int | None]:
 
 
 def parse_board(text: str) -> Board:
-    """Read a board as "8x6,0.07,0.767x0.626": inner corners, square, plate and, if given, the offset.
+    """Read a board as "8x6,0.07,0.767x0.626", or of another type, as `BOARD_FORM` says.
 
     Raises:
         UsageError: it is not written like this.
     """
-    match = _BOARD.fullmatch(text.replace(" ", ""))
+    compact = text.replace(" ", "")
     try:
-        if match is None:
-            raise ValueError
-        cols, rows, *lengths = match.groups()
-        square, width, height, right, up = (float(value or 0) for value in lengths)
+        for kind, pattern in _BOARDS.items():
+            if match := pattern.fullmatch(compact):
+                cols, rows, square, more, *lengths = match.groups()
+                marker, _, dictionary = more.partition(",")
+                width, height, *offset = (float(value or 0) for value in lengths)
+                settings = BoardSettings.model_validate(
+                    {
+                        "type": kind,
+                        KEYS_OF_TYPE[kind][0]: (int(cols), int(rows)),
+                        "square_m": float(square),
+                        "width_m": width,
+                        "height_m": height,
+                        "pattern_offset_m": tuple(offset),
+                    }
+                    | ({"marker_m": float(marker), "dictionary": dictionary} if kind == "charuco" else {})
+                    | ({"tag_spacing": float(more)} if kind == "aprilgrid" else {})
+                )
+                return settings.to_board()
+    except ValidationError as error:
+        raise explain(error, Document(f"--board {text}", {}, root=None)) from error
     except ValueError:
-        raise UsageError(f"--board {text}: give {BOARD_FORM}") from None
-    return Board(int(cols), int(rows), square, width, height, (right, up))
+        pass
+    raise UsageError(f"--board {text}: give {BOARD_FORM}")
 
 
 def parse_intrinsics(text: str) -> Intrinsics:

@@ -4,9 +4,9 @@ from lce_rig.core.findings import Kind
 
 SWAPPED_SIDES = Kind(
     "profile.swapped_sides",
-    "{subject}: {n_cols}x{n_rows} inner corners run along the shorter side of the plate "
+    "{subject}: {n_cols}x{n_rows} corners run along the shorter side of the plate "
     "{width_m:g} x {height_m:g} m",
-    "check whether to swap width_m and height_m, or the inner_corners",
+    "check whether to swap width_m and height_m, or the pattern's [columns, rows]",
     severity="warning",
 )
 DRIFTING_CLOCK = Kind(

@@ -179,7 +179,8 @@ class Rig(Settings):
 
     def warnings(self) -> Iterator[Finding]:
         """List valid but probably unintended settings; the subject is the key."""
-        (cols, rows), width_m, height_m = self.board.inner_corners, self.board.width_m, self.board.height_m
+        board = self.board.to_board()
+        cols, rows, width_m, height_m = board.cols, board.rows, board.width_m, board.height_m
         if (cols - rows) * (width_m - height_m) < 0:
             yield SWAPPED_SIDES("board", n_cols=cols, n_rows=rows, width_m=width_m, height_m=height_m)
         # Streams have timestamps and a topic of their own, cameras a device.

@@ -118,7 +118,7 @@ def _is_in_image(view: CameraView, board: Board, T_world_board: Array) -> bool:
     pattern = board.corners()
     middle = pattern.mean(axis=0)
     # The outer squares reach one square beyond the inner corners.
-    reach = (np.array([board.cols + 1, board.rows + 1]) * board.square_m) / 2
+    reach = np.array(board.pattern_size_m) / 2
     outer = middle + np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.append(reach, 0.0)
     T_cam_board = invert(view.T_world_cam) @ T_world_board
     pixels, is_valid = view.intrinsics.project(transform(T_cam_board, np.concatenate([pattern, outer])))

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.interrupts import without_interrupt
-from lce_rig.simulate.surfaces import Material, Mesh, albedo, checker, rectangle
+from lce_rig.core.pattern import is_dark
+from lce_rig.simulate.surfaces import Material, Mesh, albedo, rectangle
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -218,10 +219,9 @@ class Scene:
 
     def is_dark(self, points_world: Array) -> NDArray[np.bool_]:
         """Find which points (N, 3), taken straight onto the board, lie on a dark square."""
-        board = self.board
         from_centre = points_world - self.T_world_board[:3, 3]
         xy = np.stack([from_centre @ self.T_world_board[:3, k] for k in (0, 1)], axis=1)
-        return checker(xy, board.cols, board.rows, board.square_m, board.pattern_offset_m)
+        return is_dark(self.board, xy)
 
     def is_front(self, normals: Array) -> NDArray[np.bool_]:
         """Find which normals (N, 3) of hits on the board belong to its printed side."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.pattern import is_dark
 from lce_rig.simulate.backdrop import Backdrop, irradiance, pixel_rays, reached
 from lce_rig.simulate.event_camera import EventCamera
 from lce_rig.simulate.image_rendering import sensor_gain
@@ -224,6 +225,15 @@ class MovingView:
         smoothing the whole pattern would give, as long as the board is not seen at a grazing angle.
         """
         board, offset_m = self.board, self.board.pattern_offset_m
+        if board.has_markers:
+            # No product of waves: the mean of points over the kernel's width.
+            shifts = np.sqrt(5) * np.array([-0.6, -0.2, 0.2, 0.6])
+            dark = [
+                is_dark(board, np.stack([x + across * spread_x, y + along * spread_y], axis=-1))
+                for across in shifts
+                for along in shifts
+            ]
+            return np.asarray(np.mean(dark, axis=0), dtype=np.float32)
         axes = ((x - offset_m[0], board.cols, spread_x), (offset_m[1] - y, board.rows, spread_y))
         inside, wave = np.float32(1.0), np.float32(1.0)
         for from_middle_m, n_inner, spread_m in axes:

@@ -107,24 +107,6 @@ def _poster(u: Array, v: Array) -> Array:
     return np.where((y > 0.86)[:, None], np.array([0.55, 0.28, 0.12]), shade)
 
 
-def checker(
-    xy_board: Array, cols: int, rows: int, square_m: float, offset_m: tuple[float, float]
-) -> NDArray[np.bool_]:
-    """Find which points of the pattern are dark; the outer square at the top left is.
-
-    Args:
-        xy_board: (..., 2) m, frame board.
-        cols: inner corners along x.
-        rows: inner corners along y.
-        square_m: side of one square.
-        offset_m: (x, y) of the pattern's centre from the plate's.
-    """
-    column = np.floor((xy_board[..., 0] - offset_m[0]) / square_m + (cols + 1) / 2)
-    row = np.floor((offset_m[1] - xy_board[..., 1]) / square_m + (rows + 1) / 2)
-    inside = (column >= 0) & (column <= cols) & (row >= 0) & (row <= rows)
-    return np.asarray(inside & ((column + row) % 2 == 0))
-
-
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangle mesh.

@@ -202,7 +202,7 @@ def test_the_model_is_chosen_by_captures_left_out(lens, wanted, loser):
 
 
 def test_a_lens_differs_nothing_from_itself_and_a_moved_centre_is_mostly_a_turn(estimate):
-    corners, cov = estimate.corners_px.reshape(-1, 2), estimate.cov
+    corners, cov = estimate.corners_px, estimate.cov
     same = compare_lenses(WIDE, WIDE, corners, cov, RADTAN5)
     assert same.max_px < 1e-6
     assert np.linalg.norm(same.turn_rad) < 1e-9
@@ -218,7 +218,7 @@ def test_a_lens_is_known_where_boards_were_seen_and_the_weak_places_are_named():
     middle = estimate_intrinsics(
         photograph(12, 5, Scene(spread=(0.42, 0.58), distance_m=(2.0, 3.0))), BOARD, WIDE, RADTAN5
     )
-    certainty = certainty_of(middle.intrinsics, middle.corners_px.reshape(-1, 2), middle.cov, middle.model)
+    certainty = certainty_of(middle.intrinsics, middle.corners_px, middle.cov, middle.model)
     inside = certainty.sigma_px[certainty.is_covered].max()
     assert inside < 1 < np.nanmax(certainty.sigma_px)
     texts = find_weaknesses(middle, certainty)
@@ -229,7 +229,7 @@ def test_a_lens_is_known_where_boards_were_seen_and_the_weak_places_are_named():
 def test_boards_that_face_the_camera_are_told_to_tilt():
     scene = Scene(tilt_deg=(0.0, 4.0), spread=(0.35, 0.65), distance_m=(1.5, 2.5))
     facing = estimate_intrinsics(photograph(14, 6, scene), BOARD, WIDE, MODELS["radtan4"], n_folds=2)
-    certainty = certainty_of(facing.intrinsics, facing.corners_px.reshape(-1, 2), facing.cov, facing.model)
+    certainty = certainty_of(facing.intrinsics, facing.corners_px, facing.cov, facing.model)
     texts = find_weaknesses(facing, certainty)
     assert any("focal length" in text and "tilt the" in text for text in texts)
 
@@ -237,7 +237,7 @@ def test_boards_that_face_the_camera_are_told_to_tilt():
 def test_a_bent_board_and_a_stretched_print_are_named():
     scene = Scene(bow_m=(0.004, 0.0), aspect=0.006, sigma_px=0.03)
     bad = estimate_intrinsics(photograph(12, 7, scene), BOARD, WIDE, RADTAN5, n_folds=2)
-    certainty = certainty_of(bad.intrinsics, bad.corners_px.reshape(-1, 2), bad.cov, bad.model)
+    certainty = certainty_of(bad.intrinsics, bad.corners_px, bad.cov, bad.model)
     texts = " ".join(find_weaknesses(bad, certainty))
     assert ("4.0 mm" in texts or "3.9 mm" in texts) and "towards" in texts
     assert "too long" in texts and "plate's width" in texts

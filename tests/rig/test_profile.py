@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import exp_so3
 from lce_rig.rig import CalibrationSettings, QualitySettings, Rig, dump_rig, find_profile, load_rig, parse_rig
-from lce_rig.rig.loading import all_keys
+from lce_rig.rig.loading import Document, all_keys, rig_from_document
 from lce_rig.rig.sensors import LidarSettings
 
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
@@ -265,3 +265,44 @@ def test_a_sync_board_that_cannot_be_meant_is_refused_with_its_key(old: str, new
     with pytest.raises(ProfileError) as caught:
         parse_rig(RLFS + SYNC.replace(old, new))
     assert f"{key}: " in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"type": "charuco"}, "board.squares"),
+        ({"type": "charuco", "squares": (9, 7), "marker_m": 0.05}, "board.dictionary"),
+        (
+            {"type": "charuco", "squares": (9, 7), "marker_m": 0.05, "dictionary": "5X5_99"},
+            "board.dictionary",
+        ),
+        (
+            {"type": "charuco", "squares": (9, 7), "marker_m": 0.07, "dictionary": "5X5_50"},
+            "board.inner_corners",
+        ),
+        ({"tag_spacing": 0.3}, "board.tag_spacing"),
+        ({"type": "aprilgrid", "tags": (6, 6), "tag_spacing": 0.3}, "board.inner_corners"),
+        ({"first_id": 3}, "board.first_id"),
+        ({"type": "circles"}, "board.type"),
+    ],
+)
+def test_keys_of_another_type_of_board_are_named(changes: dict[str, object], key: str) -> None:
+    document = load_rig("rlfs").model_dump(mode="json", exclude_none=True)
+    document["board"] |= changes
+    with pytest.raises(ProfileError) as caught:
+        rig_from_document(Document("mine.yaml", document, None))
+    assert key in caught.value.what + caught.value.hint
+
+
+def test_a_board_with_markers_survives_its_profile_and_old_profiles_are_checkerboards() -> None:
+    document = load_rig("rlfs").model_dump(mode="json", exclude_none=True)
+    assert load_rig("rlfs").board.type == "checkerboard"
+    document["board"] = {
+        "type": "charuco", "squares": (7, 5), "square_m": 0.1, "marker_m": 0.075, "dictionary": "DICT_4X4_50",
+        "first_id": 20, "width_m": 0.8, "height_m": 0.6,
+    }  # fmt: skip
+    rig = rig_from_document(Document("mine.yaml", document, None))
+    board = rig.board.to_board()
+    assert (board.cols, board.rows, board.dictionary, board.first_id) == (6, 4, "4X4_50", 20)
+    assert board.marker_share == pytest.approx(0.75)
+    assert parse_rig(dump_rig(rig)) == rig

@@ -10,7 +10,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import DATA_SHEETS
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
-from lce_rig.detect.image.quality import LEAST_SQUARE_PX
+from lce_rig.detect.image.quality import LEAST_MARKED_PX, LEAST_SQUARE_PX
 from lce_rig.rig import QualitySettings, Rig
 
 #: How many captures' residuals the assumed errors are worth.
@@ -265,7 +265,8 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
     focal_px = min(model.lens.fx_px, model.lens.fy_px)
     square_px = focal_px * model.board.square_m / distance_m * cosine
     ok &= cosine > np.cos(np.radians(limits.max_tilt_deg))
-    ok &= square_px > max(LEAST_SQUARE_PX, limits.min_square_px)
+    least_px = LEAST_MARKED_PX if model.board.has_markers else LEAST_SQUARE_PX
+    ok &= square_px > max(least_px, limits.min_square_px)
 
     outline = np.einsum("nij,kj->nki", T_cam_board[:, :3, :3], model.board.outline()) + centre[:, None]
     pixels, is_valid = model.lens.project(outline)

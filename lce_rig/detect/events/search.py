@@ -38,6 +38,8 @@ def align_corner_order(found: ImageBoard, reference: ImageBoard, board: Board) -
     Returns:
         `found` unchanged, or with corners, poses, covariances and track rotated.
     """
+    if board.has_markers:
+        return found
     turns = (0, 1, 2, 3) if board.rows == board.cols else (0, 2)
     R_reference = reference.T_cam_board[:3, :3]
     angles = [

@@ -28,6 +28,8 @@ from lce_rig.detect.image.saddle import Crossings
 _EDGE_WIDTH_PER_SIGMA = 2.56
 LEAST_SQUARE_PX = 5.0
 """Least side of a square, foreshortened by the tilt, from which corners are found without fail."""
+LEAST_MARKED_PX = 20.0
+"""Least side of a square with a marker, or of a tag, from which markers are read without fail."""
 # The outer squares of a line that is not on the board are all alike.
 _MIN_OUTER_CONTRAST = 0.35
 # Wider images are searched at this width at most.
@@ -35,19 +37,20 @@ _SEARCHED_PX = 1280
 
 
 def grid_quality(grey: NDArray[np.uint8], crossings: Crossings) -> ImageQuality:
-    """Measure the corners' surroundings."""
+    """Measure the corners' surroundings; corners at NaN are hidden."""
     grid = crossings.grid_px
     height, width = grey.shape
-    square_px = float(min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)))
+    is_seen = np.isfinite(grid[..., 0])
+    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
+    square_px = float(np.nanmin(np.concatenate(steps)))
     edge_width_px = _EDGE_WIDTH_PER_SIGMA * float(np.median(crossings.edge_sigma_px[crossings.is_fitted]))
     alternating = crossings.contrast * (-1.0) ** np.indices(crossings.contrast.shape).sum(axis=0)
-    alternating *= -1.0 if np.median(alternating) < 0 else 1.0
-    contrast = float(np.median(alternating))
-    to_border = np.minimum(grid, [width - 1, height - 1] - grid).min()
+    contrast = float(abs(np.median(alternating[is_seen])))
+    to_border = np.nanmin(np.minimum(grid, [width - 1, height - 1] - grid))
     return ImageQuality(
         mean_grey=float(grey.mean()),
         contrast=contrast,
-        noise=crossings.noise,
+        noise=float(np.median(crossings.misfit[is_seen])),
         square_px=square_px,
         edge_width_px=edge_width_px,
         sharpness=square_px / edge_width_px if edge_width_px > 0 else 0.0,
@@ -114,7 +117,7 @@ def explain_absence(
     white_share = float(np.mean(grey >= 250))
     if white_share > 0.5:
         return IMAGE_OVEREXPOSED.refusal(white_share=white_share)
-    seen = seen_grid(grey)
+    seen = None if board.has_markers else seen_grid(grey)
     if seen is not None:
         return explain_other_grid(grey, board, seen, is_from_events, min_square_px)
     wanted = {"n_cols": board.cols, "n_rows": board.rows}

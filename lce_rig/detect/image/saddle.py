@@ -1,6 +1,7 @@
 """Sub-pixel corners: a blurred checkerboard crossing fitted to the grey values around each corner."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from lce_rig.core.geometry import Array
 
 # Reach of the fitted patch towards the neighbouring corners: less than half way, so that blurred edges of the
 # next corners stay outside.
-_REACH = 0.42
+REACH = 0.42
 _MAX_SAMPLES_PER_SIDE = 25
 # Of the patches that bring corners to where the final ones need few steps; those take most of the time.
 _COARSE_SAMPLES = 9
@@ -32,18 +33,35 @@ class Crossings:
         is_fitted: (rows, cols) whether the fit succeeded.
         contrast: (rows, cols) white minus black, grey values; the sign tells the colour of the quadrants.
         edge_sigma_px: (rows, cols, 2) blur across the edges that run down the columns and along the rows.
-        noise: rms of the grey values about the model, whole board.
+        misfit: (rows, cols) rms of the grey values about the model.
     """
 
     grid_px: Array
     is_fitted: NDArray[np.bool_]
     contrast: Array
     edge_sigma_px: Array
-    noise: float
+    misfit: Array
+
+
+class Patches(NamedTuple):
+    """The surroundings of corners that are no squares of a checkerboard.
+
+    Attributes:
+        e1_px: (rows, cols, 2) one unit of length to the right on the board, as `REACH` counts it.
+        e2_px: (rows, cols, 2) one unit down on the board.
+        clear: distance from an edge, in units, beyond which something else is printed.
+    """
+
+    e1_px: Array
+    e2_px: Array
+    clear: float
 
 
 def fit_crossings(
-    grey: NDArray[np.uint8], grid_px: Array, most_samples: int = _MAX_SAMPLES_PER_SIDE
+    grey: NDArray[np.uint8],
+    grid_px: Array,
+    most_samples: int = _MAX_SAMPLES_PER_SIDE,
+    patches: Patches | None = None,
 ) -> Crossings:
     """Fit I(a, b) = m + c g(f1 / s1) g(f2 / s2) around every corner at once, by Levenberg-Marquardt.
 
@@ -58,31 +76,44 @@ def fit_crossings(
         grey: (H, W).
         grid_px: (rows, cols, 2) corners to within a third of a square.
         most_samples: per side of a patch; of fewer a fit is faster and noisier.
+        patches: for patterns other than checkerboards.
     """
-    coarse, parameters = _fit_patches(grey, grid_px, min(_COARSE_SAMPLES, most_samples), None, _COARSE_STEPS)
+    n_coarse = min(_COARSE_SAMPLES, most_samples)
+    coarse, parameters = _fit_patches(grey, grid_px, n_coarse, None, patches, _COARSE_STEPS)
     if not coarse.is_fitted.all():
         # A patch that slips from its corner pulls no other one along.
-        return _fit_patches(grey, grid_px, most_samples, None)[0]
-    return _fit_patches(grey, coarse.grid_px, most_samples, parameters)[0]
+        return _fit_patches(grey, grid_px, most_samples, None, patches)[0]
+    return _fit_patches(grey, coarse.grid_px, most_samples, parameters, patches)[0]
 
 
 def _fit_patches(
-    grey: NDArray[np.uint8], grid_px: Array, most_samples: int, start: Array | None, n_steps: int = _STEPS
+    grey: NDArray[np.uint8],
+    grid_px: Array,
+    most_samples: int,
+    start: Array | None,
+    patches: Patches | None,
+    n_steps: int = _STEPS,
 ) -> tuple[Crossings, Array]:
     """Fit patches of at most so many samples a side; the parameters (K, 8) serve finer patches as start."""
-    e1, e2 = np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0)
+    if patches is None:
+        patches = Patches(np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0), REACH)
+    e1, e2, clear = patches
     area = np.abs(e1[..., 0] * e2[..., 1] - e1[..., 1] * e2[..., 0])
     # Width of a square across its edges: what one unit of a and of b is in px.
     height_px = np.stack([area / np.linalg.norm(e2, axis=-1), area / np.linalg.norm(e1, axis=-1)], axis=-1)
     longest_px = float(np.median(np.maximum(np.linalg.norm(e1, axis=-1), np.linalg.norm(e2, axis=-1))))
-    n = int(np.clip(2 * round(_REACH * longest_px) + 1, 7, most_samples))
-    axis = np.linspace(-_REACH, _REACH, n)
+    n = int(np.clip(2 * round(REACH * longest_px) + 1, 7, most_samples))
+    # A strip along the edges has samples on either side.
+    n = max(n, 2 * int(np.ceil(2 * REACH / clear)) + 1 if clear < REACH else n)
+    axis = np.linspace(-REACH, REACH, n)
     b, a = (grid.ravel() for grid in np.meshgrid(axis, axis, indexing="ij"))
+    is_clear = np.minimum(np.abs(a), np.abs(b)) <= clear + 1e-9
+    a, b = a[is_clear], b[is_clear]
     pixels = grid_px[..., None, :] + a[:, None] * e1[..., None, :] + b[:, None] * e2[..., None, :]
     # Samples far apart would see a sharp edge jump between them, and corners would rest anywhere there.
-    step_px = 2 * _REACH * longest_px / (n - 1)
+    step_px = 2 * REACH * longest_px / (n - 1)
     blur_px = 0.4 * step_px if step_px > _FAR_APART_PX else 0.0
-    values = _sample_smooth(grey, pixels, blur_px).reshape(-1, n * n)
+    values = _sample_smooth(grey, pixels, blur_px).reshape(-1, len(a))
 
     flat_height = height_px.reshape(-1, 2)
     parameters, residuals = _fit(
@@ -103,7 +134,7 @@ def _fit_patches(
         is_fitted=is_fitted,
         contrast=contrast.reshape(is_fitted.shape),
         edge_sigma_px=sigma_px.reshape(grid_px.shape),
-        noise=float(np.median(noise)),
+        misfit=noise.reshape(is_fitted.shape),
     )
     return crossings, parameters
 

@@ -23,6 +23,7 @@ from lce_rig.detect.findings import (
     IMAGE_SIZE_OTHER,
 )
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
+from lce_rig.detect.image.markers import find_marked_grid
 from lce_rig.detect.image.quality import (
     explain_absence,
     explain_other_grid,
@@ -70,7 +71,8 @@ def find_image_board(
     """Find the board's inner corners in one image and T_cam_board in both its minima.
 
     Corners are ordered as `Board.corners()` says. A pattern that is not symmetric under 180 deg is read with
-    the outer square at its top left black; a symmetric one with its top row up in the image.
+    the outer square at its top left black; a symmetric one with its top row up in the image. Of a board with
+    markers, which name the corners, a part is enough.
 
     Args:
         image: the image.
@@ -92,18 +94,25 @@ def find_image_board(
         ProfileError: the intrinsics belong to images of another size.
     """
     grey = crop_to_intrinsics(image, intrinsics)
-    followed = _follow(grey, board, last)
-    crossings = (
-        followed
-        or _find_in_region(grey, board, region, last, is_thorough=is_thorough)
-        or find_grid(grey, board, is_thorough=is_thorough)
-    )
+    followed = None
+    if board.has_markers:
+        marked = find_marked_grid(grey, board, intrinsics, is_thorough=is_thorough)
+        if isinstance(marked, Refusal):
+            return marked
+        crossings = marked
+    else:
+        followed = _follow(grey, board, last)
+        crossings = (
+            followed
+            or _find_in_region(grey, board, region, last, is_thorough=is_thorough)
+            or find_grid(grey, board, is_thorough=is_thorough)
+        )
     if crossings is None and not is_thorough:
         return NOT_SEEN_AT_ONCE
-    if crossings is None or np.mean(crossings.is_fitted) < _MIN_FITTED:
+    if crossings is None or not (board.has_markers or np.mean(crossings.is_fitted) >= _MIN_FITTED):
         return explain_absence(grey, board, is_from_events, min_square_px)
     quality = grid_quality(grey, crossings)
-    if not is_whole(grey, crossings.grid_px):
+    if not board.has_markers and not is_whole(grey, crossings.grid_px):
         seen = seen_grid(grey)
         seen = crossings.grid_px if seen is None else seen
         return explain_other_grid(grey, board, seen, is_from_events, min_square_px)
@@ -114,7 +123,10 @@ def find_image_board(
     # The poses of a board that was followed are near its last ones.
     poses = [] if followed is None or last is None else [last.T_cam_board, last.T_cam_board_alternative]
     near = [T_cam_board for T_cam_board in poses if T_cam_board is not None]
-    solved, crossings = _solve(grey, crossings, board, intrinsics, near)
+    if board.has_markers:
+        solved = solve_planar_pose(crossings.grid_px.reshape(-1, 2), board.corners(), intrinsics)
+    else:
+        solved, crossings = _solve(grey, crossings, board, intrinsics, near)
     lens = {"model": intrinsics.model, "width_px": intrinsics.width_px, "height_px": intrinsics.height_px}
     if solved is None:
         return IMAGE_NO_POSE.refusal(**lens)
@@ -129,7 +141,7 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
     """Assemble an image's detection after its pose is solved.
 
     Args:
-        corners_px: (rows * cols, 2) in the order of `Board.corners()`.
+        corners_px: (rows * cols, 2) in the order of `Board.corners()`, NaN where hidden.
         solved: both poses that they admit.
         quality: figures of the image.
     """
@@ -153,7 +165,7 @@ def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Regio
         (u0, v0, u1, v1) px, within the image.
     """
     height, width = image.pixels.shape[:2]
-    low, high = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
+    low, high = np.nanmin(found.corners_px, axis=0), np.nanmax(found.corners_px, axis=0)
     reach = margin * (high - low).max() + 8
     u0, v0 = np.maximum(np.floor(low - reach), 0).astype(int)
     u1, v1 = np.minimum(np.ceil(high + reach) + 1, [width, height]).astype(int)
@@ -288,7 +300,7 @@ def _solve(
         is_fitted=~is_lost,
         contrast=again.contrast,
         edge_sigma_px=again.edge_sigma_px,
-        noise=again.noise,
+        misfit=again.misfit,
     )
     return solve_planar_pose(repaired.grid_px.reshape(-1, 2), corners_board, intrinsics), repaired
 

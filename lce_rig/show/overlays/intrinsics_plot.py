@@ -98,7 +98,7 @@ def _style(axis: Any, title: str, note: str) -> None:
 def _draw_residuals(axis: Any, estimate: IntrinsicsEstimate) -> None:
     note = f"mean of each cell with at least {_MIN_IN_CELL} corners; nothing was seen in the blank area"
     _frame(axis, estimate, "Residuals over the image", note)
-    corners, residuals = estimate.corners_px.reshape(-1, 2), estimate.residuals_px.reshape(-1, 2)
+    corners, residuals = estimate.corners_px, estimate.residuals_px
     axis.plot(*corners.T, ".", color=_FAINT, markersize=1.6, alpha=0.7, zorder=1)
     cell_px = estimate.intrinsics.width_px / _CELLS
     cells, index, counts = np.unique(
@@ -164,9 +164,9 @@ def _draw_radial(axis: Any, estimate: IntrinsicsEstimate) -> None:
     centre = np.array([lens.cx_px, lens.cy_px])
     ends = np.array([[u, v] for u in (0, lens.width_px - 1) for v in (0, lens.height_px - 1)], dtype=float)
     farthest = float(np.linalg.norm(ends - centre, axis=1).max())
-    outward = estimate.corners_px.reshape(-1, 2) - centre
+    outward = estimate.corners_px - centre
     radius = np.linalg.norm(outward, axis=1)
-    along = np.sum(estimate.residuals_px.reshape(-1, 2) * outward, axis=1) / np.maximum(radius, 1e-9)
+    along = np.sum(estimate.residuals_px * outward, axis=1) / np.maximum(radius, 1e-9)
     axis.axhline(0, color=_FAINT, linewidth=1)
     axis.plot(radius, along, ".", color=_FAINT, markersize=2, alpha=0.6)
     rings = np.array_split(np.argsort(radius), _RINGS)

@@ -211,7 +211,8 @@ def draw_image_board(
     """Draw the board's outline at T_cam_board, bent as the lens bends it, and the corners as measured."""
     _draw_outline(picture, factor, image_board, board, intrinsics)
     unit = picture.shape[1] / 1000
-    at = (image_board.corners_px + 0.5) * factor - 0.5
+    seen_px = image_board.corners_px[np.isfinite(image_board.corners_px[:, 0])]
+    at = (seen_px + 0.5) * factor - 0.5
     canvas.draw_discs(picture, at, WHITE, 1.6 * unit, BLACK)
 
 

@@ -65,6 +65,8 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
         # A board that moved has its pose at the LiDAR's time; its corners are those of the image.
         T_cam_board, _ = refine_pose(o.image.T_cam_board, o.image.corners_px, corners, lens)
         residuals_px.append(o.image.corners_px - lens.project(transform(T_cam_board, corners))[0])
+    corners_px = np.concatenate([o.image.corners_px for o in observations])
+    is_seen = np.isfinite(corners_px[:, 0])
     return Evidence(
         observations,
         np.repeat(np.arange(len(observations)), [len(own) for own in plane_m]),
@@ -72,8 +74,8 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
         np.concatenate([o.lidar.ring for o in observations]),
         lens.project(transform(T, points))[0],
         np.array([o.lidar.quality.distance_m for o in observations]),
-        np.concatenate([o.image.corners_px for o in observations]),
-        np.concatenate(residuals_px),
+        corners_px[is_seen],
+        np.concatenate(residuals_px)[is_seen],
     )
 
 

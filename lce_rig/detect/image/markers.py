@@ -1,0 +1,263 @@
+"""Corners of ChArUco boards and AprilGrids: markers identify them, crossings measure them.
+
+OpenCV finds markers. Those whose places on the board agree with one pose predict every corner, and each is
+measured as a checkerboard's, by the edges about it. Corners that do not look as printed are hidden.
+"""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.findings import Figure, Refusal
+from lce_rig.core.geometry import Array, transform
+from lce_rig.core.pattern import DICTIONARIES, Markers, markers_of
+from lce_rig.core.planar_pose import solve_planar_pose
+from lce_rig.detect.findings import (
+    IMAGE_FEW_CORNERS,
+    IMAGE_OTHER_DICTIONARY,
+    IMAGE_OTHER_IDS,
+    IMAGE_OTHER_LAYOUT,
+)
+from lce_rig.detect.image.corners import Grey
+from lce_rig.detect.image.saddle import REACH, Crossings, Patches, fit_crossings
+
+Places = dict[int, Array]
+"""Corners (4, 2) px of markers by their ids."""
+# Images narrower than this are searched at twice their size first.
+_WIDE_PX = 700
+# Two markers show that they are the board's; fewer corners make a poor pose.
+_MIN_MARKERS, _MIN_CORNERS = 2, 8
+# Markers and corners lie so near to where a pose has them, of a marker's side, or they are others.
+_MAX_AWAY = 0.25
+# Of the markers that belong to a board, so many fit one pose if the profile has their layout.
+_MIN_FITTING = 0.6
+# Of all markers, so many must be foreign to be those of the board in the image, or of a second one.
+_MIN_FOREIGN = 0.15
+# A corner's contrast is that of others at least, and its grey values differ from the model's so much at most.
+_MIN_CONTRAST, _MAX_MISFIT = 0.5, 2.0
+# It lies from where the board's pose has it no farther than others, in units of their median.
+_MAX_OFF = 7.0
+# Edges are measured up to this share of the way to the next thing that is printed.
+_FREE = 0.8
+
+
+def find_marked_grid(
+    grey: Grey, board: Board, intrinsics: Intrinsics, *, is_thorough: bool = True
+) -> Crossings | Refusal | None:
+    """Find the corners of a board with markers.
+
+    Args:
+        grey: (H, W).
+        board: one that has markers.
+        intrinsics: of the camera; rough ones will do.
+        is_thorough: whether to search at further scales, and for markers of other dictionaries.
+
+    Returns:
+        Crossings with hidden corners at NaN; None if there are no markers; or why they are not the board's.
+    """
+    places = _search(grey, board, is_thorough=is_thorough)
+    wanted = range(board.first_id, board.first_id + len(markers_of(board).ids))
+    ours = {number: corners for number, corners in places.items() if number in wanted}
+    foreign = sorted(places.keys() - ours.keys())
+    figures: dict[str, Figure] = {"n_markers": len(places), "dictionary": board.dictionary}
+    if len(foreign) >= max(3, _MIN_FOREIGN * len(places)):
+        figures |= {"first_id": wanted[0], "last_id": wanted[-1]}
+        return IMAGE_OTHER_IDS.refusal(**figures, first_seen=foreign[0], last_seen=foreign[-1])
+    if len(ours) < _MIN_MARKERS:
+        return _other_dictionary(grey, board) if is_thorough else None
+    T_cam_board, n_fitting, is_legacy = _agree(ours, board, intrinsics)
+    if T_cam_board is None or n_fitting < max(_MIN_MARKERS, _MIN_FITTING * len(ours)):
+        return IMAGE_OTHER_LAYOUT.refusal(**figures, n_fitting=n_fitting)
+    crossings, n_seen = _measure(grey, board, intrinsics, T_cam_board, is_legacy)
+    if crossings is None:
+        return IMAGE_FEW_CORNERS.refusal(**figures, n_corners=n_seen, n_needed=_MIN_CORNERS)
+    return crossings
+
+
+def marker_corners(grey: Grey, board: Board) -> Array:
+    """List the corners (N, 2) px of the markers in an image, the board's or not."""
+    places = _search(grey, board, is_thorough=False)
+    return np.concatenate([np.zeros((0, 2)), *places.values()])
+
+
+def _search(grey: Grey, board: Board, *, is_thorough: bool) -> Places:
+    """Find markers of the board's dictionary, at one scale or until half of the board's are found."""
+    places: Places = {}
+    for scale, n_border in _attempts(grey.shape[1], board):
+        for number, corners in _detect(grey, board.dictionary, scale, n_border).items():
+            places.setdefault(number, corners)
+        if not is_thorough or 2 * len(places) >= len(markers_of(board).ids):
+            break
+    return places
+
+
+def _attempts(width_px: int, board: Board) -> Iterator[tuple[float, int]]:
+    """List scales of the image and widths of the markers' borders in modules, cheapest first.
+
+    Kalibr prints AprilGrids with a border of two modules, other programs with one.
+    """
+    scales = (1.0, 2.0) if width_px > _WIDE_PX else (2.0, 1.0)
+    for n_border in (2, 1) if board.type == "aprilgrid" else (1,):
+        yield from ((scale, n_border) for scale in scales)
+
+
+def _detect(grey: Grey, dictionary: str, scale: float, n_border: int) -> Places:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = n_border
+    parameters.minMarkerPerimeterRate = 0.015
+    # Of tags with modules of 2 px, these find seven times as many as OpenCV's defaults.
+    parameters.perspectiveRemovePixelPerCell = 8
+    parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
+    parameters.errorCorrectionRate = 1.0
+    book = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
+    image = grey
+    if scale != 1.0:
+        how = cv2.INTER_CUBIC
+        image = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=how), dtype=np.uint8)
+    corners, ids, _ = cv2.aruco.ArucoDetector(book, parameters).detectMarkers(image)
+    if ids is None:
+        return {}
+    # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the image.
+    full = [(np.asarray(four[0], dtype=np.float64) + 0.5) / scale - 0.5 for four in corners]
+    return dict(zip(ids.ravel().tolist(), full, strict=True))
+
+
+def _other_dictionary(grey: Grey, board: Board) -> Refusal | None:
+    """Name the dictionary of which the image has markers; None if there is none."""
+    own = board.dictionary.rpartition("_")[0]
+    best, most = "", 3
+    # The largest of a family holds the markers of the smaller ones.
+    for name in DICTIONARIES:
+        if not name.endswith(("_50", "_100", "_250")) and name.rpartition("_")[0] != own:
+            n_seen = max(len(_detect(grey, name, 1.0, n_border)) for n_border in (1, 2))
+            best, most = (name, n_seen) if n_seen > most else (best, most)
+    if not best:
+        return None
+    figures: dict[str, Figure] = {"dictionary": board.dictionary, "seen_dictionary": best, "n_seen": most}
+    return IMAGE_OTHER_DICTIONARY.refusal(**figures)
+
+
+def _agree(places: Places, board: Board, intrinsics: Intrinsics) -> tuple[Array | None, int, bool]:
+    """Fit one pose to markers.
+
+    OpenCV's releases differ by half a turn in the first corner of AprilTags, and by the squares with markers
+    of a ChArUco board with an even number of rows: the reading that more markers agree with is taken.
+
+    Returns:
+        The pose (4, 4); the number of markers that lie where it has them; and whether the board is a ChArUco
+        board of OpenCV's before 4.6, whose colours are exchanged.
+    """
+    ids = sorted(places)
+    pixels = np.array([places[number] for number in ids])
+    rays = intrinsics.unproject(pixels.reshape(-1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flat = np.where(rays[:, 2:] > 0.05, rays[:, :2] / rays[:, 2:], np.nan).reshape(-1, 4, 2)
+    is_ahead = np.asarray(np.isfinite(flat).all(axis=(1, 2)))
+    best: tuple[int, NDArray[np.bool_], Array, bool] | None = None
+    for markers, turn, is_legacy in _readings(board):
+        index = np.array(ids) - board.first_id
+        on_board = np.roll(markers.corners[index], turn, axis=1)
+        is_fitting = is_ahead & _fits(on_board[..., :2], flat, is_ahead)
+        if best is None or is_fitting.sum() > best[0]:
+            best = int(is_fitting.sum()), is_fitting, on_board, is_legacy
+    if best is None or best[0] < _MIN_MARKERS:
+        return None, 0, False
+    n_fitting, is_fitting, on_board, is_legacy = best
+    corners_px, corners_board = pixels[is_fitting].reshape(-1, 2), on_board[is_fitting].reshape(-1, 3)
+    solved = solve_planar_pose(corners_px, corners_board, intrinsics)
+    return None if solved is None else solved.T_cam_board, n_fitting, is_legacy
+
+
+def _readings(board: Board) -> Iterator[tuple[Markers, int, bool]]:
+    """List markers, by how many corners theirs are turned, and whether they are those of old boards."""
+    yield markers_of(board), 0, False
+    if board.type == "aprilgrid":
+        yield markers_of(board), 2, False
+    elif board.rows % 2:
+        yield markers_of(board, is_legacy=True), 0, True
+
+
+def _fits(on_board: Array, flat: Array, is_ahead: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find the markers (M,) that agree with one homography from the board to flattened rays (M, 4, 2)."""
+    away = np.full(len(flat), np.inf)
+    if is_ahead.sum() >= _MIN_MARKERS:
+        sides = np.linalg.norm(np.diff(flat[is_ahead], axis=1), axis=-1)
+        limit = _MAX_AWAY * float(np.median(sides))
+        H, _ = cv2.findHomography(
+            on_board[is_ahead].reshape(-1, 2), flat[is_ahead].reshape(-1, 2), cv2.RANSAC, limit
+        )
+        if H is not None:
+            drawn = cv2.perspectiveTransform(on_board.reshape(1, -1, 2), H).reshape(flat.shape)
+            away = np.linalg.norm(drawn - flat, axis=-1).max(axis=1) / limit
+    return np.asarray(away < 1)
+
+
+def _measure(
+    grey: Grey, board: Board, intrinsics: Intrinsics, T_cam_board: Array, is_legacy: bool
+) -> tuple[Crossings | None, int]:
+    """Measure the corners about where a pose has them; None if too few are seen, and their number."""
+    shape, corners = (board.rows, board.cols), board.corners()
+    # The corner at the upper left of a black square or tag is dark there and at its lower right.
+    signs = (-1.0) ** np.indices(shape).sum(axis=0) * (1 if is_legacy else -1)
+    grid_px = intrinsics.project(transform(T_cam_board, corners))[0].reshape(*shape, 2)
+    for _ in range(2):
+        if not np.isfinite(grid_px).all():
+            return None, 0
+        crossings = fit_crossings(grey, grid_px, patches=_patches(board, intrinsics, T_cam_board))
+        is_seen = _as_printed(grey, crossings, signs)
+        # The better half of them is hardly covered: they alone give the first pose.
+        usual = np.median(crossings.misfit[is_seen]) if is_seen.any() else 0.0
+        is_trusted = is_seen & (crossings.misfit <= usual)
+        for _ in range(3):
+            n_seen = int(is_seen.sum())
+            if n_seen < _MIN_CORNERS or min(is_seen.any(axis=0).sum(), is_seen.any(axis=1).sum()) < 2:
+                return None, n_seen
+            is_used = is_trusted if is_trusted.sum() >= _MIN_CORNERS else is_seen
+            used_px = np.where(is_used[..., None], crossings.grid_px, np.nan).reshape(-1, 2)
+            solved = solve_planar_pose(used_px, corners, intrinsics)
+            if solved is None:
+                return None, n_seen
+            predicted = intrinsics.project(transform(solved.T_cam_board, corners))[0].reshape(*shape, 2)
+            away = np.linalg.norm(predicted - crossings.grid_px, axis=-1)
+            is_seen &= away <= max(_MAX_OFF * float(np.median(away[is_used])), 0.1)
+            is_trusted, T_cam_board = is_seen, solved.T_cam_board
+        # Patches in the middles of which their corners lie are free of what is printed about them.
+        grid_px = np.where(is_seen[..., None], crossings.grid_px, predicted)
+    crossings.grid_px[~is_seen] = np.nan
+    crossings.is_fitted[...] = is_seen
+    return crossings, int(is_seen.sum())
+
+
+def _as_printed(grey: Grey, crossings: Crossings, signs: Array) -> NDArray[np.bool_]:
+    """Find the corners (rows, cols) whose surroundings look as others', with the colours of the print."""
+    height, width = grey.shape
+    contrast = signs * crossings.contrast
+    is_good = crossings.is_fitted & (contrast > 0)
+    is_good &= np.all((crossings.grid_px >= 1) & (crossings.grid_px <= [width - 2, height - 2]), axis=-1)
+    if not is_good.any():
+        return is_good
+    usual = float(np.percentile(contrast[is_good], 75))
+    is_good &= contrast > _MIN_CONTRAST * usual
+    return is_good & (crossings.misfit <= _MAX_MISFIT * float(np.median(crossings.misfit[is_good])) + 0.5)
+
+
+def _patches(board: Board, intrinsics: Intrinsics, T_cam_board: Array) -> Patches:
+    """Describe the surroundings of the corners in an image, which markers narrow."""
+    if board.type == "charuco":
+        unit_m, clear_m = board.square_m, _FREE * (1 - board.marker_share) / 2 * board.square_m
+    else:
+        # The next corner lies a gap away; a border of one module of eight is the narrowest.
+        unit_m, clear_m = _FREE * board.gap_share * board.square_m / REACH, _FREE * board.square_m / 8
+    corners, shape = board.corners(), (board.rows, board.cols, 2)
+    right, down = (
+        np.asarray(
+            intrinsics.project(transform(T_cam_board, corners + half))[0]
+            - intrinsics.project(transform(T_cam_board, corners - half))[0]
+        ).reshape(shape)
+        for half in np.array([[unit_m / 2, 0, 0], [0, -unit_m / 2, 0]])
+    )
+    return Patches(right, down, clear_m / unit_m)
