@@ -1,13 +1,24 @@
-"""LCE1, the line protocol of lce-rig's sync board (docs/sync-protocol.md): bytes in, messages out.
+"""LCE1, the line protocol of lce-rig's sync board (docs/sync-protocol.md), and what its messages add up to.
 
-Sentences are framed as NMEA 0183 frames them: `$`, name and fields, `*`, and the exclusive or of what lies
-between.
+Bytes come in; pulses, clocks and problems come out: no device, no thread. Sentences are framed as NMEA 0183
+frames them: `$`, name and fields, `*`, and the exclusive or of what lies between.
 """
 
+import math
 import re
+from collections import Counter
+from collections.abc import Mapping
 from functools import reduce
 from operator import xor
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
+
+from lce_rig.core.data import Pulse
+from lce_rig.core.findings import Finding
+from lce_rig.devices import findings
+from lce_rig.devices.reading import ClockState
+from lce_rig.rig.sync_settings import PPS_LINE
+from lce_rig.timing.clock import NS_PER_S, ClockModel
+from lce_rig.timing.clock_fit import ClockTracker
 
 VERSION = 1
 MAX_LINE = 512
@@ -182,3 +193,191 @@ def ask_time(cookie: int) -> bytes:
 
 ASK_HELLO = write_sentence("LCEHI?")
 START = write_sentence("LCEGO")
+
+
+# An answer that takes longer came while the computer's clock was set.
+_MAX_ROUND_TRIP_NS = 2 * NS_PER_S
+# Messages are out of order by less; a board whose time goes back further has restarted.
+_MOST_BACK_NS = NS_PER_S
+_STALLED_S = 3.0
+_DAMAGED = 0.01
+_MIN_DAMAGED = 5
+_PPS_LATE_S = 2.5
+_NO_CLOCK_S = 5.0
+
+
+class Arrival(NamedTuple):
+    """When a message came: by the time of day, which may be set at any moment, and by a clock never set."""
+
+    host_ns: int
+    steady_ns: int
+
+
+class BoardState:
+    """Bytes and messages in, pulses out; clocks, counts and problems in between.
+
+    Attributes:
+        reader: reads the lines, and counts damaged ones.
+        n_pulses: pulses handed on, by line.
+        n_lost_by_line: pulses whose messages never came, by line; gaps in the running numbers tell.
+        n_restarts: how often the board restarted.
+        restarted_ns: when it last did, by the steady clock; None where it did not.
+        heard_ns: when the last message came, or the port was opened, by the steady clock.
+        hello, status, error: the last of each; None before the first.
+        pps: the last pulse per second, with its arrival.
+        round_trip_ns: of the last time request.
+        host_tracker, utc_tracker: followers of the computer's time of day and of UTC on the board's clock.
+    """
+
+    def __init__(self, lines: Mapping[int, str]) -> None:
+        """Begin with a board that has said nothing yet.
+
+        Args:
+            lines: name of the camera on each channel; pulses on others are skipped.
+        """
+        self.reader = LineReader()
+        self.n_pulses: Counter[str] = Counter()
+        self.n_lost_by_line: Counter[str] = Counter()
+        self.n_restarts = self.heard_ns = 0
+        self.restarted_ns: int | None = None
+        self.hello: Hello | None = None
+        self.status: BoardStatus | None = None
+        self.pps: tuple[PpsEdge, Arrival] | None = None
+        self.error: BoardError | None = None
+        self.round_trip_ns: int | None = None
+        self.host_tracker = ClockTracker("time requests")
+        self.utc_tracker = ClockTracker("pulses per second")
+        self._opened_ns = 0
+        self._lines = dict(lines)
+        self._latest_ns = 0
+        self._last_numbers: dict[str, int] = {}
+        self._asked: tuple[int, int] | None = None
+
+    def opened(self, steady_ns: int) -> None:
+        """Note that the port was opened: a board that was unplugged knows nothing any more."""
+        self.hello = None
+        self._opened_ns = self.heard_ns = steady_ns
+
+    def asked(self, cookie: int, sent_ns: int) -> None:
+        """Note that a time request was sent at a time of day."""
+        self._asked = (cookie, sent_ns)
+
+    def feed(self, data: bytes, arrival: Arrival) -> list[Pulse]:
+        """Take bytes as they come, and give the pulses that they tell of."""
+        messages = self.reader.feed(data)
+        if messages:
+            self.heard_ns = arrival.steady_ns
+        return [pulse for message in messages for pulse in self.take(message, arrival)]
+
+    def take(self, message: Message, arrival: Arrival) -> list[Pulse]:
+        """Take a message, and give the pulses that it tells of."""
+        match message:
+            case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | TimeReply(_, _, t_us):
+                if t_us * 1000 < self._latest_ns - _MOST_BACK_NS:
+                    self._restart(arrival)
+                self._latest_ns = max(self._latest_ns, t_us * 1000)
+        match message:
+            case Hello():
+                self.hello = message
+            case TriggerEdge(channel, number, t_us, True) if channel in self._lines:
+                return self._pulse(self._lines[channel], number, t_us, arrival)
+            case PpsEdge(seq, t_us, utc_s, _):
+                self.pps = (message, arrival)
+                pulses = self._pulse(PPS_LINE, seq, t_us, arrival)
+                if pulses and utc_s is not None:
+                    self.utc_tracker.add(t_us * 1000, utc_s * NS_PER_S)
+                return pulses
+            case TimeReply(cookie, rx_us, tx_us) if self._asked is not None and self._asked[0] == cookie:
+                sent_ns, self._asked = self._asked[1], None
+                self.round_trip_ns = arrival.host_ns - sent_ns - 1000 * (tx_us - rx_us)
+                # A clock that is set between question and answer spoils both.
+                if 0 <= self.round_trip_ns <= _MAX_ROUND_TRIP_NS:
+                    middle_ns = sent_ns + (arrival.host_ns - sent_ns) // 2
+                    self.host_tracker.add(500 * (rx_us + tx_us), middle_ns, self.round_trip_ns / 2)
+            case BoardStatus():
+                self.status = message
+            case BoardError():
+                self.error = message
+        return []
+
+    @property
+    def has_answered(self) -> bool:
+        """Whether no time request is under way."""
+        return self._asked is None
+
+    @property
+    def host_clock(self) -> ClockModel | None:
+        """The computer's time of day on the board's clock, by time requests; None before it is known."""
+        return self.host_tracker.model
+
+    @property
+    def utc_clock(self) -> ClockModel | None:
+        """UTC on the board's clock, by the pulses per second; None where it does not know UTC."""
+        return self.utc_tracker.model
+
+    def clock_state(self) -> ClockState:
+        """Report the clock of the timestamps and its synchronisation with others."""
+        figures: dict[str, Any] = {}
+        for name, model in (("host", self.host_clock), ("utc", self.utc_clock)):
+            if model is not None:
+                figures |= {
+                    f"{name}_by": model.origin,
+                    f"{name}_drift_ppm": 1e6 * model.drift,
+                    f"{name}_sigma_us": model.sigma_ns(model.last_ns) / 1000,
+                }
+        if self.round_trip_ns is not None:
+            figures["round_trip_ms"] = self.round_trip_ns / 1e6
+        return ClockState(findings.BOARD_CLOCK(**figures))
+
+    def problems(self, now_ns: int) -> tuple[Finding, ...]:
+        """List the problems at a moment of the steady clock."""
+        silent_s = (now_ns - self.heard_ns) / NS_PER_S
+        if silent_s > _STALLED_S:
+            return (findings.BOARD_SILENT(silent_s=silent_s),)
+        has_waited = now_ns - self._opened_ns > _NO_CLOCK_S * NS_PER_S
+        problems: list[Finding] = []
+        n_damaged = self.reader.n_damaged
+        n_lines = n_damaged + self.reader.n_messages
+        if n_damaged >= _MIN_DAMAGED and n_damaged > _DAMAGED * n_lines:
+            problems.append(findings.DAMAGED_LINES(n=n_damaged, n_lines=n_lines))
+        if self.restarted_ns is not None:
+            ago_s = (now_ns - self.restarted_ns) / NS_PER_S
+            problems.append(findings.BOARD_RESTARTED(n=self.n_restarts, ago_s=ago_s))
+        if self.error is not None:
+            problems.append(findings.BOARD_ERROR(message=self.error.text, number=self.error.code))
+        for line in sorted(self._lines.values()):
+            if has_waited and not self.n_pulses[line]:
+                problems.append(findings.NO_PULSES(line=line))
+        if self.n_lost_by_line:
+            by_line = ", ".join(f"{line} {n}" for line, n in sorted(self.n_lost_by_line.items()))
+            problems.append(findings.PULSE_LINES_LOST(n=sum(self.n_lost_by_line.values()), by_line=by_line))
+        if self.status is not None and self.status.n_lost:
+            problems.append(findings.LINES_DROPPED_BY_BOARD(n=self.status.n_lost))
+        if self.host_clock is None and has_waited:
+            problems.append(findings.BOARD_NOT_TIED())
+        steps = self.host_tracker.steps
+        if steps:
+            problems.append(findings.COMPUTER_JUMPED(n=len(steps), last_s=steps[-1].size_ns / NS_PER_S))
+        late_s = math.inf if self.pps is None else (now_ns - self.pps[1].steady_ns) / NS_PER_S
+        if self.hello is not None and has_waited and late_s > _PPS_LATE_S:
+            problems.append(findings.NO_PPS())
+        elif self.pps is not None and self.pps[0].utc_s is None:
+            problems.append(findings.BOARD_WITHOUT_UTC())
+        return tuple(problems)
+
+    def _pulse(self, line: str, count: int, t_us: int, arrival: Arrival) -> list[Pulse]:
+        n_lost = count - self._last_numbers.get(line, count - 1) - 1
+        if n_lost > 0:
+            self.n_lost_by_line[line] += n_lost
+        self._last_numbers[line] = count
+        self.n_pulses[line] += 1
+        return [Pulse(line, t_us * 1000, count, arrival.host_ns)]
+
+    def _restart(self, arrival: Arrival) -> None:
+        self.n_restarts, self.restarted_ns = self.n_restarts + 1, arrival.steady_ns
+        self._latest_ns = 0
+        self._last_numbers.clear()
+        self._asked = None
+        self.host_tracker.restart()
+        self.utc_tracker.restart()
+        self.pps = self.status = None

@@ -13,7 +13,7 @@ import serial
 from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import lce1
-from lce_rig.devices.board_state import Arrival, BoardState
+from lce_rig.devices.lce1 import Arrival, BoardState
 from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.rig.sync_settings import BOARD, SyncSettings
 from lce_rig.timing.clock import NS_PER_S, ClockModel

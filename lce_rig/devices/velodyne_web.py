@@ -35,7 +35,7 @@ class WebReport(NamedTuple):
         model, serial, firmware: of the sensor.
         pps: "absent", "synchronizing", "locked" or "error".
         is_motor_on, is_laser_on: whether they run.
-        rotor_hz, wanted_rotor_hz: measured speed, and the speed that is set.
+        rpm: speed of the rotor that is set.
         returns: "strongest", "last" or "dual".
         fov_deg: first and last azimuth that is sent.
         host: address that packets are sent to; 255.255.255.255 is everybody.
@@ -48,8 +48,7 @@ class WebReport(NamedTuple):
     pps: str = ""
     is_motor_on: bool | None = None
     is_laser_on: bool | None = None
-    rotor_hz: float | None = None
-    wanted_rotor_hz: float | None = None
+    rpm: float | None = None
     returns: str = ""
     fov_deg: tuple[float, float] | None = None
     host: str = ""
@@ -78,7 +77,6 @@ class VelodyneWeb:
         """
         info, status, settings = self._get("info"), self._get("status"), self._get("settings")
         start, end = _number(settings, "fov", "start"), _number(settings, "fov", "end")
-        rpm, wanted_rpm = _number(status, "motor", "rpm"), _number(settings, "rpm")
         data_port = _number(settings, "host", "dport")
         position_port = _number(settings, "host", "tport")
         # The version of the application, wherever this firmware keeps it.
@@ -93,8 +91,7 @@ class VelodyneWeb:
             pps=_text(status, "gps", "pps_state").lower(),
             is_motor_on=_SWITCH.get(_text(status, "motor", "state").lower()),
             is_laser_on=laser if laser is not None else _SWITCH.get(_text(settings, "laser").lower()),
-            rotor_hz=None if rpm is None else rpm / 60,
-            wanted_rotor_hz=None if wanted_rpm is None else wanted_rpm / 60,
+            rpm=_number(settings, "rpm"),
             returns=_text(settings, "returns").lower(),
             fov_deg=None if start is None or end is None else (start, end),
             host=_text(settings, "host", "addr"),
@@ -146,9 +143,10 @@ def find_problems(report: WebReport, settings: LidarSettings) -> list[Finding]:
     compare("model", report.model, settings.model, is_other)
     compare("motor", "off", "on", report.is_motor_on is False)
     compare("laser", "off", "on", report.is_laser_on is False)
-    if report.wanted_rotor_hz is not None:
-        rpm, wanted_rpm = 60 * report.wanted_rotor_hz, 60 * settings.rate_hz
-        compare("rpm", rpm, wanted_rpm, abs(rpm - wanted_rpm) > _MAX_OFF_RATE * wanted_rpm)
+    if report.rpm is not None:
+        wanted_rpm = 60 * settings.rate_hz
+        is_off = abs(report.rpm - wanted_rpm) > _MAX_OFF_RATE * wanted_rpm
+        compare("rpm", report.rpm, wanted_rpm, is_off)
     if report.fov_deg is not None:
         first_deg, last_deg = report.fov_deg
         compare("field of view", report.fov_deg, (0, 359), (last_deg - first_deg) % 360 < 359)

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.devices.board_state import Arrival, BoardState
 from lce_rig.devices.lce1 import (
+    Arrival,
     BoardError,
+    BoardState,
     BoardStatus,
     Hello,
     LineReader,

@@ -69,7 +69,7 @@ def test_the_page_of_a_healthy_sensor_is_read_without_a_complaint() -> None:
     assert (report.model, report.serial, report.firmware) == ("VLP-16", "AG43510116", "3.0.41.1")
     assert (report.pps, report.returns, report.host) == ("locked", "strongest", "255.255.255.255")
     assert report.is_motor_on and report.is_laser_on
-    assert report.rotor_hz == pytest.approx(9.98, abs=0.01) and report.wanted_rotor_hz == 10
+    assert report.rpm == 600
     assert (report.fov_deg, report.data_port, report.position_port) == ((0, 359), 2368, 8308)
     assert find_problems(report, settings()) == []
 
@@ -90,7 +90,7 @@ def test_types_that_differ_by_firmware_do_not_matter() -> None:
         report = web.read()
     assert (report.firmware, report.serial) == ("3.0.29.0", "43510116")
     assert report.is_motor_on and report.is_laser_on
-    assert (report.rotor_hz, report.returns, report.data_port) == (10, "strongest", 2368)
+    assert (report.rpm, report.returns, report.data_port) == (600, "strongest", 2368)
     assert find_problems(report, settings()) == []
 
 

@@ -43,8 +43,7 @@ def test_a_sensor_without_pulses_is_judged_by_what_the_profile_promises(
 def test_settings_that_differ_from_the_profile_are_named_once() -> None:
     report = WebReport(
         pps="absent",
-        wanted_rotor_hz=20.0,
-        rotor_hz=20.0,
+        rpm=1200.0,
         returns="strongest",
         fov_deg=(10, 350),
         data_port=2369,
