@@ -21,6 +21,7 @@ from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes, tangent_sizes
 from lce_rig.judge.findings import KNOWN_BETTER, LARGEST_CAUSE, SURPRISING_CHI2
+from lce_rig.judge.negative_control import SURE_GAIN, NegativeControl
 from lce_rig.judge.nuisances import Nuisances
 from lce_rig.judge.split_consistency import Contrast, objections
 from lce_rig.rig import CalibrationSettings, Rig
@@ -75,6 +76,7 @@ def find_contradictions(
     estimate: CalibrationEstimate,
     nuisances: Nuisances | None,
     contrasts: Sequence[Contrast],
+    control: NegativeControl | None,
     rig: Rig,
 ) -> Iterator[Contradiction]:
     """List the checks that contradict an estimate, each with the move of the extrinsics that resolves it.
@@ -83,6 +85,7 @@ def find_contradictions(
         estimate: with the sensitivities to errors of the profile.
         nuisances: the camera's scale.
         contrasts: subsets of the captures that should agree.
+        control: moves of the result that should fit worse.
         rig: targets and limits.
     """
     target, of_source = rig.calibration, {each.source: each for each in estimate.sensitivities}
@@ -97,6 +100,9 @@ def find_contradictions(
         # from one of the two that may hold now.
         share = 1.0 if contrast.is_change else _HALF
         yield Contradiction(f"{contrast.first}_{contrast.second}", share * np.array([contrast.apart]))
+    if control is not None and control.gain_sigmas > SURE_GAIN:
+        # The optimum of held-out captures lies beyond half of the move.
+        yield Contradiction("control", _HALF * control.moves[[control.worst]])
     # Channels of one camera have one pose: the result lies between both.
     apart, cov = estimate.channel_difference, estimate.channel_difference_cov
     if apart is not None and cov is not None:

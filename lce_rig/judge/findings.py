@@ -87,6 +87,7 @@ _CONTRADICTIONS = {
     "channels": "the camera's channels",
     "cameras": "the cameras",
     "group_rest": "two groups of captures",
+    "control": "the result and held-out captures",
 }
 _LEAST_ROTATION = "{weakest:motion}, sigma {weakest_sigma_deg:3deg}"
 _LEAST_TRANSLATION = "{weakest:motion}, sigma {weakest_sigma_m:1mm}"

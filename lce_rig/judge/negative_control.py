@@ -21,8 +21,9 @@ from lce_rig.judge.findings import CONTROL, failing
 from lce_rig.judge.local_quadratic import capture_costs, feature_sigmas
 from lce_rig.rig import CalibrationSettings
 
-# A gain in the wrong direction of this many standard errors is significant, of more than these it fails.
-_SURE, _FAILS = 2.0, 4.0
+SURE_GAIN = 2.0
+"""A gain of a move by so many standard errors is significant."""
+_FAILS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,16 @@ class NegativeControl:
     moves: Array
     worse: Array
     worse_sigma: Array
+
+    @property
+    def worst(self) -> int:
+        """Index of the move that fits held-out captures best."""
+        return int(np.argmin(self.worse / self.worse_sigma))
+
+    @property
+    def gain_sigmas(self) -> float:
+        """By how many standard errors it fits better than the result."""
+        return -float(self.worse[self.worst] / self.worse_sigma[self.worst])
 
 
 def run_control(
@@ -132,17 +143,13 @@ def _compare(moves: Array, increases: Array) -> NegativeControl:
 
 def control_findings(control: NegativeControl | None) -> list[Finding]:
     """Find a result that held-out captures do not distinguish from a wrong one."""
-    if control is None:
+    if control is None or control.gain_sigmas < 0:
         return []
-    worst = int(np.argmin(control.worse / control.worse_sigma))
-    if control.worse[worst] > 0:
-        return []
-    move = control.moves[worst]
+    move, sigmas = control.moves[control.worst], control.gain_sigmas
     rotation_deg, translation_m = tangent_sizes(move)
-    sigmas = -float(control.worse[worst] / control.worse_sigma[worst])
     return [
         CONTROL(
-            severity="note" if sigmas < _SURE else failing(sigmas > _FAILS),
+            severity="note" if sigmas < SURE_GAIN else failing(sigmas > _FAILS),
             rotation_deg=rotation_deg,
             translation_m=translation_m,
             direction=main_motion(move),

@@ -87,6 +87,11 @@ class Contrast:
         """Whether the subsets are the captures before and after one of them."""
         return self.first == "before"
 
+    @property
+    def is_of_places(self) -> bool:
+        """Whether the subsets are boards at two places: near and far, left and right, upper and lower."""
+        return not (self.is_change or self.group or self.rejected)
+
     def minority(self, captures: Sequence[str]) -> Sequence[str]:
         """Name the captures of a mounting of their own, of those in the order in which they were taken."""
         if self.rejected is not None:
@@ -292,9 +297,16 @@ def objections(
     """List the subsets that differ significantly and by more than their limit.
 
     A change at one capture makes two groups, too, and a change seen in rejected captures is seen in others:
-    each is told once.
+    each is told once. Where boards at other places differ more significantly than earlier and later ones, a
+    constant error of lens, board or ranges is the cause, and no sensor moved.
     """
     found = [contrast for contrast in contrasts if contrast.excess(target, limits) > 1]
+    by_place = min((each.chance for each in found if each.is_of_places), default=1.0)
+    found = [
+        each
+        for each in found
+        if each.rejected or not ((each.is_change and each.chance > by_place) or (each.group and by_place < 1))
+    ]
     moved = [contrast for contrast in found if contrast.rejected is not None]
     has_changed = any(contrast.is_change for contrast in found)
     if moved:

@@ -222,7 +222,7 @@ def validate(
         agreeing = [observation for observation in observations if observation.capture not in apart]
         if lidar.has_rings and len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
             laser_angles = estimate_angles(agreeing, board, estimate.T_cam_lidar, lidar)
-    contradictions = list(find_contradictions(estimate, nuisances, contrasts, rig))
+    contradictions = list(find_contradictions(estimate, nuisances, contrasts, control, rig))
     azimuths = azimuth_covariance(estimate.T_cam_lidar, lidar.azimuth_offset_sigma_rad)
     cov_agreed = widened_by**2 * estimate.cov + azimuths + profile_covariance(known)
     cov = cov_agreed + sum(each.cov for each in contradictions)

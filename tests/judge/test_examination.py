@@ -132,6 +132,16 @@ def test_near_boards_that_say_something_else_than_far_ones_are_found():
     assert any(finding.figures.get("first") == "near" for finding in findings)
 
 
+def test_boards_held_near_first_and_far_later_are_told_by_their_places_and_not_as_a_sensor_that_moved():
+    turn = perturb(np.eye(4), np.array([0, 0, 0, 0, np.radians(1.0), 0]))
+    boards = sorted(observed(24, 5), key=lambda seen: float(np.linalg.norm(seen.image.T_cam_board[:3, 3])))
+    boards = [moved(seen, turn @ seen.image.T_cam_board) if k < 12 else seen for k, seen in enumerate(boards)]
+    settled = expanded(boards).settled()
+    contrasts = (*contrast_halves(settled, middles(boards)), *find_groups(settled))
+    findings = split_findings(contrasts, [seen.capture for seen in boards], TARGET, LIMITS)
+    assert {finding.code for finding in findings} == {"verdict.shares_differ"}
+
+
 def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest():
     nudge = perturb(np.eye(4), np.array([0, 0, 0, np.radians(1.0), 0, 0]))
     away = (1, 4, 5, 9, 13)
