@@ -61,7 +61,7 @@ def test_everything_fits_into_80_by_24() -> None:
 
 def test_of_several_cameras_the_picture_says_whose_it_is() -> None:
     (first, *others) = STREAMS
-    two = (replace(first, name="left.frames"), replace(first, name="right.frames"), *others[:1])
+    two = (first._replace(name="left.frames"), first._replace(name="right.frames"), *others[:1])
     drawing = replace(STATE.drawing, camera="right.frames")
     text = "\n".join(drawn(replace(STATE, streams=two, drawing=drawing)))
     assert "┌─ right.frames ─" in text
@@ -71,7 +71,7 @@ def test_of_several_cameras_the_picture_says_whose_it_is() -> None:
 SAID = replace(
     STATE,
     detail="cannot be used here: the board at 4.3 m is tilted 62 deg (limit 60 deg), half of it is hidden",
-    streams=(*STREAMS[:2], replace(STREAMS[2], reason=STREAMS[2].reason + " or lower it by 12 cm, slowly")),
+    streams=(*STREAMS[:2], STREAMS[2]._replace(reason=STREAMS[2].reason + " or lower it by 12 cm, slowly")),
     notes=(
         "boards must stand still: no sync board ties the cameras' clocks, whatever they are, to the LiDAR's",
     ),

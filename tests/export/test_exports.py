@@ -1,6 +1,5 @@
 """Every export, read by programs that know nothing of how it was written."""
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -85,26 +84,16 @@ def test_extrinsics_agree_in_every_notation_and_the_worked_points_hold(
 
 
 def test_static_transforms_for_both_ros_versions_say_the_same(rles: Rig, make: Make, tmp_path: Path) -> None:
-    calibration = make()
-    (path,) = export([calibration], rles, tmp_path, formats=["static_tf"])
-    text = path.read_text(encoding="utf-8")
-    number = r"(-?\d\S*)"
-    ros1 = re.findall(
-        rf"^rosrun tf2_ros static_transform_publisher {' '.join([number] * 7)} (\S+) (\S+)$", text, re.M
-    )
-    options = " ".join(rf"--{name} {number}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
-    ros2 = re.findall(
-        rf"^ros2 run tf2_ros static_transform_publisher {options} --frame-id (\S+) --child-frame-id (\S+)$",
-        text,
-        re.M,
-    )
+    (path,) = export([make()], rles, tmp_path, formats=["static_tf"])
+    lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+    # What ROS 2 is told is read back elsewhere; ROS 1 takes the same values in the same order, without names.
+    ros2 = [words[5::2] for words in lines if words[:3] == ["ros2", "run", "tf2_ros"]]
+    ros1 = [words[3:] for words in lines if words[:2] == ["rosrun", "tf2_ros"]]
     assert ros1 == ros2
-    assert [line[7:] for line in ros1] == [("velodyne", "davis_link"), ("davis_link", "davis_optical_frame")]
-    T = np.eye(4)
-    for line in ros1:
-        values = np.array(line[:7], dtype=float)
-        T = T @ pose(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
-    np.testing.assert_allclose(T, np.linalg.inv(calibration.T_cam_lidar), atol=1e-12)
+    assert [words[7:] for words in ros1] == [
+        ["velodyne", "davis_link"],
+        ["davis_link", "davis_optical_frame"],
+    ]
 
 
 def random_pose(seed: int) -> Array:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,8 +104,7 @@ _MOST_MORE = 60
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False)
-class Guidance:
+class Guidance(NamedTuple):
     """What is known after some captures, and where the board should go next.
 
     Attributes:

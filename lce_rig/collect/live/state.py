@@ -1,7 +1,7 @@
 """Options of a live collection, its state at one moment for the views, and its report."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,8 +101,7 @@ refused: it stands still where it adds nothing; enough: you may stop; lost: a se
 Sound = Literal["tick", "captured", "taken_back", "refused", "enough", "lost"]
 
 
-@dataclass(frozen=True)
-class StreamState:
+class StreamState(NamedTuple):
     """How one stream does, and whether the board is seen in it.
 
     Attributes:
@@ -122,8 +121,7 @@ class StreamState:
     figures: str = ""
 
 
-@dataclass(frozen=True)
-class Cue:
+class Cue(NamedTuple):
     """A moment that is worth a sound.
 
     Attributes:

@@ -11,7 +11,8 @@ from lce_rig.collect.guidance.planner import MIN_MOVE_M, MIN_TURN_DEG
 from lce_rig.collect.guidance.sensor_model import SensorPlace
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.simulated import Person
-from lce_rig.core.geometry import Array, rotation_angle
+from lce_rig.collect.placement_dedupe import Placements
+from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig
 from tests.collect.live.replay import rig
 
@@ -155,8 +156,6 @@ def test_patience_is_not_lost_with_a_guide_that_is_not_followed(guide: Guide) ->
 
 # The simulated person tries again after so long; longer than that a walk seldom takes.
 _TRY_S = 7.0
-# A placement nearer than both to a capture is not new.
-NEW_M, NEW_DEG = MIN_MOVE_M, MIN_TURN_DEG
 
 
 @dataclass
@@ -173,41 +172,34 @@ class Followed:
     proposed: list[tuple[Array, int]] = field(default_factory=list)
     simulated_s: float = 0.0
 
-    def nearest(self) -> list[tuple[float, float]]:
-        """Measure how far each proposal was from the nearest capture before it, m and deg."""
-        return [min(_apart(T, held) for held in self.captured[:n]) for T, n in self.proposed if n]
-
 
 def follow_guide(
     rig: Rig,
     n_wanted: int,
-    seed: int = 0,
     person: Person | None = None,
     can_be_held: Callable[[Array], bool] = lambda _T_cam_board: True,
-    patience_s: float = 600.0,
 ) -> Followed:
-    """Follow a rig's first guide until there are as many captures as wanted, or none for long.
+    """Follow a rig's first guide until there are as many captures as wanted, or none for ten minutes.
 
     Args:
         rig: the profile.
         n_wanted: captures.
-        seed: of the person.
         person: who follows.
         can_be_held: tells where nothing is in the way of T_cam_board (4, 4).
-        patience_s: simulated time without a capture after which it ends.
     """
     guide = make_guides(rig)[0]
     view = SensorPlace.nominal(rig, guide.key[0], guide.lidar)
-    person, rng, walk = person or Person(), np.random.default_rng(seed), Followed()
+    person, rng, walk = person or Person(), np.random.default_rng(0), Followed()
     present = build_pose(view, HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0))
     captured_s = 0.0
-    while len(walk.captured) < n_wanted and walk.simulated_s - captured_s < patience_s:
-        _ask(guide, present, walk)
+    while len(walk.captured) < n_wanted and walk.simulated_s - captured_s < 600.0:
+        before = guide.wanted
+        guide.plan(present, walk.simulated_s)
+        if guide.wanted is not None and guide.wanted is not before:
+            walk.proposed.append((guide.wanted, len(walk.captured)))
         walk.simulated_s += _TRY_S
-        if guide.wanted is None:
-            continue
-        reached = person.follow(view, present, guide.wanted, rng)
-        if not can_be_held(reached):
+        reached = None if guide.wanted is None else person.follow(view, present, guide.wanted, rng)
+        if reached is None or not can_be_held(reached):
             continue
         present = reached
         if guide.adds_nothing(present) is not None:
@@ -219,29 +211,13 @@ def follow_guide(
     return walk
 
 
-def _ask(guide: Guide, present: Array, walk: Followed) -> None:
-    """Let the guide plan, and note what it newly proposes."""
-    before = guide.wanted
-    guide.plan(present, walk.simulated_s)
-    if guide.wanted is not None and guide.wanted is not before:
-        walk.proposed.append((guide.wanted, len(walk.captured)))
-
-
-def _apart(T_1: Array, T_2: Array) -> tuple[float, float]:
-    # The pattern may be read from either end.
-    flipped = T_1[:3, :3] @ np.diag([-1.0, -1.0, 1.0])
-    turn_rad = min(float(rotation_angle(R, T_2[:3, :3])) for R in (T_1[:3, :3], flipped))
-    return float(np.linalg.norm(T_1[:3, 3] - T_2[:3, 3])), float(np.degrees(turn_rad))
-
-
-def is_new(walk_apart: list[tuple[float, float]]) -> bool:
-    return all(way_m >= NEW_M or turn_deg >= NEW_DEG for way_m, turn_deg in walk_apart)
-
-
 def test_a_person_who_goes_on_is_sent_to_new_places_until_there_are_as_many_captures_as_wanted() -> None:
     walk = follow_guide(rig(), 20)
     assert len(walk.captured) == 20
-    assert len(walk.proposed) >= 20 and is_new(walk.nearest())
+    assert len(walk.proposed) >= 20
+    places, key = Placements(MIN_MOVE_M, MIN_TURN_DEG), ("davis", "frames")
+    for T_cam_board, n_held in walk.proposed:
+        assert not any(places.are_alike({key: T_cam_board}, {key: T}) for T in walk.captured[:n_held])
 
 
 def test_half_a_room_and_a_careless_person_will_do() -> None:
@@ -256,8 +232,8 @@ def test_half_a_room_and_a_careless_person_will_do() -> None:
 
 
 def test_who_reaches_nothing_is_asked_for_other_places_until_patience_ends() -> None:
-    walk = follow_guide(rig(), 3, can_be_held=lambda _T_cam_board: False, patience_s=900.0)
-    assert not walk.captured and walk.simulated_s == pytest.approx(900.0, abs=10.0)
+    walk = follow_guide(rig(), 3, can_be_held=lambda _T_cam_board: False)
+    assert not walk.captured and walk.simulated_s == pytest.approx(600.0, abs=10.0)
     places = np.array([T_cam_board[:3, 3] for T_cam_board, _ in walk.proposed])
-    assert len(places) >= 20
+    assert len(places) >= 14
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).min() > 0.3, "one after the other elsewhere"
