@@ -40,9 +40,10 @@ if TYPE_CHECKING:
     from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
     from lce_rig.pipeline.detect_session import detect
+    from lce_rig.pipeline.pair_drift import DriftReport
     from lce_rig.pipeline.result_files import Result
     from lce_rig.pipeline.verification import Verification, verify
-    from lce_rig.pipeline.watch_drift import DriftReport, drift
+    from lce_rig.pipeline.watch_drift import drift
     from lce_rig.rig import Rig, load_rig
     from lce_rig.session import Session
 
@@ -101,7 +102,8 @@ _HOMES = {
     "lce_rig.export.reference": ("Reference", "read_reference"),
     "lce_rig.pipeline.collect_recordings": ("collect_from",),
     "lce_rig.pipeline.detect_session": ("detect",),
-    "lce_rig.pipeline.watch_drift": ("DriftReport", "drift"),
+    "lce_rig.pipeline.pair_drift": ("DriftReport",),
+    "lce_rig.pipeline.watch_drift": ("drift",),
     "lce_rig.pipeline.comparison": ("Repeat", "repeat"),
     "lce_rig.pipeline.result_files": ("Result",),
     "lce_rig.pipeline.calibrate_sessions": ("calibrate",),

@@ -16,7 +16,7 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.lidar.search import plane_limit_m
-from lce_rig.pipeline.matching import candidates_of, refusals_of
+from lce_rig.pipeline.matching import candidates_of, match_sensors
 from lce_rig.pipeline.verification import write_debug_images
 from lce_rig.rig import Rig
 
@@ -43,7 +43,7 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool, event
         with show.progress_bar("drawing") as progress:
             folder = write_debug_images(opened, detections, event_image=event_image, progress=progress)
         show.note(f"debug images: {folder}")
-    refusals = {pair: refusals_of(opened.rig, detections, pair) for pair in detections.pairs}
+    refusals = {pair: match_sensors(opened.rig, detections, pair)[0] for pair in detections.pairs}
     plates = {pair: _plates(opened.rig, detections, pair, refused) for pair, refused in refusals.items()}
     placements = {pair: _placements(detections, pair, refused) for pair, refused in refusals.items()}
     records = {

@@ -16,9 +16,10 @@ from lce_rig.core.errors import LceRigError, NotEnoughDataError, ResultRefusedEr
 from lce_rig.core.interrupts import patience
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import open_live
+from lce_rig.pipeline.pair_drift import DriftReport, PairDrift
 from lce_rig.pipeline.verification import profile_behind
-from lce_rig.pipeline.watch_drift import DriftReport, PairDrift, drift_live
 from lce_rig.pipeline.watch_drift import drift as watch_drift
+from lce_rig.pipeline.watch_drift import drift_live
 from lce_rig.rig import Rig, load_rig
 from lce_rig.scene.drift import AxisDrift, State
 from lce_rig.scene.findings import STATES

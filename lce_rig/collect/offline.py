@@ -155,7 +155,7 @@ class _Collector:
                     message = self._store(key, files.label, images, (scan,), {})
             except SourceError as error:
                 failures.append(error)
-                self.report.refused[files.label] = refusal_of("read", error, "record")
+                self.report.refused[files.label] = refusal_of("read", error, "record it again")
                 message = f"{files.label} refused: {error.what}"
             self._progress(done + 1, len(recording.pairs), message)
         if n_left_out:

@@ -68,15 +68,8 @@ class Scan:
     def select(self, keep: NDArray[Any]) -> "Scan":
         """Keep the points of a mask or index (N,) or (M,)."""
         offset = None if self.offset_ns is None else self.offset_ns[keep]
-        return Scan(
-            self.sensor,
-            self.stamp_ns,
-            self.points[keep],
-            self.intensity[keep],
-            self.ring[keep],
-            offset,
-            self.host_ns,
-        )
+        columns = {name: getattr(self, name)[keep] for name in ("points", "intensity", "ring")}
+        return replace(self, offset_ns=offset, **columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,16 +130,8 @@ class Events:
 
     def select(self, keep: NDArray[Any] | slice) -> "Events":
         """Keep the events of a mask, an index or a slice, in their order."""
-        return Events(
-            self.sensor,
-            self.t_ns[keep],
-            self.x[keep],
-            self.y[keep],
-            self.polarity[keep],
-            self.width_px,
-            self.height_px,
-            self.host_ns,
-        )
+        columns = {name: getattr(self, name)[keep] for name in ("t_ns", "x", "y", "polarity")}
+        return replace(self, **columns)
 
 
 _Stretch = TypeVar("_Stretch", Events, EventColumns)

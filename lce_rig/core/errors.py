@@ -1,6 +1,6 @@
 """Errors that the user can repair; each states what happened, where, and an action."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -139,26 +139,17 @@ def join_shortages(errors: Sequence[NotEnoughDataError]) -> NotEnoughDataError:
     return NotEnoughDataError(first.what, hint, first.finding)
 
 
-def _hint_or(otherwise: str) -> Callable[[Finding], str]:
-    def hint(finding: Finding) -> str:
-        return str(finding.figures["hint"] or otherwise)
-
-    hint.__doc__ = f"{{hint}}, else: {otherwise}."
-    return hint
-
-
 _ERRORS: dict[Stage, Kind] = {
-    "read": Kind(
-        "read.error",
-        "{what}",
-        _hint_or("collect this placement again"),
-        actions={"record": _hint_or("record it again")},
-    ),
-    "image": Kind("image.error", "{what}", "{hint}"),
-    "lidar": Kind("lidar.error", "{what}", "{hint}"),
+    stage: Kind(f"{stage}.error", "{what}", "{hint}") for stage in ("read", "image", "lidar")
 }
 
 
-def refusal_of(stage: Stage, error: LceRigError, action: str = "") -> Refusal:
-    """Refuse a capture for an error that was raised about it."""
-    return _ERRORS[stage].refusal(what=error.what, hint=error.hint, action=action)
+def refusal_of(stage: Stage, error: LceRigError, otherwise: str = "collect this placement again") -> Refusal:
+    """Refuse a capture for an error that was raised about it.
+
+    Args:
+        stage: that raised it.
+        error: names what is wrong.
+        otherwise: the action against what cannot be read, where the error names none.
+    """
+    return _ERRORS[stage].refusal(what=error.what, hint=error.hint or (otherwise if stage == "read" else ""))

@@ -40,18 +40,14 @@ def boards_in(
     return np.array(chosen).reshape(-1, 4, 4)
 
 
-def refusals_of(rig: Rig, detections: Detections, pair: Pair) -> dict[str, Refusal]:
-    """State why captures of a pair are unusable: a sensor found no board, or both sensors disagree."""
-    return match_sensors(rig, detections, pair)[0]
-
-
 def match_sensors(
     rig: Rig, detections: Detections, pair: Pair
 ) -> tuple[dict[str, Refusal], dict[str, LidarBoard]]:
     """Choose the LiDAR's candidates that agree with the images.
 
     Returns:
-        As `refusals_of`; and capture -> the candidate that is the board, where three captures agree at least.
+        Why captures are unusable, as a sensor found no board or both disagree; and capture -> the candidate
+        that is the board, where three captures agree at least.
     """
     chosen: dict[str, LidarBoard] = {}
     candidates, refused = candidates_of(detections, pair)

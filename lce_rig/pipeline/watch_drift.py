@@ -1,181 +1,241 @@
-"""Check deployed extrinsics on recordings without a board: the edges of the scene decide."""
+"""Check deployed extrinsics on recordings without a board: the edges of the scene decide.
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+Captures come from sessions, recordings of all kinds and attached sensors, in bounded memory.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
+from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
-from lce_rig.core.camera import Intrinsics
-from lce_rig.core.data import Events, Image
-from lce_rig.core.errors import SessionError
-from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array
+from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.core.geometry import transform
+from lce_rig.core.losses import Losses
 from lce_rig.core.progress import Progress, silent
-from lce_rig.core.results import ImageBoard, LidarBoard
-from lce_rig.detect.finder import BoardFinder
-from lce_rig.devices.reading import LiveSource
-from lce_rig.judge.board_drift import BoardDrift, watch_boards
-from lce_rig.pipeline.calibration import clocks_of
+from lce_rig.devices import edge_cameras
+from lce_rig.devices.reading import AttachedSensors, LiveSource
+from lce_rig.devices.sync_board import SyncBoard
+from lce_rig.io import open_recordings
+from lce_rig.io.folder.folder import FolderRecording
+from lce_rig.io.joining import join_recordings, require_sensors
+from lce_rig.io.protocol import ContinuousRecording
+from lce_rig.pipeline.pair_drift import EVENTS_NS, DriftReport, Seen, judge_pairs, own_offset_ns
 from lce_rig.pipeline.result_files import RESULT, result_folder
-from lce_rig.pipeline.scene_captures import EVENTS_NS, SceneCaptures, Seen, own_offset_ns
 from lce_rig.pipeline.verification import with_lenses_of
 from lce_rig.rig import Rig
-from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import evenly
-from lce_rig.scene.drift import Drift, State, overall, watch
-from lce_rig.scene.findings import (
-    CHANGED_WITH_BOARD,
-    CLOCKS_APART,
-    CLOCKS_INSTEAD,
-    CONTRADICTION,
-    EVENTS_OF_STANDING_RIG,
-    NO_FIRING_TIMES,
-    NO_SAMPLES,
-    UNCHANGED_WITH_BOARD,
-    UNKNOWN_WITH_BOARD,
-)
-from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
-from lce_rig.scene.views import build_view, without_board, without_movers
+from lce_rig.scene.views import MAX_CAPTURES
 from lce_rig.session import Session
-from lce_rig.show.overlays.drift_picture import draw_drift
-from lce_rig.show.overlays.overlay_files import write_picture
-from lce_rig.timing.rig_time import event_channel, rig_time_ns
+from lce_rig.timing.event_buffer import EventCut
+from lce_rig.timing.rig_clock import RigClock
+from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns, stream_of
+from lce_rig.timing.scan_pairing import Frame, pair_by_time
 
-_MIN_MOVING = 3
-_MAX_BOARDS = 20
+_LIVE_WAIT_S = 0.2
 
-
-@dataclass(frozen=True, eq=False)
-class PairDrift:
-    """What a scene says about one camera and LiDAR.
-
-    Attributes:
-        calibration: the deployed extrinsics.
-        drift: the scene's opinion; where images show the board, without its edges.
-        board: the board's own; None where both sensors see it in fewer than three placements.
-        example: the capture drawn by `write`; None without any.
-    """
-
-    calibration: Calibration
-    drift: Drift
-    board: BoardDrift | None
-    example: tuple[str, Image, SceneView] | None
-
-    @property
-    def states(self) -> dict[str, State]:
-        """Both opinions on each axis: unchanged if either covers it, unknown where they contradict.
-
-        A change is what one of them finds and the other does not refute; or the boards in all axes together.
-        """
-        scene = {axis.axis: axis.state for axis in self.drift.axes}
-        if self.board is None:
-            return scene
-        order: tuple[State, ...] = ("changed", "unchanged", "unknown")
-        states = {
-            axis.axis: next(state for state in order if state in (scene[axis.axis], axis.state))
-            for axis in self.board.axes
-        }
-        states |= dict.fromkeys((each.subject for each in self.contradictions), "unknown")
-        return states | dict.fromkeys(self.board.joint.axes, "changed")
-
-    @property
-    def contradictions(self) -> list[Finding]:
-        """Axes that one of both finds changed, and the other measured to be nearer to unchanged."""
-        found = []
-        for scene, board in zip(self.drift.axes, () if self.board is None else self.board.axes, strict=False):
-            pair = {scene.state: scene, board.state: board}
-            if pair.keys() != {"changed", "unchanged"}:
-                continue
-            change, other = pair["changed"].change, pair["unchanged"].change
-            if abs(other) < abs(other - change):
-                figures = {f"board_{scene.unit}": board.change, f"board_sigma_{scene.unit}": board.sigma}
-                found.append(CONTRADICTION(scene.axis, **scene.figures, **figures))
-        return found
-
-    @property
-    def state(self) -> State:
-        """The verdict on all axes."""
-        return overall(self.states.values())
-
-    @property
-    def summary(self) -> Finding:
-        """The verdict as a finding."""
-        if self.board is None:
-            return self.drift.findings[0]
-        kind = {
-            "changed": CHANGED_WITH_BOARD,
-            "unknown": UNKNOWN_WITH_BOARD,
-            "unchanged": UNCHANGED_WITH_BOARD,
-        }[self.state]
-        return kind(
-            n_captures=self.drift.n_captures,
-            n_boards=self.board.n_boards,
-            changed=tuple(axis for axis, state in self.states.items() if state == "changed"),
-            unknown=tuple(axis for axis, state in self.states.items() if state == "unknown"),
-        )
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """The verdict first, then the scene's opinion on each axis and what is missing, then the board's."""
-        if self.board is None:
-            return self.drift.findings
-        return (self.summary, *self.contradictions, *self.drift.findings, *self.board.findings)
-
-    def document(self) -> dict[str, Any]:
-        """List everything as plain types for JSON."""
-        return {
-            "camera": self.calibration.camera,
-            "lidar": self.calibration.lidar,
-            "state": self.state,
-            "states": self.states,
-            "scene_state": self.drift.state,
-            "n_captures": self.drift.n_captures,
-            "n_edges": self.drift.n_edges,
-            "axes": [axis.document() for axis in self.drift.axes],
-            "contradictions": [each.subject for each in self.contradictions],
-            "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
-            "T_cam_lidar_best": self.drift.T_best.tolist(),
-            "covariance_best": None if self.drift.cov_best is None else self.drift.cov_best.tolist(),
-            "board": None if self.board is None else self.board.document(),
-            "findings": [finding.as_json() for finding in self.findings],
-        }
+_Item = TypeVar("_Item")
 
 
-@dataclass(frozen=True, eq=False)
-class DriftReport:
-    """What a scene says about the extrinsics of a result.
+class Thinned(list[_Item]):
+    """The items of a stream, every one at first, every second once there are too many, and so on."""
 
-    Attributes:
+    def __init__(self) -> None:
+        super().__init__()
+        self._n_taken, self._stride = 0, 1
+
+    def take(self, item: _Item) -> None:
+        """Keep an item if it is its turn."""
+        if self._n_taken % self._stride == 0:
+            self.append(item)
+        self._n_taken += 1
+        if len(self) > MAX_CAPTURES:
+            self[:] = self[::2]
+            self._stride *= 2
+
+
+class SceneCaptures:
+    """Captures from all kinds of sources, for every camera and LiDAR of a result.
+
+    Memory does not grow with a recording's length: of each camera and LiDAR, 60 captures are kept.
+
+    Args:
         rig: the profile.
-        pairs: one for each camera and LiDAR of the result.
+        result: the deployed extrinsics.
+        source: what is read, for messages.
+
+    Attributes:
+        kept: by index of the result's pairs.
         notes: what was chosen, assumed or could not be read, in words.
+
+    Raises:
+        SessionError: the result belongs to another rig.
     """
 
-    rig: Rig
-    pairs: tuple[PairDrift, ...]
-    notes: tuple[str, ...] = ()
+    def __init__(self, rig: Rig, result: ResultFile, source: str) -> None:
+        if result.rig != rig.name or not result.pairs:
+            what = f"the result belongs to rig {result.rig!r}" if result.pairs else "the result holds no pair"
+            raise SessionError(f"{what}; {source} belongs to rig {rig.name!r}")
+        for c in result.pairs:
+            if c.camera not in rig.cameras or c.lidar not in rig.lidars:
+                raise SessionError(f"the result names {c.camera} and {c.lidar}, which rig {rig.name!r} lacks")
+        self._rig, self._source = rig, source
+        self._pairs = result.pairs
+        self.kept: list[Thinned[Seen]] = [Thinned() for _ in result.pairs]
+        self.notes: list[str] = []
+        self._last: dict[str, Scan] = {}
 
-    def write(self, folder: Path | str) -> list[Path]:
-        """Draw each pair: edges under the deployed and the best extrinsics, and the score along each axis.
+    def take_session(self, session: Session, progress: Progress) -> None:
+        """Read the captures of a session; what is damaged is skipped."""
+        cameras, lidars = {c.camera for c in self._pairs}, {c.lidar for c in self._pairs}
+        captures = evenly(session.captures, MAX_CAPTURES * len(self._pairs))
+        for done, capture in enumerate(captures, start=1):
+            progress(done, len(captures))
+            with suppress(SessionError):  # A damaged one is skipped.
+                images = [capture.image(*key) for key in capture.image_keys if key[0] in cameras]
+                scans = [capture.scan(lidar) for lidar in capture.lidars if lidar in lidars]
+                cuts = []
+                for camera in cameras.intersection(capture.event_cameras):
+                    if len(events := capture.events(camera)):
+                        offset_ns = rig_offset_ns(stream_of(events, self._rig), self._rig)
+                        first_ns, last_ns = int(events.t_ns[0]), int(events.t_ns[-1])
+                        cuts.append(EventCut((events,), first_ns, last_ns + 1, offset_ns, 0))
+                self._take(capture.name, images, scans, cuts)
+
+    def take_recordings(self, paths: Sequence[Path], progress: Progress) -> None:
+        """Read recordings: pairs of images and point clouds, or streams, whose scans are paired by time.
 
         Raises:
-            SessionError: a file cannot be written.
+            SourceError: one cannot be read at all.
         """
-        files = []
-        for pair in self.pairs:
-            if pair.example is None:
+        for recording in join_recordings(open_recordings(paths, self._rig), self._rig):
+            try:
+                if isinstance(recording, FolderRecording):
+                    self._take_pairs(recording, progress)
+                elif isinstance(recording, ContinuousRecording):
+                    self._take_stream(recording, progress)
+            except SourceError as error:
+                if not any(self.kept):
+                    raise
+                # What came before the damage is judged.
+                self.notes.append(f"not read to its end: {error.what}")
+            self.notes += recording.notes
+
+    def _take_pairs(self, recording: FolderRecording, progress: Progress) -> None:
+        pairs = evenly(recording.pairs, MAX_CAPTURES * len(self._pairs))
+        failures: list[SourceError] = []
+        for done, files in enumerate(pairs, start=1):
+            try:
+                images, scan, _ = files.read()
+                self._take(files.label, images, (scan,))
+            except SourceError as error:
+                failures.append(error)
+            progress(done, len(pairs))
+        if failures and len(failures) == len(pairs):
+            raise failures[0]
+        self.notes += [f"skipped: {error.what}" for error in failures]
+
+    def _take_stream(self, recording: ContinuousRecording, progress: Progress) -> None:
+        require_sensors(recording)
+        losses = Losses()
+
+        def counted() -> Iterator[Sample]:
+            done = 0
+            for sample in recording.samples():
+                yield sample
+                if not isinstance(sample, Events):
+                    done += 1
+                    progress(done, recording.n_samples)
+
+        for frame in pair_by_time(counted(), self._rig, losses, are_events_enough=True):
+            self.take_frame(frame)
+        if not any(self.kept) and losses.counts():
+            (why, n), *_ = losses.counts()
+            raise SourceError(f"{recording.path}: {n} scans cannot be used: {why.text}")
+
+    def take_live(self, sources: Sequence[LiveSource], is_over: Callable[[int], bool]) -> None:
+        """Read attached sensors until it is over.
+
+        Raises:
+            SourceError: a sensor cannot be opened.
+        """
+        board = next((source for source in sources if isinstance(source, SyncBoard)), None)
+        clock = RigClock(self._rig, has_board=board is not None, edge_cameras=edge_cameras(self._rig))
+        n_frames = 0
+        with (
+            AttachedSensors(sources) as sensors,
+            FrameFeed(self._rig, sensors, clock, board, are_events_enough=True) as feed,
+        ):
+            while not is_over(n_frames):
+                frame = feed.take(_LIVE_WAIT_S)
+                if frame is not None:
+                    n_frames += 1
+                    self.take_frame(frame)
+            self.notes += [error.what for error, _ in sensors.lost().values()]
+
+    def take_frame(self, frame: Frame) -> None:
+        """Take what the rig saw at one time of a continuous recording."""
+        self._take(f"{1e-9 * frame.time_ns:.2f} s", frame.images, frame.scans, frame.events)
+        self._last = {scan.sensor: scan for scan in frame.scans}
+
+    def _take(
+        self, name: str, images: Sequence[Image], scans: Sequence[Scan], events: Sequence[EventCut] = ()
+    ) -> None:
+        for c, kept in zip(self._pairs, self.kept, strict=True):
+            scan = next((each for each in scans if each.sensor == c.lidar), None)
+            own = [image for image in images if image.sensor == c.camera]
+            # Frames before images that were made of events.
+            frames = self._rig.cameras[c.camera].first_channel("frames")
+            own = [image for image in own if image.channel == frames] or own
+            if scan is None:
                 continue
-            name, image, view = pair.example
-            c = pair.calibration
-            lens = self.rig.lens_of(c)
-            board = () if pair.board is None else pair.board.axes
-            title = f"{c.camera}, {c.lidar}  {name}"
-            picture = draw_drift(pair.drift, image, view.edges, lens, title, pair.states, board)
-            files.append(write_picture(Path(folder) / f"drift_{c.camera}_{c.lidar}.png", picture))
-        return files
+            # Grey: colour is not used, and would hold three times the memory.
+            image: Image | Events | None = replace(own[0], pixels=own[0].grey) if own else None
+            if image is None:
+                cut = next((each for each in events if each.sensor == c.camera), None)
+                image = None if cut is None else _about_scan(cut, scan, self._rig, c)
+            if image is not None:
+                kept.take(Seen(name, image, scan, self._last.get(c.lidar)))
+
+    def judge(self) -> DriftReport:
+        """Judge the result by what was taken.
+
+        Raises:
+            SourceError: nothing of any camera and LiDAR of the result.
+        """
+        if not any(self.kept):
+            wanted = " or ".join(f"{c.camera} and {c.lidar}" for c in self._pairs)
+            raise SourceError(
+                f"{self._source} holds no images and scans of {wanted} at the same time",
+                "Check the profile's topics and timestamps; "
+                "`lce-rig doctor --rig RIG` looks at attached sensors.",
+            )
+        pairs = judge_pairs(self._rig, self._pairs, self.kept)
+        return DriftReport(self._rig, pairs, tuple(dict.fromkeys(self.notes)))
+
+
+def _about_scan(cut: EventCut, scan: Scan, rig: Rig, c: Calibration) -> Events | None:
+    """Copy the events of the time at which the LiDAR looks where the camera does; None if there are none."""
+    scan_ns = rig_time_ns(scan, rig)
+    if scan_ns is None or scan.offset_ns is None or not len(scan.points):
+        return None
+    lens = rig.lens_of(c)
+    pixels, is_valid = lens.project(transform(c.T_cam_lidar, scan.points))
+    is_seen = is_valid & lens.is_inside(pixels)
+    if not is_seen.any():
+        return None
+    offset_ns = cut.offset_ns + own_offset_ns(c, event_channel(rig, c.camera) or "")
+    middle_ns = scan_ns + int(np.median(scan.offset_ns[is_seen])) - offset_ns
+    events = cut.events.between(middle_ns - EVENTS_NS // 2, middle_ns + EVENTS_NS // 2)
+    if not len(events):
+        return None
+    columns = {name: getattr(events, name).copy() for name in ("t_ns", "x", "y", "polarity")}
+    return replace(events, **columns)
 
 
 def drift(
@@ -218,7 +278,7 @@ def drift(
         rig, notes = with_lenses_of(session.rig, profile)
         captures = SceneCaptures(rig, result, str(session.path))
         captures.take_session(session, progress)
-    report = judge(rig, result, captures)
+    report = captures.judge()
     return replace(report, notes=(*(note.sentence for note in notes), *report.notes))
 
 
@@ -243,134 +303,4 @@ def drift_live(
     """
     captures = SceneCaptures(rig, result, f"the sensors of rig {rig.name}")
     captures.take_live(sources, is_over)
-    return judge(rig, result, captures)
-
-
-def judge(rig: Rig, result: ResultFile, captures: SceneCaptures) -> DriftReport:
-    """Judge a result by captures of a scene.
-
-    Raises:
-        SourceError: there are none of any camera and LiDAR of the result.
-    """
-    captures.require_any()
-    judging = _Judge(rig)
-    pairs = tuple(map(judging.pair, result.pairs, captures.kept))
-    return DriftReport(rig, pairs, tuple(dict.fromkeys(captures.notes)))
-
-
-class _Judge:
-    """Judges cameras and LiDARs in turn; the motion of a LiDAR is estimated once for all cameras."""
-
-    def __init__(self, rig: Rig) -> None:
-        self._rig, self._finder = rig, BoardFinder(rig)
-        self._motions: dict[int, RigMotion | None] = {}
-
-    def pair(self, c: Calibration, kept: Sequence[Seen]) -> PairDrift:
-        lens = self._rig.lens_of(c)
-        views: list[SceneView] = []
-        whole: list[SceneView] = []
-        boards: list[tuple[Seen, ImageBoard]] = []
-        moving: list[MovingView] = []
-        n_untimed = 0
-        for seen in kept:
-            view = build_view(self._rig, c, seen.name, seen.image, seen.scan)
-            motion = self._motion(seen)
-            if motion is not None:
-                after_s = _after_s(view.edges.points, seen, self._rig, c)
-                if after_s is None:
-                    n_untimed += 1
-                    continue
-                points = motion.moved(view.edges.points, after_s)
-                view = replace(view, edges=replace(view.edges, points=points))
-                moving.append(MovingView(view, motion))
-            whole.append(view)
-            if isinstance(seen.image, Image):
-                board = self._finder.image(seen.image)
-                view = without_board(view, board, self._rig, c)
-                if motion is None and isinstance(board, ImageBoard):
-                    boards.append((seen, board))
-            views.append(view)
-        if boards:
-            # Who holds the board moves with it.
-            views = without_movers(views)
-        judged = watch(views, lens, c.T_cam_lidar, c.cov)
-        if not kept:
-            judged = replace(judged, findings=(NO_SAMPLES(c.camera, lidar=c.lidar),))
-        elif n_untimed:
-            untimed = NO_FIRING_TIMES(c.lidar, n_captures=n_untimed)
-            judged = replace(judged, findings=(*judged.findings, untimed))
-        if judged.state == "unknown" and not moving and any(isinstance(each.image, Events) for each in kept):
-            judged = replace(judged, findings=(*judged.findings, EVENTS_OF_STANDING_RIG(c.camera)))
-        if len(moving) >= _MIN_MOVING and judged.curves:
-            judged = _with_clocks(judged, moving, lens, c.camera)
-        example = None
-        if whole:
-            # The picture is of the capture with most edges.
-            view = max(whole, key=lambda each: len(each.edges))
-            image = next(seen.image for seen in kept if seen.name == view.capture)
-            example = view.capture, image if isinstance(image, Image) else _picture_of(image), view
-        return PairDrift(c, judged, self._boards(c, boards), example)
-
-    def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
-        """Compare the extrinsics with the boards of at most 20 captures."""
-        images: dict[str, ImageBoard] = {}
-        scans: dict[str, list[LidarBoard]] = {}
-        for seen, board in evenly(boards, _MAX_BOARDS):
-            found = self._finder.scan(seen.scan)
-            if isinstance(found, list):
-                images[seen.name], scans[seen.name] = board, found
-        if not images:
-            return None
-        channel = boards[0][0].image.channel if isinstance(boards[0][0].image, Image) else ""
-        clocks = clocks_of(self._rig, c.camera, c.lidar)
-        return watch_boards(self._rig, c, channel, images, scans, clocks)
-
-    def _motion(self, seen: Seen) -> RigMotion | None:
-        """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""
-        if seen.previous is None:
-            return None
-        key = id(seen.scan)
-        if key not in self._motions:
-            motion = estimate_motion(seen.previous, seen.scan)
-            self._motions[key] = None if motion is None or motion.is_still else motion
-        return self._motions[key]
-
-
-def _picture_of(events: Events) -> Image:
-    """Draw the number of events of each pixel, dark on white."""
-    counts = np.zeros((events.height_px, events.width_px))
-    np.add.at(counts, (events.y, events.x), 1.0)
-    grey = np.asarray(np.clip(255 - 60 * counts, 0, 255), dtype=np.uint8)
-    return Image(events.sensor, "events", None, grey)
-
-
-def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | None:
-    """Tell how long after each edge (N, 3) the image was taken; None where times are unknown."""
-    image, scan_ns = seen.image, rig_time_ns(seen.scan, rig)
-    image_ns = rig_time_ns(image, rig)
-    fired_s = firing_times_s(seen.scan, points)
-    if scan_ns is None or image_ns is None or fired_s is None:
-        return None
-    channel = image.channel if isinstance(image, Image) else event_channel(rig, c.camera) or ""
-    # Events are cut about their middle.
-    middle_ns = EVENTS_NS // 2 if isinstance(image, Events) else 0
-    return np.asarray(1e-9 * (image_ns + middle_ns + own_offset_ns(c, channel) - scan_ns) - fired_s)
-
-
-def _with_clocks(judged: Drift, moving: Sequence[MovingView], lens: Intrinsics, camera: str) -> Drift:
-    """Give no all-clear where the images of a moving rig fit the scans of another time.
-
-    Where the extrinsics seem changed, clocks that explain it nearly as well are named beside them.
-    """
-    is_changed = judged.state == "changed"
-    apart_s = clocks_apart_s(moving, lens, judged.T_cam_lidar, judged.T_changed if is_changed else None)
-    if apart_s is None:
-        return judged
-    found = (CLOCKS_INSTEAD if is_changed else CLOCKS_APART)(camera, apart_s=apart_s)
-    axes = tuple(
-        replace(axis, state="unknown", reason=found.code) if axis.state == "unchanged" else axis
-        for axis in judged.axes
-    )
-    first, *rest = judged.findings
-    others = [each for each in rest if each.code != "scene.axis_unchanged"]
-    return replace(judged, axes=axes, findings=(*([first] if is_changed else []), found, *others))
+    return captures.judge()

@@ -17,8 +17,8 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, difference, perturb
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.pipeline.scene_captures import SceneCaptures, Seen
-from lce_rig.pipeline.watch_drift import PairDrift, judge
+from lce_rig.pipeline.pair_drift import PairDrift, Seen
+from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION, SceneView
 from lce_rig.scene.depth_edges import leave_standing
@@ -109,7 +109,7 @@ class _Watched:
         for each in self.samples:
             if each.name in names:
                 captures.kept[0].take(each)
-        return judge(self.rig, result, captures).pairs[0]
+        return captures.judge().pairs[0]
 
     def judge(self, views: list[SceneView], tangent: Array, *, is_joint: bool = False) -> Drift:
         """Watch the board calibration, moved by a tangent."""

@@ -7,7 +7,7 @@ from lce_rig.calibrate import Clocks
 from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.judge.board_drift import BoardDrift, JointDrift, watch_boards
-from lce_rig.pipeline.watch_drift import PairDrift
+from lce_rig.pipeline.pair_drift import PairDrift
 from lce_rig.rig import load_rig
 from lce_rig.scene.alignment import AXES
 from lce_rig.scene.drift import AxisDrift, Drift, State

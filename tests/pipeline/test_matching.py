@@ -8,7 +8,7 @@ import lce_rig as lce
 from lce_rig.core.findings import Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.pipeline.detect_session import detect
-from lce_rig.pipeline.matching import expected_poses, refusals_of
+from lce_rig.pipeline.matching import expected_poses, match_sensors
 from lce_rig.session import Session
 
 RIGS = Path(__file__).parents[1] / "rigs"
@@ -28,7 +28,7 @@ def test_boards_that_walls_hide_are_found_where_their_image_has_them(
     detections = detect(session)
     pair = Pair("cam", "frames", "lidar")
     assert len(detections.captures(pair)) == 11
-    assert refusals_of(session.rig, detections, pair) == {}
+    assert match_sensors(session.rig, detections, pair)[0] == {}
     # Nothing is left to be looked for.
     assert expected_poses(session.rig, detections) == {}
 

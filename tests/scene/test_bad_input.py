@@ -10,8 +10,8 @@ import pytest
 from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, exp_so3
-from lce_rig.pipeline.scene_captures import SceneCaptures
-from lce_rig.pipeline.watch_drift import PairDrift, judge
+from lce_rig.pipeline.pair_drift import PairDrift
+from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulatedCapture, truth_extrinsics
 from lce_rig.timing.scan_pairing import Frame
@@ -73,7 +73,7 @@ def judge_corrupted(
     for capture in captures:
         image, scan = corrupt(capture.images[0], capture.scans[0], rng)
         taken.take_frame(Frame(scan.stamp_ns or 0, (image,), (scan,)))
-    (pair,) = judge(rig, result, taken).pairs
+    (pair,) = taken.judge().pairs
     return pair
 
 

@@ -19,8 +19,7 @@ from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
 from lce_rig.io.network import build_frame
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.pipeline.scene_captures import SceneCaptures, Thinned
-from lce_rig.pipeline.watch_drift import drift, judge
+from lce_rig.pipeline.watch_drift import SceneCaptures, Thinned, drift
 from lce_rig.rig import Rig, dump_rig
 from lce_rig.scene.alignment import AXES
 from lce_rig.session import Session
@@ -234,7 +233,7 @@ def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen) -> None:
         noise = Events("cam", t_ns, x, y, np.ones(n, dtype=np.bool_), 640, 360)
         cut = EventCut((noise,), int(t_ns[0]), int(t_ns[-1]) + 1, 0, 0)
         captures.take_frame(Frame(scan.stamp_ns, (), (scan,), (cut,)))
-    (pair,) = judge(seen.rig, result, captures).pairs
+    (pair,) = captures.judge().pairs
     assert pair.state == "unknown" and pair.drift.n_captures == len(seen.captures)
     told = [each.subject for each in pair.findings if each.code == "scene.events_of_standing_rig"]
     assert told == ["cam"]

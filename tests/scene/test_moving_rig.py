@@ -7,8 +7,7 @@ import pytest
 
 from lce_rig.core.calibration import ResultFile
 from lce_rig.core.geometry import perturb
-from lce_rig.pipeline.scene_captures import SceneCaptures
-from lce_rig.pipeline.watch_drift import judge
+from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.scene.alignment import AXES
 from lce_rig.scene.rig_motion import estimate_motion
 from lce_rig.timing.scan_pairing import Frame
@@ -44,7 +43,7 @@ def watch_captures(driven, late_ns=0, change=lambda scan: scan, T_cam_lidar=None
         stamped = replace(image, stamp_ns=image.stamp_ns - late_ns)
         for each, images in ((before, ()), (scan, (stamped,))):
             captures.take_frame(Frame(each.stamp_ns, images, (change(each),)))
-    (pair,) = judge(rig.stage.rig, result, captures).pairs
+    (pair,) = captures.judge().pairs
     return pair.drift
 
 

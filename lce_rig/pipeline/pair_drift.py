@@ -1,0 +1,326 @@
+"""What a scene, and the boards in view, say about the deployed extrinsics of a camera and a LiDAR."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lce_rig.core.calibration import Calibration
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array
+from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.detect.finder import BoardFinder
+from lce_rig.judge.board_drift import BoardDrift, watch_boards
+from lce_rig.pipeline.calibration import clocks_of
+from lce_rig.rig import Rig
+from lce_rig.scene.alignment import SceneView
+from lce_rig.scene.depth_edges import evenly
+from lce_rig.scene.drift import Drift, State, overall, watch
+from lce_rig.scene.findings import (
+    CHANGED_WITH_BOARD,
+    CLOCKS_APART,
+    CLOCKS_INSTEAD,
+    CONTRADICTION,
+    EVENTS_OF_STANDING_RIG,
+    NO_FIRING_TIMES,
+    NO_SAMPLES,
+    UNCHANGED_WITH_BOARD,
+    UNKNOWN_WITH_BOARD,
+)
+from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
+from lce_rig.scene.views import build_view, without_board, without_movers
+from lce_rig.show.overlays.drift_picture import draw_drift
+from lce_rig.show.overlays.overlay_files import write_picture
+from lce_rig.timing.rig_time import event_channel, rig_time_ns
+
+_MIN_MOVING = 3
+_MAX_BOARDS = 20
+#: Of events this long about the time at which the LiDAR looks where the camera does.
+EVENTS_NS = 20_000_000
+
+
+class Seen(NamedTuple):
+    """One capture of one camera and LiDAR.
+
+    Attributes:
+        name: of the capture, or its time.
+        image: what the camera saw, or else events of 20 ms.
+        scan: of the LiDAR.
+        previous: the scan before, where the recording is continuous.
+    """
+
+    name: str
+    image: Image | Events
+    scan: Scan
+    previous: Scan | None
+
+
+@dataclass(frozen=True, eq=False)
+class PairDrift:
+    """What a scene says about one camera and LiDAR.
+
+    Attributes:
+        calibration: the deployed extrinsics.
+        drift: the scene's opinion; where images show the board, without its edges.
+        board: the board's own; None where both sensors see it in fewer than three placements.
+        example: the capture drawn by `write`; None without any.
+    """
+
+    calibration: Calibration
+    drift: Drift
+    board: BoardDrift | None
+    example: tuple[str, Image, SceneView] | None
+
+    @property
+    def states(self) -> dict[str, State]:
+        """Both opinions on each axis: unchanged if either covers it, unknown where they contradict.
+
+        A change is what one of them finds and the other does not refute; or the boards in all axes together.
+        """
+        scene = {axis.axis: axis.state for axis in self.drift.axes}
+        if self.board is None:
+            return scene
+        order: tuple[State, ...] = ("changed", "unchanged", "unknown")
+        states = {
+            axis.axis: next(state for state in order if state in (scene[axis.axis], axis.state))
+            for axis in self.board.axes
+        }
+        states |= dict.fromkeys((each.subject for each in self.contradictions), "unknown")
+        return states | dict.fromkeys(self.board.joint.axes, "changed")
+
+    @property
+    def contradictions(self) -> list[Finding]:
+        """Axes that one of both finds changed, and the other measured to be nearer to unchanged."""
+        found = []
+        for scene, board in zip(self.drift.axes, () if self.board is None else self.board.axes, strict=False):
+            pair = {scene.state: scene, board.state: board}
+            if pair.keys() != {"changed", "unchanged"}:
+                continue
+            change, other = pair["changed"].change, pair["unchanged"].change
+            if abs(other) < abs(other - change):
+                figures = {f"board_{scene.unit}": board.change, f"board_sigma_{scene.unit}": board.sigma}
+                found.append(CONTRADICTION(scene.axis, **scene.figures, **figures))
+        return found
+
+    @property
+    def state(self) -> State:
+        """The verdict on all axes."""
+        return overall(self.states.values())
+
+    @property
+    def summary(self) -> Finding:
+        """The verdict as a finding."""
+        if self.board is None:
+            return self.drift.findings[0]
+        kind = {
+            "changed": CHANGED_WITH_BOARD,
+            "unknown": UNKNOWN_WITH_BOARD,
+            "unchanged": UNCHANGED_WITH_BOARD,
+        }[self.state]
+        return kind(
+            n_captures=self.drift.n_captures,
+            n_boards=self.board.n_boards,
+            changed=tuple(axis for axis, state in self.states.items() if state == "changed"),
+            unknown=tuple(axis for axis, state in self.states.items() if state == "unknown"),
+        )
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The verdict first, then the scene's opinion on each axis and what is missing, then the board's."""
+        if self.board is None:
+            return self.drift.findings
+        return (self.summary, *self.contradictions, *self.drift.findings, *self.board.findings)
+
+    def document(self) -> dict[str, Any]:
+        """List everything as plain types for JSON."""
+        return {
+            "camera": self.calibration.camera,
+            "lidar": self.calibration.lidar,
+            "state": self.state,
+            "states": self.states,
+            "scene_state": self.drift.state,
+            "n_captures": self.drift.n_captures,
+            "n_edges": self.drift.n_edges,
+            "axes": [axis.document() for axis in self.drift.axes],
+            "contradictions": [each.subject for each in self.contradictions],
+            "T_cam_lidar": self.drift.T_cam_lidar.tolist(),
+            "T_cam_lidar_best": self.drift.T_best.tolist(),
+            "covariance_best": None if self.drift.cov_best is None else self.drift.cov_best.tolist(),
+            "board": None if self.board is None else self.board.document(),
+            "findings": [finding.as_json() for finding in self.findings],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class DriftReport:
+    """What a scene says about the extrinsics of a result.
+
+    Attributes:
+        rig: the profile.
+        pairs: one for each camera and LiDAR of the result.
+        notes: what was chosen, assumed or could not be read, in words.
+    """
+
+    rig: Rig
+    pairs: tuple[PairDrift, ...]
+    notes: tuple[str, ...] = ()
+
+    def write(self, folder: Path | str) -> list[Path]:
+        """Draw each pair: edges under the deployed and the best extrinsics, and the score along each axis.
+
+        Raises:
+            SessionError: a file cannot be written.
+        """
+        files = []
+        for pair in self.pairs:
+            if pair.example is None:
+                continue
+            name, image, view = pair.example
+            c = pair.calibration
+            lens = self.rig.lens_of(c)
+            board = () if pair.board is None else pair.board.axes
+            title = f"{c.camera}, {c.lidar}  {name}"
+            picture = draw_drift(pair.drift, image, view.edges, lens, title, pair.states, board)
+            files.append(write_picture(Path(folder) / f"drift_{c.camera}_{c.lidar}.png", picture))
+        return files
+
+
+def judge_pairs(
+    rig: Rig, calibrations: Sequence[Calibration], kept: Sequence[Sequence[Seen]]
+) -> tuple[PairDrift, ...]:
+    """Judge calibrations by captures of a scene.
+
+    Args:
+        rig: the profile.
+        calibrations: the deployed extrinsics.
+        kept: the captures of each.
+    """
+    return tuple(map(_Judge(rig).pair, calibrations, kept))
+
+
+class _Judge:
+    """Judges cameras and LiDARs in turn; the motion of a LiDAR is estimated once for all cameras."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig, self._finder = rig, BoardFinder(rig)
+        self._motions: dict[int, RigMotion | None] = {}
+
+    def pair(self, c: Calibration, kept: Sequence[Seen]) -> PairDrift:
+        lens = self._rig.lens_of(c)
+        views: list[SceneView] = []
+        whole: list[SceneView] = []
+        boards: list[tuple[Seen, ImageBoard]] = []
+        moving: list[MovingView] = []
+        n_untimed = 0
+        for seen in kept:
+            view = build_view(self._rig, c, seen.name, seen.image, seen.scan)
+            motion = self._motion(seen)
+            if motion is not None:
+                after_s = _after_s(view.edges.points, seen, self._rig, c)
+                if after_s is None:
+                    n_untimed += 1
+                    continue
+                points = motion.moved(view.edges.points, after_s)
+                view = replace(view, edges=replace(view.edges, points=points))
+                moving.append(MovingView(view, motion))
+            whole.append(view)
+            if isinstance(seen.image, Image):
+                board = self._finder.image(seen.image)
+                view = without_board(view, board, self._rig, c)
+                if motion is None and isinstance(board, ImageBoard):
+                    boards.append((seen, board))
+            views.append(view)
+        if boards:
+            # Who holds the board moves with it.
+            views = without_movers(views)
+        judged = watch(views, lens, c.T_cam_lidar, c.cov)
+        if not kept:
+            judged = replace(judged, findings=(NO_SAMPLES(c.camera, lidar=c.lidar),))
+        elif n_untimed:
+            untimed = NO_FIRING_TIMES(c.lidar, n_captures=n_untimed)
+            judged = replace(judged, findings=(*judged.findings, untimed))
+        if judged.state == "unknown" and not moving and any(isinstance(each.image, Events) for each in kept):
+            judged = replace(judged, findings=(*judged.findings, EVENTS_OF_STANDING_RIG(c.camera)))
+        if len(moving) >= _MIN_MOVING and judged.curves:
+            judged = _with_clocks(judged, moving, lens, c.camera)
+        example = None
+        if whole:
+            # The picture is of the capture with most edges.
+            view = max(whole, key=lambda each: len(each.edges))
+            image = next(seen.image for seen in kept if seen.name == view.capture)
+            example = view.capture, image if isinstance(image, Image) else _picture_of(image), view
+        return PairDrift(c, judged, self._boards(c, boards), example)
+
+    def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
+        """Compare the extrinsics with the boards of at most 20 captures."""
+        images: dict[str, ImageBoard] = {}
+        scans: dict[str, list[LidarBoard]] = {}
+        for seen, board in evenly(boards, _MAX_BOARDS):
+            found = self._finder.scan(seen.scan)
+            if isinstance(found, list):
+                images[seen.name], scans[seen.name] = board, found
+        if not images:
+            return None
+        channel = boards[0][0].image.channel if isinstance(boards[0][0].image, Image) else ""
+        clocks = clocks_of(self._rig, c.camera, c.lidar)
+        return watch_boards(self._rig, c, channel, images, scans, clocks)
+
+    def _motion(self, seen: Seen) -> RigMotion | None:
+        """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""
+        if seen.previous is None:
+            return None
+        key = id(seen.scan)
+        if key not in self._motions:
+            motion = estimate_motion(seen.previous, seen.scan)
+            self._motions[key] = None if motion is None or motion.is_still else motion
+        return self._motions[key]
+
+
+def _picture_of(events: Events) -> Image:
+    """Draw the number of events of each pixel, dark on white."""
+    counts = np.zeros((events.height_px, events.width_px))
+    np.add.at(counts, (events.y, events.x), 1.0)
+    grey = np.asarray(np.clip(255 - 60 * counts, 0, 255), dtype=np.uint8)
+    return Image(events.sensor, "events", None, grey)
+
+
+def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | None:
+    """Tell how long after each edge (N, 3) the image was taken; None where times are unknown."""
+    image, scan_ns = seen.image, rig_time_ns(seen.scan, rig)
+    image_ns = rig_time_ns(image, rig)
+    fired_s = firing_times_s(seen.scan, points)
+    if scan_ns is None or image_ns is None or fired_s is None:
+        return None
+    channel = image.channel if isinstance(image, Image) else event_channel(rig, c.camera) or ""
+    # Events are cut about their middle.
+    middle_ns = EVENTS_NS // 2 if isinstance(image, Events) else 0
+    return np.asarray(1e-9 * (image_ns + middle_ns + own_offset_ns(c, channel) - scan_ns) - fired_s)
+
+
+def _with_clocks(judged: Drift, moving: Sequence[MovingView], lens: Intrinsics, camera: str) -> Drift:
+    """Give no all-clear where the images of a moving rig fit the scans of another time.
+
+    Where the extrinsics seem changed, clocks that explain it nearly as well are named beside them.
+    """
+    is_changed = judged.state == "changed"
+    apart_s = clocks_apart_s(moving, lens, judged.T_cam_lidar, judged.T_changed if is_changed else None)
+    if apart_s is None:
+        return judged
+    found = (CLOCKS_INSTEAD if is_changed else CLOCKS_APART)(camera, apart_s=apart_s)
+    axes = tuple(
+        replace(axis, state="unknown", reason=found.code) if axis.state == "unchanged" else axis
+        for axis in judged.axes
+    )
+    first, *rest = judged.findings
+    others = [each for each in rest if each.code != "scene.axis_unchanged"]
+    return replace(judged, axes=axes, findings=(*([first] if is_changed else []), found, *others))
+
+
+def own_offset_ns(c: Calibration, channel: str) -> int:
+    """Return what the calibration adds to a channel's timestamps beyond the profile's expected offset."""
+    found = [each.time_offset_s for each in c.channel_results if each.channel == channel]
+    return round(1e9 * found[0]) if found and found[0] is not None else 0
