@@ -5,7 +5,6 @@ References:
 """
 
 import shutil
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -38,7 +37,6 @@ class _Topics:
     def __init__(self, writer: Any) -> None:
         self._writer = writer
         self._connections: dict[str, Any] = {}
-        self.counts: Counter[str] = Counter()
 
     def write(self, topic: str, msgtype: str, time_ns: int, message: Any) -> None:
         store = typestore(False)
@@ -46,7 +44,6 @@ class _Topics:
             self._connections[topic] = self._writer.add_connection(topic, msgtype, typestore=store)
         data = message if isinstance(message, bytes | memoryview) else store.serialize_cdr(message, msgtype)
         self._writer.write(self._connections[topic], time_ns, data)
-        self.counts[topic] += 1
 
 
 def export_tf_static_bag(job: ExportJob) -> list[Path]:
@@ -96,14 +93,14 @@ def export_mcap(job: ExportJob) -> list[Path]:
                 scan = scan if scan.stamp_ns is not None else replace(scan, stamp_ns=time_ns)
                 settings = job.rig.lidars[scan.sensor]
                 topic = settings.topic or f"/{scan.sensor}/points"
-                data = encode_scan(scan, settings, False, topics.counts[topic])
+                data = encode_scan(scan, settings, False)
                 topics.write(topic, CLOUD_TYPE, time_ns, data)
             for image in images:
                 shown.add(image.sensor)
                 image = image if image.stamp_ns is not None else replace(image, stamp_ns=time_ns)
                 topic = image_topic(job, image.sensor, image.channel)
                 frame = job.rig.cameras[image.sensor].optical_frame
-                data = encode_image(image, frame, False, topics.counts[topic])
+                data = encode_image(image, frame, False)
                 topics.write(topic, IMAGE_TYPE, time_ns, data)
                 info = _camera_info(job, image.sensor, image.stamp_ns or 0)
                 topics.write(f"{topic.rpartition('/')[0]}/camera_info", _INFO_TYPE, time_ns, info)

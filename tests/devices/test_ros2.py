@@ -59,12 +59,12 @@ def samples(rig: Rig, n: int) -> Iterator[tuple[str, bytes]]:
     for k in range(n):
         stamp_ns = begin_ns + k * 20_000_000
         pixels = np.full((height, width), k, np.uint8)
-        data = bytes(encode_image(Image("cam", "frames", stamp_ns, pixels), "camera", False, k))
+        data = bytes(encode_image(Image("cam", "frames", stamp_ns, pixels), "camera", False))
         yield IMAGES, data[: len(data) // 2] if k % 5 == 4 else data
         ring = np.arange(1600) % 16
         points = np.column_stack((5 * np.cos(angle), 5 * np.sin(angle), 0.1 * (ring - 8))).astype(np.float32)
         scan = Scan("lidar", stamp_ns, points, np.full(1600, 9, np.float32), ring.astype(np.uint16))
-        yield POINTS, bytes(encode_scan(scan, rig.lidars["lidar"], False, k))
+        yield POINTS, bytes(encode_scan(scan, rig.lidars["lidar"], False))
 
 
 @pytest.fixture

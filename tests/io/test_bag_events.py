@@ -118,10 +118,10 @@ def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path: Pa
             store = typestore(True)
             writer.add_connection("/davis/events", EVENT_ARRAY_TYPE, typestore=store)
             cloud = writer.add_connection("/velodyne_points", "sensor_msgs/msg/PointCloud2", typestore=store)
-            writer.write(cloud, T0_NS, encode_scan(sweep(0), rig.lidars["lidar"], True, 0))
+            writer.write(cloud, T0_NS, encode_scan(sweep(0), rig.lidars["lidar"], True))
             if has_pictures:
                 image = writer.add_connection("/davis/image_raw", "sensor_msgs/msg/Image", typestore=store)
-                writer.write(image, T0_NS, encode_image(picture(0), "davis", True, 0))
+                writer.write(image, T0_NS, encode_image(picture(0), "davis", True))
         return path
 
     recording = opened(write(tmp_path / "a.bag", True), rig)

@@ -9,7 +9,6 @@ References:
     https://github.com/uzh-rpg/rpg_dvs_ros/tree/master/dvs_msgs/msg
 """
 
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -27,8 +26,6 @@ from lce_rig.timing.rig_time import event_channel
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
-# The event drivers' own rate.
-_MESSAGE_NS = 33_000_000
 _NS_PER_S = 10**9
 _UINT16, _FLOAT32 = 4, 7
 BAG_NAMES = {1: "recording.bag", 2: "recording"}
@@ -50,43 +47,18 @@ def open_bag_writer(path: Path) -> Any:
     return Ros2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
 
 
-def event_messages(
-    events: Events, frame_id: str, is_ros1: bool, first_number: int = 0
-) -> Iterator[tuple[int, bytes]]:
-    """Cut events into messages of 33 ms.
-
-    Yields:
-        Time of receipt in ns, that of the last event where the host's clock is not known, and the message.
-    """
-    if not len(events):
-        return
-    first_ns, last_ns = int(events.t_ns[0]), int(events.t_ns[-1])
-    edges_ns = np.arange(first_ns, last_ns + _MESSAGE_NS + 1, _MESSAGE_NS)
-    encoding = "ros1" if is_ros1 else "cdr"
-    number = first_number
-    for start_ns in edges_ns[:-1]:
-        part = events.between(int(start_ns), int(start_ns) + _MESSAGE_NS)
-        if len(part):
-            received_ns = int(part.t_ns[-1])
-            if events.host_ns is not None:
-                received_ns = events.host_ns + int(part.t_ns[0]) - first_ns
-            yield received_ns, encode_event_array(part, frame_id, encoding, number)
-            number += 1
-
-
-def encode_image(image: Image, frame_id: str, is_ros1: bool, number: int) -> memoryview:
+def encode_image(image: Image, frame_id: str, is_ros1: bool) -> memoryview:
     """Encode an image as sensor_msgs/Image, mono8 or bgr8.
 
     Args:
         image: the image; one without a timestamp gets 0, which readers take for none.
         frame_id: of the header.
         is_ros1: whether for ROS 1.
-        number: of the message in its topic; ROS 1 headers carry it.
     """
     height_px, width_px = image.pixels.shape[:2]
     data = np.ascontiguousarray(image.pixels).reshape(-1)
     message = typestore(is_ros1).types[IMAGE_TYPE](
-        header=_header(image.stamp_ns or 0, frame_id, is_ros1, number),
+        header=_header(image.stamp_ns or 0, frame_id, is_ros1),
         height=height_px,
         width=width_px,
         encoding="mono8" if image.pixels.ndim == 2 else "bgr8",
@@ -97,14 +69,13 @@ def encode_image(image: Image, frame_id: str, is_ros1: bool, number: int) -> mem
     return _serialize(message, IMAGE_TYPE, is_ros1)
 
 
-def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool, number: int) -> memoryview:
+def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool) -> memoryview:
     """Encode a scan as sensor_msgs/PointCloud2 with x, y, z, intensity, ring and, where known, time.
 
     Args:
         scan: the scan; one without a timestamp gets 0, which readers take for none.
         settings: the LiDAR's frame, and which firing its timestamps mark.
         is_ros1: whether for ROS 1.
-        number: of the message in its topic; ROS 1 headers carry it.
     """
     # The LiDAR's driver would have timestamped the first firing, or the last one.
     stamp_ns = scan.stamp_ns or 0
@@ -122,7 +93,7 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool, number: int)
     types = typestore(is_ros1).types
     field = types["sensor_msgs/msg/PointField"]
     message = types[CLOUD_TYPE](
-        header=_header(stamp_ns, settings.frame, is_ros1, number),
+        header=_header(stamp_ns, settings.frame, is_ros1),
         height=1,
         width=len(points),
         fields=[
@@ -138,11 +109,11 @@ def encode_scan(scan: Scan, settings: LidarSettings, is_ros1: bool, number: int)
     return _serialize(message, CLOUD_TYPE, is_ros1)
 
 
-def _header(stamp_ns: int, frame_id: str, is_ros1: bool, number: int) -> Any:
+def _header(stamp_ns: int, frame_id: str, is_ros1: bool) -> Any:
     types = typestore(is_ros1).types
     seconds, nanoseconds = divmod(stamp_ns, _NS_PER_S)
     stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-    sequence = {"seq": number} if is_ros1 else {}
+    sequence = {"seq": 0} if is_ros1 else {}
     return types["std_msgs/msg/Header"](**sequence, stamp=stamp, frame_id=frame_id)
 
 
@@ -171,7 +142,6 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         self.path = path
         self._rig = rig
         self._is_ros1 = path.suffix == ".bag"
-        self._numbers: Counter[str] = Counter()
         self._connections: dict[str, tuple[str, Any]] = {}
         self._failure: SourceError | None = None
         self._writer: Any = open_bag_writer(path)
@@ -189,8 +159,9 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         if isinstance(sample, Events):
             channel = event_channel(self._rig, sample.sensor) or "events"
             topic, frame = self._camera_topic(sample.sensor, channel)
-            first = self._numbers[topic]
-            for arrival_ns, packet in event_messages(sample, frame, self._is_ros1, first):
+            if len(sample):
+                arrival_ns = int(sample.t_ns[-1]) if sample.host_ns is None else sample.host_ns
+                packet = encode_event_array(sample, frame, "ros1" if self._is_ros1 else "cdr")
                 self._write(topic, EVENT_ARRAY_TYPE, arrival_ns, packet)
             return
         received_ns = sample.stamp_ns if sample.host_ns is None else sample.host_ns
@@ -198,14 +169,14 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
             raise ValueError(f"a sample of {sample.sensor} carries no time")
         if isinstance(sample, Image):
             topic, frame = self._camera_topic(sample.sensor, sample.channel)
-            image = encode_image(sample, frame, self._is_ros1, self._numbers[topic])
+            image = encode_image(sample, frame, self._is_ros1)
             self._write(topic, IMAGE_TYPE, received_ns, image)
         else:
             if sample.sensor not in self._rig.lidars:
                 raise SourceError(f"rig {self._rig.name!r} has no lidar {sample.sensor!r}")
             settings = self._rig.lidars[sample.sensor]
             topic = settings.topic or f"/{sample.sensor}/points"
-            cloud = encode_scan(sample, settings, self._is_ros1, self._numbers[topic])
+            cloud = encode_scan(sample, settings, self._is_ros1)
             self._write(topic, CLOUD_TYPE, received_ns, cloud)
 
     def close(self) -> None:
@@ -236,7 +207,6 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
             raise SourceError(f"topic {topic} would carry both {before} and {msgtype}", hint)
         with self._disk():
             self._writer.write(connection, received_ns, data)
-        self._numbers[topic] += 1
 
     def _camera_topic(self, camera: str, channel: str) -> tuple[str, str]:
         settings = self._rig.cameras.get(camera)

@@ -259,14 +259,13 @@ def decode_event_array(data: bytes, encoding: str) -> tuple[EventHead, EventColu
     return head, EventColumns(t_ns, x, y, raw["polarity"].copy())
 
 
-def encode_event_array(events: Events, frame_id: str, encoding: str, number: int = 0) -> bytes:
+def encode_event_array(events: Events, frame_id: str, encoding: str) -> bytes:
     """Encode events as one dvs_msgs/EventArray, timestamped with the first event's time.
 
     Args:
         events: at least one.
         frame_id: of the header.
         encoding: "ros1" or "cdr".
-        number: of the message in its topic; ROS 1 headers carry it.
     """
     raw = np.zeros(len(events), _ROS1_EVENT if encoding == "ros1" else _CDR_EVENT)
     raw["x"], raw["y"], raw["polarity"] = events.x, events.y, events.polarity
@@ -276,6 +275,6 @@ def encode_event_array(events: Events, frame_id: str, encoding: str, number: int
     head = struct.pack("<III", *divmod(int(events.t_ns[0]), 10**9), len(name)) + name
     sizes = struct.pack("<III", events.height_px, events.width_px, len(events))
     if encoding == "ros1":
-        return struct.pack("<I", number) + head + sizes + body
+        return bytes(4) + head + sizes + body
     lead = b"\0\1\0\0" + head + bytes(-len(head) % 4) + sizes
     return lead + body[:4] + body[4 + _CDR_LEAD_BYTES : -_CDR_TAIL_BYTES]

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from lce_rig.core.data import Events
 from lce_rig.io.ros.bag_file import RawMessage
-from lce_rig.io.ros.bag_recorder import event_messages, open_bag_writer
+from lce_rig.io.ros.bag_recorder import open_bag_writer
 from lce_rig.io.ros.event_messages import EventPacket, parse_packet
-from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, typestore
+from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, encode_event_array, typestore
 
 
 def parsed(data: bytes, is_ros1: bool) -> EventPacket:
@@ -33,8 +33,8 @@ def write_event_bag(path: Path, stretches: Iterable[Events]) -> None:
     with open_bag_writer(path) as writer:
         store = typestore(is_ros1)
         connection = writer.add_connection("/dvs/events", EVENT_ARRAY_TYPE, typestore=store)
-        number = 0
         for stretch in stretches:
-            for received_ns, message in event_messages(stretch, "event_camera", is_ros1, number):
-                writer.write(connection, received_ns, message)
-                number += 1
+            for begin in range(0, len(stretch), 1000):
+                part = stretch.select(slice(begin, begin + 1000))
+                message = encode_event_array(part, "event_camera", "ros1" if is_ros1 else "cdr")
+                writer.write(connection, int(part.t_ns[-1]), message)

@@ -118,7 +118,7 @@ def test_stamps_that_wrap_inside_a_libcaer_packet_go_on() -> None:
 def test_event_arrays_are_what_ros_itself_reads(is_ros1: bool) -> None:
     store = typestore(is_ros1)
     events = random_events(20, 4, start_us=1_700_000_000_000_000)
-    data = encode_event_array(events, "cam", "ros1" if is_ros1 else "cdr", number=5)
+    data = encode_event_array(events, "cam", "ros1" if is_ros1 else "cdr")
     read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     message = read(data, EVENT_ARRAY_TYPE)
     found = [(e.ts.sec * 10**6 + e.ts.nanosec // 1000, e.x, e.y, e.polarity) for e in message.events]
