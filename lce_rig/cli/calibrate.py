@@ -291,8 +291,9 @@ def calibrate(
                 progress=progress,
             )
         except NotEnoughDataError as error:
-            hint = f"{error.hint}\n{_collect_command(opened[0])}".strip()
-            raise NotEnoughDataError(error.what, hint, error.finding) from None
+            if error.finding is not None and error.finding.figures.get("where"):
+                error.hint += f"\n{_collect_command(opened[0])}"
+            raise
     for shortage in result.shortages:
         show.warn(str(NotEnoughDataError.of(shortage)))
     if truth is not None and any(c.egt_rotation_deg is None for c in result.pairs):

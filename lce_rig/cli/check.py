@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 import lce_rig as lce
 from lce_rig.calibrate.observations import group_placements
@@ -84,8 +85,8 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool, event
 
 
 def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> list[Finding]:
-    """Compare the plate's size in all scans of a pair with the profile; other things of its size are not."""
-    from lce_rig.judge.verdict import plate_findings
+    """Compare the plate's size in all scans of a pair, and the boards' distances, with the profile."""
+    from lce_rig.judge.verdict import distance_findings, plate_findings
 
     scans: list[LidarBoard | Refusal] = []
     for name in detections.captures(pair):
@@ -94,7 +95,11 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
             scans.append(scan)
         elif name not in refused or refused[name].stage == "image":
             scans.append(scan[0])
-    return plate_findings(scans, rig.board.to_board())
+    both = candidates_of(detections, pair)[0]
+    in_camera = np.array([each.image.T_cam_board[:3, 3] for each in both]).reshape(-1, 3)
+    in_lidar = np.array([each.lidar.T_lidar_board[:3, 3] for each in both]).reshape(-1, 3)
+    of_distances = distance_findings(in_camera, in_lidar, rig.board.square_m)
+    return [*of_distances, *plate_findings(scans, rig.board.to_board())]
 
 
 def _record(image: ImageDetection, lidar: LidarDetection, refusal: Refusal | None) -> dict[str, Any]:

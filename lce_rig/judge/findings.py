@@ -30,6 +30,12 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.plate_size": (
         ["verdict.edge_shift", "verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]
     ),
+    "verdict.plate_edge": [
+        "verdict.edge_shift",
+        "verdict.edge_residual",
+        "verdict.shares_differ",
+        *_OF_SIGMAS,
+    ],
     "verdict.laser_angles": _OF_POSES.split(),
     "verdict.intrinsics": (
         f"{_OF_DISTANCES}verdict.scale verdict.far_from_nominal verdict.cameras_differ".split()
@@ -185,10 +191,10 @@ def _reach(finding: Finding) -> str:
 def _scale(finding: Finding) -> str:
     """Camera distances differ by {scale} +- {scale_sigma}: squares {square_m}, not {profile_square_m}."""
     scale, sigma = 100 * finding.figure("scale"), 100 * finding.figure("scale_sigma")
-    squares = fill("the squares measure {square_m:1mm} instead of {profile_square_m:1mm}", finding.figures)
+    squares = fill("squares of {square_m:1mm}, not {profile_square_m:1mm}", finding.figures)
     return (
         f"camera distances are {abs(scale):.1f} +- {sigma:.1f} % {'longer' if scale > 0 else 'shorter'} than "
-        f"the LiDAR's: {squares}, or the intrinsics belong to another lens"
+        f"the LiDAR's: {squares}, or another lens"
     )
 
 
@@ -367,6 +373,12 @@ FAR_FROM_NOMINAL = Kind(
     "check nominal_extrinsics and frames in the profile, and the sensors used",
 )
 PLATE_SIZE = Kind("verdict.plate_size", _plate, "measure the plate")
+PLATE_EDGE = Kind(
+    "verdict.plate_edge",
+    "no edge where the profile's plate ends in {side} ({profile_m:.3f} m) in {n_lacking} of {n_captures} "
+    "scans",
+    "measure the plate and correct board.{side}_m",
+)
 INTRINSICS = Kind(
     "verdict.intrinsics",
     _intrinsics,

@@ -27,8 +27,10 @@ from lce_rig.judge.findings import (
     NOT_CERTIFIED,
     PLANE_RESIDUAL,
     PLANES_APART,
+    PLATE_EDGE,
     PLATE_SIZE,
     ROTATION_UNCERTAIN,
+    SCALE_OFF,
     SCENE,
     SCENE_NOT_USED,
     SCENE_UNKNOWN,
@@ -51,6 +53,11 @@ from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
 
 # A side of the plate counts as measured below this standard deviation; 5 % of it exceeds the beam's spot.
 PLATE_KNOWN_M, PLATE_FAIL = 0.03, 0.05
+# Rings do not cross the ends of a side that is as upright as this.
+_UPRIGHT = 0.87
+# Shares of scans without one of two edges, and of ring ends off the outline. Of 15 sessions with the right
+# size one lacks edges, by its mounting, and drops none; one drops as many, at hands, and lacks none.
+_LACKING, _DROPPED = 0.3, 0.04
 # A contradiction of the scene by so many standard deviations fails; from three it is told.
 SCENE_FAILS = 5.0
 
@@ -307,14 +314,22 @@ def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) ->
 def plate_findings(scans: Iterable[LidarBoard | Refusal], board: Board) -> list[Finding]:
     """Compare the plate's size from the LiDAR with the profile; the uncertainty is mainly the beam's spot.
 
+    On a plate that is too large in the profile by more than the search for its edges reaches, one of two
+    opposite edges stays without ring ends, and those of the true edge are dropped.
+
     Args:
         scans: boards, and refusals: a plate refused for its size counts as measured.
         board: of the profile.
     """
     sizes: dict[str, list[tuple[float, float]]] = {"width": [], "height": []}
+    dropped, n_lacking = [], {"width": 0, "height": 0}
     for scan in scans:
         if isinstance(scan, LidarBoard):
             q = scan.quality
+            dropped.append(q.n_ring_ends_dropped / max(q.n_ring_ends + q.n_ring_ends_dropped, 1))
+            for k, (side, sigma_m) in enumerate((("width", q.width_sigma_m), ("height", q.height_sigma_m))):
+                is_crossed = abs(scan.T_lidar_board[2, k]) < _UPRIGHT
+                n_lacking[side] += int(is_crossed and sigma_m > PLATE_KNOWN_M)
             sizes["width"].append((q.width_m, q.width_sigma_m))
             sizes["height"].append((q.height_m, q.height_sigma_m))
         elif scan.code == LIDAR_OTHER_SIZE.code:
@@ -323,6 +338,10 @@ def plate_findings(scans: Iterable[LidarBoard | Refusal], board: Board) -> list[
     found = []
     for side, wanted_m in (("width", board.width_m), ("height", board.height_m)):
         known = [each for each in sizes[side] if each[1] < PLATE_KNOWN_M]
+        n, n_without = len(sizes[side]), n_lacking[side]
+        if n_without >= max(3, _LACKING * n) and np.median(dropped) > _DROPPED:
+            found.append(PLATE_EDGE(side=side, profile_m=wanted_m, n_lacking=n_without, n_captures=n))
+            continue
         if len(known) < 3:
             continue
         measured_m, sigma_m = (float(median) for median in np.median(known, axis=0))
@@ -338,3 +357,36 @@ def plate_findings(scans: Iterable[LidarBoard | Refusal], board: Board) -> list[
                 )
             )
     return found
+
+
+def distance_findings(in_camera: Array, in_lidar: Array, square_m: float) -> list[Finding]:
+    """Compare distances between boards, which are the same for both sensors with any extrinsics.
+
+    Coarse, and before any estimate: it names squares or a lens so wrong that captures are refused.
+
+    Args:
+        in_camera, in_lidar: (N, 3) centres of the boards of N captures, m.
+        square_m: of the profile.
+    """
+    first, second = np.triu_indices(len(in_camera), 1)
+    camera_m, lidar_m = (np.linalg.norm(c[first] - c[second], axis=1) for c in (in_camera, in_lidar))
+    is_far = (camera_m > _FAR_APART_M) & (lidar_m > _FAR_APART_M)
+    if np.count_nonzero(is_far) < 3:
+        return []
+    ratios = np.log(camera_m[is_far] / lidar_m[is_far])
+    ratio = float(np.median(ratios))
+    sigma = 1.4826 * float(np.median(np.abs(ratios - ratio))) / np.sqrt(len(in_camera))
+    if abs(ratio) < max(_COARSE_SCALE, 4 * sigma):
+        return []
+    scale = float(np.exp(ratio))
+    return [
+        SCALE_OFF(
+            scale=scale - 1,
+            scale_sigma=scale * sigma,
+            square_m=square_m / scale,
+            profile_square_m=square_m,
+        )
+    ]
+
+
+_FAR_APART_M, _COARSE_SCALE = 0.5, 0.03

@@ -8,7 +8,8 @@ def _commonest(finding: Finding) -> str:
     causes = finding.figures["causes"]
     assert isinstance(causes, tuple)
     lines = [f"{cause[0]} x {cause[2]}" for cause in causes if isinstance(cause, tuple)]
-    if finding.figures["n_detected"] or not lines:
+    # Where most captures are refused, their causes come first.
+    if 2 * finding.figure("n_detected") >= finding.figure("n_captures"):
         n_missing = int(finding.figure("n_needed") - finding.figure("n_detected"))
         more = f"add {n_missing} captures or more, with the board at other places and tilts"
         lines.append(str(finding.figures.get("where") or more))

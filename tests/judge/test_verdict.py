@@ -21,7 +21,7 @@ from lce_rig.judge.findings import (
     consequences,
 )
 from lce_rig.judge.validate import validate
-from lce_rig.judge.verdict import judge, plate_findings
+from lce_rig.judge.verdict import distance_findings, judge, plate_findings
 from lce_rig.lens.models import LensPrior
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, simulate
@@ -166,6 +166,36 @@ def test_a_plate_refused_for_its_size_counts_as_measured():
     assert (finding.code, finding.severity) == ("verdict.plate_size", "error")
     assert (finding.figures["n_captures"], finding.figures["measured_m"]) == (3, 0.9)
     assert plate_findings(refused[:2], BOARD) == []
+
+
+def test_a_plate_far_too_large_in_the_profile_has_an_edge_without_ring_ends(estimate):
+    def enlarged(seen, n_dropped):
+        sizes = {"width_m": BOARD.width_m, "width_sigma_m": 0.1}
+        sizes |= {"height_m": BOARD.height_m, "height_sigma_m": 0.01}
+        quality = replace(seen.lidar.quality, **sizes, n_ring_ends_dropped=n_dropped)
+        return replace(seen.lidar, quality=quality)
+
+    scans = [enlarged(seen, seen.lidar.quality.n_ring_ends) for seen in estimate.observations.values()]
+    (finding,) = plate_findings(scans, BOARD)
+    assert (finding.code, finding.figures["side"]) == ("verdict.plate_edge", "width")
+    # A mounting may show no ring ends on two edges either; then none are off the outline.
+    assert not plate_findings([enlarged(seen, 0) for seen in estimate.observations.values()], BOARD)
+
+
+@pytest.mark.parametrize(
+    ("factor", "codes"), [(1.01, []), (8 / 7, ["verdict.scale"]), (0.7, ["verdict.scale"])]
+)
+def test_wrong_squares_or_another_lens_are_named_before_any_estimate(factor, codes):
+    rng = np.random.default_rng(0)
+    boards = rng.uniform([-1, -1, 1], [1, 1, 5], (8, 3))
+    in_lidar = boards @ T_FORWARD[:3, :3] + rng.normal(0, 0.005, boards.shape)
+    findings = distance_findings(factor * boards, in_lidar, 0.07)
+    assert [finding.code for finding in findings] == codes
+    for finding in findings:
+        assert finding.figure("square_m") == pytest.approx(0.07 / factor, rel=0.01)
+    order = rng.permutation(8)
+    assert not distance_findings(boards, in_lidar[order], 0.07), "mixed up, distances say nothing"
+    assert not distance_findings(boards[:2], in_lidar[:2], 0.07)
 
 
 def test_the_worst_reason_comes_first(estimate, verdict_of):

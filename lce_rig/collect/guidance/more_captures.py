@@ -62,7 +62,7 @@ def plan_captures(
         guidance = planner.guide(wanted)
         sigmas = ratios * [guidance.sigma_rotation_deg, guidance.sigma_translation_m]
         is_met = guidance.is_enough if calibration is None else needed.in_targets(*sigmas) <= ENOUGH_SHARE
-        is_enough = is_met and len(wanted) >= max(rig.quality.min_captures, len(held) + _FEWEST)
+        is_enough = bool(is_met and len(wanted) >= max(rig.quality.min_captures, len(held) + _FEWEST))
     added = wanted[len(held) :]
     if not len(added):
         return []
