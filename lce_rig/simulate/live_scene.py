@@ -11,7 +11,7 @@ from lce_rig.rig import Rig
 from lce_rig.simulate.image_rendering import develop, focus, glance, render_radiance, shot_noise_e
 from lce_rig.simulate.lidar import Sweep, sweep_again, sweep_scene
 from lce_rig.simulate.options import SimulationOptions
-from lce_rig.simulate.placements import between, can_be_held, count_rings
+from lce_rig.simulate.placements import between
 from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, OF_SESSION, set_stage
@@ -69,8 +69,8 @@ class LiveScene:
         """Return whether a pose (4, 4) is free of obstacles, and enough rings of the LiDAR hit the board."""
         view = next(view for view in self.stage.views if view.camera == camera)
         stage = self.stage
-        is_free = can_be_held(view, stage.board, stage.room, T_world_board)
-        return is_free and count_rings(view, stage.board, T_world_board) >= stage.rig.quality.min_rings
+        is_free = view.can_be_held(stage.board, stage.room, T_world_board)
+        return is_free and view.count_rings(stage.board, T_world_board) >= stage.rig.quality.min_rings
 
     def take(self, stamp_ns: int) -> Iterator[Image | Scan]:
         """Take a scan of each LiDAR that begins at a time, and an image of each camera at its middle."""

@@ -40,6 +40,86 @@ class CameraView:
     model: LidarModel
     T_world_lidar: Array
 
+    def is_in_image(self, board: Board, T_world_board: Array) -> bool:
+        """Return whether the camera sees the whole pattern."""
+        pattern = board.corners()
+        middle = pattern.mean(axis=0)
+        # The outer squares reach one square beyond the inner corners.
+        reach = np.array(board.pattern_size_m) / 2
+        outer = middle + np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.append(reach, 0.0)
+        T_cam_board = invert(self.T_world_cam) @ T_world_board
+        pixels, is_valid = self.intrinsics.project(transform(T_cam_board, np.concatenate([pattern, outer])))
+        lens = self.intrinsics
+        offset = (pixels - [lens.cx_px, lens.cy_px]) / [lens.fx_px, lens.fy_px]
+        is_seen = is_valid & lens.is_inside(pixels, 0.01 * lens.width_px)
+        return bool(np.all(is_seen & (np.linalg.norm(offset, axis=-1) < 0.97 * lens_reach(lens))))
+
+    def can_be_held(self, board: Board, room: Room, T_world_board: Array) -> bool:
+        """Return whether a person can hold the board there, and the camera and the LiDAR see all of it."""
+        return self.is_in_image(board, T_world_board) and self.stands_free(board, room, T_world_board)
+
+    def stands_free(self, board: Board, room: Room, T_world_board: Array) -> bool:
+        """Return whether a person can hold the board there, with nothing before it."""
+        centre, normal = T_world_board[:3, 3], T_world_board[:3, 2]
+        if abs(normal[2]) > 0.7:
+            return False  # no person holds a board flat
+        to_lidar = self.T_world_lidar[:3, 3] - centre
+        if normal @ to_lidar < 0.45 * np.linalg.norm(to_lidar):
+            return False
+        outline = transform(T_world_board, board.outline())
+        behind = centre - 0.8 * normal
+        footing = np.array([[behind[0], behind[1], 0.6], [centre[0], centre[1], 0.6]])
+        if not room.is_free(np.concatenate([outline, footing])).all():
+            return False
+        eyes = [self.T_world_cam[:3, 3], self.T_world_lidar[:3, 3]]
+        return not any(room.raycaster.is_blocked(outline, eye).any() for eye in eyes)
+
+    def seen_share(self, board: Board, T_world_board: Array) -> float:
+        """Measure the fraction of the plate's height within the LiDAR's vertical field, 0..1."""
+        outline = transform(invert(self.T_world_lidar) @ T_world_board, board.outline())
+        elevation = np.arctan2(outline[:, 2], np.hypot(outline[:, 0], outline[:, 1]))
+        lasers = self.model.elevations_rad
+        margin_rad = np.ptp(lasers) / (len(lasers) - 1) / 2
+        top, bottom = elevation.max(), elevation.min()
+        seen = min(top, lasers.max() + margin_rad) - max(bottom, lasers.min() - margin_rad)
+        return float(np.clip(seen / (top - bottom), 0.0, 1.0))
+
+    def count_rings(self, board: Board, T_world_board: Array) -> int:
+        """Count the LiDAR's rings with at least a few returns from the board.
+
+        Without rings, a board that lies in the field of view, with a margin, counts as one with enough.
+        """
+        if self.model.pattern != "rings":
+            return _WANTED_RINGS if self._is_in_view(board, T_world_board) else 0
+        scene = Scene(Raycaster(()), (), board, T_world_board)
+        outline = transform(invert(self.T_world_lidar) @ T_world_board, board.outline())
+        azimuth = np.arctan2(outline[:, 1], outline[:, 0])
+        spread = np.angle(np.exp(1j * (azimuth - azimuth[0])))
+        n_steps = int(np.ceil(np.ptp(spread) / self.model.step_rad)) + 1
+        across = azimuth[0] + spread.min() + self.model.step_rad * np.arange(n_steps)
+        elevation, around = (
+            grid.ravel() for grid in np.meshgrid(self.model.elevations_rad, across, indexing="ij")
+        )
+        level = np.cos(elevation)
+        rays = np.stack([level * np.cos(around), level * np.sin(around), np.sin(elevation)], axis=1)
+        hits = scene.cast_board(self.T_world_lidar[:3, 3], rays @ self.T_world_lidar[:3, :3].T)
+        returns = (hits.surface >= 0).reshape(len(self.model.elevations_rad), -1).sum(axis=1)
+        return int(np.sum(returns >= _RETURNS_PER_RING))
+
+    def _is_in_view(self, board: Board, T_world_board: Array) -> bool:
+        """Return whether the plate lies within the pattern of a LiDAR without rings."""
+        outline = transform(invert(self.T_world_lidar) @ T_world_board, 1.1 * board.outline())
+        azimuth, elevation = (
+            np.arctan2(outline[:, 1], outline[:, 0]),
+            np.arctan2(outline[:, 2], outline[:, 0]),
+        )
+        low, high = self.model.elevations_rad.min(), self.model.elevations_rad.max()
+        if self.model.pattern == "rosette":
+            half = np.ptp(self.model.azimuths_rad) / 2, (high - low) / 2
+            return bool(np.all(np.hypot(azimuth / half[0], (elevation - (low + high) / 2) / half[1]) < 0.95))
+        elevation = np.arctan2(outline[:, 2], np.hypot(outline[:, 0], outline[:, 1]))
+        return bool(np.all((elevation > low) & (elevation < high)))
+
 
 def place_board(
     view: CameraView,
@@ -71,13 +151,13 @@ def place_board(
         wander = min(1.0, attempt / 60)
         where = np.mod(even + wander * rng.uniform(-0.5, 0.5, 3), 1.0)
         T_world_board = _candidate(view, options, where, rng)
-        if T_world_board is None or not _is_in_image(view, board, T_world_board):
+        if T_world_board is None or not view.is_in_image(board, T_world_board):
             continue
-        if seen_share(view, board, T_world_board) < _WANTED_SHARE:
+        if view.seen_share(board, T_world_board) < _WANTED_SHARE:
             continue
-        if not _stands_free(view, board, room, T_world_board):
+        if not view.stands_free(board, room, T_world_board):
             continue
-        n_rings = count_rings(view, board, T_world_board)
+        n_rings = view.count_rings(board, T_world_board)
         if n_rings >= _WANTED_RINGS:
             return T_world_board
         if n_rings > most_rings:
@@ -112,87 +192,6 @@ def _candidate(
     axis = np.array([np.cos(direction_rad), np.sin(direction_rad), 0.0])
     turns = exp_so3(np.stack([tilt_rad * axis, [0.0, 0.0, roll_rad]]))
     return pose(facing @ turns[0] @ turns[1], centre)
-
-
-def _is_in_image(view: CameraView, board: Board, T_world_board: Array) -> bool:
-    pattern = board.corners()
-    middle = pattern.mean(axis=0)
-    # The outer squares reach one square beyond the inner corners.
-    reach = np.array(board.pattern_size_m) / 2
-    outer = middle + np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.append(reach, 0.0)
-    T_cam_board = invert(view.T_world_cam) @ T_world_board
-    pixels, is_valid = view.intrinsics.project(transform(T_cam_board, np.concatenate([pattern, outer])))
-    lens = view.intrinsics
-    offset = (pixels - [lens.cx_px, lens.cy_px]) / [lens.fx_px, lens.fy_px]
-    is_seen = is_valid & lens.is_inside(pixels, 0.01 * lens.width_px)
-    return bool(np.all(is_seen & (np.linalg.norm(offset, axis=-1) < 0.97 * lens_reach(lens))))
-
-
-def can_be_held(view: CameraView, board: Board, room: Room, T_world_board: Array) -> bool:
-    """Return whether a person can hold the board there, and the camera and the LiDAR see all of it."""
-    return _is_in_image(view, board, T_world_board) and _stands_free(view, board, room, T_world_board)
-
-
-def _stands_free(view: CameraView, board: Board, room: Room, T_world_board: Array) -> bool:
-    centre, normal = T_world_board[:3, 3], T_world_board[:3, 2]
-    if abs(normal[2]) > 0.7:
-        return False  # no person holds a board flat
-    to_lidar = view.T_world_lidar[:3, 3] - centre
-    if normal @ to_lidar < 0.45 * np.linalg.norm(to_lidar):
-        return False
-    outline = transform(T_world_board, board.outline())
-    behind = centre - 0.8 * normal
-    footing = np.array([[behind[0], behind[1], 0.6], [centre[0], centre[1], 0.6]])
-    if not room.is_free(np.concatenate([outline, footing])).all():
-        return False
-    eyes = [view.T_world_cam[:3, 3], view.T_world_lidar[:3, 3]]
-    return not any(room.raycaster.is_blocked(outline, eye).any() for eye in eyes)
-
-
-def seen_share(view: CameraView, board: Board, T_world_board: Array) -> float:
-    """Measure the fraction of the plate's height within the LiDAR's vertical field, 0..1."""
-    outline = transform(invert(view.T_world_lidar) @ T_world_board, board.outline())
-    elevation = np.arctan2(outline[:, 2], np.hypot(outline[:, 0], outline[:, 1]))
-    lasers = view.model.elevations_rad
-    margin_rad = np.ptp(lasers) / (len(lasers) - 1) / 2
-    top, bottom = elevation.max(), elevation.min()
-    seen = min(top, lasers.max() + margin_rad) - max(bottom, lasers.min() - margin_rad)
-    return float(np.clip(seen / (top - bottom), 0.0, 1.0))
-
-
-def count_rings(view: CameraView, board: Board, T_world_board: Array) -> int:
-    """Count the LiDAR's rings with at least a few returns from the board.
-
-    Without rings, a board that lies in the field of view, with a margin, counts as one with enough of them.
-    """
-    if view.model.pattern != "rings":
-        return _WANTED_RINGS if _is_in_view(view, board, T_world_board) else 0
-    scene = Scene(Raycaster(()), (), board, T_world_board)
-    outline = transform(invert(view.T_world_lidar) @ T_world_board, board.outline())
-    azimuth = np.arctan2(outline[:, 1], outline[:, 0])
-    spread = np.angle(np.exp(1j * (azimuth - azimuth[0])))
-    n_steps = int(np.ceil(np.ptp(spread) / view.model.step_rad)) + 1
-    across = azimuth[0] + spread.min() + view.model.step_rad * np.arange(n_steps)
-    elevation, around = (
-        grid.ravel() for grid in np.meshgrid(view.model.elevations_rad, across, indexing="ij")
-    )
-    level = np.cos(elevation)
-    rays = np.stack([level * np.cos(around), level * np.sin(around), np.sin(elevation)], axis=1)
-    hits = scene.cast_board(view.T_world_lidar[:3, 3], rays @ view.T_world_lidar[:3, :3].T)
-    returns = (hits.surface >= 0).reshape(len(view.model.elevations_rad), -1).sum(axis=1)
-    return int(np.sum(returns >= _RETURNS_PER_RING))
-
-
-def _is_in_view(view: CameraView, board: Board, T_world_board: Array) -> bool:
-    """Return whether the plate lies within the pattern of a LiDAR without rings."""
-    outline = transform(invert(view.T_world_lidar) @ T_world_board, 1.1 * board.outline())
-    azimuth, elevation = np.arctan2(outline[:, 1], outline[:, 0]), np.arctan2(outline[:, 2], outline[:, 0])
-    low, high = view.model.elevations_rad.min(), view.model.elevations_rad.max()
-    if view.model.pattern == "rosette":
-        half = np.ptp(view.model.azimuths_rad) / 2, (high - low) / 2
-        return bool(np.all(np.hypot(azimuth / half[0], (elevation - (low + high) / 2) / half[1]) < 0.95))
-    elevation = np.arctan2(outline[:, 2], np.hypot(outline[:, 0], outline[:, 1]))
-    return bool(np.all((elevation > low) & (elevation < high)))
 
 
 _N_SWAYS = 4

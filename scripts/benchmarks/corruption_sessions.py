@@ -19,7 +19,6 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures, truth_extrinsics
-from lce_rig.simulate.placements import can_be_held, count_rings, seen_share
 from lce_rig.simulate.sampling import capture_at
 from lce_rig.simulate.stage import PLACEMENT, Stage, set_stage
 
@@ -191,10 +190,10 @@ def nearly_parallel(stage: Stage, rng: np.random.Generator) -> Iterator[Array]:
     n_found = 0
     for _ in range(_N_PLACES):
         T_world_board = _facing(stage, lean, spread_deg, rng)
-        if not can_be_held(view, stage.board, stage.room, T_world_board):
+        if not view.can_be_held(stage.board, stage.room, T_world_board):
             continue
-        is_seen = seen_share(view, stage.board, T_world_board) > 0.8
-        if is_seen and count_rings(view, stage.board, T_world_board) >= 5:
+        is_seen = view.seen_share(stage.board, T_world_board) > 0.8
+        if is_seen and view.count_rings(stage.board, T_world_board) >= 5:
             yield T_world_board
             n_found += 1
             if n_found == N_PARALLEL:
