@@ -38,9 +38,6 @@ from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import Observation
 
 _N_SHARES = 7
-# A scale of the camera's distances so many prior deviations from that of the profile contradicts it, and is
-# then estimated with this deviation.
-_SCALE_SIGMAS, _FREE_SCALE = 3.0, 0.02
 
 
 def estimate_extrinsics(
@@ -174,10 +171,6 @@ def estimate_observations(
         return by_scatter(start, board, settings)
     priors, usual = what_is_known(settings)
     joint = maximise_likelihood([start.observations], board, [start.T_cam_lidar], priors, usual)
-    if abs(float(joint.state.scale[0])) > _SCALE_SIGMAS * np.max(priors.scale):
-        # Squares that LiDAR and profile disagree on are as large as the LiDAR says.
-        priors = replace(priors, scale=_FREE_SCALE)
-        joint = maximise_likelihood([start.observations], board, [joint.T_cam_lidar[0]], priors, usual)
     return by_likelihood(start, joint, board, settings)
 
 

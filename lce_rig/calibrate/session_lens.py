@@ -70,31 +70,36 @@ class SessionLens:
         """Fit the poses of observations anew with this lens and board."""
         boards = [observation.image for observation in observations]
         corners_px = np.array([board.corners_px for board in boards])
-        others = [board.T_cam_board_alternative for board in boards]
-        first = fit_poses(self.estimate, corners_px, np.array([board.T_cam_board for board in boards]))
-        starts = [b.T_cam_board if other is None else other for b, other in zip(boards, others, strict=True)]
-        second = fit_poses(self.estimate, corners_px, np.array(starts))
-        n_seen = np.isfinite(corners_px[..., 0]).sum(axis=1).tolist()
-        refitted = []
-        for k, (observation, other, n) in enumerate(zip(observations, others, n_seen, strict=True)):
-            (T, cost, H), (T_other, cost_other, H_other) = (
-                [part[k] for part in fit] for fit in (first, second)
+        F, n = len(boards), np.isfinite(corners_px[..., 0]).sum(axis=1)
+        has_other = np.array([board.T_cam_board_alternative is not None for board in boards])
+        starts = [board.T_cam_board for board in boards]
+        for board in boards:
+            other = board.T_cam_board_alternative
+            starts.append(board.T_cam_board if other is None else other)
+        fitted = fit_poses(self.estimate, np.concatenate([corners_px, corners_px]), np.array(starts))
+        # Of both minima of each board, the lower one first.
+        order = np.argsort(fitted[1].reshape(2, F), axis=0, kind="stable")
+        (T, T_other), (cost, cost_other), (H, _) = (
+            values.reshape(2, F, *values.shape[1:])[order, np.arange(F)] for values in fitted
+        )
+        variance = np.maximum(cost / np.maximum(2 * n - 6, 1), 1e-12)
+        gap = np.where(has_other, (cost_other - cost) / variance, np.inf)
+        cov = variance[:, None, None] * np.linalg.inv(H)
+        return [
+            replace(
+                observation,
+                image=replace(
+                    _moved(observation.image, T[k]),
+                    cov=cov[k],
+                    T_cam_board_alternative=T_other[k] if has_other[k] else None,
+                    chi2_gap=float(gap[k]),
+                    is_ambiguous=bool(gap[k] < _AMBIGUOUS_CHI2),
+                    reprojection_px=float(np.sqrt(cost[k] / n[k])),
+                    sigma_px=float(np.sqrt(variance[k])),
+                ),
             )
-            if other is not None and cost_other < cost:
-                (T, cost, H), (T_other, cost_other) = (T_other, cost_other, H_other), (T, cost)
-            variance = max(float(cost) / max(2 * n - 6, 1), 1e-12)
-            gap = np.inf if other is None else (float(cost_other) - float(cost)) / variance
-            image = replace(
-                _moved(observation.image, T),
-                cov=variance * np.linalg.inv(H),
-                T_cam_board_alternative=None if other is None else T_other,
-                chi2_gap=gap,
-                is_ambiguous=gap < _AMBIGUOUS_CHI2,
-                reprojection_px=float(np.sqrt(cost / n)),
-                sigma_px=float(np.sqrt(variance)),
-            )
-            refitted.append(replace(observation, image=image))
-        return refitted
+            for k, observation in enumerate(observations)
+        ]
 
 
 def fit_session_lens(

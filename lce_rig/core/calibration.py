@@ -382,6 +382,7 @@ class Calibration:
         intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
         intrinsics_cross_cov: (6, P) of `T_cam_lidar` with these.
         square_m: the side of a square by the profile and the LiDAR.
+        board_shape: (15,) its deviation from the nominal one, `lens.fit.board_shapes`; None if unknown.
         scene_share: the change of the extrinsics by the scene; None without `--use-scene`.
         scene: the opinion of the scene's edges; None if they were not compared.
         board_distances_m: 10 % and 90 % of the boards' distances from the camera; empty if unknown.
@@ -426,6 +427,7 @@ class Calibration:
     intrinsics_cov: Values | None = None
     intrinsics_cross_cov: Values | None = None
     square_m: Size | None = None
+    board_shape: Values | None = None
     scene_share: SceneShare | None = None
     scene: (
         Annotated[

@@ -22,6 +22,7 @@ from lce_rig.detect.detection import Detections, ImageDetection, Pair
 from lce_rig.detect.image.search import board_from_pose
 from lce_rig.judge.findings import ELSEWHERE, UNSEEN
 from lce_rig.judge.verdict import residuals_beyond, scene_findings
+from lce_rig.lens.fit import board_shapes
 from lce_rig.rig import Rig
 
 # Boards displaced by slightly wrong extrinsics are measured; farther surfaces are other objects.
@@ -236,7 +237,7 @@ def check_session(
 
 
 def seen_by_own_lens(rig: Rig, detections: Detections, calibration: Calibration) -> Detections:
-    """Solve the boards' poses in images of a result's camera again, with the result's lens and squares.
+    """Solve the boards' poses in images of a result's camera again, with the result's lens and board.
 
     Poses of moving boards, which come with those of further images, are kept.
     """
@@ -245,6 +246,8 @@ def seen_by_own_lens(rig: Rig, detections: Detections, calibration: Calibration)
         return detections
     board = rig.board.to_board()
     corners = replace(board, square_m=calibration.square_m or board.square_m).corners()
+    if calibration.board_shape is not None:
+        corners = corners + np.tensordot(calibration.board_shape, board_shapes(board)[0], axes=1)
 
     def again(image: ImageDetection) -> ImageDetection:
         if not isinstance(image, ImageBoard) or image.track_ns is not None:

@@ -37,8 +37,8 @@ _PRIOR_DOF = 30.0
 # corners fit to 0.01 px differ as if all had at least this error.
 _SHARED_PX = 0.02
 # A profile's intrinsics that the boards contradict by more (squared, in standard deviations) are trusted
-# less: their covariance is widened to the mean of chi-squared with four degrees of freedom.
-_CONTRADICTION, _EXPECTED = 16.0, 4.0
+# less: 98 % of chi-squared with nine degrees of freedom.
+_CONTRADICTION = 20.0
 # Rounds of comparing the scatter of captures with the stated deviations.
 _SCATTER_ROUNDS = 3
 # Corners with residuals this many times the typical value of their channel are outliers.
@@ -229,9 +229,10 @@ def _weigh_scatter(
     for _ in range(_SCATTER_ROUNDS):
         ratio = _scatter_ratio(setup, state, weights, captures)
         inflation, weights = inflation * ratio, weights / ratio
-        if has_prior:
-            surprise = setup.surprise(state.lens)
-            setup = setup.with_wider_lens(surprise / _EXPECTED) if surprise > _CONTRADICTION else setup
+        is_contradicted = has_prior and setup.surprise(state.lens) > _CONTRADICTION
+        setup = setup.doubting(state.lens) if is_contradicted else setup
+        if ratio == 1.0 and not is_contradicted:
+            break
         state = fit(setup, state, weights)
     _, information = reduced(setup, state, weights)
     cov = solve_scaled(information.sum(axis=0) + setup.information, np.eye(len(setup.mean)))

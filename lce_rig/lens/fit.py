@@ -114,10 +114,15 @@ class Setup:
         off = lens - self.mean[: len(lens)]
         return float(off @ self.information[: len(lens), : len(lens)] @ off)
 
-    def with_wider_lens(self, factor: float) -> "Setup":
-        """Multiply the prior covariance of the lens."""
-        information, P = self.information.copy(), self.model.size
-        information[:P, :P] /= factor
+    def doubting(self, lens: Array) -> "Setup":
+        """Widen the prior of focal lengths, principal point and distortion, each alone, to what was fitted.
+
+        One that the fitted lens (P,) is far from becomes one standard deviation per parameter.
+        """
+        information, off = self.information.copy(), lens - self.mean[: len(lens)]
+        for part in (slice(0, 2), slice(2, 4), slice(4, len(lens))):
+            surprise = float(off[part] @ information[part, part] @ off[part])
+            information[part, part] *= min(1.0, len(off[part]) / max(surprise, 1e-12))
         return replace(self, information=information)
 
 

@@ -404,6 +404,7 @@ def _judged(
         intrinsics_cov=None if estimate.lens is None else estimate.lens.estimate.cov,
         intrinsics_cross_cov=None if lens is None else estimate.cov_with_lens,
         square_m=None if lens is None else square_m,
+        board_shape=None if estimate.lens is None else estimate.lens.estimate.shape,
         estimated_with=estimate.estimated_with,
         other_cameras=tuple(
             _other_camera(solved, k, next(i for i in link.members if i != k), link.pair)

@@ -72,21 +72,30 @@ def with_profile_errors(
 def _draw_lens(known: Tolerances, rng: np.random.Generator) -> Intrinsics:
     prior = known.lens
     lens = prior.lens
-    focal, cx_px, cy_px, corner_px = rng.standard_normal(4) * [
+    focal, cx_px, cy_px, radial_px, first_px, second_px = rng.standard_normal(6) * [
         prior.focal_length,
         prior.principal_point_px,
         prior.principal_point_px,
         prior.distortion_px,
+        prior.decentring_px,
+        prior.decentring_px,
     ]
     radius = np.hypot(lens.width_px, lens.height_px) / 2 / lens.fx_px
-    k1, *others = lens.distortion or (0.0,) * 4
+    k1, k2, p1, p2, *others = lens.distortion or (0.0,) * 4
+    decentring_px = 3 * lens.fx_px * radius**2
     return replace(
         lens,
         fx_px=lens.fx_px * (1 + focal),
         fy_px=lens.fy_px * (1 + focal),
         cx_px=lens.cx_px + cx_px,
         cy_px=lens.cy_px + cy_px,
-        distortion=(k1 + corner_px / (lens.fx_px * radius**3), *others),
+        distortion=(
+            k1 + radial_px / (lens.fx_px * radius**3),
+            k2,
+            p1 + first_px / decentring_px,
+            p2 + second_px / decentring_px,
+            *others,
+        ),
     )
 
 

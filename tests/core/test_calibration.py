@@ -38,6 +38,7 @@ FIELDS = [
     *("reprojection_px", "certificate", "egt_rotation_deg", "egt_translation_m", "verdict", "reasons"),
     *("findings", "diagnostics", "channels", "method", "uncertainty", "estimated_with", "other_cameras"),
     *("cov_shared", "contributions", "intrinsics", "intrinsics_cov", "intrinsics_cross_cov", "square_m"),
+    "board_shape",
     *("scene_share", "scene", "board_distances_m"),
 ]
 REQUIRED = [

@@ -103,7 +103,7 @@ def maximise_likelihood(
         cameras: observations of each.
         board: the board.
         T_cam_lidar: (4, 4) of each, accurate to some degrees and centimetres.
-        priors: of the constant errors.
+        priors: of the constant errors; a scale that contradicts its own is freed.
         usual: typical noise levels.
         levels: of the noise, if known; else estimated.
         pose_ratios: for each camera, ratio of its images' errors beyond corner noise to `levels`; 1 if None.
@@ -124,8 +124,11 @@ def maximise_likelihood(
     terms = linearise(scans, images, board, state, _once(placement, images))
     for blur_rad in _BLURS_RAD:
         terms = search.settle(terms, now.blurred(blur_rad), _STEPS, _NEAR)
-    for n_rounds in _LEVEL_ROUNDS if levels is None else ():
+    for k, n_rounds in enumerate(_LEVEL_ROUNDS if levels is None else ()):
         terms = search.settle(terms, now, _STEPS, _NEAR)
+        if k == len(_LEVEL_ROUNDS) - 1:
+            priors = priors.freed(terms.state.scale)
+            search = replace(search, priors=priors)
         now = fit_levels(terms, now, usual, priors, n_rounds)
         terms = replace(terms, trust=trust_captures(terms, now, priors, placement))
     terms = search.settle(terms, now, _LAST_STEPS, _SETTLED)

@@ -76,6 +76,8 @@ LOG_SIGMA: Mapping[str, float] = {
     "laser_m": 0.3,
 }
 """Prior standard deviation of the logarithm of each level; the profile gives the lasers' spread."""
+# A scale of the camera's distances so many prior deviations from the profile's is estimated with this one.
+_SCALE_SIGMAS, _FREE_SCALE = 3.0, 0.02
 # Most ring ends must be at the board's edge, or the board could not be located.
 MOST_LOST = 0.6
 
@@ -125,6 +127,17 @@ class Priors:
             "bow": np.array([self.bow_m, self.bow_m]),
             "shifts": np.array([*of_width, self.displacement_m, self.displacement_m]),
         }
+
+    def freed(self, scale: Array) -> "Priors":
+        """Free the scales of cameras (C,) whose estimate contradicts the profile.
+
+        Squares that LiDAR and profile disagree on are as large as the LiDAR says.
+        """
+        sigma = np.broadcast_to(self.scale, scale.shape)
+        is_wrong = np.abs(scale) > _SCALE_SIGMAS * sigma
+        if not is_wrong.any():
+            return self
+        return replace(self, scale=tuple(np.where(is_wrong, np.maximum(sigma, _FREE_SCALE), sigma).tolist()))
 
 
 # Offsets of lasers without any in the profile.
