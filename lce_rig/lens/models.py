@@ -137,7 +137,7 @@ def convert(intrinsics: Intrinsics, model: LensModel) -> Array:
 
 # Where a profile states no standard deviation of its intrinsics, in focal lengths; the last is of a pixel in
 # the image's corner. Chosen on some rigs' recordings, they repeat best on the other rigs', too.
-_FOCAL, _PRINCIPAL_POINT, _DISTORTION = 2e-3, 4e-3, 2.5e-3
+_FOCAL, _PRINCIPAL_POINT, _DISTORTION = 2.5e-3, 4e-3, 2.5e-3
 # Of the ratio of both focal lengths.
 _ASPECT = 5e-4
 # The mean square over the image of a displacement that grows with the third power, by that in the corner.

@@ -76,7 +76,7 @@ def test_extrinsics_move_with_the_lens_as_its_directions_say(captures, method):
     lens = estimate.lens
     (by_lens,) = (each for each in estimate.sensitivities if each.source == "intrinsics")
     k = int(np.argmax(np.linalg.norm(by_lens.moves, axis=1)))
-    poses = lens.moves(np.array([o.image.T_cam_board for o in estimate.observations.values()]))[k]
+    poses = lens.moves(list(estimate.observations.values()))[k]
     moved = [
         replace(o, image=replace(o.image, T_cam_board=perturb(o.image.T_cam_board, move)))
         for o, move in zip(estimate.observations.values(), poses, strict=True)
