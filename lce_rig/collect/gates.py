@@ -30,8 +30,14 @@ from lce_rig.rig import Rig
 from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_time import rig_time_ns
 
-# For how long a board has to stand still; samples farther apart than this are single shots.
-_WINDOW_S, _SINGLE_S = 0.5, 1.0
+# For how long a board has to stand still at least, and for how many scans.
+_WINDOW_S, _WINDOW_SCANS = 0.5, 2.5
+
+
+def stillness_window_s(rig: Rig) -> float:
+    """Return for how long a board has to stand still: LiDARs without rings accumulate scans meanwhile."""
+    slowest_hz = min((lidar.rate_hz for lidar in rig.lidars.values() if not lidar.has_rings), default=np.inf)
+    return max(_WINDOW_S, _WINDOW_SCANS / slowest_hz)
 
 
 class StillnessGate:
@@ -44,8 +50,9 @@ class StillnessGate:
         board: the profile's.
         max_motion_m: how far it may move in a window; a hand never holds it quite still.
         dwell_s: after this long a capture is taken without waiting for the board to be moved on.
-        takes_singles: whether a detection with none in the second before and after it is a moment, as of a
+        takes_singles: whether a detection with none in two windows before and after it is a moment, as of a
             recording that was triggered once for each placement; nothing tells whether its board stood still.
+        window_s: of stillness.
 
     Attributes:
         motion_m: how far the board moved in the last window; infinite where there is no whole one.
@@ -53,9 +60,15 @@ class StillnessGate:
     """
 
     def __init__(
-        self, board: Board, max_motion_m: float, dwell_s: float = 2.0, *, takes_singles: bool = False
+        self,
+        board: Board,
+        max_motion_m: float,
+        dwell_s: float = 2.0,
+        *,
+        takes_singles: bool = False,
+        window_s: float = _WINDOW_S,
     ) -> None:
-        self._takes_singles = takes_singles
+        self._takes_singles, self._window_ns = takes_singles, window_s * 1e9
         self._last_ns: int | None = None
         self._single: BoardDetection | None = None
         self.motion_m = np.inf
@@ -70,7 +83,7 @@ class StillnessGate:
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
         """Take the next detection, and give the moment of a stretch that has ended with it."""
         now_ns = detection.frame.time_ns
-        is_apart = self._last_ns is None or now_ns - self._last_ns > _SINGLE_S * 1e9
+        is_apart = self._last_ns is None or now_ns - self._last_ns > 2 * self._window_ns
         alone = self._take_single() if is_apart else []
         self._single = detection if self._takes_singles and is_apart and detection.is_usable else None
         self._last_ns = now_ns
@@ -102,7 +115,7 @@ class StillnessGate:
     def _measure(self, detection: BoardDetection) -> float:
         """Put a detection into the window and measure how far the board moved in it."""
         window = self._window
-        now_ns, window_ns = detection.frame.time_ns, _WINDOW_S * 1e9
+        now_ns, window_ns = detection.frame.time_ns, self._window_ns
         # Start again after a gap, or where the clock was set back.
         if not detection.is_usable or (window and not 0 < now_ns - window[-1].frame.time_ns < window_ns):
             window.clear()

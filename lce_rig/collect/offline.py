@@ -8,7 +8,7 @@ from lce_rig.collect.board_search import sight_ahead
 from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.findings import CALIBRATE_SAME_PLACEMENT
-from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments
+from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments, stillness_window_s
 from lce_rig.collect.placement_dedupe import Placements, capture_poses, pose_figures
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
@@ -223,7 +223,7 @@ class _Collector:
             are_still = not has_events and max_motion_m <= _GLANCED_M
             detections = sight_ahead(tracker, frames, is_still_wanted=are_still)
         gate: StillnessGate | MotionGate = StillnessGate(
-            rig.board.to_board(), max_motion_m, takes_singles=True
+            rig.board.to_board(), max_motion_m, takes_singles=True, window_s=stillness_window_s(rig)
         )
         if has_events:
             gate = MotionGate(rig, Placements(options.min_move_m, options.min_turn_deg), losses)

@@ -3,6 +3,7 @@
 import re
 import time
 from contextlib import ExitStack
+from importlib import import_module
 from typing import Any
 
 from lce_rig.core.data import LiveSample
@@ -70,7 +71,6 @@ class Ros2Source(LiveSource):
             raise SourceError(what, hint) from None
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import qos_profile_sensor_data
-        from sensor_msgs import msg
 
         with ExitStack() as stack:
             context = rclpy.Context()
@@ -85,7 +85,8 @@ class Ros2Source(LiveSource):
             self._executor.add_node(node)
             stack.callback(self._executor.shutdown)
             self._msgtype = self._find_type(node)
-            kind = getattr(msg, self._msgtype.partition("/")[2])
+            package, _, name = self._msgtype.partition("/")
+            kind = getattr(import_module(f"{package}.msg"), name)
             node.create_subscription(kind, self._topic, self._receive, qos_profile_sensor_data, raw=True)
             self._waiting.clear()
             self._stack = stack.pop_all()

@@ -137,6 +137,7 @@ class LidarSettings(Settings):
         serial: serial number of this very unit, if the device does not tell it.
         frame: frame of its points, x forward, y left, z up.
         topic: topic of its point clouds in bags.
+        rate_hz: of its scans. Without rings, scans that come faster are accumulated to this rate.
         min_range_m: nearer returns are ignored.
         max_range_m: farther returns are ignored.
         elevations_deg: of the rings, lowest first, where they differ from the model's.
@@ -182,6 +183,7 @@ class LidarSettings(Settings):
             "beam_divergence_rad": sheet.divergence_rad[0],
             "laser_bias_sigma_m": sheet.laser_bias_sigma_m,
             "range_offset_sigma_m": sheet.range_offset_sigma_m,
+            "rate_hz": 10.0 if sheet.has_rings else 1.0,
         } | values
 
     def data_sheet(self) -> DataSheet | None:

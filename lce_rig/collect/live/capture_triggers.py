@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
-from lce_rig.collect.gates import BEST_SPEED_MPS, MotionGate, StillnessGate
+from lce_rig.collect.gates import BEST_SPEED_MPS, MotionGate, StillnessGate, stillness_window_s
 from lce_rig.collect.guidance.instructions import say
 from lce_rig.collect.live.guide import Guide
 from lce_rig.collect.live.state import Phase
@@ -84,7 +84,8 @@ class StillBoards:
         self._hold_s = hold_s
         self._max_motion_m = rig.quality.max_motion_m
         # The first window of stillness has passed when the hold begins.
-        self._gate = StillnessGate(rig.board.to_board(), self._max_motion_m, hold_s)
+        window_s = stillness_window_s(rig)
+        self._gate = StillnessGate(rig.board.to_board(), self._max_motion_m, hold_s, window_s=window_s)
         self._is_judged = self._is_decided = False
         self._refusal: Refusal | None = None
 

@@ -206,6 +206,13 @@ def to_scan(
             f"{settings.max_range_m:g} m: points in millimetres must be converted to metres"
         )
     notes: list[str] = []
+    if not settings.has_rings and "tag" in fields:
+        is_noise = _is_noise(cloud[fields["tag"]], settings)
+        n_noise = int(np.count_nonzero(is_kept & is_noise))
+        if n_noise:
+            notes.append("returns whose tag says noise, rain or bleeding are dropped")
+        is_kept &= ~is_noise
+        n_dropped = int(np.count_nonzero(~is_kept))
     if n_dropped:
         points, cloud = points[is_kept], cloud[is_kept]
     if settings.has_rings:
@@ -224,6 +231,21 @@ def to_scan(
         intensity = np.nan_to_num(cloud[name].astype(np.float32), posinf=0.0, neginf=0.0)
     scan = Scan(lidar, stamp_ns, points, intensity, ring, offset_ns, host_ns)
     return CloudReading(scan, n_dropped, tuple(notes))
+
+
+def _is_noise(tag: NDArray[Any], settings: LidarSettings) -> NDArray[np.bool_]:
+    """Return which Livox tags (N,) mark a return as noise with high or moderate confidence.
+
+    Bits 0-1 judge by place, 2-3 by intensity (rain, fog, dust). Bits 4-5 number the return, from the Mid-360
+    and the HAP on they mark returns between near objects: those that bleed over an edge.
+
+    References:
+        Livox Wiki, point cloud characteristics: tag information.
+    """
+    bits = tag.astype(np.uint8)
+    groups = (0, 2, 4) if getattr(settings.data_sheet(), "name", "") in ("Mid-360", "HAP") else (0, 2)
+    levels = np.stack([(bits >> shift) & 3 for shift in groups])
+    return np.asarray(((levels == 1) | (levels == 2)).any(axis=0))
 
 
 def _is_scalar(field: np.dtype[Any]) -> bool:

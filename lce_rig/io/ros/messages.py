@@ -6,6 +6,7 @@ References:
     https://github.com/uzh-rpg/rpg_dvs_ros/tree/master/dvs_msgs/msg
     https://github.com/prophesee-ai/prophesee_ros_wrapper (the same fields)
     https://github.com/ros-event-camera/event_camera_msgs
+    https://github.com/Livox-SDK/livox_ros_driver2/tree/master/msg (CustomMsg; the older driver's is equal)
 """
 
 import struct
@@ -26,7 +27,18 @@ _PACKET = (
     "std_msgs/Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\n"
     "string encoding\nbool is_bigendian\nuint8[] events\n"
 )
+_LIVOX = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+    "{package}/CustomPoint[] points\n"
+)
+_LIVOX_POINT = (
+    "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+)
+_LIVOX_PACKAGES = ("livox_ros_driver", "livox_ros_driver2")
+LIVOX_TYPES = frozenset(f"{package}/CustomMsg" for package in _LIVOX_PACKAGES)
 _DEFINITIONS = {
+    **{f"{package}/msg/CustomPoint": _LIVOX_POINT for package in _LIVOX_PACKAGES},
+    **{f"{package}/msg/CustomMsg": _LIVOX.format(package=package) for package in _LIVOX_PACKAGES},
     "tf2_msgs/msg/TFMessage": _TRANSFORMS,
     "tf/msg/tfMessage": _TRANSFORMS,
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
@@ -184,6 +196,17 @@ def decode_pointcloud2(message: Any) -> NDArray[Any]:
         raise ValueError(f"it holds {len(data)} of {n_needed} bytes of points")
     rows: NDArray[Any] = np.ndarray((height, width), dtype, data.data, 0, (row_step, step))
     return rows.reshape(-1)
+
+
+_LIVOX_DTYPE = np.dtype(
+    [("offset_time", "i8"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1")]
+)
+
+
+def decode_livox(message: Any) -> NDArray[Any]:
+    """View the points of a CustomMsg of either Livox driver as a structured array (N,)."""
+    points = [(p.offset_time, p.x, p.y, p.z, p.reflectivity, p.tag) for p in message.points]
+    return np.array(points, dtype=_LIVOX_DTYPE)
 
 
 class EventHead(NamedTuple):

@@ -19,6 +19,8 @@ from lce_rig.io.protocol import SourceOptions, Span
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import BagEvents
 from lce_rig.io.ros.messages import (
+    LIVOX_TYPES,
+    decode_livox,
     decode_pointcloud2,
     decode_ros_image,
     deserialize,
@@ -30,6 +32,8 @@ from lce_rig.rig import CameraSettings, LidarSettings, Rig
 
 # A timestamp this much earlier than the one before is a clock that was set, not a message that came late.
 CLOCK_JUMP_NS = 1_000_000_000
+# Scans come by this share of the period too early, at most.
+_EARLY = 0.05
 # Drivers start within this many messages of each other; the span of a later one is not known beforehand.
 _N_PROBED = 500
 
@@ -56,6 +60,7 @@ class TopicDecoder:
         self._target, self._settings = target, settings
         self._last_ns: int | None = None
         self._packets: Vlp16Stream | None = None
+        self._parts: list[Scan] = []
 
     def decode(self, message: RawMessage) -> list[Image | Scan]:
         """Decode one message; empty, and counted, where it is damaged, sent twice or late."""
@@ -67,7 +72,7 @@ class TopicDecoder:
             if stamp_ns == 0:
                 self.notes.add("headers have no timestamps; the time of receipt is used")
                 stamp_ns = message.log_ns
-            return self._in_order([self._to_sample(message, content, stamp_ns)])
+            return self._accumulate(self._in_order([self._to_sample(message, content, stamp_ns)]))
         except (SourceError, ValueError) as error:
             cause = error.what if isinstance(error, SourceError) else str(error)
             self.hint = error.hint if isinstance(error, SourceError) else ""
@@ -75,7 +80,9 @@ class TopicDecoder:
             return []
 
     def finish(self) -> list[Image | Scan]:
-        """Return the last scan where a revolution of packets ends with the recording."""
+        """Return the last scan where a revolution, or what accumulates, ends with the recording."""
+        if self._parts:
+            return [self._join()]
         last = self._packets.finish() if self._packets else None
         return [] if last is None else self._in_order([last])
 
@@ -110,11 +117,50 @@ class TopicDecoder:
                     "messages have no exposure time; timestamps of its start are used as its middle"
                 )
             return Image(sensor, channel, stamp_ns, decode_ros_image(content), message.log_ns)
-        cloud = decode_pointcloud2(content)
+        cloud = (decode_livox if message.msgtype in LIVOX_TYPES else decode_pointcloud2)(content)
         reading = to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns)
         self.notes.update(reading.notes)
         self.losses.add(findings.POINTS_WITHOUT_RETURN(), reading.n_without_return)
         return reading.scan
+
+    def _accumulate(self, samples: list[Image | Scan]) -> list[Image | Scan]:
+        """Join scans without rings, which are sparse, to scans of the profile's rate; pass others on."""
+        ready: list[Image | Scan] = []
+        for sample in samples:
+            if not isinstance(self._settings, LidarSettings) or self._settings.has_rings:
+                ready.append(sample)
+                continue
+            assert isinstance(sample, Scan)  # as a LiDAR has no images
+            period_ns = 1e9 / self._settings.rate_hz
+            first_ns = self._parts[0].stamp_ns if self._parts else None
+            if first_ns is not None and (sample.stamp_ns or 0) - first_ns >= (1 - _EARLY) * period_ns:
+                ready.append(self._join())
+            self._parts.append(sample)
+        return ready
+
+    def _join(self) -> Scan:
+        """Put the scans that have accumulated together."""
+        parts, self._parts = self._parts, []
+        first_ns = parts[0].stamp_ns or 0
+        if len(parts) == 1:
+            return parts[0]
+        self.notes.add(f"scans are accumulated to {getattr(self._settings, 'rate_hz', 0):g} per second")
+        since_ns = [(part.stamp_ns or 0) - first_ns for part in parts]
+        offsets = [part.offset_ns for part in parts]
+        return Scan(
+            parts[0].sensor,
+            parts[0].stamp_ns,
+            np.concatenate([part.points for part in parts]),
+            np.concatenate([part.intensity for part in parts]),
+            np.concatenate([part.ring for part in parts]),
+            np.concatenate(
+                [
+                    np.full(len(part.points), since, dtype=np.int64) if offset is None else offset + since
+                    for part, offset, since in zip(parts, offsets, since_ns, strict=True)
+                ]
+            ),
+            parts[-1].host_ns,
+        )
 
     def _in_order(self, samples: list[Image | Scan]) -> list[Image | Scan]:
         """Keep the samples with timestamps later than their predecessor's; count the others."""

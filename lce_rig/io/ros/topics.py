@@ -15,10 +15,16 @@ from lce_rig.core.errors import SourceError
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import EVENT_TYPES, read_event_head
-from lce_rig.io.ros.messages import decode_pointcloud2, decode_ros_image, deserialize
+from lce_rig.io.ros.messages import (
+    LIVOX_TYPES,
+    decode_livox,
+    decode_pointcloud2,
+    decode_ros_image,
+    deserialize,
+)
 from lce_rig.rig import Rig
 
-CLOUD_TYPES = frozenset({"sensor_msgs/PointCloud2"})
+CLOUD_TYPES = frozenset({"sensor_msgs/PointCloud2"}) | LIVOX_TYPES
 PACKET_TYPES = frozenset({"velodyne_msgs/VelodyneScan"})
 IMAGE_TYPES = frozenset({"sensor_msgs/Image", "sensor_msgs/CompressedImage"})
 _INFO = "sensor_msgs/CameraInfo"
@@ -252,6 +258,8 @@ def _probe(message: RawMessage, n: int) -> SensorTopic:
         return SensorTopic(message.topic, "frames", n, frame=frame, size_px=(width_px, height_px))
     if message.msgtype in PACKET_TYPES:
         return SensorTopic(message.topic, "scans", n, frame=frame)
+    if message.msgtype in LIVOX_TYPES:
+        return SensorTopic(message.topic, "scans", n, frame=frame, cloud=decode_livox(content))
     cloud = decode_pointcloud2(content)
     n_rings = int(content.height) if content.height > 1 else None
     for name in ("channel", "ring"):
