@@ -142,10 +142,12 @@ class BoardFinder:
             scan: the next one of the same LiDAR.
             last: `boards` of the search before, at least one.
         """
-        if not self.rig.lidars[scan.sensor].has_rings:
-            return self.search_scan(scan)
         limits = self._limits(scan.sensor)
-        tracked = [track_lidar_board(scan, self.board, previous, limits) for previous in last]
+        if self.rig.lidars[scan.sensor].has_rings:
+            tracked = [track_lidar_board(scan, self.board, previous, limits) for previous in last]
+        else:
+            poses = (previous.T_lidar_board for previous in last)
+            tracked = [look_for_unstructured_board(scan, self.board, pose, limits) for pose in poses]
         boards = [result for result in tracked if isinstance(result, LidarBoard)]
         lost = [result for result in tracked if isinstance(result, Refusal)]
         return self._compared(boards or lost[0], scan)

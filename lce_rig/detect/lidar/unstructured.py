@@ -50,6 +50,8 @@ _CELLS = 11.0
 # Accumulated point clouds hold millions of points: enough of them find the plates, all near one measure it.
 _MOST_SEARCHED, _MOST_MEASURED = 200_000, 40_000
 _MOST_PATCHES = 8
+# Sum of |log| of the ratios of its sides to the board's up to which a patch may be it, though another is found.
+_ALIKE = 0.3
 _MIN_CELL_POINTS = 6
 _SAME_NORMAL = np.cos(np.radians(15.0))
 _NOISE_M = 0.012  # of a plane's returns, at most before the noise of the cloud itself is measured
@@ -112,6 +114,8 @@ def find_unstructured_boards(
     found: list[LidarBoard] = []
     misses: list[tuple[float, Refusal]] = []
     for k in can_be[np.argsort(misfit[can_be])][:_MOST_PATCHES]:
+        if found and misfit[k] > _ALIKE:
+            break
         measured = measure_unstructured(points[index], board, patches.plane[k], patches.centre[k], limits)
         if isinstance(measured, LidarBoard):
             found.append(measured)
