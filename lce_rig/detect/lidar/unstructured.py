@@ -50,7 +50,7 @@ _CELLS = 11.0
 # Accumulated point clouds hold millions of points: enough of them find the plates, all near one measure it.
 _MOST_SEARCHED, _MOST_MEASURED = 200_000, 40_000
 _MOST_PATCHES = 8
-# Sum of |log| of the ratios of its sides to the board's up to which a patch may be it, though another is found.
+# Sum of |log| of its sides over the board's up to which a patch may be it, though another is found.
 _ALIKE = 0.3
 _MIN_CELL_POINTS = 6
 _SAME_NORMAL = np.cos(np.radians(15.0))
