@@ -6,7 +6,7 @@ SWAPPED_SIDES = Kind(
     "profile.swapped_sides",
     "{subject}: {n_cols}x{n_rows} corners run along the shorter side of the plate "
     "{width_m:g} x {height_m:g} m",
-    "check whether to swap width_m and height_m, or the pattern's [columns, rows]",
+    "check whether to swap width_m and height_m, or the [columns, rows]",
     severity="warning",
 )
 DRIFTING_CLOCK = Kind(

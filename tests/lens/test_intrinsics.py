@@ -82,12 +82,19 @@ def test_lens_and_board_are_found_within_their_deviations(estimate):
     assert 0.06 < estimate.rms_px < estimate.held_out_rms_px < 0.1
 
 
-def test_stated_deviations_are_true():
+@pytest.mark.parametrize("hidden", [0.0, 0.3], ids=["whole", "hidden"])
+def test_stated_deviations_are_true(hidden):
     scene = Scene(bow_m=(0.001, 0.0), aspect=-0.001, print_sigma_m=1e-4)
-    found = [
-        estimate_intrinsics(photograph(11, seed, scene), BOARD, WIDE, RADTAN5, n_folds=2)
-        for seed in range(10)
-    ]
+    rng, found = np.random.default_rng(0), []
+    for seed in range(10):
+        views = photograph(11, seed, scene)
+        views = [
+            with_corners(view, np.where(rng.random((24, 1)) < hidden, np.nan, view.board.corners_px))
+            for view in views
+        ]
+        found.append(estimate_intrinsics(views, BOARD, WIDE, RADTAN5, n_folds=2))
+        n_seen = sum(int(np.isfinite(view.board.corners_px[:, 0]).sum()) for view in found[-1].views)
+        assert found[-1].corners_px.shape == found[-1].residuals_px.shape == (n_seen, 2)
     nees = []
     for one in found:
         error = RADTAN5.vector(one.intrinsics) - RADTAN5.vector(WIDE)

@@ -12,6 +12,7 @@ from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.detect.image.corners import find_grid, seen_grid
+from lce_rig.detect.image.markers import marker_corners
 from lce_rig.detect.lidar.search import plane_limit_m
 from lce_rig.rig import QualitySettings
 from lce_rig.show.overlays import canvas
@@ -126,16 +127,21 @@ def _camera_pane(
     if isinstance(result, ImageBoard):
         draw_image_board(picture, factor, result, board, intrinsics)
         # The first corner, its row (x) and its column (-y), so that a flipped order is visible.
-        grid = ((result.corners_px + 0.5) * factor - 0.5).reshape(board.rows, board.cols, 2)
+        predicted_px, _ = intrinsics.project(transform(result.T_cam_board, board.corners()))
+        corners_px = np.where(np.isfinite(result.corners_px), result.corners_px, predicted_px)
+        grid = ((corners_px + 0.5) * factor - 0.5).reshape(board.rows, board.cols, 2)
         canvas.draw_line(picture, grid[0], ORANGE, max(2, round(3 * unit)))
         canvas.draw_line(picture, grid[:, 0], BLUE, max(2, round(3 * unit)))
         canvas.draw_discs(picture, grid[0, :1], MAGENTA, 6 * unit, WHITE)
         left, baseline = grid[0, -1] + 8 * unit
         canvas.draw_text(picture, "x", float(left), float(baseline), 16 * unit, ORANGE)
     else:
-        # The corners detected in a refused image, of the whole pattern or a part of it.
-        whole = find_grid(image.grey, board, is_thorough=False)
-        grid_px = seen_grid(image.grey) if whole is None else whole.grid_px
+        # The corners detected in a refused image, of the whole pattern or a part of it, or of markers.
+        whole = None if board.has_markers else find_grid(image.grey, board, is_thorough=False)
+        if board.has_markers:
+            grid_px: Array | None = marker_corners(image.grey, board)
+        else:
+            grid_px = seen_grid(image.grey) if whole is None else whole.grid_px
         if grid_px is not None:
             pixels = (grid_px.reshape(-1, 2) + 0.5) * factor - 0.5
             canvas.draw_discs(picture, pixels, ORANGE, max(1.5, 2.5 * unit), BLACK)
