@@ -274,7 +274,13 @@ class BoardState:
         match message:
             case PpsEdge(_, t_us, _, _) | TriggerEdge(_, _, t_us, _) | TimeReply(_, _, t_us):
                 if t_us * 1000 < self._latest_ns - _MOST_BACK_NS:
-                    self._restart(arrival)
+                    self.n_restarts, self.restarted_ns = self.n_restarts + 1, arrival.steady_ns
+                    self._latest_ns = 0
+                    self._last_numbers.clear()
+                    self._asked = None
+                    self.host_tracker.restart()
+                    self.utc_tracker.restart()
+                    self.pps = self.status = None
                 self._latest_ns = max(self._latest_ns, t_us * 1000)
         match message:
             case Hello():
@@ -372,12 +378,3 @@ class BoardState:
         self._last_numbers[line] = count
         self.n_pulses[line] += 1
         return [Pulse(line, t_us * 1000, count, arrival.host_ns)]
-
-    def _restart(self, arrival: Arrival) -> None:
-        self.n_restarts, self.restarted_ns = self.n_restarts + 1, arrival.steady_ns
-        self._latest_ns = 0
-        self._last_numbers.clear()
-        self._asked = None
-        self.host_tracker.restart()
-        self.utc_tracker.restart()
-        self.pps = self.status = None

@@ -155,7 +155,16 @@ class SyncBoard(LiveSource):
         while not self._is_set_up and not self.is_stopping:
             self._early = self.read()
             if not self._is_set_up and time.monotonic() > until_s:
-                raise self._silent()
+                device, baud = self._settings.device, self._settings.port_baud
+                if not self._heard:
+                    raise SourceError(
+                        f"{self._who} on {device} is silent: nothing for {self._hello_s:g} s",
+                        "Check its power and firmware, and that sync.device is its port.",
+                    )
+                raise SourceError(
+                    f"{self._who} on {device} does not talk LCE1: {self._heard!r}",
+                    f"Check sync.baud (now {baud}), that this is the board's port, and its firmware.",
+                )
         hello = self._state.hello
         if hello is not None and hello.version != lce1.VERSION:
             raise SourceError(
@@ -270,16 +279,3 @@ class SyncBoard(LiveSource):
         if board_clock.sigma_ns(utc_s * NS_PER_S) < _UTC_SIGMA_NS:
             self._told_utc_ns = now_ns
             port.write(lce1.set_utc(round(board_clock.convert(utc_s * NS_PER_S) / 1000), utc_s))
-
-    def _silent(self) -> SourceError:
-        """Explain why a board has not introduced itself: it is silent, or of another kind."""
-        device, baud = self._settings.device, self._settings.port_baud
-        if not self._heard:
-            return SourceError(
-                f"{self._who} on {device} is silent: nothing for {self._hello_s:g} s",
-                "Check its power and firmware, and that sync.device is its port.",
-            )
-        return SourceError(
-            f"{self._who} on {device} does not talk LCE1: {self._heard!r}",
-            f"Check sync.baud (now {baud}), that this is the board's port, and its firmware.",
-        )

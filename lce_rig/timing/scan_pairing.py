@@ -89,7 +89,18 @@ class _Pairing:
             # Computed once per scan: samples come hundreds of times as often.
             half_ns = _half_sweep_ns(sample, self._rig) if isinstance(sample, Scan) else 0
             time_ns += half_ns
-            self._take_frame_part(sample, time_ns, half_ns)
+            if time_ns < self._newest_ns - 2 * PATIENCE_NS:
+                self._waiting.clear()
+                self._buffers.clear()
+                self._events.clear()
+                self._newest_ns = self._position_ns = time_ns
+            self._newest_ns = max(self._newest_ns, time_ns)
+            if isinstance(sample, Scan) and sample.sensor == (self._anchor or sample.sensor):
+                self._anchor = sample.sensor
+                self._waiting.append((time_ns, half_ns, sample))
+            else:
+                key = (sample.sensor, sample.channel if isinstance(sample, Image) else "")
+                self._buffers.setdefault(key, deque()).append((time_ns, sample))
         self._position_ns = max(self._position_ns, time_ns)
         self._events.forget_before(self._position_ns - self._kept_ns)
 
@@ -108,20 +119,6 @@ class _Pairing:
         """Yield what waits when the streams have ended."""
         while self._waiting:
             yield from self._frame(*self._waiting.popleft())
-
-    def _take_frame_part(self, sample: Image | Scan, time_ns: int, half_ns: int) -> None:
-        if time_ns < self._newest_ns - 2 * PATIENCE_NS:
-            self._waiting.clear()
-            self._buffers.clear()
-            self._events.clear()
-            self._newest_ns = self._position_ns = time_ns
-        self._newest_ns = max(self._newest_ns, time_ns)
-        if isinstance(sample, Scan) and sample.sensor == (self._anchor or sample.sensor):
-            self._anchor = sample.sensor
-            self._waiting.append((time_ns, half_ns, sample))
-        else:
-            key = (sample.sensor, sample.channel if isinstance(sample, Image) else "")
-            self._buffers.setdefault(key, deque()).append((time_ns, sample))
 
     def _frame(self, time_ns: int, half_ns: int, scan: Scan) -> Iterator[Frame]:
         images: list[Image] = []
