@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from drawn_boards import ASYMMETRIC, DAVIS, FISHEYE, SYMMETRIC, TALL, WIDE, draw, looking, picture
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
@@ -18,6 +17,17 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, difference, pose, rotation_angle, transform
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.image.search import find_image_board, region_around
+from tests.detect.drawn_boards import (
+    ASYMMETRIC,
+    DAVIS,
+    FISHEYE,
+    SYMMETRIC,
+    TALL,
+    WIDE,
+    draw,
+    looking,
+    picture,
+)
 
 
 def found(pixels: NDArray[np.uint8], board: Board, camera: Intrinsics) -> ImageBoard:

@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from drawn_boards import DAVIS, FISHEYE, WIDE, draw, looking, picture
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
@@ -15,6 +14,7 @@ from lce_rig.core.geometry import Array, difference, rotation_angle, transform
 from lce_rig.core.pattern import markers_of
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.image.search import find_image_board
+from tests.detect.drawn_boards import DAVIS, FISHEYE, WIDE, draw, looking, picture
 
 CHECKERBOARD = Board(8, 6, 0.07, 0.767, 0.626)
 CHARUCO = replace(CHECKERBOARD, type="charuco", marker_share=0.75, dictionary="5X5_100")
