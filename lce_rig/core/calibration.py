@@ -70,11 +70,8 @@ def _record(record: Any) -> Any:
     return {"figures": {}, **record, "code": code, "action": record.get("action_code", ""), "stored": words}
 
 
-def _known(figures: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in figures.items() if value is not None}
-
-
 _LISTS = PlainSerializer(lambda array: (array.astype(np.float64) + 0.0).tolist())
+_WITHOUT_NULL = BeforeValidator(lambda values: {key: v for key, v in values.items() if v is not None})
 _NULL = PlainSerializer(lambda number: float(number) if math.isfinite(number) else None)
 _OR_NAN = WrapValidator(lambda number, check: math.nan if number is None else check(number))
 _OR_INF = WrapValidator(lambda number, check: math.inf if number is None else check(number))
@@ -413,8 +410,8 @@ class Calibration:
     egt_translation_m: Size | None = None
     verdict: Literal["pass", "marginal", "fail"]
     findings: tuple[StoredFinding, ...] = ()
-    diagnostics: Annotated[Diagnostics, BeforeValidator(_known), PlainSerializer(Diagnostics.figures)] = (
-        field(default_factory=Diagnostics)
+    diagnostics: Annotated[Diagnostics, _WITHOUT_NULL, PlainSerializer(Diagnostics.figures)] = field(
+        default_factory=Diagnostics
     )
     channel_results: Annotated[tuple[ChannelResult, ...], Field(alias="channels")] = ()
     method: str = "paper"

@@ -20,7 +20,7 @@ from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.folder.decoding import DECODERS, read_cloud
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
 from lce_rig.rig import BoardSettings, LidarSettings
-from lce_rig.rig.board_settings import KEYS_OF_TYPE, board_block
+from lce_rig.rig.board_settings import KEYS_OF_TYPE
 from lce_rig.rig.loading import Document, dump_yaml, explain, rig_from_document
 
 _UNKNOWN_MODEL = "other"
@@ -145,7 +145,16 @@ def new_profile(
     data = {
         "format_version": 1,
         "name": name,
-        "board": _board(board),
+        "board": {
+            "inner_corners": [board.cols, board.rows],
+            "square_m": board.square_m,
+            "width_m": board.width_m,
+            "height_m": board.height_m,
+            "pattern_offset_m": list(board.pattern_offset_m),
+            # The usual standard deviations.
+            "square_sigma_m": float(f"{board.square_m / 1000:.2g}"),
+            **{key: BoardSettings.model_fields[key].default for key in _BOARD_SIGMAS},
+        },
         "lidars": lidars,
         "cameras": blocks,
     }
@@ -155,15 +164,6 @@ def new_profile(
         comment = _COMMENTS.get(line.strip().partition(":")[0])
         lines.append(f"{line:<40} # {comment}" if comment else line)
     return "\n".join(lines) + "\n", notes
-
-
-def _board(board: Board) -> dict[str, Any]:
-    """List the board's settings, with the usual standard deviations."""
-    return {
-        **board_block(board),
-        "square_sigma_m": float(f"{board.square_m / 1000:.2g}"),
-        **{key: BoardSettings.model_fields[key].default for key in _BOARD_SIGMAS},
-    }
 
 
 def _lidar(

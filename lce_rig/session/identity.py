@@ -100,20 +100,8 @@ def foreign_keys(theirs: Rig, ours: Rig) -> list[DifferingKey]:
 
     Board, intrinsics, limits and what else is measured or chosen may differ.
     """
-    keys = differing_keys(theirs, ours)
-    named = [key for key in keys if _OF_THE_RIG(key.name)]
-    missing = [key for key in keys if not all(_has_place(rig, key.path) for rig in (theirs, ours))]
-    return [*named, *(key for key in missing if key not in named)]
-
-
-def _has_place(rig: Rig, path: tuple[str, ...]) -> bool:
-    """Tell whether a rig has the sensor, and the channel, of a key."""
-    if path[0] == "lidars":
-        return path[1] in rig.lidars
-    if path[0] != "cameras":
-        return True
-    camera = rig.cameras.get(path[1])
-    return camera is not None and (path[2] != "channels" or path[3] in camera.channels)
+    # A sensor or channel that one of them lacks differs in its model or kind.
+    return [key for key in differing_keys(theirs, ours) if _OF_THE_RIG(key.name)]
 
 
 def keep_identity(earlier: Rig, rig: Rig) -> Rig:
