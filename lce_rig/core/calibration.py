@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from pydantic import (
@@ -217,8 +217,7 @@ class OtherCamera:
     board_rms_m: Size
 
 
-@dataclass(frozen=True)
-class CaptureResidual:
+class CaptureResidual(NamedTuple):
     """How well one capture fits extrinsics.
 
     Attributes:

@@ -47,8 +47,23 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
         detections: of this session: its captures, and where the board is.
         calibration: the extrinsics and their covariance.
     """
-    views = scene_views(session, detections, calibration, OPINION_CAPTURES)
-    return opinion_of(views, session.rig.lens_of(calibration), calibration)
+    c = calibration
+    views = scene_views(session, detections, c, OPINION_CAPTURES)
+    drift = watch(without_movers(views), session.rig.lens_of(c), c.T_cam_lidar, c.cov, is_joint=False)
+    if not drift.curves:
+        return SceneOpinion(drift.n_captures, drift.n_edges)
+    axes = tuple(
+        AxisOpinion(
+            axis.axis,
+            _STATES[axis.state],
+            axis.unit,
+            float(axis.change),
+            float(axis.sigma),
+            float(axis.smallest) if np.isfinite(axis.smallest) else None,
+        )
+        for axis in drift.axes
+    )
+    return SceneOpinion(drift.n_captures, drift.n_edges, axes)
 
 
 def scene_views(
@@ -75,26 +90,6 @@ def scene_views(
             view = build_view(session.rig, c, capture.name, image, scan)
             views.append(without_board(view, boards[capture.name], session.rig, c))
     return views
-
-
-def opinion_of(views: Sequence[SceneView], lens: Intrinsics, calibration: Calibration) -> SceneOpinion:
-    """Compare extrinsics with the edges of some captures, without what moves before a standing rig."""
-    c = calibration
-    drift = watch(without_movers(views), lens, c.T_cam_lidar, c.cov, is_joint=False)
-    if not drift.curves:
-        return SceneOpinion(drift.n_captures, drift.n_edges)
-    axes = tuple(
-        AxisOpinion(
-            axis.axis,
-            _STATES[axis.state],
-            axis.unit,
-            float(axis.change),
-            float(axis.sigma),
-            float(axis.smallest) if np.isfinite(axis.smallest) else None,
-        )
-        for axis in drift.axes
-    )
-    return SceneOpinion(drift.n_captures, drift.n_edges, axes)
 
 
 def sharpen(sessions: Sequence[Session], found: Sequence[Detections], by_boards: Calibration) -> SceneShare:
