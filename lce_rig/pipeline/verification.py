@@ -1,6 +1,7 @@
 """Compare extrinsics with captures: residuals, overlays, and the sensors' detections."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
@@ -242,11 +243,10 @@ def _extrinsics(
         raise SessionError(f"{session.path} has no result {name!r}", f"Its results: {names}.")
     if isinstance(result, Result):
         saved, is_own = result.file(), result.session.path.resolve() == session.path.resolve()
-        content = content if is_own and saved.text().encode() == content else None
+        is_stored = is_own and saved.text().encode() == content
     else:
-        is_own = result is None
         saved = result or read_result(folder / RESULT)
-        content = content if is_own else None
+        is_own = is_stored = result is None
     calibrations = saved.pairs
     if saved.rig != session.rig.name or not calibrations:
         what = f"the result belongs to rig {saved.rig!r}" if calibrations else "the result holds no pair"
@@ -256,7 +256,7 @@ def _extrinsics(
     elif not is_own:
         # Names of captures differ between sessions: none of these was fitted.
         calibrations = tuple(replace(c, captures_used=(), captures_refused={}) for c in calibrations)
-    return calibrations, content
+    return calibrations, content if is_stored else None
 
 
 def write_debug_images(
@@ -264,7 +264,6 @@ def write_debug_images(
     detections: Detections,
     *,
     event_image: EventImage | None = None,
-    folder: Path | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Draw for every capture each sensor's detection of the board, or why it was refused.
@@ -273,28 +272,24 @@ def write_debug_images(
         session: the source of the captures.
         detections: of the session.
         event_image: how images were reconstructed from raw events for the detections.
-        folder: for the images; the session's debug/ if None.
         progress: called with (done, total).
 
     Returns:
-        The folder of the images.
+        The folder of the images, debug/ of the session.
     """
     from lce_rig.show.overlays.debug_image import draw_debug
     from lce_rig.show.overlays.overlay_files import write_picture
 
-    base = folder or session.path / DEBUG
+    base = session.path / DEBUG
     jobs = [(pair, name) for pair in detections.pairs for name in detections.captures(pair)]
     matches = {pair: match_sensors(session.rig, detections, pair) for pair in detections.pairs}
     for done, (pair, name) in enumerate(jobs, start=1):
         refused, chosen = matches[pair]
         mismatch = refused.get(name)
         capture, (image, lidar) = session.capture(name), detections.of(pair, name)
-        view = _view(session, pair.camera, pair.channel, event_image, capture)
-        try:
+        view, scan = _view(session, pair.camera, pair.channel, event_image, capture), None
+        with suppress(SessionError):  # The detection of a damaged one says so.
             scan = capture.scan(pair.lidar)
-        except SessionError:
-            # It is damaged; its detection says so.
-            scan = None
         candidates = lidar if isinstance(lidar, list) else []
         index = next((k for k, each in enumerate(candidates) if each is chosen.get(name)), 0)
         picture = draw_debug(
@@ -320,12 +315,10 @@ def _view(
     session: Session, camera: str, channel: str, event_image: EventImage | None, capture: Capture
 ) -> ImageWithEvents | None:
     """Return a camera's image; None if it is damaged or events gave none; its detection says why."""
-    try:
+    with suppress(SessionError):
         if (camera, channel) not in event_channels(session.rig, capture, event_image):
             return ImageWithEvents(capture.image(camera, channel))
         picture = event_picture(session, capture, camera, channel, event_image)
-        if isinstance(picture, Refusal):
-            return None
-        return ImageWithEvents.of_events(picture, capture.events(camera))
-    except SessionError:
-        return None
+        if not isinstance(picture, Refusal):
+            return ImageWithEvents.of_events(picture, capture.events(camera))
+    return None

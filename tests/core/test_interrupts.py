@@ -30,15 +30,6 @@ BUSY = {
     with ThreadPoolExecutor(1) as pool:
         pool.submit(time.sleep, 30).result()
 """,
-    "code that swallows it": """
-    class Deaf:
-        def __del__(self):
-            try:
-                time.sleep(30)
-            except KeyboardInterrupt:
-                time.sleep(30)
-    Deaf()
-""",
     "a callback that cannot raise": """
     class Deaf:
         def __del__(self):
