@@ -30,12 +30,12 @@ GUIDE_NO_NOMINAL = Kind(
 )
 GUIDE_CONTINUES = Kind(
     "guide.continues",
-    "captures to go: {n_more} (ends at {n_least} captures, +-{limit_deg:g} deg, +-{limit_mm:g} mm)",
+    "captures to go: {n_more} (minimum {n_least}, below {limit_deg:g} deg, {limit_mm:g} mm)",
     severity="note",
 )
 GUIDE_PREDICTED = Kind(
     "guide.predicted",
-    "{subject}: predicted {rotation_deg:2deg} (target {target_deg:g}), {position_mm:.1f} mm "
+    "{subject}: predicted below {rotation_deg:2deg} (target {target_deg:g}), {position_mm:.1f} mm "
     "(target {target_mm:g})",
     severity="note",
 )

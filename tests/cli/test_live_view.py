@@ -54,7 +54,15 @@ def test_everything_fits_into_80_by_24() -> None:
     assert len(lines) <= 24
     assert max(len(line) for line in lines) <= 80
     text = "\n".join(lines)
-    for wanted in ("HOLD STILL", "1.2 s", "7 of 15", "come 0.8 m closer", "3 lost", "1.20M/s", "+-0.12 deg"):
+    for wanted in (
+        "HOLD STILL",
+        "1.2 s",
+        "7 of 15",
+        "come 0.8 m closer",
+        "3 lost",
+        "1.20M/s",
+        "below 0.12 deg",
+    ):
         assert wanted in text
     assert "captured 000006" in text and "boards must" in text and "q stop" in text
 

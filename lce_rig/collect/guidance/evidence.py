@@ -303,10 +303,13 @@ class Precision:
 def few_captures_factor(n_captures: int) -> float:
     """Compute by what a calibration multiplies the covariance of scatter because captures are few.
 
-    Fewer than `N_UNKNOWNS` + 4 captures hardly tell their own scatter: they count as badly as that many.
+    The factor has no limit at `N_UNKNOWNS` + 2 captures, as fewer hardly tell their own scatter; from one
+    more on downwards it grows with the inverse of their number.
     """
-    n = max(n_captures, N_UNKNOWNS + 4)
-    return (n - 1) / (n - N_UNKNOWNS - 2)
+    fewest = N_UNKNOWNS + 3
+    if n_captures < fewest:
+        return (fewest - 1) * fewest / max(n_captures, 1)
+    return (n_captures - 1) / (n_captures - N_UNKNOWNS - 2)
 
 
 def combine(held: Evidence, errors: ErrorModel, more: Evidence | None = None) -> Precision:

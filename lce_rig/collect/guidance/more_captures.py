@@ -74,7 +74,7 @@ def _describe(view: SensorPlace, poses: Array) -> tuple[tuple[int, float, str, t
 
     Returns:
         Of each group the number, the mean distance in m, its place in the image if that is aside,
-        and the tilts, as the person who holds the board has them: "left" is nearer to the rig.
+        and the tilts, as the person who holds the board has them: where they face.
     """
     ordered = poses[np.argsort(np.linalg.norm(poses[:, :3, 3], axis=1))]
     distance_m = np.linalg.norm(ordered[:, :3, 3], axis=1)
@@ -106,12 +106,12 @@ def _place(view: SensorPlace, poses: Array) -> str:
 
 
 def _sides(view: SensorPlace, poses: Array) -> tuple[str, ...]:
-    """Name the tilts of boards, each once: the side that is nearer to the rig, or the top or bottom."""
+    """Name the tilts of boards, each once: where they face, as the person who holds them says it."""
     sides: dict[str, None] = {}
     for T_cam_board in poses:
         held = describe_pose(view, T_cam_board)
-        leans = {"forward": held.tilt_deg, "back": -held.tilt_deg}
-        leans |= {"left": held.turn_deg, "right": -held.turn_deg}
+        leans = {"down": held.tilt_deg, "up": -held.tilt_deg}
+        leans |= {"right": held.turn_deg, "left": -held.turn_deg}
         side = max(leans, key=lambda name: leans[name])
         if leans[side] > LEANS_DEG:
             sides[side] = None

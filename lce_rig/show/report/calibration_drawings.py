@@ -289,7 +289,11 @@ def principal_axes(cov: Array) -> tuple[Array, Array]:
 
 def draw_by_distance(calibration: Calibration, lens: Intrinsics) -> Markup:
     """Draw the expected error of a LiDAR point in pixels and in centimetres by its distance."""
-    points = point_uncertainties(calibration.T_cam_lidar, calibration.cov, lens, _DISTANCES_M)
+    cov, cross = calibration.cov, calibration.intrinsics_cross_cov
+    if cross is not None and calibration.intrinsics_cov is not None:
+        # Errors of extrinsics and intrinsics of one result compensate each other in part.
+        cov = np.block([[cov, cross], [cross.T, calibration.intrinsics_cov]])
+    points = point_uncertainties(calibration.T_cam_lidar, cov, lens, _DISTANCES_M)
     figure, (left, right) = new_axes(2.1, 2)
     _draw_reach(left, [p.centre_px for p in points], [p.corner_px for p in points], "error in the image, px")
     _draw_reach(

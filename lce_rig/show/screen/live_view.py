@@ -301,10 +301,11 @@ def render(
     edge = 1 if n_room - len(side) >= 2 else 0
     if n_room < len(side):
         side = side[len(_BARS) :]
-    n_room = height - n_fixed - len(side) - 2 * edge
-    messages = _fill(notes, state.log, n_room, width)
-    n_room -= len(messages)
-    drawing = _drawing(state, (width - _SIDE_WIDTH - 2, len(side) + n_room))
+    n_room = height - n_fixed - 2 * edge
+    # Of one size whatever messages come.
+    n_beside = max(min(height - 14, n_room - 3), len(side)) if height > _HEIGHT else len(side)
+    messages = _fill(notes, state.log, n_room - n_beside, width)
+    drawing = _drawing(state, (width - _SIDE_WIDTH - 2, n_beside))
     texts = Text("\n".join(banner), style="bold", justify="center")
     parts: list[Any] = [title, Padding(texts, (edge, 2), style=_STYLES[state.phase])]
     parts += [Text("\n".join(detail), style="italic"), streams]
@@ -394,7 +395,8 @@ def _progress(state: LiveState) -> list[Any]:
     ):
         is_known = np.isfinite(sigma)
         shown = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
-        figure = f"+-{shown} {unit}" if is_known else "-"
+        # Cautious with few captures: a result states less.
+        figure = f"below {shown} {unit}" if is_known else "-"
         style = "green" if is_known and sigma <= target else "yellow"
         lines.append(Text.assemble(f"{name:<11}", (figure, style), f" (target {target:g})"))
     if state.goes_on:
