@@ -39,7 +39,7 @@ def measure_lidar(
         progress: called with (done, total) while a session is read.
 
     Raises:
-        UsageError: sessions of different boards or LiDARs.
+        UsageError: sessions of different boards or LiDARs, or a LiDAR without rings.
         NotEnoughDataError: too few captures that agree.
         ResultRefusedError: a session's boards moved; the captures do not determine the lasers' ranges.
     """
@@ -55,6 +55,8 @@ def measure_lidar(
                 f"{session.path} has another board than {sessions[0].path}", "Give sessions of one board."
             )
     board, settings = rig.board.to_board(), rig.lidars[name]
+    if not settings.has_rings:
+        raise UsageError(f"{name} ({settings.model}) has no lasers of its own", "Calibrate it as it is.")
     options = EstimateSettings.of(CalibrateOptions("paper", n_draws=0), settings)
     used, starts = [], []
     for k, session in enumerate(sessions):

@@ -77,8 +77,6 @@ def scene_views(
         n_most: captures.
     """
     c = extrinsics
-    if not session.rig.lidars[c.lidar].has_rings:
-        return []
     channel = session.rig.cameras[c.camera].first_channel("frames") or ""
     boards = detections.images.get((c.camera, channel), {})
     names = sorted(boards.keys() & detections.lidars.get(c.lidar, {}).keys())

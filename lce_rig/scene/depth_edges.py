@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import Scan
+from lce_rig.core.data import NO_RING, Scan
 from lce_rig.core.geometry import Array
 from lce_rig.detect.lidar.measurement import Beam
 
@@ -102,7 +102,7 @@ def find_depth_edges(scan: Scan, beam: Beam) -> DepthEdges:
     """Find the outlines of near objects and the changes of reflectivity along the rings of a scan.
 
     Args:
-        scan: with rings; without intensities it has no changes of reflectivity.
+        scan: without rings it has no edges; without intensities, no changes of reflectivity.
         beam: of this LiDAR.
     """
     rings = _in_order(scan)
@@ -118,7 +118,8 @@ def _in_order(scan: Scan) -> _Rings:
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     order = np.lexsort((azimuth, ring))
     points, ring, azimuth = points[order], ring[order], azimuth[order]
-    gap, is_neighbour = np.diff(azimuth), np.diff(ring) == 0
+    # Without rings, no two returns are known to be neighbours: such a scan has no edges.
+    gap, is_neighbour = np.diff(azimuth), (np.diff(ring) == 0) & (ring[1:] != NO_RING)
     is_step = is_neighbour & (gap > 0)
     step_rad = float(np.median(gap[is_step])) if is_step.any() else 0.0
     is_neighbour &= gap < _GAP_STEPS * step_rad

@@ -144,8 +144,8 @@ _FIRINGS_PER_INSTANT = 256
 _MARGIN_RAD, _NEAREST_M = 0.04, 0.5
 
 
-# Of the two prisms of a rosette and of the Mid-360's rotor and mirror, in turns per second; no multiples.
-_PRISMS_HZ, _MID360_HZ = (121.67, -77.33), (10.37, 2311.7)
+# Of a rosette's two prisms, for all of its lines, and of the Mid-360's rotor and mirror, Hz; no multiples.
+_PRISMS_HZ, _MID360_HZ = (1213.7, -771.3), (10.37, 2311.7)
 _LINES = 4  # of a Mid-360: beams side by side in elevation
 _LINE_RAD = np.radians(0.7)
 
