@@ -129,7 +129,7 @@ IMAGE_OTHER_DICTIONARY = Kind(
 IMAGE_OTHER_IDS = Kind(
     "image.other_ids",
     "markers with ids from {first_seen} to {last_seen} beside those of the board, {first_id} to {last_id}",
-    "correct board.squares or board.tags, and board.first_id; hide other boards",
+    "correct board.squares, tags and first_id; hide other boards",
 )
 IMAGE_OTHER_LAYOUT = Kind(
     "image.other_layout",
