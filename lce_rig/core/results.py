@@ -197,7 +197,7 @@ class LidarBoard:
     @property
     def has_rings(self) -> bool:
         """Whether the LiDAR scans in rings; else `points` are means, `edge_points` places on the outline."""
-        return len(self.ring) == 0 or int(self.ring[0]) != NO_RING
+        return len(self.ring) > 0 and int(self.ring[0]) != NO_RING
 
     def figures(self) -> dict[str, float]:
         """List every figure of the quality by name, for tables and programs."""

@@ -238,6 +238,16 @@ LIDAR_OUTLINE = Kind(
     "{hidden_share:percent} of the board occluded",
     "show the whole board, with nothing in front of it or at its edges",
 )
+LIDAR_HIDDEN = Kind(
+    "lidar.hidden",
+    "{hidden_share:percent} of the board at {distance_m:.1f} m is hidden",
+    "show the whole board, with nothing in front of it",
+)
+LIDAR_NO_BORDER = Kind(
+    "lidar.no_border",
+    "the border at {distance_m:.1f} m is located at {n_upright} upright and {n_level} level places only",
+    "free 10 cm around the board, with a wall behind; scan longer",
+)
 LIDAR_OUT_OF_VIEW = Kind(
     "lidar.out_of_view",
     "{share:percent} of the board at {distance_m:.1f} m returned nothing: it reaches out of the LiDAR's view",

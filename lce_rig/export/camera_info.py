@@ -12,6 +12,9 @@ from lce_rig.export.job import ExportJob
 from lce_rig.export.writing import numbers, quoted
 from lce_rig.session.durable import write_atomically
 
+# How files of cv::FileStorage begin.
+_OPENCV = b"%YAML:1.0"
+
 
 def export_camera_info(job: ExportJob) -> list[Path]:
     """Write a file for each calibrated camera."""
@@ -58,7 +61,9 @@ def _matrix(key: str, matrix: Any) -> list[str]:
 
 
 def load_camera_info(path: Path) -> Intrinsics:
-    """Read a camera_info file of any maker; its projection_matrix, of a rectified image, is not used.
+    """Read a camera_info file of any maker, or the lens that OpenCV's calibration sample writes.
+
+    The projection_matrix, of a rectified image, is not used.
 
     Raises:
         ProfileError: it cannot be read, or is none, or of a camera that was not calibrated.
@@ -66,16 +71,22 @@ def load_camera_info(path: Path) -> Intrinsics:
     import yaml
 
     try:
-        data = yaml.safe_load(path.read_bytes())
+        text = path.read_bytes()
+        is_opencv = text.startswith(_OPENCV)
+        # OpenCV's directive and tags are no YAML; what they mark reads as plain mappings.
+        data = yaml.safe_load(text.removeprefix(_OPENCV).replace(b"!!opencv-matrix", b""))
         coefficients = tuple(float(value) for value in data["distortion_coefficients"]["data"])
         size = int(data["image_width"]), int(data["image_height"])
         K = np.array(data["camera_matrix"]["data"], dtype=np.float64)
+        if is_opencv:
+            perspective = "plumb_bob" if len(coefficients) <= 5 else "rational_polynomial"
+            data.setdefault("distortion_model", "fisheye" if data.get("fisheye_model") else perspective)
         return Intrinsics.from_ros(str(data["distortion_model"]), K, coefficients, size)
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read: {error.strerror}") from None
     except KeyError as error:
-        raise ProfileError(f"{path}: not a camera_info file of ROS: it has no key {error.args[0]}") from None
+        raise ProfileError(f"{path}: not a camera_info file: it has no key {error.args[0]}") from None
     except TypeError:
-        raise ProfileError(f"{path}: not a camera_info file of ROS: a block of it has no keys") from None
+        raise ProfileError(f"{path}: not a camera_info file: a block of it has no keys") from None
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise ProfileError(f"{path}: not a usable camera_info file: {' '.join(str(error).split())}") from None

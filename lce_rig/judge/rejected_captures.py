@@ -103,7 +103,8 @@ class _Test:
         names = tuple(observation.capture for observation in group)
         group = group[:: -(-len(group) // _MAX_TESTED)]
         n = int(group_placements(group).max()) + 1
-        is_rest = np.array([name not in {o.capture for o in group} for name in self._names], dtype=np.float64)
+        # Captures of the group that are not tested, being many, are no part of the rest either.
+        is_rest = np.array([name not in names for name in self._names], dtype=np.float64)
         if n < 2 or is_rest.sum() < _MIN_GROUP:
             return None
         x = self._used.solve(is_rest[None])[0]
@@ -123,9 +124,8 @@ class _Test:
         # Where the last captures moved, the result holds no longer.
         words = ("before", "after") if place == "last" else ("group", "rest")
         rejected = RejectedGroup(names, place, neighbour)
-        return float(np.sum(self._costs(group, T_rest) - costs)), replace(
-            make_contrast(*words, apart, chance, len(names)), rejected=rejected
-        )
+        gain = float(np.sum(self._costs(group, T_rest) - costs)) * len(names) / len(group)
+        return gain, replace(make_contrast(*words, apart, chance, len(names)), rejected=rejected)
 
     def _fit(self, group: Sequence[Observation], T: Array, x: Array) -> tuple[Array, Array]:
         """Fit extrinsics to a group with the constants of the rest: costs (F,), and the extrinsics."""

@@ -338,7 +338,7 @@ def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
     return replace(
         solved,
         estimate=replace(estimate, T_cam_lidar=share.T_cam_lidar, cov=share.cov, residuals=residuals),
-        validation=replace(solved.validation, cov=share.cov, cov_used=share.cov),
+        validation=replace(solved.validation, cov=share.cov, cov_agreed=share.cov, cov_used=share.cov),
         together=None,
         share=share,
     )

@@ -97,7 +97,7 @@ def test_other_plates_are_refused_with_their_cause() -> None:
     beside = pose(T[:3, :3], T[:3, 3] + T[:3, 0] * (W / 2 + 0.1))
     assert code_of(board_plate(T), Plate(beside, 0.2, H)) in ("lidar.touching", "lidar.other_plate")
     before = pose(T[:3, :3], 0.7 * (T[:3, 3] - T[:3, 1] * H / 3))
-    assert code_of(board_plate(T), Plate(before, W, H / 4)) in ("lidar.outline", "lidar.other_plate")
+    assert code_of(board_plate(T), Plate(before, W, H / 4)) in ("lidar.hidden", "lidar.other_plate")
     assert code_of(board_plate(place(3, 14, 0)), fov_deg=30.0) in ("lidar.out_of_view", "lidar.other_plate")
     assert code_of() in ("lidar.no_plate", "lidar.other_plate")
 
@@ -118,3 +118,14 @@ def test_board_that_moved_while_scans_were_accumulated_is_refused() -> None:
 def test_few_points_are_no_board(n: int) -> None:
     scan = accumulate([board_plate(place(3, 5, 20)), *room(13)], n=max(n, 1)).select(np.arange(n))
     assert isinstance(find_unstructured_boards(scan, BOARD, POINT_BEAM), Refusal)
+
+
+@pytest.mark.parametrize("n", [4_000, 8_000, 16_000])
+def test_sparse_board_without_a_located_border_is_refused(n: int) -> None:
+    """Without border nothing tells where in its plane the plate lies, and no residual would contradict."""
+    scan = accumulate([board_plate(place(3, 5, 20)), *room(13)], n=n)
+    found = find_unstructured_boards(scan, BOARD, POINT_BEAM)
+    for board in () if isinstance(found, Refusal) else found:
+        assert np.isfinite(board.quality.edge_rms_m)
+        assert board.quality.n_ring_ends >= 4
+        assert len(board.points) >= 10

@@ -183,6 +183,18 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
     assert load_camera_info(tmp_path / "camera_info_davis.yaml") == rles.cameras["davis"].to_intrinsics()
 
 
+@pytest.mark.parametrize("extra, model", [("", "radtan"), ("fisheye_model: 1\n", "equidistant")])
+def test_a_lens_of_opencv_is_read(extra: str, model: str, tmp_path: Path) -> None:
+    matrix = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [ {} ]\n"
+    text = "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n" + extra
+    text += "camera_matrix: " + matrix.format(3, 3, "500., 0., 320., 0., 501., 240., 0., 0., 1.")
+    text += "distortion_coefficients: " + matrix.format(4, 1, "0.1, 0.01, 0.001, 0.002")
+    (tmp_path / "lens.yaml").write_text(text, encoding="utf-8")
+    lens = load_camera_info(tmp_path / "lens.yaml")
+    assert (lens.model, lens.fx_px, lens.fy_px, lens.width_px) == (model, 500.0, 501.0, 640)
+    assert lens.distortion == (0.1, 0.01, 0.001, 0.002)
+
+
 @pytest.mark.parametrize("name", sorted(EXPORTS))
 def test_a_pose_that_is_not_finite_is_refused_before_a_file_is_written(
     name: str, rles: Rig, make: Make, tmp_path: Path

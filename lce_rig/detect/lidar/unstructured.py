@@ -11,13 +11,14 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import LidarBoard, LidarQuality
 from lce_rig.detect.findings import (
+    LIDAR_HIDDEN,
+    LIDAR_NO_BORDER,
     LIDAR_NO_PLATE,
     LIDAR_NO_RETURNS,
     LIDAR_NOT_WHERE_EXPECTED,
     LIDAR_NOTHING_WHERE_EXPECTED,
     LIDAR_OTHER_PLATE,
     LIDAR_OUT_OF_VIEW,
-    LIDAR_OUTLINE,
     LIDAR_TOO_FEW_POINTS,
     LIDAR_TOUCHING,
     LIDAR_TURNED,
@@ -71,6 +72,8 @@ _MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
 _COARSE_M, _FINE_M, _LEAST_MEAN_M = 0.25, 0.10, 0.002
 _TOUCHED_SHARE = 0.2
 _STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
+# Fewer located places on upright or on level edges, or fewer means on the plate, leave its pose open.
+_MIN_STRIPS, _MIN_MEANS = 2, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,7 +362,10 @@ def measure_unstructured(
     if not starts:
         return LIDAR_TOO_FEW_POINTS.refusal(n_points=n_on, min_points=_MIN_POINTS, closer_m=distance_m / 4)
     if starts[0].error_m > _MOST_MISSES:
-        return _other_plate(np.array(half_m) * 2, distance_m, board)
+        size_m = np.percentile(view.uv[view.is_on], 98, axis=0) - np.percentile(
+            view.uv[view.is_on], 2, axis=0
+        )
+        return _other_plate(size_m / 0.96, distance_m, board)
     outline: Outline | None = None
     for _ in range(2):
         rays = view.rays(half_m, starts[0])
@@ -411,9 +417,7 @@ def _describe(view: _View, board: Board, outline: Outline, limits: Limits) -> Li
     if hidden > _HIDDEN_SHARE or beyond > TOUCHING_SHARE:
         if beyond > TOUCHING_SHARE:
             return LIDAR_TOUCHING.refusal(distance_m=distance_m, beyond_share=beyond)
-        return LIDAR_OUTLINE.refusal(
-            distance_m=distance_m, error_m=0.0, max_error_m=limits.template_m, hidden_share=hidden
-        )
+        return LIDAR_HIDDEN.refusal(distance_m=distance_m, hidden_share=hidden)
     rays = view.rays(placement.half_m, placement)
     strips = measure_strips(rays, outline, view.blur_m)
     # A strip that lies elsewhere than its neighbours shows what touches the border, or hides it.
@@ -421,10 +425,18 @@ def _describe(view: _View, board: Board, outline: Outline, limits: Limits) -> Li
         np.abs(strips.off_m) < np.hypot(_STRIP_OFF * strips.sigma_m, 0.015)
     )
     is_good &= ~_is_touched(view, strips)
-    edge_rms_m = float(np.sqrt(np.mean(strips.off_m[is_good] ** 2))) if is_good.any() else float("nan")
+    # Upright edges tell the plate's place along its width, the others along its height: both are needed.
+    width_axis = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
+    is_upright = np.abs(strips.outwards[is_good] @ width_axis) > np.sqrt(0.5)
+    n_upright, n_level = int(np.count_nonzero(is_upright)), int(np.count_nonzero(~is_upright))
+    if min(n_upright, n_level) < _MIN_STRIPS:
+        return LIDAR_NO_BORDER.refusal(distance_m=distance_m, n_upright=n_upright, n_level=n_level)
+    edge_rms_m = float(np.sqrt(np.mean(strips.off_m[is_good] ** 2)))
     growth, size_sigma = outline.growth_m, 2 * np.sqrt(np.diag(outline.cov)[3:])
     sigma_m = np.hypot(size_sigma, view.beam_m.max() / 2)
     points, point_sigma_m = _average(view.points[is_board], placement.local(view.uv[is_board]), view.plane)
+    if len(points) < _MIN_MEANS:
+        return LIDAR_TOO_FEW_POINTS.refusal(n_points=n_on, min_points=2 * n_on, closer_m=distance_m / 4)
     size_m = np.array([board.width_m, board.height_m]) + 2 * (growth - view.growth_m(placement)[0])
     quality = LidarQuality(
         width_m=float(size_m[0]),
@@ -447,8 +459,7 @@ def _describe(view: _View, board: Board, outline: Outline, limits: Limits) -> Li
     inwards = view.half_beam_m(strips.outwards)[:, None] * strips.outwards
     edge = view.origin + (strips.uv - inwards)[is_good] @ view.axes.T
     # y points upwards where the rectangle leaves the choice.
-    direction = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
-    x = view.axes @ (-direction if direction[0] < 0 else direction)
+    x = view.axes @ (-width_axis if width_axis[0] < 0 else width_axis)
     normal = view.plane[:3]
     R = np.stack([x, np.cross(normal, x), normal], axis=1)
     none = np.zeros(len(edge))
