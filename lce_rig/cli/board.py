@@ -16,7 +16,7 @@ from lce_rig.rig.board_settings import KEYS_OF_TYPE, board_block
 from lce_rig.rig.loading import Document, dump_yaml, explain
 
 _SIZE = re.compile(r"(\d+)x(\d+)")
-_PLATE = re.compile(r"([\d.]+)x([\d.]+)")
+_PLATE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)x(\d+(?:\.\d*)?|\.\d+)")
 _MARKER_SHARE, _TAG_SPACING = 0.75, 0.3
 # About the plate on the page; below it stand the profile block and how to mount the board.
 _MARGIN_MM, _TEXT_MM, _LINE_MM = 15.0, 75.0, 5.0
@@ -77,16 +77,16 @@ def board(
       lce-rig board --type charuco --squares 9x7 --size 0.07 -o board.pdf
       lce-rig board --type aprilgrid --squares 4x3 --size 0.13
     """
-    counts, outline = _SIZE.fullmatch(squares), _PLATE.fullmatch(plate or "0x0")
+    counts, outline = _SIZE.fullmatch(squares), _PLATE.fullmatch("0x0" if plate is None else plate)
     if counts is None or outline is None or Path(output).suffix not in (".pdf", ".svg"):
         raise UsageError("give --squares as 9x7, --plate as 0.8x0.6, and an output that ends in .pdf or .svg")
     cols, rows = map(int, counts.groups())
     more: dict[str, object] = {"marker_m": marker_m, "tag_spacing": spacing, "dictionary": dictionary}
     if kind == "charuco":
-        more["marker_m"] = marker_m or round(_MARKER_SHARE * square_m, 6)
+        more["marker_m"] = round(_MARKER_SHARE * square_m, 6) if marker_m is None else marker_m
         more["dictionary"] = dictionary or _smallest("5X5", (first_id or 0) + cols * rows // 2)
     elif kind == "aprilgrid":
-        more["tag_spacing"] = spacing or _TAG_SPACING
+        more["tag_spacing"] = _TAG_SPACING if spacing is None else spacing
     less = 1 if kind == "checkerboard" else 0
     document = {
         "type": kind,

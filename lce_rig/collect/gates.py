@@ -136,13 +136,13 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
     motions: list[float] = []
     for key, reference in middle.images.items():
         others = [s.images[key].corners_px for s in window if key in s.images]
-        grid = reference.corners_px.reshape(board.rows, board.cols, 2)
-        square_px = float(np.nanmedian(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
-        # The order may start at the other end of the pattern where it has no unique top.
+        # Without markers the order may start at the other end: a symmetric pattern has no unique top, and
+        # pictures of events can have the colours of its squares wrong.
+        steps = (1,) if board.has_markers else (1, -1)
         shift_px = max(
-            min(_rms(corners - reference.corners_px), _rms(corners[::-1] - reference.corners_px))
-            for corners in others
+            min(_rms(corners[::step] - reference.corners_px) for step in steps) for corners in others
         )
+        square_px = _square_px(reference.corners_px, board)
         motions.append(shift_px * board.square_m / max(square_px, 1e-6))
     lidar_motions = [
         max(_plane_motion_m(candidate, detection.lidars.get(lidar, []), max_motion_m) for detection in window)
@@ -151,6 +151,19 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
     ]
     # Walls and tables always stand still: the cameras, which identify the board by its pattern, must agree.
     return max(max(motions), min(lidar_motions))
+
+
+def _square_px(corners_px: Array, board: Board) -> float:
+    """Measure the side of a square; where no two neighbours are visible, by how far corners are spread."""
+    grid = corners_px.reshape(board.rows, board.cols, 2)
+    sides = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
+    if np.isfinite(sides).any():
+        return float(np.nanmedian(sides))
+    is_seen = np.isfinite(corners_px).all(axis=1)
+    spread_px, spread_m = (
+        np.linalg.norm(corners[is_seen].std(axis=0)) for corners in (corners_px, board.corners())
+    )
+    return float(board.square_m * spread_px / spread_m)
 
 
 def _rms(difference: Array) -> float:

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator, model_validator
 
 from lce_rig.core.board import Board, BoardType
-from lce_rig.core.pattern import DICTIONARIES, n_markers_of
+from lce_rig.core.pattern import DICTIONARIES, LEAST_CORNERS, n_markers_of
 from lce_rig.rig.settings import Figure, Settings, problem
 
 # Beyond these the figure is in millimetres.
@@ -94,6 +94,9 @@ class BoardSettings(Settings):
     def _has_markers_enough(self) -> "BoardSettings":
         board = self.to_board()
         if board.has_markers:
+            if min(board.cols, board.rows) < 2 or board.cols * board.rows < LEAST_CORNERS:
+                what = f"{board.cols}x{board.rows} corners are too few: 2 each way, {LEAST_CORNERS} in all"
+                raise problem(what, KEYS_OF_TYPE[self.type][0])
             n_needed, n_there = board.first_id + board.n_markers, n_markers_of(board.dictionary)
             if n_needed > n_there:
                 raise problem(f"{board.dictionary} has {n_there} markers, the board needs {n_needed}")

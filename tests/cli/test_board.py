@@ -45,7 +45,11 @@ def test_the_block_that_it_prints_is_that_of_a_new_profile(lce_rig, tmp_path, wo
     [
         (["--squares", "9", "--size", "0.07"], 2),
         (["--squares", "9x7", "--size", "0.07", "-o", "board.doc"], 2),
+        (["--squares", "9x7", "--size", "0.07", "--plate", "1.2.3x0.5"], 2),
         (["--squares", "9x7", "--size", "70"], 3),
+        (["--type", "charuco", "--squares", "9x7", "--size", "0.07", "--marker", "0"], 3),
+        (["--type", "charuco", "--squares", "3x3", "--size", "0.07"], 3),
+        (["--type", "aprilgrid", "--squares", "4x3", "--size", "0.13", "--spacing", "0"], 3),
         (["--squares", "9x7", "--size", "0.07", "--plate", "0.5x0.4"], 3),
         (["--type", "charuco", "--squares", "9x7", "--size", "0.07", "--dictionary", "5X5"], 3),
         (["--type", "charuco", "--squares", "9x7", "--size", "0.07", "--marker", "0.08"], 3),

@@ -1,13 +1,15 @@
 """Which moments of a moving board become captures for an event camera, and why others do not."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
-from lce_rig.collect.gates import MotionGate, find_moments
+from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments
 from lce_rig.collect.placement_dedupe import Placements
+from lce_rig.core.board import Board
 from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
 from lce_rig.rig import Rig, load_rig
@@ -107,3 +109,26 @@ def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig:
         told = [BoardDetection(s.frame, {}, {}, {("davis", "events"): unseen}) for s in detections]
         moments, refused = choose(told, rig)
         assert moments == [] and list(refused) == [code]
+
+
+@pytest.mark.parametrize(
+    ("markers", "is_turned", "is_still"),
+    [("charuco", False, True), ("charuco", True, False), ("checkerboard", True, True)],
+)
+def test_markers_tell_a_turned_board_from_a_still_one_and_need_no_neighbours(
+    rig: Rig, markers: str, is_turned: bool, is_still: bool
+) -> None:
+    board = Board(8, 6, 0.07, 0.767, 0.626)
+    corners_px = 100 + 400 * board.corners()[:, :2]
+    if markers == "charuco":
+        board = replace(board, type="charuco", marker_share=0.75, dictionary="5X5_50")
+        # Of these columns no corner has a neighbour in its row.
+        corners_px[~np.isin(np.arange(48) % 8, (0, 2, 5, 7))] = np.nan
+    gate = StillnessGate(board, 0.01)
+    for k, detection in enumerate(watch(rig, lambda _t: (0.0, 0.0), 1.0, PLENTY)):
+        px = corners_px[::-1] if is_turned and k % 2 else corners_px
+        images = {key: replace(image, corners_px=px) for key, image in detection.images.items()}
+        (plate,) = detection.lidars["lidar"]
+        lidars = {"lidar": [replace(plate, plane=np.array([0, 0, 1.0, 0]))]}
+        gate.take(replace(detection, images=images, lidars=lidars))
+    assert (gate.motion_m < 0.001) == is_still

@@ -294,6 +294,33 @@ def test_keys_of_another_type_of_board_are_named(changes: dict[str, object], key
     assert key in caught.value.what + caught.value.hint
 
 
+@pytest.mark.parametrize(
+    ("key", "size", "is_accepted"),
+    [
+        ("squares", (3, 3), False),
+        ("squares", (2, 9), False),
+        ("squares", (5, 3), True),
+        ("tags", (1, 1), False),
+        ("tags", (2, 1), True),
+    ],
+)
+def test_boards_with_too_few_corners_to_be_detected_are_refused(
+    key: str, size: tuple[int, int], is_accepted: bool
+) -> None:
+    board = {
+        "squares": {"type": "charuco", "marker_m": 0.05, "dictionary": "5X5_50"},
+        "tags": {"type": "aprilgrid", "tag_spacing": 0.3},
+    }[key]
+    document = load_rig("rlfs").model_dump(mode="json", exclude_none=True)
+    document["board"] = board | {key: size, "square_m": 0.07, "width_m": 0.8, "height_m": 0.8}
+    if is_accepted:
+        assert rig_from_document(Document("mine.yaml", document, None)).board.to_board().has_markers
+        return
+    with pytest.raises(ProfileError) as caught:
+        rig_from_document(Document("mine.yaml", document, None))
+    assert f"board.{key}" in caught.value.what + caught.value.hint
+
+
 def test_a_board_with_markers_survives_its_profile_and_old_profiles_are_checkerboards() -> None:
     document = load_rig("rlfs").model_dump(mode="json", exclude_none=True)
     assert load_rig("rlfs").board.type == "checkerboard"

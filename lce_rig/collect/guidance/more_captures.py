@@ -9,6 +9,7 @@ from lce_rig.collect.guidance.instructions import describe_pose
 from lce_rig.collect.guidance.planner import ENOUGH_SHARE, LEANS_DEG, Planner
 from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.core.calibration import Calibration
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
@@ -86,21 +87,25 @@ def _describe(view: SensorPlace, poses: Array) -> tuple[tuple[int, float, str, t
         (
             len(part),
             round(float(np.linalg.norm(part[:, :3, 3], axis=1).mean()), 1),
-            _place(view, part),
+            common_third(view.model.lens, part[:, :3, 3]),
             _sides(view, part),
         )
         for part in parts
     )
 
 
-def _place(view: SensorPlace, poses: Array) -> str:
-    """Name the outer third of the image in which all boards are; "" for none."""
-    lens = view.model.lens
-    pixels, _ = lens.project(poses[:, :3, 3])
-    x, y = pixels.mean(axis=0) / [lens.width_px, lens.height_px]
+def common_third(lens: Intrinsics, centres: Array) -> str:
+    """Name the outer third of the image in which all boards are; "" for none.
+
+    Args:
+        lens: of the camera.
+        centres: (N, 3) of the boards, camera frame, m.
+    """
+    pixels, _ = lens.project(centres)
+    x, y = (pixels / [lens.width_px, lens.height_px]).T
     # The person faces the rig: the image's right is on the left.
     for word, share in (("high", y), ("low", 1 - y), ("on your right", x), ("on your left", 1 - x)):
-        if share < 1 / 3:
+        if share.max() < 1 / 3:
             return word
     return ""
 

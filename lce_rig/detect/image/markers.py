@@ -14,7 +14,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Figure, Refusal
 from lce_rig.core.geometry import Array, transform
-from lce_rig.core.pattern import DICTIONARIES, Markers, markers_of
+from lce_rig.core.pattern import DICTIONARIES, LEAST_CORNERS, Markers, markers_of
 from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.detect.findings import (
     IMAGE_FEW_CORNERS,
@@ -29,8 +29,8 @@ Places = dict[int, Array]
 """Corners (4, 2) px of markers by their ids."""
 # Images narrower than this are searched at twice their size first.
 _WIDE_PX = 700
-# Two markers show that they are the board's; fewer corners make a poor pose.
-_MIN_MARKERS, _MIN_CORNERS = 2, 8
+# Two markers show that they are the board's.
+_MIN_MARKERS = 2
 # Markers and corners lie so near to where a pose has them, of a marker's side, or they are others.
 _MAX_AWAY = 0.25
 # Of the markers that belong to a board, so many fit one pose if the profile has their layout.
@@ -74,7 +74,7 @@ def find_marked_grid(
         return IMAGE_OTHER_LAYOUT.refusal(**figures, n_fitting=n_fitting)
     crossings, n_seen = _measure(grey, board, intrinsics, T_cam_board, is_legacy)
     if crossings is None:
-        return IMAGE_FEW_CORNERS.refusal(**figures, n_corners=n_seen, n_needed=_MIN_CORNERS)
+        return IMAGE_FEW_CORNERS.refusal(**figures, n_corners=n_seen, n_needed=LEAST_CORNERS)
     return crossings
 
 
@@ -128,17 +128,22 @@ def _detect(grey: Grey, dictionary: str, scale: float, n_border: int) -> Places:
 
 def _other_dictionary(grey: Grey, board: Board) -> Refusal | None:
     """Name the dictionary of which the image has markers; None if there is none."""
-    own = board.dictionary.rpartition("_")[0]
+    own = _family(board.dictionary)
     best, most = "", 3
     # The largest of a family holds the markers of the smaller ones.
     for name in DICTIONARIES:
-        if not name.endswith(("_50", "_100", "_250")) and name.rpartition("_")[0] != own:
+        if not name.endswith(("_50", "_100", "_250")) and _family(name) != own:
             n_seen = max(len(_detect(grey, name, 1.0, n_border)) for n_border in (1, 2))
             best, most = (name, n_seen) if n_seen > most else (best, most)
     if not best:
         return None
     figures: dict[str, Figure] = {"dictionary": board.dictionary, "seen_dictionary": best, "n_seen": most}
     return IMAGE_OTHER_DICTIONARY.refusal(**figures)
+
+
+def _family(dictionary: str) -> str:
+    """Name a dictionary without its size, as "5X5" of 5X5_100; each of AprilTag's is a family of its own."""
+    return dictionary.partition("_")[0] if dictionary[0].isdigit() else dictionary
 
 
 def _agree(places: Places, board: Board, intrinsics: Intrinsics) -> tuple[Array | None, int, bool]:
@@ -214,9 +219,9 @@ def _measure(
         is_trusted = is_seen & (crossings.misfit <= usual)
         for _ in range(3):
             n_seen = int(is_seen.sum())
-            if n_seen < _MIN_CORNERS or min(is_seen.any(axis=0).sum(), is_seen.any(axis=1).sum()) < 2:
+            if n_seen < LEAST_CORNERS or min(is_seen.any(axis=0).sum(), is_seen.any(axis=1).sum()) < 2:
                 return None, n_seen
-            is_used = is_trusted if is_trusted.sum() >= _MIN_CORNERS else is_seen
+            is_used = is_trusted if is_trusted.sum() >= LEAST_CORNERS else is_seen
             used_px = np.where(is_used[..., None], crossings.grid_px, np.nan).reshape(-1, 2)
             solved = solve_planar_pose(used_px, corners, intrinsics)
             if solved is None:

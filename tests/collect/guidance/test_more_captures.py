@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from lce_rig.collect.guidance.more_captures import plan_captures
+from lce_rig.collect.guidance.more_captures import common_third, plan_captures
 from lce_rig.collect.guidance.planner import Planner
 from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig, load_rig
 
@@ -47,3 +48,12 @@ def test_a_plan_needs_no_nominal_extrinsics_but_the_beams_of_the_lidar(placement
     assert not plan_captures(
         rig.model_copy(update={"lidars": {"lidar": unknown}}), "cam", "lidar", placements
     )
+
+
+@pytest.mark.parametrize(
+    ("shares", "word"), [((0.02, 0.6), ""), ((0.02, 0.3), "on your right"), ((0.7, 0.98), "on your left")]
+)
+def test_an_outer_third_is_named_only_where_all_boards_are(shares: tuple[float, ...], word: str) -> None:
+    lens = Intrinsics(900, 900, 499.5, 299.5, 1000, 600, "radtan", (0.0,) * 4)
+    centres = 2.0 * lens.unproject(np.array([[1000 * share, 300] for share in shares]))
+    assert common_third(lens, centres) == word
