@@ -73,14 +73,14 @@ def test_a_page_that_cannot_be_served_is_said_before_anything_is_made(lce_rig, t
             assert "starting" not in result.err and not path.exists() and not record.exists()
 
 
-def start(path: Path, *arguments: str, **options: object) -> "subprocess.Popen[str]":
+def start(path: Path, *arguments: str, rig: str = "rles", **options: object) -> "subprocess.Popen[str]":
     command = [
         sys.executable,
         "-m",
         "lce_rig",
         "collect",
         "--rig",
-        "rles",
+        rig,
         str(path),
         "--simulated",
         *arguments,
@@ -89,9 +89,12 @@ def start(path: Path, *arguments: str, **options: object) -> "subprocess.Popen[s
 
 
 @pytest.mark.long
-def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("rig", "camera"), [("rles", "davis"), ("mid360", "cam")])
+def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(
+    tmp_path: Path, rig: str, camera: str
+) -> None:
     path = tmp_path / "session"
-    process = start(path, "--plain", "--captures", "2", "--timeout", "240", "--hold", "0.3")
+    process = start(path, "--plain", "--captures", "2", "--timeout", "240", "--hold", "0.3", rig=rig)
     _, said = process.communicate(timeout=300)
     assert process.returncode == 0, said
     session = Session.open(path)
@@ -99,7 +102,7 @@ def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path
     for capture in session.captures:
         capture.check()
     truth = json.loads((path / "truth.json").read_text())
-    expected = truth_extrinsics(load_rig("rles"), 0)["davis", "lidar"]
+    expected = truth_extrinsics(load_rig(rig), 0)[camera, "lidar"]
     assert np.allclose(truth["T_cam_lidar"], expected)
     assert "2 captures (2 new)" in said and "holding:" in said
     assert "lce-rig calibrate" not in said

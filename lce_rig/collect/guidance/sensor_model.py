@@ -18,6 +18,9 @@ PRIOR_CAPTURES = 5
 #: Rms distance of a board's points from its middle line: what a tilt moves them by.
 BOARD_LEVER_M = 0.2
 _POINTS_PER_EDGE = 12
+# Without rings, returns all along the outline let the calibration estimate the ranges' offset: it states less
+# than a millimetre for it.
+_OUTLINED_OFFSET_M = 0.003
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,7 @@ class SensorModel:
         lens: the camera.
         elevations_rad: (L,) of the LiDAR's rings, from the lowest.
         azimuth_step_rad: angle between neighbouring firings of one ring.
+        pattern, width_rad: how its beams sweep the field of view, and its width; as `DataSheet` has them.
         limits: the profile's, on what a capture must show.
         target_sigma_rad, target_sigma_m: how well the extrinsic is to be known.
         errors: how both measure.
@@ -101,6 +105,8 @@ class SensorModel:
     target_sigma_rad: float
     target_sigma_m: float
     errors: ErrorModel = field(default_factory=ErrorModel)
+    pattern: str = "rings"
+    width_rad: float = 2 * np.pi
 
     @classmethod
     def of(cls, rig: Rig, camera: str, lidar: str) -> "SensorModel":
@@ -117,6 +123,9 @@ class SensorModel:
                 f"lidars.{lidar}.model: no guidance for {settings.model}, its beams are not known",
                 f"set elevations_deg, collect without guidance, or use one of {names}",
             )
+        offset_m = settings.range_offset_sigma_m
+        if not settings.has_rings:
+            offset_m = min(offset_m, _OUTLINED_OFFSET_M)
         return cls(
             board=rig.board.to_board(),
             lens=rig.cameras[camera].to_intrinsics(),
@@ -128,8 +137,10 @@ class SensorModel:
             errors=ErrorModel(
                 range_m=sheet.range_sigma_m,
                 laser_bias_m=settings.laser_bias_sigma_m,
-                range_offset_m=settings.range_offset_sigma_m,
+                range_offset_m=offset_m,
             ),
+            pattern=sheet.pattern,
+            width_rad=float(np.radians(sheet.fov_deg[0])),
         )
 
 
@@ -156,6 +167,8 @@ DIAMOND_DEG = 45.0
 ROLLS_DEG = (-12.0, 0.0, 12.0)
 #: Share of the plate's height that must lie within the LiDAR's vertical field.
 SEEN_SHARE = 0.8
+# Without rings a plate that reaches out of the field of view is refused: it lies so much larger within it.
+_FREE_SHARE = 1.2
 #: How far below and above the LiDAR arms hold the board's centre.
 REACH_M = (-0.9, 0.8)
 # Free border of the image, as a share of its width: people do not hold the board to the pixel.
@@ -272,14 +285,7 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
     pixels, is_valid = model.lens.project(outline)
     ok &= np.all(is_valid & model.lens.is_inside(pixels, _MARGIN * model.lens.width_px), axis=1)
 
-    T_lidar_cam = invert(view.T_cam_lidar)
-    seen = outline @ T_lidar_cam[:3, :3].T + T_lidar_cam[:3, 3]
-    elevation = np.arctan2(seen[..., 2], np.hypot(seen[..., 0], seen[..., 1]))
-    lasers = model.elevations_rad
-    half_gap = np.ptp(lasers) / (len(lasers) - 1) / 2
-    top, bottom = elevation.max(axis=1), elevation.min(axis=1)
-    covered = np.minimum(top, lasers.max() + half_gap) - np.maximum(bottom, lasers.min() - half_gap)
-    ok &= covered >= SEEN_SHARE * (top - bottom)
+    ok &= _is_in_lidar_view(view, outline)
 
     to_lidar = view.T_cam_lidar[:3, 3] - centre
     range_m = np.linalg.norm(to_lidar, axis=1)
@@ -288,3 +294,23 @@ def is_reachable(view: SensorPlace, T_cam_board: Array) -> NDArray[np.bool_]:
     ok &= (height_m > REACH_M[0]) & (height_m < REACH_M[1])
     # People do not hold a board flat.
     return np.asarray(ok & (np.abs(normal @ view.up) < 0.7))
+
+
+def _is_in_lidar_view(view: SensorPlace, outline: Array) -> NDArray[np.bool_]:
+    """Find which outlines (N, K, 3), frame camera, the LiDAR sees: rings most of one, others all of it."""
+    model, T_lidar_cam = view.model, invert(view.T_cam_lidar)
+    if model.pattern != "rings":
+        middle = outline.mean(axis=1, keepdims=True)
+        outline = middle + _FREE_SHARE * (outline - middle)
+    seen = outline @ T_lidar_cam[:3, :3].T + T_lidar_cam[:3, 3]
+    elevation = np.arctan2(seen[..., 2], np.hypot(seen[..., 0], seen[..., 1]))
+    lasers = model.elevations_rad
+    if model.pattern == "rings":
+        half_gap = np.ptp(lasers) / (len(lasers) - 1) / 2
+        top, bottom = elevation.max(axis=1), elevation.min(axis=1)
+        covered = np.minimum(top, lasers.max() + half_gap) - np.maximum(bottom, lasers.min() - half_gap)
+        return np.asarray(covered >= SEEN_SHARE * (top - bottom))
+    across = 2 * np.arctan2(seen[..., 1], seen[..., 0]) / model.width_rad
+    upwards = (2 * elevation - lasers.max() - lasers.min()) / np.ptp(lasers)
+    off = np.hypot(across, upwards) if model.pattern == "rosette" else np.maximum(abs(across), abs(upwards))
+    return np.asarray(np.all(off <= 1, axis=1))

@@ -16,7 +16,7 @@ from lce_rig.collect.guidance.sensor_model import (
     is_reachable,
     outline_px,
 )
-from lce_rig.core.geometry import perturb
+from lce_rig.core.geometry import invert, perturb, transform
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import T_FORWARD
 from tests.collect.guidance.boards import model, placements, predict_covariance, view
@@ -127,6 +127,21 @@ def test_reach_ends_at_the_arms_the_border_and_the_lidar_s_field():
     far[:, :3, 3] *= 7.0 / np.linalg.norm(poses[:, :3, 3], axis=1)[:, None]
     for moved in (raised, aside, far):
         assert not is_reachable(view(), moved).any()
+
+
+def test_without_rings_the_whole_plate_is_kept_in_the_field_of_view():
+    shape = {"elevations_rad": np.radians(np.arange(-20.0, 20.5, 0.5)), "width_rad": np.radians(60.0)}
+    n_placed = []
+    for pattern in ("rings", "any", "rosette"):
+        place = SensorPlace.upright(replace(model(), pattern=pattern, **shape), T_FORWARD)
+        poses = Planner(place, n_places=100).candidates
+        n_placed.append(len(poses))
+        outline = transform(invert(T_FORWARD) @ poses, model().board.outline())
+        elevation = np.arctan2(outline[..., 2], np.hypot(outline[..., 0], outline[..., 1]))
+        azimuth = np.arctan2(outline[..., 1], outline[..., 0])
+        is_inside = bool(np.all(abs(elevation) < np.radians(20)) and np.all(abs(azimuth) < np.radians(30)))
+        assert is_inside == (pattern != "rings")
+    assert n_placed[0] > n_placed[1] > n_placed[2] > 0
 
 
 def test_who_stands_at_a_capture_is_always_told_to_move(planner, guided):
