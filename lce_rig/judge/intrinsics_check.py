@@ -100,8 +100,9 @@ class IntrinsicsCheck:
         turned = self.turn_deg if self.is_turned else 0.0
         if bent > _BENT_FAIL * target_deg or turned > _TURN_FAIL * target_deg:
             return "fail"
+        is_other_lens = self.surprise is not None and self.surprise > _OTHER_LENS
         is_marginal = bent > _BENT_MARGINAL * target_deg or turned > _TURN_MARGINAL * target_deg
-        return "marginal" if is_marginal else "pass"
+        return "marginal" if is_marginal or is_other_lens else "pass"
 
     @property
     def is_bent(self) -> bool:

@@ -82,7 +82,7 @@ def test_what_one_check_finds_decides_and_is_named(estimate, verdict_of, change,
     if "diagnostics" in change:
         change = {"diagnostics": replace(estimate.diagnostics, **change["diagnostics"])}
     if "residuals" in change:
-        change = {"residuals": tuple(replace(r, **change["residuals"]) for r in estimate.residuals)}
+        change = {"residuals": tuple(r._replace(**change["residuals"]) for r in estimate.residuals)}
     found, reasons = verdict_of(replace(estimate, **change))
     assert (found, reasons[0].code) == (verdict, code)
     assert reasons[0].figures == pytest.approx(figures)
@@ -199,7 +199,7 @@ def test_wrong_squares_or_another_lens_are_named_before_any_estimate(factor, cod
 
 
 def test_the_worst_reason_comes_first(estimate, verdict_of):
-    residuals = tuple(replace(r, held_out_m=1.0) for r in estimate.residuals)
+    residuals = tuple(r._replace(held_out_m=1.0) for r in estimate.residuals)
     doubtful = replace(estimate, certificate=Certificate(False, 1.0), residuals=residuals)
     verdict, reasons = verdict_of(doubtful)
     assert verdict == "fail"

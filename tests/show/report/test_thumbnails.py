@@ -43,7 +43,7 @@ def test_the_capture_that_stands_out_comes_first() -> None:
 
 def test_the_page_shows_every_capture_with_the_command_that_rejects_the_worst(one: Calibration) -> None:
     residuals = list(one.residuals)
-    residuals[3] = replace(residuals[3], plane_mean_m=0.2)
+    residuals[3] = residuals[3]._replace(plane_mean_m=0.2)
     picture = data_uri(np.zeros((72, 128), np.uint8), np.empty((0, 2)))
     text = calibration_page(
         RLFS,
