@@ -24,7 +24,7 @@ from lce_rig.judge.findings import (
     Verdict,
     failing,
 )
-from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
+from lce_rig.lens.calibrate_lens import CONTRADICTION, distances_under, estimate_intrinsics
 from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses, lens_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import model_of
@@ -100,9 +100,9 @@ class IntrinsicsCheck:
         turned = self.turn_deg if self.is_turned else 0.0
         if bent > _BENT_FAIL * target_deg or turned > _TURN_FAIL * target_deg:
             return "fail"
-        is_other_lens = self.surprise is not None and self.surprise > _OTHER_LENS
+        is_contradicted = self.surprise is not None and self.surprise > CONTRADICTION
         is_marginal = bent > _BENT_MARGINAL * target_deg or turned > _TURN_MARGINAL * target_deg
-        return "marginal" if is_marginal or is_other_lens else "pass"
+        return "marginal" if is_marginal or is_contradicted else "pass"
 
     @property
     def is_bent(self) -> bool:

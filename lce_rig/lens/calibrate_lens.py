@@ -38,7 +38,7 @@ _PRIOR_DOF = 30.0
 _SHARED_PX = 0.02
 # A profile's intrinsics that the boards contradict by more (squared, in standard deviations) are trusted
 # less: 98 % of chi-squared with nine degrees of freedom.
-_CONTRADICTION = 20.0
+CONTRADICTION = 20.0
 # Rounds of comparing the scatter of captures with the stated deviations.
 _SCATTER_ROUNDS = 3
 # Corners with residuals this many times the typical value of their channel are outliers.
@@ -229,7 +229,7 @@ def _weigh_scatter(
     for _ in range(_SCATTER_ROUNDS):
         ratio = _scatter_ratio(setup, state, weights, captures)
         inflation, weights = inflation * ratio, weights / ratio
-        is_contradicted = has_prior and setup.surprise(state.lens) > _CONTRADICTION
+        is_contradicted = has_prior and setup.surprise(state.lens) > CONTRADICTION
         setup = setup.doubting(state.lens) if is_contradicted else setup
         if ratio == 1.0 and not is_contradicted:
             break
