@@ -6,7 +6,7 @@
     scripts/fuzz.py deploy-kills --n 200        `deploy`, killed, into a folder and over ssh
     scripts/fuzz.py interrupts --n 100          Ctrl-C at any moment of any verb
 
-Exits with 1 if anything was lost. docs/fuzzing.md describes the checks.
+Exits with 1 if anything was lost. CONTRIBUTING.md describes the checks.
 """
 
 import argparse

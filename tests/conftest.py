@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Long runs of the property tests try more examples, and new ones each time (docs/fuzzing.md).
+# Long runs of the property tests try more examples, and new ones each time (CONTRIBUTING.md, Fuzzing).
 _EXAMPLES = os.environ.get("LCE_RIG_EXAMPLES")
 settings.register_profile(
     "lce-rig", deadline=None, derandomize=not _EXAMPLES, max_examples=int(_EXAMPLES or 50)
