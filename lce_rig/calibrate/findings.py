@@ -1,7 +1,7 @@
 """Findings of the calibration: captures that disagree, and captures that are too few."""
 
 from lce_rig.core.findings import Finding, Kind
-from lce_rig.core.phrasing import motion_words
+from lce_rig.core.phrasing import captures_to_add, motion_words
 
 
 def _undetermined(finding: Finding) -> str:
@@ -18,7 +18,9 @@ def _undetermined(finding: Finding) -> str:
 def _tilt(finding: Finding) -> str:
     """{where}, or: add captures with the board tilted by 20 deg or more to all sides."""
     where = finding.figures.get("where")
-    return str(where or "add captures with the board tilted by 20 deg or more to all sides")
+    if isinstance(where, tuple):
+        return captures_to_add(*where)
+    return "add captures with the board tilted by 20 deg or more to all sides"
 
 
 def _elsewhere(finding: Finding) -> str:

@@ -1,24 +1,13 @@
 """Why captures are not taken, why guidance is missing, and why a collection continues."""
 
-from typing import Any
-
 from lce_rig.core.findings import Finding, Kind
+from lce_rig.core.phrasing import captures_to_add
 
 
 def _placements(finding: Finding) -> str:
     """Add {n_captures} captures ({is_enough}: predicted to suffice): {placements}."""
-    groups = finding.figures["placements"]
-    assert isinstance(groups, tuple)
-    more = "" if finding.figures["is_enough"] else "+"
-    return f"add {finding.figures['n_captures']}{more} captures: {', '.join(map(_group, groups))}"
-
-
-def _group(group: Any) -> str:
-    n, distance_m, place, sides = group
-    text = f"{n} at {distance_m:g} m"
-    if sides:
-        return f"{text} tilted {'/'.join(sides) if len(sides) < 3 else 'all ways'}"
-    return f"{text} {place}".rstrip()
+    figures = finding.figures
+    return captures_to_add(figures["n_captures"], figures["is_enough"], figures["placements"])
 
 
 GUIDE_NO_BEAMS = Kind("guide.no_beams", "no guidance: {cause}", severity="warning")

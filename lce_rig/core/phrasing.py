@@ -109,6 +109,25 @@ def figures_apart(value: float, limit: float) -> tuple[str, str]:
     return next((each for each in texts if each[0] != each[1]), texts[-1])
 
 
+def captures_to_add(n_captures: Any, is_enough: Any, groups: Any) -> str:
+    """Say how many captures to add, where to stand and how to tilt the board.
+
+    Args:
+        n_captures: in all.
+        is_enough: whether they are predicted to suffice.
+        groups: of each the number, the distance in m, the place in the image if that is aside, and the tilts.
+    """
+    return f"add {n_captures}{'' if is_enough else '+'} captures: {', '.join(map(_placements, groups))}"
+
+
+def _placements(group: Any) -> str:
+    n, distance_m, place, sides = group
+    text = f"{n} at {distance_m:g} m"
+    if sides:
+        return f"{text} tilted {'/'.join(sides) if len(sides) < 3 else 'all ways'}"
+    return f"{text} {place}".rstrip()
+
+
 def as_line(text: str) -> str:
     """Write words as a sentence, with a capital and a full stop."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."

@@ -155,9 +155,9 @@ def calibrate_detections(
             sensors = f"{pairs[0].camera} and {pairs[0].lidar}"
             if shortage.code in (FEW_DETECTED.code, UNDETERMINED.code):
                 held = boards_in(detections, pairs[0].camera, pairs[0].lidar)
-                plan = plan_captures(rig, pairs[0].camera, pairs[0].lidar, held)
-                where = next((each.advice for each in plan), "")
-                shortage = replace(shortage, figures={**shortage.figures, "where": where})
+                for plan in plan_captures(rig, pairs[0].camera, pairs[0].lidar, held):
+                    where = tuple(plan.figures[key] for key in ("n_captures", "is_enough", "placements"))
+                    shortage = replace(shortage, figures={**shortage.figures, "where": where})
             shortages.append(shortage if shortage.subject else replace(shortage, subject=sensors))
     if not alone and not shortages:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""

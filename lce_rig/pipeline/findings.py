@@ -1,6 +1,7 @@
 """Kinds of findings of the verbs: sensors without a result, and results that cannot be compared."""
 
 from lce_rig.core.findings import Finding, Kind
+from lce_rig.core.phrasing import captures_to_add
 
 
 def _commonest(finding: Finding) -> str:
@@ -10,9 +11,10 @@ def _commonest(finding: Finding) -> str:
     lines = [f"{cause[0]} x {cause[2]}" for cause in causes if isinstance(cause, tuple)]
     # Where most captures are refused, their causes come first.
     if 2 * finding.figure("n_detected") >= finding.figure("n_captures"):
+        where = finding.figures.get("where")
         n_missing = int(finding.figure("n_needed") - finding.figure("n_detected"))
         more = f"add {n_missing} captures or more, with the board at other places and tilts"
-        lines.append(str(finding.figures.get("where") or more))
+        lines.append(captures_to_add(*where) if isinstance(where, tuple) else more)
     return "\n".join(lines)
 
 

@@ -69,7 +69,7 @@ _LEAST_TOLERANCE_M, _MOST_TOLERANCE_M, _MOST_THICK_M = 0.02, 0.05, 0.03
 # Share of rays that contradict the best placement, and growth of the outline: beyond, it is another plate.
 _MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
 # Cells of the plate for means of returns; their noise is never taken as less than this.
-_COARSE_M, _FINE_M, _LEAST_MEAN_M = 0.25, 0.10, 0.002
+_COARSE_M, _FINE_M, _LEAST_MEAN_M, _MIN_CELL_RETURNS = 0.25, 0.10, 0.002, 3
 _TOUCHED_SHARE = 0.2
 _STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
 # Fewer located places on upright or on level edges, or fewer means on the plate, leave its pose open.
@@ -139,6 +139,10 @@ def _other_plate(size_m: Array, distance_m: float, board: Board) -> Refusal:
     wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
     width_m, height_m = size_m.tolist()
     return LIDAR_OTHER_PLATE.refusal(width_m=width_m, height_m=height_m, distance_m=distance_m, **wanted)
+
+
+def _too_few(n_points: int, distance_m: float, min_points: int = _MIN_POINTS) -> Refusal:
+    return LIDAR_TOO_FEW_POINTS.refusal(n_points=n_points, min_points=min_points, closer_m=distance_m / 4)
 
 
 def look_for_unstructured_board(
@@ -360,7 +364,7 @@ def measure_unstructured(
     n_on = int(np.count_nonzero(view.is_on))
     starts = register_rays(view.rays(half_m), half_m) if n_on >= _MIN_POINTS else []
     if not starts:
-        return LIDAR_TOO_FEW_POINTS.refusal(n_points=n_on, min_points=_MIN_POINTS, closer_m=distance_m / 4)
+        return _too_few(n_on, distance_m)
     if starts[0].error_m > _MOST_MISSES:
         size_m = np.percentile(view.uv[view.is_on], 98, axis=0) - np.percentile(
             view.uv[view.is_on], 2, axis=0
@@ -373,9 +377,7 @@ def measure_unstructured(
         outline = min((fit for fit in fits if fit), key=lambda fit: fit.placement.error_m, default=None)
         inside = np.zeros(0) if outline is None else view.is_on & (outline.placement.distance_m(view.uv) < 0)
         if outline is None or np.count_nonzero(inside) < _MIN_POINTS:
-            return LIDAR_TOO_FEW_POINTS.refusal(
-                n_points=int(np.count_nonzero(inside)), min_points=_MIN_POINTS, closer_m=distance_m / 4
-            )
+            return _too_few(int(np.count_nonzero(inside)), distance_m)
         on_plate = view.points[inside]
         scale_m = 1.4826 * median(np.abs(view.height_m[inside] - median(view.height_m[inside]))) + 0.001
         plane = fit_plane_to_ranges(on_plate, view.plane, scale_m * distance_m / view.plane[3])
@@ -386,12 +388,12 @@ def measure_unstructured(
         starts = [replace(outline.placement, u_m=0.0, v_m=0.0)]
     outline = fit_outline(view.rays(half_m, starts[0]), starts[0], view.blur_m, view.growth_m(starts[0]))
     if outline is None:
-        return LIDAR_TOO_FEW_POINTS.refusal(n_points=0, min_points=_MIN_POINTS, closer_m=distance_m / 4)
-    return _describe(view, board, outline, limits)
+        return _too_few(0, distance_m)
+    return _describe(view, board, outline)
 
 
-def _describe(view: _View, board: Board, outline: Outline, limits: Limits) -> LidarBoard | Refusal:
-    """Check a fitted outline against the limits and sum up the board."""
+def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refusal:
+    """Check what a fitted outline encloses and sum up the board."""
     placement = outline.placement
     distance_m = float(np.linalg.norm(view.origin))
     away = placement.distance_m(view.uv)
@@ -414,9 +416,9 @@ def _describe(view: _View, board: Board, outline: Outline, limits: Limits) -> Li
         return too_thick(sheet, _MOST_THICK_M)
     if dark_share > _DARK_SHARE:
         return LIDAR_OUT_OF_VIEW.refusal(distance_m=distance_m, share=float(dark_share))
-    if hidden > _HIDDEN_SHARE or beyond > TOUCHING_SHARE:
-        if beyond > TOUCHING_SHARE:
-            return LIDAR_TOUCHING.refusal(distance_m=distance_m, beyond_share=beyond)
+    if beyond > TOUCHING_SHARE:
+        return LIDAR_TOUCHING.refusal(distance_m=distance_m, beyond_share=beyond)
+    if hidden > _HIDDEN_SHARE:
         return LIDAR_HIDDEN.refusal(distance_m=distance_m, hidden_share=hidden)
     rays = view.rays(placement.half_m, placement)
     strips = measure_strips(rays, outline, view.blur_m)
@@ -436,7 +438,8 @@ def _describe(view: _View, board: Board, outline: Outline, limits: Limits) -> Li
     sigma_m = np.hypot(size_sigma, view.beam_m.max() / 2)
     points, point_sigma_m = _average(view.points[is_board], placement.local(view.uv[is_board]), view.plane)
     if len(points) < _MIN_MEANS:
-        return LIDAR_TOO_FEW_POINTS.refusal(n_points=n_on, min_points=2 * n_on, closer_m=distance_m / 4)
+        n_needed = int(np.ceil(_MIN_CELL_RETURNS * board.width_m * board.height_m / _FINE_M**2))
+        return _too_few(n_on, distance_m, n_needed)
     size_m = np.array([board.width_m, board.height_m]) + 2 * (growth - view.growth_m(placement)[0])
     quality = LidarQuality(
         width_m=float(size_m[0]),
@@ -512,7 +515,7 @@ def _average(points: Array, local: Array, plane: Array) -> tuple[Array, float]:
         cells -= cells.min(axis=0)
         _, cell = np.unique(cells[:, 0] * 1000 + cells[:, 1], return_inverse=True)
         count = np.bincount(cell)
-        is_full = count >= max(3, 0.2 * float(np.median(count)))
+        is_full = count >= max(_MIN_CELL_RETURNS, 0.2 * float(np.median(count)))
         means = np.stack([np.bincount(cell, column)[is_full] / count[is_full] for column in points.T], axis=1)
         height = means @ plane[:3] + plane[3]
         freedom = max(len(height) - 3, 1)

@@ -63,7 +63,7 @@ def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(
         collecting.wait_for_captures(n_before + 1)
         assert collecting.end() == 0
     # What was lost before it was opened again is not forgotten.
-    assert journal_of(tmp_path / "session")[0]["lost"]["lidar"] >= rig.stop()["withheld"] > 50
+    assert journal_of(tmp_path / "session")[0]["lost"]["lidar"] >= rig.stop()["withheld"] > 0
     sent = read_sent(reel, rig.rig.lidars["lidar"])
     for capture in check_whole(tmp_path / "session"):
         check_stamps(capture, check_sent(capture, sent), reel.n_placements)
