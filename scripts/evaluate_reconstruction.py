@@ -17,8 +17,7 @@ import torch
 from training.event_simulation import EventStream
 from training.textures import TEXTURE_PX, draw_checkerboard
 
-from lce_rig.detect.events.reconstruct.model import ReconstructionModel
-from lce_rig.detect.events.reconstruct.reconstructor import IntensityScale
+from lce_rig.detect.events.reconstructor import IntensityScale, ReconstructionModel
 
 HELD_OUT_SEED = 2_000_000_000
 SIZE_PX = 192

@@ -13,7 +13,6 @@ from lce_rig.cli import show
 from lce_rig.cli.captures import put_aside
 from lce_rig.cli.options import (
     cameras_option,
-    event_image_option,
     require_sensors,
     robot_option,
     split_names,
@@ -176,7 +175,6 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
     metavar="NAME[,NAME]",
     help="Use only these channels, such as frames or events [default: all, in one joint estimate].",
 )
-@event_image_option
 @click.option(
     "--method",
     type=click.Choice(get_args(Method)),
@@ -217,7 +215,6 @@ def calibrate(
     reference: Path | None,
     cameras: tuple[str, ...],
     channels: list[str] | None,
-    event_image: Any,
     use_scene: bool,
     name: str | None,
     robot: str | None,
@@ -277,7 +274,7 @@ def calibrate(
     detections = []
     for each in opened:
         with show.progress_bar("detecting") as progress:
-            detections.append(lce.detect(each, event_image=event_image, progress=progress))
+            detections.append(lce.detect(each, progress=progress))
     with show.progress_bar("calibrating") as progress:
         try:
             result = lce.calibrate(

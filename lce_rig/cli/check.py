@@ -11,7 +11,7 @@ import numpy as np
 import lce_rig as lce
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.cli import show
-from lce_rig.cli.options import event_image_option, explain_option, json_option, session_argument
+from lce_rig.cli.options import explain_option, json_option, session_argument
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
@@ -27,8 +27,7 @@ from lce_rig.rig import Rig
 @explain_option
 @json_option
 @click.option("--debug-images", is_flag=True, help="Write one image per capture into SESSION/debug/.")
-@event_image_option
-def check(session: Path, explain: bool, as_json: bool, debug_images: bool, event_image: Any) -> None:
+def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> None:
     """Report how many captures of SESSION (default: session/) are usable, and why the others are not.
 
     Usable: both sensors detect the board, and agree on its place. Exits with 6 if no capture is usable.
@@ -39,10 +38,10 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool, event
             f"{session} holds no captures", f"Run `lce-rig collect --rig RIG {session}` first."
         )
     with show.progress_bar("detecting") as progress:
-        detections = lce.detect(opened, event_image=event_image, progress=progress)
+        detections = lce.detect(opened, progress=progress)
     if debug_images:
         with show.progress_bar("drawing") as progress:
-            folder = write_debug_images(opened, detections, event_image=event_image, progress=progress)
+            folder = write_debug_images(opened, detections, progress=progress)
         show.note(f"debug images: {folder}")
     refusals = {pair: match_sensors(opened.rig, detections, pair)[0] for pair in detections.pairs}
     plates = {pair: _plates(opened.rig, detections, pair, refused) for pair, refused in refusals.items()}

@@ -60,15 +60,6 @@ def require_sensors(what: str, names: Sequence[str], choices: Collection[str]) -
         raise UsageError(f"the rig has no {what} {unknown[0]!r}", f"Choose one of: {', '.join(choices)}")
 
 
-EVENT_IMAGES = click.Choice(["network", "map"])
-
-event_image_option = click.option(
-    "--event-image",
-    type=EVENT_IMAGES,
-    help="Reconstruct images from events with the network, or as sums of polarities (map) "
-    "[default: the profile's, else network].",
-)
-
 registry_option = click.option(
     "--registry",
     required=True,

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 
 from lce_rig.cli import show
-from lce_rig.cli.options import EVENT_IMAGES, FiniteRange
+from lce_rig.cli.options import FiniteRange
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.phrasing import significant
-from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor
-from lce_rig.detect.events.reconstruct.filters import measure_flicker
+from lce_rig.detect.events.noise import measure_flicker
+from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.io.events import open_events
 from lce_rig.io.events.event_recording import EventRecording
 from lce_rig.show.overlays.overlay_files import write_gif, write_picture, write_video
@@ -51,13 +51,6 @@ _WARM_UP_NS = 1_500_000_000
 @click.option("--duration", type=FiniteRange(0.001), metavar="S", help="End S seconds after the beginning.")
 @click.option("--topic", metavar="/TOPIC", help="Choose the topic if a bag has several with events.")
 @click.option(
-    "--event-image",
-    type=EVENT_IMAGES,
-    default="network",
-    show_default=True,
-    help="Reconstruct with the recurrent network, or as sums of polarities (map, for comparison).",
-)
-@click.option(
     "--model",
     type=click.Path(path_type=Path),
     metavar="FILE",
@@ -76,7 +69,6 @@ def reconstruct(
     start: float,
     duration: float | None,
     topic: str | None,
-    event_image: Any,
     model: Path | None,
     video: Path | None,
 ) -> None:
@@ -85,7 +77,7 @@ def reconstruct(
     Reads AEDAT4, Prophesee RAW (EVT2, EVT3), ROS 1, ROS 2 and mcap bags, HDF5 in DSEC's layout and E2VID's
     text. Skips the first images, until the network has settled, and prints how many.
     """
-    reconstructor = Reconstructor(model, ReconstructionOptions(method=event_image))
+    reconstructor = Reconstructor(model)
     events = open_events(recording, topic=topic)
     flicker = measure_flicker(events.read(events.start_ns, events.start_ns + 1_000_000_000))
     if flicker.is_storm:

@@ -8,7 +8,7 @@ import click
 import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.calibrate import exit_by_verdict, scene_texts
-from lce_rig.cli.options import event_image_option, explain_option, json_option, session_argument
+from lce_rig.cli.options import explain_option, json_option, session_argument
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.findings import worst
 from lce_rig.detect.detection import Pair
@@ -35,7 +35,6 @@ from lce_rig.pipeline.verification import profile_behind
 )
 @explain_option
 @json_option
-@event_image_option
 def verify(
     session: Path,
     result: Path | None,
@@ -43,7 +42,6 @@ def verify(
     output: Path | None,
     explain: bool,
     as_json: bool,
-    event_image: Any,
 ) -> None:
     """Project the point clouds of SESSION (default: session/) into the images and print residuals.
 
@@ -57,9 +55,7 @@ def verify(
     saved = None if result is None else lce.read_result(result)
     profile = None if result is None or saved is None else profile_behind(result, saved)
     with show.progress_bar("detecting") as progress:
-        verification = lce.verify(
-            opened, saved, name=name, profile=profile, event_image=event_image, progress=progress
-        )
+        verification = lce.verify(opened, saved, name=name, profile=profile, progress=progress)
     for note in verification.notes:
         show.warn(note.sentence)
     with show.progress_bar("drawing") as progress:

@@ -16,7 +16,7 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, from_arrays, to_arrays
-from lce_rig.detect.events.search import EventImage, EventSighting, find_event_board, reconstructor_for
+from lce_rig.detect.events.search import EventSighting, find_event_board, reconstructor_for
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.pipeline.matching import expected_poses
 from lce_rig.rig import ReconstructionSettings, Rig
@@ -31,7 +31,6 @@ _Found = TypeVar("_Found", ImageDetection, LidarDetection, Image | Refusal)
 def detect(
     session: Session,
     *,
-    event_image: EventImage | None = None,
     progress: Progress = silent,
     n_threads: int = 2,
 ) -> Detections:
@@ -44,14 +43,13 @@ def detect(
 
     Args:
         session: open for reading is enough.
-        event_image: how to reconstruct images from raw events; None for the profile's method.
         progress: called with (done, total).
         n_threads: detectors that run in parallel.
 
     Raises:
         ProfileError: a network that the profile names cannot be used.
     """
-    finder = _Finder(session, event_image)
+    finder = _Finder(session)
     scan_jobs, image_jobs, event_jobs = finder.jobs(session.captures)
     n_scans, total = len(scan_jobs), len(scan_jobs) + len(image_jobs) + len(event_jobs)
     images: dict[Key, dict[str, ImageDetection]] = {}
@@ -95,18 +93,15 @@ def detect(
     return detections
 
 
-def event_picture(
-    session: Session, capture: Capture, camera: str, channel: str, event_image: EventImage | None = None
-) -> Image | Refusal:
+def event_picture(session: Session, capture: Capture, camera: str, channel: str) -> Image | Refusal:
     """Return the image reconstructed from a capture's raw events, or the cause if there is none.
 
     Args:
         session: open for reading is enough.
         capture: holds events of the camera.
         camera, channel: the image's camera and channel.
-        event_image: as in `detect`.
     """
-    finder = _Finder(session, event_image)
+    finder = _Finder(session)
     scans = {lidar: finder.scan(capture, lidar) for lidar in capture.lidars}
     return finder.picture(capture, camera, channel, scans)
 
@@ -114,8 +109,8 @@ def event_picture(
 class _Finder:
     """Detects boards and stores the detections in the session's cache."""
 
-    def __init__(self, session: Session, event_image: EventImage | None) -> None:
-        self._session, self._event_image = session, event_image
+    def __init__(self, session: Session) -> None:
+        self._session = session
         self._boards = BoardFinder(session.rig)
         self._digest = detection_digest(session.rig)
         self._event_digests: dict[Key, str] = {}
@@ -131,7 +126,7 @@ class _Finder:
         held: dict[str, tuple[list[str], list[Key], list[Key]]] = {}
         for capture in captures:
             with suppress(SessionError):
-                made_here = event_channels(self._session.rig, capture, self._event_image)
+                made_here = event_channels(self._session.rig, capture)
                 stored = [key for key in capture.image_keys if key not in made_here]
                 held[capture.name] = capture.lidars, stored, made_here
         if captures and not held:
@@ -216,7 +211,7 @@ class _Finder:
         return find_event_board(
             events,
             stamp_ns,
-            reconstructor_for(settings, channel, self._event_image),
+            reconstructor_for(settings, channel),
             rig.board.to_board(),
             rig.cameras[camera].to_intrinsics(),
             rig.quality,
@@ -225,15 +220,13 @@ class _Finder:
 
     def _event_digest(self, camera: str, channel: str) -> str:
         """Hash the inputs of images from a channel's events besides the capture, to 12 digits."""
-        from lce_rig.detect.events.reconstruct import model_bytes
+        from lce_rig.detect.events.reconstructor import model_bytes
 
         if (camera, channel) not in self._event_digests:
             stated = self._session.rig.cameras[camera].channels[channel].reconstruction
             settings = stated or ReconstructionSettings()
-            settings = settings.model_copy(update={"method": self._event_image or settings.method})
             digest = hashlib.sha256(f"{self._digest} {settings.model_dump_json()}".encode())
-            if settings.method == "network":
-                digest.update(model_bytes(None if settings.model is None else Path(settings.model)))
+            digest.update(model_bytes(None if settings.model is None else Path(settings.model)))
             self._event_digests[camera, channel] = digest.hexdigest()[:12]
         return self._event_digests[camera, channel]
 
@@ -274,10 +267,10 @@ def detection_digest(rig: Rig) -> str:
     return digest.hexdigest()[:12]
 
 
-def event_channels(rig: Rig, capture: Capture, event_image: EventImage | None) -> list[tuple[str, str]]:
+def event_channels(rig: Rig, capture: Capture) -> list[tuple[str, str]]:
     """List the (camera, channel) whose images are reconstructed here from raw events.
 
-    An image that the capture already holds takes precedence, unless a method of reconstruction is requested.
+    An image that the capture already holds takes precedence.
 
     Raises:
         SessionError: the capture is damaged, or names sensors that the rig lacks.
@@ -287,7 +280,7 @@ def event_channels(rig: Rig, capture: Capture, event_image: EventImage | None) -
         (camera, name)
         for camera in capture.event_cameras
         for name, channel in rig.cameras[camera].channels.items()
-        if channel.kind == "events" and (event_image is not None or not capture.has_image(camera, name))
+        if channel.kind == "events" and not capture.has_image(camera, name)
     ]
 
 

@@ -14,7 +14,6 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.progress import Progress, silent
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.detect.events.search import EventImage
 from lce_rig.judge.board_drift import watch_boards
 from lce_rig.judge.session_check import SessionCheck, check_session
 from lce_rig.pipeline.calibration import clocks_of
@@ -49,7 +48,6 @@ class Verification:
         checks: one for each channel of a camera and LiDAR with captures in the session.
         calibrations: the extrinsics, including those of sensors without captures.
         detections: of the session.
-        event_image: how images were reconstructed from raw events for the detections.
         own_result: content of the session's result.json if the calibrations come from it, else None.
         name: of that result; None for the one in calibration/.
         notes: in what the session's profile differs from the result's.
@@ -59,7 +57,6 @@ class Verification:
     checks: tuple[SessionCheck, ...]
     calibrations: tuple[Calibration, ...]
     detections: Detections
-    event_image: EventImage | None
     own_result: bytes | None
     name: str | None = None
     notes: tuple[Finding, ...] = ()
@@ -123,7 +120,7 @@ class Verification:
                 self.detections,
                 check,
                 base if len(self.checks) == 1 else base / check.pair.folder_name,
-                view_of=partial(_view, self.session, check.pair.camera, check.pair.channel, self.event_image),
+                view_of=partial(_view, self.session, check.pair.camera, check.pair.channel),
                 progress=progress,
             )
             for check in self.checks
@@ -137,7 +134,6 @@ def verify(
     *,
     name: str | None = None,
     profile: Rig | None = None,
-    event_image: EventImage | None = None,
     progress: Progress = silent,
 ) -> Verification:
     """Compare extrinsics with every capture of a session.
@@ -148,7 +144,6 @@ def verify(
         name: of the session's result to check; None for the one in calibration/.
         profile: with which the result was made, as `profile_behind` finds it: its lenses count.
         detections: of this session; None to detect the board first.
-        event_image: how images were reconstructed from raw events for the detections.
         progress: called with (done, total) while the board is detected.
 
     Raises:
@@ -159,7 +154,7 @@ def verify(
     rig, notes = with_lenses_of(session.rig, profile)
     if rig is not session.rig:
         session, detections = Session(session.path, rig, None), None
-    detections = detections or detect(session, event_image=event_image, progress=progress)
+    detections = detections or detect(session, progress=progress)
     checks = []
     for c in calibrations:
         scene, clocks = hear_scene(session, detections, c), clocks_of(session.rig, c.camera, c.lidar)
@@ -174,9 +169,7 @@ def verify(
     if not checks:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
         raise SessionError(f"{session.path} holds no captures of {wanted}", "Check the result's session.")
-    return Verification(
-        session, tuple(checks), tuple(calibrations), detections, event_image, own_result, name, notes
-    )
+    return Verification(session, tuple(checks), tuple(calibrations), detections, own_result, name, notes)
 
 
 def profile_behind(path: Path, result: ResultFile) -> Rig | None:
@@ -263,7 +256,6 @@ def write_debug_images(
     session: Session,
     detections: Detections,
     *,
-    event_image: EventImage | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Draw for every capture each sensor's detection of the board, or why it was refused.
@@ -271,7 +263,6 @@ def write_debug_images(
     Args:
         session: the source of the captures.
         detections: of the session.
-        event_image: how images were reconstructed from raw events for the detections.
         progress: called with (done, total).
 
     Returns:
@@ -287,7 +278,7 @@ def write_debug_images(
         refused, chosen = matches[pair]
         mismatch = refused.get(name)
         capture, (image, lidar) = session.capture(name), detections.of(pair, name)
-        view, scan = _view(session, pair.camera, pair.channel, event_image, capture), None
+        view, scan = _view(session, pair.camera, pair.channel, capture), None
         with suppress(SessionError):  # The detection of a damaged one says so.
             scan = capture.scan(pair.lidar)
         candidates = lidar if isinstance(lidar, list) else []
@@ -311,14 +302,12 @@ def write_debug_images(
     return base
 
 
-def _view(
-    session: Session, camera: str, channel: str, event_image: EventImage | None, capture: Capture
-) -> ImageWithEvents | None:
+def _view(session: Session, camera: str, channel: str, capture: Capture) -> ImageWithEvents | None:
     """Return a camera's image; None if it is damaged or events gave none; its detection says why."""
     with suppress(SessionError):
-        if (camera, channel) not in event_channels(session.rig, capture, event_image):
+        if (camera, channel) not in event_channels(session.rig, capture):
             return ImageWithEvents(capture.image(camera, channel))
-        picture = event_picture(session, capture, camera, channel, event_image)
+        picture = event_picture(session, capture, camera, channel)
         if not isinstance(picture, Refusal):
             return ImageWithEvents.of_events(picture, capture.events(camera))
     return None

@@ -257,13 +257,13 @@ class ReconstructionSettings(Settings):
     """Settings of image reconstruction from a channel's events.
 
     Attributes:
-        method: a recurrent network, or the event map: sums of polarities, for comparison.
+        method: how; the recurrent network is the only one.
         model: ONNX file of another network than the shipped one; absolute in a loaded profile.
         window_s: windows of this duration; if neither is given, the rate of events decides.
         window_events: windows of this number of events.
     """
 
-    method: Literal["network", "map"] = "network"
+    method: Literal["network"] = "network"
     model: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
     window_s: Annotated[float, Field(ge=0.001, le=10)] | None = None
     window_events: Annotated[int, Field(ge=1, le=1 << 26)] | None = None
@@ -272,8 +272,6 @@ class ReconstructionSettings(Settings):
     def _is_consistent(self) -> "ReconstructionSettings":
         if self.window_s is not None and self.window_events is not None:
             raise problem("window_s and window_events exclude each other", "window_events")
-        if self.model is not None and self.method == "map":
-            raise problem("the event map needs no network", "model")
         return self
 
 

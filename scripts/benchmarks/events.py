@@ -54,19 +54,14 @@ class SessionRun:
 
 
 def bench_events(n_seeds: int, n_captures: int = 30) -> None:
-    """Tabulate frames, events, both, and the network against the event map."""
+    """Tabulate frames, events and both."""
     work = partial(_session, n_captures=n_captures)
     with ProcessPoolExecutor(2) as pool:
         sessions = list(pool.map(work, range(n_seeds)))
     head = "channels, sessions, boards found, corner rms px, rms deg, rms mm, reported deg / mm, NEES"
     print_head(*head.split(", "), "clock rms ms")
     for name in ("frames", "events", "events+frames"):
-        print_row(*_row(name, [network for network, _ in sessions]))
-    print()
-    print_head("images from events by", "boards found", "corner rms px", "rms deg", "rms mm")
-    for title, index in (("network", 0), ("event map", 1)):
-        found, corners, deg, mm = _row("events", [session[index] for session in sessions])[2:6]
-        print_row(title, found, corners, deg, mm)
+        print_row(*_row(name, sessions))
 
 
 def _row(name: str, sessions: Sequence[SessionRun]) -> tuple[object, ...]:
@@ -95,8 +90,8 @@ def _row(name: str, sessions: Sequence[SessionRun]) -> tuple[object, ...]:
     )
 
 
-def _session(seed: int, n_captures: int) -> tuple[SessionRun, SessionRun]:
-    """Simulate, detect and calibrate one session: with the network, and with the event map."""
+def _session(seed: int, n_captures: int) -> SessionRun:
+    """Simulate, detect and calibrate one session."""
     rig = load_rig("rles")
     options = replace(
         SimulationOptions.for_rig("rles", "moving"),
@@ -111,9 +106,7 @@ def _session(seed: int, n_captures: int) -> tuple[SessionRun, SessionRun]:
             for capture in simulate_captures(rig, n_captures=n_captures, seed=seed, options=options):
                 name = session.add_capture(capture.images, capture.scans, {}, events=capture.events)
                 captures[name] = capture
-            network = _assess(rig, lce.detect(session, n_threads=1), captures, truth, CHOICES)
-            by_map = lce.detect(session, event_image="map", n_threads=1)
-            return network, _assess(rig, by_map, captures, truth, (("events",),))
+            return _assess(rig, lce.detect(session, n_threads=1), captures, truth)
 
 
 def _assess(
@@ -121,13 +114,12 @@ def _assess(
     detections: Detections,
     captures: dict[str, SimulatedCapture],
     truth: Array,
-    choices: Sequence[tuple[str, ...]],
 ) -> SessionRun:
     run = SessionRun(n_captures=len(captures))
     for channel in ("frames", "events"):
         found = detections.images.get((CAMERA, channel), {})
         run.corner_px[channel] = list(_corner_errors(rig, channel, found, captures))
-    for channels in choices:
+    for channels in CHOICES:
         try:
             (calibration, *_), _ = calibrate_detections(rig, detections, channels=channels)
         except NotEnoughDataError:

@@ -78,12 +78,6 @@ def test_debug_images_show_the_reconstruction_and_the_events(lce_rig, moving):
     assert coloured(lower, BRIGHTER) > 500 and coloured(lower, DARKER) > 500
 
 
-def test_the_event_map_is_refused_where_the_network_is_not(lce_rig, moving):
-    outcome = lce_rig("check", moving, "--event-image", "map")
-    assert outcome.code == 0  # the frames still serve
-    assert "0 of 1 captures" in outcome.out and "1 of 1 captures" in outcome.out
-
-
 def test_verify_draws_the_lidar_and_the_events_for_each_channel(lce_rig, moving, tmp_path):
     outcome = lce_rig("verify", moving, "-o", tmp_path)
     assert outcome.code == 0, outcome.err + outcome.out

@@ -38,13 +38,6 @@ def test_images_and_their_timestamps_are_written_and_skipped_ones_are_counted(lc
     assert "skipped" in outcome.err
 
 
-def test_the_event_map_needs_no_warm_up(lce_rig, tmp_path):
-    path = recording(tmp_path / "sweep.aedat4")
-    outcome = lce_rig("reconstruct", path, "-o", tmp_path / "out", "--event-image", "map")
-    assert outcome.code == 0, outcome.err
-    assert "skipped" not in outcome.err
-
-
 @pytest.mark.parametrize(("duration_s", "words", "code"), [(0.1, (), 5), (1.2, ("--start", 60), 2)])
 def test_a_recording_too_short_for_an_image_is_refused_and_nothing_is_written(
     lce_rig, tmp_path, duration_s, words, code

@@ -48,9 +48,9 @@ def detection(stream):
     return find(stream, sweep_s=0.02)
 
 
-def find(events, stamp_ns=STAMP, limits=LIMITS, method="network", **more):
+def find(events, stamp_ns=STAMP, limits=LIMITS, **more):
     return find_event_board(
-        events, stamp_ns, reconstructor_for(None, "events", method), BOARD, CAMERA, limits, **more
+        events, stamp_ns, reconstructor_for(None, "events"), BOARD, CAMERA, limits, **more
     )
 
 
@@ -165,7 +165,5 @@ def test_the_profile_says_how_pictures_are_made(tmp_path):
     assert (by_count.windows.kind, by_count.windows.n_events, by_count.channel) == ("count", 5_000, "dvs")
     by_time = reconstructor_for(ReconstructionSettings(window_s=0.03), "dvs").options
     assert (by_time.windows.kind, by_time.windows.duration_s) == ("time", 0.03)
-    assert reconstructor_for(ReconstructionSettings(method="map"), "dvs").options.method == "map"
-    assert reconstructor_for(ReconstructionSettings(), "dvs", "map").options.method == "map"
     with pytest.raises(ProfileError):
         reconstructor_for(ReconstructionSettings(model=str(tmp_path / "gone.onnx")), "dvs")

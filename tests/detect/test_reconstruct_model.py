@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.errors import ProfileError
-from lce_rig.detect.events.reconstruct import ReconstructionModel
+from lce_rig.detect.events.reconstructor import ReconstructionModel
 
 from .onnx_file import write_network
 

@@ -10,7 +10,8 @@ from moving_board import COLS, ROWS, Motion, board_events, cut, events_of, inner
 from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Refusal
-from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
+from lce_rig.detect.events.reconstructor import ReconstructionOptions, Reconstructor
+from lce_rig.detect.events.windows import WindowOptions
 
 MS = 1_000_000
 DURATION_S = 1.6
@@ -37,15 +38,15 @@ def corner_rms_px(image, truth_px):
     return min(np.sqrt(np.square(corners - order).sum(1).mean()) for order in (truth_px, truth_px[::-1]))
 
 
-def errors_px(events, method, windows, motion=STEADY, stamps=STAMPS):
-    pictures = Reconstructor(options=options(method=method, windows=windows)).reconstruct([events], stamps)
+def errors_px(events, windows, motion=STEADY, stamps=STAMPS):
+    pictures = Reconstructor(options=options(windows=windows)).reconstruct([events], stamps)
     truth = [inner_corners_px(motion, stamp / 1e9) for stamp in stamps]
     return np.array([corner_rms_px(image, corners) for image, corners in zip(pictures, truth, strict=True)])
 
 
 @pytest.mark.parametrize("kind", ["auto", "time", "count"])
 def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream, kind):
-    errors = errors_px(stream, "network", WindowOptions(kind))
+    errors = errors_px(stream, WindowOptions(kind))
     assert np.isfinite(errors).mean() >= 0.9
     assert np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2)) < 0.5
 
@@ -53,7 +54,7 @@ def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream, kind):
 def test_the_picture_lasts_while_the_board_stands_still():
     events = board_events(PAUSE, DURATION_S)
     stamps = [1_200 * MS, 1_500 * MS]
-    errors = errors_px(events, "network", WindowOptions(), PAUSE, stamps)
+    errors = errors_px(events, WindowOptions(), PAUSE, stamps)
     assert (errors < 1.0).all()
 
 
@@ -125,18 +126,6 @@ def test_an_hour_of_silence_costs_no_hour_of_steps(stream, kind):
     assert reconstructor.n_steps < 100
 
 
-def test_steps_of_the_callers_own_windows_give_float_pictures_and_grey_ones(stream):
-    reconstructor = Reconstructor()
-    for start in range(0, 800, 50):
-        picture = reconstructor.step(
-            stream.between(start * MS, (start + 50) * MS), start * MS, (start + 50) * MS
-        )
-    assert reconstructor.is_warm and reconstructor.n_steps == 16
-    assert picture.dtype == np.float32 and picture.shape == (120, 160)
-    grey = Image("cam", "events", 800 * MS, reconstructor.to_grey(picture))
-    assert corner_rms_px(grey, inner_corners_px(Motion(), 0.8)) < 0.6
-
-
 def test_flickering_lamps_do_not_blind_the_network_for_good(stream):
     lamp = np.arange(0, 400 * MS, 10 * MS) + 400 * MS
     y, x = (a.ravel() for a in np.mgrid[0:120:2, 0:160:2])
@@ -150,5 +139,5 @@ def test_flickering_lamps_do_not_blind_the_network_for_good(stream):
         np.concatenate(pair)
         for pair in zip(*((e.t_ns, e.x, e.y, e.polarity) for e in (stream, storm)), strict=True)
     ]
-    errors = errors_px(events_of(*parts), "network", WindowOptions(), stamps=[1_300 * MS, 1_500 * MS])
+    errors = errors_px(events_of(*parts), WindowOptions(), stamps=[1_300 * MS, 1_500 * MS])
     assert (errors < 1.0).all()

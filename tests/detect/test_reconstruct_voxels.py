@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from moving_board import Motion, board_events, events_of, join, lamps, noise
 
-from lce_rig.detect.events.reconstruct import event_map, normalise_voxels, voxel_grid
-from lce_rig.detect.events.reconstruct.filters import (
+from lce_rig.detect.events.noise import (
     hot_pixels,
     measure_flicker,
     without_background_activity,
 )
+from lce_rig.detect.events.windows import normalise_voxels, voxel_grid
 from lce_rig.io.events import open_events
 
 
@@ -50,11 +50,6 @@ def test_normalised_grids_have_mean_0_and_deviation_1_over_what_was_hit():
     assert normalised[is_hit].std() == pytest.approx(1, abs=1e-5)
     assert not normalised[~is_hit].any()
     assert not normalise_voxels(np.zeros((5, 3, 4), np.float32)).any()
-
-
-def test_an_event_map_holds_each_pixels_polarity_sum():
-    summed = event_map(events_of([1, 2, 3, 4], [0, 0, 0, 1], [1, 1, 1, 0], [1, 1, 0, 0], 2, 2))
-    np.testing.assert_array_equal(summed, [[0, -1], [1, 0]])
 
 
 def test_a_hot_pixel_is_told_from_an_edge():

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from moving_board import events_of
 
 from lce_rig.core.errors import UsageError
-from lce_rig.detect.events.reconstruct import WindowOptions
-from lce_rig.detect.events.reconstruct.windows import active_share, window_rule
+from lce_rig.detect.events.windows import WindowOptions, active_share, window_rule
 
 MS = 1_000_000
 

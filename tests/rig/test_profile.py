@@ -232,11 +232,10 @@ def test_the_path_of_a_network_begins_at_the_profiles_folder_and_stays_absolute_
     ("block", "key"),
     [
         ("{window_s: 0.05, window_events: 100}", "window_events"),
-        ("{method: map, model: x.onnx}", "model"),
         ("{windows_s: 0.05}", "windows_s"),
         ("{window_s: 50}", "window_s"),
         ("{window_events: 0}", "window_events"),
-        ("{method: e2vid}", "method"),
+        ("{method: map}", "method"),
         ("{model: ''}", "model"),
     ],
 )

@@ -16,7 +16,8 @@ from training.network import ReconstructionNetwork  # noqa: E402
 from training.onnx_export import export_onnx, export_recurrent  # noqa: E402
 
 from lce_rig.core.data import Events  # noqa: E402
-from lce_rig.detect.events.reconstruct import ReconstructionModel, normalise_voxels, voxel_grid  # noqa: E402
+from lce_rig.detect.events.reconstructor import ReconstructionModel  # noqa: E402
+from lce_rig.detect.events.windows import normalise_voxels, voxel_grid  # noqa: E402
 
 CPU = torch.device("cpu")
 SIZE = 16

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -15,7 +14,8 @@ from lce_rig.core.geometry import Array, exp_so3, pose, rotation_angle, skew
 from lce_rig.core.planar_pose import pose_covariance
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.figures import event_quality, outline_px, with_motion
-from lce_rig.detect.events.reconstruct import ReconstructionOptions, Reconstructor, WindowOptions
+from lce_rig.detect.events.reconstructor import ReconstructionOptions, Reconstructor
+from lce_rig.detect.events.windows import WindowOptions
 from lce_rig.detect.image.search import find_image_board, region_around
 from lce_rig.detect.limits_met import explain_missing_board, gate_event_board, gate_image_board
 from lce_rig.rig import QualitySettings, ReconstructionSettings
@@ -98,8 +98,6 @@ def _turned_cov(T: Array, cov: Array, F: Array) -> Array:
     return np.asarray(A @ cov @ np.swapaxes(A, -1, -2))
 
 
-EventImage = Literal["network", "map"]
-
 #: When the board is looked for besides the main picture, ns after it.
 TRACK_NS = (-100_000_000, -50_000_000, 50_000_000, 100_000_000)
 # Between neighbouring images no hand turns the board by more: it is another board, or misread.
@@ -119,15 +117,12 @@ class EventSighting:
     board: ImageBoard | Refusal
 
 
-def reconstructor_for(
-    settings: ReconstructionSettings | None, channel: str, method: EventImage | None = None
-) -> Reconstructor:
+def reconstructor_for(settings: ReconstructionSettings | None, channel: str) -> Reconstructor:
     """Set up a reconstructor according to a profile.
 
     Args:
         settings: the channel's block; None for the shipped network and automatic windows.
         channel: the channel of the images.
-        method: replaces the profile's.
 
     Raises:
         ProfileError: the network cannot be used.
@@ -139,7 +134,7 @@ def reconstructor_for(
         windows = WindowOptions("time", duration_s=settings.window_s)
     elif settings.window_events is not None:
         windows = WindowOptions("count", n_events=settings.window_events)
-    options = ReconstructionOptions(method=method or settings.method, windows=windows, channel=channel)
+    options = ReconstructionOptions(windows=windows, channel=channel)
     model = None if settings.model is None else Path(settings.model)
     return Reconstructor(model, options)
 

@@ -151,14 +151,6 @@ def normalise_voxels(voxels: FloatArray) -> FloatArray:
     return voxels
 
 
-def event_map(events: Events) -> FloatArray:
-    """Sum the polarities of each pixel, (H, W): the paper's rejected alternative to a reconstruction."""
-    n_pixels = events.height_px * events.width_px
-    sign = np.where(events.polarity, 1.0, -1.0)
-    sums = np.bincount(_pixel_index(events), sign, n_pixels)
-    return sums.astype(np.float32).reshape(events.height_px, events.width_px)
-
-
 def _pixel_index(events: Events) -> NDArray[np.intp]:
     index = events.y.astype(np.intp)
     index *= events.width_px

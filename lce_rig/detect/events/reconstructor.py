@@ -1,25 +1,27 @@
-"""Images from an event stream at any requested time."""
+"""The recurrent network that makes images of events, and images of a stream at any requested time."""
 
+import math
+import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image, join_events
-from lce_rig.core.errors import SourceError, UsageError
+from lce_rig.core.errors import ProfileError, SourceError, UsageError, reason_of
 from lce_rig.core.findings import Refusal
-from lce_rig.detect.events.reconstruct.filters import NoiseFilter
-from lce_rig.detect.events.reconstruct.model import ReconstructionModel, States
-from lce_rig.detect.events.reconstruct.windows import (
+from lce_rig.core.interrupts import without_interrupt
+from lce_rig.detect.events.noise import NoiseFilter
+from lce_rig.detect.events.windows import (
     FloatArray,
     WindowOptions,
     WindowRule,
     active_share,
-    event_map,
     normalise_voxels,
     voxel_grid,
     window_rule,
@@ -31,24 +33,146 @@ from lce_rig.detect.findings import (
     READ_NO_EVENTS,
 )
 
-# From arbitrary scales to 8 bits, without flicker: intensities of the network, sums of polarities.
+States = tuple[FloatArray, ...]
+_MAX_MULTIPLE = 256
 
+_EXPECTED = (
+    "expected the inputs voxels (1, bins, height, width) and states (1, channels, height_2, width_2) with "
+    "height_2 meaning half of the height and so on, and the outputs image (1, 1, height, width) and the "
+    "next states in the same order; docs/model-card.md says how to export such a file"
+)
+
+
+@dataclass(frozen=True)
+class StateSpec:
+    """A recurrent state's channels and its size as a fraction of the image's: 2 is half."""
+
+    name: str
+    n_channels: int
+    divisor: int
+
+
+class ReconstructionModel:
+    """A recurrent event-to-image network in ONNX, its state explicit.
+
+    Args:
+        path: ONNX file; None for the one shipped with the package.
+        n_threads: threads of onnxruntime.
+
+    Raises:
+        ProfileError: the file cannot be loaded, or has other inputs or outputs than expected.
+        SourceError: onnxruntime is not installed.
+    """
+
+    def __init__(self, path: Path | None = None, n_threads: int = 1) -> None:
+        self.name = "the shipped model" if path is None else str(path)
+        content = model_bytes(path)
+        try:
+            with without_interrupt():
+                import onnxruntime
+        except ImportError as error:
+            raise SourceError("onnxruntime is not installed", "Run: pip install onnxruntime") from error
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = n_threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        try:
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime raises classes of its own, one for each status
+            raise self._refused(f"cannot be loaded: {reason_of(error)}") from error
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if len(inputs) < 1 or len(inputs) != len(outputs):
+            raise self._refused(f"{len(inputs)} inputs and {len(outputs)} outputs")
+        self.n_bins = self._check_voxels(inputs[0])
+        self.states = tuple(self._read_state(item) for item in inputs[1:])
+        # The image is padded so that every state has a whole number of rows and columns.
+        self.size_multiple = math.lcm(2, *(state.divisor for state in self.states))
+        if self.size_multiple > _MAX_MULTIPLE:
+            raise self._refused(f"images would be padded to multiples of {self.size_multiple} px")
+
+    def initial_states(self, height_px: int, width_px: int) -> States:
+        """Make the states before the first window for a sensor of this size: zeros.
+
+        Raises:
+            ProfileError: they do not fit into memory.
+        """
+        height, width = self._padded(height_px), self._padded(width_px)
+        try:
+            return tuple(
+                np.zeros((1, spec.n_channels, height // spec.divisor, width // spec.divisor), np.float32)
+                for spec in self.states
+            )
+        except (MemoryError, ValueError) as error:  # ValueError: beyond what an array can hold
+            raise self._refused("its states do not fit into memory") from error
+
+    def step(self, voxels: FloatArray, states: States) -> tuple[FloatArray, States]:
+        """Reconstruct one window.
+
+        Args:
+            voxels: (bins, H, W) normalised voxel grid.
+            states: as the last step or `initial_states` gave them.
+
+        Returns:
+            image (H, W), arbitrary scale; next states.
+        """
+        _, height, width = voxels.shape
+        rows, cols = self._padded(height) - height, self._padded(width) - width
+        grid = np.pad(voxels, ((0, 0), (0, rows), (0, cols)))[None]
+        names = (item.name for item in self._session.get_inputs())
+        try:
+            outputs = self._session.run(None, dict(zip(names, (grid, *states), strict=True)))
+        except Exception as error:  # see __init__
+            raise self._refused(f"a step of {width} x {height} px fails: {reason_of(error)}") from error
+        expected = [(1, 1, height + rows, width + cols), *(state.shape for state in states)]
+        shapes = [getattr(array, "shape", None) for array in outputs]
+        if shapes != expected:
+            raise self._refused(f"its outputs have the shapes {shapes}, not {expected}")
+        image, *following = (np.asarray(array, np.float32) for array in outputs)
+        return image[0, 0, :height, :width], tuple(following)
+
+    def _padded(self, size_px: int) -> int:
+        return -(-size_px // self.size_multiple) * self.size_multiple
+
+    def _check_voxels(self, item: Any) -> int:
+        shape = tuple(item.shape or ())
+        is_fixed = len(shape) == 4 and any(isinstance(size, int) for size in shape[2:])
+        if len(shape) != 4 or not isinstance(shape[1], int) or shape[1] < 2 or is_fixed:
+            raise self._refused(f"its first input {item.name} has the shape {shape}")
+        return int(shape[1])
+
+    def _read_state(self, item: Any) -> StateSpec:
+        shape = tuple(item.shape or ())
+        if len(shape) != 4 or not isinstance(shape[1], int) or shape[1] < 1:
+            raise self._refused(f"its input {item.name} has the shape {shape}")
+        divisors = [re.fullmatch(r"(?:height|width)(?:_(\d{1,4}))?", str(size)) for size in shape[2:]]
+        values = [int(match.group(1) or 1) if match else 0 for match in divisors]
+        if values[0] == 0 or values[0] != values[1]:
+            raise self._refused(f"its input {item.name} has the shape {shape}")
+        return StateSpec(item.name, shape[1], values[0])
+
+    def _refused(self, what: str, hint: str = "") -> ProfileError:
+        return ProfileError(f"reconstruction model {self.name}: {what}", hint or _EXPECTED)
+
+
+def model_bytes(path: Path | None) -> bytes:
+    """Read a network's file; None takes the one shipped with the package.
+
+    Raises:
+        ProfileError: there is no such file, or it cannot be read.
+    """
+    if path is None:
+        return (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
+    try:
+        return path.read_bytes()
+    except (OSError, MemoryError) as error:
+        hint = "Omit the key to use the shipped one."
+        raise ProfileError(f"reconstruction model {path}: {reason_of(error)}", hint) from error
+
+
+# From the network's arbitrary scale to 8 bits, without flicker.
 _PERCENTILES = (1.0, 99.0)
 # Smallest spread that is stretched to the full range: below it there is noise, not contrast.
 _MIN_SPREAD = 0.05
-
-
-class SignedScale:
-    """Nothing is grey 128, sums of polarities brighter and darker alike, but for the largest twentieth."""
-
-    def follow(self, picture: FloatArray) -> None:
-        """Do nothing, as every map is independent."""
-
-    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
-        """Map (H, W) to uint8."""
-        sums = np.abs(picture[picture != 0])
-        largest = float(np.percentile(sums, 95)) if len(sums) else 1.0
-        return np.asarray(np.clip(np.rint(128 + 127 * picture / largest), 0, 255), dtype=np.uint8)
 
 
 class IntensityScale:
@@ -78,62 +202,9 @@ class IntensityScale:
         return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)
 
 
-GreyScale = IntensityScale | SignedScale
-"""Mapping of a stream's images to 8 bits."""
-
-
 def _bounds(picture: FloatArray) -> NDArray[np.float64]:
     # Every fourth pixel in each direction tells the percentiles well enough.
     return np.asarray(np.percentile(picture[::4, ::4], _PERCENTILES), dtype=np.float64)
-
-
-class NetworkImager:
-    """Makes images of windows of events by the recurrent network, one step a window.
-
-    Args:
-        model: ONNX file; None takes the shipped one.
-        n_warm_up: steps until the states have settled; 12 on a real DAVIS346 recording.
-        n_threads: threads of onnxruntime.
-    """
-
-    def __init__(self, model: Path | None, n_warm_up: int, n_threads: int) -> None:
-        self.model = ReconstructionModel(model, n_threads)
-        self.n_warm_up = n_warm_up
-
-    def initial_states(self, height_px: int, width_px: int) -> States:
-        """Make zero states."""
-        return self.model.initial_states(height_px, width_px)
-
-    def grey_scale(self) -> GreyScale:
-        """Follow the intensities' bounds."""
-        return IntensityScale()
-
-    def picture(
-        self, events: Events, start_ns: int, end_ns: int, states: States
-    ) -> tuple[FloatArray, States]:
-        """Make the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
-        voxels = normalise_voxels(voxel_grid(events, self.model.n_bins, start_ns, end_ns))
-        return self.model.step(voxels, states)
-
-
-class MapImager:
-    """Makes images of windows of events as event maps: polarity sums, nothing carried over."""
-
-    n_warm_up = 0
-
-    def initial_states(self, height_px: int, width_px: int) -> States:
-        """Nothing is carried over."""
-        return ()
-
-    def grey_scale(self) -> GreyScale:
-        """Draw no events as grey."""
-        return SignedScale()
-
-    def picture(
-        self, events: Events, start_ns: int, end_ns: int, states: States
-    ) -> tuple[FloatArray, States]:
-        """Sum the polarities."""
-        return event_map(events), ()
 
 
 # A window emptier than this is judged together with the one before it: too few events make noise, not edges.
@@ -150,15 +221,13 @@ class ReconstructionOptions:
     """How events become images.
 
     Attributes:
-        method: "network" (recurrent reconstruction) or "map" (polarity sums, for comparison).
         windows: how the stream is cut.
-        n_warm_up: windows of the network before its images count.
+        n_warm_up: steps until the states have settled; 12 on a real DAVIS346 recording.
         is_filtered: leave out hot pixels and background activity.
         channel: the channel of the images.
         n_threads: threads of onnxruntime.
     """
 
-    method: Literal["network", "map"] = "network"
     windows: WindowOptions = field(default_factory=WindowOptions)
     n_warm_up: int = 12
     is_filtered: bool = True
@@ -184,7 +253,7 @@ class Reconstructor:
 
     Args:
         model: ONNX file; None takes the one shipped with the package.
-        options: method, windows, filters.
+        options: windows, filters.
 
     Raises:
         ProfileError: the model cannot be used.
@@ -195,17 +264,13 @@ class Reconstructor:
         self, model: Path | None = None, options: ReconstructionOptions = ReconstructionOptions()
     ) -> None:
         self.options = options
-        self._imager = (
-            MapImager()
-            if options.method == "map"
-            else NetworkImager(model, options.n_warm_up, options.n_threads)
-        )
+        self._model = ReconstructionModel(model, options.n_threads)
         self.reset()
 
     def reset(self) -> None:
         """Forget the stream."""
         self.n_steps = 0
-        self._scale = self._imager.grey_scale()
+        self._scale = IntensityScale()
         self._share = 1.0
         self._first_ns: int | None = None
         self._fed_ns: int | None = None
@@ -216,28 +281,7 @@ class Reconstructor:
     @property
     def is_warm(self) -> bool:
         """Whether enough of the stream has been seen for images to count."""
-        return self.n_steps >= self._imager.n_warm_up
-
-    def step(self, events: Events, start_ns: int | None = None, end_ns: int | None = None) -> FloatArray:
-        """Advance by a window of the caller's choice and give its image, (H, W), arbitrary scale.
-
-        Args:
-            events: the window's events; following windows must follow in time.
-            start_ns, end_ns: its bounds; None takes the first and the last event's timestamp.
-        """
-        if start_ns is None:
-            start_ns = int(events.t_ns[0]) if len(events) else 0
-        if end_ns is None:
-            end_ns = int(events.t_ns[-1]) + 1 if len(events) else start_ns
-        if self._current is None:
-            self._begin(events)
-        assert self._current is not None
-        self._current = _Window(start_ns, events, self._current.states)
-        return self._commit(end_ns)
-
-    def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
-        """Map an image of `step` to uint8, (H, W), with percentiles smoothed over the steps so far."""
-        return self._scale.to_grey(picture)
+        return self.n_steps >= self.options.n_warm_up
 
     def reconstruct(
         self, batches: Iterable[Events], stamps_ns: Sequence[int] | None = None, every_ns: int | None = None
@@ -308,7 +352,7 @@ class Reconstructor:
 
     def _begin(self, events: Events) -> None:
         self._first_ns = int(events.t_ns[0]) if len(events) else 0
-        states = self._imager.initial_states(events.height_px, events.width_px)
+        states = self._model.initial_states(events.height_px, events.width_px)
         self._current = _Window(self._first_ns, events, states)
 
     def _take(self, batch: Events, last_ns: int | None) -> None:
@@ -353,7 +397,7 @@ class Reconstructor:
         events = window.events.between(window.start_ns, end_ns)
         self._noise.learn(events)
         events = self._cleaned(events)
-        picture, states = self._imager.picture(events, window.start_ns, end_ns, window.states)
+        picture, states = self._picture(events, window.start_ns, end_ns, window.states)
         self._scale.follow(picture)
         memory = _SHARE_MEMORY if self.n_steps else 0.0
         self._share = memory * self._share + (1 - memory) * active_share(events)
@@ -362,6 +406,13 @@ class Reconstructor:
         self._current = _Window(end_ns, window.events.between(end_ns, max(last_ns, end_ns)), states)
         self.n_steps += 1
         return picture
+
+    def _picture(
+        self, events: Events, start_ns: int, end_ns: int, states: States
+    ) -> tuple[FloatArray, States]:
+        """Make the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
+        voxels = normalise_voxels(voxel_grid(events, self._model.n_bins, start_ns, end_ns))
+        return self._model.step(voxels, states)
 
     def _cleaned(self, events: Events) -> Events:
         return self._noise.clean(events) if self.options.is_filtered else events
@@ -372,7 +423,7 @@ class Reconstructor:
             return READ_BEFORE_EVENTS.refusal(gap_s=1e-9 * (self._first_ns - stamp_ns))
         self._advance(stamp_ns)
         if not self.is_warm:
-            seen_s, n_warm_up = 1e-9 * (stamp_ns - self._first_ns), self._imager.n_warm_up
+            seen_s, n_warm_up = 1e-9 * (stamp_ns - self._first_ns), self.options.n_warm_up
             return READ_NETWORK_SETTLING.refusal(n_steps=self.n_steps, n_warm_up=n_warm_up, seen_s=seen_s)
         window = self._current
         assert window is not None
@@ -384,5 +435,5 @@ class Reconstructor:
         if is_step and not is_thin:
             picture = self._commit(stamp_ns)
         else:
-            picture, _ = self._imager.picture(events, window.start_ns, stamp_ns, window.states)
+            picture, _ = self._picture(events, window.start_ns, stamp_ns, window.states)
         return Image(events.sensor, self.options.channel, stamp_ns, self._scale.to_grey(picture))
