@@ -100,7 +100,6 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 )
 @click.option(
     "--captures",
-    "--frames",  # Its earlier name.
     "n_wanted",
     type=click.IntRange(1),
     metavar="N",

@@ -9,10 +9,9 @@ import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option, session_argument
 from lce_rig.core.errors import UsageError
-from lce_rig.fleet.deploy import deployment
-from lce_rig.fleet.deploy.deployment import Deployed, Plan
-from lce_rig.fleet.deploy.releases import ReleaseRecord, TargetState, differences_in_words
-from lce_rig.fleet.deploy.targets import find_target
+from lce_rig.fleet import deployment
+from lce_rig.fleet.deployment import Deployed, Plan
+from lce_rig.fleet.releases import ReleaseRecord, TargetState, differences_in_words, find_target
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig.target_settings import TargetSettings
 
@@ -28,7 +27,6 @@ from lce_rig.rig.target_settings import TargetSettings
 )
 @click.option("--name", metavar="NAME", help="Deploy this result of SESSION (see `lce-rig results`).")
 @click.option("--dry-run", is_flag=True, help="Print what would change; change nothing.")
-@click.option("--diff", is_flag=True, help="With --dry-run: print the lines that would change.")
 @click.option("--status", is_flag=True, help="Print what is at the target; change nothing.")
 @click.option("--rollback", is_flag=True, help="Restore the files that were there before.")
 @click.option("--release", metavar="NAME", help="With --rollback: restore this release (see --status).")
@@ -41,7 +39,6 @@ def deploy(
     targets: Path | None,
     name: str | None,
     dry_run: bool,
-    diff: bool,
     status: bool,
     rollback: bool,
     release: str | None,
@@ -61,8 +58,6 @@ def deploy(
     """
     if sum((dry_run, status, rollback)) > 1:
         raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
-    if diff and not dry_run:
-        raise UsageError("--diff applies to --dry-run only", "Add --dry-run.")
     if release is not None and not rollback:
         raise UsageError("--release applies to --rollback only", "Add --rollback.")
     if force and not reason.strip():
@@ -85,7 +80,7 @@ def deploy(
     result = result_folder(opened.path, name)
     if dry_run:
         plan = deployment.plan(result, opened.rig, target, session=opened)
-        _show_plan(plan, target, has_diff=diff, as_json=as_json)
+        _show_plan(plan, target, as_json=as_json)
         return
     if target.run is not None:
         show.note(f"afterwards there: {target.run}")
@@ -93,7 +88,7 @@ def deploy(
     _show_done(done, target, as_json=as_json)
 
 
-def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: bool) -> None:
+def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
     if as_json:
         show.print_json(
             {
@@ -103,19 +98,9 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
                 "new": plan.record,
                 "changed": dict(plan.changed),
                 "changed_there": dict(plan.state.changed),
-                "sensors": [
-                    {
-                        "camera": change.camera,
-                        "lidar": change.lidar,
-                        "is_new": change.is_new,
-                        "rotation_deg": None if change.moved is None else change.moved[0],
-                        "translation_m": None if change.moved is None else change.moved[1],
-                    }
-                    for change in plan.sensors
-                ],
+                "sensors": plan.sensors,
                 "objections": plan.objections,
                 "remarks": plan.remarks,
-                **({"diff": plan.diff} if has_diff else {}),
             }
         )
         return
@@ -123,8 +108,8 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
     show.say(f"{target.to}: {'nothing deployed yet' if current is None else _described(current)}")
     for change in plan.sensors:
         how = "new" if change.is_new else "removed"
-        if change.moved is not None:
-            how = f"moves by {change.moved[0]:.3f} deg, {1000 * change.moved[1]:.1f} mm"
+        if change.rotation_deg is not None and change.translation_m is not None:
+            how = f"moves by {change.rotation_deg:.3f} deg, {1000 * change.translation_m:.1f} mm"
         show.say(f"  {change.camera} and {change.lidar}: {how}")
     _warn_of_changes(plan.state.changed)
     if plan.is_in_place:
@@ -136,9 +121,6 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
         show.note(each.text)
     for each in plan.objections:
         show.warn(f"would be refused: {each.text}")
-    if has_diff:
-        for line in plan.diff:
-            click.echo(line)
 
 
 _CHANGES = {"added": "new:", "missing": "removed:", "changed": "changed:"}

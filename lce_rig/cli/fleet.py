@@ -289,8 +289,10 @@ def report(registry: str, output: Path, json_file: Path | None) -> None:
     "Exit code 7, as of `drift`, contradicts the result; 6 cannot tell and passes.",
 )
 @click.option("--dry-run", is_flag=True, help="Print which result would go where; change nothing.")
-@click.option("--status", is_flag=True, help="Print the state of every robot; change nothing.")
-@click.option("--rollback", is_flag=True, help="Restore the earlier files of every robot deployed to.")
+@click.option("--status", is_flag=True, help="Ask every robot for what it holds; change nothing.")
+@click.option(
+    "--rollback", is_flag=True, help="Restore the earlier files of every robot that holds its newest result."
+)
 @click.option(
     "--reason", default="", metavar="TEXT", help="With --rollback: say why; it is written down there."
 )
@@ -314,32 +316,31 @@ def deploy(
     robot, use --where. Robots whose newest session failed are left out. Exits with 7 if it was stopped.
     """
     from lce_rig.fleet.registry import Registry
-    from lce_rig.fleet.rollout import FleetDeployment, newest_results, read_rollout
+    from lce_rig.fleet.rollout import FleetDeployment, newest_results
     from lce_rig.fleet.storage import Storage
 
     if sum((dry_run, status, rollback)) > 1:
         raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
-    opened = Registry(Storage.at(registry))
-    if status:
-        rollout = read_rollout(opened, target)
-    elif dry_run:
+    newest = newest_results(Registry(Storage.at(registry)), where)
+    if dry_run:
         table = show.plain_table("", "robot", "result", "")
-        for robot, state in newest_results(opened, where).items():
+        for robot, state in newest.items():
             table.add_row(*map(show.escape, (robot, state.folder, state.detail)))
         show.print_table(table)
         return
-    else:
-        under_way = FleetDeployment(opened, target, targets, check)
-        with show.progress_bar("robots") as progress:
-            if rollback:
-                rollout = under_way.roll_back(reason, progress=progress)
-            else:
-                rollout = under_way.run(newest_results(opened, where), progress=progress)
+    robots = FleetDeployment(Registry(Storage.at(registry)), target, targets, check)
+    with show.progress_bar("robots") as progress:
+        if status:
+            rollout = robots.status(newest, progress=progress)
+        elif rollback:
+            rollout = robots.roll_back(newest, reason, progress=progress)
+        else:
+            rollout = robots.run(newest, progress=progress)
     if as_json:
-        show.print_json(rollout.model_dump())
+        show.print_json({"format_version": 2, **vars(rollout)})
     else:
         counts = ", ".join(f"{_words(state)} {n}" for state, n in rollout.counts.most_common())
-        show.say(f"{rollout.target}: {counts or 'nothing deployed yet'}")
+        show.say(f"{rollout.target}: {counts or 'no robots'}")
         if status:
             table = show.plain_table("", "robot", "state", "release", "replaces")
             for state in rollout.robots.values():
@@ -349,7 +350,7 @@ def deploy(
         for state in rollout.robots.values():
             if state.detail:
                 show.note(f"{state.robot}: {_line(state)}")
-    if rollout.stopped_by and not (status or rollback):
+    if rollout.stopped_by:
         stopped = rollout.robots[rollout.stopped_by]
         raise ResultRefusedError(
             f"stopped at {stopped.robot}: {_line(stopped)}",

@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import cv2
-import numpy as np
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange
@@ -18,7 +16,7 @@ from lce_rig.detect.events.noise import measure_flicker
 from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.io.events import open_events
 from lce_rig.io.events.event_recording import EventRecording
-from lce_rig.show.overlays.overlay_files import write_gif, write_picture, write_video
+from lce_rig.show.overlays.overlay_files import write_picture
 
 STAMPS = "stamps.csv"
 # 14 hours at the default period; one wrong timestamp makes a recording centuries long.
@@ -56,12 +54,6 @@ _WARM_UP_NS = 1_500_000_000
     metavar="FILE",
     help="Use this ONNX file instead of the shipped network.",
 )
-@click.option(
-    "--video",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Also write a video: .mp4, .avi, .mkv or .gif.",
-)
 def reconstruct(
     recording: Path,
     output: Path,
@@ -70,7 +62,6 @@ def reconstruct(
     duration: float | None,
     topic: str | None,
     model: Path | None,
-    video: Path | None,
 ) -> None:
     """Reconstruct grey images from the events of RECORDING into FOLDER, with timestamps in stamps.csv.
 
@@ -96,11 +87,6 @@ def reconstruct(
             f"{recording}: no image reconstructed", "Record longer: the network needs time to settle."
         )
     show.note(f"{len(files)} images in {output}, timestamps in {output / STAMPS}")
-    if video is not None:
-        pictures = (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files)
-        write = write_gif if video.suffix.lower() == ".gif" else write_video
-        write(video, (np.asarray(picture, dtype=np.uint8) for picture in pictures), every)
-        show.note(f"written: {video}")
 
 
 def _stamps(

@@ -5,7 +5,7 @@ import re
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
@@ -76,38 +76,6 @@ _CAPTURES, _DURATION_S = 30, 20.0
     help="Hold the board still, or move it by hand. Only a moving board gives events "
     "[default: still; moving for rigs without frames].",
 )
-@click.option(
-    "--speed",
-    type=FiniteRange(0, 3),
-    nargs=2,
-    metavar="MIN MAX",
-    help="Set the moving board's speed, m/s; in a recording MAX is the speed between placements "
-    "[default: 0.05 0.3; recording 0.6].",
-)
-@click.option(
-    "--frame-offset",
-    default=0.0,
-    type=FiniteRange(-10, 10),
-    metavar="S",
-    help="Add this offset from the LiDAR's clock to the timestamps of images.",
-)
-@click.option(
-    "--event-offset",
-    type=FiniteRange(-10, 10),
-    metavar="S",
-    help="Add this offset from the LiDAR's clock to the timestamps of events.",
-)
-@click.option(
-    "--carrier",
-    type=click.Choice(["stand", "person", "none"]),
-    help="Choose what holds the board [default: person for rigs rles..., none for sss..., else stand].",
-)
-@click.option(
-    "--range-sigma",
-    type=FiniteRange(0, 1),
-    metavar="M",
-    help="Set the standard deviation of the LiDAR's ranges.",
-)
 def simulate(
     rig_name: str,
     session: Path | None,
@@ -116,7 +84,8 @@ def simulate(
     duration: float | None,
     ros: str | None,
     seed: int,
-    **choices: Any,
+    mounting: int | None,
+    motion: Literal["still", "moving"] | None,
 ) -> None:
     """Simulate SESSION (default: session/) of a rig: images, scans and exact truth.
 
@@ -137,8 +106,8 @@ def simulate(
         if duration is not None or ros is not None:
             raise UsageError("--duration and --ros apply to recordings only", "Add --recording FOLDER.")
         kinds = {channel.kind for camera in rig.cameras.values() for channel in camera.channels.values()}
-        usual = "moving" if kinds == {"events"} else "still"
-        options = _options(rig, choices["motion"] or usual, choices)
+        usual: Literal["still", "moving"] = "moving" if kinds == {"events"} else "still"
+        options = replace(SimulationOptions.for_rig(rig.name, motion or usual), mounting_seed=mounting)
         path = session or Path("session")
         _simulate_session(path, rig, captures or _CAPTURES, seed, options)
         Session.open(path).keep_text(read_profile(find_profile(rig_name)))
@@ -146,40 +115,10 @@ def simulate(
     if session is not None or captures is not None:
         other = f"the session {session}" if session is not None else "--captures"
         raise UsageError(f"--recording and {other} exclude each other", "Run it twice, with the same --seed.")
-    if choices["motion"] == "still":
+    if motion == "still":
         raise UsageError("--motion still: the board moves in a recording", "Omit --motion, or --recording.")
-    options = _options(rig, "moving", choices)
-    if options.hand.carry_mps <= 0:
-        raise UsageError("--speed: MAX is 0, but the board moves in a recording", "Give a MAX above 0.")
+    options = replace(SimulationOptions.for_rig(rig.name, "moving"), mounting_seed=mounting)
     _simulate_recording(recording, rig, duration or _DURATION_S, seed, options, int(ros or 1))
-
-
-def _options(rig: Rig, motion: Any, choices: dict[str, Any]) -> SimulationOptions:
-    """Apply the chosen options to the defaults of the rig.
-
-    Raises:
-        UsageError: an option of a moving board was chosen for a still one.
-    """
-    of_motion = [name for name in ("speed", "event_offset") if choices[name] is not None]
-    if motion == "still" and of_motion:
-        option = of_motion[0].replace("_", "-")
-        raise UsageError(f"--{option} applies to a moving board only", "Add --motion moving.")
-    options = SimulationOptions.for_rig(rig.name, motion)
-    hand = options.hand
-    if choices["speed"] is not None:
-        slow, fast = choices["speed"]
-        if slow > fast:
-            raise UsageError(f"--speed {slow:g} {fast:g}: MIN exceeds MAX", "Give MIN first.")
-        hand = replace(hand, speed_mps=(slow, fast), carry_mps=fast)
-    return replace(
-        options,
-        hand=hand,
-        range_sigma_m=choices["range_sigma"],
-        mounting_seed=choices["mounting"],
-        carrier=choices["carrier"] or options.carrier,
-        frame_offset_s=choices["frame_offset"],
-        event_offset_s=choices["event_offset"] or 0.0,
-    )
 
 
 def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options: SimulationOptions) -> None:

@@ -1,75 +1,70 @@
 """Put the newest results of many robots onto them, one after the other, until the first failure.
 
-The registry keeps the state of each robot: the same call continues after an interrupt, and all that was
-deployed can be rolled back.
+Nothing is kept of a roll-out: robots that hold their newest result are not written again, so the same call
+continues after an interrupt, and a rollback restores what such robots held before.
 """
 
+import hashlib
 import re
 import shlex
 import subprocess
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from datetime import datetime, timezone
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
-from lce_rig.core.errors import CommandError, LceRigError, NotEnoughDataError, SessionError, UsageError
+from lce_rig.core.errors import CommandError, LceRigError, NotEnoughDataError, UsageError
 from lce_rig.core.progress import Progress, silent
-from lce_rig.fleet.deploy import deployment
-from lce_rig.fleet.deploy.place import run_bounded
-from lce_rig.fleet.deploy.targets import read_targets
+from lce_rig.fleet import deployment
 from lce_rig.fleet.jobs import folder_name
+from lce_rig.fleet.place import run_bounded
 from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.releases import read_targets
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import load_rig
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session.session import PROFILE
 
-FOLDER = ".deployments"
 State: TypeAlias = Literal["waiting", "in_place", "left_out", "failed", "rolled_back", "not_rolled_back"]
 _CHECK_LIMIT_S = 1800.0
 _MOST_SAID = 2000
 _COLUMNS = ("robot", "folder", "date", "finished", "status", "verdict", "cause")
 
 
-class RobotState(BaseModel):
+@dataclass(frozen=True)
+class RobotState:
     """One robot in a roll-out.
 
     Attributes:
         robot: its name.
-        folder: of its result in the registry.
-        state: `State`; files of earlier versions hold others.
+        folder: of its newest result in the registry.
+        state: "waiting" while this result is not in place.
         to: the place of its files.
-        release: the release that was made current.
-        replaces: the release that was current before; "" if there was none.
-        time: of the last step, UTC.
+        release: the release that is current there; "" if there is none or it was not asked.
+        replaces: the release that it replaced; "" if there was none.
         detail: cause and action, or the output of a check.
     """
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
     robot: str
     folder: str = ""
-    state: str = "waiting"
+    state: State = "waiting"
     to: str = ""
     release: str = ""
     replaces: str = ""
-    time: str = ""
     detail: str = ""
 
-    def ended(self, state: State, cause: "Exception | str" = "", **changes: str) -> "RobotState":
+    def ended(self, state: State, cause: "Exception | str" = "") -> "RobotState":
         """Return the robot after a step."""
         detail = f"{cause.what} {cause.hint}".strip() if isinstance(cause, LceRigError) else str(cause)
-        now = f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ}"
-        return self.model_copy(update={"state": state, "detail": detail, "time": now} | changes)
+        return replace(self, state=state, detail=detail)
 
 
-class Rollout(BaseModel):
-    """A roll-out to one target of every robot.
+@dataclass
+class Rollout:
+    """The outcome of a roll-out, of a question for its state, or of a rollback.
 
     Attributes:
         target: its name.
@@ -77,38 +72,14 @@ class Rollout(BaseModel):
         robots: by name.
     """
 
-    model_config = ConfigDict(extra="ignore")
-
-    format_version: Literal[1] = 1
     target: str
     stopped_by: str = ""
-    robots: dict[str, RobotState] = Field(default_factory=dict)
+    robots: dict[str, RobotState] = field(default_factory=dict)
 
     @property
     def counts(self) -> Counter[str]:
         """The number of robots in each state."""
         return Counter(robot.state for robot in self.robots.values())
-
-
-def read_rollout(registry: Registry, target: str) -> Rollout:
-    """Read the state of a roll-out; empty if nothing was deployed.
-
-    Raises:
-        UsageError: no target can have this name.
-        SessionError: the file is damaged.
-    """
-    if target != folder_name(target):
-        raise UsageError(
-            f"{target!r} cannot name a target", "Use letters, digits, dots, dashes and underscores."
-        )
-    place = registry.place / FOLDER / f"{target}.json"
-    content = place.read()
-    if content is None:
-        return Rollout(target=target)
-    try:
-        return Rollout.model_validate_json(content)
-    except ValidationError as error:
-        raise SessionError(f"{place.url} is damaged", "Restore it from a copy of the registry.") from error
 
 
 def newest_results(registry: Registry, where: str = "") -> dict[str, RobotState]:
@@ -123,7 +94,7 @@ def newest_results(registry: Registry, where: str = "") -> dict[str, RobotState]
     by_robot: dict[str, list[Mapping[str, Any]]] = {}
     for row in registry.read_table(_COLUMNS, where).to_pylist():
         by_robot.setdefault(row["robot"], []).append(row)
-    states = {}
+    states: dict[str, RobotState] = {}
     for robot, rows in sorted(by_robot.items()):
         last = max(rows, key=lambda row: (row["date"] or "", row["finished"] or "", row["folder"]))
         first, _, name = last["folder"].partition("/")
@@ -133,13 +104,13 @@ def newest_results(registry: Registry, where: str = "") -> dict[str, RobotState]
             why = "its name or folder is not safe"
         elif not why and any(row["verdict"] == "fail" for row in newest):
             why = "verdict fail"
-        state = "left_out" if why else "waiting"
+        state: State = "left_out" if why else "waiting"
         states[robot] = RobotState(robot=robot, folder=last["folder"], state=state, detail=why)
     return states
 
 
 class FleetDeployment:
-    """A roll-out that is under way.
+    """One target of every robot.
 
     Args:
         registry: with the results.
@@ -152,16 +123,14 @@ class FleetDeployment:
     Raises:
         UsageError: the target's name, or the check, cannot be used.
         ProfileError: the file with the targets is invalid.
-        SessionError: the registry's state of the roll-out is damaged.
     """
 
     def __init__(self, registry: Registry, target: str, file: Path, check: str = "") -> None:
-        self._registry = registry
+        self._registry, self._name = registry, target
         try:
             self._check = shlex.split(check)
         except ValueError as error:
             raise UsageError(f"--check {check!r}: {error}", "Close the quotes.") from error
-        self.rollout = read_rollout(registry, target)
         targets = read_targets(file)
         if target not in targets:
             raise UsageError(f"no target is called {target!r}", f"Known targets: {', '.join(targets)}.")
@@ -175,58 +144,88 @@ class FleetDeployment:
         Args:
             wanted: as `newest_results` gives them.
             progress: called with (done, total) robots.
-
-        Raises:
-            SessionError: the registry cannot be written.
         """
-        self.rollout.stopped_by = ""
+        return self._each(wanted, self._deploy, progress, is_stopped=True)
+
+    def status(self, wanted: Mapping[str, RobotState], *, progress: Progress = silent) -> Rollout:
+        """Ask every robot for what it holds; the arguments are those of `run`."""
+        return self._each(wanted, self._ask, progress)
+
+    def roll_back(
+        self, wanted: Mapping[str, RobotState], reason: str = "", *, progress: Progress = silent
+    ) -> Rollout:
+        """Restore the earlier release on each robot that holds its newest result, as `run` left it."""
+
+        def restore(state: RobotState, target: TargetSettings) -> RobotState:
+            state = self._ask(state, target)
+            if state.state != "in_place":
+                return state.ended("not_rolled_back", state.detail)
+            if not state.replaces:
+                return state.ended("not_rolled_back", "it is the first release there")
+            try:
+                deployment.rollback(target, state.replaces, reason=reason)
+            except CommandError as error:
+                return state.ended("rolled_back", error)
+            return state.ended("rolled_back")
+
+        return self._each(wanted, restore, progress)
+
+    def _each(
+        self,
+        wanted: Mapping[str, RobotState],
+        step: Callable[[RobotState, TargetSettings], RobotState],
+        progress: Progress,
+        *,
+        is_stopped: bool = False,
+    ) -> Rollout:
+        """Take a step at each robot that is not left out; if asked to, stop at the first failure."""
+        rollout = Rollout(self._name)
         for done, state in enumerate(wanted.values(), 1):
-            ended = state if state.state == "left_out" else self._deploy(state)
-            if ended.state == "failed":
-                self.rollout.stopped_by = ended.robot
-            self._keep(ended)
+            if state.state != "left_out":
+                try:
+                    target = self._target_of(state.robot)
+                    state = step(replace(state, to=target.to), target)
+                except (LceRigError, OSError) as error:
+                    state = state.ended("failed", error)
+            rollout.robots[state.robot] = state
             progress(done, len(wanted))
-            if self.rollout.stopped_by:
+            if is_stopped and state.state == "failed":
+                rollout.stopped_by = state.robot
                 break
-        return self.rollout
+        return rollout
 
-    def roll_back(self, reason: str = "", *, progress: Progress = silent) -> Rollout:
-        """Restore the earlier release on each robot that still has the release of this roll-out.
-
-        Raises:
-            SessionError: the registry cannot be written.
-        """
-        held = [
-            state for state in self.rollout.robots.values() if state.release and state.state != "rolled_back"
-        ]
-        for done, state in enumerate(held, 1):
-            self._keep(self._restore(state, reason))
-            progress(done, len(held))
-        return self.rollout
-
-    def _deploy(self, state: RobotState) -> RobotState:
+    def _target_of(self, robot: str) -> TargetSettings:
         try:
-            target = self._target_of(state.robot)
-            state = state.model_copy(update={"to": target.to})
-            with TemporaryDirectory(prefix="lce-rig-") as scratch:
-                place, folder = self._registry.place / state.folder, Path(scratch) / "result"
-                place.fetch(folder)
+            return self._target.for_robot(robot)
+        except ValueError as error:
+            raise UsageError(f"it cannot be part of {self._target.to}", "Rename the robot.") from error
+
+    def _ask(self, state: RobotState, target: TargetSettings) -> RobotState:
+        """Ask a robot whether its current release has its newest result."""
+        current = deployment.standing(target).current
+        if current is None:
+            return state.ended("waiting", "nothing is deployed there")
+        state = replace(state, release=current.name, replaces=current.replaces)
+        newest = (self._registry.place / state.folder / RESULT).read() or b""
+        if current.files.get(RESULT) != hashlib.sha256(newest).hexdigest():
+            return state.ended("waiting", f"{current.name} holds another result")
+        return state.ended("in_place")
+
+    def _deploy(self, state: RobotState, target: TargetSettings) -> RobotState:
+        """Deploy to a robot, and run the check, if there is one."""
+        with TemporaryDirectory(prefix="lce-rig-") as scratch:
+            place, folder = self._registry.place / state.folder, Path(scratch) / "result"
+            place.fetch(folder)
+            try:
                 done = deployment.deploy(folder, load_rig(folder / PROFILE), target)
-                releases = {"release": done.release.name, "replaces": done.replaces}
-                return self._checked(state.model_copy(update=releases), folder)
-        except CommandError as error:
-            current = None
-            with suppress(LceRigError):
-                current = deployment.standing(target).current
-            releases = {} if current is None else {"release": current.name, "replaces": current.replaces}
-            return state.ended("failed", error, **releases)
-        except (LceRigError, OSError) as error:
-            return state.ended("failed", error)
+            except CommandError as error:
+                with suppress(LceRigError):
+                    state = self._ask(state, target)
+                return state.ended("failed", error)
+            state = replace(state, release=done.release.name, replaces=done.replaces)
+            return self._checked(state, folder) if self._check else state.ended("in_place")
 
     def _checked(self, state: RobotState, folder: Path) -> RobotState:
-        """Run the check, if there is one."""
-        if not self._check:
-            return state.ended("in_place")
         values = {"{robot}": state.robot, "{result}": str(folder / RESULT), "{to}": state.to}
         words = [re.sub(r"\{(robot|result|to)\}", lambda name: values[name[0]], word) for word in self._check]
         try:
@@ -239,33 +238,3 @@ class FleetDeployment:
         if ran.code == NotEnoughDataError.exit_code:
             return state.ended("in_place", f"the check cannot tell: {output}")
         return state.ended("failed", f"the check ended with exit code {ran.code}: {output}")
-
-    def _restore(self, state: RobotState, reason: str) -> RobotState:
-        try:
-            target = self._target_of(state.robot)
-            current = deployment.standing(target).current
-            if current is None or current.name != state.release:
-                now = "nothing" if current is None else current.name
-                return state.ended("not_rolled_back", f"{now} is in place by now, not {state.release}")
-            if not state.replaces:
-                return state.ended("not_rolled_back", "it is the first release there")
-            deployment.rollback(target, state.replaces, reason=reason)
-        except CommandError as error:
-            return state.ended("rolled_back", error)
-        except LceRigError as error:
-            return state.ended("not_rolled_back", error)
-        return state.ended("rolled_back")
-
-    def _target_of(self, robot: str) -> TargetSettings:
-        try:
-            return self._target.for_robot(robot)
-        except ValueError as error:
-            raise UsageError(
-                f"robot {robot!r} cannot be part of {self._target.to}", "Rename the robot."
-            ) from error
-
-    def _keep(self, state: RobotState) -> None:
-        """Keep a robot's state in the registry."""
-        self.rollout.robots = dict(sorted({**self.rollout.robots, state.robot: state}.items()))
-        place = self._registry.place / FOLDER / f"{self.rollout.target}.json"
-        place.write(self.rollout.model_dump_json(indent=1).encode() + b"\n")

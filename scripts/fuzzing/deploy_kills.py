@@ -25,8 +25,8 @@ from wire.sshd import NoServerError, Sshd
 from fuzzing.report import Report
 from fuzzing.started import PATIENCE_S, must_end_well, said, start
 from lce_rig.core.errors import TargetError
-from lce_rig.fleet.deploy.place import RECORD, USED
-from lce_rig.fleet.deploy.releases import content_of
+from lce_rig.fleet.place import RECORD, USED
+from lce_rig.fleet.releases import content_of
 
 _N_CAPTURES = 8
 _EVERY = 10

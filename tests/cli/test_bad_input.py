@@ -120,13 +120,6 @@ def test_a_plate_of_the_boards_size_that_stands_in_the_room_is_not_taken_for_the
     assert np.degrees(rotation_angle(np.array(pair["T_cam_lidar"])[:3, :3], truth[:3, :3])) < 0.5
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-0.1"])
-def test_a_range_noise_that_is_no_length_is_a_usage_error(lce_rig, tmp_path, value):
-    words = ["simulate", "--rig", "rles", tmp_path / "s", "--range-sigma", value]
-    assert lce_rig(*words).code == 2
-    assert not (tmp_path / "s").exists()
-
-
 @pytest.mark.parametrize(
     "changes",
     [{"file": True}, {"file": "../../../secret.png"}, {"camera": "other"}, {"channel": "none"}],

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.cli.collect import collect
 from lce_rig.core.files import encode_pcd
 
 TWO = Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"
@@ -78,8 +77,3 @@ def test_a_session_is_named_by_output_too_and_continues_with_its_own_profile(lce
     assert lce_rig("collect", session, "--from", folders[1], "--camera", "right").code == 0
     assert cameras_held(session) == [("left", 100), ("right", 101)]
     assert lce_rig("collect", session, "-o", session, *first).code == 2
-
-
-@pytest.mark.parametrize("name", ["--captures", "--frames"])
-def test_earlier_names_of_the_number_of_captures_go_on(name):
-    assert collect.make_context("collect", ["--rig", "rlfs", name, "4"]).params["n_wanted"] == 4

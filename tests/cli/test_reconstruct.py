@@ -70,16 +70,6 @@ def stamps(folder):
     return [int(line.split(",")[1]) for line in (folder / "stamps.csv").read_text().splitlines()[1:]]
 
 
-def test_an_animation_is_written_and_a_video_of_an_unknown_kind_refused(lce_rig, tmp_path):
-    words = ["reconstruct", recording(tmp_path / "sweep.aedat4"), "-o"]
-    outcome = lce_rig(*words, tmp_path / "out", "--video", tmp_path / "a.gif")
-    assert outcome.code == 0, outcome.err
-    assert (tmp_path / "a.gif").read_bytes()[:6] == b"GIF89a"
-    outcome = lce_rig(*words, tmp_path / "other", "--video", tmp_path / "a.mov")
-    assert outcome.code == 5
-    assert all(kind in outcome.err for kind in (".mp4", ".avi", ".mkv"))
-
-
 def test_one_wild_stamp_does_not_ask_for_images_of_centuries(lce_rig, tmp_path):
     (tmp_path / "a.txt").write_text("346 260\n0.0 1 1 0\n0.001 2 2 1\n1000000000 3 3 1\n")
     outcome = lce_rig("reconstruct", tmp_path / "a.txt", "-o", tmp_path / "out")

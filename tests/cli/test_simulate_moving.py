@@ -1,7 +1,6 @@
 """`lce-rig simulate` of a moving board: sessions with raw events, recordings, and truth that fits both."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +14,11 @@ from lce_rig.io.events import open_events
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import Session
-from lce_rig.simulate import HandMotion, SimulatedCapture, SimulationOptions, simulate_captures
+from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures
 
 # The placement is 1.3 m away: squares are 9 px wide, even to a camera of half the resolution.
 SEED = 9
-CHOICES = ("--carrier", "none", "--speed", "0.25", "0.3", "--frame-offset", "0.12", "--event-offset", "-0.3")
-OPTIONS = replace(
-    SimulationOptions.for_rig("rles", motion="moving"),
-    carrier="none",
-    hand=HandMotion(speed_mps=(0.25, 0.3), carry_mps=0.3),
-    frame_offset_s=0.12,
-    event_offset_s=-0.3,
-)
+OPTIONS = SimulationOptions.for_rig("rles", motion="moving")
 
 
 def small_rig(*channels: str) -> Rig:
@@ -56,7 +48,7 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session of one capture of a moving board."""
     folder = tmp_path_factory.mktemp("moving")
     profile = write_profile(folder, "frames", "events")
-    words = ["--rig", profile, folder / "s", "--motion", "moving", "--captures", 1, "--seed", SEED, *CHOICES]
+    words = ["--rig", profile, folder / "s", "--motion", "moving", "--captures", 1, "--seed", SEED]
     assert run(["simulate", *map(str, words)]) == 0
     return folder / "s"
 
@@ -90,10 +82,8 @@ def test_the_session_holds_exactly_what_was_simulated(moving: Path, simulated: S
         assert np.array_equal(getattr(events, column), getattr(simulated.events[0], column))
 
 
-def test_truth_names_the_clocks_the_speed_and_the_board(
-    truth: dict[str, Any], simulated: SimulatedCapture
-) -> None:
-    assert (truth["motion"], truth["frame_offset_s"], truth["event_offset_s"]) == ("moving", 0.12, -0.3)
+def test_truth_names_the_speed_and_the_board(truth: dict[str, Any], simulated: SimulatedCapture) -> None:
+    assert truth["motion"] == "moving"
     for sensor, board in truth["captures"]["000000"]["boards"].items():
         expected = simulated.T_sensor_board(sensor, board["t_ns"])
         np.testing.assert_allclose(board["T_sensor_board"], expected, atol=1e-6)
@@ -104,7 +94,7 @@ def test_truth_names_the_clocks_the_speed_and_the_board(
 
 def test_a_rig_of_events_alone_is_simulated_moving(lce_rig: Any, tmp_path: Path) -> None:
     profile = write_profile(tmp_path, "events")
-    words = ("simulate", "--rig", profile, "--captures", 1, "--carrier", "none")
+    words = ("simulate", "--rig", profile, "--captures", 1)
     outcome = lce_rig(*words, tmp_path / "s")
     assert outcome.code == 0, outcome.err
     (capture,) = Session.open(tmp_path / "s").captures
@@ -116,7 +106,7 @@ def test_a_rig_of_events_alone_is_simulated_moving(lce_rig: Any, tmp_path: Path)
 
 def test_a_still_board_makes_no_events_and_help_says_so(lce_rig: Any, tmp_path: Path) -> None:
     profile = write_profile(tmp_path, "frames", "events")
-    outcome = lce_rig("simulate", "--rig", profile, tmp_path / "s", "--captures", 1, "--carrier", "none")
+    outcome = lce_rig("simulate", "--rig", profile, tmp_path / "s", "--captures", 1)
     assert outcome.code == 0
     assert Session.open(tmp_path / "s").captures[0].event_cameras == []
     text = " ".join(lce_rig("simulate", "--help").out.split())
@@ -126,16 +116,12 @@ def test_a_still_board_makes_no_events_and_help_says_so(lce_rig: Any, tmp_path: 
 @pytest.mark.parametrize(
     "words",
     [
-        ("s", "--speed", "0.1", "0.2"),
-        ("s", "--event-offset", "0"),
-        ("s", "--motion", "moving", "--speed", "0.3", "0.1"),
-        ("s", "--motion", "moving", "--speed", "nan", "1"),
         ("s", "--duration", "3"),
         ("s", "--ros", "2"),
         ("s", "--recording", "r"),
         ("--captures", "3", "--recording", "r"),
         ("--motion", "still", "--recording", "r"),
-        ("--speed", "0", "0", "--recording", "r"),
+        *(("--duration", value, "--recording", "r") for value in ("nan", "inf", "-0.1")),
     ],
 )
 def test_choices_that_cannot_be_meant_exit_with_2_and_write_nothing(
@@ -153,7 +139,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
     profile = write_profile(folder, "frames", "events")
     words = ["--rig", profile, "--recording", folder / "r", "--duration", 0.25, "--seed", 2, "--ros", 2]
-    assert run(["simulate", *map(str, words), "--carrier", "none", "--speed", "0", "0.6"]) == 0
+    assert run(["simulate", *map(str, words)]) == 0
     return folder / "r"
 
 
@@ -178,7 +164,7 @@ def test_a_recording_is_read_by_the_readers_of_recordings(recorded: Path, rig: R
 def test_a_recording_overwrites_nothing(lce_rig: Any, recorded: Path, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()}
     profile = write_profile(tmp_path, "frames", "events")
-    outcome = lce_rig("simulate", "--rig", profile, "--recording", recorded, "--carrier", "none")
+    outcome = lce_rig("simulate", "--rig", profile, "--recording", recorded)
     assert outcome.code == 5
     assert "exists already" in outcome.err
     assert {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()} == before

@@ -1,16 +1,10 @@
 """Events over their pictures: where they fell, in the colour of their sign, and in animations."""
 
-from pathlib import Path
-
-import cv2
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Events, Image
-from lce_rig.core.errors import SourceError
 from lce_rig.show.overlays.overlay import BRIGHTER, DARKER, ImageWithEvents, draw_events
-from lce_rig.show.overlays.overlay_files import write_gif, write_video
 from tests.show.overlays.test_pictures import (
     FOLDING,
     count,
@@ -75,43 +69,3 @@ def test_an_overlay_shows_the_events_and_the_ring_ends_below_the_legend() -> Non
     assert below.shape[0] > 260 * 3
     assert count(below, BRIGHTER) >= 30 * 9
     assert count(below, (60, 160, 255)) > 50  # orange: the ring ends
-
-
-def frames(n: int = 5) -> list[NDArray[np.uint8]]:
-    return [np.full((26, 34), 40 * index, np.uint8) for index in range(n)]
-
-
-def test_a_gif_holds_every_picture_and_runs_at_the_rate_asked_for(tmp_path: Path) -> None:
-    pillow = pytest.importorskip("PIL.Image")
-    write_gif(tmp_path / "new" / "a.gif", iter(frames()), 0.05)
-    with pillow.open(tmp_path / "new" / "a.gif") as animation:
-        assert (animation.n_frames, animation.size, animation.info["duration"]) == (5, (34, 26), 50)
-        animation.seek(3)
-        assert abs(int(np.asarray(animation.convert("L"))[5, 5]) - 120) < 4
-
-
-@pytest.mark.parametrize("name", ["a.avi", "a.mp4"])
-def test_a_video_holds_every_picture_or_says_that_it_cannot_be_written(tmp_path: Path, name: str) -> None:
-    large = [cv2.resize(frame, (346, 260)) for frame in frames()]
-    try:
-        write_video(tmp_path / name, iter(large), 0.05)
-    except SourceError as error:
-        assert "OpenCV" in error.what and "GIF" in error.hint
-        assert not (tmp_path / name).exists()
-        return
-    video = cv2.VideoCapture(str(tmp_path / name))
-    read = [video.read() for _ in range(6)]
-    assert [is_read for is_read, _ in read] == [True] * 5 + [False]
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(20)
-    assert abs(int(read[3][1][100, 100, 0]) - 120) < 12
-    video.release()
-
-
-def test_files_that_cannot_be_written_are_named(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    pytest.importorskip("PIL.Image")
-    for write, name in ((write_gif, "a.gif"), (write_video, "a.mp4")):
-        with pytest.raises(SourceError):
-            write(tmp_path / "file" / name, iter(frames()), 0.05)
-    with pytest.raises(SourceError, match=r"a\.mov"):
-        write_video(tmp_path / "a.mov", iter(frames()), 0.05)

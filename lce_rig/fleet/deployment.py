@@ -4,7 +4,6 @@
 makes an earlier release current again. Each opens its own connections; nothing is kept between calls.
 """
 
-import difflib
 import json
 import shutil
 from collections.abc import Mapping
@@ -13,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 from lce_rig.core.calibration import ResultFile, read_result
 from lce_rig.core.errors import (
@@ -26,7 +24,14 @@ from lce_rig.core.errors import (
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.export import export_formats
-from lce_rig.fleet.deploy.place import (
+from lce_rig.fleet.findings import (
+    DEPLOY_FAILED,
+    DEPLOY_OLDER,
+    DEPLOY_OTHER_ROBOT,
+    DEPLOY_OTHER_SERIAL,
+    DEPLOY_UNDATED,
+)
+from lce_rig.fleet.place import (
     CHANGED,
     COMMIT,
     DISCARD,
@@ -37,7 +42,7 @@ from lce_rig.fleet.deploy.place import (
     LostError,
     Place,
 )
-from lce_rig.fleet.deploy.releases import (
+from lce_rig.fleet.releases import (
     ReleaseRecord,
     TargetState,
     content_of,
@@ -46,13 +51,6 @@ from lce_rig.fleet.deploy.releases import (
     fetch,
     read_state,
     user_name,
-)
-from lce_rig.fleet.findings import (
-    DEPLOY_FAILED,
-    DEPLOY_OLDER,
-    DEPLOY_OTHER_ROBOT,
-    DEPLOY_OTHER_SERIAL,
-    DEPLOY_UNDATED,
 )
 from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
@@ -63,19 +61,21 @@ from lce_rig.session.replacing import copy_over
 _OTHER = "Another deployment came first: look at `--status`, then run the same command again."
 
 
-class SensorChange(NamedTuple):
+@dataclass(frozen=True)
+class SensorChange:
     """The change of the extrinsics of a camera and a LiDAR.
 
     Attributes:
         camera, lidar: the sensors.
-        moved: deg and m between both sets; None if only one of them has these extrinsics.
-        is_new: whether the new set has them.
+        is_new: whether the new set has extrinsics of them.
+        rotation_deg, translation_m: between both sets; None if only one of them has extrinsics.
     """
 
     camera: str
     lidar: str
-    moved: tuple[float, float] | None
-    is_new: bool = False
+    is_new: bool
+    rotation_deg: float | None = None
+    translation_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,6 @@ class Plan:
         changed: files that differ from the current release's: "changed", "missing", "added".
         sensors: changes of the extrinsics.
         findings: objections, and notes of what could not be compared.
-        diff: lines in which changed texts differ, as `diff -u` prints them.
     """
 
     record: ReleaseRecord
@@ -96,7 +95,6 @@ class Plan:
     changed: Mapping[str, str]
     sensors: tuple[SensorChange, ...]
     findings: tuple[Finding, ...]
-    diff: tuple[str, ...]
 
     @property
     def objections(self) -> tuple[Finding, ...]:
@@ -272,28 +270,15 @@ def _plan(
     files = content_of(new)
     before, after = _extrinsics(deployed), _extrinsics(new)
     sensors = [
-        SensorChange(
-            *key,
-            tangent_sizes(difference(after[key], before[key])) if key in before and key in after else None,
-            key in after,
-        )
+        SensorChange(*key, True, *tangent_sizes(difference(after[key], before[key])))
+        if key in before and key in after
+        else SensorChange(*key, key in after)
         for key in dict.fromkeys([*after, *before])
     ]
     changed = differences(files, {} if state.current is None else state.current.files)
-    # Lines as `diff -u` prints them; new and removed texts whole, other files not at all.
-    lines: list[str] = []
-    for name in changed:
-        with suppress(OSError, ValueError):
-            before_text, after_text = (
-                path.read_text("utf-8").splitlines() if path.is_file() else []
-                for path in (deployed / name, new / name)
-            )
-            lines += difflib.unified_diff(
-                before_text, after_text, f"deployed/{name}", f"new/{name}", lineterm=""
-            )
     findings = _compare(saved, target, state.current)
     record = ReleaseRecord.of(saved, files, state)
-    return Plan(record, state, changed, tuple(sensors), tuple(findings), tuple(lines))
+    return Plan(record, state, changed, tuple(sensors), tuple(findings))
 
 
 def _stage(

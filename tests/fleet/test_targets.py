@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.errors import ProfileError, TargetError, UsageError
-from lce_rig.fleet.deploy.deployment import standing
-from lce_rig.fleet.deploy.place import Place
-from lce_rig.fleet.deploy.targets import find_target, read_targets
+from lce_rig.fleet.deployment import standing
+from lce_rig.fleet.place import Place
+from lce_rig.fleet.releases import find_target, read_targets
 from lce_rig.rig import load_rig
 from lce_rig.rig.target_settings import TargetSettings
 

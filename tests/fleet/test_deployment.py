@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.errors import CommandError, ResultRefusedError, SessionError, TargetError
-from lce_rig.fleet.deploy import deployment
-from lce_rig.fleet.deploy.deployment import deploy, plan, rollback, standing
-from lce_rig.fleet.deploy.place import RECORD, Place
-from lce_rig.fleet.deploy.releases import content_of, set_sha256
+from lce_rig.fleet import deployment
+from lce_rig.fleet.deployment import deploy, plan, rollback, standing
+from lce_rig.fleet.place import RECORD, Place
+from lce_rig.fleet.releases import content_of, set_sha256
 from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
-from tests.fleet.deploy.conftest import ORIGIN, log_of
+from tests.fleet.conftest import ORIGIN, log_of
 
 Result = Callable[..., Path]
 FILES = {"camera_info_davis.yaml", "extrinsics.yaml", "result.json", "rles.urdf", "static_transforms.txt"}
@@ -82,13 +82,13 @@ def test_a_dry_run_gives_degrees_millimetres_and_changes_nothing(
     planned = plan(result("a"), rig, target)
     assert planned.state.current is None and not robot.exists()
     (change,) = planned.sensors
-    assert (change.moved, change.is_new) == (None, True)
+    assert (change.rotation_deg, change.is_new) == (None, True)
     assert planned.changed == dict.fromkeys(planned.record.files, "added")
     deploy(result("b"), rig, target)
     before = {path: path.stat().st_mtime_ns for path in robot.rglob("*")}
     planned = plan(result("c", 0.15), rig, target)
     (change,) = planned.sensors
-    assert change.moved == pytest.approx((0, 0.03), abs=1e-9)
+    assert (change.rotation_deg, change.translation_m) == pytest.approx((0, 0.03), abs=1e-9)
     assert set(planned.changed.values()) == {"changed"} and "result.json" in planned.changed
     assert {path: path.stat().st_mtime_ns for path in robot.rglob("*")} == before
 
