@@ -13,7 +13,7 @@ from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, rig_option
 from lce_rig.core.errors import SessionError, UsageError
 from lce_rig.core.files import read_json
-from lce_rig.io.ros.bag_recorder import FolderRecorder
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig, find_profile, load_rig, read_profile
 from lce_rig.session import Session
 from lce_rig.simulate import (
@@ -42,8 +42,7 @@ _CAPTURES, _DURATION_S = 30, 20.0
     "--recording",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Write a recording instead of a session: recording.bag with images, scans and events, and "
-    "events.aedat4.",
+    help="Write a recording instead of a session: recording.bag with images, scans and events.",
 )
 @click.option(
     "--duration",
@@ -148,14 +147,14 @@ def _simulate_recording(
     folder: Path, rig: Rig, duration_s: float, seed: int, options: SimulationOptions, ros: int
 ) -> None:
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
-    with FolderRecorder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:
+    with BagRecorder.in_folder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:
         write_truth(folder / TRUTH, rig_truth(rig, seed, options) | recording_truth(recording))
         for sample in recording:
             recorder.write(sample)
             progress(max(0, stamp_of(sample) - recording.start_ns) // 10**9, round(duration_s))
     names = ", ".join(sorted(path.name for path in folder.iterdir()))
     show.note(f"{folder}: {duration_s:g} s of rig {rig.name}: {names}")
-    show.note(f"next: lce-rig collect --rig {rig.name} --from {recorder.bag}")
+    show.note(f"next: lce-rig collect --rig {rig.name} --from {recorder.path}")
 
 
 def require_kind(session: Path, seed: int | None) -> None:

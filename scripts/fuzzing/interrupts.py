@@ -114,7 +114,7 @@ _VERBS: dict[str, Callable[[_Bench], list[object]]] = {
         "collect", "--rig", "rlfs", bench.new(), "--simulated", "--plain", "--timeout", "20",
         "--preview", "127.0.0.1:0",
     ],
-    "reconstruct": lambda bench: ["reconstruct", bench.recording / "events.aedat4", "-o", bench.new()],
+    "reconstruct": lambda bench: ["reconstruct", bench.recording / "recording.bag", "-o", bench.new()],
     "doctor": lambda bench: ["doctor", "--rig", "rlfs"],
 }  # fmt: skip
 _LIVE = "collect --simulated"

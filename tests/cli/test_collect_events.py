@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.data import Events, Image, Sample
-from lce_rig.io.events.aedat4 import Aedat4Writer
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.session import Session
 from tests.collect import simulated_moves as moves
@@ -32,7 +31,7 @@ def folder(tmp_path_factory) -> Path:
     write_aedat4(path / "late.aedat4", [replace(e, t_ns=e.t_ns + late_ns) for e in moves.events()])
     other = replace(moves.events()[0], width_px=640, height_px=480)
     write_aedat4(path / "other.aedat4", [other])
-    Aedat4Writer(path / "none.aedat4", (346, 260)).close()
+    write_aedat4(path / "none.aedat4", [])
     return path
 
 

@@ -144,21 +144,16 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_recording_is_read_by_the_readers_of_recordings(recorded: Path, rig: Rig) -> None:
-    assert sorted(path.name for path in recorded.iterdir()) == ["events.aedat4", "recording", "truth.json"]
+    assert sorted(path.name for path in recorded.iterdir()) == ["recording", "truth.json"]
     recording = open_recording(recorded / "recording", rig)
     assert isinstance(recording, ContinuousRecording)
     samples = list(recording.samples())
     assert sum(isinstance(sample, Image) for sample in samples) == 5
     assert sum(isinstance(sample, Scan) for sample in samples) == 2
     size = rig.cameras["davis"].resolution_px
-    streams = [
-        list(open_events(recorded / name, sensor="davis", resolution=size))
-        for name in ("recording", "events.aedat4")
-    ]
-    for column in ("t_ns", "x", "y", "polarity"):
-        bag, aedat4 = (np.concatenate([getattr(part, column) for part in parts]) for parts in streams)
-        assert len(bag) > 1000 and np.array_equal(bag, aedat4)
-    assert all(isinstance(part, Events) for part in streams[0])
+    events = list(open_events(recorded / "recording", sensor="davis", resolution=size))
+    assert sum(map(len, events)) > 1000
+    assert sum(len(sample) for sample in samples if isinstance(sample, Events)) == sum(map(len, events))
 
 
 def test_a_recording_overwrites_nothing(lce_rig: Any, recorded: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
-from lce_rig.io.ros.bag_recorder import BagRecorder, FolderRecorder
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig, load_rig
 
 from .rig_samples import KINDS, T0_NS, one_second, packet, picture, read, read_events, record, sweep
@@ -141,13 +141,3 @@ def test_a_full_disk_stops_the_recording(tmp_path: Path, rles: Rig, name: str) -
     assert 10 < n_taken < 50
     with pytest.raises(SourceError, match=name):
         open_recording(tmp_path / name, rles)
-
-
-def test_a_full_disk_stops_a_folder_with_one_error(tmp_path: Path, rles: Rig) -> None:
-    with (
-        files_up_to(300_000),
-        pytest.raises(SourceError, match=r"events\.aedat4"),
-        FolderRecorder(tmp_path / "r", rles) as recorder,
-    ):
-        for k in range(100):
-            recorder.write(packet(k, 6000))

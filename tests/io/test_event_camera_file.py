@@ -9,7 +9,6 @@ import pytest
 from lce_rig.core.data import Events, Image, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.events.aedat4 import Aedat4Writer
 from lce_rig.io.protocol import ContinuousRecording, serials_of
 from lce_rig.rig import Rig, load_rig
 from tests.io.events import encoders
@@ -93,8 +92,7 @@ def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path: Path, rig: Rig, na
 
 
 def test_serial_numbers_in_heads_of_files_are_told(tmp_path: Path, rig: Rig) -> None:
-    with Aedat4Writer(tmp_path / "a.aedat4", (346, 260), "DAVIS346_00000499") as writer:
-        writer.write(EVENTS)
+    write_aedat4(tmp_path / "a.aedat4", [EVENTS], "DAVIS346_00000499")
     local = [(t - T0_US, x, y, p) for t, x, y, p in listed(EVENTS)]
     head = b"% evt 3.0\n% geometry 346x260\n% serial_number 00050423\n% end\n"
     (tmp_path / "b.raw").write_bytes(head + encoders.evt3(local))
@@ -104,7 +102,7 @@ def test_serial_numbers_in_heads_of_files_are_told(tmp_path: Path, rig: Rig) -> 
 
 
 def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path: Path, rig: Rig) -> None:
-    Aedat4Writer(tmp_path / "none.aedat4", (346, 260)).close()
+    write_aedat4(tmp_path / "none.aedat4", [])
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     with pytest.raises(SourceError, match=r"none\.aedat4"):
         opened(tmp_path / "none.aedat4", rig)

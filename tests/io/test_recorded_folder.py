@@ -12,7 +12,7 @@ from lce_rig.io import list_parts, open_recordings
 from lce_rig.io.joining import JoinedRecording, join_recordings
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
-from lce_rig.io.ros.bag_recorder import FolderRecorder
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig, load_rig
 
 from .rig_samples import KINDS, T0_NS, one_second
@@ -30,9 +30,9 @@ def rlfs() -> Rig:
 
 
 def fill(folder: Path, rig: Rig, ros: int = 1) -> int:
-    """Record a second as `collect --record` does: packets apart, all else in a bag, events also in a file."""
+    """Record a second as `collect --record` does: packets apart, all else in a bag."""
     n_pictures = 0
-    with FolderRecorder(folder, rig, ros) as recorder:
+    with BagRecorder.in_folder(folder, rig, ros) as recorder:
         for sample in one_second():
             if not isinstance(sample, Scan):
                 recorder.write(sample)
@@ -56,7 +56,7 @@ def test_packets_pictures_and_events_of_a_folder_come_back_as_one_recording(
 ) -> None:
     folder = tmp_path / "kept"
     n_pictures = fill(folder, rles, ros)
-    assert {each.name for each in folder.iterdir()} == {bag, "events.aedat4", "lidar.pcap"}
+    assert {each.name for each in folder.iterdir()} == {bag, "lidar.pcap"}
     joined = read(folder, rles)
     samples = list(joined.samples())
     assert sum(isinstance(sample, Image) for sample in samples) == n_pictures
@@ -65,10 +65,10 @@ def test_packets_pictures_and_events_of_a_folder_come_back_as_one_recording(
     assert 8 <= len(scans) <= 10
     assert all(abs((scan.stamp_ns or 0) - T0_NS) < 1.1e9 for scan in scans)
     events = np.concatenate([sample.t_ns for sample in samples if isinstance(sample, Events)])
-    assert len(events) == 50 * 4000, "events lie in two files, and are read once"
+    assert len(events) == 50 * 4000
     assert joined.key == read(folder, rles).key, "so that a second run knows what was captured"
     with pytest.raises(SourceError, match="kept"):
-        FolderRecorder(folder, rles, ros)
+        BagRecorder.in_folder(folder, rles, ros)
 
 
 def test_a_file_that_a_killed_recorder_left_empty_is_passed_over_and_named(tmp_path: Path, rles: Rig) -> None:

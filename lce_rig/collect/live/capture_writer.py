@@ -21,7 +21,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import Observation
 from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.reading import LiveSource
-from lce_rig.io.ros.bag_recorder import FolderRecorder
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.timing.event_buffer import EventCut
@@ -205,7 +205,7 @@ def record_streams(
     Raises:
         SourceError: the folder exists already, or cannot be made.
     """
-    recorder = FolderRecorder(folder, rig)
+    recorder = BagRecorder.in_folder(folder, rig)
     by_packets = {source.sensor for source in sources if source.record_packets(folder, disk)}
     sink: Sink[Sample] = disk.add(folder, recorder.write, recorder.close)
 

@@ -1,8 +1,8 @@
-"""iniVation's AEDAT4 files: events and frames read, events written.
+"""iniVation's AEDAT4 files: events and frames.
 
 The file is read here, not by dv-processing: that library refuses recordings that were cut short and never
-returns from some damaged ones, and `collect --record` writes AEDAT4 on computers that lack it. The table at
-the end of the file is not needed: packets are walked from the front, as far as they go.
+returns from some damaged ones. The table at the end of the file is not needed: packets are walked from the
+front, as far as they go.
 
 References:
     https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-4.0.html
@@ -15,16 +15,14 @@ import struct
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
-from xml.sax.saxutils import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.data import MAX_TIME_NS, EventColumns, Events, join_events
+from lce_rig.core.data import MAX_TIME_NS, EventColumns, join_events
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
@@ -42,28 +40,7 @@ _TIMESTAMP, _EXPOSURE_START, _EXPOSURE_END, _FORMAT = 0, 3, 4, 5
 _WIDTH, _HEIGHT, _PIXELS, _EXPOSURE = 6, 7, 10, 11
 # OpenCV's type numbers of 8-bit images.
 _CHANNELS = {0: 1, 16: 3, 24: 4}
-# DV's own packets hold 10 ms; smaller ones are read slowly, larger ones late.
-_PACKET_EVENTS = 1 << 13
-_LZ4 = 1
 _NOT_CLOSED = -1
-_XML = """<dv version="2.0">
- <node name="outInfo" path="/mainloop/Recorder/outInfo/">
-  <node name="0" path="/mainloop/Recorder/outInfo/0/">
-   <attr key="compression" type="string">LZ4</attr>
-   <attr key="originalModuleName" type="string">lce-rig</attr>
-   <attr key="originalOutputName" type="string">events</attr>
-   <attr key="typeDescription" type="string">Array of events (polarity ON/OFF).</attr>
-   <attr key="typeIdentifier" type="string">EVTS</attr>
-   <node name="info" path="/mainloop/Recorder/outInfo/0/info/">
-    <attr key="sizeX" type="int">{width}</attr>
-    <attr key="sizeY" type="int">{height}</attr>
-    <attr key="source" type="string">{camera}</attr>
-    <attr key="tsOffset" type="long">0</attr>
-   </node>
-  </node>
- </node>
-</dv>
-"""
 _Content = TypeVar("_Content")
 
 
@@ -289,61 +266,3 @@ def _decompress(data: bytes) -> bytes:
     if module == "compression.zstd" and sys.version_info < (3, 14):
         module = "backports.zstd"
     return bytes(import_module(module).decompress(data)) if module else data
-
-
-class Aedat4Writer(AbstractContextManager["Aedat4Writer"]):
-    """An AEDAT4 file with one stream of events, which DV and dv-processing open; a context manager.
-
-    dv-processing takes events one by one, at a microsecond each; the flatbuffers are few and fixed, so they
-    are laid out by hand. The table of packets at the end is left out, as after a crash: readers walk them.
-
-    Raises:
-        FileExistsError: the file is there already.
-    """
-
-    def __init__(self, path: Path, resolution_px: tuple[int, int], camera_name: str = "lce_rig") -> None:
-        self._file: BinaryIO = path.open("xb")
-        self._resolution_px = resolution_px
-        width, height = resolution_px
-        text = _XML.format(width=width, height=height, camera=escape(camera_name)).encode()
-        # IOHeader {compression, dataTablePosition, infoNode}.
-        vtable = struct.pack("<5H2x", 10, 20, 16, 8, 4)
-        table = struct.pack("<iIqi", 12, 16, _NOT_CLOSED, _LZ4)
-        header = struct.pack("<I4s", 20, b"IOHE") + vtable + table + _sized(text) + b"\0"
-        self._file.write(MAGIC + _sized(header))
-
-    def write(self, events: Events) -> None:
-        """Append events, which follow those written before in time.
-
-        Raises:
-            ValueError: they are of another resolution.
-        """
-        if (events.width_px, events.height_px) != self._resolution_px:
-            size = f"{events.width_px}x{events.height_px}"
-            raise ValueError(f"events of {size} pixels for a file of {self._resolution_px}")
-        from lz4.frame import compress  # type: ignore[import-untyped]
-
-        for begin in range(0, len(events), _PACKET_EVENTS):
-            cut = slice(begin, begin + _PACKET_EVENTS)
-            raw = np.zeros(len(events.t_ns[cut]), EVENT)
-            raw["t"] = events.t_ns[cut] // NS_PER_US
-            raw["x"], raw["y"], raw["on"] = events.x[cut], events.y[cut], events.polarity[cut]
-            # EventPacket {elements}: a table whose only field is a vector.
-            head = struct.pack("<I4s2x3HiII", 16, b"EVTS", 6, 8, 4, 6, 4, len(raw))
-            data = compress(_sized(head + raw.tobytes()))
-            self._file.write(struct.pack("<ii", 0, len(data)) + data)
-
-    def close(self) -> None:
-        """Write what waits, and close the file.
-
-        Raises:
-            OSError: it cannot be written; the disk may be full.
-        """
-        self._file.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def _sized(body: bytes) -> bytes:
-    return struct.pack("<I", len(body)) + body

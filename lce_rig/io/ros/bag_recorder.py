@@ -10,16 +10,14 @@ References:
 """
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.io.events.aedat4 import Aedat4Writer
 from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, encode_event_array, typestore
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.timing.rig_time import event_channel
@@ -28,8 +26,7 @@ IMAGE_TYPE = "sensor_msgs/msg/Image"
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 _NS_PER_S = 10**9
 _UINT16, _FLOAT32 = 4, 7
-BAG_NAMES = {1: "recording.bag", 2: "recording"}
-"""By the version of ROS; a ROS 2 bag is a folder."""
+_BAG_NAMES = {1: "recording.bag", 2: "recording"}
 # velodyne_pointcloud's: times are seconds after the header's timestamp, which float32 holds to 4 ns.
 _POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2")])
 _TIMED_POINT = np.dtype([*_POINT.descr, ("time", "<f4")])
@@ -148,6 +145,22 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         with self._disk():
             self._writer.open()
 
+    @classmethod
+    def in_folder(cls, folder: Path, rig: Rig, ros: int = 1) -> "BagRecorder":
+        """Begin recording.bag, or for ROS 2 recording/, in a new folder.
+
+        Raises:
+            SourceError: the folder is there already, or cannot be made.
+        """
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            hint = "Name another folder: recordings are never overwritten."
+            raise SourceError(f"{folder} exists already", hint) from None
+        except OSError as error:
+            raise _not_writable(folder, error) from error
+        return cls(folder / _BAG_NAMES[ros], rig)
+
     def write(self, sample: Sample) -> None:
         """Add an image, a scan or a packet of events.
 
@@ -222,7 +235,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
         try:
             yield
         except BaseException as error:
-            self._failure = not_writable(self.path, error)
+            self._failure = _not_writable(self.path, error)
             with suppress(OSError):
                 # Of rosbags before 0.11 nothing closes a file without trying to write the index.
                 getattr(self._writer, "abort", self._writer.close)()
@@ -231,73 +244,9 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
             raise
 
 
-def not_writable(path: Path, error: BaseException) -> SourceError:
+def _not_writable(path: Path, error: BaseException) -> SourceError:
     """Say that a recording cannot be written, and that what was written before is not lost."""
     return SourceError(
         f"{path} cannot be written: {getattr(error, 'strerror', '') or str(error) or type(error).__name__}",
         "Make room or record elsewhere; `rosbag reindex` or `mcap recover` restores what was recorded.",
     )
-
-
-class FolderRecorder(AbstractContextManager["FolderRecorder"]):
-    """A new folder with a bag of all samples and an AEDAT4 file of each camera's events; a context manager.
-
-    Attributes:
-        folder: what it fills: recording.bag or, for ROS 2, recording/; events.aedat4, or CAMERA.aedat4 for
-            each where several cameras have events.
-        bag: the bag's path.
-    """
-
-    def __init__(self, folder: Path, rig: Rig, ros: int = 1) -> None:
-        """Make the folder.
-
-        Raises:
-            SourceError: it is there already, or cannot be made.
-        """
-        self.folder = folder
-        self.bag = folder / BAG_NAMES[ros]
-        self._event_cameras = [name for name in rig.cameras if event_channel(rig, name)]
-        self._aedat4: dict[str, Aedat4Writer] = {}
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            hint = "Name another folder: recordings are never overwritten."
-            raise SourceError(f"{folder} exists already", hint) from None
-        except OSError as error:
-            raise not_writable(folder, error) from error
-        self._open = ExitStack()
-        self._recorder = self._open.enter_context(BagRecorder(self.bag, rig))
-
-    def write(self, sample: Sample) -> None:
-        """Add a sample to every file that holds its kind.
-
-        Raises:
-            SourceError: the disk is full, or the rig lacks the sensor.
-        """
-        self._recorder.write(sample)
-        if isinstance(sample, Events):
-            is_only = self._event_cameras == [sample.sensor]
-            path = self.folder / ("events.aedat4" if is_only else f"{sample.sensor}.aedat4")
-            try:
-                if sample.sensor not in self._aedat4:
-                    writer = Aedat4Writer(path, (sample.width_px, sample.height_px), sample.sensor)
-                    self._aedat4[sample.sensor] = self._open.enter_context(writer)
-                self._aedat4[sample.sensor].write(sample)
-            except OSError as error:
-                raise not_writable(path, error) from error
-
-    def close(self) -> None:
-        """Finish the files; does nothing the second time.
-
-        Raises:
-            SourceError: the disk is full.
-        """
-        self.__exit__(None, None, None)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            self._open.__exit__(kind, error, trace)
-        except OSError as failure:
-            raise not_writable(self.folder, failure) from failure

@@ -1,14 +1,14 @@
 """AEDAT4 files of a DAVIS, events and frames, laid out independently of the readers."""
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 
 from lce_rig.core.data import Events
-from lce_rig.io.events.aedat4 import Aedat4Writer
 
 Value = tuple[str, int] | bytes
 """A number with its struct code, or the content of a vector of bytes or of structs."""
@@ -23,7 +23,7 @@ STREAM = """<node name="{number}" path="/mainloop/Recorder/outInfo/{number}/">
 <attr key="typeIdentifier" type="string">{kind}</attr>
 <node name="info" path="/mainloop/Recorder/outInfo/{number}/info/">
 <attr key="sizeX" type="int">{width}</attr><attr key="sizeY" type="int">{height}</attr>
-<attr key="source" type="string">DAVIS346_0</attr></node></node>"""
+<attr key="source" type="string">{camera}</attr></node></node>"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,12 +101,14 @@ def write_davis(
     events: Sequence[Events],
     frames: Sequence[RawFrame],
     resolution_px: tuple[int, int] = (346, 260),
+    camera: str = "DAVIS346_0",
+    pack: Callable[[bytes], bytes] = bytes,
 ) -> Path:
     """Write a file whose recorder was not closed: packets by time of their first stamp."""
     width, height = resolution_px
-    kinds = (["EVTS"] if events else []) + (["FRME"] if frames else [])
+    kinds = (["EVTS"] if events or not frames else []) + (["FRME"] if frames else [])
     streams = "".join(
-        STREAM.format(number=n, kind=kind, name=NAMES[kind], width=width, height=height)
+        STREAM.format(number=n, kind=kind, name=NAMES[kind], width=width, height=height, camera=camera)
         for n, kind in enumerate(kinds)
     )
     header = flatbuffer(b"IOHE", {1: ("q", -1), 2: XML.format(streams=streams).encode()})
@@ -115,13 +117,14 @@ def write_davis(
     with path.open("wb") as file:
         file.write(b"#!AER-DAT4.0\r\n" + header)
         for _, number, data in sorted(packets, key=lambda packet: packet[:2]):
-            file.write(struct.pack("<ii", number, len(data)) + data)
+            packed = pack(data)
+            file.write(struct.pack("<ii", number, len(packed)) + packed)
     return path
 
 
-def write_aedat4(path: Path, stretches: Iterable[Events], camera_name: str = "lce_rig") -> None:
-    """Write events as `collect --record` does, at least one stretch."""
-    first, *others = stretches
-    with Aedat4Writer(path, (first.width_px, first.height_px), camera_name) as writer:
-        for events in (first, *others):
-            writer.write(events)
+def write_aedat4(path: Path, stretches: Iterable[Events], camera: str = "lce_rig") -> None:
+    """Write events as a DVXplorer's recorder does, in packets of 8192; without any, an empty stream."""
+    parts = list(stretches)
+    packets = [part.select(slice(k, k + 8192)) for part in parts for k in range(0, len(part), 8192)]
+    size = (parts[0].width_px, parts[0].height_px) if parts else (346, 260)
+    write_davis(path, packets, [], size, camera, lz4.frame.compress)

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError
 from lce_rig.io.events import EventRecording, open_events
-from lce_rig.io.events.aedat4 import Aedat4Writer
 from tests.damage import damaged
 from tests.io.events import encoders
 from tests.io.events.aedat4_files import write_aedat4
@@ -81,10 +80,7 @@ def test_every_format_gives_every_event_back_to_the_microsecond(tmp_path: Path, 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
 def test_no_events_is_an_error_that_names_the_file(tmp_path: Path, name: str) -> None:
-    if name == "a.aedat4":
-        Aedat4Writer(tmp_path / name, (346, 260)).close()
-    else:
-        WRITERS[name](tmp_path / name, EVENTS.select(slice(0, 0)))
+    WRITERS[name](tmp_path / name, EVENTS.select(slice(0, 0)))
     with pytest.raises(SourceError, match=name):
         open_events(tmp_path / name)
 
@@ -94,24 +90,6 @@ def test_events_of_another_camera_are_refused(tmp_path: Path, name: str) -> None
     WRITERS[name](tmp_path / name, EVENTS)
     with pytest.raises(SourceError, match="240x180"):
         list(open_events(tmp_path / name, sensor="davis", resolution=(240, 180)))
-
-
-def test_dv_processing_reads_what_is_written(tmp_path: Path) -> None:
-    dv = pytest.importorskip("dv_processing")
-    write_aedat4(
-        tmp_path / "a.aedat4", [EVENTS.select(slice(0, 9)), EVENTS.select(slice(9, None))], "cam & co"
-    )
-    recording = dv.io.MonoCameraRecording(str(tmp_path / "a.aedat4"))
-    assert tuple(recording.getEventResolution()) == (346, 260)
-    assert recording.getCameraName() == "cam & co"
-    assert recording.getTimeRange() == (EVENTS.t_ns[0] // 1000, EVENTS.t_ns[-1] // 1000)
-    batches = []
-    while (batch := recording.getNextEventBatch()) is not None:
-        batches.append(batch.numpy().copy())
-    found = np.concatenate(batches)
-    assert np.array_equal(found["timestamp"] * 1000, EVENTS.t_ns)
-    for name in ("x", "y", "polarity"):
-        assert np.array_equal(found[name], getattr(EVENTS, name))
 
 
 def test_what_dv_processing_writes_is_read(tmp_path: Path) -> None:
