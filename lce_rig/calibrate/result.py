@@ -93,7 +93,7 @@ class CalibrationEstimate:
 
     @property
     def cov_with_lens(self) -> Array:
-        """Cross-covariance (6, P) of extrinsics and intrinsics; empty without a lens of the session."""
+        """Cross-covariance (6, P) of extrinsics as used and intrinsics; empty without a session's lens."""
         if self.lens is None:
             return np.zeros((6, 0))
         (by_lens,) = (each for each in self.sensitivities if each.source == "intrinsics")

@@ -5,7 +5,10 @@ look like a shift of the principal point, and would move a lens that it may move
 therefore follow from the images and the profile alone; every pose of the board is fitted anew with them, and
 the extrinsics are estimated with these poses. The covariance of lens and board is propagated to first order:
 
-    cov_T = cov_T|K + J cov_K J^T,    cov_TK = J cov_K,    J = dT / dK                                     (1)
+    cov = cov_T|K + J cov_K J^T,    cov_K' = J cov_K,    J = dT / dK + W                                   (1)
+
+Extrinsics and intrinsics of a result are used together. An error of the intrinsics that projects like a
+rotation W of the camera turns the extrinsics back by nearly as much, and what is left counts: W is in J.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +23,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, difference, perturb
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
+from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.fit import fit_poses, pose_moves
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import LensPrior, model_of
@@ -59,6 +63,12 @@ class SessionLens:
         sigma = np.sqrt(np.diag(cov))
         variances, axes = np.linalg.eigh(cov / np.outer(sigma, sigma))
         return np.asarray((np.sqrt(np.maximum(variances, 0.0)) * axes).T * sigma)
+
+    @property
+    def turns(self) -> Array:
+        """Rotations (n, 3) of the camera that project like `directions`."""
+        by_lens = turn_of_lens(self.intrinsics)
+        return np.asarray(self.directions[:, : by_lens.shape[1]] @ by_lens.T)
 
     def moves(self, observations: Sequence[Observation]) -> Array:
         """Compute how far each of `directions` moves the fitted poses of F captures: (n, F, 6) tangents."""

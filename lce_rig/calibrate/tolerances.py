@@ -5,7 +5,7 @@ it does to the observations, from which a method finds how far its result moves 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -68,7 +68,7 @@ class Tolerances:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """How far an error of the profile moves the extrinsics.
+    """How far an error of the profile moves the extrinsics, as they are used with the result's intrinsics.
 
     Attributes:
         source: what is wrong.
@@ -96,6 +96,7 @@ class Variant:
         pose_moves: (F, 6) tangents by which it moves T_cam_board of each capture.
         board: the board that the method assumes.
         bow_axis: the axis along which the plate of the scans is bent, if it is.
+        turn: (3,) rotation of the camera that projects like it, as the intrinsics have the same error.
     """
 
     source: Source
@@ -103,6 +104,7 @@ class Variant:
     pose_moves: Array
     board: Board
     bow_axis: int | None = None
+    turn: Array = field(default_factory=lambda: np.zeros(3))
 
     def apply(self, observations: Sequence[Observation]) -> list[Observation]:
         """Move the observations."""
@@ -116,10 +118,14 @@ class Variant:
 
 
 def sensitivities_of(variants: Sequence[Variant], moves: Array, known: Tolerances) -> tuple[Sensitivity, ...]:
-    """Collect the moves (V, 6) of a method's result under each variant by source."""
+    """Collect the moves (V, 6) of a method's result under each variant by source.
+
+    The extrinsics are used with the intrinsics of the same result: what both errors do together counts.
+    """
     by_source: dict[Source, list[Array]] = {}
     for variant, move in zip(variants, moves, strict=True):
-        by_source.setdefault(variant.source, []).append(move / variant.step)
+        used = move + np.append(np.zeros(3), variant.turn)
+        by_source.setdefault(variant.source, []).append(used / variant.step)
     return tuple(
         Sensitivity(source, known.sigma(source), np.array(rows)) for source, rows in by_source.items()
     )
@@ -140,7 +146,8 @@ def vary(
     still = np.zeros((len(poses), 6))
     variants = []
     if lens is not None:
-        variants += [Variant("intrinsics", 1.0, move, board) for move in lens.moves(observations)]
+        moves = zip(lens.moves(observations), lens.turns, strict=True)
+        variants += [Variant("intrinsics", 1.0, move, board, turn=turn) for move, turn in moves]
     # All squares larger by a fraction: boards are as much farther away. The pattern's centre on the plate.
     R, t = poses[:, :3, :3], poses[:, :3, 3]
     middle = R @ [*board.pattern_offset_m, 0.0]

@@ -359,7 +359,8 @@ class Calibration:
         channels: of the camera, names.
         channel_results: the result of each of these alone.
         T_cam_lidar: (4, 4), p_cam = R p_lidar + t.
-        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera.
+        cov: (6, 6), tangent (translation m, rotation rad), axes of the camera, of extrinsics that are used
+            with `intrinsics`, and with point clouds as the LiDAR's driver delivers them.
         cov_shared: (6, 6) the part of it that all sessions of one board have in common, as the profile states
             this; zero if unknown.
         contributions: the causes of `cov`, the largest first.
@@ -376,7 +377,7 @@ class Calibration:
         intrinsics: of the camera, which belong to the extrinsics: by the profile and the session's images.
             None in files of earlier versions, whose extrinsics belong to the profile's.
         intrinsics_cov: (P, P) of fx, fy, cx, cy and the distortion's coefficients, px.
-        intrinsics_cross_cov: (6, P) of `T_cam_lidar` with these.
+        intrinsics_cross_cov: (6, P) of the extrinsics, as in `cov`, with these.
         square_m: the side of a square by the profile and the LiDAR.
         board_shape: (15,) its deviation from the nominal one, `lens.fit.board_shapes`; None if unknown.
         scene_share: the change of the extrinsics by the scene; None without `--use-scene`.

@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from lce_rig.core.errors import SessionError, SourceError, UsageError
+from lce_rig.judge.reach import covariance_alone
 
 try:
     import pyarrow as pa
@@ -89,7 +90,7 @@ def pair_columns(c: Calibration, serials: Mapping[str, str]) -> Row:
         "severities": [finding.severity for finding in c.findings],
         "refusals": [refusal.code for refusal in c.captures_refused.values()],
         "T_cam_lidar": c.T_cam_lidar.ravel().tolist(),
-        "cov": c.cov[_UPPER].tolist(),
+        "cov": covariance_alone(c)[_UPPER].tolist(),
         "cov_shared": c.cov_shared[_UPPER].tolist(),
         "n_captures": c.n_captures,
         "n_detected": c.n_detected,

@@ -1,6 +1,6 @@
 """The reported covariance: what the captures show, what the profile may have wrong, what checks contradict.
 
-    cov = widened^2 cov_session + cov_azimuths + sum_i sigma_i^2 S_i S_i^T + sum_c m_c m_c^T
+    cov = widened^2 cov_session + sum_i sigma_i^2 S_i S_i^T + sum_c m_c m_c^T
 
 with S_i the sensitivity to error i of the profile's lens or board, and m_c the move of the extrinsics that
 would resolve contradiction c: a check that finds something else than the profile says, beyond both standard
@@ -53,20 +53,6 @@ class Contradiction:
         return np.asarray(self.moves.T @ self.moves)
 
 
-def azimuth_covariance(T_cam_lidar: Array, sigma_rad: float) -> Array:
-    """Propagate an azimuth error common to all points, which no capture shows, to (6, 6).
-
-    Drivers and simulators label returns with the azimuth at the start, in the middle or at the end of the
-    step that a beam turns through. The extrinsics turn about the LiDAR's axis z by it: R exp(a z^).
-
-    Args:
-        T_cam_lidar: (4, 4).
-        sigma_rad: of the azimuths.
-    """
-    move = sigma_rad * np.r_[np.zeros(3), T_cam_lidar[:3, 2]]
-    return np.outer(move, move)
-
-
 def profile_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
     """Sum the covariances (6, 6) by errors of the profile's lens and board."""
     return np.asarray(sum((each.covariance() for each in sensitivities), np.zeros((6, 6))))
@@ -114,7 +100,6 @@ def find_contradictions(
 def list_contributions(
     figures: Diagnostics,
     widened_by: float,
-    azimuths: Array,
     sensitivities: Sequence[Sensitivity],
     contradictions: Sequence[Contradiction],
 ) -> tuple[Contribution, ...]:
@@ -130,7 +115,6 @@ def list_contributions(
             widened_by * figures.sigma_systematic_rotation_deg,
             widened_by * figures.sigma_systematic_translation_m,
         ),
-        Contribution("lidar_azimuths", *sigma_sizes(azimuths)),
         *(Contribution(each.source, *sigma_sizes(each.covariance())) for each in sensitivities),
         *(Contribution(_CONTRADICTION + each.source, *sigma_sizes(each.cov)) for each in contradictions),
     ]

@@ -85,7 +85,6 @@ _CAUSES = {
     "pattern_offset": "the pattern's place on the plate",
     "plate_size": "the plate's size",
     "board_bow": "the board's bow",
-    "lidar_azimuths": "the azimuths of the LiDAR's driver",
 }
 _CONTRADICTIONS = {
     "intrinsics": "the profile's intrinsics and those of the session's boards",

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lce_rig.calibrate.result import CalibrationEstimate
-from lce_rig.core.calibration import PointUncertainty
+from lce_rig.core.calibration import Calibration, PointUncertainty
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, skew
 from lce_rig.lens.difference import turn_of_lens
@@ -21,35 +20,23 @@ DISTANCES_M = (5.0, 10.0, 20.0)
 _INWARDS = np.linspace(0.0, 1.0, 41)[:-1]
 
 
-def joint_covariance(estimate: CalibrationEstimate, cov: Array) -> Array:
-    """Extend a covariance (6, 6) of extrinsics by the session's intrinsics: (6 + P, 6 + P).
+def covariance_alone(calibration: Calibration) -> Array:
+    """Compute the covariance (6, 6) of `T_cam_lidar` without the intrinsics that belong to it.
 
-    Args:
-        estimate: with the lens; without one, nothing is added.
-        cov: of the extrinsics, which contains the effect of the lens.
+    Sessions have their own intrinsics each: where matrices are compared, the rotation by which the errors of
+    the intrinsics are compensated counts in full.
     """
-    if estimate.lens is None:
-        return cov
-    cross = estimate.cov_with_lens
-    return np.block([[cov, cross], [cross.T, estimate.lens.estimate.cov]])
+    c = calibration
+    if c.intrinsics is None or c.intrinsics_cov is None or c.intrinsics_cross_cov is None:
+        return c.cov
+    turn = turn_of_lens(c.intrinsics)
+    M = np.hstack([np.eye(6), np.vstack([np.zeros_like(turn), -turn])])
+    return np.asarray(M @ with_lens(c.cov, c.intrinsics_cross_cov, c.intrinsics_cov) @ M.T)
 
 
-def effective_covariance(estimate: CalibrationEstimate, joint: Array) -> Array:
-    """Compute the covariance (6, 6) of the extrinsics used with the intrinsics of the same result.
-
-    The error of the intrinsics acts as a rotation of the camera, which is subtracted from that of the
-    extrinsics.
-
-    Args:
-        estimate: with the lens.
-        joint: (6 + P, 6 + P), `joint_covariance`.
-    """
-    if estimate.lens is None:
-        return joint
-    fitted = estimate.lens.estimate
-    turn = turn_of_lens(fitted.intrinsics, fitted.corners_px, fitted.model)
-    M = np.hstack([np.eye(6), np.vstack([np.zeros_like(turn), turn])])
-    return np.asarray(M @ joint @ M.T)
+def with_lens(cov: Array, cross: Array, cov_lens: Array) -> Array:
+    """Join the covariances of extrinsics (6, 6) and intrinsics (P, P) to (6 + P, 6 + P)."""
+    return np.block([[cov, cross], [cross.T, cov_lens]])
 
 
 def point_uncertainties(
@@ -59,7 +46,7 @@ def point_uncertainties(
 
     Args:
         T_cam_lidar: (4, 4).
-        cov: (6, 6) tangent (translation m, rotation rad), or (6 + P, 6 + P) with the intrinsics.
+        cov: (6, 6) tangent (translation m, rotation rad), or (6 + P, 6 + P) `with_lens`.
         lens: of the camera.
         distances_m: of the points.
 
@@ -68,9 +55,12 @@ def point_uncertainties(
     """
     middle = [(lens.width_px - 1) / 2, (lens.height_px - 1) / 2]
     rays = lens.unproject(np.concatenate([[middle], outermost_pixels(lens)]))
-    model, found = model_of(lens), []
+    model, turn, found = model_of(lens), turn_of_lens(lens), []
     for distance_m in distances_m:
-        sigmas = [_sigmas(distance_m * ray, T_cam_lidar[:3, 3], cov, lens, model) for ray in rays]
+        sigmas = [
+            _sigmas(distance_m * ray, T_cam_lidar[:3, 3], cov, model.vector(lens), model, turn)
+            for ray in rays
+        ]
         corner_px, corner_m = np.max(sigmas[1:], axis=0)
         found.append(PointUncertainty(distance_m, *sigmas[0], float(corner_px), float(corner_m)))
     return tuple(found)
@@ -88,10 +78,14 @@ def outermost_pixels(lens: Intrinsics) -> Array:
     return np.array(corners)
 
 
-def _sigmas(point: Array, t: Array, cov: Array, lens: Intrinsics, model: LensModel) -> tuple[float, float]:
+def _sigmas(
+    point: Array, t: Array, cov: Array, lens: Array, model: LensModel, turn: Array
+) -> tuple[float, float]:
     """Compute the expected size of a point's error in the image, px, and in space, m."""
     by_tangent = np.concatenate([np.eye(3), -skew(point - t)], axis=1)
-    _, by_point, by_lens = model.project(model.vector(lens), point)
+    _, by_point, by_lens = model.project(lens, point)
+    # The tangent contains the rotation `turn` by the intrinsics' errors already.
+    by_lens = by_lens - by_point @ by_tangent[:, 3:] @ turn
     by_all = np.concatenate([by_point @ by_tangent, by_lens], axis=1)[:, : len(cov)]
     cov_px, cov_point = by_all @ cov @ by_all.T, by_tangent @ cov[:6, :6] @ by_tangent.T
     return float(np.sqrt(np.trace(cov_px))), float(np.sqrt(np.trace(cov_point)))

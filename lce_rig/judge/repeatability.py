@@ -11,6 +11,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, invert, log_so3
 from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE, RESULTS_AGREE, RESULTS_DISAGREE
+from lce_rig.judge.reach import covariance_alone
 from lce_rig.judge.relative_pose import mean_pose
 
 # Calibrations disagree if correct ones spread this far with less than this probability.
@@ -143,7 +144,7 @@ def compare_calibrations(
         raise ValueError("a comparison requires two calibrations, 1 given")
     names = tuple(calibrations)
     T = np.array([calibrations[name].T_cam_lidar for name in names])
-    cov = np.array([calibrations[name].cov for name in names])
+    cov = np.array([covariance_alone(calibrations[name]) for name in names])
     if are_independent:
         # Errors of a lens and board that all sessions share do not make their results differ.
         cov = cov - np.array([calibrations[name].cov_shared for name in names])

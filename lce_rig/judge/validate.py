@@ -22,7 +22,6 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import (
     KnownBetter,
-    azimuth_covariance,
     find_contradictions,
     known_better,
     list_contributions,
@@ -34,7 +33,6 @@ from lce_rig.judge.laser_angles import estimate_angles
 from lce_rig.judge.local_quadratic import SCALE, expand
 from lce_rig.judge.negative_control import NegativeControl, run_control, run_control_with_constants
 from lce_rig.judge.nuisances import Nuisances, estimate_nuisances
-from lce_rig.judge.reach import effective_covariance, joint_covariance
 from lce_rig.judge.rejected_captures import find_moved
 from lce_rig.judge.split_consistency import Contrast, contrast_halves, find_groups, objections
 from lce_rig.rig import LidarSettings, Rig, VerdictSettings
@@ -134,12 +132,9 @@ class Validation:
     """Results of checks of an estimate on its own captures.
 
     Attributes:
-        cov: (6, 6) to report: the estimate's, widened if resampling spreads it farther, with errors of the
-            profile and what checks contradict.
+        cov: (6, 6) to report, of extrinsics used with the session's intrinsics: the estimate's, widened if
+            resampling spreads it farther, with errors of the profile and what checks contradict.
         cov_agreed: (6, 6) the same without what checks contradict.
-        cov_with_lens: (6 + P, 6 + P) of extrinsics and the session's intrinsics, as `cov`, for point clouds
-            with the azimuths of the session's driver.
-        cov_used: (6, 6) of extrinsics that are used with these intrinsics and point clouds.
         cov_shared: (6, 6) the part of `cov` from errors of the profile's board and LiDAR.
         contributions: its causes, the largest first.
         known_better: what the session's boards determine better than the profile.
@@ -154,8 +149,6 @@ class Validation:
 
     cov: Array
     cov_agreed: Array
-    cov_with_lens: Array
-    cov_used: Array
     cov_shared: Array
     contributions: tuple[Contribution, ...]
     known_better: tuple[KnownBetter, ...]
@@ -223,19 +216,13 @@ def validate(
         if lidar.has_rings and len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
             laser_angles = estimate_angles(agreeing, board, estimate.T_cam_lidar, lidar)
     contradictions = list(find_contradictions(estimate, nuisances, contrasts, control, rig))
-    azimuths = azimuth_covariance(estimate.T_cam_lidar, lidar.azimuth_offset_sigma_rad)
-    cov_agreed = widened_by**2 * estimate.cov + azimuths + profile_covariance(known)
-    cov = cov_agreed + sum(each.cov for each in contradictions)
-    # Extrinsics are used with clouds of the same driver, whose azimuths have the same error.
-    joint = joint_covariance(estimate, cov - azimuths)
+    cov_agreed = widened_by**2 * estimate.cov + profile_covariance(known)
     return Validation(
-        cov=cov,
+        cov=cov_agreed + sum(each.cov for each in contradictions),
         cov_agreed=cov_agreed,
-        cov_with_lens=joint,
-        cov_used=effective_covariance(estimate, joint),
         # Each session has fitted its own lens.
-        cov_shared=azimuths + profile_covariance([each for each in known if each.source != "intrinsics"]),
-        contributions=list_contributions(estimate.diagnostics, widened_by, azimuths, known, contradictions),
+        cov_shared=profile_covariance([each for each in known if each.source != "intrinsics"]),
+        contributions=list_contributions(estimate.diagnostics, widened_by, known, contradictions),
         known_better=known_better(estimate, nuisances),
         widened_by=widened_by,
         remark=remark,

@@ -188,10 +188,8 @@ def _certificate(estimate: CalibrationEstimate) -> list[Finding]:
 
 
 def _precision(estimate: CalibrationEstimate, examination: Validation, rig: Rig) -> Iterator[Finding]:
-    # Extrinsics are used with the intrinsics of the same result, whose errors compensate part of theirs.
-    cov, contradicted = examination.cov_used, examination.cov - examination.cov_agreed
-    agreed_deg, agreed_m = sigma_sizes(cov - contradicted)
-    sigmas, target, of_lidar = np.sqrt(np.diag(cov)), rig.calibration, estimate.diagnostics
+    agreed_deg, agreed_m = sigma_sizes(examination.cov_agreed)
+    sigmas, target, of_lidar = np.sqrt(np.diag(examination.cov)), rig.calibration, estimate.diagnostics
     for kind, unit, first, axes, goal, agreed, of_lidar_alone, size in (
         (
             *(ROTATION_UNCERTAIN, "deg", 3, np.degrees(sigmas[3:]), target.target_sigma_deg, agreed_deg),

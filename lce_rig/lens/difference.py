@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, exp_so3, log_so3, project_to_so3, skew
-from lce_rig.lens.models import LensModel
+from lce_rig.lens.models import LensModel, model_of
 
 _GRID = 40
 _NEARLY_ALL = 98.0
@@ -149,15 +149,9 @@ def lens_errors(
     return solve @ (pixels - given.project(rays)[0]).ravel(), by_lens @ cov @ by_lens.T
 
 
-def turn_of_lens(intrinsics: Intrinsics, corners_px: Array, model: LensModel) -> Array:
-    """Find the rotation of the camera (3, P) that projects like a change of each parameter of its lens.
-
-    Args:
-        intrinsics: the lens.
-        corners_px: (n, 2) where boards were seen; pixels differ least there.
-        model: whose parameters these are.
-    """
-    rays = intrinsics.unproject(corners_px)
+def turn_of_lens(intrinsics: Intrinsics) -> Array:
+    """Find the rotation of the camera (3, P) that projects like a change of each parameter of its lens."""
+    model, rays = model_of(intrinsics), intrinsics.unproject(_grid(intrinsics).reshape(-1, 2))
     turn, _ = _best_turn(model, model.vector(intrinsics), rays[np.isfinite(rays).all(axis=1)])
     return -turn
 

@@ -35,7 +35,7 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.camera_pairs import CameraEvidence, CameraPair, camera_findings, find_exchanged, relate
 from lce_rig.judge.contributions import profile_covariance
-from lce_rig.judge.reach import point_uncertainties
+from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.judge.relative_pose import relative_pose
 from lce_rig.judge.session_check import find_meetings
 from lce_rig.judge.validate import Validation, validate
@@ -338,7 +338,7 @@ def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
     return replace(
         solved,
         estimate=replace(estimate, T_cam_lidar=share.T_cam_lidar, cov=share.cov, residuals=residuals),
-        validation=replace(solved.validation, cov=share.cov, cov_agreed=share.cov, cov_used=share.cov),
+        validation=replace(solved.validation, cov=share.cov, cov_agreed=share.cov),
         together=None,
         share=share,
     )
@@ -374,8 +374,9 @@ def _judged(
     scale = estimate.diagnostics.camera_scale
     square_m = rig.board.square_m * (2 - scale if np.isfinite(scale) else 1.0)
     # The scene moves extrinsics, not the lens.
-    is_of_boards = own.share is None or own.share.state != "used"
-    joint = validation.cov_with_lens if is_of_boards else validation.cov
+    is_of_scene = own.share is not None and own.share.state == "used"
+    cov_lens = np.zeros((0, 0)) if estimate.lens is None else estimate.lens.estimate.cov
+    cross = (0.0 if is_of_scene else 1.0) * estimate.cov_with_lens
     distances_m = [np.linalg.norm(o.image.T_cam_board[:3, 3]) for o in estimate.observations.values()]
     return Calibration(
         camera=own.camera,
@@ -398,11 +399,13 @@ def _judged(
         channel_results=estimate.channels,
         method=estimate.method,
         uncertainty=point_uncertainties(
-            estimate.T_cam_lidar, joint, lens or rig.cameras[own.camera].to_intrinsics()
+            estimate.T_cam_lidar,
+            with_lens(validation.cov, cross, cov_lens),
+            lens or rig.cameras[own.camera].to_intrinsics(),
         ),
         intrinsics=lens,
-        intrinsics_cov=None if estimate.lens is None else estimate.lens.estimate.cov,
-        intrinsics_cross_cov=None if lens is None else estimate.cov_with_lens,
+        intrinsics_cov=None if lens is None else cov_lens,
+        intrinsics_cross_cov=None if lens is None else cross,
         square_m=None if lens is None else square_m,
         board_shape=None if estimate.lens is None else estimate.lens.estimate.shape,
         estimated_with=estimate.estimated_with,

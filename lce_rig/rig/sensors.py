@@ -146,8 +146,6 @@ class LidarSettings(Settings):
         beam_divergence_rad: full angle by which the beam widens.
         laser_bias_sigma_m: standard deviation of the lasers' constant range errors about their mean.
         range_offset_sigma_m: standard deviation of that mean, the range error common to all lasers.
-        azimuth_offset_sigma_deg: standard deviation of the azimuth error common to all points of a driver;
-            None takes azimuths as labelled anywhere within the step that the beam turns through.
         intrinsics: measured constant errors; None if there are none.
     """
 
@@ -164,7 +162,6 @@ class LidarSettings(Settings):
     beam_divergence_rad: NotNegative
     laser_bias_sigma_m: RangeError
     range_offset_sigma_m: RangeError
-    azimuth_offset_sigma_deg: Annotated[float, Field(ge=0, le=5)] | None = None
     intrinsics: LidarIntrinsicsSettings | None = None
     timestamps: TimestampSettings = TimestampSettings(reference="first_firing")
     driver: DriverSettings = DriverSettings()
@@ -198,15 +195,6 @@ class LidarSettings(Settings):
         """Whether its beams sweep cones about its axis, as those of LiDARs of unknown models do."""
         sheet = self.data_sheet()
         return sheet is None or sheet.has_rings or self.elevations_deg is not None
-
-    @property
-    def azimuth_offset_sigma_rad(self) -> float:
-        """Standard deviation of the azimuth error common to all points; uniform in a step if not stated."""
-        if self.azimuth_offset_sigma_deg is not None:
-            return float(np.radians(self.azimuth_offset_sigma_deg))
-        # Beams that are no rings turn in no steps.
-        step_rad = (self.data_sheet() or TYPICAL).step_rad(self.rate_hz) if self.has_rings else 0.0
-        return step_rad / float(np.sqrt(12))
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "LidarSettings":

@@ -19,10 +19,11 @@ from benchmarks.tables import compare, print_head, print_row
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration, Method
 from lce_rig.core.errors import LceRigError
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.detect.detection import Detections, ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.judge.findings import Verdict
+from lce_rig.judge.reach import covariance_alone
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
@@ -215,7 +216,9 @@ def _judge(
 
 def _outcome(rig: Rig, what: tuple[str, str, str, str], calibration: Calibration, truth: Array) -> Outcome:
     error_deg, error_mm = compare(calibration.T_cam_lidar, truth)
-    sigma_deg, sigma_mm = calibration.sigma_rotation_deg, 1000 * calibration.sigma_translation_m
+    # The truth is a pose alone, whatever the intrinsics.
+    sigma_deg, sigma_m = sigma_sizes(covariance_alone(calibration))
+    sigma_mm = 1000 * sigma_m
     return Outcome(
         *what,
         calibration.verdict,

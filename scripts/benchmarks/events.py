@@ -15,6 +15,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, transform
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections
+from lce_rig.judge.reach import covariance_alone
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Session
@@ -126,7 +127,7 @@ def _assess(
             continue
         deg, mm = compare(calibration.T_cam_lidar, truth)
         off = difference(calibration.T_cam_lidar, truth)
-        nees = float(off @ np.linalg.solve(calibration.cov, off))
+        nees = float(off @ np.linalg.solve(covariance_alone(calibration), off))
         sigmas = calibration.sigma_rotation_deg, 1000 * calibration.sigma_translation_m
         run.runs["+".join(sorted(channels))] = ChannelRun(deg, mm, *sigmas, nees)
         for result in calibration.channel_results:

@@ -11,6 +11,7 @@ from benchmarks.tables import compare, print_head, print_row
 from lce_rig.core.geometry import Array, difference
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.judge.reach import covariance_alone
 from lce_rig.rig import Rig, find_profile, parse_rig, read_profile
 from lce_rig.session import Session
 from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
@@ -64,7 +65,7 @@ def _bench_model(model: str, n_captures: int, folder: Path) -> None:
         return
     deg, mm = compare(pair.T_cam_lidar, T_cam_lidar)
     tangent = difference(pair.T_cam_lidar, T_cam_lidar)
-    chi2 = float(tangent @ np.linalg.solve(pair.cov, tangent))
+    chi2 = float(tangent @ np.linalg.solve(covariance_alone(pair), tangent))
     sigma = f"{pair.sigma_rotation_deg:.3f} deg, {1e3 * pair.sigma_translation_m:.1f} mm"
     p = f"{chi2:.1f}, {stats.chi2.sf(chi2, 6):.2f}"
     print_row(model, points, found, took, f"{deg:.3f} deg, {mm:.1f} mm", sigma, p, pair.verdict)

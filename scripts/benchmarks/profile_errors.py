@@ -9,7 +9,7 @@ from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.calibrate.tolerances import Tolerances, bend, bow
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, exp_so3, pose, transform
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.rig import Rig
@@ -20,11 +20,11 @@ _STREAM = 3
 
 def with_profile_errors(
     rig: Rig, session: StillSession, seed: int, sigma_px: float
-) -> tuple[Rig, Detections, Intrinsics, Array]:
+) -> tuple[Rig, Detections, Intrinsics]:
     """Draw how wrong a profile is, and what the sensors would have seen of the same session.
 
-    The simulated plate and LiDAR stay what they are: the profile states another plate, points move along
-    their rays by a common range offset and the plate's bow, and all azimuths are labelled beside their beams.
+    The simulated plate and LiDAR stay what they are: the profile states another plate, and points move along
+    their rays by a common range offset and the plate's bow.
 
     Args:
         rig: that was simulated, of one camera and one LiDAR.
@@ -33,8 +33,7 @@ def with_profile_errors(
         sigma_px: noise of each corner's coordinates.
 
     Returns:
-        The profile to calibrate with, its detections, the true lens, and the turn (4, 4) from the LiDAR to
-        its point clouds.
+        The profile to calibrate with, its detections, and the true lens.
     """
     rng = np.random.default_rng([seed, _STREAM])
     (camera, settings), (lidar, of_lidar) = next(iter(rig.cameras.items())), next(iter(rig.lidars.items()))
@@ -49,16 +48,13 @@ def with_profile_errors(
     bows_m = known.bow_m * rng.standard_normal(2)
     corners = corners + sum(bow(corners, axis, height, board) for axis, height in enumerate(bows_m))
     offset_m = of_lidar.range_offset_sigma_m * float(rng.standard_normal())
-    # Within a step, as a driver labels its azimuths.
-    azimuth_rad = np.sqrt(12) * of_lidar.azimuth_offset_sigma_rad * float(rng.uniform(-0.5, 0.5))
-    turn = pose(exp_so3(np.array([0.0, 0.0, azimuth_rad])), np.zeros(3))
     images: dict[str, ImageBoard] = {}
     for name, T_cam_board in session.T_cam_board.items():
         image = draw_corners(rig, T_cam_board, sigma_px, rng, lens, corners)
         if image is not None:
             images[name] = image
     scans = {
-        item.capture: [_turned(_as_scanned(found, board, bows_m, offset_m), turn) for found in item.places]
+        item.capture: [_as_scanned(found, board, bows_m, offset_m) for found in item.places]
         for item in session.candidates
         if item.capture in images
     }
@@ -66,7 +62,7 @@ def with_profile_errors(
     profile = rig.model_copy(update={"board": rig.board.model_copy(update=plate)})
     channel = next(iter(settings.channels))
     found = Detections({(camera, channel): {name: images[name] for name in scans}}, {lidar: scans})
-    return profile, found, lens, turn
+    return profile, found, lens
 
 
 def _draw_lens(known: Tolerances, rng: np.random.Generator) -> Intrinsics:
@@ -103,17 +99,6 @@ def _as_scanned(lidar: LidarBoard, board: Board, bows_m: Array, offset_m: float)
     for axis, height_m in enumerate(bows_m):
         lidar = bend(lidar, axis, float(height_m), board)
     return _lengthened(lidar, offset_m)
-
-
-def _turned(lidar: LidarBoard, turn: Array) -> LidarBoard:
-    """Turn a board about the LiDAR's axis."""
-    return replace(
-        lidar,
-        points=transform(turn, lidar.points),
-        edge_points=transform(turn, lidar.edge_points),
-        plane=np.append(turn[:3, :3] @ lidar.plane[:3], lidar.plane[3]),
-        T_lidar_board=turn @ lidar.T_lidar_board,
-    )
 
 
 def _lengthened(lidar: LidarBoard, offset_m: float) -> LidarBoard:

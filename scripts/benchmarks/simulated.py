@@ -9,6 +9,7 @@ from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.geometry import difference
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection
 from lce_rig.detect.finder import BoardFinder
+from lce_rig.judge.reach import covariance_alone
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import load_rig
 
@@ -48,7 +49,7 @@ def _simulated_runs(name: str, n_seeds: int, n_captures: int) -> Iterator[tuple[
         detections = Detections({(camera, "frames"): images}, {lidar: scans})
         (calibration, *_), _ = calibrate_detections(rig, detections, CalibrateOptions(seed=seed))
         error = difference(calibration.T_cam_lidar, truth_extrinsics(rig, seed, options)[camera, lidar])
-        nees = float(error @ np.linalg.solve(calibration.cov, error))
+        nees = float(error @ np.linalg.solve(covariance_alone(calibration), error))
         yield (
             float(np.degrees(np.linalg.norm(error[3:]))),
             float(1000 * np.linalg.norm(error[:3])),

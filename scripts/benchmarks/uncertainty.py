@@ -28,6 +28,8 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, difference, invert, transform
 from lce_rig.core.results import Observation
+from lce_rig.lens.difference import turn_of_lens
+from lce_rig.lens.models import model_of
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import LidarNoise, SimulationOptions
@@ -174,13 +176,22 @@ def _runs_in_error(
     rig = load_rig(case.rig)
     for seed in range(n_seeds):
         session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
-        profile, found, lens, turn = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
+        profile, found, lens = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
         options = CalibrateOptions(method=method, n_draws=0)
         (calibration,), _ = calibrate_detections(profile, found, options)
-        error = difference(calibration.T_cam_lidar, session.T_cam_lidar)
-        point_px = _point_error_px(calibration, session.T_cam_lidar @ invert(turn), lens)
+        error = _error_in_use(calibration, session.T_cam_lidar, lens)
+        point_px = _point_error_px(calibration, session.T_cam_lidar, lens)
         (claimed_px,) = (u.centre_px for u in calibration.uncertainty if u.distance_m == _POINT_M)
         yield JudgedRun(error, calibration.cov, calibration.verdict, point_px, claimed_px)
+
+
+def _error_in_use(calibration: Calibration, T_cam_lidar: Array, lens: Intrinsics) -> Array:
+    """Measure the error (6,) of extrinsics used with their intrinsics, whose errors turn them back."""
+    assert calibration.intrinsics is not None
+    model = model_of(lens)
+    wrong = model.vector(calibration.intrinsics) - model.vector(lens)
+    turn = turn_of_lens(calibration.intrinsics) @ wrong
+    return difference(calibration.T_cam_lidar, T_cam_lidar) + np.append(np.zeros(3), turn)
 
 
 def _point_error_px(calibration: Calibration, T_cam_lidar: Array, lens: Intrinsics) -> float:

@@ -9,10 +9,21 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, exp_so3, fit_plane, invert, pose, project_to_so3, transform
+from lce_rig.core.geometry import (
+    Array,
+    exp_so3,
+    fit_plane,
+    invert,
+    perturb,
+    pose,
+    project_to_so3,
+    transform,
+)
 from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.core.results import ImageBoard, LidarBoard, LidarQuality, Observation
 from lce_rig.detect.image.search import board_from_pose
+from lce_rig.lens.difference import turn_of_lens
+from lce_rig.lens.models import model_of
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
 CAMERA = Intrinsics(897.0, 897.0, 639.5, 359.5, 1280, 720, "radtan", (-0.44, 0.23, -0.001, 0.0002, -0.07))
@@ -205,3 +216,10 @@ def with_decoy(item: Observation, decoy: LidarBoard, *, is_first: bool) -> Obser
     """Add a rival to the LiDAR's candidates."""
     places = (decoy, *item.places) if is_first else (*item.places, decoy)
     return replace(item, lidar=places[0], others=places[1:])
+
+
+def in_use(T_cam_lidar: Array, lens: Intrinsics) -> Array:
+    """Turn extrinsics (4, 4) back as the error of the estimated lens, with which they are used, does."""
+    model = model_of(lens)
+    turn = turn_of_lens(lens) @ (model.vector(lens) - model.vector(CAMERA))
+    return perturb(T_cam_lidar, np.append(np.zeros(3), turn))

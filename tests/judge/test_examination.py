@@ -228,4 +228,4 @@ def test_few_placements_leave_nothing_to_be_left_out():
     examination = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA)
     assert examination.control is None
     assert examination.contrasts == ()
-    np.testing.assert_allclose(examination.cov_used, estimate.cov, rtol=1e-9)
+    np.testing.assert_allclose(examination.cov, estimate.cov, rtol=1e-9)

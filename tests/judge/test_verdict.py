@@ -46,7 +46,7 @@ def verdict_of(estimate):
 
     def judged(changed, n_captures=20, rig=RIG):
         cov = changed.cov
-        examination = replace(examined(estimate), cov=cov, cov_agreed=cov, cov_used=cov)
+        examination = replace(examined(estimate), cov=cov, cov_agreed=cov)
         return judge(changed, examination, rig, "cam", "lidar", n_captures)
 
     return judged
@@ -105,7 +105,7 @@ def test_a_deviation_above_the_target_is_marginal_and_far_above_fails(estimate, 
 
 def test_a_contradiction_widens_the_claim_and_fails_nothing_by_its_width(estimate):
     cov = np.diag([1e-8] * 3 + [np.radians(9.0 * RIG.calibration.target_sigma_deg) ** 2 / 3] * 3)
-    examination = replace(examined(estimate), cov=cov, cov_used=cov, cov_agreed=estimate.cov)
+    examination = replace(examined(estimate), cov=cov, cov_agreed=estimate.cov)
     verdict, reasons = judge(estimate, examination, RIG, "cam", "lidar", 20)
     assert verdict == "marginal"
     assert [reason.code for reason in reasons] == ["verdict.rotation_uncertain", "verdict.may_be_off"]

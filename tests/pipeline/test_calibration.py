@@ -43,9 +43,8 @@ def test_a_profile_that_says_that_all_is_exact_is_believed(method: Method) -> No
         text = set_value(text, f"board.{key}", "0.0")
     for key in ("focal_sigma_px", "principal_point_sigma_px", "distortion_sigma_px"):
         text = set_value(text, f"cameras.cam.intrinsics.{key}", "0.0")
-    text = set_value(text, "lidars.lidar.azimuth_offset_sigma_deg", "0.0")
     options = CalibrateOptions(method, n_draws=0)
     (calibration,), _ = calibrate_detections(parse_rig(text), found(), options)
-    # What checks contradict may widen the claim; lens, board and azimuths add nothing to it.
+    # What checks contradict may widen the claim; lens and board add nothing to it.
     assert not calibration.cov_shared.any()
     assert 0 < calibration.sigma_translation_m < 0.02

@@ -14,6 +14,7 @@ from lce_rig.core.geometry import difference, invert
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import load_rig
+from tests.calibrate.boards import in_use
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
 
 RIG = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
@@ -61,7 +62,7 @@ def test_cameras_that_share_boards_are_estimated_together_and_say_so(together):
         assert own.verdict == "pass"
         assert own.method == "ml"
         assert own.estimated_with == (other,)
-        error = difference(own.T_cam_lidar, TRUTH[name])
+        error = difference(in_use(own.T_cam_lidar, own.intrinsics), TRUTH[name])
         assert error @ np.linalg.solve(own.cov, error) < 25  # 0.9997 of chi square with 6 degrees
         assert own.sigma_rotation_deg < own.diagnostics.alone_sigma_rotation_deg
         (line,) = together_lines(own)
@@ -73,8 +74,13 @@ def test_where_one_camera_sits_to_the_other_is_told_from_both_sides(together):
     (to_left,), (to_right,) = (together[name].other_cameras for name in (RIGHT, LEFT))
     assert (to_left.camera, to_left.n_captures) == (LEFT, 12)
     assert (to_right.camera, to_right.n_captures) == (RIGHT, 12)
-    for other, truth in ((to_left, T_RIGHT_LEFT), (to_right, invert(T_RIGHT_LEFT))):
-        error = difference(other.T_cam_other, truth)
+    T_right, T_left = (in_use(c.T_cam_lidar, c.intrinsics) for c in (together[RIGHT], together[LEFT]))
+    T_right_left = T_right @ invert(T_left)
+    for other, T, truth in (
+        (to_left, T_right_left, T_RIGHT_LEFT),
+        (to_right, invert(T_right_left), invert(T_RIGHT_LEFT)),
+    ):
+        error = difference(T, truth)
         assert error @ np.linalg.solve(other.cov, error) < 25
         assert np.linalg.norm(error[:3]) < 0.001
         assert np.linalg.norm(difference(other.T_cam_other_pictures, truth)[:3]) < 0.003
@@ -142,7 +148,7 @@ def test_a_nudged_camera_is_told_at_both_and_not_estimated_with_the_other(option
         assert change.subject.split(" to ") == [LEFT, RIGHT]
         assert change.figures["capture"] == "000006"
     # The left camera, which nobody touched, is what it is without the other.
-    error = difference(found[LEFT].T_cam_lidar, TRUTH[LEFT])
+    error = difference(in_use(found[LEFT].T_cam_lidar, found[LEFT].intrinsics), TRUTH[LEFT])
     assert error @ np.linalg.solve(found[LEFT].cov, error) < 25
 
 

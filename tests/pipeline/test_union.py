@@ -12,6 +12,7 @@ from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionE
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections
+from lce_rig.judge.reach import covariance_alone
 from lce_rig.pipeline.calibrate_sessions import join_detections
 from lce_rig.pipeline.result_files import as_named_in, inputs_sha256
 from lce_rig.rig import find_profile, parse_rig, set_value
@@ -56,7 +57,7 @@ def test_one_estimate_of_two_sessions_is_nearer_to_the_truth_than_each_and_says_
         (both,) = lce.calibrate(sessions, found, options=FAST).pairs
         errors[1] += [difference(c.T_cam_lidar, T_FORWARD) for c in alone]
         errors[2].append(error := difference(both.T_cam_lidar, T_FORWARD))
-        nees.append(error @ np.linalg.solve(both.cov, error))
+        nees.append(error @ np.linalg.solve(covariance_alone(both), error))
         scatter_m = [c.diagnostics.sigma_scatter_translation_m for c in (both, *alone)]
         ratios.append(scatter_m[0] / np.mean(scatter_m[1:]))
         assert len(both.captures_used) == 24

@@ -20,7 +20,7 @@ from lce_rig.core.planar_pose import refine_pose
 from lce_rig.core.results import Observation
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.judge.findings import cause_words
-from lce_rig.judge.reach import point_uncertainties
+from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.show.report.page import BLUE, FAINT, INK, ORANGE, QUIET, WIDTH_IN, drawing, new_axes
 
 
@@ -291,8 +291,7 @@ def draw_by_distance(calibration: Calibration, lens: Intrinsics) -> Markup:
     """Draw the expected error of a LiDAR point in pixels and in centimetres by its distance."""
     cov, cross = calibration.cov, calibration.intrinsics_cross_cov
     if cross is not None and calibration.intrinsics_cov is not None:
-        # Errors of extrinsics and intrinsics of one result compensate each other in part.
-        cov = np.block([[cov, cross], [cross.T, calibration.intrinsics_cov]])
+        cov = with_lens(cov, cross, calibration.intrinsics_cov)
     points = point_uncertainties(calibration.T_cam_lidar, cov, lens, _DISTANCES_M)
     figure, (left, right) = new_axes(2.1, 2)
     _draw_reach(left, [p.centre_px for p in points], [p.corner_px for p in points], "error in the image, px")
