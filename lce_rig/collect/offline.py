@@ -14,7 +14,7 @@ from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
 from lce_rig.core.findings import Refusal
 from lce_rig.core.losses import Losses
-from lce_rig.io.folder.folder import FolderRecording
+from lce_rig.io.folder import FolderRecording
 from lce_rig.io.joining import join_recordings, require_sensors
 from lce_rig.io.protocol import (
     ContinuousRecording,

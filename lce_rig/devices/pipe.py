@@ -23,7 +23,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.devices import findings
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, Pixels, find_format
 from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
-from lce_rig.io.folder.decoding import decode_image
+from lce_rig.io.decoding import decode_image
 from lce_rig.rig import CameraSettings
 from lce_rig.rig.sensors import MAX_PIXELS
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.io.folder.decoding import decode_image
+from lce_rig.io.decoding import decode_image
 
 Pixels = NDArray[np.uint8]
 

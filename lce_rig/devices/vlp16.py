@@ -28,7 +28,7 @@ from lce_rig.devices.disk_writer import DiskWriter, Sink
 from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
 from lce_rig.devices.velodyne_web import VelodyneWeb
 from lce_rig.io.network import Datagram, PcapWriter
-from lce_rig.io.velodyne.stream import Vlp16Stream, read_controls
+from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
 
 SILENCE_S = 2.0

@@ -12,17 +12,17 @@ from lce_rig.io.ros.bag_file import kind_of
 from lce_rig.rig import Rig
 
 RECORDINGS = {
-    "folder": "lce_rig.io.folder.folder:FolderRecording",
+    "folder": "lce_rig.io.folder:FolderRecording",
     ".bag": "lce_rig.io.ros.rosbag:BagRecording",
     ".db3": "lce_rig.io.ros.rosbag:BagRecording",
     ".mcap": "lce_rig.io.ros.rosbag:BagRecording",
-    ".pcap": "lce_rig.io.velodyne.pcap:PcapRecording",
-    ".pcapng": "lce_rig.io.velodyne.pcap:PcapRecording",
-    ".aedat4": "lce_rig.io.events.camera_file:EventCameraFile",
-    ".raw": "lce_rig.io.events.camera_file:EventCameraFile",
-    ".h5": "lce_rig.io.events.camera_file:EventCameraFile",
-    ".hdf5": "lce_rig.io.events.camera_file:EventCameraFile",
-    ".txt": "lce_rig.io.events.camera_file:EventCameraFile",
+    ".pcap": "lce_rig.io.velodyne_scans:PcapRecording",
+    ".pcapng": "lce_rig.io.velodyne_scans:PcapRecording",
+    ".aedat4": "lce_rig.io.events:EventCameraFile",
+    ".raw": "lce_rig.io.events:EventCameraFile",
+    ".h5": "lce_rig.io.events:EventCameraFile",
+    ".hdf5": "lce_rig.io.events:EventCameraFile",
+    ".txt": "lce_rig.io.events:EventCameraFile",
 }
 """Reader by suffix, or "folder"; imported when wanted."""
 _BAGS = frozenset({".bag", ".db3", ".mcap"})
@@ -52,7 +52,7 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
         model = rig.lidars[choose_lidar(rig, options, [])].model.upper().removeprefix("OUSTER").lstrip(" -_")
         reader = "lce_rig.io.ouster:OusterRecording" if model.startswith("OS") else reader
     if kind == "folder" and options.is_part and not _holds_clouds(path):
-        reader = "lce_rig.io.folder.folder:ImagesRecording"
+        reader = "lce_rig.io.folder:ImagesRecording"
     recording: Recording = resolve_name(reader)(path, rig, options)
     return recording
 

@@ -14,7 +14,7 @@ from itertools import combinations
 from pathlib import Path
 
 from lce_rig.calibrate import CalibrateOptions
-from lce_rig.collect.guidance.more_captures import plan_captures
+from lce_rig.collect.guidance.planner import plan_captures
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, SessionError, UsageError
 from lce_rig.core.findings import Finding

@@ -24,7 +24,7 @@ from lce_rig.calibrate.observability import find_weakest
 from lce_rig.calibrate.result import capture_residual, error_to_reference
 from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.tolerances import Tolerances
-from lce_rig.collect.guidance.more_captures import plan_captures
+from lce_rig.collect.guidance.planner import plan_captures
 from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal

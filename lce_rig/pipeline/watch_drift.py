@@ -22,7 +22,7 @@ from lce_rig.devices import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.io import open_recordings
-from lce_rig.io.folder.folder import FolderRecording
+from lce_rig.io.folder import FolderRecording
 from lce_rig.io.joining import join_recordings, require_sensors
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.pipeline.pair_drift import EVENTS_NS, DriftReport, Seen, judge_pairs, own_offset_ns
@@ -32,10 +32,9 @@ from lce_rig.rig import Rig
 from lce_rig.scene.depth_edges import evenly
 from lce_rig.scene.views import MAX_CAPTURES
 from lce_rig.session import Session
-from lce_rig.timing.event_buffer import EventCut
 from lce_rig.timing.rig_clock import RigClock
 from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns, stream_of
-from lce_rig.timing.scan_pairing import Frame, pair_by_time
+from lce_rig.timing.scan_pairing import EventCut, Frame, pair_by_time
 
 _LIVE_WAIT_S = 0.2
 

@@ -19,7 +19,7 @@ from lce_rig.core.results import Observation
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.search import find_lidar_boards
-from lce_rig.io.folder.cloud import rings_from_elevation, to_scan
+from lce_rig.io.cloud import rings_from_elevation, to_scan
 from lce_rig.judge.validate import validate
 from lce_rig.rig import Rig, load_rig, parse_rig
 

@@ -8,8 +8,7 @@ from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.rig import Rig
-from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS, EventBuffer
-from lce_rig.timing.scan_pairing import Frame
+from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, EventBuffer, Frame
 from tests.calibrate.boards import measured_plate
 
 T0_NS = 1_700_000_000 * 10**9

@@ -21,10 +21,10 @@ MS = 1_000_000
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> ReconstructionSettings:
-    """A network that takes the mean of its bins, which is quick; it settles in 0.12 s."""
+    """A network that takes the mean of its bins, which is quick; it settles in 0.36 s."""
     voxels, image = ("v", [1, 5, "height", "width"]), [1, 1, "height", "width"]
     path = write_network(tmp_path_factory.mktemp("network") / "mean.onnx", [voxels], [image])
-    return ReconstructionSettings(model=str(path), window_s=0.01)
+    return ReconstructionSettings(model=str(path), window_s=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def scan(time_ms: float) -> Scan:
 
 
 EVENTS = event_stream([(0.0, 2.0, 0.5)])
-MIDDLES_MS = range(150, 1950, 100)
+MIDDLES_MS = range(450, 1950, 100)
 
 
 def pictures(samples: Iterable[Sample], rig: Rig, tally: Losses | None = None) -> list[Image]:
@@ -66,7 +66,7 @@ def test_images_are_those_of_the_whole_stream_at_the_middle_of_each_scan(
         assert isinstance(other, Image) and np.array_equal(image.pixels, other.pixels)
 
 
-@pytest.mark.parametrize("late_ms", [0, 120, 700])
+@pytest.mark.parametrize("late_ms", [120, 700])
 def test_scans_that_come_late_and_packets_of_any_length_change_nothing(rig: Rig, late_ms: int) -> None:
     whole = replace(
         EVENTS[0],
@@ -85,9 +85,9 @@ def test_scans_before_the_first_event_get_no_picture_and_are_counted(rig: Rig) -
     tally = Losses()
     scans = [scan(t) for t in range(-2950, 500, 100)]
     found = pictures(merge_by_time([EVENTS, scans], rig), rig, tally)
-    assert [i.stamp_ns for i in found] == [T0_NS + t * MS for t in range(150, 500, 100)]
+    assert [i.stamp_ns for i in found] == [T0_NS + t * MS for t in (450,)]
     counts = {refusal.code: n for refusal, n in tally.counts()}
-    assert counts == {"read.events_not_begun": 30, "read.network_settling": 1}
+    assert counts == {"read.events_not_begun": 30, "read.network_settling": 4}
 
 
 def test_scans_of_a_clock_that_was_set_back_get_no_picture_of_other_times(rig: Rig) -> None:

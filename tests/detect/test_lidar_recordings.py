@@ -17,7 +17,7 @@ from lce_rig.core.files import decode_pcd
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import invert, pose
 from lce_rig.detect.lidar.search import find_lidar_boards, track_lidar_board
-from lce_rig.io.folder.cloud import rings_from_elevation
+from lce_rig.io.cloud import rings_from_elevation
 
 pytestmark = pytest.mark.dataset
 SETS = ["rlfs01", "sss_noise15mm", "rles01_lf", "rles01_le", "rles02_lf", "rles02_le", "acfr_vlp16"]

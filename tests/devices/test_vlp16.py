@@ -19,7 +19,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.vlp16 import N_AT_ONCE, UdpPort, Vlp16Source
 from lce_rig.io.protocol import SourceOptions
-from lce_rig.io.velodyne.pcap import PcapRecording
+from lce_rig.io.velodyne_scans import PcapRecording
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.rig.sensors import DriverSettings
 from tests.devices.test_vlp16_web import PAGES, serving

@@ -6,7 +6,7 @@ from numpy.lib.recfunctions import drop_fields, rename_fields
 
 from lce_rig.core.data import NO_RING
 from lce_rig.core.errors import SourceError
-from lce_rig.io.folder.cloud import rings_from_elevation, to_scan
+from lce_rig.io.cloud import rings_from_elevation, to_scan
 from lce_rig.rig import LidarSettings, TimestampSettings
 from tests.notes import has_note
 

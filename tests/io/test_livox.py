@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lce_rig.core.data import NO_RING, Scan
 from lce_rig.io import open_recording
-from lce_rig.io.folder.cloud import to_scan
+from lce_rig.io.cloud import to_scan
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
 from lce_rig.rig import Rig, load_rig
 

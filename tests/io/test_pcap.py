@@ -15,7 +15,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.network import Datagram, PcapFile, PcapWriter, build_frame
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
-from lce_rig.io.velodyne.pcap import PcapRecording
+from lce_rig.io.velodyne_scans import PcapRecording
 from lce_rig.rig import Rig
 from tests.damage import damaged
 from tests.notes import has_note

@@ -15,8 +15,7 @@ from lce_rig.io.ros.bag_file import BagFile
 from lce_rig.io.ros.bag_recorder import open_bag_writer
 from lce_rig.io.ros.messages import deserialize, typestore
 from lce_rig.io.ros.rosbag import BagRecording
-from lce_rig.io.velodyne.pcap import PcapRecording
-from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.io.velodyne_scans import PcapRecording, Vlp16Stream
 from lce_rig.rig import LidarSettings, Rig, load_rig
 
 from .vlp16_room import (

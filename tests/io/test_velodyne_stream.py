@@ -13,8 +13,8 @@ from wire.vlp16_packets import SensorPacket, Vlp16Clock, Vlp16Packets
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.io.velodyne.packet import BadPacketError, read_data_packet, read_position_packet
-from lce_rig.io.velodyne.stream import Vlp16Stream, read_controls
+from lce_rig.io.velodyne_packets import BadPacketError, read_data_packet, read_position_packet
+from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig.sensors import DriverSettings, TimestampSettings
 
 from .vlp16_room import (

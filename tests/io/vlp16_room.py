@@ -7,7 +7,7 @@ from wire.vlp16_packets import STREAMED_VLP16, SensorPacket, Vlp16Clock, Vlp16Pa
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
-from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.io.velodyne_scans import Vlp16Stream
 from lce_rig.rig import LidarSettings, load_rig
 
 PERIOD_NS = STREAMED_VLP16.period_ns

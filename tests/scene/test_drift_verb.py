@@ -23,8 +23,7 @@ from lce_rig.pipeline.watch_drift import SceneCaptures, Thinned, drift
 from lce_rig.rig import Rig, dump_rig
 from lce_rig.scene.alignment import AXES
 from lce_rig.session import Session
-from lce_rig.timing.event_buffer import EventCut
-from lce_rig.timing.scan_pairing import Frame
+from lce_rig.timing.scan_pairing import EventCut, Frame
 from tests.doctor.attached import Attached, attach
 from tests.io.events.aedat4_files import RawFrame, write_davis
 from tests.io.test_pcap import to_datagram, write_pcap

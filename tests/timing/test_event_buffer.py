@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.losses import Losses
 from lce_rig.rig import Rig, load_rig
-from lce_rig.timing.event_buffer import AFTER_NS, BEFORE_NS
 from lce_rig.timing.rig_time import rig_time_ns
-from lce_rig.timing.scan_pairing import Frame, pair_by_time
+from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, Frame, pair_by_time
 
 T0_NS = 1_700_000_000 * 10**9
 MS = 1_000_000

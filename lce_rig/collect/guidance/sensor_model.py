@@ -9,7 +9,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import DATA_SHEETS
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
+from lce_rig.core.geometry import Array, exp_so3, invert, pose
 from lce_rig.detect.image.quality import LEAST_MARKED_PX, LEAST_SQUARE_PX
 from lce_rig.rig import QualitySettings, Rig
 
@@ -17,7 +17,6 @@ from lce_rig.rig import QualitySettings, Rig
 PRIOR_CAPTURES = 5
 #: Rms distance of a board's points from its middle line: what a tilt moves them by.
 BOARD_LEVER_M = 0.2
-_POINTS_PER_EDGE = 12
 # Without rings, returns all along the outline let the calibration estimate the ranges' offset: it states less
 # than a millimetre for it.
 _OUTLINED_OFFSET_M = 0.003
@@ -142,20 +141,6 @@ class SensorModel:
             pattern=sheet.pattern,
             width_rad=float(np.radians(sheet.fov_deg[0])),
         )
-
-
-def outline_px(model: SensorModel, T_cam_board: Array) -> Array:
-    """Project the plate's border at T_cam_board (4, 4) as a closed polygon; distortion bends its edges.
-
-    Returns:
-        (N, 2) px, the last point the first; NaN where a point is outside the lens's field of view.
-    """
-    corners = model.board.outline()
-    share = np.arange(_POINTS_PER_EDGE)[:, None] / _POINTS_PER_EDGE
-    edges = [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    border = np.concatenate([*edges, corners[:1]])
-    pixels, _ = model.lens.project(transform(T_cam_board, border))
-    return pixels
 
 
 NEAREST_M = 1.2

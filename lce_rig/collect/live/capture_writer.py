@@ -24,7 +24,7 @@ from lce_rig.devices.reading import LiveSource
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig
 from lce_rig.session import Session
-from lce_rig.timing.event_buffer import EventCut
+from lce_rig.timing.scan_pairing import EventCut
 
 _NICE = 10
 

@@ -18,16 +18,19 @@ from lce_rig.collect.board_tracker import (
     CaptureMoment,
     ImageKey,
 )
-from lce_rig.collect.live.capture_triggers import (
+from lce_rig.collect.live.capture_writer import CaptureWriter, Learning, record_streams
+from lce_rig.collect.live.frame_feed import FrameFeed
+from lce_rig.collect.live.guide import (
+    GIVE_UP_S,
+    Guide,
     Narration,
     SlowBoards,
     StillBoards,
+    count_in,
+    make_guides,
     narrate_refused,
     narrate_unseen,
 )
-from lce_rig.collect.live.capture_writer import CaptureWriter, Learning, record_streams
-from lce_rig.collect.live.frame_feed import FrameFeed
-from lce_rig.collect.live.guide import GIVE_UP_S, Guide, count_in, make_guides
 from lce_rig.collect.live.monitor import Monitor
 from lce_rig.collect.live.state import Ending, Key, LiveOptions, LiveReport, LiveState, TakeBack
 from lce_rig.collect.placement_dedupe import Placements

@@ -6,9 +6,8 @@ from collections import deque
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection
-from lce_rig.collect.live.capture_triggers import Narration
 from lce_rig.collect.live.frame_feed import FrameFeed
-from lce_rig.collect.live.guide import Guide
+from lce_rig.collect.live.guide import Guide, Narration
 from lce_rig.collect.live.state import Cue, Drawing, LiveOptions, LiveState, Phase, Sound, StreamState
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array

@@ -41,7 +41,7 @@ class BoardMotion(NamedTuple):
 
 
 def outline_px(T_cam_board: Array, board: Board, intrinsics: Intrinsics) -> Array:
-    """Draw the plate's outline as the lens bends it: (96, 2) px, NaN if it cannot be seen."""
+    """Draw the plate's outline as the lens bends it: (96, 2) px, closed, NaN if it cannot be seen."""
     corners = board.outline()
     edges = [a + _ALONG * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     pixels, _ = intrinsics.project(transform(T_cam_board, np.concatenate(edges)))

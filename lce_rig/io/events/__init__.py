@@ -1,11 +1,20 @@
-"""Recordings of event cameras: `open_events` finds the reader for a path."""
+"""Recordings of event cameras: `open_events` finds the reader for a path, `EventCameraFile` adds frames."""
 
+import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from pkgutil import resolve_name
 
+from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io.events.event_recording import EventRecording
+from lce_rig.core.losses import Losses
+from lce_rig.io import findings
+from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
+from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
+from lce_rig.io.joining import merge_by_time
+from lce_rig.io.protocol import SourceOptions, Span, choose_event_camera, fingerprint
 from lce_rig.io.ros.bag_file import kind_of
+from lce_rig.rig import Rig
 
 READERS = {
     ".aedat4": "lce_rig.io.events.aedat4:Aedat4Events",
@@ -13,13 +22,13 @@ READERS = {
     ".db3": "lce_rig.io.ros.event_messages:BagEvents",
     ".mcap": "lce_rig.io.ros.event_messages:BagEvents",
     ".raw": "lce_rig.io.events.prophesee:PropheseeEvents",
-    ".h5": "lce_rig.io.events.hdf5:Hdf5Events",
-    ".hdf5": "lce_rig.io.events.hdf5:Hdf5Events",
-    ".txt": "lce_rig.io.events.text:TextEvents",
+    ".h5": "lce_rig.io.events.tables:Hdf5Events",
+    ".hdf5": "lce_rig.io.events.tables:Hdf5Events",
+    ".txt": "lce_rig.io.events.tables:TextEvents",
 }
 """Reader by suffix; a folder is a ROS 2 bag. Imported when wanted."""
 
-__all__ = ["READERS", "EventRecording", "open_events"]
+__all__ = ["READERS", "EventCameraFile", "EventRecording", "open_events"]
 
 
 def open_events(
@@ -51,3 +60,98 @@ def open_events(
     reader = resolve_name(READERS[kind])
     stream = reader(path, topic) if reader.__name__ == "BagEvents" else reader(path)
     return EventRecording(path, stream, sensor, resolution)
+
+
+class EventCameraFile:
+    """One file of one event camera; see `ContinuousRecording`. Its LiDAR is recorded elsewhere.
+
+    Attributes:
+        path: the file.
+        notes: assumptions on opening; after reading, losses with their causes.
+        key: fingerprint of the file.
+        n_samples: number of frames.
+        streams: the camera's events and, if the file and the profile have them, its frames.
+        serials: the camera's serial number, if the file records it.
+    """
+
+    def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
+        """Open the file.
+
+        Raises:
+            SourceError: it cannot be read or holds nothing, the rig has no event camera, or the events are
+                of another resolution than its.
+        """
+        self.path = path
+        self.notes: list[str] = []
+        self.key = fingerprint([path])
+        self.n_samples = 0
+        self.streams: dict[Stream, Span | None] = {}
+        self._rig = rig
+        self._camera, channel = choose_event_camera(rig, options, self.notes)
+        aedat4 = Aedat4File(path) if path.suffix.lower() == ".aedat4" else None
+        self._frames = None if aedat4 is None else self._open_frames(aedat4)
+        serial = "" if aedat4 is None else aedat4.serial
+        self._events: EventRecording | None = None
+        try:
+            size = rig.cameras[self._camera].resolution_px
+            self._events = open_events(path, sensor=self._camera, resolution=size)
+            self._events.tie_to_host()
+            first_ns, last_ns = self._events.span_ns
+            self.streams[Stream(self._camera, channel, "events")] = first_ns, last_ns
+            length_s = (last_ns - first_ns) * 1e-9
+            self.notes.append(f"{path.name}: {length_s:.1f} s of {self._camera}.{channel}")
+            serial = serial or self._events.serial
+        except NoEventsError as error:
+            if self._frames is None:
+                raise
+            self.notes.append(f"{error.what}; its frames are read")
+        self.serials = {self._camera: serial} if re.fullmatch("[A-Za-z0-9]{1,64}", serial) else {}
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield packets of events, and frames, in order of time.
+
+        Raises:
+            SourceError: after all that can be read, where the events' clock was set back.
+        """
+        parts: list[Iterable[Sample]] = [] if self._events is None else [self._events]
+        losses = Losses()
+        if self._frames is not None:
+            parts.append(self._images(*self._frames, losses))
+        try:
+            yield from merge_by_time(parts, self._rig)
+        finally:
+            notes = [f"{self.path.name}: frames: {line}" for line in worded(losses)]
+            notes += [] if self._events is None else self._events.notes
+            self.notes += [note for note in notes if note not in self.notes]
+
+    def _open_frames(self, file: Aedat4File) -> tuple[Aedat4File, int, str] | None:
+        """Find the frames of an AEDAT4 file, the number of their stream and their channel; None without."""
+        number = file.first_stream("FRME")
+        if number is None:
+            return None
+        first = next(file.packets(number, Losses(), decode_frame), None)
+        last = file.last_packet(number, decode_frame)
+        if first is None or last is None:
+            return None
+        channel = self._rig.cameras[self._camera].first_channel("frames")
+        if channel is None:
+            note = f"frames skipped; {self._camera} has no channel of kind frames"
+            self.notes.append(f"{self.path.name}: {note}")
+            return None
+        self.streams[Stream(self._camera, channel, "images")] = first.mid_exposure_ns, last.mid_exposure_ns
+        self.n_samples = len(file.places[number])
+        meaning = "has no exposure time; its timestamps are used as mid exposure"
+        if first.exposure_ns:
+            exposure_ms = first.exposure_ns * 1e-6
+            meaning = f"timestamped at mid exposure; exposure {exposure_ms:.1f} ms in the first frame"
+        self.notes += [*file.notes, f"{self.path.name}: {self._camera}.{channel} {meaning}"]
+        return file, number, channel
+
+    def _images(self, file: Aedat4File, number: int, channel: str, losses: Losses) -> Iterator[Sample]:
+        last_ns: int | None = None
+        for frame in file.packets(number, losses, decode_frame):
+            if last_ns is not None and frame.mid_exposure_ns <= last_ns:
+                losses.add(findings.FRAMES_OUT_OF_ORDER())
+                continue
+            last_ns = frame.mid_exposure_ns
+            yield Image(self._camera, channel, last_ns, frame.pixels)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import EventColumns, Events
 from lce_rig.core.errors import reason_of
-from lce_rig.io.folder.decoding import decode_image, to_8_bit
+from lce_rig.io.decoding import decode_image, to_8_bit
 from lce_rig.io.ros.bag_file import RawMessage
 
 EVENT_ARRAY_TYPE = "dvs_msgs/msg/EventArray"

@@ -12,8 +12,8 @@ from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
+from lce_rig.io.cloud import to_scan
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
-from lce_rig.io.folder.cloud import to_scan
 from lce_rig.io.joining import check_overlap, merge_by_time
 from lce_rig.io.protocol import SourceOptions, Span
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
@@ -27,7 +27,7 @@ from lce_rig.io.ros.messages import (
     header_stamp_ns,
 )
 from lce_rig.io.ros.topics import PACKET_TYPES, Target, choose_topics
-from lce_rig.io.velodyne.stream import OFFSETS_NOTE, Vlp16Stream
+from lce_rig.io.velodyne_scans import OFFSETS_NOTE, Vlp16Stream
 from lce_rig.rig import CameraSettings, LidarSettings, Rig
 
 # A timestamp this much earlier than the one before is a clock that was set, not a message that came late.

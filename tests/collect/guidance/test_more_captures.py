@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from lce_rig.collect.guidance.more_captures import common_third, plan_captures
-from lce_rig.collect.guidance.planner import Planner
+from lce_rig.collect.guidance.planner import Planner, common_third, plan_captures
 from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array

@@ -14,9 +14,9 @@ from lce_rig.collect.guidance.sensor_model import (
     NEAREST_M,
     SensorPlace,
     is_reachable,
-    outline_px,
 )
 from lce_rig.core.geometry import invert, perturb, transform
+from lce_rig.detect.events.figures import outline_px
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import T_FORWARD
 from tests.collect.guidance.boards import model, placements, predict_covariance, view
@@ -58,7 +58,7 @@ def test_every_candidate_is_seen_by_both_sensors(planner):
     assert distance_m.min() >= 1.2 - 1e-6
     assert distance_m.max() <= limits.max_distance_m
     for T_cam_board in planner.candidates:
-        outline = outline_px(planner.view.model, T_cam_board)
+        outline = outline_px(T_cam_board, planner.view.model.board, planner.view.model.lens)
         assert planner.view.model.lens.is_inside(outline).all()
 
 

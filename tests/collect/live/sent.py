@@ -14,7 +14,7 @@ from wire.timing import LOOP_NS, PACKET_NS, placement_at
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
-from lce_rig.io.velodyne.stream import Vlp16Stream
+from lce_rig.io.velodyne_scans import Vlp16Stream
 from lce_rig.rig import LidarSettings
 from lce_rig.session import Capture, Session
 from tests.collect.live.conftest import LOOPS_PER_HOLD

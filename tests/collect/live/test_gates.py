@@ -6,8 +6,7 @@ from functools import cache
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection
-from lce_rig.collect.live.capture_triggers import StillBoards
-from lce_rig.collect.live.guide import make_guides
+from lce_rig.collect.live.guide import StillBoards, make_guides
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder

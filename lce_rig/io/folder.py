@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from lce_rig.core.data import Image, Scan, Stream
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.losses import Losses
+from lce_rig.io.cloud import to_scan
+from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image
 from lce_rig.io.findings import NOT_DECODED
-from lce_rig.io.folder.cloud import to_scan
-from lce_rig.io.folder.decoding import DECODERS, SUFFIXES, read_cloud, read_image
 from lce_rig.io.protocol import (
     PairMethod,
     SourceOptions,

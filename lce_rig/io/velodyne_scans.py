@@ -7,44 +7,40 @@ cuts revolutions at packets, hands on partial ones, and keeps both returns of a 
 """
 
 import math
-from collections import Counter, deque
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import velodyne
-from lce_rig.core.data import Scan
+from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Figure, Finding, Kind
+from lce_rig.core.findings import Finding
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
-from lce_rig.io.velodyne.packet import (
+from lce_rig.io.network import PcapFile
+from lce_rig.io.protocol import SourceOptions, Span, choose_lidar, fingerprint
+from lce_rig.io.velodyne_packets import (
     BadPacketError,
     DataPacket,
     PacketOrder,
-    PositionPacket,
+    VelodyneClock,
     read_data_packet,
     read_position_packet,
 )
-from lce_rig.rig import LidarSettings
-from lce_rig.timing.clock import resolve_hour
+from lce_rig.rig import LidarSettings, Rig
 
 #: What a recording made elsewhere may lack.
 OFFSETS_NOTE = "points include the lasers' vertical offsets (VLP-16: up to 11 mm), which ROS 1 drivers omit"
 DUAL_NOTE = "dual returns: of each firing the brighter one is kept"
 _CONTROLS = ("position_port", "cut_deg")
 _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "VLP-32C": "VLP32C"}
-#: Clocks further apart than this do not both show UTC.
-MAX_DISAGREEMENT_NS = 100_000_000
-# Position packets come 50 to 150 times per second; a sentence stays until the next, a second later.
-_MAX_AGE_S = 3
-_SENTENCE_LAG_S = (0, 1)
-# The least delayed arrival of a tenth of a second gives the host's time of a firing best. Of twenty of them
-# the lower quartile is safe from late arrivals and from a damaged packet.
-_WINDOW_NS = 100_000_000
-_N_WINDOWS = 20
+# So many data packets, per second or less of one sensor, show which sensors were recorded.
+_SURVEY_PACKETS = 800
+_MAX_SHOWN = 6
 # A scan with more of its packets lost is not worth looking at.
 _MIN_COVERAGE = 0.5
 # Timestamps by arrival and by the sensor may differ by 0.1 s when one takes over from the other.
@@ -78,105 +74,6 @@ def read_controls(sensor: str, settings: LidarSettings) -> tuple[int, float]:
     if isinstance(cut_deg, bool | str) or not -360 <= cut_deg <= 360:
         raise SourceError(f"{where}.cut_deg is {cut_deg!r}, not an angle from -360 to 360 degrees")
     return port, math.radians(cut_deg)
-
-
-class VelodyneClock:
-    """Keeps the sensor's counter, its position packets and the host's clock together.
-
-    The counter in the packets runs free from power-up, and looks no different then: only pulses and
-    sentences, which the position packets report, tie it to UTC. The hour is never sent.
-
-    Attributes:
-        position: the position packet that came last; None before the first.
-    """
-
-    def __init__(self, is_device_wanted: bool = True) -> None:
-        self.position: PositionPacket | None = None
-        self._is_device_wanted = is_device_wanted
-        self._delays_ns: deque[tuple[int, int]] = deque(maxlen=_N_WINDOWS)
-        self._last_us = 0
-        self._last_elapsed_ns = 0
-
-    def restart(self) -> None:
-        """Forget the delays between counter and host: the counter was set."""
-        self._delays_ns.clear()
-
-    def see_data(self, packet: DataPacket, elapsed_ns: int) -> None:
-        """Take note of an arrival.
-
-        Args:
-            packet: in its place.
-            elapsed_ns: of the counter since any fixed moment.
-        """
-        self._last_us, self._last_elapsed_ns = packet.us, elapsed_ns
-        if not packet.host_ns:
-            return
-        delay_ns = packet.host_ns - packet.packet_ns - elapsed_ns
-        window = elapsed_ns // _WINDOW_NS
-        if self._delays_ns and self._delays_ns[-1][0] == window:
-            delay_ns = min(delay_ns, self._delays_ns.pop()[1])
-        self._delays_ns.append((window, delay_ns))
-
-    def ahead_ns(self) -> int | None:
-        """Compute by how much the sensor's time is ahead of the host's; None where that is unknown.
-
-        The hour is the host's. A packet arrives after its last firing, so its length is subtracted from the
-        arrival; what is left is the host's time of the first firing, late by the network's delay.
-        """
-        host_ns = self._host_ns(self._last_elapsed_ns)
-        return None if host_ns is None else resolve_hour(1000 * self._last_us, host_ns) - host_ns
-
-    def stamp_ns(self, elapsed_ns: int) -> int | None:
-        """Stamp a moment of the counter, with the sensor's time where it can be trusted, else the host's."""
-        host_ns = self._host_ns(elapsed_ns)
-        if host_ns is None or not self.is_utc:
-            return host_ns
-        return resolve_hour(1000 * self._last_us + elapsed_ns - self._last_elapsed_ns, host_ns)
-
-    @property
-    def is_utc(self) -> bool:
-        """Whether scans are timestamped with the sensor's own time, UTC."""
-        return self._state() is findings.LIDAR_UTC
-
-    def state(self) -> Finding:
-        """Report the clock that scans are timestamped with, and the reason where it is not the sensor's."""
-        ahead_ns, position = self.ahead_ns(), self.position
-        figures: dict[str, Figure] = {} if ahead_ns is None else {"ahead_s": ahead_ns * 1e-9}
-        if position is not None:
-            figures |= {"pps": velodyne.PPS_STATES[position.pps], "is_fix": position.is_fix}
-            figures["nmea_past_hour_s"] = position.nmea_s
-        return self._state()(**figures)
-
-    def _state(self) -> Kind:
-        """Find the first reason not to trust the sensor's time.
-
-        It is trusted where it is locked to pulses, the sentence it holds is of the second that its counter
-        shows, and the host's clock agrees.
-        """
-        position, ahead_ns = self.position, self.ahead_ns()
-        if not self._is_device_wanted:
-            return findings.HOST_WANTED
-        if position is None:
-            return findings.NO_POSITION_PACKETS
-        age_s = ((self._last_us - position.us) % velodyne.HOUR_US) // 1_000_000
-        # A position packet may have overtaken the data packets it belongs to.
-        if _MAX_AGE_S <= age_s < 3600 - _MAX_AGE_S:
-            return findings.POSITION_PACKETS_STOPPED
-        if position.pps != velodyne.PPS_LOCKED:
-            return findings.PPS_NOT_LOCKED
-        if position.nmea_s is None:
-            return findings.NMEA_DAMAGED if position.nmea else findings.NO_NMEA
-        if (position.us // 1_000_000 - position.nmea_s) % 3600 not in _SENTENCE_LAG_S:
-            return findings.NMEA_OF_OTHER_SECOND
-        if ahead_ns is None:
-            return findings.ARRIVALS_UNKNOWN
-        return findings.LIDAR_UTC_DIFFERS if abs(ahead_ns) > MAX_DISAGREEMENT_NS else findings.LIDAR_UTC
-
-    def _host_ns(self, elapsed_ns: int) -> int | None:
-        if not self._delays_ns:
-            return None
-        delays_ns = sorted(delay_ns for _, delay_ns in self._delays_ns)
-        return elapsed_ns + delays_ns[len(delays_ns) // 4]
 
 
 class _Piece(NamedTuple):
@@ -405,3 +302,107 @@ def keep_brighter(packets: NDArray[np.void]) -> None:
     )
     strongest["range"][is_last_kept] = 0
     last["range"][~is_last_kept] = 0
+
+
+class PcapRecording:
+    """The scans of one Velodyne in a pcap or pcapng file.
+
+    Attributes:
+        path: the file.
+        notes: the sensor whose packets are taken, and after reading the losses.
+        key: fingerprint of the file.
+        n_samples: number of scans to come, estimated from the file's size.
+        streams: the LiDAR's scans; their span, by arrival, is found only where they are part of a recording.
+    """
+
+    def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
+        """Find the sensor's packets.
+
+        Raises:
+            SourceError: it is not a recording of the network, holds no packets of the profile's model, or
+                those of several sensors of which none has the profile's address.
+        """
+        self.path = path
+        self.notes: list[str] = []
+        self._file = PcapFile(path)
+        self._lidar = choose_lidar(rig, options, self.notes)
+        self._settings: LidarSettings = rig.lidars[self._lidar]
+        self._product = Vlp16Stream(self._lidar, self._settings).product
+        self._address, n_packets = self._choose_sender()
+        self.key = fingerprint([path])
+        span_ns: Span | None = None
+        if options.is_part:
+            arrivals_ns = [d.host_ns for d in self._file.datagrams() if d.source == self._address]
+            span_ns = (min(arrivals_ns), max(arrivals_ns)) if any(arrivals_ns) else None
+        self.streams: Mapping[Stream, Span | None] = {Stream(self._lidar, "", "scans"): span_ns}
+        sweep_s = n_packets * self._product.packet_ns(is_dual=False) * 1e-9
+        self.n_samples = max(1, round(sweep_s * self._settings.rate_hz))
+
+    def samples(self) -> Iterator[Scan]:
+        """Yield the scans, in order of time; packets that are damaged, late or lost are counted in `notes`.
+
+        Raises:
+            SourceError: not one whole revolution was recorded.
+        """
+        stream = Vlp16Stream(self._lidar, self._settings)
+        try:
+            for datagram in self._file.datagrams():
+                if datagram.source != self._address:
+                    continue
+                if len(datagram.payload) == velodyne.POSITION_BYTES:
+                    stream.push_position(datagram.payload)
+                elif len(datagram.payload) == velodyne.DATA_BYTES:
+                    scan = stream.push_data(datagram.payload, datagram.host_ns)
+                    if scan is not None:
+                        yield scan
+            last = stream.finish()
+            if last is not None:
+                yield last
+        finally:
+            lines = [OFFSETS_NOTE, *([DUAL_NOTE] if stream.mode == velodyne.DUAL else [])]
+            lines += [stream.clock.state().text, *stream.account(), *self._file.account()]
+            notes = [f"{self.path.name}: {line}" for line in lines]
+            self.notes += [note for note in notes if note not in self.notes]
+        if stream.n_scans == 0:
+            causes = "; ".join(stream.account()) or f"{stream.n_data} packets are less than a revolution"
+            raise SourceError(f"{self.path}: no whole revolution in it: {causes}", "Record at least 1 s.")
+
+    def _choose_sender(self) -> tuple[str, float]:
+        """Choose the sensor whose packets are taken by the start of the file.
+
+        Returns:
+            Its IP address, and the number of its data packets in the whole file, about.
+
+        Raises:
+            SourceError: there is none of the profile's model, or several of which none has its address.
+        """
+        senders, others, ports = Counter[str](), Counter[str](), Counter[int]()
+        for datagram in self._file.datagrams():
+            ports[datagram.port] += 1
+            try:
+                read_data_packet(datagram.payload, datagram.host_ns, self._product)
+                senders[datagram.source] += 1
+            except BadPacketError as error:
+                others.update([error.model] if error.model else [])
+            n_sound = senders.total() + others.total()
+            if n_sound >= _SURVEY_PACKETS or (n_sound and ports.total() >= 50 * _SURVEY_PACKETS):
+                break
+        name, wanted = self._product.name, self._settings.driver.address
+        if wanted not in senders and len(senders) == 1:
+            wanted = next(iter(senders))
+            self.notes.append(f"{self.path.name}: packets of {wanted}, the only {name} in it")
+        if wanted in senders:
+            share = self._file.n_bytes_read / self.path.stat().st_size
+            return str(wanted), senders[str(wanted)] / share
+        if senders:
+            addresses = ", ".join(sorted(senders))
+            hint = f"Set driver.address of {self._lidar!r} in the profile to one of them."
+            what = f"{self.path}: packets of several LiDARs, none of them {wanted}: {addresses}"
+            raise SourceError(what, hint)
+        by_port = [f"{n} to port {port}" for port, n in ports.most_common(_MAX_SHOWN)]
+        holds = [f"{n} packets of {model}" for model, n in others.most_common()] or by_port
+        causes = "; ".join([*holds, *self._file.account()]) or "no UDP packets at all"
+        what = f"{self.path}: holds no packets of a {name}: {causes}"
+        read = ", ".join(product.name for product in velodyne.READ)
+        hint = f"Record whole packets (tcpdump -s 0), or set the model of {self._lidar!r}; read are {read}."
+        raise SourceError(what, hint)

@@ -1,7 +1,8 @@
-"""Packets of a Velodyne, checked and ordered by its clock; UDP delivers anything sent to the port."""
+"""Packets of a Velodyne, checked and ordered by its counter, and its clock; UDP delivers anything sent."""
 
 import re
 import struct
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import velodyne
+from lce_rig.core.findings import Figure, Finding, Kind
 from lce_rig.core.losses import Losses
 from lce_rig.io import findings
+from lce_rig.timing.clock import resolve_hour
 
 # Neighbouring blocks of a real rotor at 600 rpm lie 0.38 to 0.42 deg apart.
 _MAX_UNEVEN_STEPS = 6
@@ -222,3 +225,113 @@ class PacketOrder:
             return "late"
         self._losses.add(findings.CLOCK_SET())
         return "after a step"
+
+
+#: Clocks further apart than this do not both show UTC.
+MAX_DISAGREEMENT_NS = 100_000_000
+# Position packets come 50 to 150 times per second; a sentence stays until the next, a second later.
+_MAX_AGE_S = 3
+_SENTENCE_LAG_S = (0, 1)
+# The least delayed arrival of a tenth of a second gives the host's time of a firing best. Of twenty of them
+# the lower quartile is safe from late arrivals and from a damaged packet.
+_WINDOW_NS = 100_000_000
+_N_WINDOWS = 20
+
+
+class VelodyneClock:
+    """Keeps the sensor's counter, its position packets and the host's clock together.
+
+    The counter in the packets runs free from power-up, and looks no different then: only pulses and
+    sentences, which the position packets report, tie it to UTC. The hour is never sent.
+
+    Attributes:
+        position: the position packet that came last; None before the first.
+    """
+
+    def __init__(self, is_device_wanted: bool = True) -> None:
+        self.position: PositionPacket | None = None
+        self._is_device_wanted = is_device_wanted
+        self._delays_ns: deque[tuple[int, int]] = deque(maxlen=_N_WINDOWS)
+        self._last_us = 0
+        self._last_elapsed_ns = 0
+
+    def restart(self) -> None:
+        """Forget the delays between counter and host: the counter was set."""
+        self._delays_ns.clear()
+
+    def see_data(self, packet: DataPacket, elapsed_ns: int) -> None:
+        """Take note of an arrival.
+
+        Args:
+            packet: in its place.
+            elapsed_ns: of the counter since any fixed moment.
+        """
+        self._last_us, self._last_elapsed_ns = packet.us, elapsed_ns
+        if not packet.host_ns:
+            return
+        delay_ns = packet.host_ns - packet.packet_ns - elapsed_ns
+        window = elapsed_ns // _WINDOW_NS
+        if self._delays_ns and self._delays_ns[-1][0] == window:
+            delay_ns = min(delay_ns, self._delays_ns.pop()[1])
+        self._delays_ns.append((window, delay_ns))
+
+    def ahead_ns(self) -> int | None:
+        """Compute by how much the sensor's time is ahead of the host's; None where that is unknown.
+
+        The hour is the host's. A packet arrives after its last firing, so its length is subtracted from the
+        arrival; what is left is the host's time of the first firing, late by the network's delay.
+        """
+        host_ns = self._host_ns(self._last_elapsed_ns)
+        return None if host_ns is None else resolve_hour(1000 * self._last_us, host_ns) - host_ns
+
+    def stamp_ns(self, elapsed_ns: int) -> int | None:
+        """Stamp a moment of the counter, with the sensor's time where it can be trusted, else the host's."""
+        host_ns = self._host_ns(elapsed_ns)
+        if host_ns is None or not self.is_utc:
+            return host_ns
+        return resolve_hour(1000 * self._last_us + elapsed_ns - self._last_elapsed_ns, host_ns)
+
+    @property
+    def is_utc(self) -> bool:
+        """Whether scans are timestamped with the sensor's own time, UTC."""
+        return self._state() is findings.LIDAR_UTC
+
+    def state(self) -> Finding:
+        """Report the clock that scans are timestamped with, and the reason where it is not the sensor's."""
+        ahead_ns, position = self.ahead_ns(), self.position
+        figures: dict[str, Figure] = {} if ahead_ns is None else {"ahead_s": ahead_ns * 1e-9}
+        if position is not None:
+            figures |= {"pps": velodyne.PPS_STATES[position.pps], "is_fix": position.is_fix}
+            figures["nmea_past_hour_s"] = position.nmea_s
+        return self._state()(**figures)
+
+    def _state(self) -> Kind:
+        """Find the first reason not to trust the sensor's time.
+
+        It is trusted where it is locked to pulses, the sentence it holds is of the second that its counter
+        shows, and the host's clock agrees.
+        """
+        position, ahead_ns = self.position, self.ahead_ns()
+        if not self._is_device_wanted:
+            return findings.HOST_WANTED
+        if position is None:
+            return findings.NO_POSITION_PACKETS
+        age_s = ((self._last_us - position.us) % velodyne.HOUR_US) // 1_000_000
+        # A position packet may have overtaken the data packets it belongs to.
+        if _MAX_AGE_S <= age_s < 3600 - _MAX_AGE_S:
+            return findings.POSITION_PACKETS_STOPPED
+        if position.pps != velodyne.PPS_LOCKED:
+            return findings.PPS_NOT_LOCKED
+        if position.nmea_s is None:
+            return findings.NMEA_DAMAGED if position.nmea else findings.NO_NMEA
+        if (position.us // 1_000_000 - position.nmea_s) % 3600 not in _SENTENCE_LAG_S:
+            return findings.NMEA_OF_OTHER_SECOND
+        if ahead_ns is None:
+            return findings.ARRIVALS_UNKNOWN
+        return findings.LIDAR_UTC_DIFFERS if abs(ahead_ns) > MAX_DISAGREEMENT_NS else findings.LIDAR_UTC
+
+    def _host_ns(self, elapsed_ns: int) -> int | None:
+        if not self._delays_ns:
+            return None
+        delays_ns = sorted(delay_ns for _, delay_ns in self._delays_ns)
+        return elapsed_ns + delays_ns[len(delays_ns) // 4]

@@ -1,1 +1,0 @@
-"""Folders of images, point clouds and other recorders' files."""

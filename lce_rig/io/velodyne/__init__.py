@@ -1,1 +1,0 @@
-"""Velodyne packets from network recordings and live sensors."""
