@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from lce_rig.export import export
     from lce_rig.export.reference import Reference, read_reference
     from lce_rig.io.protocol import SourceOptions
-    from lce_rig.pipeline.calibrate_sessions import calibrate
+    from lce_rig.pipeline.calibration import calibrate
     from lce_rig.pipeline.collect_recordings import collect_from
     from lce_rig.pipeline.comparison import Repeat, repeat
     from lce_rig.pipeline.detect_session import detect
@@ -106,7 +106,7 @@ _HOMES = {
     "lce_rig.pipeline.watch_drift": ("drift",),
     "lce_rig.pipeline.comparison": ("Repeat", "repeat"),
     "lce_rig.pipeline.result_files": ("Result",),
-    "lce_rig.pipeline.calibrate_sessions": ("calibrate",),
+    "lce_rig.pipeline.calibration": ("calibrate",),
     "lce_rig.pipeline.verification": ("Verification", "verify"),
     "lce_rig.rig": ("Rig", "load_rig"),
     "lce_rig.session": ("Session",),

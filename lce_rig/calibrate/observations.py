@@ -47,13 +47,11 @@ class SharedScan:
         captures: names of those that hold it, sorted; its images may lie in several, with copies of it.
         images: the board by channel, at least one.
         lidar: the board in the scan.
-        session: where captures are of several.
     """
 
     captures: tuple[str, ...]
     images: Mapping[str, ImageBoard]
     lidar: LidarBoard
-    session: str = ""
 
     @property
     def capture(self) -> str:
@@ -63,7 +61,7 @@ class SharedScan:
     def observation(self, channel: str | None = None) -> Observation:
         """Pair the scan with a channel's image, by default the first's."""
         image = self.images[channel or next(iter(self.images))]
-        return Observation(self.capture, image, self.lidar, self.session)
+        return Observation(self.capture, image, self.lidar)
 
 
 def join_scans(
@@ -97,7 +95,7 @@ def join_scans(
         captures = tuple(sorted({o.capture for o in group.values()}))
         first = next(iter(group.values()))
         images = {channel: o.image for channel, o in group.items()}
-        scans.append(SharedScan(captures, images, first.lidar, first.session))
+        scans.append(SharedScan(captures, images, first.lidar))
     return sorted(scans, key=lambda scan: scan.capture), refused
 
 
@@ -114,7 +112,7 @@ def pooled_noise_px(images: Sequence[ImageBoard]) -> float:
 def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
     """Number the board placements of captures; captures that stood in the same place share a number.
 
-    A capture joins the first placement of its session whose first capture has its centre and normal nearby.
+    A capture joins the first placement whose first capture has its centre and normal nearby.
 
     Args:
         observations: with the camera's pose of the board.
@@ -123,13 +121,11 @@ def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
         (F,) numbers from 0.
     """
     T = np.array([observation.image.T_cam_board for observation in observations]).reshape(-1, 4, 4)
-    session = np.array([observation.session for observation in observations])
     numbers = np.zeros(len(observations), dtype=np.intp)
     firsts: list[int] = []
     for k, T_cam_board in enumerate(T):
         apart = np.linalg.norm(T[firsts] - T_cam_board, axis=1)
         is_same = (apart[:, 3] < SAME_PLACE_M) & (apart[:, 2] < SAME_TURN_RAD)
-        is_same &= session[firsts] == session[k]
         if is_same.any():
             numbers[k] = np.argmax(is_same)
         else:

@@ -15,6 +15,7 @@ from lce_rig.cli.options import (
     cameras_option,
     require_sensors,
     robot_option,
+    session_argument,
     split_names,
 )
 from lce_rig.collect.findings import GUIDE_ADD
@@ -32,10 +33,9 @@ from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
 from lce_rig.export.reference import read_reference
 from lce_rig.judge.findings import consequences, lacks_captures, weakest_words
-from lce_rig.pipeline.calibrate_sessions import require_unit
-from lce_rig.pipeline.result_files import UNION, Result, WrittenResult, result_folder
+from lce_rig.pipeline.result_files import Result, WrittenResult, result_folder
 from lce_rig.rig import find_profile, read_profile
-from lce_rig.session.provenance import provenance_of
+from lce_rig.session.provenance import serials_of
 
 _AXES = ("x right", "y down", "z forward")
 _OPINIONS = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
@@ -161,7 +161,7 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
 
 
 @click.command()
-@click.argument("sessions", nargs=-1, type=click.Path(path_type=Path), metavar="[SESSION]...")
+@session_argument
 @click.option(
     "--reference",
     type=click.Path(path_type=Path),
@@ -189,8 +189,7 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
 @click.option(
     "--name",
     metavar="NAME",
-    help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged "
-    "[default of several sessions: union].",
+    help="Write the result to SESSION/results/NAME/ and leave SESSION/calibration/ unchanged.",
 )
 @robot_option
 @click.option(
@@ -211,7 +210,7 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
 @click.option("--force", is_flag=True, help="Export failed results too, marked NOT FOR USE.")
 @click.option("--no-report", is_flag=True, help="Do not write report.html.")
 def calibrate(
-    sessions: tuple[Path, ...],
+    session: Path,
     reference: Path | None,
     cameras: tuple[str, ...],
     channels: list[str] | None,
@@ -232,33 +231,17 @@ def calibrate(
     extrinsics.yaml, URDF, camera_info and static transforms. The earlier result moves to
     SESSION/calibration/previous/. A run without a result leaves it unchanged.
 
-    Several SESSIONs of one rig whose sensors were not moved in between give one result from all captures. It
-    goes into results/union/ of the first; nothing else changes. Each session is calibrated alone before, and
-    sessions that disagree are refused.
-
     Exits with 7 if a result has failed; the exports then skip that camera, unless --force is given. Exits
-    with 7 if sessions disagree, and with 6 if a camera has no result.
+    with 6 if a camera has no result.
     """
-    paths = sessions or (Path("session"),)
-    name = UNION if name is None and len(paths) > 1 else name
     result_folder(Path(), name, is_new=True)
     if profile is not None:
-        if len(paths) > 1:
-            raise UsageError("--rig applies to one session", "Calibrate each session alone with it first.")
-        _take_profile(paths[0], profile)
+        _take_profile(session, profile)
     if without:
-        if len(paths) > 1:
-            raise UsageError(
-                "--without applies to one session",
-                "Reject them by: lce-rig captures SESSION --reject CAPTURE",
-            )
-        put_aside(paths[0], without, "calibrate --without")
-    opened = [lce.Session.open(path) for path in paths]
-    require_unit(opened)
-    for each in opened:
-        each.rig = each.rig.of_robot(robot)
-    provenance_of(opened)
-    rig = opened[0].rig
+        put_aside(session, without, "calibrate --without")
+    opened = lce.Session.open(session)
+    rig = opened.rig = opened.rig.of_robot(robot)
+    serials_of(opened)
     require_sensors("camera", cameras, rig.cameras)
     wanted = [
         name
@@ -271,10 +254,8 @@ def calibrate(
             f"{reference}: T_cam_lidar names no sensors, but the rig has several: {', '.join(wanted)}",
             'Write {"pairs": [{"camera": ..., "lidar": ..., "T_cam_lidar": ...}, ...]}, or add --camera.',
         )
-    detections = []
-    for each in opened:
-        with show.progress_bar("detecting") as progress:
-            detections.append(lce.detect(each, progress=progress))
+    with show.progress_bar("detecting") as progress:
+        detections = lce.detect(opened, progress=progress)
     with show.progress_bar("calibrating") as progress:
         try:
             result = lce.calibrate(
@@ -289,7 +270,7 @@ def calibrate(
             )
         except NotEnoughDataError as error:
             if error.finding is not None and error.finding.figures.get("where"):
-                error.hint += f"\n{_collect_command(opened[0])}"
+                error.hint += f"\n{_collect_command(opened)}"
             raise
     for shortage in result.shortages:
         show.warn(str(NotEnoughDataError.of(shortage)))
@@ -298,7 +279,7 @@ def calibrate(
     # The result is on the disk and on the screen before its report is drawn, which takes about as long.
     written = result.write(name=name, force=force, report=False)
     _show(result, written, is_explained=explain, as_json=as_json)
-    lacking = _lacking(wanted, {pair.camera for each in detections for pair in each.pairs}, result.pairs)
+    lacking = _lacking(wanted, {pair.camera for pair in detections.pairs}, result.pairs)
     if lacking is not None and any(c.verdict == "fail" for c in result.pairs):
         show.warn(str(lacking))
     if not no_report:
@@ -308,9 +289,9 @@ def calibrate(
     others = f" and {n_others} for the robot" if n_others else ""
     show.note(f"  files        {written.files[0].parent}/: result.json{page}{others}")
     if any(finding.code == GUIDE_ADD.code for c in result.pairs for finding in c.findings):
-        show.note(f"  next         {_collect_command(opened[0])}")
+        show.note(f"  next         {_collect_command(opened)}")
     elif all(c.verdict != "fail" for c in result.pairs):
-        show.name_next("verify", paths[0], "" if name is None else f" --name {name}")
+        show.name_next("verify", session, "" if name is None else f" --name {name}")
     exit_by_verdict(result.pairs, are_printed=not as_json)
     if lacking is not None:
         raise lacking

@@ -20,26 +20,39 @@ from lce_rig.session import Session
 @click.option(
     "--restore", metavar="NAMES", multiple=True, help="Restore these captures, separated by commas."
 )
+@click.option(
+    "--add",
+    type=click.Path(path_type=Path),
+    metavar="OTHER_SESSION",
+    help="Copy the captures of another session of this rig, if no sensor was moved in between.",
+)
 @click.option("--reason", metavar="TEXT", default="", help="Write this reason into the session's journal.")
 @json_option
 def captures(
-    session: Path, reject: tuple[str, ...], restore: tuple[str, ...], reason: str, as_json: bool
+    session: Path,
+    reject: tuple[str, ...],
+    restore: tuple[str, ...],
+    add: Path | None,
+    reason: str,
+    as_json: bool,
 ) -> None:
-    """List the captures of SESSION (default: session/); reject or restore them by name.
+    """List the captures of SESSION (default: session/); reject or restore them by name, or add others.
 
     A rejected capture moves to SESSION/rejected/ with all its files. No command uses it, and `collect` does
     not take it again from the same recording. Restoring moves it back.
     """
     rejecting, restoring = _names(reject), _names(restore)
-    with lce.Session.open(session, writable=bool(rejecting or restoring)) as opened:
+    other = None if add is None else lce.Session.open(add)
+    is_changed = bool(rejecting or restoring or other)
+    with lce.Session.open(session, writable=is_changed) as opened:
         _require_there(opened, rejecting, restoring)
         for name in sorted(rejecting):
             opened.reject(name, reason)
         for name in sorted(restoring):
             opened.restore(name)
-        changed = rejecting | restoring
+        changed = rejecting | restoring | set(opened.add_session(other) if other else ())
         stored = stored_results(opened)
-        records = [each for each in _records(opened, stored) if not changed or each["name"] in changed]
+        records = [each for each in _records(opened, stored) if not is_changed or each["name"] in changed]
         outdated = [each.name for each in stored if changed and each.is_outdated]
         n_kept, n_rejected = len(opened.captures), len(opened.rejected)
     if as_json:

@@ -531,7 +531,6 @@ class ResultFile:
         made_by: the program and its version.
         provenance: robot, sensors and date; empty in files of earlier versions.
         inputs_sha256: SHA-256 of the result's input files, by their path in the session.
-        sessions: of an estimate from several, by name: their paths from the one that holds the result.
         pairs: one for each camera and LiDAR.
     """
 
@@ -541,7 +540,6 @@ class ResultFile:
     made_by: str = MADE_BY
     provenance: Provenance = field(default_factory=Provenance)
     inputs_sha256: Mapping[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = field(default_factory=dict)
-    sessions: Mapping[str, str] = field(default_factory=dict)
     pairs: tuple[Annotated[Calibration, BeforeValidator(_from_pair), WrapSerializer(_as_pair)], ...]
 
     def document(self) -> dict[str, Any]:
@@ -564,8 +562,6 @@ class ResultFile:
             del document["provenance"]
         else:
             document["provenance"]["serials"] = dict(sorted(document["provenance"]["serials"].items()))
-        if not self.sessions:
-            del document["sessions"]
         return document
 
     def text(self) -> str:

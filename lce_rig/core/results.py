@@ -206,20 +206,17 @@ class LidarBoard:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One board placement seen by one camera channel and one LiDAR; of several sessions, also its session."""
+    """One board placement seen by one camera channel and one LiDAR."""
 
     capture: str
     image: ImageBoard
     lidar: LidarBoard
-    session: str = ""
     others: tuple[LidarBoard, ...] = ()
 
     @classmethod
-    def of(
-        cls, capture: str, image: ImageBoard, places: Sequence[LidarBoard], session: str = ""
-    ) -> "Observation":
+    def of(cls, capture: str, image: ImageBoard, places: Sequence[LidarBoard]) -> "Observation":
         """Pair a board in an image with the places of the scan where it may be, best first."""
-        return cls(capture, image, places[0], session, tuple(places[1:]))
+        return cls(capture, image, places[0], tuple(places[1:]))
 
     @property
     def places(self) -> tuple[LidarBoard, ...]:

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -99,12 +99,10 @@ class Detections:
     Attributes:
         images: (camera, channel) -> capture -> detection.
         lidars: LiDAR -> capture -> detection.
-        session_of: capture -> its session, where they are of several.
     """
 
     images: Mapping[tuple[str, str], Mapping[str, ImageDetection]]
     lidars: Mapping[str, Mapping[str, LidarDetection]]
-    session_of: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def pairs(self) -> list[Pair]:

@@ -135,7 +135,7 @@ def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]
             tell(row)
             if session is None:
                 session = lce.collect_from(rig, scratch / Storage(job.source).name, scratch / "session")
-                row = _dated(row, provenance_of([session]), ending)
+                row = _dated(row, provenance_of(session), ending)
                 tell(row)
             return _calibrate(registry, session, row, settings, start_s)
         except (LceRigError, OSError) as error:
@@ -189,7 +189,7 @@ def _open(job: Job, scratch: Path) -> tuple[Rig, Session | None, Provenance]:
                 )
             replace_file(copy / PROFILE, dump_rig(rig).encode())
         session = Session.open(copy)
-        return session.rig, session, provenance_of([session])
+        return session.rig, session, provenance_of(session)
     if rig is None:
         raise ProfileError(
             f"{job.source} is not a session, and the manifest names no profile for it",

@@ -63,12 +63,10 @@ def _choices(
     """List groups to test with their place in time and neighbour: at least half of each is rejected."""
     names = {observation.capture for observation in rejected}
     every = sorted([*used, *rejected], key=lambda observation: observation.capture)
-    for session in dict.fromkeys(observation.session for observation in every):
-        own = [observation for observation in every if observation.session == session]
-        for n in range(2, len(own) // 2 + 1):
-            for place, group, neighbour in (("last", own[-n:], own[-n - 1]), ("first", own[:n], own[n])):
-                if 2 * sum(observation.capture in names for observation in group) >= n:
-                    yield group, place, neighbour.capture
+    for n in range(2, len(every) // 2 + 1):
+        for place, group, neighbour in (("last", every[-n:], every[-n - 1]), ("first", every[:n], every[n])):
+            if 2 * sum(observation.capture in names for observation in group) >= n:
+                yield group, place, neighbour.capture
     if len(rejected) >= _MIN_GROUP:
         yield rejected, "", ""
 

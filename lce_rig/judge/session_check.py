@@ -317,8 +317,7 @@ def find_meetings(
             image, lidar = detections.of(of_channel, capture)
             if not isinstance(image, ImageBoard) or not isinstance(lidar, list):
                 continue
-            session = detections.session_of.get(capture, "")
-            matched = match_candidates(Observation.of(capture, image, lidar, session), board, T_cam_lidar)
+            matched = match_candidates(Observation.of(capture, image, lidar), board, T_cam_lidar)
             middle = T_cam_lidar @ matched.lidar.T_lidar_board[:, 3]
             if np.linalg.norm(middle[:3] - matched.image.T_cam_board[:3, 3]) < _ELSEWHERE_M:
                 observations[name].append(matched)

@@ -7,7 +7,9 @@ the scene's opinion
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -35,15 +37,20 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.reference import Reference
 from lce_rig.judge.camera_pairs import CameraEvidence, CameraPair, camera_findings, find_exchanged, relate
 from lce_rig.judge.contributions import profile_covariance
+from lce_rig.judge.findings import lacks_captures
 from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.judge.relative_pose import relative_pose
 from lce_rig.judge.session_check import find_meetings
 from lce_rig.judge.validate import Validation, validate
-from lce_rig.judge.verdict import judge, share_findings
+from lce_rig.judge.verdict import judge, share_findings, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
+from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE
 from lce_rig.pipeline.matching import boards_in, candidates_of
+from lce_rig.pipeline.result_files import Result
+from lce_rig.pipeline.witness import by_boards, hear_scene, sharpen
 from lce_rig.rig import Rig
+from lce_rig.session import Session
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +122,58 @@ class _Link(NamedTuple):
     exchanged: list[Finding]
 
 
+def calibrate(
+    session: Session | str | Path,
+    detections: Detections | None = None,
+    *,
+    options: CalibrateOptions | None = None,
+    cameras: Sequence[str] | None = None,
+    channels: Sequence[str] | None = None,
+    reference: Reference | None = None,
+    use_scene: bool = False,
+    progress: Progress = silent,
+) -> Result:
+    """Estimate and judge the extrinsics of every camera with every LiDAR; nothing is written.
+
+    Args:
+        session: its folder, or one that is open for reading.
+        detections: of the session; None detects the board first, as `detect` does by default.
+        options: of the estimate; None for the defaults.
+        cameras: the cameras to calibrate, as if the session held no others; None for all.
+        channels: the cameras' channels to use; None for all that the session holds.
+        reference: extrinsics to report errors against; they never enter the estimate or the verdict.
+        use_scene: estimate each frame camera from the edges of the scene, too.
+        progress: called with (done, total) for each camera and LiDAR in turn.
+
+    Raises:
+        NotEnoughDataError: every pair has too few captures or an undetermined direction; the causes are
+            named.
+        UsageError: no capture holds one of the channels.
+    """
+    session = session if isinstance(session, Session) else Session.open(session)
+    if detections is None:
+        detections = detect(session)
+    calibrations, shortages = calibrate_detections(
+        session.rig,
+        detections,
+        options,
+        cameras=cameras,
+        channels=channels,
+        reference=reference,
+        scene=partial(sharpen, session, detections) if use_scene else None,
+        progress=progress,
+    )
+    begin(progress, "comparing with the scene")
+    judged = []
+    for c in calibrations:
+        c = with_opinion(c, hear_scene(session, detections, by_boards(c)))
+        if lacks_captures(c.findings):
+            held = boards_in(detections, c.camera, c.lidar, c.captures_used)
+            c = replace(c, findings=(*c.findings, *plan_captures(session.rig, c.camera, c.lidar, held, c)))
+        judged.append(c)
+    return Result(session, tuple(judged), tuple(shortages))
+
+
 def calibrate_detections(
     rig: Rig,
     detections: Detections,
@@ -134,7 +193,7 @@ def calibrate_detections(
     Args:
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
-        options, cameras, channels, reference, progress: as of `calibrate_sessions.calibrate`.
+        options, cameras, channels, reference, progress: as of `calibrate`.
         scene: asks the scene about the boards' extrinsics; None for the boards alone.
 
     Returns:

@@ -1,9 +1,10 @@
 """Compare the calibrations of one rig in several sessions."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +13,12 @@ from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.errors import NotEnoughDataError, SessionError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.core.progress import Progress, silent
-from lce_rig.judge.repeatability import Repeatability
-from lce_rig.pipeline.calibrate_sessions import (
-    calibrate,
-    compare_sensors,
-    require_apart,
-    require_independent,
-    require_same,
-    session_names,
-)
-from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, OTHER_BOARD, OUTDATED
+from lce_rig.judge.repeatability import Repeatability, compare_calibrations
+from lce_rig.pipeline.calibration import calibrate
+from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, ONLY_ONE, OTHER_BOARD, OUTDATED
 from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_folder, stored_results
 from lce_rig.session import Session
+from lce_rig.session.identity import differing_keys
 from lce_rig.session.session import CAPTURES
 
 
@@ -76,7 +71,7 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
             f"{listed} Add one: lce-rig calibrate {session.path} --name NAME, or name a second session.",
         )
     results = {name: list(_read(session, stored[name].folder).pairs) for name in chosen}
-    comparisons, lonely = compare_sensors(results, are_independent=False)
+    comparisons, lonely = _compare_sensors(results, are_independent=False)
     failures = _require_some(comparisons, results, "results")
     path = shlex.quote(str(session.path))
     outdated = [OUTDATED(name, session=path) for name in chosen if stored[name].is_outdated]
@@ -102,13 +97,9 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
     paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
         raise UsageError("a comparison requires two sessions or more, 1 given", "Give two sessions or more.")
-    sessions = dict(zip(session_names(paths), (Session.open(path) for path in paths), strict=True))
-    require_same(
-        sessions,
-        lambda key: key.is_of_lens_or_model,
-        "Put the same intrinsics into both (rig.yaml of the session) and calibrate again.",
-    )
-    require_independent(sessions)
+    sessions = dict(zip(_session_names(paths), (Session.open(path) for path in paths), strict=True))
+    _require_same(sessions)
+    _require_independent(sessions)
     results: dict[str, list[Calibration]] = {}
     captures: dict[str, frozenset[str]] = {}
     calibrated: list[str] = []
@@ -146,7 +137,7 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
             captures[label] = frozenset(hashes)
         progress(done, len(sessions))
     # The result of several sessions contains the captures of each.
-    require_apart(
+    _require_apart(
         {f"the result of {label}": held for label, held in captures.items()},
         "Compare results of one session each (without --name), or of sessions that it does not contain.",
     )
@@ -156,10 +147,89 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
         for label, session in sessions.items()
         if session.rig.board != first.rig.board
     ]
-    comparisons, lonely = compare_sensors(results)
+    comparisons, lonely = _compare_sensors(results)
     failures = _require_some(comparisons, results, "sessions")
     findings = (*other_boards, *troubles, *lonely, *failures)
     return Repeat(first.rig.name, comparisons, tuple(calibrated), findings)
+
+
+def _session_names(paths: Sequence[Path]) -> list[str]:
+    """Name sessions by their folder, or by their path if two folders have the same name.
+
+    Raises:
+        UsageError: one is given twice.
+    """
+    resolved = [path.resolve() for path in paths]
+    for path, where in zip(paths, resolved, strict=True):
+        if resolved.count(where) > 1:
+            raise UsageError(f"{path} is given twice", "Give independent sessions.")
+    short = [path.name for path in resolved]
+    return short if len(set(short)) == len(short) else [str(path) for path in paths]
+
+
+def _require_same(sessions: Mapping[str, Session]) -> None:
+    """Refuse sessions of different rigs, or with other intrinsics.
+
+    Raises:
+        SessionError: with the keys.
+    """
+    (first_name, first), *others = sessions.items()
+    for name, session in others:
+        if session.rig.name != first.rig.name:
+            raise SessionError(
+                f"{first_name} belongs to rig {first.rig.name!r}, {name} to rig {session.rig.name!r}",
+                "Give sessions of one rig.",
+            )
+        keys = [str(key) for key in differing_keys(first.rig, session.rig) if key.is_of_lens_or_model]
+        if keys:
+            raise SessionError(
+                f"the profiles of {first_name} and {name} differ: {'; '.join(keys[:4])}",
+                "Put the same intrinsics into both (rig.yaml of the session) and calibrate again.",
+            )
+
+
+def _require_independent(sessions: Mapping[str, Session]) -> None:
+    """Refuse sessions that share images or scans: a copy agrees with its original despite any error."""
+    hashes: dict[str, set[str]] = {name: set() for name in sessions}
+    for name, session in sessions.items():
+        for capture in session.captures:
+            # A damaged capture is reported when it is read.
+            with suppress(SessionError):
+                hashes[name] |= capture.file_hashes
+    _require_apart(hashes, "Collect each session separately, with the board mounted again.")
+
+
+def _require_apart(contents: Mapping[str, Set[str]], hint: str) -> None:
+    """Refuse what holds the same samples, known by their hashes.
+
+    Raises:
+        SessionError: two of them share some.
+    """
+    for one, other in combinations(contents, 2):
+        if n_shared := len(contents[one] & contents[other]):
+            what = f"{one} and {other} share {n_shared} samples: they are not independent"
+            raise SessionError(what, hint)
+
+
+def _compare_sensors(
+    results: dict[str, list[Calibration]], *, are_independent: bool = True
+) -> tuple[tuple[Repeatability, ...], list[Finding]]:
+    """Compare each camera and LiDAR, and report those that only one session calibrates."""
+    groups: dict[tuple[str, str], dict[str, Calibration]] = {}
+    for name, calibrations in results.items():
+        for calibration in calibrations:
+            groups.setdefault((calibration.camera, calibration.lidar), {})[name] = calibration
+    comparisons = [
+        compare_calibrations(group, are_independent=are_independent)
+        for _, group in sorted(groups.items())
+        if len(group) > 1
+    ]
+    lonely = [
+        ONLY_ONE(next(iter(group)), camera=camera, lidar=lidar)
+        for (camera, lidar), group in sorted(groups.items())
+        if len(group) == 1
+    ]
+    return tuple(comparisons), lonely
 
 
 def _require_some(

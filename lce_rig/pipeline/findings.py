@@ -48,13 +48,6 @@ ONLY_ONE = Kind(
 OTHER_BOARD = Kind(
     "repeat.other_board", "{first} and {subject} were taken with different boards", severity="warning"
 )
-MOVED = Kind(
-    "union.moved",
-    "the extrinsics of {camera} and {lidar} from {first} and {second} differ by {rotation_deg:3deg} and "
-    "{translation_m:1mm}, more than their uncertainties allow (chance {p:.2g})",
-    "calibrate them separately: a sensor was moved, or one session is wrong",
-    actions={"odd_one": "leave out {odd_one}, where a sensor was moved; the others agree"},
-)
 OTHER_PROFILE = Kind(
     "verify.other_profile",
     "the profile of these samples differs from the result's in {keys}: judged with the result's intrinsics",

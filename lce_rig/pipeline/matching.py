@@ -24,7 +24,7 @@ def candidates_of(detections: Detections, pair: Pair) -> tuple[list[Observation]
         elif isinstance(lidar, Refusal):
             refused[name] = lidar
         else:
-            candidates.append(Observation.of(name, image, lidar, detections.session_of.get(name, "")))
+            candidates.append(Observation.of(name, image, lidar))
     return candidates, refused
 
 

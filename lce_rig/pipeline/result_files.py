@@ -1,10 +1,9 @@
 """Write the files of a result into its session in one step; keep the last usable earlier ones."""
 
 import hashlib
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +20,6 @@ from lce_rig.session.replacing import check_folder, copy_over
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
 
 RESULT, REPORT, OVERLAYS, PREVIOUS = "result.json", "report.html", "overlays", "previous"
-UNION = "union"
-"""How the result of several sessions is called in the first of them, unless it is named."""
 CURRENT = "current"
 """How the result in calibration/ is called beside those with names."""
 _LONGEST_NAME = 64
@@ -54,14 +51,11 @@ class Result:
         session: the source of the captures.
         pairs: one for each calibrated camera and LiDAR.
         shortages: for each other camera and LiDAR with captures, why it has no result.
-        sessions: by name, those of an estimate from several, `session` first; names of captures begin with
-            that of their session and a slash. Empty for one session.
     """
 
     session: Session
     pairs: tuple[Calibration, ...]
     shortages: tuple[Finding, ...] = ()
-    sessions: Mapping[str, Session] = field(default_factory=dict)
 
     def of(self, camera: str, lidar: str | None = None) -> Calibration:
         """Return the extrinsics of a camera with a LiDAR, by default the first with a result.
@@ -79,24 +73,20 @@ class Result:
         """Robot, sensors and date.
 
         Raises:
-            SessionError: captures are of different robots, or of different units of a sensor.
+            SessionError: captures are of different units of a sensor.
         """
-        return provenance_of([*self.sessions.values()] or [self.session])
+        return provenance_of(self.session)
 
     def file(self) -> ResultFile:
-        """Build result.json; other sessions are named by their path from the first.
+        """Build result.json.
 
         Raises:
             SessionError: a capture that was used is missing, or `provenance` raises it.
         """
-        main = self.session.path.resolve()
         return ResultFile(
             rig=self.session.rig.name,
             provenance=self.provenance,
-            inputs_sha256=inputs_sha256(self.session, self.pairs, self.sessions),
-            sessions={
-                name: os.path.relpath(session.path.resolve(), main) for name, session in self.sessions.items()
-            },
+            inputs_sha256=inputs_sha256(self.session, self.pairs),
             pairs=self.pairs,
         )
 
@@ -121,7 +111,6 @@ class Result:
 
         Args:
             folder: None for the session's calibration/; in any other folder files are replaced one by one.
-                Several sessions' result goes into results/union/ of the first instead.
             name: writes the session's results/NAME/ instead, in the same way; calibration/ is untouched.
             force: export failed results too; each file then says so.
             report: write report.html, too, as `write_report` does; that of another result does not stay.
@@ -164,7 +153,7 @@ class Result:
         text = file.text()
         place, is_in_session = self._place(folder, name)
         has_previous = is_in_session and bool(_usable(place / PREVIOUS))
-        page = report_text(self.session, self.sessions, file, text, OVERLAYS, has_previous=has_previous)
+        page = report_text(self.session, file, text, OVERLAYS, has_previous=has_previous)
         if not is_in_session:
             write_atomically(place / REPORT, page)
             return place / REPORT
@@ -185,7 +174,7 @@ class Result:
         root = self.session.path
         if folder is not None and Path(folder).resolve() != (root / CALIBRATION).resolve():
             return Path(folder), False
-        return result_folder(root, UNION if self.sessions and name is None else name, is_new=True), True
+        return result_folder(root, name, is_new=True), True
 
     def _write_into(self, folder: Path, *, force: bool) -> tuple[list[str], tuple[Finding, ...]]:
         """Write result.json and the exports of usable results.
@@ -231,72 +220,24 @@ def result_folder(session: Path, name: str | None = None, *, is_new: bool = Fals
     return session / RESULTS / name
 
 
-def inputs_sha256(
-    session: Session, calibrations: Sequence[Calibration], sessions: Mapping[str, Session] | None = None
-) -> dict[str, str]:
+def inputs_sha256(session: Session, calibrations: Sequence[Calibration]) -> dict[str, str]:
     """Fingerprint the inputs of results: the profile, and the manifest of every capture used.
 
     A manifest holds the SHA-256 of the capture's files.
 
-    Args:
-        session: the source of the captures.
-        calibrations: the results.
-        sessions: of an estimate from several, as in `Result`.
-
     Returns:
-        SHA-256 by path in the session; of several sessions, by name of the session and path in it.
+        SHA-256 by path in the session.
 
     Raises:
         SessionError: a capture that was used is missing.
     """
-    used = sorted({name for calibration in calibrations for name in calibration.captures_used})
-    digests = {}
-    for name, part in (sessions or {"": session}).items():
-        start = f"{name}/" if name else ""
-        digests[start + PROFILE] = hashlib.sha256((part.path / PROFILE).read_bytes()).hexdigest()
-        held = {capture.name: capture for capture in part.captures}
-        for own in _of_session(name, used):
-            # `Session.capture` raises where one is missing; it lists the folder each time.
-            capture = held.get(own) or part.capture(own)
-            digests[f"{start}{CAPTURES}/{own}/{MANIFEST}"] = capture.manifest_sha256
+    digests = {PROFILE: hashlib.sha256((session.path / PROFILE).read_bytes()).hexdigest()}
+    held = {capture.name: capture for capture in session.captures}
+    for name in sorted({name for calibration in calibrations for name in calibration.captures_used}):
+        # `Session.capture` raises where one is missing; it lists the folder each time.
+        capture = held.get(name) or session.capture(name)
+        digests[f"{CAPTURES}/{name}/{MANIFEST}"] = capture.manifest_sha256
     return digests
-
-
-def _of_session(name: str, captures: Iterable[str]) -> list[str]:
-    """Give a session's own names of its captures among those of several sessions."""
-    split = (capture.rpartition("/") for capture in captures)
-    return [capture for session, _, capture in split if session == name]
-
-
-def as_named_in(session: Session, result: ResultFile) -> tuple[Calibration, ...]:
-    """Give the calibrations of several sessions with the captures of one of them, named as in it.
-
-    A session is recognised by its captures' manifests, wherever it lies. Of a session that was no part of the
-    estimate, no capture was used.
-
-    Args:
-        session: any session of the rig.
-        result: of several sessions.
-    """
-    manifests: set[str] = set()
-    for capture in session.captures:
-        with suppress(SessionError):  # a damaged capture is reported when it is read
-            manifests.add(capture.manifest_sha256)
-    shared = [path for path, digest in result.inputs_sha256.items() if digest in manifests]
-    is_part = [name for name in result.sessions if any(p.startswith(f"{name}/{CAPTURES}/") for p in shared)]
-    name = is_part[0] if is_part else ""
-    return tuple(
-        replace(
-            c,
-            captures_used=tuple(_of_session(name, c.captures_used)),
-            captures_refused={
-                capture: refusal
-                for qualified, refusal in c.captures_refused.items()
-                for capture in _of_session(name, [qualified])
-            },
-        )
-        for c in result.pairs
-    )
 
 
 def _usable(folder: Path) -> set[str]:
@@ -398,10 +339,7 @@ def stored_results(session: Session) -> list[StoredResult]:
             if file is not None:
                 is_outdated = True
                 with suppress(LceRigError):
-                    parts = {
-                        label: Session.open(session.path / path) for label, path in file.sessions.items()
-                    }
-                    is_outdated = dict(file.inputs_sha256) != inputs_sha256(session, file.pairs, parts)
+                    is_outdated = dict(file.inputs_sha256) != inputs_sha256(session, file.pairs)
             written_s = (folder / RESULT).stat().st_mtime
             results.append(StoredResult(name, folder, file, problem, written_s, is_outdated))
     return results

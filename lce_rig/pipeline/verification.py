@@ -24,7 +24,6 @@ from lce_rig.pipeline.result_files import (
     OVERLAYS,
     RESULT,
     Result,
-    as_named_in,
     keep_foreign,
     result_content,
     result_folder,
@@ -244,9 +243,7 @@ def _extrinsics(
     if saved.rig != session.rig.name or not calibrations:
         what = f"the result belongs to rig {saved.rig!r}" if calibrations else "the result holds no pair"
         raise SessionError(f"{what}; the session {session.path} belongs to rig {session.rig.name!r}")
-    if saved.sessions:
-        calibrations = as_named_in(session, saved)
-    elif not is_own:
+    if not is_own:
         # Names of captures differ between sessions: none of these was fitted.
         calibrations = tuple(replace(c, captures_used=(), captures_refused={}) for c in calibrations)
     return calibrations, content if is_stored else None

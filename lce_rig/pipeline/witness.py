@@ -90,22 +90,16 @@ def scene_views(
     return views
 
 
-def sharpen(sessions: Sequence[Session], found: Sequence[Detections], by_boards: Calibration) -> SceneShare:
+def sharpen(session: Session, detections: Detections, by_boards: Calibration) -> SceneShare:
     """Add what the edges of the scene tell to extrinsics that boards gave.
 
     Args:
-        sessions: of the captures; damaged ones are skipped.
-        found: detections of each: edges at the board and its holder are left out.
+        session: of the captures; damaged ones are skipped.
+        detections: of this session: edges at the board and its holder are left out.
         by_boards: the extrinsics by the boards alone.
     """
-    lens = sessions[0].rig.lens_of(by_boards)
-    n_most = MAX_CAPTURES // len(sessions)
-    views = [
-        view
-        for session, detections in zip(sessions, found, strict=True)
-        for view in without_movers(scene_views(session, detections, by_boards, n_most))
-    ]
-    return share_of(views, lens, by_boards)
+    views = without_movers(scene_views(session, detections, by_boards, MAX_CAPTURES))
+    return share_of(views, session.rig.lens_of(by_boards), by_boards)
 
 
 def share_of(views: Sequence[SceneView], lens: Intrinsics, by_boards: Calibration) -> SceneShare:

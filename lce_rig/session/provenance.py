@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,40 +19,39 @@ _FIRST_UTC_NS = 946_684_800 * 10**9
 _LAST_UTC_NS = 4_102_444_800 * 10**9
 
 
-def provenance_of(sessions: Sequence[Session]) -> Provenance:
-    """Gather where a result of one session, or of several together, comes from.
+def provenance_of(session: Session) -> Provenance:
+    """Gather where a result comes from.
 
     Raises:
-        SessionError: captures are of different robots, or of different units of a sensor.
+        SessionError: two units of one sensor took the captures.
     """
-    robots = sorted({session.rig.robot for session in sessions if session.rig.robot})
-    if len(robots) > 1:
-        raise SessionError(
-            f"the captures are of several robots: {', '.join(robots)}", "Calibrate each robot alone."
-        )
-    date = max(filter(None, map(date_of, sessions)), default=None)
-    imported = None if date else max(filter(None, map(_imported, sessions)), default=None)
-    return Provenance("".join(robots), serials_of(sessions), date, content_sha256(sessions), imported)
+    date = date_of(session)
+    return Provenance(
+        robot=session.rig.robot or "",
+        serials=serials_of(session),
+        date=date,
+        session_sha256=content_sha256(session),
+        imported=None if date else _imported(session),
+    )
 
 
-def serials_of(sessions: Iterable[Session]) -> dict[str, str]:
+def serials_of(session: Session) -> dict[str, str]:
     """Give the serial number of each sensor that told one, or whose profile states one.
 
     Raises:
         SessionError: two units of one sensor took the captures.
     """
     sources: dict[str, tuple[str, str]] = {}
-    for session in sessions:
-        devices = [(c.name, c.serials) for c in _readable(session.captures)]
-        for where, serials in (("the profile", stated_serials(session.rig)), *devices):
-            for sensor, serial in serials.items():
-                first, other = sources.setdefault(sensor, (where, serial))
-                if other != serial:
-                    raise SessionError(
-                        f"{session.path}: {sensor} has serial number {other} in {first}, {serial} in {where}",
-                        "One result requires one set of sensors: reject the captures of the other unit with "
-                        f"`lce-rig captures {session.path}`, or correct `serial` in rig.yaml.",
-                    )
+    devices = [(c.name, c.serials) for c in _readable(session.captures)]
+    for where, serials in (("the profile", stated_serials(session.rig)), *devices):
+        for sensor, serial in serials.items():
+            first, other = sources.setdefault(sensor, (where, serial))
+            if other != serial:
+                raise SessionError(
+                    f"{session.path}: {sensor} has serial number {other} in {first}, {serial} in {where}",
+                    "One result requires one set of sensors: reject the captures of the other unit with "
+                    f"`lce-rig captures {session.path}`, or correct `serial` in rig.yaml.",
+                )
     return {sensor: serial for sensor, (_, serial) in sorted(sources.items())}
 
 
@@ -86,21 +85,19 @@ def _in_utc(time: datetime) -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def content_sha256(sessions: Iterable[Session]) -> str:
-    """Fingerprint what results are computed from: profiles, and all samples and timestamps of all captures.
+def content_sha256(session: Session) -> str:
+    """Fingerprint what results are computed from: the profile, all samples and timestamps of all captures.
 
     It does not depend on where a session lies, on names of recordings, on the robot's name, or on how sensors
     are reached. The order of captures counts, as random subsets are drawn by it. A capture is known by the
     SHA-256 of its files in its manifest, which reading a capture checks.
     """
-    digest = hashlib.sha256()
-    for session in sessions:
-        digest.update(_canonical(_profile(session.rig)))
-        for capture in session.captures:
-            try:
-                digest.update(_canonical(capture.contents))
-            except SessionError:  # Detection refuses it.
-                digest.update(b"damaged\n")
+    digest = hashlib.sha256(_canonical(_profile(session.rig)))
+    for capture in session.captures:
+        try:
+            digest.update(_canonical(capture.contents))
+        except SessionError:  # Detection refuses it.
+            digest.update(b"damaged\n")
     return digest.hexdigest()
 
 

@@ -47,6 +47,8 @@ PROFILE_TEXT = "profile.yaml"
 CAPTURES, REJECTED, DETECTIONS, DRAFT_PREFIX = "captures", "rejected", "detections", ".new-"
 CAPTURED = "captured"
 """The journal's event of a capture."""
+# The keys of a profile by which captures are read.
+_OF_CAPTURES = ("name", "robot", "board", "cameras", "lidars")
 CALIBRATION, RESULTS, INTRINSICS, DEBUG = "calibration", "results", "intrinsics", "debug"
 
 
@@ -346,6 +348,32 @@ class Session:
         contents.setdefault(Capture(folder).content_sha256, name)
         self.journal(CAPTURED, capture=name)
         return name
+
+    def add_session(self, other: "Session") -> list[str]:
+        """Copy the captures of another session of this rig, but those that this one holds or has rejected.
+
+        Args:
+            other: of the same board and sensors; limits and targets may differ.
+
+        Returns:
+            The names of the copies.
+
+        Raises:
+            SessionError: the session is of another rig, a capture is damaged, or as of `add_capture`.
+        """
+        foreign = [key for key in differing_keys(other.rig, self.rig) if key.path[0] in _OF_CAPTURES]
+        if foreign:
+            raise _of_another_rig(self, other.rig, foreign, "Correct the wrong rig.yaml.")
+        return [
+            self.add_capture(
+                [each.image(*key) for key in each.image_keys],
+                [each.scan(lidar) for lidar in each.lidars],
+                each.meta,
+                [each.events(camera) for camera in each.event_cameras],
+            )
+            for each in other.captures
+            if each.content_sha256 not in self._contents()
+        ]
 
     @property
     def next_name(self) -> str:

@@ -1,6 +1,7 @@
 """`lce-rig captures` as a user types it."""
 
 import json
+import shutil
 
 import pytest
 
@@ -56,3 +57,12 @@ def test_the_list_names_every_capture_and_a_damaged_one(lce_rig, session):
     outcome = lce_rig("captures", session)
     assert outcome.code == 0 and outcome.out.count("00000") >= 10
     assert "000003" in listed(lce_rig, session)["000003"]["damage"]
+
+
+def test_captures_of_another_session_are_added_once(lce_rig, session, tmp_path):
+    shutil.copytree(session, tmp_path / "friday")
+    shutil.rmtree(session / "captures" / "000003")
+    for n_added in (1, 0):
+        added = json.loads(lce_rig("captures", session, "--add", tmp_path / "friday", "--json").out)
+        assert len(added["captures"]) == n_added
+    assert lce_rig("calibrate", session, tmp_path / "friday").code == 2

@@ -2,16 +2,13 @@
 
 import json
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import read_result
 from lce_rig.core.data import Image
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import perturb
-from lce_rig.pipeline.result_files import Result
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
 from tests.saved_results import made_calibration, write_result
@@ -100,15 +97,8 @@ def test_a_copy_is_no_second_session(lce_rig, made, tmp_path):
     assert "monday" in outcome.err and "copy" in outcome.err
 
 
-def test_a_picture_or_a_session_in_two_results_makes_them_one(lce_rig, made):
-    paths = {name: made(name, [0] * 6) for name in ("monday", "tuesday", "wednesday")}
-    opened = {name: Session.open(path) for name, path in paths.items()}
-    for name in ("monday", "wednesday"):
-        (own,) = read_result(paths[name] / "calibration" / "result.json").pairs
-        both = {name: opened[name], "tuesday": opened["tuesday"]}
-        union = replace(own, captures_used=(f"{name}/000000", "tuesday/000000"))
-        Result(opened[name], (union,), sessions=both).write(name="union")
-    assert lce_rig("repeat", paths["monday"], paths["wednesday"], "--name", "union").code == 4
+def test_a_picture_in_two_sessions_makes_them_one(lce_rig, made):
+    paths = {name: made(name, [0] * 6) for name in ("monday", "wednesday")}
     assert lce_rig("repeat", paths["monday"], paths["wednesday"]).code == 0
     pixels = np.full((260, 346), 80, np.uint8)
     for name, stamp_ns in (("monday", 1), ("wednesday", None)):

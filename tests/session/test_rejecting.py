@@ -45,6 +45,23 @@ def test_neither_the_name_nor_the_data_of_a_rejected_capture_is_taken_anew(sessi
         assert names(again.captures) == ["000000", "000001", "000002", "000003"]
 
 
+def test_another_sessions_captures_come_in_once_and_as_they_were(session, tmp_path, rig, samples):
+    with Session.create(tmp_path / "friday", rig) as friday:
+        for seed in (2, 7, 8):
+            friday.add_capture(*samples(seed), {"source": {"key": f"f:{seed}"}})
+    session.reject("000001")
+    assert session.add_session(friday) == ["000003", "000004"]
+    assert session.add_session(friday) == []
+    copied, source = session.capture("000003"), friday.capture("000001")
+    assert (copied.contents, copied.meta) == (source.contents, source.meta)
+    board = rig.board.model_copy(update={"width_m": 0.9})
+    with Session.create(tmp_path / "other", rig.model_copy(update={"board": board})) as other:
+        other.add_capture(*samples(9), {})
+    with pytest.raises(SessionError):
+        session.add_session(other)
+    assert len(session.captures) == 4
+
+
 @pytest.mark.parametrize("verb", ["reject", "restore"])
 def test_a_capture_that_is_not_there_is_named(session, verb):
     with pytest.raises(SessionError, match="000009"):

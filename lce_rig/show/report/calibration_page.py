@@ -44,7 +44,6 @@ _STANDS_OUT, _MOST_PICTURES = 2.0, 96
 
 def report_text(
     session: Session,
-    sessions: Mapping[str, Session],
     file: ResultFile,
     text: str,
     overlays: str,
@@ -55,7 +54,6 @@ def report_text(
 
     Args:
         session: whose result it is.
-        sessions: of an estimate from several, by name, `session` first.
         file: the result; text: the same as it is written.
         overlays: the folder of overlays beside the report.
         has_previous: whether `previous/` beside the report holds a usable result.
@@ -64,15 +62,12 @@ def report_text(
 
     def paths(c: Calibration, capture: str) -> list[str]:
         """Name a capture's overlays as `verify` of the session does."""
-        name = capture.rpartition("/")[2]
-        if sessions and capture != f"{next(iter(sessions))}/{name}":
-            return []
-        held = session.capture(name)
+        held = session.capture(capture)
         paths = []
         for channel in c.channels:
             if held.has_image(c.camera, channel) or (channel == "events" and c.camera in held.event_cameras):
                 folder = f"{Pair(c.camera, channel, c.lidar).folder_name}/" if n_pairs > 1 else ""
-                paths.append(f"{overlays}/{folder}{name}.png")
+                paths.append(f"{overlays}/{folder}{capture}.png")
         return paths
 
     origin = file.provenance
@@ -81,7 +76,6 @@ def report_text(
         ("robot", origin.robot),
         ("date of the captures", origin.date_words),
         *((f"serial number of {name}", serial) for name, serial in sorted(origin.serials.items())),
-        ("sessions", ", ".join(file.sessions)),
         ("method", ", ".join(dict.fromkeys(c.method for c in file.pairs))),
         ("made by", file.made_by),
         ("SHA-256 of the session", origin.session_sha256),
@@ -90,19 +84,13 @@ def report_text(
     facts = [(name, value) for name, value in facts if value]
 
     def picture(c: Calibration, capture: str) -> str:
-        of_session, _, name = capture.rpartition("/")
-        source = sessions.get(of_session, session)
         with suppress(LceRigError):
             board, lens = session.rig.board.to_board(), session.rig.cameras[c.camera].to_intrinsics()
-            return picture_of(source.capture(name), c, capture, board, lens)
+            return picture_of(session.capture(capture), c, board, lens)
         return ""
 
     def rejecting(capture: str) -> str:
-        of_session, _, name = capture.rpartition("/")
-        if sessions:
-            where = shlex.quote(sessions.get(of_session, session).path.resolve().name)
-            return f"lce-rig captures {where} --reject {name}"
-        return f"lce-rig calibrate {shlex.quote(session.path.resolve().name)} --without {name}"
+        return f"lce-rig calibrate {shlex.quote(session.path.resolve().name)} --without {capture}"
 
     return calibration_page(
         session.rig,

@@ -25,20 +25,19 @@ _QUALITIES = (75, 60, 45, 30, 15)
 _EVENTS_NS = 20_000_000
 
 
-def picture_of(capture: Capture, c: Calibration, name: str, board: Board, lens: Intrinsics) -> str:
+def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics) -> str:
     """Draw a capture's image with the board's outline; raw events where it holds no image.
 
     Args:
         capture: with the data.
         c: the result, whose channels are looked at in their order.
-        name: of the capture in the result.
         board: of the outline.
         lens: of the camera.
 
     Returns:
         A data URI of at most `MOST_BYTES`; "" where the capture holds no picture, or a damaged one.
     """
-    observation = c.observations.get(name)
+    observation = c.observations.get(capture.name)
     outline, stamp_ns = np.empty((0, 2)), None
     if observation is not None:
         outline = outline_px(observation.image.T_cam_board, board, lens)
