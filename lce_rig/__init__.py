@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from lce_rig.core.findings import Finding, Refusal
     from lce_rig.detect.detection import Detections
     from lce_rig.export import export
-    from lce_rig.export.reference import Reference, read_reference
+    from lce_rig.export.extrinsics import Reference, read_reference
     from lce_rig.io.protocol import SourceOptions
     from lce_rig.pipeline.calibration import calibrate
     from lce_rig.pipeline.collect_recordings import collect_from
@@ -99,7 +99,7 @@ _HOMES = {
     "lce_rig.core.findings": ("Finding", "Refusal"),
     "lce_rig.detect.detection": ("Detections",),
     "lce_rig.export": ("export",),
-    "lce_rig.export.reference": ("Reference", "read_reference"),
+    "lce_rig.export.extrinsics": ("Reference", "read_reference"),
     "lce_rig.pipeline.collect_recordings": ("collect_from",),
     "lce_rig.pipeline.detect_session": ("detect",),
     "lce_rig.pipeline.pair_drift": ("DriftReport",),

@@ -31,7 +31,7 @@ from lce_rig.core.files import read_json
 from lce_rig.core.geometry import Array, sigma_sizes
 from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
-from lce_rig.export.reference import read_reference
+from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import consequences, lacks_captures, weakest_words
 from lce_rig.pipeline.result_files import Result, WrittenResult, result_folder
 from lce_rig.rig import find_profile, read_profile

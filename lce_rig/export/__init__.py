@@ -2,21 +2,97 @@
 
 import shutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
 
 import numpy as np
 
-from lce_rig.core.calibration import Calibration
+from lce_rig.core.calibration import MADE_BY, Calibration
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError, reading
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import difference, tangent_sizes
 from lce_rig.export.findings import MOUNT_UNUSED
-from lce_rig.export.job import ExportJob
-from lce_rig.export.robot_tree import RobotTree, require_known
+from lce_rig.export.robot_tree import FrameTree, RobotTree, build_trees, choose_channels, require_known
 from lce_rig.rig import Rig
 from lce_rig.session import Session
+from lce_rig.session.durable import write_atomically
+
+
+@dataclass(frozen=True, eq=False)
+class ExportJob:
+    """The source of an output.
+
+    Attributes:
+        calibrations: one for each camera channel and LiDAR.
+        rig: the profile the calibrations belong to.
+        folder: for the files.
+        robot: its own tree of frames; None where outputs hang from the profile's `mount` or root.
+        session: with the images and scans; None where only results are at hand.
+        findings: content that was left out of the outputs or put into another form, and why; grows.
+    """
+
+    calibrations: Sequence[Calibration]
+    rig: Rig
+    folder: Path
+    robot: RobotTree | None = None
+    session: Session | None = None
+    findings: list[Finding] = field(default_factory=list)
+
+    @cached_property
+    def chosen(self) -> list[Calibration]:
+        """One calibration of each camera and LiDAR."""
+        return choose_channels(self.calibrations, self.rig)
+
+    @cached_property
+    def trees(self) -> list[FrameTree]:
+        """The trees of frames in which outputs place the sensors."""
+        return build_trees(self.calibrations, self.rig, self.robot)
+
+    def name_of(self, calibration: Calibration) -> str:
+        """Name files of one camera and LiDAR: by the camera, and by the LiDAR too where there are several."""
+        both = f"{calibration.camera}_{calibration.lidar}"
+        return both if len(self.rig.lidars) > 1 else calibration.camera
+
+    def image_topic(self, calibration: Calibration) -> str:
+        """Name the topic of a calibration's images."""
+        camera = self.rig.cameras[calibration.camera]
+        return camera.channels[calibration.channels[0]].topic or f"/{calibration.camera}"
+
+    def head(self, content: str, *calibrations: Calibration, of_one_camera: bool = False) -> list[str]:
+        """List the lines at the head of a file: content, program, whether to use it.
+
+        Args:
+            content: of the file.
+            calibrations: those in the file.
+            of_one_camera: whether the file is for one camera; else the head names cameras that it lacks.
+        """
+        lines = [f"{content} of rig {self.rig.name}, written by {MADE_BY}"]
+        for calibration in calibrations:
+            pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
+            deg, mm = calibration.sigma_rotation_deg, 1e3 * calibration.sigma_translation_m
+            lines.append(f"{pair}: {calibration.verdict}, standard deviation {deg:.3f} deg, {mm:.2f} mm")
+            if calibration.verdict == "fail":
+                reasons = "; ".join(finding.sentence for finding in calibration.findings)
+                reasons = " ".join(reasons.split()) or "no reason given"
+                lines.append(f"NOT FOR USE: the calibration of {pair} failed: {reasons}")
+        present = {calibration.camera for calibration in calibrations}
+        absent = [camera for camera in self.rig.cameras if camera not in present]
+        if absent and not of_one_camera:
+            lines.append(f"not in this file, without a usable result: {', '.join(absent)}")
+        return lines
+
+    def write(self, name: str, lines: Sequence[str]) -> Path:
+        """Write a text file into the folder; it is there whole or not at all.
+
+        Raises:
+            SessionError: a full disk, no permission.
+        """
+        path = self.folder / name
+        write_atomically(path, "\n".join(lines) + "\n")
+        return path
+
 
 Exporter = Callable[[ExportJob], list[Path]]
 
@@ -45,19 +121,17 @@ EXPORTS: dict[str, Format] = {
         "extrinsics:export_extrinsics", "extrinsics.yaml: pose, inverse, example point, covariance"
     ),
     "urdf": _usual("urdf:export_urdf", "RIG.urdf: for robot_state_publisher"),
-    "camera_info": _usual(
-        "camera_info:export_camera_info", "camera_info_CAMERA.yaml: for ROS camera drivers"
-    ),
+    "camera_info": _usual("ros_files:export_camera_info", "camera_info_CAMERA.yaml: for ROS camera drivers"),
     "static_tf": _usual(
-        "static_tf:export_static_tf", "static_transforms.txt: static_transform_publisher lines, ROS 1 and 2"
+        "ros_files:export_static_tf", "static_transforms.txt: static_transform_publisher lines, ROS 1 and 2"
     ),
-    "ros2_launch": Format("static_tf:export_ros2_launch", "RIG.launch.py: a ROS 2 launch file"),
+    "ros2_launch": Format("ros_files:export_ros2_launch", "RIG.launch.py: a ROS 2 launch file"),
     "tf_static_bag": Format(
         "ros_bag:export_tf_static_bag", "tf_static/: a ROS 2 bag with latched /tf_static"
     ),
     "kalibr": Format("other_tools:export_kalibr", "camchain_LIDAR.yaml: Kalibr's camera chain"),
     "autoware": Format(
-        "autoware:export_autoware",
+        "other_tools:export_autoware",
         "sensor_kit_calibration.yaml, sensors_calibration.yaml: Autoware's individual_params",
     ),
     "fast_livo2": Format(

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image, Scan
+from lce_rig.export import ExportJob
 from lce_rig.export.findings import NO_IMAGES, NO_SESSION
-from lce_rig.export.job import ExportJob
 from lce_rig.scene.colouring import colour_points
 from lce_rig.session.durable import write_atomically
 

@@ -34,7 +34,7 @@ from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.export.reference import Reference
+from lce_rig.export.extrinsics import Reference
 from lce_rig.judge.camera_pairs import CameraEvidence, CameraPair, camera_findings, find_exchanged, relate
 from lce_rig.judge.contributions import profile_covariance
 from lce_rig.judge.findings import lacks_captures

@@ -14,7 +14,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.files import read_json
 from lce_rig.core.phrasing import as_line, significant
-from lce_rig.export.camera_info import camera_info_text
+from lce_rig.export.ros_files import camera_info_text
 from lce_rig.export.writing import number, numbers
 from lce_rig.judge.findings import verdict_of
 from lce_rig.pipeline.measure_intrinsics import MeasuredIntrinsics

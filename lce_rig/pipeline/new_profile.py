@@ -15,7 +15,7 @@ from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import TYPICAL, find_data_sheet
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.detect.lidar.segments import order_scan
-from lce_rig.export.camera_info import load_camera_info
+from lce_rig.export.ros_files import load_camera_info
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.decoding import DECODERS, read_cloud
 from lce_rig.io.ros.topics import SensorTopic, survey_bag

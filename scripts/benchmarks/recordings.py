@@ -39,7 +39,7 @@ class RecordedSet:
 
     def reference(self) -> Array:
         """Read the reference extrinsic that comes with it."""
-        from lce_rig.export.reference import read_reference
+        from lce_rig.export.extrinsics import read_reference
 
         folder = recordings() / self.folders[0][0]
         if (folder / "reference.json").exists():

@@ -16,9 +16,9 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
 from lce_rig.export import EXPORTS, export, export_formats
-from lce_rig.export.camera_info import load_camera_info
 from lce_rig.export.other_tools import fit_coefficients
 from lce_rig.export.robot_tree import Joint, RobotTree, build_trees
+from lce_rig.export.ros_files import load_camera_info
 from lce_rig.export.urdf import read_robot_urdf
 from lce_rig.export.writing import T_BODY_OPTICAL
 from lce_rig.rig import Rig

@@ -9,9 +9,8 @@ import pytest
 
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.geometry import Array, perturb
-from lce_rig.export import EXPORTS, is_export, remove_exports, usual_formats
+from lce_rig.export import EXPORTS, ExportJob, is_export, remove_exports, usual_formats
 from lce_rig.export.coloured_cloud import coloured
-from lce_rig.export.job import ExportJob
 from lce_rig.rig import load_rig
 from lce_rig.rig.profile import OutputFormat
 from tests.export.readers import MODELS, READERS, Case, off_px, outputs_case, session_image

@@ -9,7 +9,7 @@ import yaml
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
-from lce_rig.export.camera_info import load_camera_info
+from lce_rig.export.ros_files import load_camera_info
 from lce_rig.judge.intrinsics_check import judge_lens
 from lce_rig.pipeline.intrinsics_files import profile_block, save_profile, write_intrinsics
 from lce_rig.pipeline.measure_intrinsics import measure_intrinsics

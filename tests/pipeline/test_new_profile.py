@@ -5,7 +5,7 @@ import pytest
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError, UsageError
-from lce_rig.export.camera_info import camera_info_text
+from lce_rig.export.ros_files import camera_info_text
 from lce_rig.pipeline.new_profile import new_profile, parse_board, parse_intrinsics
 from lce_rig.rig import parse_rig
 
