@@ -10,7 +10,7 @@ import numpy as np
 
 import lce_rig as lce
 from lce_rig.cli import show
-from lce_rig.cli.captures import put_aside
+from lce_rig.cli.contents import put_aside
 from lce_rig.cli.options import (
     cameras_option,
     require_sensors,
@@ -21,7 +21,6 @@ from lce_rig.cli.options import (
 from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.core.calibration import (
     DEFAULT_METHOD,
-    AxisOpinion,
     Calibration,
     Method,
     SceneOpinion,
@@ -45,28 +44,33 @@ _CORRECTED = {"verdict.intrinsics", "verdict.scale"}
 _N_REASONS, _FAR_M = 3, 10.0
 
 
-def uncertainty_lines(c: Calibration) -> list[str]:
-    """State extrinsics's standard deviations, by axis and for points at several distances."""
-
+def _uncertainty_lines(c: Calibration, *, is_explained: bool) -> list[str]:
+    """State the standard deviations, by axis unless the result has failed, and for points at distances."""
     sigmas = np.sqrt(np.diag(c.cov))
-    lines = [
-        _sigma_line(c.sigma_rotation_deg, c.sigma_translation_m),
-        f"               about {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg",
-        f"               along {_by_axis(1000 * sigmas[:3], '.1f')} mm",
-    ]
+    lines = [_sigma_line(c.sigma_rotation_deg, c.sigma_translation_m)]
+    if c.verdict == "fail" and not is_explained:
+        return lines
+    lines += [f"    about      {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg"]
+    lines += [f"    along      {_by_axis(1000 * sigmas[:3], '.1f')} mm"]
+    if not is_explained:
+        return lines + [
+            f"  {_FAR_M:g} m away    a point is off by {point.centre_px:.1f} px, "
+            f"{100 * point.centre_m:.1f} cm; in a corner {point.corner_px:.1f} px"
+            for point in c.uncertainty
+            if point.distance_m == _FAR_M
+        ]
     if c.scene_share is not None and c.scene_share.state == "used":
         sigma_deg, sigma_m = sigma_sizes(c.scene_share.cov_boards)
         lines.append(f"               of the boards alone {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm")
     if c.weakest:
         lines.append(f"  weakest: {weakest_words(c.weakest)}")
-    if c.uncertainty:
-        rows = {
-            "a point": [f"{each.distance_m:g} m away" for each in c.uncertainty],
-            "  in centre": [f"{e.centre_px:.1f} px, {100 * e.centre_m:.1f} cm" for e in c.uncertainty],
-            "  in corner": [f"{e.corner_px:.1f} px, {100 * e.corner_m:.1f} cm" for e in c.uncertainty],
-        }
-        for title, cells in rows.items():
-            lines.append(f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip())
+    rows = {
+        "a point": [f"{each.distance_m:g} m away" for each in c.uncertainty],
+        "  in centre": [f"{e.centre_px:.1f} px, {100 * e.centre_m:.1f} cm" for e in c.uncertainty],
+        "  in corner": [f"{e.corner_px:.1f} px, {100 * e.corner_m:.1f} cm" for e in c.uncertainty],
+    }
+    for title, cells in rows.items() if c.uncertainty else ():
+        lines.append(f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip())
     return lines
 
 
@@ -87,34 +91,16 @@ def scene_texts(opinion: SceneOpinion) -> list[str]:
         return [f"cannot tell: too few edges ({edges})"]
     texts = [f"{_OPINIONS[opinion.state]} ({edges})"]
     texts += [
-        f"{motion_words(axis.axis)}: {_value(axis, axis.change, '+')} +- {_value(axis, axis.sigma)} "
-        f"{_UNITS[axis.unit]}"
+        f"{motion_words(axis.axis)}: {show.amount(axis.change, axis.unit, '+')} +- "
+        f"{show.amount(axis.sigma, axis.unit)} {_UNITS[axis.unit]}"
         for axis in opinion.of("contradicts")
     ]
-    texts += [f"would see changes {kind}" for kind in _by_kind(opinion.of("agrees"), with_size=True)]
+    sizes = {axis.axis: show.amount(axis.smallest, axis.unit) for axis in opinion.of("agrees")}
+    texts += [f"would see changes {kind}" for kind in show.axes_by_kind(sizes)]
     if opinion.state != "unknown" and opinion.of("unknown"):
-        texts.append(f"cannot tell changes {'; '.join(_by_kind(opinion.of('unknown')))}")
+        blind = show.axes_by_kind({axis.axis: "" for axis in opinion.of("unknown")})
+        texts.append(f"cannot tell changes {'; '.join(blind)}")
     return texts
-
-
-def _by_kind(axes: Sequence[AxisOpinion], *, with_size: bool = False) -> list[str]:
-    """Name axes as rotations about and translations along x, y and z."""
-    parts = []
-    for unit, kind in (("deg", "about"), ("m", "along")):
-        names = [
-            f"{each.axis[-1]} {_value(each, each.smallest)}" if with_size else each.axis[-1]
-            for each in axes
-            if each.unit == unit
-        ]
-        if names:
-            parts.append(f"{kind} {', '.join(names)}{' ' + _UNITS[unit] if with_size else ''}")
-    return parts
-
-
-def _value(axis: AxisOpinion, value: float | None, sign: str = "") -> str:
-    if value is None:
-        return "?"
-    return f"{value:{sign}.2f}" if axis.unit == "deg" else f"{1000 * value:{sign}.0f}"
 
 
 def together_lines(calibration: Calibration) -> list[str]:
@@ -401,7 +387,7 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
         lines.append(f"  {show.counted(len(causes) - _N_REASONS, 'more reason')}: --explain, or report.html")
     if is_explained or not has_failed:
         lines += ["  T_cam_lidar (p_cam = R p_lidar + t)", *show.matrix_lines(c.T_cam_lidar, "    ")]
-    lines += uncertainty_lines(c) if is_explained else _short_uncertainty(c)
+    lines += _uncertainty_lines(c, is_explained=is_explained)
     if not is_explained:
         # Lens and squares that the result has corrected go with its extrinsics.
         lines += [
@@ -414,23 +400,6 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
             f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
         )
     return lines + _explanation(c) if is_explained else lines
-
-
-def _short_uncertainty(c: Calibration) -> list[str]:
-    """State the standard deviations, by axis unless the result has failed, and those of a point 10 m away."""
-    sigmas = np.sqrt(np.diag(c.cov))
-    lines = [_sigma_line(c.sigma_rotation_deg, c.sigma_translation_m)]
-    if c.verdict == "fail":
-        return lines
-    lines += [f"    about      {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg"]
-    lines += [f"    along      {_by_axis(1000 * sigmas[:3], '.1f')} mm"]
-    for point in c.uncertainty:
-        if point.distance_m == _FAR_M:
-            lines.append(
-                f"  {_FAR_M:g} m away    a point is off by {point.centre_px:.1f} px, "
-                f"{100 * point.centre_m:.1f} cm; in a corner {point.corner_px:.1f} px"
-            )
-    return lines
 
 
 def _explanation(c: Calibration) -> list[str]:

@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -149,11 +148,11 @@ def _table(pair: PairDrift) -> Any:
 
 
 def _figures(axis: AxisDrift | None) -> tuple[str, str]:
+    """Write the change that fits best, and the smallest that would have been seen."""
     if axis is None or not math.isfinite(axis.sigma) or axis.reason in _WITHOUT_FIT:
         return "-", "-"
-    scale, digits = (1.0, 2) if axis.is_rotation else (1000.0, 0)
-    best = f"{scale * axis.change:+.{digits}f} +- {scale * axis.sigma:.{digits}f}"
-    return best, f"{scale * axis.smallest:.{digits}f}" if math.isfinite(axis.smallest) else "-"
+    best = f"{show.amount(axis.change, axis.unit, '+')} +- {show.amount(axis.sigma, axis.unit)}"
+    return best, show.amount(axis.smallest, axis.unit).replace("?", "-")
 
 
 def _sensors(pair: PairDrift) -> str:
@@ -183,7 +182,13 @@ def _lines(pair: PairDrift, *, is_explained: bool) -> list[str]:
     opinions = [_opinion(pair, index) for index in range(len(pair.drift.axes))]
     for state, title in _TITLES.items():
         if state != pair.state or state != "unknown" or len(set(pair.states.values())) > 1:
-            parts = _by_kind([each for each in opinions if each.state == state])
+            column = {"changed": 0, "unchanged": 1}.get(state)
+            figures = {
+                each.axis: "" if column is None else _figures(each)[column]
+                for each in opinions
+                if each.state == state
+            }
+            parts = show.axes_by_kind(figures)
             lines += show.titled_lines(title, parts)
     if pair.board is not None and is_explained:
         metrics = pair.board.metrics
@@ -215,19 +220,3 @@ def _opinion(pair: PairDrift, index: int) -> AxisDrift:
     deciding = [each for each in (scene, pair.board.axes[index]) if each.state == state]
     best = min(deciding or [pair.board.axes[index]], key=lambda axis: axis.smallest)
     return replace(best, state=state)
-
-
-def _by_kind(axes: Sequence[AxisDrift]) -> list[str]:
-    """Name axes of one state, those of rotation first: the change, or the smallest that would be seen."""
-    lines = []
-    for is_rotation, kind, unit in ((True, "about", "deg"), (False, "along", "mm")):
-        names = []
-        for axis in axes:
-            if axis.is_rotation is is_rotation:
-                best, smallest = _figures(axis)
-                figure = {"changed": best, "unknown": "", "unchanged": smallest}[axis.state]
-                names.append(f"{axis.axis[-1]} {figure}".strip())
-        if names:
-            has_figures = axes[0].state != "unknown"
-            lines.append(f"{kind} {', '.join(names)}{f' {unit}' if has_figures else ''}")
-    return lines

@@ -1,8 +1,6 @@
 """`lce-rig rigs`: list, show, check and derive rig profiles."""
 
-import inspect
 import json
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -71,9 +69,7 @@ def list_profiles(as_json: bool) -> None:
 
 @rigs.command("show")
 @click.argument("rig_name", metavar="RIG")
-@click.option(
-    "--all", "is_whole", is_flag=True, help="Print defaults, too, and thresholds with their meaning."
-)
+@click.option("--all", "is_whole", is_flag=True, help="Print settings that have their default, too.")
 @click.option("--json", "as_json", is_flag=True, help="Print every setting as JSON.")
 def show_profile(rig_name: str, is_whole: bool, as_json: bool) -> None:
     """Print the profile RIG, a name or a file, as YAML without settings that have their default."""
@@ -81,37 +77,8 @@ def show_profile(rig_name: str, is_whole: bool, as_json: bool) -> None:
     if as_json:
         show.print_json(rig.model_dump(mode="json"))
         return
-    if not is_whole:
-        click.echo(dump_rig(rig, is_whole=False), nl=False)
-        _print_warnings(rig)
-        return
-    block = ""
-    for line in dump_rig(rig).splitlines():
-        key, _, value = line.partition(":")
-        block = block if line.startswith((" ", "-")) else key
-        if block in _THRESHOLDS and value:
-            settings = type(getattr(rig, block))
-            default = settings.model_fields[key.strip()].default
-            changed = (
-                "" if default == getattr(getattr(rig, block), key.strip()) else f" (default: {default:g})"
-            )
-            click.echo(f"  # {_attributes(settings).get(key.strip(), '')}{changed}")
-        click.echo(line)
+    click.echo(dump_rig(rig, is_whole=is_whole), nl=False)
     _print_warnings(rig)
-
-
-_THRESHOLDS = ("quality", "calibration", "verdict")
-
-
-def _attributes(documented: type) -> dict[str, str]:
-    """Read what a class's docstring says of each attribute."""
-    _, _, text = (inspect.getdoc(documented) or "").partition("Attributes:\n")
-    entries = re.findall(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
-    return {
-        name.strip(): " ".join(meaning.split()).rstrip(".")
-        for names, meaning in entries
-        for name in names.split(",")
-    }
 
 
 @rigs.command("check")

@@ -1,11 +1,12 @@
 """Print to a terminal: tables, progress bars, notes. Results go to stdout, all else to stderr."""
 
 import json
+import math
 import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,28 @@ def plain_table(title: str, *headings: str) -> Any:
 def matrix_lines(T: Any, indent: str) -> list[str]:
     """Write the upper three rows of a pose."""
     return [indent + "  ".join(f"{value: .6f}" for value in row) for row in T[:3]]
+
+
+def amount(value: float | None, unit: str, sign: str = "") -> str:
+    """Write a rotation in deg, or a translation (m) in mm, without the unit; "?" where it is not known."""
+    if value is None or not math.isfinite(value):
+        return "?"
+    return f"{value:{sign}.2f}" if unit == "deg" else f"{1000 * value:{sign}.0f}"
+
+
+def axes_by_kind(figures: Mapping[str, str]) -> list[str]:
+    """Write axes as rotations about and translations along x, y and z.
+
+    Args:
+        figures: by axis, "translation_x" to "rotation_z", in deg and mm; "" for none.
+    """
+    parts = []
+    for kind, word, unit in (("rotation", "about", "deg"), ("translation", "along", "mm")):
+        chosen = {axis[-1]: figure for axis, figure in figures.items() if axis.startswith(kind)}
+        if chosen:
+            names = ", ".join(f"{axis} {figure}".strip() for axis, figure in chosen.items())
+            parts.append(f"{word} {names} {unit}" if any(chosen.values()) else f"{word} {names}")
+    return parts
 
 
 def print_table(table: Any) -> None:

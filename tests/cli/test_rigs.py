@@ -24,7 +24,7 @@ def test_the_list_for_machines_is_json(capsys: pytest.CaptureFixture[str]) -> No
     assert rigs["rles"]["cameras"] == {"davis": ["frames", "events"]}
 
 
-def test_show_gives_the_figures_and_marks_what_is_not_default(
+def test_show_prints_what_is_not_default_and_with_all_everything(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "mine.yaml"
@@ -33,10 +33,7 @@ def test_show_gives_the_figures_and_marks_what_is_not_default(
     out = capsys.readouterr().out
     assert "  min_rings: 7\n" in out and "min_points" not in out and "model: VLP-16" in out
     assert run(["rigs", "show", str(path), "--all"]) == 0
-    out = capsys.readouterr().out
-    lines = out.splitlines()
-    at = lines.index("  min_rings: 7")
-    assert lines[at - 1].startswith("  # ") and "4" in lines[at - 1]
+    assert "min_points" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("more", [[], ["--all"]])
