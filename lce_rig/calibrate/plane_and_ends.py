@@ -27,6 +27,7 @@ EDGE_SHIFT_SIGMA_M = 0.015
 """Prior standard deviation of the distance of ring ends beyond an edge: about a beam's width."""
 BLENDS_M = 0.35
 """Echoes from surfaces nearer to each other than this blend into one."""
+_HALF_BEAM_M = 0.008  # of the beams that the priors of the shifts by the background are from
 BLENDS = 1
 """Column of `describe_background` that tells whether the background's echo blends into the board's."""
 
@@ -134,10 +135,12 @@ def describe_background(lidar: LidarBoard) -> Array:
     """Describe the background of each ring end (M, 3).
 
     Columns are the background's share of the power where it is far behind, whether it blends, and its share
-    where it does.
+    where it does. The share acts in proportion to the beam's width: without rings, it is multiplied by that.
     """
-    blends = is_blended(lidar)
-    return np.stack([lidar.edge_echo * ~blends, blends, lidar.edge_echo * blends], axis=1)
+    blends, echo = is_blended(lidar), lidar.edge_echo
+    if lidar.edge_beam_m is not None:
+        echo = echo * lidar.edge_beam_m.sum(axis=1) / _HALF_BEAM_M
+    return np.stack([echo * ~blends, blends, echo * blends], axis=1)
 
 
 def freedoms_of_plane() -> Array:

@@ -170,6 +170,8 @@ class LidarBoard:
             inf if there is none. What stands close behind blends into the beam's return.
         edge_echo: (M,) share 0..1 of the received power that comes from there where a beam meets it and the
             board alike; 0 where nothing is there. A beam that meets both reports the stronger echo.
+        edge_beam_m: (M, 2) of a board without rings: half the beam's width along the edge's normal, already
+            subtracted from the edge points, as the sum of what its width and its height add; None with rings.
         azimuth_step_rad: angle between neighbouring firings of one ring.
         plane: (4,) as (n, d), n.p + d = 0, unit n towards the LiDAR (d > 0).
         sigma_m: rms distance of `points` from the plane.
@@ -193,6 +195,7 @@ class LidarBoard:
     quality: LidarQuality
     offset_ns: NDArray[np.int64] | None = None
     stamp_ns: int | None = None
+    edge_beam_m: Array | None = None
 
     @property
     def has_rings(self) -> bool:

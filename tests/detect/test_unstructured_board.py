@@ -1,5 +1,7 @@
 """The board in point clouds without rings: where it is, what touches it, and what is not taken for it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scans import BOARD, Box, Plate, Shape, board_plate, outline_distance, person, place, room
@@ -79,6 +81,8 @@ def test_predicted_board_is_found_or_the_cause_is_named() -> None:
     found = look_for_unstructured_board(scan, BOARD, off, POINT_BEAM)
     assert isinstance(found, LidarBoard)
     assert_is_at(found, T)
+    too_near = look_for_unstructured_board(scan, BOARD, off, replace(POINT_BEAM, min_range_m=4.0))
+    assert isinstance(too_near, Refusal)
     elsewhere = look_for_unstructured_board(scan, BOARD, place(4, 25, 0), POINT_BEAM)
     assert isinstance(elsewhere, Refusal) and elsewhere.code.startswith("lidar.not")
 
@@ -129,3 +133,29 @@ def test_sparse_board_without_a_located_border_is_refused(n: int) -> None:
         assert np.isfinite(board.quality.edge_rms_m)
         assert board.quality.n_ring_ends >= 4
         assert len(board.points) >= 10
+
+
+def test_half_a_beam_is_drawn_out_where_it_meets_the_plate_obliquely() -> None:
+    """A beam ten times as high as wide, on a plate turned about its upright edges."""
+    beam, yaw_rad = Beam(0.005, 0.0005, 0.005), np.radians(40)
+    T = place(3, 0, 0, 40)
+    board = best(find_unstructured_boards(accumulate([board_plate(T), *room(13)]), BOARD, Limits(beam=beam)))
+    assert board.edge_beam_m is not None and board.edge_beam_m.shape == (len(board.edge_points), 2)
+    wide_m, high_m = (beam.widths_m(3.0) / 2).tolist()
+    on_plate = (board.edge_points - T[:3, 3]) @ T[:3, :2]
+    is_side = np.abs(on_plate[:, 0]) / BOARD.width_m > np.abs(on_plate[:, 1]) / BOARD.height_m
+    assert board.edge_beam_m[is_side, 0].mean() == pytest.approx(wide_m / np.cos(yaw_rad), rel=0.1)
+    assert board.edge_beam_m[~is_side, 1].mean() == pytest.approx(high_m, rel=0.1)
+    assert board.edge_beam_m[is_side, 1].max() < 0.002
+
+
+@pytest.mark.parametrize("intensity", [0.0, 50.0], ids=["without intensity", "alike"])
+def test_the_wall_behind_each_edge_is_measured(intensity: float) -> None:
+    T = place(3, 5, 20)
+    scan = accumulate([board_plate(T), *room(13)])
+    scan = replace(scan, intensity=np.full(len(scan.points), intensity, dtype=np.float32))
+    board = best(find_unstructured_boards(scan, BOARD, POINT_BEAM))
+    range_m = np.linalg.norm(board.edge_points, axis=1)
+    beyond_m = np.median(board.edge_behind_m) / np.abs(T[:3, 2] @ T[:3, 3]) * 3.0
+    share = 1 / (1 + ((range_m + beyond_m) / range_m) ** 2)
+    assert np.median(board.edge_echo) == pytest.approx(np.median(share), rel=0.25)

@@ -85,7 +85,7 @@ def information(blur: Array, lost_share: float) -> Array:
 def edge_system(
     edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float, n_captures: int
 ) -> Array:
-    """Expand -2 ln p of the ring ends to second order, by capture and ring: (F, L, 22, 22).
+    """Expand -2 ln p of the ring ends to second order, by capture and ring: (F, L, 24, 24).
 
     With J a row without its residual: J J^T times the information, J times the score in the last column, and
     -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur, as that of a

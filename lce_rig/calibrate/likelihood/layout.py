@@ -24,8 +24,9 @@ from lce_rig.core.geometry import Array, perturb
 Indices = NDArray[np.intp]
 LASER = ("range", "azimuth", "elevation")
 """Constant errors of each laser, in m and rad."""
-SHIFTS = ("d_0", "c", "d_1", "d_2", "d_3", "p", "along azimuth", "upwards")
-"""Unknowns of ring ends: equation (3) of `rays`, the plate's shape, and the displacement of ring ends."""
+SHIFTS = ("d_0", "c", "d_1", "d_2", "d_3", "p", "along azimuth", "upwards", "beam's width", "beam's height")
+"""Unknowns of ring ends: equation (3) of `rays`, the plate's shape, the displacement of ring ends, and
+relative errors of a beam's two widths."""
 _FIELDS = {"lens": 2, "bow": 2}
 _OWN = {"pose": 6, "own_shift": 1}
 
@@ -157,7 +158,7 @@ class State:
 
     @property
     def shifts(self) -> Array:
-        """(8,) of ring ends, `SHIFTS`."""
+        """(10,) of ring ends, `SHIFTS`."""
         return self.z[self.layout.z["shifts"]]
 
     @property

@@ -97,6 +97,7 @@ class Priors:
         vertical_m: its height, per rad of elevation.
         bow_m: height of the plate's middle over its ends, along its width and its height.
         azimuth_rad, elevation_rad: of each laser, about their means, which are part of the extrinsics.
+        beam: relative error of the beam's width and of its height, without rings.
         known: the LiDAR's errors as measured before: lasers and lens have this mean and these deviations.
         scale: relative error of each camera's distances, from squares or focal length; one figure for all.
         scale_is_claimed: whether the covariance contains the error of the scale. It must not where the
@@ -114,18 +115,19 @@ class Priors:
     bow_m: float = 0.001
     azimuth_rad: float = 4e-4
     elevation_rad: float = 2e-4
+    beam: float = 1.0
     known: KnownLidar | None = None
     scale: float | tuple[float, ...] = 0.001
     scale_is_claimed: bool = True
 
     @property
     def independent(self) -> dict[str, Array]:
-        """Deviations of lens (2,), bow (2,) and shifts (8,), as `layout` names them."""
+        """Deviations of lens (2,), bow (2,) and shifts (10,), as `layout` names them."""
         of_width = [self.shift_m, self.growth, *self.background_m, self.plate_m]
         return {
             "lens": np.array([self.lateral_m, self.vertical_m]),
             "bow": np.array([self.bow_m, self.bow_m]),
-            "shifts": np.array([*of_width, self.displacement_m, self.displacement_m]),
+            "shifts": np.array([*of_width, *2 * [self.displacement_m], *2 * [self.beam]]),
         }
 
     def freed(self, scale: Array) -> "Priors":
@@ -151,8 +153,8 @@ def what_is_known(options: EstimateSettings) -> tuple[Priors, Levels]:
     offset_m = max(options.range_offset_sigma_m, _EXACT_M)
     priors = Priors(offset_m=offset_m, shift_m=EDGE_SHIFT_SIGMA_M, known=options.known)
     if not options.has_rings:
-        # No axis, so no lens beside it; beams are wider than those in rings, and more so one way.
-        priors = replace(priors, lateral_m=_EXACT_M, vertical_m=_EXACT_M, growth=0.002, plate_m=0.006)
+        # No axis, so no lens beside it.
+        priors = replace(priors, lateral_m=_EXACT_M, vertical_m=_EXACT_M)
     if options.tolerances is not None:
         # The effects of focal length and squares on the result contain what the scale does not absorb.
         focal_sigma = (

@@ -30,7 +30,9 @@ and r the range,
 Recordings show d_1 near -17 mm, simulation -15 mm. A plate that is larger than its drawing shifts all edges
 alike and is part of d_0; by the shape p its upright edges lie farther out, the others as much farther in.
 What is left, the same for all ring ends (a beam that is not symmetric, a clock of the rotor), is a small
-displacement of ring ends against the returns between them, along azimuth and upwards.
+displacement of ring ends against the returns between them, along azimuth and upwards. Without rings, beams
+may be ten times as wide one way as the other: what half a beam's width adds along each edge's normal is
+subtracted by the search, in two parts for its two axes, and a relative error of each is unknown.
 
 Lens. A spinning LiDAR sends its beams from a lens beside its axis, and drivers that do not know where place
 points as if they came from the axis. With e_a the direction of growing azimuth and alpha the elevation, a
@@ -93,6 +95,7 @@ class StackedScans:
         next_rays: (M, 3) unit vectors of the firing after it, which missed the board.
         end_fields: (M, 3, 4) as `fields`.
         end_background: (M, 3) what is behind it, `describe_background`.
+        end_beam: (M, 2) half the beam's width along the edge's normal, by the beam's two axes; 0 with rings.
     """
 
     n_captures: int
@@ -109,6 +112,7 @@ class StackedScans:
     next_rays: Array
     end_fields: Array
     end_background: Array
+    end_beam: Array
 
     @cached_property
     def group(self) -> Indices:
@@ -164,7 +168,12 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
         next_rays=turn_about_z(end_rays, angle),
         end_fields=_fields(ends, T_lidar_board[end_capture[sorted_ends]], board),
         end_background=np.concatenate([describe_background(board) for board in boards])[sorted_ends],
+        end_beam=np.concatenate([_beams(board) for board in boards])[sorted_ends],
     )
+
+
+def _beams(lidar: LidarBoard) -> Array:
+    return np.zeros((len(lidar.edge_points), 2)) if lidar.edge_beam_m is None else lidar.edge_beam_m
 
 
 def _fields(points: Array, T_lidar_board: Array, board: Board) -> Array:
@@ -289,7 +298,7 @@ class EdgeRows:
 
     Attributes:
         capture, ring: (M,).
-        rows: (M, 22) in columns of `END`, e in m.
+        rows: (M, 24) in columns of `END`, e in m.
         step_m: (M,) D.
         range_m: (M,) to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
@@ -351,7 +360,7 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     of_width = np.column_stack([np.ones(len(range_m)), range_m, scans.end_background])
     of_plate = outwards[:, 0] ** 2 - outwards[:, 1] ** 2
     by_azimuth = np.sum(sideways * scans.end_fields[:, :, 0], axis=1)
-    by_shifts = np.column_stack([across * of_width, of_plate, -by_azimuth, -sideways[:, 2]])
+    by_shifts = np.column_stack([across * of_width, of_plate, -by_azimuth, -sideways[:, 2], scans.end_beam])
     rows[:, END["shifts"]] = by_shifts
     rows[:, -1] = inside_m + rows[:, END.of(["shifts"])] @ state.shifts - step_m / 2
     rows[:, -1] += by_shifts[:, 0] * state.own_shift_m[scans.end_capture]

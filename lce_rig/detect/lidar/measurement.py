@@ -189,8 +189,8 @@ class Beam:
         """Compute half the width of the spot at a distance, or at each of several."""
         return (self.aperture_m + self.divergence_rad * distance_m) / 2
 
-    def widths_m(self, distance_m: float) -> Array:
-        """Compute the spot's width and height (2,) at a distance."""
+    def widths_m(self, distance_m: float | Array) -> Array:
+        """Compute the spot's width and height (2,) at a distance, or (K, 2) at several (K, 1)."""
         upright_rad = self.divergence_rad if self.upright_rad is None else self.upright_rad
         return self.aperture_m + np.array([self.divergence_rad, upright_rad]) * distance_m
 

@@ -23,7 +23,7 @@ from lce_rig.detect.findings import (
     LIDAR_TOUCHING,
     LIDAR_TURNED,
 )
-from lce_rig.detect.lidar.measurement import fit_plane_to_ranges, median
+from lce_rig.detect.lidar.measurement import Beam, fit_plane_to_ranges, median
 from lce_rig.detect.lidar.outline import (
     STRIP_M,
     Outline,
@@ -110,6 +110,7 @@ def find_unstructured_boards(
     searched = index[range_m[index] <= limits.max_range_m]
     searched = searched[:: 1 + len(searched) // _MOST_SEARCHED]
     patches = grow_patches(points[searched], min(board.width_m, board.height_m) / _CELLS)
+    near = np.column_stack([points[index], scan.intensity[index]])
     board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
     ratio = patches.size_m / board_m
     misfit = np.abs(np.log(np.maximum(ratio, 1e-3))).sum(axis=1)
@@ -119,7 +120,7 @@ def find_unstructured_boards(
     for k in can_be[np.argsort(misfit[can_be])][:_MOST_PATCHES]:
         if found and misfit[k] > _ALIKE:
             break
-        measured = measure_unstructured(points[index], board, patches.plane[k], patches.centre[k], limits)
+        measured = measure_unstructured(near, board, patches.plane[k], patches.centre[k], limits)
         if isinstance(measured, LidarBoard):
             found.append(measured)
         else:
@@ -150,16 +151,16 @@ def look_for_unstructured_board(
 ) -> LidarBoard | Refusal:
     """Find the board about a predicted pose (4, 4), such as an image and extrinsics give."""
     centre, normal = T_lidar_board[:3, 3], T_lidar_board[:3, 2]
-    away = np.linalg.norm(scan.points - centre.astype(np.float32), axis=1)
+    is_far = np.linalg.norm(scan.points, axis=1) >= limits.min_range_m
+    returns = np.column_stack([scan.points, scan.intensity])[is_far].astype(np.float64)
+    away = returns[:, :3] - centre
     reach_m = np.hypot(board.width_m, board.height_m) / 2 + MARGIN_M
-    on = scan.points[away < reach_m]
-    on = on[np.abs((on - centre) @ normal) < MARGIN_M]
-    patches = grow_patches(on.astype(np.float64), min(board.width_m, board.height_m) / _CELLS)
-    points = np.asarray(scan.points, dtype=np.float64)
+    is_near = (np.linalg.norm(away, axis=1) < reach_m) & (np.abs(away @ normal) < MARGIN_M)
+    patches = grow_patches(returns[is_near, :3], min(board.width_m, board.height_m) / _CELLS)
     cause: Refusal | None = None
     for k in range(min(len(patches.centre), 3)):
         if abs(patches.plane[k, :3] @ normal) > LOOK_TURN:
-            measured = measure_unstructured(points, board, patches.plane[k], centre, limits)
+            measured = measure_unstructured(returns, board, patches.plane[k], centre, limits)
             if isinstance(measured, Refusal):
                 cause = cause or measured
             elif np.linalg.norm(measured.T_lidar_board[:3, 3] - centre) < MARGIN_M:
@@ -247,46 +248,66 @@ class _View:
         axes: (3, 2) of the plane.
         origin: (3,) m.
         points: (M, 3) their returns.
+        intensity: (M,) of these; all the same where the point cloud has none.
         uv: (M, 2) where they pierce it.
         height_m: (M,) of the returns over the plane.
         tolerance_m: returns within it lie on the plane.
-        beam: widths of the beam, horizontal and vertical, at the origin, m.
+        beam: the LiDAR's.
     """
 
     plane: Array
     axes: Array
     origin: Array
     points: Array
+    intensity: Array
     uv: Array
     height_m: Array
     tolerance_m: float
-    beam_m: Array
+    beam: Beam
 
     @classmethod
-    def of(cls, points: Array, plane: Array, centre: Array, tolerance_m: float, limits: Limits) -> "_View":
-        """Pierce a plane near a point by the rays of returns (N, 3)."""
+    def of(cls, returns: Array, plane: Array, centre: Array, tolerance_m: float, limits: Limits) -> "_View":
+        """Pierce a plane near a point by the rays of returns (N, 4) x, y, z, intensity."""
         origin, axes = centre - (centre @ plane[:3] + plane[3]) * plane[:3], plane_axes(plane[:3])
-        along = points @ plane[:3]
-        points, along = points[along < 0], along[along < 0]
+        along = returns[:, :3] @ plane[:3]
+        returns, along = returns[along < 0], along[along < 0]
+        points = returns[:, :3]
         uv = (points * (-plane[3] / along)[:, None] - origin) @ axes
-        beam_m = limits.beam.widths_m(float(np.linalg.norm(origin)))
-        return cls(plane, axes, origin, points, uv, along + plane[3], tolerance_m, beam_m)
+        return cls(plane, axes, origin, points, returns[:, 3], uv, along + plane[3], tolerance_m, limits.beam)
 
     @property
     def is_on(self) -> NDArray[np.bool_]:
         """Which rays return from the plane (M,)."""
         return np.abs(self.height_m) <= self.tolerance_m
 
-    def half_beam_m(self, normals: Array) -> Array:
-        """Compute half the beam's width on the plane along unit normals (..., 2)."""
-        ray = self.origin / np.linalg.norm(self.origin)
+    def beam_parts_m(self, normals: Array, uv: Array) -> Array:
+        """Split half the beam's width on the plane along unit normals (K, 2) at uv (K, 2) by its two axes.
+
+        The spot is an ellipse across the ray, of half widths a and b; on the plane it is drawn out by the
+        plane's turn. Along a normal m of the plane with normal n it reaches
+
+            h = |diag(a, b) [level, up]^T s|,    s = m - (m . ray) / (n . ray) n                         (1)
+
+        the root of a sum of two squares, whose shares (K, 2) of h are returned.
+        """
+        at = self.origin + uv @ self.axes.T
+        range_m = np.linalg.norm(at, axis=1, keepdims=True)
+        ray = at / range_m
         level = np.cross([0.0, 0.0, 1.0], ray)
-        level /= max(float(np.linalg.norm(level)), 1e-9)
-        across = normals @ self.axes.T @ np.stack([level, np.cross(ray, level)], axis=1)
-        return np.asarray(np.linalg.norm(across * self.beam_m, axis=-1) / 2)
+        level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
+        along = normals @ self.axes.T
+        turn = np.sum(along * ray, axis=1) / (ray @ self.plane[:3])
+        sideways = along - turn[:, None] * self.plane[:3]
+        across = np.stack([np.sum(sideways * axis, axis=1) for axis in (level, np.cross(ray, level))], axis=1)
+        squares = (across * self.beam.widths_m(range_m) / 2) ** 2
+        return np.asarray(squares / np.sqrt(np.maximum(squares.sum(axis=1, keepdims=True), 1e-18)))
+
+    def half_beam_m(self, normals: Array) -> Array:
+        """Compute half the beam's width along unit normals (K, 2) of the plane, at the origin."""
+        return np.asarray(self.beam_parts_m(normals, np.zeros_like(normals)).sum(axis=1))
 
     def blur_m(self, normals: Array) -> Array:
-        """Compute the border's blur for unit normals (..., 2): a quarter of the beam, noise of directions."""
+        """Compute the border's blur for unit normals (K, 2): a quarter of the beam, noise of directions."""
         distance_m = float(np.linalg.norm(self.origin))
         return np.asarray(np.hypot(self.half_beam_m(normals) / 2, _DIRECTION_RAD * distance_m))
 
@@ -341,12 +362,12 @@ def _empty_places(uv: Array, placement: Placement, n_due: float) -> tuple[Array,
 
 
 def measure_unstructured(
-    points: Array, board: Board, plane: Array, centre: Array, limits: Limits
+    returns: Array, board: Board, plane: Array, centre: Array, limits: Limits
 ) -> LidarBoard | Refusal:
     """Fit plane and outline to the rays about a patch, measure the board and check it against the limits.
 
     Args:
-        points: (N, 3) returns.
+        returns: (N, 4) x, y, z, intensity.
         board: nominal size.
         plane: (4,) first guess.
         centre: (3,) m, about the plate's middle.
@@ -358,9 +379,10 @@ def measure_unstructured(
     half_m = (board.width_m / 2, board.height_m / 2)
     reach_m = 1.4 * float(np.hypot(*half_m)) + _SURROUND_M
     cosine = 1.0 / np.hypot(1.0, reach_m / distance_m)
-    points = points[points @ (centre / distance_m) > cosine * np.linalg.norm(points, axis=1)]
-    points = points[:: 1 + len(points) // _MOST_MEASURED]
-    view = _View.of(points, plane, centre, 4 * _NOISE_M, limits)
+    points = returns[:, :3]
+    returns = returns[points @ (centre / distance_m) > cosine * np.linalg.norm(points, axis=1)]
+    returns = returns[:: 1 + len(returns) // _MOST_MEASURED]
+    view = _View.of(returns, plane, centre, 4 * _NOISE_M, limits)
     n_on = int(np.count_nonzero(view.is_on))
     starts = register_rays(view.rays(half_m), half_m) if n_on >= _MIN_POINTS else []
     if not starts:
@@ -384,7 +406,7 @@ def measure_unstructured(
         spread_m = 1.4826 * median(np.abs(on_plate @ plane[:3] + plane[3]))
         tolerance_m = min(max(3.5 * spread_m, _LEAST_TOLERANCE_M), _MOST_TOLERANCE_M)
         centre = view.origin + view.axes @ [outline.placement.u_m, outline.placement.v_m]
-        view = _View.of(points, plane, centre, tolerance_m, limits)
+        view = _View.of(returns, plane, centre, tolerance_m, limits)
         starts = [replace(outline.placement, u_m=0.0, v_m=0.0)]
     outline = fit_outline(view.rays(half_m, starts[0]), starts[0], view.blur_m, view.growth_m(starts[0]))
     if outline is None:
@@ -426,7 +448,8 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     is_good = (strips.sigma_m < _STRIP_SIGMA_M) & (
         np.abs(strips.off_m) < np.hypot(_STRIP_OFF * strips.sigma_m, 0.015)
     )
-    is_good &= ~_is_touched(view, strips)
+    is_touched, behind_m, echo = _look_beyond(view, strips, placement)
+    is_good &= ~is_touched
     # Upright edges tell the plate's place along its width, the others along its height: both are needed.
     width_axis = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
     is_upright = np.abs(strips.outwards[is_good] @ width_axis) > np.sqrt(0.5)
@@ -435,7 +458,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         return LIDAR_NO_BORDER.refusal(distance_m=distance_m, n_upright=n_upright, n_level=n_level)
     edge_rms_m = float(np.sqrt(np.mean(strips.off_m[is_good] ** 2)))
     growth, size_sigma = outline.growth_m, 2 * np.sqrt(np.diag(outline.cov)[3:])
-    sigma_m = np.hypot(size_sigma, view.beam_m.max() / 2)
+    sigma_m = np.hypot(size_sigma, view.beam.widths_m(distance_m).max() / 2)
     points, point_sigma_m = _average(view.points[is_board], placement.local(view.uv[is_board]), view.plane)
     if len(points) < _MIN_MEANS:
         n_needed = int(np.ceil(_MIN_CELL_RETURNS * board.width_m * board.height_m / _FINE_M**2))
@@ -459,21 +482,22 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         incidence_deg=float(np.degrees(np.arccos(np.clip(view.plane[3] / distance_m, 0.0, 1.0)))),
         range_noise_m=rms_m,
     )
-    inwards = view.half_beam_m(strips.outwards)[:, None] * strips.outwards
+    beam_m = view.beam_parts_m(strips.outwards, strips.uv)
+    inwards = beam_m.sum(axis=1)[:, None] * strips.outwards
     edge = view.origin + (strips.uv - inwards)[is_good] @ view.axes.T
     # y points upwards where the rectangle leaves the choice.
     x = view.axes @ (-width_axis if width_axis[0] < 0 else width_axis)
     normal = view.plane[:3]
     R = np.stack([x, np.cross(normal, x), normal], axis=1)
-    none = np.zeros(len(edge))
     return LidarBoard(
         points=points,
         ring=np.full(len(points), NO_RING, dtype=np.int16),
         edge_points=edge,
         edge_ring=np.full(len(edge), NO_RING, dtype=np.int16),
-        edge_side=none.astype(np.int8),
-        edge_behind_m=none + np.inf,
-        edge_echo=none,
+        edge_side=np.zeros(len(edge), dtype=np.int8),
+        edge_behind_m=behind_m[is_good],
+        edge_echo=echo[is_good],
+        edge_beam_m=beam_m[is_good],
         azimuth_step_rad=0.0,
         plane=view.plane,
         sigma_m=point_sigma_m,
@@ -482,20 +506,30 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     )
 
 
-def _is_touched(view: _View, strips: Strips) -> NDArray[np.bool_]:
-    """Return for each strip (K,) whether something hides what is beyond: a hand, a box."""
+def _look_beyond(view: _View, strips: Strips, placement: Placement) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Look at what is beyond each strip of the border (K,).
+
+    Returns:
+        Whether something hides it, a hand or a box; `edge_behind_m` and `edge_echo` of `LidarBoard`.
+    """
     from scipy.spatial import cKDTree
 
-    if not len(strips.uv):
-        return np.zeros(0, dtype=np.bool_)
+    behind_m, echo = np.full(len(strips.uv), np.inf), np.zeros(len(strips.uv))
+    is_touched = np.zeros(len(strips.uv), dtype=np.bool_)
+    # The power received falls with the square of the range.
+    power = np.maximum(view.intensity, 1e-9) / (view.points**2).sum(axis=1)
+    away = placement.distance_m(view.uv)
+    of_plate = float(np.median(power[view.is_on & (away < -0.01) & (away > -STRIP_M)]))
     beyond = strips.uv + strips.outwards * STRIP_M / 2
-    n_before, n_in_all = (
-        cKDTree(uv).query_ball_point(beyond, STRIP_M / 2, return_length=True)
-        if len(uv)
-        else np.zeros(len(beyond))
-        for uv in (view.uv[view.height_m > _FOOT_M], view.uv)
-    )
-    return np.asarray(n_before > _TOUCHED_SHARE * n_in_all)
+    for k, members in enumerate(cKDTree(view.uv).query_ball_point(beyond, STRIP_M / 2)):
+        height_m = view.height_m[members]
+        is_touched[k] = np.count_nonzero(height_m > _FOOT_M) > _TOUCHED_SHARE * len(members)
+        is_behind = height_m < -max(view.tolerance_m, _BEHIND_M)
+        if np.count_nonzero(is_behind) > _TOUCHED_SHARE * len(members):
+            behind_m[k] = -median(height_m[is_behind])
+            of_background = median(power[members][is_behind])
+            echo[k] = of_background / (of_background + of_plate)
+    return is_touched, behind_m, echo
 
 
 def _average(points: Array, local: Array, plane: Array) -> tuple[Array, float]:
