@@ -28,9 +28,9 @@ class Seen(NamedTuple):
     views: list[SceneView]
 
 
-def small_rig() -> Rig:
-    """The rig rlfs with a camera of half its resolution, which renders fast."""
-    text = find_profile("rlfs").read_text(encoding="utf-8")
+def small_rig(name: str = "rlfs") -> Rig:
+    """A rig with a camera of half its resolution, which renders fast."""
+    text = find_profile(name).read_text(encoding="utf-8")
     camera = "cameras.cam"
     for key, value in {
         "resolution_px": "[640, 360]",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Scan
+from lce_rig.core.data import NO_RING, Scan
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.scene.depth_edges import CHANNELS, DepthEdges, find_depth_edges, leave_standing
 
@@ -25,6 +25,55 @@ def scan_of(range_at, elevations_deg, intensity_at=None):
 
 def pillar(az, el):
     return np.where(np.abs(az) < 0.1, 3.0, 6.0)
+
+
+def scattered(range_at, intensity_at=None, n=60_000):
+    """Measure a scene with beams in random directions, about 0.2 deg apart, and no rings."""
+    rng = np.random.default_rng(0)
+    az, el = rng.uniform(-0.6, 0.6, n), rng.uniform(-0.35, 0.25, n)
+    r = range_at(az, el) + rng.normal(0, 0.01, n)
+    points = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1) * r[:, None]
+    intensity = np.zeros(n) if intensity_at is None else intensity_at(az, el)
+    none = np.full(n, NO_RING, dtype=np.int16)
+    return Scan("lidar", 0, points.astype(np.float32), intensity.astype(np.float32), none)
+
+
+def azimuth_of(edges):
+    return np.arctan2(edges.points[:, 1], edges.points[:, 0])
+
+
+def test_without_rings_outlines_lie_between_the_last_return_and_the_next() -> None:
+    def leaning(az, el):
+        return np.where(np.abs(az - el / 3) < 0.1, 3.0, 6.0)
+
+    edges = find_depth_edges(scattered(leaning), NEEDLE)
+    elevation = np.arcsin(edges.points[:, 2] / np.linalg.norm(edges.points, axis=1))
+    from_outline = np.abs(azimuth_of(edges) - elevation / 3) - 0.1
+    assert len(edges) > 2 * 100
+    assert np.abs(from_outline.mean()) < 0.1 * STEP and np.abs(from_outline).mean() < STEP / 2
+    assert np.linalg.norm(edges.points, axis=1) == pytest.approx(3.0, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [
+        lambda az, el: np.minimum(1.7 / np.sin(np.maximum(-el, 0.02)), 60.0),
+        lambda az, el: np.minimum(1.5 / np.sin(np.maximum(np.abs(az), 0.02)), 60.0),
+        lambda az, el: np.where(el > 0, 4.0, 8.0),
+        lambda az, el: np.random.default_rng(1).uniform(5.0, 9.0, len(az)),
+    ],
+    ids=["floor", "walls of a corridor", "upper edge", "foliage"],
+)
+def test_without_rings_slopes_and_clutter_have_hardly_any_outlines(surface) -> None:
+    assert len(find_depth_edges(scattered(surface), NEEDLE)) < 0.01 * 60_000
+
+
+def test_without_rings_changes_of_reflectivity_lie_on_the_borders_of_a_stripe() -> None:
+    edges = find_depth_edges(scattered(lambda az, el: 4.0 + 0 * az, stripe), NEEDLE)
+    elevation = np.arcsin(edges.points[:, 2] / 4.0)
+    from_border = np.abs(azimuth_of(edges) - elevation / 2) - 0.05
+    assert len(edges) > 2 * 100 and set(edges.channel) == {CHANNELS.index("reflectivity")}
+    assert np.abs(from_border).max() < 2 * STEP
 
 
 def test_upright_outlines_lie_between_the_last_return_and_the_next() -> None:
@@ -77,10 +126,10 @@ def test_single_returns_between_two_surfaces_are_no_outline() -> None:
     assert len(find_depth_edges(scan_of(mixed, range(-15, 16, 2)), NEEDLE)) == 0
 
 
-@pytest.mark.parametrize("n", [0, 1])
-def test_an_almost_empty_scan_has_no_outlines(n) -> None:
-    empty = scan_of(pillar, [0]).select(np.arange(n))
-    assert len(find_depth_edges(empty, NEEDLE)) == 0
+@pytest.mark.parametrize("scan", [scan_of(lambda az, el: 3.0 + az, [0]), scattered(lambda az, el: 3.0 + az)])
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_an_almost_empty_scan_has_no_outlines(n, scan) -> None:
+    assert len(find_depth_edges(scan.select(np.arange(n)), NEEDLE)) == 0
 
 
 def test_the_board_and_its_stand_move_before_a_standing_rig_and_are_left_out(seen) -> None:
