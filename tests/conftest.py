@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.shared import Shared, find_folder
+
 # Long runs of the property tests try more examples, and new ones each time (CONTRIBUTING.md, Fuzzing).
 _EXAMPLES = os.environ.get("LCE_RIG_EXAMPLES")
 settings.register_profile(
@@ -17,6 +19,11 @@ settings.load_profile("lce-rig")
 # What a shell runs in the background ignores Ctrl-C, and so would processes that tests start to press it for.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _shared(tmp_path_factory: pytest.TempPathFactory) -> None:
+    Shared.folder = find_folder(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

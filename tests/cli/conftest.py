@@ -8,6 +8,7 @@ import pytest
 
 from lce_rig.cli.main import run
 from lce_rig.core.findings import Finding
+from tests.shared import make_once
 
 
 @dataclass(frozen=True)
@@ -39,21 +40,25 @@ def mute(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def simulated(tmp_path_factory) -> Path:
+def simulated() -> Path:
     """A session of the rig rles with sixteen captures, detected once."""
-    session = tmp_path_factory.mktemp("simulated") / "session"
-    assert run(["simulate", "--rig", "rles", str(session), "--captures", "16", "--seed", "3"]) == 0
-    assert run(["check", str(session)]) == 0
-    return session
+
+    def make(session: Path) -> None:
+        assert run(["simulate", "--rig", "rles", str(session), "--captures", "16", "--seed", "3"]) == 0
+        assert run(["check", str(session)]) == 0
+
+    return make_once("simulated", make)
 
 
 @pytest.fixture(scope="session")
-def calibrated_once(simulated, tmp_path_factory) -> Path:
+def calibrated_once(simulated) -> Path:
     """The simulated session with its result; as `lce-rig calibrate` leaves it."""
-    copy = tmp_path_factory.mktemp("calibrated") / "session"
-    shutil.copytree(simulated, copy)
-    assert run(["calibrate", str(copy)]) == 0
-    return copy
+
+    def make(session: Path) -> None:
+        shutil.copytree(simulated, session)
+        assert run(["calibrate", str(session)]) == 0
+
+    return make_once("calibrated", make)
 
 
 @pytest.fixture

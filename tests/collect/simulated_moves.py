@@ -7,6 +7,7 @@ from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import HandMotion, LidarNoise, SimulatedRecording, SimulationOptions, simulate_recording
 from lce_rig.simulate.sampling import stamp_of
+from tests.shared import compute_once
 
 DURATION_S = 1.8
 # What comes before is there for its events only.
@@ -35,6 +36,10 @@ def recording() -> SimulatedRecording:
 @cache
 def samples() -> tuple[Sample, ...]:
     """Events of nearly two seconds, and the scans and frames at their end."""
+    return compute_once("moves", _sample)
+
+
+def _sample() -> tuple[Sample, ...]:
     start_ns = recording().start_ns
     return tuple(s for s in recording() if isinstance(s, Events) or stamp_of(s) >= start_ns + _FIRST_SCAN_NS)
 

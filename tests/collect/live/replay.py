@@ -10,6 +10,7 @@ from functools import cache
 from lce_rig.collect.live.simulated import SimulatedSource
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import SimulatedCapture, simulate_captures
+from tests.shared import compute_once
 
 PERIOD_NS = 100_000_000
 
@@ -23,7 +24,8 @@ def rig() -> Rig:
 @cache
 def placements(n: int = 4, seed: int = 5) -> tuple[SimulatedCapture, ...]:
     """Simulate boards held still."""
-    return tuple(simulate_captures(rig(), n_captures=n, seed=seed))
+    name = f"placements_{n}_{seed}"
+    return compute_once(name, lambda: tuple(simulate_captures(rig(), n_captures=n, seed=seed)))
 
 
 class Show:
