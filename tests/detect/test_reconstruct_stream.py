@@ -101,7 +101,6 @@ def test_a_stream_without_events_refuses_every_stamp():
     for batches in ([], [empty]):
         answers = list(Reconstructor().reconstruct(batches, [1, 2]))
         assert [answer.code for answer in answers] == ["read.no_events"] * 2
-        assert list(Reconstructor().reconstruct(batches, every_ns=MS)) == []
 
 
 def test_events_of_another_resolution_are_an_error(stream):

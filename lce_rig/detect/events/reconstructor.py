@@ -283,36 +283,27 @@ class Reconstructor:
         """Whether enough of the stream has been seen for images to count."""
         return self.n_steps >= self.options.n_warm_up
 
-    def reconstruct(
-        self, batches: Iterable[Events], stamps_ns: Sequence[int] | None = None, every_ns: int | None = None
-    ) -> Iterator[Image | Refusal]:
+    def reconstruct(self, batches: Iterable[Events], stamps_ns: Sequence[int]) -> Iterator[Image | Refusal]:
         """Return one image, or the reason for none, for every timestamp, in the order of the timestamps.
 
         Args:
             batches: the stream from its beginning, in time order, cut anywhere.
             stamps_ns: when images are wanted, never decreasing, the events' clock.
-            every_ns: instead of stamps_ns, one image per this period from the first event on.
 
         Raises:
             SourceError: the batches are of different sensors or go back in time.
-            UsageError: neither or both of stamps_ns and every_ns, or timestamps out of order.
+            UsageError: timestamps out of order.
         """
-        if (stamps_ns is None) == (every_ns is None) or (every_ns is not None and every_ns <= 0):
-            raise UsageError("give either stamps_ns or every_ns above 0")
-        if stamps_ns is not None and np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
+        if np.any(np.diff(np.asarray(stamps_ns, dtype=np.int64)) < 0):
             raise UsageError("stamps_ns must not decrease")
         self.reset()
-        wanted = deque(stamps_ns or ())
+        wanted = deque(stamps_ns)
         last_ns: int | None = None
         for batch in batches:
             if not len(batch):
                 continue
             self._take(batch, last_ns)
-            first_ns, before_ns, last_ns = self._first_ns, last_ns, int(batch.t_ns[-1])
-            assert first_ns is not None
-            if every_ns is not None:
-                n_passed = 0 if before_ns is None else (before_ns - first_ns) // every_ns
-                wanted.extend(range(first_ns + (n_passed + 1) * every_ns, last_ns + 1, every_ns))
+            last_ns = int(batch.t_ns[-1])
             while wanted and wanted[0] <= last_ns:
                 yield self._picture_at(wanted.popleft())
             self._advance(last_ns)

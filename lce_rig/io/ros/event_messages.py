@@ -27,11 +27,10 @@ ARRAY_TYPES = frozenset({"dvs_msgs/EventArray", "prophesee_event_msgs/EventArray
 # event_array_msgs is what event_camera_msgs was called before; the layout is the same.
 PACKET_TYPES = frozenset({"event_camera_msgs/EventPacket", "event_array_msgs/EventArray"})
 EVENT_TYPES = ARRAY_TYPES | PACKET_TYPES
-ENCODINGS = ("evt3", "libcaer", "libcaer_cmp", "mono", "trigger")
-_BATCH_BYTES = 1 << 17
+ENCODINGS = ("evt3", "libcaer_cmp", "trigger")
+_BATCH_WORDS = 1 << 16
 # A word of two bytes may hold twelve events.
 _WORDS_AT_ONCE = 1 << 17
-_LIBCAER_WRAP_US = 1 << 31
 
 
 class EventPacket(NamedTuple):
@@ -41,28 +40,14 @@ class EventPacket(NamedTuple):
         number: of the message, as the driver counted them.
         time_base_ns: origin of the timestamps inside; 0 where they count from the sensor's start.
         encoding: one of `ENCODINGS`.
-        is_big_endian: byte order of the payload.
-        payload: (N,) bytes.
+        words: (N,) uint16, the payload.
     """
 
     head: EventHead
     number: int
     time_base_ns: int
     encoding: str
-    is_big_endian: bool
-    payload: NDArray[np.uint8]
-
-    def words(self, kind: str) -> NDArray[np.void]:
-        """View the payload as words of one kind: "u2", "u8".
-
-        Raises:
-            ValueError: it does not hold a whole number of them.
-        """
-        dtype = np.dtype(f"{'>' if self.is_big_endian else '<'}{kind}")
-        if len(self.payload) % dtype.itemsize:
-            n_bytes = len(self.payload)
-            raise ValueError(f"{n_bytes} bytes are not a whole number of {dtype.itemsize}-byte words")
-        return self.payload.view(dtype)
+    words: NDArray[np.uint16]
 
 
 def parse_packet(message: RawMessage) -> EventPacket:
@@ -77,8 +62,10 @@ def parse_packet(message: RawMessage) -> EventPacket:
     frame_id = str(content.header.frame_id)
     head = EventHead(header_stamp_ns(content), frame_id, int(content.width), int(content.height))
     payload = np.ascontiguousarray(content.events, np.uint8)
-    time_base_ns, encoding = int(content.time_base), str(content.encoding)
-    return EventPacket(head, int(content.seq), time_base_ns, encoding, bool(content.is_bigendian), payload)
+    if len(payload) % 2:
+        raise ValueError(f"{len(payload)} bytes are not a whole number of 2-byte words")
+    words = payload.view(">u2" if content.is_bigendian else "<u2").astype(np.uint16)
+    return EventPacket(head, int(content.seq), int(content.time_base), str(content.encoding), words)
 
 
 def read_event_head(message: RawMessage) -> EventHead:
@@ -99,7 +86,7 @@ class PacketDecoder:
         self._evt3 = WordDecoder(EVT3)
         self._compressed = WordDecoder(LIBCAER_CMP)
         self._waiting: list[EventPacket] = []
-        self._n_waiting_bytes = 0
+        self._n_waiting = 0
 
     def decode(self, packet: EventPacket) -> Iterator[EventColumns]:
         """Yield the events that are decoded by now: small EVT3 packets are decoded together, later.
@@ -108,25 +95,15 @@ class PacketDecoder:
             ValueError: the packet is damaged or of no known encoding.
         """
         if packet.encoding == "evt3":
-            packet.words("u2")
             self._waiting.append(packet)
-            self._n_waiting_bytes += len(packet.payload)
-            if self._n_waiting_bytes >= _BATCH_BYTES:
+            self._n_waiting += len(packet.words)
+            if self._n_waiting >= _BATCH_WORDS:
                 yield from self.finish()
             return
         yield from self.finish()
-        if packet.encoding == "mono":
-            # Polarity 1 | y 15 | x 16 | ns after the time base 32 bits.
-            double = packet.words("u8").astype(np.uint64)
-            upper = (double >> np.uint64(32)).astype(np.uint32)
-            t_ns = packet.time_base_ns + (double & np.uint64(0xFFFFFFFF)).astype(np.int64)
-            x, y = (upper & 0xFFFF).astype(np.uint16), ((upper >> 16) & 0x7FFF).astype(np.uint16)
-            yield EventColumns(t_ns, x, y, (upper >> 31).astype(bool), packet.head.stamp_ns)
-        elif packet.encoding == "libcaer":
-            yield _decode_libcaer(packet)
-        elif packet.encoding == "libcaer_cmp":
+        if packet.encoding == "libcaer_cmp":
             self._compressed.start_packet()
-            for words in _pieces(packet.words("u2").astype(np.uint16)):
+            for words in _pieces(packet.words):
                 events = self._compressed.decode(words)
                 # The driver's time base has nanoseconds of its own start; the codec drops them, and so do we.
                 base_ns = packet.time_base_ns // NS_PER_US * NS_PER_US
@@ -137,9 +114,9 @@ class PacketDecoder:
     def finish(self) -> Iterator[EventColumns]:
         """Yield the events of the packets that wait."""
         if self._waiting:
-            words = [packet.words("u2").astype(np.uint16) for packet in self._waiting]
+            words = [packet.words for packet in self._waiting]
             host_ns: int | None = self._waiting[0].head.stamp_ns
-            self._waiting, self._n_waiting_bytes = [], 0
+            self._waiting, self._n_waiting = [], 0
             for piece in _pieces(np.concatenate(words)):
                 events = self._evt3.decode(piece)
                 yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
@@ -153,18 +130,6 @@ class PacketDecoder:
 
 def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
     return (words[at : at + _WORDS_AT_ONCE] for at in range(0, len(words), _WORDS_AT_ONCE))
-
-
-def _decode_libcaer(packet: EventPacket) -> EventColumns:
-    """Decode x 15 | y 15 | polarity 1 | valid 1 bits, then 31 bits of us, which may wrap inside a packet."""
-    pairs = packet.words("u4").astype(np.uint32)
-    if len(pairs) % 2:
-        raise ValueError(f"{len(packet.payload)} bytes are not a whole number of 8-byte events")
-    where, t_us = pairs[0::2], pairs[1::2].astype(np.int64)
-    wraps = np.cumsum(np.diff(t_us, prepend=t_us[:1]) < -_LIBCAER_WRAP_US // 2)
-    t_ns = packet.time_base_ns + (t_us + wraps * _LIBCAER_WRAP_US) * NS_PER_US
-    x, y = (where >> 17).astype(np.uint16), ((where >> 2) & 0x7FFF).astype(np.uint16)
-    return EventColumns(t_ns, x, y, (where >> 1 & 1).astype(bool), packet.head.stamp_ns)
 
 
 class BagEvents(EventStream):

@@ -94,19 +94,6 @@ def libcaer_cmp(events: Sequence[Event], base_us: int) -> bytes:
     return struct.pack(f"<{len(words)}H", *words)
 
 
-def libcaer(events: Iterable[Event], base_us: int) -> bytes:
-    return b"".join(
-        struct.pack("<II", x << 17 | y << 2 | int(p) << 1 | 1, (t - base_us) & 0x7FFFFFFF)
-        for t, x, y, p in events
-    )
-
-
-def mono(events: Iterable[Event], base_ns: int) -> bytes:
-    return b"".join(
-        struct.pack("<Q", int(p) << 63 | y << 48 | x << 32 | (t * 1000 - base_ns)) for t, x, y, p in events
-    )
-
-
 def packet(
     payload: bytes,
     encoding: str,

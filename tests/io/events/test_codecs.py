@@ -84,16 +84,14 @@ def test_a_damaged_time_word_is_repaired_and_counted(name: str) -> None:
 
 
 @pytest.mark.parametrize("is_ros1", [True, False])
-@pytest.mark.parametrize("encoding", ["evt3", "libcaer", "libcaer_cmp", "mono"])
+@pytest.mark.parametrize("encoding", ["evt3", "libcaer_cmp"])
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 60))
 def test_packets_of_every_encoding_come_back(encoding: str, is_ros1: bool, seed: int, n: int) -> None:
     start_us = 0 if encoding == "evt3" else 1_700_000_000_000_000
     truth = listed(random_events(n, seed, start_us=start_us))
     payloads = {
         "evt3": lambda part: encoders.evt3(part),
-        "libcaer": lambda part: encoders.libcaer(part, start_us),
         "libcaer_cmp": lambda part: encoders.libcaer_cmp(part, start_us),
-        "mono": lambda part: encoders.mono(part, start_us * 1000),
     }
     decoder = PacketDecoder()
     parts = []
@@ -104,14 +102,6 @@ def test_packets_of_every_encoding_come_back(encoding: str, is_ros1: bool, seed:
     parts += list(decoder.finish())
     assert columns_listed(join_events(parts)) == truth
     assert parts[0].host_ns == 77
-
-
-def test_stamps_that_wrap_inside_a_libcaer_packet_go_on() -> None:
-    start_us = (1 << 31) - 30
-    truth = [(start_us + 20 * i, i, i, True) for i in range(5)]
-    data = encoders.packet(encoders.libcaer(truth, 0), "libcaer", is_ros1=False)
-    (columns,) = PacketDecoder().decode(parsed(data, False))
-    assert columns_listed(columns) == truth
 
 
 @pytest.mark.parametrize("is_ros1", [True, False])
@@ -141,8 +131,8 @@ TRUTH = listed(random_events(2000, 11))
 PIECES = [TRUTH[i : i + 100] for i in range(0, 2000, 100)]
 
 
-def messages(is_ros1: bool, encoding: str = "mono") -> list[tuple[str, int, bytes]]:
-    encode = {"mono": lambda piece: encoders.mono(piece, 0), "evt3": encoders.evt3}[encoding]
+def messages(is_ros1: bool, encoding: str = "libcaer_cmp") -> list[tuple[str, int, bytes]]:
+    encode = {"libcaer_cmp": lambda piece: encoders.libcaer_cmp(piece, 0), "evt3": encoders.evt3}[encoding]
     return [
         (TOPIC, 10**9 + 10**7 * i, encoders.packet(encode(piece), encoding, is_ros1=is_ros1, number=i))
         for i, piece in enumerate(PIECES)
@@ -154,7 +144,7 @@ def everything(recording: EventRecording) -> list[Event]:
 
 
 @pytest.mark.parametrize("name", ["a.bag", "ros2"])
-@pytest.mark.parametrize("encoding", ["mono", "evt3"])
+@pytest.mark.parametrize("encoding", ["libcaer_cmp", "evt3"])
 def test_packets_of_a_topic_are_one_recording(tmp_path: Path, name: str, encoding: str) -> None:
     path = write_packet_bag(tmp_path / name, messages(name == "a.bag", encoding))
     recording = open_events(path)
@@ -183,7 +173,7 @@ def test_packets_that_never_arrived_are_counted(tmp_path: Path) -> None:
 
 def test_packets_of_another_size_or_encoding_are_broken_ones(tmp_path: Path) -> None:
     sent = messages(is_ros1=True)
-    odd = encoders.packet(b"", "mono", is_ros1=True, number=20, size=(640, 480))
+    odd = encoders.packet(b"", "libcaer_cmp", is_ros1=True, number=20, size=(640, 480))
     strange = encoders.packet(b"12345678", "evt9", is_ros1=True, number=21)
     sent += [(TOPIC, 2 * 10**9, odd), (TOPIC, 2 * 10**9, strange)]
     recording = open_events(write_packet_bag(tmp_path / "a.bag", sent))
