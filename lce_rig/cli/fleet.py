@@ -53,7 +53,7 @@ def fleet() -> None:
     "--manifest",
     metavar="FILE",
     help="Read robots, profiles, collectors and sites from this file "
-    "[default: ROOT/fleet.yaml or ROOT/fleet.csv, if there is one].",
+    "[default: ROOT/fleet.yaml, if there is one].",
 )
 @click.option(
     "--workers",
@@ -85,13 +85,6 @@ def fleet() -> None:
     show_default=True,
     help="Estimate as `lce-rig calibrate` does with this method.",
 )
-@click.option(
-    "--pictures",
-    type=click.Choice(["all", "sheets", "none"]),
-    default="sheets",
-    show_default=True,
-    help="Keep the overlays of all captures, their contact sheets only, or draw none.",
-)
 @click.option("--retry", is_flag=True, help="Run sessions without a result again.")
 @json_option
 def run(
@@ -103,7 +96,6 @@ def run(
     time_limit: float,
     memory_limit: float,
     method: Any,
-    pictures: Any,
     retry: bool,
     as_json: bool,
 ) -> None:
@@ -122,7 +114,7 @@ def run(
     place = Storage.at(registry)
     jobs = find_jobs(Storage.at(root), None if manifest is None else Storage.at(manifest))
     limits = (time_limit, memory_limit)
-    settings = Settings(place.url, method, *limits, retry, pictures)
+    settings = Settings(place.url, method, *limits, retry)
     n_workers = workers or len(os.sched_getaffinity(0))
     show.note(f"{show.counted(len(jobs), 'session')} in {root}")
     with patience(_GRACE_S), cluster(n_workers, memory_limit, scheduler) as client:

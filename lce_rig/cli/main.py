@@ -142,7 +142,7 @@ def _report(error: BaseException, *, show_traceback: bool) -> int:
     elif isinstance(error, ModuleNotFoundError):
         what, hint, code = (
             f"the package '{error.name}' is missing",
-            "Install it with the others: pip install lce-rig",
+            "Install it with the others: pip install lce-rig, for `fleet` pip install 'lce-rig[fleet]'",
             5,
         )
         show_traceback |= (error.name or "").startswith("lce_rig")

@@ -1,8 +1,6 @@
 """Find sessions and recordings below a root, with what a manifest says of them."""
 
-import csv
 import hashlib
-import io
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from lce_rig.fleet.storage import Storage
 from lce_rig.rig.loading import find_profile
 from lce_rig.session.identity import MARKER
 
-MANIFESTS = ("fleet.yaml", "fleet.csv")
+MANIFEST = "fleet.yaml"
 _FIELDS = ("robot", "collector", "site")
 _FIELD = re.compile(r"\{(\w+)\}")
 _SAFE = re.compile(r"[^A-Za-z0-9_.-]+")
@@ -85,7 +83,7 @@ class Entry(BaseModel):
 def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
     """List the sessions and recordings below a folder.
 
-    A manifest, `fleet.yaml` or `fleet.csv` in the folder unless another is given, names them by patterns.
+    A manifest, `fleet.yaml` in the folder unless another is given, names them by patterns.
     Without one, every session is taken.
 
     Args:
@@ -99,19 +97,19 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
     """
     if not root.exists():
         raise UsageError(f"{root.url} does not exist", "Give the folder that the sessions lie in.")
-    named = [manifest] if manifest is not None else [root / name for name in MANIFESTS]
-    text = next(((each, content) for each in named if (content := each.read()) is not None), None)
+    place = manifest or root / MANIFEST
+    text = place.read()
     if text is None and manifest is not None:
-        raise UsageError(f"{manifest.url} does not exist", "Give a manifest, fleet.yaml or fleet.csv.")
+        raise UsageError(f"{manifest.url} does not exist", "Give a manifest such as fleet.yaml.")
     if text is None:
         paths = root.folders_with(MARKER)
         names = {path: path.partition("/")[0] or root.name for path in paths}
         jobs = [Job(f"{root.url}/{path}".rstrip("/"), fallback_robot=names[path]) for path in paths]
     else:
-        jobs = _matches(root, text[0], _entries(*text))
+        jobs = _matches(root, place, _entries(place, text))
     if not jobs:
         raise NotEnoughDataError(
-            f"{root.url} holds no session" + ("" if text is None else f" that {text[0].url} names"),
+            f"{root.url} holds no session" + ("" if text is None else f" that {place.url} names"),
             "A session is a folder with session.json; recordings are named in a manifest (docs/fleets.md).",
         )
     return jobs
@@ -120,12 +118,7 @@ def find_jobs(root: Storage, manifest: Storage | None = None) -> list[Job]:
 def _entries(manifest: Storage, content: bytes) -> list[Entry]:
     """Read a manifest."""
     try:
-        text = content.decode()
-        documents: Any = (
-            [{k: v for k, v in row.items() if v} for row in csv.DictReader(io.StringIO(text))]
-            if manifest.url.endswith(".csv")
-            else (yaml.safe_load(text) or {})
-        )
+        documents: Any = yaml.safe_load(content.decode()) or {}
         if isinstance(documents, Mapping):
             documents = documents.get("sessions")
         if not isinstance(documents, list):
@@ -138,7 +131,7 @@ def _entries(manifest: Storage, content: bytes) -> list[Entry]:
             f"{manifest.url}: {key}: {problem}; {first['input']!r:.60} given",
             f"Keys: {', '.join(Entry.model_fields)}; see docs/fleets.md.",
         ) from None
-    except Exception as error:  # csv, yaml and pydantic raise many kinds about odd text
+    except Exception as error:  # yaml raises many kinds about odd text
         raise UsageError(
             f"{manifest.url} is not a manifest: {reason_of(error)}",
             "List entries with `path` below `sessions:`.",
@@ -162,7 +155,7 @@ def _matches(root: Storage, manifest: Storage, entries: Iterable[Entry]) -> list
             raise ProfileError(f"{manifest.url}: rig: {rig} does not exist", "Name a profile's file.")
         stated = entry.model_dump(include=set(_FIELDS))
         for path in root.matching(entry.glob):
-            if path not in jobs and path not in MANIFESTS:
+            if path not in jobs and path != MANIFEST:
                 read = entry.fields_of(path)
                 fields = {name: stated[name] or read.get(name, "") for name in _FIELDS}
                 jobs[path] = Job(

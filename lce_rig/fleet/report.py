@@ -19,17 +19,15 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from markupsafe import Markup
 from numpy.typing import NDArray
 
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
 from lce_rig.core.phrasing import as_line
 from lce_rig.fleet.findings import MOVED
-from lce_rig.fleet.registry import Registry
-from lce_rig.fleet.table import covariances, poses
+from lce_rig.fleet.registry import Registry, covariances, poses
 from lce_rig.session.durable import write_atomically
-from lce_rig.show.report.page import BLUE, FAINT, RED, drawing, new_axes, render, style
+from lce_rig.show.report.page import render
 
 State = Literal["moved", "steady", "cannot_tell"]
 STATES: tuple[State, ...] = ("moved", "steady", "cannot_tell")
@@ -58,7 +56,6 @@ class History:
         is_compared: (N,) whether a result is compared with the one in the row before it.
         change: (N, 6) tangent from the pose in the row before, m and rad, axes of the camera; NaN if not
             compared.
-        sigma: (N, 6) its standard deviations.
         chi2: (N,) of it.
         limit: of `chi2`.
         robots: state of every robot in the registry.
@@ -67,7 +64,6 @@ class History:
     rows: Any
     is_compared: NDArray[np.bool_]
     change: Array
-    sigma: Array
     chi2: Array
     limit: float
     robots: Mapping[str, State]
@@ -116,7 +112,7 @@ def history_of(table: Any) -> History:
         is_compared[1:] &= same[name][1:] | ~is_known[1:] | ~is_known[:-1]
     # A copy of a session is not another one.
     is_compared &= ~(same["session_sha256"] & rows["session_sha256"].is_valid().to_numpy())
-    change, sigma, chi2 = np.full((n, 6), np.nan), np.full((n, 6), np.nan), np.full(n, np.nan)
+    change, chi2 = np.full((n, 6), np.nan), np.full(n, np.nan)
     k = np.flatnonzero(is_compared)
     limit = float(chdtri(6, FALSE_ALARMS / max(len(k), 1)))
     if len(k):
@@ -124,13 +120,12 @@ def history_of(table: Any) -> History:
         differs = ~(same["profile_sha256"] & same["method"])
         change[k] = difference(T[k], T[k - 1])
         both = cov[k] + cov[k - 1] - np.where(differs[k, None, None], 0.0, shared[k] + shared[k - 1]) + _LEAST
-        sigma[k] = np.sqrt(np.einsum("kii->ki", both))
         chi2[k] = np.einsum("ki,ki->k", change[k], np.linalg.solve(both, change[k][..., None])[..., 0])
     robots: dict[str, State] = dict.fromkeys(sorted(pc.unique(table["robot"]).to_pylist()), "cannot_tell")
     names = rows["robot"].to_pylist()
     robots |= {names[i]: "steady" for i in k.tolist()}
     robots |= {names[i]: "moved" for i in k[chi2[k] > limit].tolist()}
-    return History(rows, is_compared, change, sigma, chi2, limit, robots)
+    return History(rows, is_compared, change, chi2, limit, robots)
 
 
 def _usable(table: Any) -> NDArray[np.intp]:
@@ -149,8 +144,7 @@ def _usable(table: Any) -> NDArray[np.intp]:
 
 FORMAT_VERSION = 1
 Count = tuple[Any, int, int]
-_AXES = tuple((f"{kind} {axis}", unit) for kind, unit in (("along", "m"), ("about", "deg")) for axis in "xyz")
-_MOST_ROWS, _MOST_DRAWINGS, _MOST_SESSIONS = 60, 12, 400
+_MOST_ROWS = 60
 _STATE_WORDS = {"moved": "moved", "steady": "steady", "cannot_tell": "cannot tell yet"}
 
 
@@ -230,7 +224,6 @@ class FleetReport:
             moved=[(finding.subject, as_line(finding.text)) for finding in shown],
             n_moves=len(self.findings),
             action=as_line(str(MOVED.action)),
-            drawings=_drawings(history),
             verdicts=[(*count, f"{100 * count[1] / self.n_rows:.1f} %") for count in self.verdicts],
             causes=[(code, severity, n, m) for (severity, code), n, m in self.causes[:_MOST_ROWS]],
             limit=f"{history.limit:.1f}",
@@ -245,47 +238,3 @@ def _counted(pairs: Iterable[tuple[Any, str]]) -> list[Count]:
         robots.setdefault(key, []).append(robot)
     counts = [(key, len(names), len(set(names))) for key, names in robots.items()]
     return sorted(counts, key=lambda count: (-count[1], count[0]))
-
-
-def _drawings(history: History) -> list[tuple[str, str, Markup]]:
-    """Draw the first few robots that moved along the axis that changed most: (title, note, drawing)."""
-    drawn: dict[tuple[str, ...], tuple[str, str, Markup]] = {}
-    is_start = ~history.is_compared
-    for k in history.moves:
-        robot, camera, lidar = (history.rows[name][k].as_py() for name in ("robot", "camera", "lidar"))
-        if len(drawn) == _MOST_DRAWINGS or (robot, camera, lidar) in drawn:
-            continue
-        starts = np.flatnonzero(is_start[: k + 1])
-        ends = np.flatnonzero(is_start[k + 1 :])
-        first = max(int(starts[-1]), k - _MOST_SESSIONS // 2)
-        last = min(k + 1 + (int(ends[0]) if len(ends) else len(history.rows)), k + _MOST_SESSIONS // 2)
-        axis = int(np.argmax(np.abs(history.change[k] / history.sigma[k])))
-        title, note = f"{robot}: {camera} and {lidar}", f"{_AXES[axis][0]} of the camera"
-        drawn[robot, camera, lidar] = (title, note, _in_time(history, first, last, axis, title))
-    return list(drawn.values())
-
-
-def _in_time(history: History, first: int, last: int, axis: int, label: str) -> Markup:
-    """Draw rows first to last along one axis, with bars of two independent standard deviations."""
-    from matplotlib import dates
-
-    rows = history.rows.slice(first, last - first)
-    T, cov = poses(rows["T_cam_lidar"]), covariances(rows["cov"]) - covariances(rows["cov_shared"])
-    unit = float(np.degrees(1.0)) if _AXES[axis][1] == "deg" else 1e3
-    values = unit * difference(T, np.broadcast_to(T[0], T.shape))[:, axis]
-    sigma = unit * np.sqrt(np.maximum(cov[:, axis, axis], 0.0))
-    days: Any = np.array([date.removesuffix("Z") for date in rows["date"].to_pylist()], dtype="datetime64[s]")
-    module: Any = dates
-    with style():
-        figure, (axes,) = new_axes(2.2, left_in=0.62, top_in=0.08)
-        axes.errorbar(days, values, 2 * sigma, fmt="none", lw=0.8, ecolor=FAINT)
-        axes.plot(days, values, "o", ms=3.5, color=BLUE, mew=0)
-        for k in history.moves:
-            if first < k < last:
-                axes.axvspan(days[k - first - 1], days[k - first], color=RED, alpha=0.25, lw=0)
-        axes.set_ylabel("deg" if _AXES[axis][1] == "deg" else "mm")
-        axes.grid(axis="y")
-        locator = module.AutoDateLocator(maxticks=6)
-        axes.xaxis.set_major_locator(locator)
-        axes.xaxis.set_major_formatter(module.ConciseDateFormatter(locator))
-        return drawing(figure, label)

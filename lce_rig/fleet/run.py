@@ -16,7 +16,7 @@ from lce_rig.core.errors import LceRigError, SourceError
 from lce_rig.core.progress import Progress, silent
 from lce_rig.fleet.findings import WORKER_LOST
 from lce_rig.fleet.jobs import Job
-from lce_rig.fleet.table import Row
+from lce_rig.fleet.registry import Row
 from lce_rig.fleet.work import Settings, first_row, publish, run_apart, without_result
 
 # A session cannot kill its worker; a worker that died was killed from outside.

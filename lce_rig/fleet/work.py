@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import IO, Any, Literal
+from typing import IO, Any
 
 import psutil  # type: ignore[import-untyped]
 
@@ -37,9 +37,8 @@ from lce_rig.core.errors import (
 )
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.fleet.jobs import Job, folder_name
-from lce_rig.fleet.registry import Registry, write_rows
+from lce_rig.fleet.registry import Registry, Row, Status, with_pairs, write_rows
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import Row, Status, with_pairs
 from lce_rig.io.protocol import fingerprint
 from lce_rig.pipeline.result_files import OVERLAYS
 from lce_rig.rig import Rig, dump_rig, load_rig
@@ -69,7 +68,6 @@ _KINDS: tuple[tuple[type[LceRigError], Kind], ...] = (
     (LceRigError, findings.OTHER_ERROR),
 )
 _HASH_DIGITS = 12
-Pictures = Literal["all", "sheets", "none"]
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,6 @@ class Settings:
         time_limit_s: of a session.
         memory_limit_mb: of its process.
         retry: whether sessions without a result are run again.
-        pictures: whether overlays of all captures are kept, contact sheets of them only, or nothing is drawn.
     """
 
     registry: str
@@ -90,7 +87,6 @@ class Settings:
     time_limit_s: float = 600.0
     memory_limit_mb: float = 4000.0
     retry: bool = False
-    pictures: Pictures = "sheets"
 
     def opened(self) -> Registry:
         """Open the registry."""
@@ -224,7 +220,7 @@ def _calibrate(
     detections = lce.detect(session, n_threads=1)
     result = lce.calibrate(session, detections, options=lce.CalibrateOptions(settings.method))
     saved = result.file()
-    verification = None if settings.pictures == "none" else lce.verify(session, result, detections)
+    verification = lce.verify(session, result, detections)
     row = row | {"profile_sha256": saved.inputs_sha256[PROFILE]}
     solved = {(c.camera, c.lidar) for c in result.pairs}
     pairs = dict.fromkeys((pair.camera, pair.lidar) for pair in detections.pairs)
@@ -237,11 +233,9 @@ def _calibrate(
     def fill(folder: Path) -> None:
         result.write(folder)
         replace_file(folder / PROFILE, dump_rig(session.rig).encode())
-        if verification is not None:
-            checks = verification.write(folder / OVERLAYS)
-            for path in (path for check in checks for path in check.pictures):
-                if settings.pictures == "sheets":
-                    path.unlink()
+        # Of the overlays, contact sheets are enough.
+        for path in (path for check in verification.write(folder / OVERLAYS) for path in check.pictures):
+            path.unlink()
 
     return publish(registry, [row, *lacking], start_s, fill, saved=saved)
 

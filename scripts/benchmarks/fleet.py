@@ -15,10 +15,9 @@ import numpy as np
 from benchmarks.fleet_sessions import BROKEN, TRUTH, break_sessions, make_fleet
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.geometry import perturb
-from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.registry import SCHEMA, TABLE, Registry, as_table, in_order, table_bytes
 from lce_rig.fleet.report import MOVED_COLUMNS, history_of
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import SCHEMA, TABLE, as_table, in_order, table_bytes
 
 _FEW_ROBOTS, _FEW_SESSIONS = 10, 30
 _TABLE_ROWS = 1_000_000
@@ -52,7 +51,7 @@ def few_sessions(folder: Path) -> Path:
 
 def _command(root: str | Path, registry: str | Path, *options: str) -> list[str]:
     run = [sys.executable, "-m", "lce_rig", "fleet", "run", str(root), "--registry", str(registry), "--json"]
-    return [*run, "--pictures", "none", *options]
+    return [*run, *options]
 
 
 def run_cli(root: str | Path, registry: str | Path, *options: str) -> tuple[dict[str, Any], float, float]:

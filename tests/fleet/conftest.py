@@ -13,7 +13,7 @@ from wire.sshd import NoServerError, Sshd
 import lce_rig.collect.findings
 import lce_rig.judge.findings  # noqa: F401  kinds of the findings in stored results
 from lce_rig.core.calibration import Provenance
-from lce_rig.fleet.table import Row
+from lce_rig.fleet.registry import Row
 from lce_rig.rig import Rig, load_rig
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session

@@ -42,12 +42,6 @@ def test_a_manifest_names_robot_profile_and_collector_by_patterns(tmp_path):
     assert jobs["bags/r7.bag"].rig == f"{tmp_path}/profiles/r.yaml"
 
 
-def test_a_table_of_comma_separated_values_serves_as_well(tmp_path):
-    lay_out(tmp_path, "a", "b")
-    (tmp_path / "fleet.csv").write_text("path,robot,rig\na,r1,\nb,r2,rlfs\n")
-    assert [(job.robot, job.rig) for job in find_jobs(Storage.at(tmp_path))] == [("r1", ""), ("r2", "rlfs")]
-
-
 @pytest.mark.parametrize(
     "text",
     [

@@ -24,7 +24,7 @@ def test_a_lost_worker_and_a_client_that_ends_lose_nothing(simulated, tmp_path, 
         shutil.copytree(simulated, root / f"r{k}/s")
         shutil.rmtree(root / f"r{k}/s/captures/00000{k}")
     command = [sys.executable, "-m", "lce_rig", "fleet", "run", str(root), "--workers", "2", "--json"]
-    command += ["--registry", registry.place.url, "--pictures", "none"]
+    command += ["--registry", registry.place.url]
     first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     _wait_for(lambda: len(registry.folders()) >= 1)
     for worker in workers_of(first.pid)[:1]:

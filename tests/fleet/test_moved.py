@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lce_rig.core.geometry import perturb
+from lce_rig.fleet.registry import as_table
 from lce_rig.fleet.report import history_of
-from lce_rig.fleet.table import as_table
 
 SIGMA = np.array([2e-3, 2e-3, 3e-3, *np.radians([0.06, 0.06, 0.04])])
 UPPER = np.triu_indices(6)

@@ -3,9 +3,8 @@
 import pytest
 
 from lce_rig.core.errors import UsageError
-from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.registry import SCHEMA, Registry, as_table
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import SCHEMA, as_table
 
 
 @pytest.fixture

@@ -3,9 +3,8 @@
 import pytest
 
 from lce_rig.core.errors import SessionError
-from lce_rig.fleet.registry import SUPERSEDED, Registry, write_rows
+from lce_rig.fleet.registry import ROWS, SUPERSEDED, TABLE, Registry, write_rows
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import ROWS, TABLE
 
 
 @pytest.fixture

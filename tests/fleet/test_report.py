@@ -7,10 +7,9 @@ import pytest
 
 from lce_rig.cli.main import run
 from lce_rig.core.geometry import perturb
-from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.registry import Registry, as_table
 from lce_rig.fleet.report import FleetReport
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import as_table
 
 SIGMA = np.array([2e-3, 2e-3, 3e-3, *np.radians([0.06, 0.06, 0.04])])
 
@@ -39,7 +38,7 @@ def registry(row, tmp_path):
 def test_the_page_names_the_robot_that_moved_and_escapes_names(registry):
     text = FleetReport.of(registry).page()
     assert "<b>&lt;r1&gt;</b>" in text and "<r1>" not in text
-    assert "fleet.signal" in text and text.count("<svg") == 1
+    assert "fleet.signal" in text
     assert "http" not in text.replace("http-equiv", "")
     assert text == FleetReport.of(registry).page()
 

@@ -13,10 +13,9 @@ import lce_rig.judge.findings  # noqa: F401  kinds of the findings in stored res
 from lce_rig.cli.main import run
 from lce_rig.core.calibration import Provenance
 from lce_rig.core.errors import ProfileError, UsageError
-from lce_rig.fleet.registry import Registry, write_rows
+from lce_rig.fleet.registry import Registry, as_table, write_rows
 from lce_rig.fleet.rollout import FleetDeployment, Rollout, newest_results
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import as_table
 from lce_rig.rig import dump_rig, load_rig
 from tests.export.conftest import calibration, some_pose
 from tests.saved_results import result_file

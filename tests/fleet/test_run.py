@@ -10,9 +10,9 @@ import pytest
 
 from lce_rig.core.calibration import read_result
 from lce_rig.fleet.jobs import find_jobs
+from lce_rig.fleet.registry import poses
 from lce_rig.fleet.run import cluster, run_fleet, run_job
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import poses
 from lce_rig.fleet.work import Settings
 
 pytestmark = pytest.mark.long

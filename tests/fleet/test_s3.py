@@ -13,9 +13,8 @@ from s3fs import S3FileSystem
 
 from lce_rig.cli.main import run
 from lce_rig.fleet.jobs import find_jobs
-from lce_rig.fleet.registry import Registry, write_rows
+from lce_rig.fleet.registry import TABLE, Registry, write_rows
 from lce_rig.fleet.storage import Storage
-from lce_rig.fleet.table import TABLE
 from lce_rig.fleet.work import Settings, work
 
 

@@ -31,7 +31,7 @@ def recorded(simulated, small_rig, tmp_path):
 
 @pytest.mark.long
 def test_a_recording_is_calibrated_by_a_cluster_that_runs_already(recorded, capsys, tmp_path):
-    words = ["fleet", "run", str(recorded), "--registry", str(tmp_path / "registry"), "--pictures", "none"]
+    words = ["fleet", "run", str(recorded), "--registry", str(tmp_path / "registry")]
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster:
         address = cluster.scheduler_address
         assert run([*words, "--scheduler", address]) == 0

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lce_rig.core.errors import SessionError
-from lce_rig.fleet.table import (
+from lce_rig.fleet.registry import (
     SCHEMA,
     as_table,
     covariances,
