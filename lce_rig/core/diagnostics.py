@@ -62,7 +62,6 @@ class Diagnostics:
     noise_across_m: float = _NONE
     alone_sigma_rotation_deg: float = _NONE  # standard deviations without the other cameras
     alone_sigma_translation_m: float = _NONE
-    sigma_widened: float = _NONE  # factor on the standard deviations, from resampling
     channels_rotation_deg: float = _NONE  # between the extrinsics of two channels of the camera
     channels_translation_m: float = _NONE
 

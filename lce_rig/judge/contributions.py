@@ -1,6 +1,6 @@
 """The reported covariance: what the captures show, what the profile may have wrong, what checks contradict.
 
-    cov = widened^2 cov_session + sum_i sigma_i^2 S_i S_i^T + sum_c m_c m_c^T
+    cov = cov_session + sum_i sigma_i^2 S_i S_i^T + sum_c m_c m_c^T
 
 with S_i the sensitivity to error i of the profile's lens or board, and m_c the move of the extrinsics that
 would resolve contradiction c: a check that finds something else than the profile says, beyond both standard
@@ -9,7 +9,7 @@ deviations, widens the claim until it holds both.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
@@ -20,16 +20,12 @@ from lce_rig.core.calibration import Contribution
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes, tangent_sizes
-from lce_rig.judge.findings import KNOWN_BETTER, LARGEST_CAUSE, SURPRISING_CHI2
-from lce_rig.judge.negative_control import SURE_GAIN, NegativeControl
-from lce_rig.judge.nuisances import Nuisances
+from lce_rig.judge.findings import LARGEST_CAUSE, SURPRISING_CHI2
 from lce_rig.judge.split_consistency import Contrast, objections
 from lce_rig.rig import CalibrationSettings, Rig
 
 # Scales differ significantly beyond this many standard deviations.
 _SURE = 3.0
-# The session knows a quantity better than the profile below this ratio of their standard deviations.
-_CLEARLY = 0.5
 # Two subsets of the captures that contradict each other: the result is the mean of both.
 _HALF = 0.5
 _CONTRADICTION = "contradiction_"
@@ -60,35 +56,30 @@ def profile_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
 
 def find_contradictions(
     estimate: CalibrationEstimate,
-    nuisances: Nuisances | None,
+    scale: tuple[float, float] | None,
     contrasts: Sequence[Contrast],
-    control: NegativeControl | None,
     rig: Rig,
 ) -> Iterator[Contradiction]:
     """List the checks that contradict an estimate, each with the move of the extrinsics that resolves it.
 
     Args:
         estimate: with the sensitivities to errors of the profile.
-        nuisances: the camera's scale.
+        scale: of the camera's distances, with its standard deviation.
         contrasts: subsets of the captures that should agree.
-        control: moves of the result that should fit worse.
         rig: targets and limits.
     """
     target, of_source = rig.calibration, {each.source: each for each in estimate.sensitivities}
     # The likelihood weighs the camera's distances and the LiDAR's itself.
-    if of_source and nuisances is not None and estimate.method == "paper" and estimate.lens is not None:
+    if of_source and scale is not None and estimate.method == "paper" and estimate.lens is not None:
         squares = of_source["square_size"]
-        variance = nuisances.scale_sigma**2 + squares.sigma**2 + estimate.lens.focal_sigma**2
-        if nuisances.scale**2 > _SURE**2 * variance:
-            yield Contradiction("scale", nuisances.scale * squares.moves)
+        variance = scale[1] ** 2 + squares.sigma**2 + estimate.lens.focal_sigma**2
+        if scale[0] ** 2 > _SURE**2 * variance:
+            yield Contradiction("scale", scale[0] * squares.moves)
     for contrast in objections(contrasts, target, rig.verdict):
         # The result lies between both subsets; where the extrinsics change on the way, it lies a whole change
         # from one of the two that may hold now.
         share = 1.0 if contrast.is_change else _HALF
         yield Contradiction(f"{contrast.first}_{contrast.second}", share * np.array([contrast.apart]))
-    if control is not None and control.gain_sigmas > SURE_GAIN:
-        # The optimum of held-out captures lies beyond half of the move.
-        yield Contradiction("control", _HALF * control.moves[[control.worst]])
     # Channels of one camera have one pose: the result lies between both.
     apart, cov = estimate.channel_difference, estimate.channel_difference_cov
     if apart is not None and cov is not None:
@@ -99,21 +90,14 @@ def find_contradictions(
 
 def list_contributions(
     figures: Diagnostics,
-    widened_by: float,
     sensitivities: Sequence[Sensitivity],
     contradictions: Sequence[Contradiction],
 ) -> tuple[Contribution, ...]:
     """List the causes of the reported standard deviations, the largest translation first."""
     parts = [
+        Contribution("captures", figures.sigma_scatter_rotation_deg, figures.sigma_scatter_translation_m),
         Contribution(
-            "captures",
-            widened_by * figures.sigma_scatter_rotation_deg,
-            widened_by * figures.sigma_scatter_translation_m,
-        ),
-        Contribution(
-            "lidar_ranges",
-            widened_by * figures.sigma_systematic_rotation_deg,
-            widened_by * figures.sigma_systematic_translation_m,
+            "lidar_ranges", figures.sigma_systematic_rotation_deg, figures.sigma_systematic_translation_m
         ),
         *(Contribution(each.source, *sigma_sizes(each.covariance())) for each in sensitivities),
         *(Contribution(_CONTRADICTION + each.source, *sigma_sizes(each.cov)) for each in contradictions),
@@ -134,36 +118,8 @@ def measure_action(source: str) -> str:
     return f"measure_{source}" if source in get_args(Source) else ""
 
 
-@dataclass(frozen=True)
-class KnownBetter:
-    """A quantity of the profile that the session's boards determine better.
-
-    Attributes:
-        source: which, as `Contribution.source`.
-        error, error_sigma: session less profile, with its standard deviation, in the unit of `Sensitivity`.
-        profile_sigma: standard deviation by the profile.
-    """
-
-    source: str
-    error: float
-    error_sigma: float
-    profile_sigma: float
-
-
-def known_better(estimate: CalibrationEstimate, found: Nuisances | None) -> tuple[KnownBetter, ...]:
-    """Find whether the LiDAR's distances determine the squares' size clearly better than the profile."""
-    sigma = {each.source: each.sigma for each in estimate.sensitivities}
-    if found is None or estimate.lens is None or not sigma:
-        return ()
-    own, of_profile = math.hypot(found.scale_sigma, estimate.lens.focal_sigma), sigma["square_size"]
-    better = KnownBetter("square_size", -found.scale, own, of_profile)
-    return (better,) if own < _CLEARLY * of_profile else ()
-
-
-def uncertainty_notes(
-    causes: Sequence[Contribution], better: Sequence[KnownBetter], target: CalibrationSettings
-) -> Iterator[Finding]:
-    """Name the largest cause of the standard deviations, and what the session knows better than the profile.
+def uncertainty_notes(causes: Sequence[Contribution], target: CalibrationSettings) -> Iterator[Finding]:
+    """Name the largest cause of the standard deviations.
 
     The larger of rotation and translation counts, in units of the target.
     """
@@ -181,5 +137,3 @@ def uncertainty_notes(
             "share": (part / total) ** 2,
         }
         yield LARGEST_CAUSE(action=measure_action(source), **figures)
-    for each in better:
-        yield KNOWN_BETTER(**asdict(each))

@@ -12,14 +12,13 @@ Verdict = Literal["pass", "marginal", "fail"]
 SURPRISING_CHI2 = 16.81
 """99 % of the chi-squared distribution with six degrees of freedom: differences beyond it are significant."""
 _OF_DISTANCES = (
-    "verdict.two_groups verdict.shares_differ verdict.camera_shares_differ verdict.control "
-    "verdict.plane_residual verdict.edge_residual verdict.held_out verdict.rotation_uncertain "
+    "verdict.two_groups verdict.shares_differ verdict.camera_shares_differ "
+    "verdict.plane_residual verdict.edge_residual verdict.rotation_uncertain "
     "verdict.translation_uncertain verdict.scene verdict.scene_not_used "
 )
 _OF_POSES = _OF_DISTANCES + (
     "verdict.cameras_differ verdict.channels_differ verdict.planes_apart verdict.sensors_disagree "
-    "verdict.few_used verdict.few_placements verdict.far_from_nominal verdict.edge_shift "
-    "verdict.laser_offset verdict.scale "
+    "verdict.few_used verdict.few_placements verdict.far_from_nominal verdict.scale "
 )
 _OF_SIGMAS = ["verdict.rotation_uncertain", "verdict.translation_uncertain"]
 _FOLLOWS: Mapping[str, Sequence[str]] = {
@@ -27,11 +26,8 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.moved": _OF_POSES.split(),
     "verdict.changed": _OF_POSES.split(),
     "verdict.camera_changed": _OF_POSES.split(),
-    "verdict.plate_size": (
-        ["verdict.edge_shift", "verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]
-    ),
+    "verdict.plate_size": (["verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]),
     "verdict.plate_edge": [
-        "verdict.edge_shift",
         "verdict.edge_residual",
         "verdict.shares_differ",
         *_OF_SIGMAS,
@@ -52,8 +48,6 @@ _LACKS = {
     ("verdict.rotation_uncertain", ""),
     ("verdict.translation_uncertain", ""),
     ("verdict.not_certified", ""),
-    ("verdict.held_out", ""),
-    ("verdict.control", ""),
 }
 """Code and action of findings against which more captures help."""
 _VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}
@@ -92,7 +86,6 @@ _CONTRADICTIONS = {
     "channels": "the camera's channels",
     "cameras": "the cameras",
     "group_rest": "two groups of captures",
-    "control": "the result and held-out captures",
 }
 _LEAST_ROTATION = "{weakest:motion}, sigma {weakest_sigma_deg:3deg}"
 _LEAST_TRANSLATION = "{weakest:motion}, sigma {weakest_sigma_m:1mm}"
@@ -197,17 +190,6 @@ def _scale(finding: Finding) -> str:
     )
 
 
-def _widened(finding: Finding) -> str:
-    """Standard deviations are {ratio} times the method's, as {spread} vary."""
-    ways = {
-        "bootstrap": "bootstrap samples",
-        "left_out": "leave-one-out results",
-        "halves": "random halves of the captures",
-    }
-    way = ways[str(finding.figures["spread"])]
-    return f"standard deviations widened {finding.figure('ratio'):.1f} times: {way} vary that much"
-
-
 def _largest_cause(finding: Finding) -> str:
     """Of the standard deviation {total_m} or {total_deg}, {share} is {source}: {sigma_m} or {sigma_deg}."""
     what = "translation" if "sigma_m" in finding.figures else "rotation"
@@ -216,18 +198,6 @@ def _largest_cause(finding: Finding) -> str:
     return (
         f"largest cause of the {what}'s uncertainty: {source}, {part.split()[0]} of {total} "
         f"({share:.0f} % of the variance)"
-    )
-
-
-def _known_better(finding: Finding) -> str:
-    """The session's boards determine {source} to {error_sigma}, the profile to {profile_sigma}: {error}."""
-    source = str(finding.figures["source"])
-    error, sigma, of_profile = (
-        100 * finding.figure(name) for name in ("error", "error_sigma", "profile_sigma")
-    )
-    return (
-        f"the session's boards determine {cause_words(source)} better than the profile: {error:+.2f} +- "
-        f"{sigma:.2f} % from it, which has +- {of_profile:.2f} %"
     )
 
 
@@ -330,12 +300,6 @@ EDGE_RESIDUAL = Kind(
     "ring ends {mean_m:mm} on average from the board's edges (limit {limit_m:mm})",
     _STILL,
 )
-HELD_OUT = Kind(
-    "verdict.held_out",
-    "held-out captures fit worse ({held_out_m:1mm}) than captures used ({fitted_m:1mm})",
-    "collect more captures",
-    severity="warning",
-)
 PLANES_APART = Kind(
     "verdict.planes_apart",
     "camera and LiDAR board planes differ by {rms_m:mm} rms (still boards: under 10 mm)",
@@ -423,26 +387,7 @@ SHARES_DIFFER = Kind(
     _LENS,
     actions=_NEAR,
 )
-CONTROL = Kind(
-    "verdict.control",
-    "control failed: moved by "
-    + _APART
-    + " ({direction:motion}), the result fits held-out captures no worse",
-    "collect more captures; if this persists, re-measure the board",
-)
 SCALE_OFF = Kind("verdict.scale", _scale, "measure the squares")
-EDGE_SHIFT = Kind(
-    "verdict.edge_shift",
-    "ring ends {shift_m:mm} beyond the plate's edges (limit {limit_m:mm}, the beam's width)",
-    "measure the plate",
-    severity="warning",
-)
-LASER_OFFSET = Kind(
-    "verdict.laser_offset",
-    "ranges of laser ring {ring} {offset_m:mm} too long (limit {limit_m:mm}, from the profile)",
-    "correct them in the LiDAR's driver",
-    severity="warning",
-)
 LASER_ANGLES = Kind(
     "verdict.laser_angles",
     "the lasers' {angle}s differ from those of the scans by {rms_deg:deg} rms (limit {limit_deg:deg})",
@@ -477,9 +422,7 @@ CAMERAS_DIFFER = Kind(
     "relative poses from extrinsics and images by " + _APART,
     "check whether a camera has moved, and the intrinsics",
 )
-WIDENED = Kind("verdict.widened", _widened, severity="note")
 LARGEST_CAUSE = Kind("verdict.largest_cause", _largest_cause, severity="note", actions=_MEASURE)
-KNOWN_BETTER = Kind("verdict.known_better", _known_better, severity="note")
 MAY_BE_OFF = Kind(
     "verdict.may_be_off",
     "with 95 % probability each, the rotation is off by less than {rotation_deg:deg} and the translation by "

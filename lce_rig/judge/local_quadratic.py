@@ -21,7 +21,7 @@ from lce_rig.calibrate.plane_and_ends import (
     end_rows,
     plane_residuals,
 )
-from lce_rig.calibrate.quadratics import Quadratics
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Observation
@@ -77,6 +77,21 @@ def expand(
             hessians[k] += weight * J.T @ J
     prior = priors_of_constants(len(rings), laser_bias_sigma_m, range_offset_sigma_m)
     return Quadratics(gradients, hessians, prior, np.zeros(p), group_placements(observations))
+
+
+def scale_of(expansion: Quadratics) -> tuple[float, float]:
+    """Estimate the camera's distances over the LiDAR's, less 1, by single errors and by leave-one-out.
+
+    Args:
+        expansion: by `expand`, with the scale free.
+
+    Returns:
+        The scale without a prior, and its standard deviation.
+    """
+    without = expansion.without_each()[:, [SCALE]]
+    scatter = jackknife_scatter(without - without.mean(axis=0))[0, 0]
+    sigma = float(np.sqrt(expansion.covariance()[SCALE, SCALE] + scatter))
+    return float(expansion.optimum()[SCALE]), sigma
 
 
 def plane_rows(

@@ -20,7 +20,6 @@ from lce_rig.judge.findings import (
     FAR_FROM_NOMINAL,
     FEW_PLACEMENTS,
     FEW_USED,
-    HELD_OUT,
     LAST_REJECTED,
     MAY_BE_OFF,
     NO_CERTIFICATE,
@@ -45,8 +44,6 @@ from lce_rig.judge.findings import (
 )
 from lce_rig.judge.intrinsics_check import lens_findings
 from lce_rig.judge.laser_angles import angle_findings
-from lce_rig.judge.negative_control import control_findings
-from lce_rig.judge.nuisances import nuisance_findings
 from lce_rig.judge.split_consistency import split_findings
 from lce_rig.judge.validate import Validation
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
@@ -58,6 +55,8 @@ _UPRIGHT = 0.87
 # Shares of scans without one of two edges, and of ring ends off the outline. Of 15 sessions with the right
 # size one lacks edges, by its mounting, and drops none; one drops as many, at hands, and lacks none.
 _LACKING, _DROPPED = 0.3, 0.04
+# Scales differ beyond this many standard deviations, and fail beyond this many limits.
+_SURE, _SCALE_FAIL = 3.0, 2.5
 # A contradiction of the scene by so many standard deviations fails; from three it is told.
 SCENE_FAILS = 5.0
 
@@ -83,8 +82,7 @@ def judge(
         others: of other evidence: contradictions between cameras, what the scene did to the result.
 
     Returns:
-        The verdict, and the reasons for anything but a pass: worst first, causes before symptoms. A note on
-        a widened standard deviation is compatible with a pass.
+        The verdict, and the reasons for anything but a pass: worst first, causes before symptoms.
     """
     board = rig.board.to_board()
     findings = [
@@ -92,20 +90,17 @@ def judge(
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
         *angle_findings(examination.laser_angles),
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
-        *nuisance_findings(examination.nuisances, estimate, board, rig.lidars[lidar], rig.verdict),
+        *_scale(examination.scale, estimate, board, rig.verdict.max_scale_error),
         *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
         *others,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
         *_channels(estimate, rig),
-        *_residuals(estimate, rig),
-        *control_findings(examination.control),
+        *residuals_beyond(estimate.metrics, rig.quality),
         *_captures(estimate, n_captures, rig.quality),
         *_nominal(estimate, rig.nominal(camera, lidar)),
         *_precision(estimate, examination, rig),
     ]
-    if examination.remark is not None:
-        findings.append(examination.remark)
-    findings += uncertainty_notes(examination.contributions, examination.known_better, rig.calibration)
+    findings += uncertainty_notes(examination.contributions, rig.calibration)
     return _verdict(findings, examination.cov)
 
 
@@ -234,12 +229,26 @@ def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[Finding]
     ]
 
 
-def _residuals(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
-    found = residuals_beyond(estimate.metrics, rig.quality)
-    fitted_m = float(np.mean([np.hypot(r.plane_rms_m, r.edge_rms_m) for r in estimate.residuals]))
-    if np.isfinite(estimate.held_out_m) and estimate.held_out_m > rig.verdict.max_held_out_ratio * fitted_m:
-        found.append(HELD_OUT(held_out_m=estimate.held_out_m, fitted_m=fitted_m))
-    return found
+def _scale(
+    scale: tuple[float, float] | None, estimate: CalibrationEstimate, board: Board, limit: float
+) -> list[Finding]:
+    """Compare the camera's distances with the LiDAR's.
+
+    The likelihood estimates the squares, with which it is consistent: their size is a note then.
+    """
+    if scale is None or abs(scale[0]) <= max(limit, _SURE * scale[1]):
+        return []
+    is_weighed = estimate.method == "ml" and estimate.lens is not None
+    is_fail = abs(scale[0]) - _SURE * scale[1] > _SCALE_FAIL * limit
+    return [
+        SCALE_OFF(
+            severity="note" if is_weighed else failing(is_fail),
+            scale=scale[0],
+            scale_sigma=scale[1],
+            square_m=board.square_m / (1 + scale[0]),
+            profile_square_m=board.square_m,
+        )
+    ]
 
 
 def _motion(estimate: CalibrationEstimate, limit_m: float) -> list[Finding]:

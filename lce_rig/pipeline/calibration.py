@@ -420,8 +420,6 @@ def _judged(
     n_captures = len({name for pair in own.pairs for name in detections.captures(pair)})
     verdict, findings = judge(estimate, validation, rig, own.camera, own.lidar, n_captures, others)
     diagnostics = estimate.diagnostics
-    if validation.widened_by != 1:
-        diagnostics = replace(diagnostics, sigma_widened=validation.widened_by)
     if estimate.channel_difference is not None:
         apart_deg, apart_m = tangent_sizes(estimate.channel_difference)
         diagnostics = replace(diagnostics, channels_rotation_deg=apart_deg, channels_translation_m=apart_m)
@@ -488,8 +486,6 @@ def _other_camera(solved: Sequence[_Solved], k: int, other_k: int, pair: CameraP
     T, J = relative_pose(own.estimate.T_cam_lidar, other.estimate.T_cam_lidar)
     cov = None
     if own.together is not None and own.together is other.together:
-        # Widened like both extrinsics.
-        J = J * np.repeat([own.validation.widened_by, other.validation.widened_by], 6)
         joint = own.together.covariance_of(own.camera, other.camera)
         joint[:6, :6] += own.cov_lens
         joint[6:, 6:] += other.cov_lens

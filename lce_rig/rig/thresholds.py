@@ -83,10 +83,7 @@ class VerdictSettings(Settings):
     Attributes:
         fail_factor: a standard deviation, or a difference of two results, of this many targets fails.
         max_scale_error: largest relative difference of camera and LiDAR distances; 2.5 times that fails.
-        max_edge_shift_m: largest distance of ring ends beyond the plate's edge; beams are not wider.
         max_plane_misfit_m: largest rms distance between both sensors' planes; still boards stay below.
-        max_held_out_ratio: largest ratio of the residuals of held-out and used captures.
-        max_prior_sigmas: largest range offset of a laser, in units of the profile's `laser_bias_sigma_m`.
         max_change: largest difference of earlier and later captures, in targets; twice it fails.
         max_contrast: the same between near and far, left and right, upper and lower boards, and between two
             groups of captures, whose differences nearly cancel in the whole.
@@ -94,21 +91,12 @@ class VerdictSettings(Settings):
             and its largest change during the session, in targets; `fail_factor` times that, or twice for a
             change, fails.
         least_chance: a difference of subsets of the captures is significant below this probability.
-        control_sigmas: number of standard deviations, at least the target, by which the negative control
-            moves the result; held-out captures must then fit worse.
-        max_spread_ratio: if resampling spreads the result by more than this many reported standard
-            deviations, the covariance is widened.
     """
 
     fail_factor: Annotated[float, Field(gt=1, le=1e6)] = 3.0
     max_scale_error: Positive = 0.008
-    max_edge_shift_m: Positive = 0.03
     max_plane_misfit_m: Positive = 0.012
-    max_held_out_ratio: Annotated[float, Field(gt=1, le=1e6)] = 1.6
-    max_prior_sigmas: Positive = 4.0
     max_change: Positive = 1.5
     max_contrast: Positive = 2.5
     max_camera_difference: Positive = 1.0
     least_chance: Annotated[float, Field(gt=0, lt=0.5)] = 0.001
-    control_sigmas: Positive = 3.0
-    max_spread_ratio: Annotated[float, Field(ge=1, le=1e6)] = 1.2

@@ -12,7 +12,7 @@ from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.detect.findings import LIDAR_TOO_FEW_RINGS
-from lce_rig.judge.findings import ROTATION_UNCERTAIN, WIDENED
+from lce_rig.judge.findings import LAST_REJECTED, ROTATION_UNCERTAIN
 from lce_rig.rig import Rig, load_rig
 
 Make = Callable[..., Calibration]
@@ -69,7 +69,7 @@ def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration
         },
         "verdict": "pass",
         "findings": (
-            WIDENED(ratio=1.5, spread="halves"),
+            LAST_REJECTED(capture="000003"),
             ROTATION_UNCERTAIN(severity="warning", action="measure_ranges", **_UNCERTAIN),
         ),
         "diagnostics": Diagnostics(n_placements=4.0, fit_plane_rms_m=1 / 300),

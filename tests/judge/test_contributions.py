@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.calibrate import fit_extrinsic
 from lce_rig.core.geometry import difference, sigma_sizes
-from lce_rig.judge.contributions import known_better, profile_covariance, uncertainty_notes
+from lce_rig.judge.contributions import profile_covariance, uncertainty_notes
 from lce_rig.judge.validate import validate
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, in_use, simulate
@@ -39,7 +39,7 @@ def test_a_sound_result_reports_the_sum_of_its_captures_and_its_profile(sound):
     estimate, examination = sound
     assert not any(source.startswith("contradiction") for source in sources(examination))
     of_profile = profile_covariance(estimate.sensitivities)
-    np.testing.assert_allclose(examination.cov, examination.widened_by**2 * estimate.cov + of_profile)
+    np.testing.assert_allclose(examination.cov, estimate.cov + of_profile)
     of_board = [each for each in estimate.sensitivities if each.source != "intrinsics"]
     np.testing.assert_array_equal(examination.cov_shared, profile_covariance(of_board))
 
@@ -71,7 +71,7 @@ def test_a_wrong_profile_leaves_the_error_within_the_claim(lens, board, expected
 
 def test_the_largest_cause_is_named_with_its_share_and_how_to_measure_it(sound):
     _, examination = sound
-    note, *_ = uncertainty_notes(examination.contributions, (), RIG.calibration)
+    note, *_ = uncertainty_notes(examination.contributions, RIG.calibration)
     assert note.severity == "note"
     unit = "deg" if "sigma_deg" in note.figures else "m"
     assert note.figure("share") == pytest.approx(
@@ -80,11 +80,3 @@ def test_the_largest_cause_is_named_with_its_share_and_how_to_measure_it(sound):
     size = "sigma_rotation_deg" if unit == "deg" else "sigma_translation_m"
     largest = max(examination.contributions, key=lambda each: getattr(each, size))
     assert note.figures["source"] == largest.source
-
-
-def test_boards_that_know_the_squares_better_than_the_profile_say_so(sound):
-    estimate, examination = sound
-    vague = tuple(replace(each, sigma=50 * each.sigma) for each in estimate.sensitivities)
-    (squares,) = known_better(replace(estimate, sensitivities=vague), examination.nuisances)
-    assert squares.error_sigma < 0.5 * squares.profile_sigma == 25 * KNOWN.square_size
-    assert abs(squares.error) < 4 * squares.error_sigma

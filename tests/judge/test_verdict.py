@@ -12,9 +12,9 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.findings import (
-    CONTROL,
     LAST_REJECTED,
     NOT_CERTIFIED,
+    PLANE_RESIDUAL,
     SCALE_OFF,
     SHARES_DIFFER,
     by_cause,
@@ -199,15 +199,14 @@ def test_wrong_squares_or_another_lens_are_named_before_any_estimate(factor, cod
 
 
 def test_the_worst_reason_comes_first(estimate, verdict_of):
-    residuals = tuple(r._replace(held_out_m=1.0) for r in estimate.residuals)
-    doubtful = replace(estimate, certificate=Certificate(False, 1.0), residuals=residuals)
-    verdict, reasons = verdict_of(doubtful)
+    cov = np.diag([1e-8] * 3 + [1e-9, np.radians(0.3) ** 2, 1e-9])
+    verdict, reasons = verdict_of(replace(estimate, certificate=Certificate(False, 1.0), cov=cov))
     assert verdict == "fail"
-    assert [reason.code for reason in reasons] == ["verdict.not_certified", "verdict.held_out"]
+    assert [reason.code for reason in reasons] == ["verdict.not_certified", "verdict.rotation_uncertain"]
 
 
 def test_what_follows_from_a_cause_stands_below_it():
-    control = CONTROL(rotation_deg=1.0, translation_m=0.01, direction="rotation_x")
+    plane = PLANE_RESIDUAL(mean_m=0.05, limit_m=0.03)
     shares = SHARES_DIFFER(
         severity="warning", first="near", second="far", rotation_deg=1.0, translation_m=0.1
     )
@@ -216,9 +215,9 @@ def test_what_follows_from_a_cause_stands_below_it():
     )
     note = LAST_REJECTED(capture="000014")
     certificate = NOT_CERTIFIED(severity="error", gap=0.1)
-    listed = by_cause([note, control, shares, scale, certificate])
-    assert listed == (certificate, scale, control, shares, note)
-    assert consequences(listed) == {"verdict.control": scale.code, "verdict.shares_differ": scale.code}
+    listed = by_cause([note, plane, shares, scale, certificate])
+    assert listed == (certificate, scale, plane, shares, note)
+    assert consequences(listed) == {"verdict.plane_residual": scale.code, "verdict.shares_differ": scale.code}
 
 
 def test_squares_of_the_wrong_size_are_told_from_the_distances():

@@ -35,7 +35,7 @@ Pictures = Callable[[Calibration, str], str]
 Row = Sequence[object]
 _STEP = 1e-6
 _AXES = {"x": "x right", "y": "y down", "z": "z forward"}
-_LENS_CODES = ("verdict.intrinsics", "verdict.known_better", "verdict.scale")
+_LENS_CODES = ("verdict.intrinsics", "verdict.scale")
 # The statement names the expected error at this distance.
 _USUAL_M = 10.0
 # Captures with more than this many times the median residual are marked. A page holds so many pictures.
