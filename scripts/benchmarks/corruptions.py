@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import get_args
 
 from benchmarks.corruption_kinds import Corruption, corruptions
@@ -14,7 +14,7 @@ from benchmarks.corruption_sessions import (
     recorded_samples,
     simulated_samples,
 )
-from benchmarks.recordings import RIGS, SETS, RecordedSet
+from benchmarks.recordings import RIGS, SETS, RecordedSet, recordings
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration, Method
@@ -31,9 +31,18 @@ from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrins
 METHODS: tuple[Method, ...] = ("paper", "ml")
 _SIMULATED = ("rlfs", "rles")
 _EXCHANGED = "two_cameras"
+_FRAMES_OF = ("rlfs02", "rles01", "rles02", "acfr_vlp16")
 _RECORDED = (
-    *(recorded for recorded in SETS if recorded.name == "rlfs02"),
+    *(replace(each, folders=each.folders[:1]) for each in SETS if each.name in _FRAMES_OF),
     RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)),
+    *(
+        RecordedSet(
+            f"vlp32c_{side}",
+            f"{recordings()}/vlp32c_stereo/{side}.yaml",
+            ((f"vlp32c_stereo/{side}", "frames"),),
+        )
+        for side in (("left", "right") if os.environ.get("LCE_RIG_DATA") else ())
+    ),
 )
 _VERDICTS = (*get_args(Verdict), "refused")
 # An error beyond so many reported standard deviations, or targets of the profile, is a wrong result.
