@@ -95,34 +95,25 @@ def test_events_are_counted_on_the_board_only(stream, detection):
     assert quality.events_px > 3
 
 
-def test_a_stream_that_ends_before_the_stamp_is_told_by_how_much(stream):
-    detection = find(stream, stamp_ns=3_000 * MS)
-    assert isinstance(detection.picture, Refusal)
-    assert detection.board.code == "read.after_events"
-    assert detection.board.figure("gap_s") == pytest.approx(1.6, abs=1e-3)
-
-
-def test_a_capture_without_events_says_so(stream):
-    detection = find(stream.between(0, 0))
-    assert detection.board.code == "image.no_events"
-
-
-def test_a_stream_too_short_to_settle_is_told(stream):
-    board = find(stream.between(1_100 * MS, 1_400 * MS)).board
-    assert board.code == "read.network_settling"
-
-
-def test_a_board_that_stands_still_is_told_to_move():
-    board = find(noise(0.8)).board
-    assert board.code == "image.still_scene" and board.figure("events_px") < board.figure("min_events_px")
-    board = find(noise(0.005)).board
-    assert board.code == "image.few_events"
-
-
-def test_flickering_lamps_are_named_with_their_frequency():
-    board = find(join(noise(0.3), lamps(100))).board
-    assert board.code == "image.flicker"
-    assert board.figure("frequency_hz") == pytest.approx(100, abs=1)
+@pytest.mark.parametrize(
+    ("events", "code", "figures"),
+    [
+        (lambda s: s.between(0, 0), "image.no_events", {}),
+        (lambda s: s.between(1_100 * MS, 1_400 * MS), "read.network_settling", {}),
+        (lambda s: s.between(0, 700 * MS), "read.after_events", {"gap_s": pytest.approx(0.5, abs=1e-3)}),
+        (lambda _: noise(0.8), "image.still_scene", {}),
+        (lambda _: noise(0.005), "image.few_events", {}),
+        (
+            lambda _: join(noise(0.3), lamps(100)),
+            "image.flicker",
+            {"frequency_hz": pytest.approx(100, abs=1)},
+        ),
+    ],
+)
+def test_events_that_show_no_board_are_refused_by_their_cause(stream, events, code, figures):
+    board = find(events(stream)).board
+    assert board.code == code
+    assert {name: board.figures[name] for name in figures} == figures
 
 
 def test_hot_pixels_are_named_with_their_share_and_do_not_hide_a_moving_board(stream):

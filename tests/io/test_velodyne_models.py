@@ -87,13 +87,6 @@ def test_scans_have_the_models_rings_and_times(product: velodyne.Product) -> Non
     assert 0 <= scan.offset_ns.min() < 60_000 and scan.offset_ns.max() == pytest.approx(0.1e9, abs=200_000)
 
 
-def test_packets_of_another_model_than_the_profiles_are_counted_not_read() -> None:
-    stream = Vlp16Stream("lidar", LidarSettings(model="VLP-32C"))
-    for payload in packets_of(velodyne.READ[0], 0.1, 0.002):
-        assert stream.push_data(payload, 0) is None
-    assert set(stream.other_models) == {"VLP-16"} and stream.n_data == 0
-
-
 def test_a_model_without_packets_is_named() -> None:
     with pytest.raises(SourceError) as caught:
         Vlp16Stream("lidar", LidarSettings(model="OS1-64"))
