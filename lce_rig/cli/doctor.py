@@ -1,13 +1,9 @@
 """`lce-rig doctor`: check whether the computer and the rig's sensors are fit to collect."""
 
-import sys
 from collections import Counter
 from pathlib import Path
 
 import click
-from rich.console import Console
-from rich.padding import Padding
-from rich.table import Table
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, explain_option, json_option, rig_option
@@ -17,10 +13,8 @@ from lce_rig.devices import sensors
 from lce_rig.doctor.checks import Check, DoctorOptions, examine
 from lce_rig.rig import load_rig
 
-_MARKS = {"note": "[green]ok[/]", "warning": "[yellow]warn[/]", "error": "[bold red]FAIL[/]"}
+_MARKS = {"note": "[green]ok[/]  ", "warning": "[yellow]warn[/]", "error": "[bold red]FAIL[/]"}
 _EXIT_ERROR = 5
-_INDENT = 5
-_FILE_WIDTH = 160
 
 
 @click.command()
@@ -77,37 +71,23 @@ def doctor(rig_name: str, explain: bool, as_json: bool, duration: float, folder:
             show.say(f"fit to collect, with limits: {n['warning']} warn, {n['note']} ok")
         else:
             show.say(f"fit to collect: all {n['note']} ok")
-        _print_checks(
-            checks if explain else [each for each in _worst_first(checks) if each.severity != "note"]
-        )
+        worst_first = sorted(checks, key=lambda check: check.severity != "error")
+        shown = checks if explain else [check for check in worst_first if check.severity != "note"]
+        show.print_lines(_lines(shown))
     return _EXIT_ERROR if severity == "error" else 0
 
 
-def _worst_first(checks: list[Check]) -> list[Check]:
-    return sorted(checks, key=lambda check: check.severity != "error")
-
-
-def _print_checks(checks: list[Check]) -> None:
-    """Print a line per check, and its actions below it in the full width."""
-    if not checks:
-        return
-    widths = [4, *(max(len(getattr(check, column)) for check in checks) for column in ("subject", "name"))]
-    console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
-    last = ""
-    with console.capture() as capture:
-        for check in checks:
-            row = Table.grid(padding=(0, 1))
-            for width in widths:
-                row.add_column(width=width)
-            row.add_column(overflow="fold")
-            subject = "" if check.subject == last else f"[bold]{show.escape(check.subject)}[/]"
-            text = "; ".join(finding.text for finding in check.findings)
-            row.add_row(_MARKS[check.severity], subject, check.name, show.escape(text))
-            console.print(row)
-            advice = [line for finding in check.findings for line in finding.advice.splitlines()]
-            for action in dict.fromkeys(map(as_line, advice)):
-                console.print(Padding(f"[cyan]-> {show.escape(action)}[/]", (0, 0, 0, _INDENT), expand=False))
-            last = check.subject
-    # Rich fills wrapped lines up with blanks.
-    for line in capture.get().splitlines():
-        click.echo(line.rstrip())
+def _lines(checks: list[Check]) -> list[str]:
+    """List a line per check, and its actions below it."""
+    subject_width = max((len(check.subject) for check in checks), default=0)
+    name_width = max((len(check.name) for check in checks), default=0)
+    lines, last = [], ""
+    for check in checks:
+        subject = f"{'' if check.subject == last else check.subject:<{subject_width}}"
+        text = "; ".join(finding.text for finding in check.findings)
+        cells = f"[bold]{show.escape(subject)}[/] {check.name:<{name_width}} {show.escape(text)}"
+        lines.append(f"{_MARKS[check.severity]} {cells}")
+        advice = [line for finding in check.findings for line in finding.advice.splitlines()]
+        lines += [f"     [cyan]-> {show.escape(action)}[/]" for action in dict.fromkeys(map(as_line, advice))]
+        last = check.subject
+    return lines

@@ -62,7 +62,7 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
             head = _head(session.rig, one)
             write_atomically(draft / info, camera_info_text(one.camera, one.intrinsics, head))
             title, notes = f"Intrinsics of camera {one.camera}, rig {session.rig.name}", one.weaknesses
-            plot = draw_intrinsics(one.estimate, one.certainty, one.difference, title=title, weaknesses=notes)
+            plot = draw_intrinsics(one.estimate, one.certainty, title=title, weaknesses=notes)
             write_picture(draft / page, plot)
             names += [block, info, page]
     return [session.path / INTRINSICS / name for name in names]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.geometry import Array
-from lce_rig.lens.difference import LensCertainty, LensDifference
+from lce_rig.lens.difference import LensCertainty
 from lce_rig.lens.lens_estimate import IntrinsicsEstimate
 from lce_rig.show.overlays.canvas import Picture
 
@@ -16,24 +16,21 @@ _BLUE, _ORANGE = "#1f6fb4", "#d9730d"
 # The standard deviation map covers 0.01 to 10 px; beyond, the intrinsics are unusable.
 _CERTAIN_PX, _UNKNOWN_PX = 0.01, 10.0
 _CELLS, _MIN_IN_CELL = 16, 4
-_RINGS = 14
 _DPI = 110
 
 
 def draw_intrinsics(
     estimate: IntrinsicsEstimate,
     certainty: LensCertainty,
-    difference: LensDifference | None,
     *,
     title: str,
     weaknesses: Sequence[str] = (),
 ) -> Picture:
-    """Draw residuals over the image and over the radius, certainty, and the difference from the profile.
+    """Draw residuals and certainty over the image.
 
     Args:
         estimate: of the lens.
         certainty: of the same.
-        difference: of the estimate from the profile's intrinsics; None if these are of another resolution.
         title: of the page.
         weaknesses: sentences to print below.
 
@@ -45,7 +42,7 @@ def draw_intrinsics(
 
     notes = [line for text in weaknesses for line in wrap(f"- {text}", 190, subsequent_indent="  ")]
     below = 0.2 * len(notes)
-    height = 10.2 + below
+    height = 6.2 + below
     figure: Any = Figure(figsize=(15, height), dpi=_DPI, facecolor="white")
     canvas: Any = FigureCanvasAgg(figure)
     figure.text(0.035, 1 - 0.3 / height, title, fontsize=16, color=_INK, fontweight="bold", va="center")
@@ -57,14 +54,9 @@ def draw_intrinsics(
     )
     figure.text(0.035, 1 - 0.65 / height, summary, fontsize=11, color=_INK, va="center")
     lowest, highest = (0.7 + below) / height, 1 - 1.45 / height
-    grid = figure.add_gridspec(
-        2, 2, left=0.05, right=0.92, top=highest, bottom=lowest, hspace=0.36, wspace=0.16
-    )
-    axes = [figure.add_subplot(grid[row, column]) for row in range(2) for column in range(2)]
-    _draw_residuals(axes[0], estimate)
-    _draw_certainty(figure, axes[1], estimate, certainty)
-    _draw_radial(axes[2], estimate)
-    _draw_difference(axes[3], estimate, difference)
+    grid = figure.add_gridspec(1, 2, left=0.05, right=0.92, top=highest, bottom=lowest, wspace=0.16)
+    _draw_residuals(figure.add_subplot(grid[0]), estimate)
+    _draw_certainty(figure, figure.add_subplot(grid[1]), estimate, certainty)
     for row, line in enumerate(reversed(notes)):
         figure.text(0.035, (0.15 + 0.2 * row) / height, line, fontsize=10, color=_INK)
     canvas.draw()
@@ -108,17 +100,17 @@ def _draw_residuals(axis: Any, estimate: IntrinsicsEstimate) -> None:
     np.add.at(sums, index.ravel(), np.concatenate([corners, residuals], axis=1))
     means = (sums / counts[:, None])[counts >= _MIN_IN_CELL]
     if len(means):
-        _arrows(axis, means[:, :2], means[:, 2:], cell_px, _BLUE)
+        _arrows(axis, means[:, :2], means[:, 2:], cell_px)
 
 
-def _arrows(axis: Any, at: Array, vectors_px: Array, reach_px: float, colour: str) -> None:
+def _arrows(axis: Any, at: Array, vectors_px: Array, reach_px: float) -> None:
     """Draw arrows scaled so that a typical one fills its cell, with a key of a round length."""
     lengths = np.linalg.norm(vectors_px, axis=1)
     usual = max(float(np.percentile(lengths, 90)), 1e-6)
     magnification = reach_px / usual
     shown = vectors_px * np.minimum(1.0, 2.0 * usual / np.maximum(lengths, 1e-12))[:, None] * magnification
     arrows = axis.quiver(
-        *at.T, *shown.T, color=colour, angles="xy", scale_units="xy", scale=1.0, width=0.0026, zorder=3
+        *at.T, *shown.T, color=_BLUE, angles="xy", scale_units="xy", scale=1.0, width=0.0026, zorder=3
     )
     # The key is 1, 2 or 5 times a power of ten, not above the usual length.
     power = 10.0 ** np.floor(np.log10(usual))
@@ -157,51 +149,3 @@ def _draw_certainty(figure: Any, axis: Any, estimate: IntrinsicsEstimate, certai
     bar.set_label("standard deviation of a pixel", color=_INK)
     bar.ax.tick_params(colors=_INK, labelsize=9)
     bar.set_ticks([0.01, 0.1, 1.0, 10.0], labels=["0.01 px", "0.1 px", "1 px", "10 px"])
-
-
-def _draw_radial(axis: Any, estimate: IntrinsicsEstimate) -> None:
-    lens = estimate.intrinsics
-    centre = np.array([lens.cx_px, lens.cy_px])
-    ends = np.array([[u, v] for u in (0, lens.width_px - 1) for v in (0, lens.height_px - 1)], dtype=float)
-    farthest = float(np.linalg.norm(ends - centre, axis=1).max())
-    outward = estimate.corners_px - centre
-    radius = np.linalg.norm(outward, axis=1)
-    along = np.sum(estimate.residuals_px * outward, axis=1) / np.maximum(radius, 1e-9)
-    axis.axhline(0, color=_FAINT, linewidth=1)
-    axis.plot(radius, along, ".", color=_FAINT, markersize=2, alpha=0.6)
-    rings = np.array_split(np.argsort(radius), _RINGS)
-    means = np.array([[radius[ring].mean(), along[ring].mean()] for ring in rings])
-    errors = [along[ring].std() / np.sqrt(len(ring)) for ring in rings]
-    axis.errorbar(*means.T, yerr=errors, fmt="o-", color=_BLUE, markersize=4, linewidth=1.5, capsize=2)
-    limit = 1.15 * float(np.percentile(np.abs(along), 99.5))
-    axis.set_ylim(-limit, limit)
-    axis.set_xlim(0, farthest)
-    axis.axvspan(radius.max(), farthest, color=_SHADE, zorder=0)
-    if radius.max() < 0.93 * farthest:
-        middle = (radius.max() + farthest) / 2
-        axis.text(middle, 0.85 * limit, "not covered", ha="center", fontsize=10, color=_INK)
-    axis.set_xlabel("distance from the principal point, px, up to the image's farthest corner", color=_INK)
-    axis.set_ylabel("residual outwards, px", color=_INK)
-    note = "blue: means with their standard errors; a wrong lens model would bend the line"
-    _style(axis, "Residuals along the radius", note)
-
-
-def _draw_difference(axis: Any, estimate: IntrinsicsEstimate, difference: LensDifference | None) -> None:
-    if difference is None:
-        axis.axis("off")
-        text = "The profile's intrinsics are for another resolution."
-        axis.text(0.5, 0.5, text, transform=axis.transAxes, ha="center", fontsize=12, color=_INK)
-        return
-    turn_deg = np.degrees(np.linalg.norm(difference.turn_rad))
-    note = (
-        f"{difference.rms_px:.2f} px rms (standard deviation {difference.sigma_px:.2f}), "
-        f"{difference.max_px:.2f} px at most; rotated by {turn_deg:.2f} deg"
-    )
-    _frame(axis, estimate, "Difference from the profile's intrinsics", note)
-    moved, pixels = difference.displacement_px, difference.pixels
-    is_shown = difference.is_covered & np.isfinite(moved).all(axis=1)
-    for side in pixels.T:
-        is_shown &= np.isin(side, np.unique(side)[::2])
-    reach_px = 2 * float(np.unique(pixels[:, 0])[1] - np.unique(pixels[:, 0])[0])
-    if is_shown.any():
-        _arrows(axis, pixels[is_shown], moved[is_shown], reach_px, _ORANGE)

@@ -33,7 +33,6 @@ class Evidence:
         capture: (N,) index of each point's capture.
         plane_m: (N,) signed distance from the camera's board plane, positive behind it.
         ring: (N,) of each point.
-        points_px: (N, 2) where it falls onto the image; NaN outside of the lens's range.
         range_m: (C,) distance of each capture's board from the LiDAR.
         corners_px: (M, 2) as measured.
         corner_residuals_px: (M, 2) measured less predicted from the board's best pose in its image.
@@ -43,7 +42,6 @@ class Evidence:
     capture: NDArray[np.intp]
     plane_m: Array
     ring: NDArray[np.int16]
-    points_px: Array
     range_m: Array
     corners_px: Array
     corner_residuals_px: Array
@@ -59,7 +57,6 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
     plane_m = [
         plane_residuals(extract_features(o, board, half_step=False), T, o.lidar.points) for o in observations
     ]
-    points = np.concatenate([o.lidar.points for o in observations])
     residuals_px = []
     for o in observations:
         # A board that moved has its pose at the LiDAR's time; its corners are those of the image.
@@ -72,7 +69,6 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
         np.repeat(np.arange(len(observations)), [len(own) for own in plane_m]),
         np.concatenate(plane_m),
         np.concatenate([o.lidar.ring for o in observations]),
-        lens.project(transform(T, points))[0],
         np.array([o.lidar.quality.distance_m for o in observations]),
         corners_px[is_seen],
         np.concatenate(residuals_px)[is_seen],
@@ -87,9 +83,9 @@ _DISTANCES_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0,
 _LEAST_SHARE = 0.5
 
 
-def _image_axes(lens: Intrinsics, below_in: float = 0.0) -> tuple[Any, Any]:
-    """Start a figure with axes as the camera's image, pixels, v down; `below_in` stays free below them."""
-    left_in, right_in, bottom_in, top_in = 0.42, 0.1, 0.42 + below_in, 0.25
+def _image_axes(lens: Intrinsics) -> tuple[Any, Any]:
+    """Start a figure with axes as the camera's image, pixels, v down."""
+    left_in, right_in, bottom_in, top_in = 0.42, 0.1, 0.42, 0.25
     image_in = (WIDTH_IN - left_in - right_in) * lens.height_px / lens.width_px
     figure, (axes,) = new_axes(
         image_in + bottom_in + top_in, left_in=left_in, right_in=right_in, bottom_in=bottom_in, top_in=top_in
@@ -223,26 +219,6 @@ def draw_by_range(evidence: Evidence, links: Mapping[str, str]) -> Markup:
 def _zero(axes: Any) -> None:
     axes.axhline(0, color=QUIET, linewidth=0.8)
     axes.grid(axis="y")
-
-
-def draw_by_place(evidence: Evidence, lens: Intrinsics) -> Markup:
-    """Draw the mean residual of the points in each cell of the image."""
-    is_seen = lens.is_inside(evidence.points_px, -0.5)
-    cells, means_mm = _cell_means(evidence.points_px[is_seen], 1000 * evidence.plane_m[is_seen, None], lens)
-    figure, axes = _image_axes(lens, below_in=0.6)
-    size_px = lens.width_px / _CELLS
-    grid = np.full((int(np.ceil(lens.height_px / size_px)), _CELLS), np.nan)
-    for (u, v), value in zip(cells.astype(int), means_mm[:, 0], strict=True):
-        grid[v, u] = value
-    limit_mm = max(float(np.nanmax(np.abs(grid), initial=0.0)), 1.0)
-    edges_u, edges_v = (size_px * np.arange(n + 1) - 0.5 for n in grid.shape[::-1])
-    shown = axes.pcolormesh(edges_u, edges_v, grid, cmap="RdBu_r", vmin=-limit_mm, vmax=limit_mm)
-    height_in = figure.get_size_inches()[1]
-    place = figure.add_axes((0.25, 0.4 / height_in, 0.6, 0.1 / height_in))
-    bar = figure.colorbar(shown, cax=place, orientation="horizontal")
-    bar.set_label("behind the plane, mm")
-    bar.outline.set_visible(False)
-    return drawing(figure, "Residuals by place in the image")
 
 
 def draw_corners(evidence: Evidence, lens: Intrinsics) -> Markup:

@@ -229,7 +229,6 @@ def _drawings(
             "by_capture": drawings.draw_by_capture(c, links),
             "by_ring": drawings.draw_by_ring(evidence),
             "by_range": drawings.draw_by_range(evidence, links),
-            "by_place": drawings.draw_by_place(evidence, lens),
             "corners": drawings.draw_corners(evidence, lens),
         }
     return drawn

@@ -15,7 +15,7 @@ from tests.export.conftest import calibration as without_boards
 
 from .conftest import RLFS, overlay_of, page
 
-_DRAWINGS = 9
+_DRAWINGS = 8
 
 
 @pytest.mark.long
