@@ -50,6 +50,8 @@ from lce_rig.detect.lidar.template import Placement, plane_axes
 _CELLS = 11.0
 # Accumulated point clouds hold millions of points: enough of them find the plates, all near one measure it.
 _MOST_SEARCHED, _MOST_MEASURED = 200_000, 40_000
+# So many returns, or rays, find about where plane and outline are, before all of them locate them.
+_ROUGH = 6_000
 _MOST_PATCHES = 8
 # Sum of |log| of its sides over the board's up to which a patch may be it, though another is found.
 _ALIKE = 0.3
@@ -103,14 +105,14 @@ def find_unstructured_boards(
     """
     points = np.asarray(scan.points, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
-        range_m = np.linalg.norm(points, axis=1)
+        range_m = np.sqrt(np.einsum("ij,ij->i", points, points))
         index = np.flatnonzero((range_m >= limits.min_range_m) & (range_m <= 2.5 * limits.max_range_m + 5))
     if len(index) == 0:
         return LIDAR_NO_RETURNS.refusal(n_points=len(points), min_range_m=limits.min_range_m)
     searched = index[range_m[index] <= limits.max_range_m]
     searched = searched[:: 1 + len(searched) // _MOST_SEARCHED]
     patches = grow_patches(points[searched], min(board.width_m, board.height_m) / _CELLS)
-    near = np.column_stack([points[index], scan.intensity[index]])
+    near = np.column_stack([points, scan.intensity])[index]
     board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
     ratio = patches.size_m / board_m
     misfit = np.abs(np.log(np.maximum(ratio, 1e-3))).sum(axis=1)
@@ -221,7 +223,7 @@ def _sum_cells(points: Array, cell_m: float) -> Array:
     cells -= cells.min(axis=0)
     extent = cells.max(axis=0) + 1
     key = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-    order = np.argsort(key, kind="stable")
+    order = np.argsort(key)
     starts = np.flatnonzero(np.diff(key[order], prepend=-1))
     x, y, z = points[order].T
     columns = (np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
@@ -379,10 +381,11 @@ def measure_unstructured(
     half_m = (board.width_m / 2, board.height_m / 2)
     reach_m = 1.4 * float(np.hypot(*half_m)) + _SURROUND_M
     cosine = 1.0 / np.hypot(1.0, reach_m / distance_m)
-    points = returns[:, :3]
-    returns = returns[points @ (centre / distance_m) > cosine * np.linalg.norm(points, axis=1)]
+    along = returns[:, :3] @ (centre / distance_m)
+    returns, along = returns[along > 0], along[along > 0]
+    returns = returns[along > cosine * np.linalg.norm(returns[:, :3], axis=1)]
     returns = returns[:: 1 + len(returns) // _MOST_MEASURED]
-    view = _View.of(returns, plane, centre, 4 * _NOISE_M, limits)
+    view = _View.of(returns[:: 1 + len(returns) // _ROUGH], plane, centre, 4 * _NOISE_M, limits)
     n_on = int(np.count_nonzero(view.is_on))
     starts = register_rays(view.rays(half_m), half_m) if n_on >= _MIN_POINTS else []
     if not starts:
@@ -395,6 +398,7 @@ def measure_unstructured(
     outline: Outline | None = None
     for _ in range(2):
         rays = view.rays(half_m, starts[0])
+        rays = rays.select(np.arange(len(rays.uv)) % (1 + len(rays.uv) // _ROUGH) == 0)
         fits = (fit_outline(rays, start, view.blur_m, view.growth_m(start)) for start in starts)
         outline = min((fit for fit in fits if fit), key=lambda fit: fit.placement.error_m, default=None)
         inside = np.zeros(0) if outline is None else view.is_on & (outline.placement.distance_m(view.uv) < 0)
