@@ -73,7 +73,8 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
             show.print_lines(_causes(names, refused, plates[pair], str(session), is_whole=explain))
             show.print_lines(_repeated(placements[pair], is_whole=explain))
     n_usable = max(len(detections.captures(pair)) - len(refused) for pair, refused in refusals.items())
-    if n_usable >= opened.rig.quality.min_captures:
+    is_contradicted = any(each.severity == "error" for findings in plates.values() for each in findings)
+    if n_usable >= opened.rig.quality.min_captures and not is_contradicted:
         show.name_next("calibrate", session)
     if n_usable == 0:
         raise NotEnoughDataError(

@@ -36,7 +36,7 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.intrinsics": (
         f"{_OF_DISTANCES}verdict.scale verdict.far_from_nominal verdict.cameras_differ".split()
     ),
-    "verdict.scale": _OF_DISTANCES.split(),
+    "verdict.scale": f"{_OF_DISTANCES}verdict.sensors_disagree verdict.planes_apart".split(),
     "verdict.two_groups": _OF_SIGMAS,
     "verdict.shares_differ": _OF_SIGMAS,
     "verdict.cameras_differ": _OF_SIGMAS,
@@ -335,7 +335,9 @@ FAR_FROM_NOMINAL = Kind(
     "(tolerance {tolerance_deg:g} deg, {tolerance_m:mm})",
     "check nominal_extrinsics and frames in the profile, and the sensors used",
 )
-PLATE_SIZE = Kind("verdict.plate_size", _plate, "measure the plate")
+PLATE_SIZE = Kind(
+    "verdict.plate_size", _plate, "measure the plate, then `lce-rig calibrate {session} --rig FILE`"
+)
 PLATE_EDGE = Kind(
     "verdict.plate_edge",
     "no edge where the profile's plate ends in {side} ({profile_m:.3f} m) in {n_lacking} of {n_captures} "
@@ -387,7 +389,9 @@ SHARES_DIFFER = Kind(
     _LENS,
     actions=_NEAR,
 )
-SCALE_OFF = Kind("verdict.scale", _scale, "measure the squares")
+SCALE_OFF = Kind(
+    "verdict.scale", _scale, "measure the squares, then `lce-rig calibrate {session} --rig FILE`"
+)
 LASER_ANGLES = Kind(
     "verdict.laser_angles",
     "the lasers' {angle}s differ from those of the scans by {rms_deg:deg} rms (limit {limit_deg:deg})",

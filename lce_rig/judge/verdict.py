@@ -9,7 +9,7 @@ import numpy as np
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion, SceneShare, WeakestMotion
-from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.findings import Finding, Refusal, Severity
 from lce_rig.core.geometry import Array, largest_sizes, rotation_angle, sigma_sizes, tangent_sizes
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
@@ -22,6 +22,7 @@ from lce_rig.judge.findings import (
     FEW_USED,
     LAST_REJECTED,
     MAY_BE_OFF,
+    MOVED,
     NO_CERTIFICATE,
     NOT_CERTIFIED,
     PLANE_RESIDUAL,
@@ -101,7 +102,23 @@ def judge(
         *_precision(estimate, examination, rig),
     ]
     findings += uncertainty_notes(examination.contributions, rig.calibration)
-    return _verdict(findings, examination.cov)
+    return _verdict(_blame_scale(findings), examination.cov)
+
+
+def _blame_scale(findings: Sequence[Finding]) -> list[Finding]:
+    """Make a corrected scale a reason again where planes or captures contradict: it is their cause.
+
+    Captures that fit another mounting, though not before or after the others, are a note beside it.
+    """
+    scattered = [f for f in findings if f.code == MOVED.code and not f.figures["place"]]
+    blamed = [f for f in findings if f.code == PLANE_RESIDUAL.code] + scattered
+    if not blamed or all(f.code != SCALE_OFF.code for f in findings):
+        return list(findings)
+    severities: dict[str, Severity] = {SCALE_OFF.code: "error"}
+    return [
+        replace(f, severity="note" if f in scattered else severities.get(f.code, f.severity))
+        for f in findings
+    ]
 
 
 def _verdict(findings: Sequence[Finding], cov: Array) -> tuple[Verdict, tuple[Finding, ...]]:

@@ -220,6 +220,16 @@ def test_what_follows_from_a_cause_stands_below_it():
     assert consequences(listed) == {"verdict.plane_residual": scale.code, "verdict.shares_differ": scale.code}
 
 
+@pytest.mark.parametrize(("plane_mean_m", "verdict"), [(0.08, "fail"), (0.008, "pass")])
+def test_a_corrected_scale_that_leaves_residuals_is_their_cause(estimate, plane_mean_m, verdict):
+    changed = replace(
+        estimate, residuals=tuple(r._replace(plane_mean_m=plane_mean_m) for r in estimate.residuals)
+    )
+    scale = SCALE_OFF(severity="note", scale=0.04, scale_sigma=0.005, square_m=0.07, profile_square_m=0.0728)
+    judged, (first, *_) = judge(changed, examined(estimate), RIG, "cam", "lidar", 20, [scale])
+    assert (judged, first.code) == (verdict, scale.code)
+
+
 def test_squares_of_the_wrong_size_are_told_from_the_distances():
     """The camera believes in 70 mm squares where they measure 73.5 mm: it sees the boards 5 % too near."""
     captures = []
