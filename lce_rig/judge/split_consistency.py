@@ -46,6 +46,10 @@ _N_NULL, _N_STARTS, _N_ROUNDS = 100, 10, 8
 _EULER = 0.5772
 # Errors that placements have in common, such as those of a laser, gain a tenth more than random ones.
 _COMMON = 1.1
+# How much wider gains of sound sessions are distributed than those of errors exchanged within one of them. Of
+# 2,160 draws of 8 to 20 captures from seven sound sessions, five of them recorded, 0.9 % have groups with it
+# (simulated: none) and 15 % without; with every third capture turned by 1 deg, 83 % and 96 %.
+_WIDER = 2.67
 
 
 class RejectedGroup(NamedTuple):
@@ -223,7 +227,7 @@ def find_groups(expansion: Quadratics, seed: int = 0) -> tuple[Contrast, ...]:
     made_smaller = np.linalg.norm(np.einsum("kji,bkj->bki", axes, left) / roots) / np.linalg.norm(drawn)
     gains = gains * _COMMON / made_smaller
     # The largest of many gains follows a Gumbel distribution.
-    width = float(gains.std(ddof=1)) * np.sqrt(6) / np.pi
+    width = _WIDER * float(gains.std(ddof=1)) * np.sqrt(6) / np.pi
     excess = (float(gain[0]) - gains.mean()) / max(width, 1e-12) + _EULER
     chance = float(-np.expm1(-np.exp(-excess)))
     smaller = is_first[0] if 2 * is_first[0].sum() <= n else ~is_first[0]
