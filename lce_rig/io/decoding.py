@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.core.errors import reading
+from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.files import decode_pcd, decode_pixels
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
@@ -120,11 +121,52 @@ def decode_ply(data: bytes) -> NDArray[Any]:
     return rows
 
 
-DECODERS: dict[str, Callable[[bytes], NDArray[Any]]] = {".pcd": decode_pcd, ".ply": decode_ply}
+def decode_las(data: bytes) -> NDArray[Any]:
+    """Decode the points of a LAS or LAZ file: coordinates in metres, intensity and dimensions of its own.
+
+    Returns:
+        Structured (N,), by lower-case names.
+
+    Raises:
+        SourceError: laspy is not installed.
+        ValueError: the file is truncated.
+    """
+    require_las()
+    import laspy
+
+    cloud = laspy.read(io.BytesIO(data))
+    if len(cloud.points) != cloud.header.point_count:
+        raise ValueError(
+            f"it is truncated: {len(cloud.points)} of {cloud.header.point_count} points are there"
+        )
+    own = list(cloud.point_format.extra_dimension_names)
+    columns = {name.lower(): np.asarray(cloud[name]) for name in ("x", "y", "z", "intensity", *own)}
+    rows = np.empty(len(cloud.points), [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    return rows
+
+
+def require_las() -> None:
+    """Refuse LAS and LAZ files where their reader is not installed.
+
+    Raises:
+        SourceError: laspy is not installed.
+    """
+    if find_spec("laspy") is None:
+        raise SourceError("LAS and LAZ files need laspy", "pip install 'lce-rig[las]'")
+
+
+LAS = frozenset({".las", ".laz"})
+DECODERS: dict[str, Callable[[bytes], NDArray[Any]]] = {
+    ".pcd": decode_pcd,
+    ".ply": decode_ply,
+    **dict.fromkeys(sorted(LAS), decode_las),
+}
 
 
 def read_cloud(path: Path) -> NDArray[Any]:
-    """Read a PCD or PLY file unchanged.
+    """Read a PCD, PLY, LAS or LAZ file unchanged.
 
     Returns:
         Structured (N,) with the file's own fields.

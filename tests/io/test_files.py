@@ -1,6 +1,9 @@
 """Pictures and clouds from files, whole and damaged."""
 
+import io
+
 import cv2
+import laspy
 import numpy as np
 import pytest
 from hypothesis import given
@@ -103,7 +106,28 @@ def test_ply_without_all_its_vertices_is_refused(tmp_path, data):
         read_cloud(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize("name", ["ascii.ply", "binary.ply", "a.pcd", "a.png", "a.jpg"])
+def las(*, is_compressed: bool) -> bytes:
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales = np.full(3, 0.0005)
+    header.add_extra_dim(laspy.ExtraBytesParams("Ring", np.uint8))
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z, cloud.Ring = (POINTS[name] for name in ("x", "y", "z", "ring"))
+    cloud.intensity = [30, 40]
+    file = io.BytesIO()
+    cloud.write(file, do_compress=is_compressed)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz", ".LAS"])
+def test_las_is_read_in_metres_with_its_own_dimensions(tmp_path, suffix):
+    (tmp_path / f"a{suffix}").write_bytes(las(is_compressed=suffix == ".laz"))
+    read = read_cloud(tmp_path / f"a{suffix}")
+    for name in POINTS.dtype.names:
+        np.testing.assert_allclose(read[name], POINTS[name], atol=1e-9)
+    assert list(read["intensity"]) == [30, 40]
+
+
+@pytest.mark.parametrize("name", ["ascii.ply", "binary.ply", "a.pcd", "a.las", "a.laz", "a.png", "a.jpg"])
 @given(data=st.data())
 def test_damaged_files_are_read_or_refused_in_one_line(tmp_path_factory, name, data):
     small = np.arange(192, dtype=np.uint8).reshape(8, 8, 3)
@@ -111,6 +135,8 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path_factory, name, d
         "ascii.ply": HEADER.format("ascii").encode() + b"1 2 3 4\n4 5 6 9\n3 0 1 1\n",
         "binary.ply": HEADER.format("binary_little_endian").encode() + POINTS.tobytes() + bytes(13),
         "a.pcd": encode_pcd(POINTS),
+        "a.las": las(is_compressed=False),
+        "a.laz": las(is_compressed=True),
         "a.png": cv2.imencode(".png", small)[1].tobytes(),
         "a.jpg": cv2.imencode(".jpg", small)[1].tobytes(),
     }[name]

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import cv2
@@ -148,6 +149,16 @@ def test_a_damaged_file_spoils_its_own_pair_only(make_folder, rig, name):
     recording.pairs[0].read()
     with pytest.raises(SourceError, match=name.replace("/", ".*")):
         recording.pairs[1].read()
+
+
+def test_las_without_its_reader_is_one_error_that_names_the_extra(make_folder, rig, monkeypatch):
+    path = make_folder()
+    for cloud in (path / "pcd").iterdir():
+        cloud.rename(cloud.with_suffix(".las"))
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(SourceError) as refused:
+        open_recording(path, rig)
+    assert "lce-rig[las]" in refused.value.hint
 
 
 @pytest.mark.dataset
