@@ -147,13 +147,13 @@ class Result:
             SessionError: another result has replaced this one meanwhile, or the disk is full; the files there
                 are unchanged.
         """
-        from lce_rig.show.report.calibration_page import report_text
+        from lce_rig.show.report.calibration_page import report_page
 
         file = self.file()
         text = file.text()
         place, is_in_session = self._place(folder, name)
         has_previous = is_in_session and bool(_usable(place / PREVIOUS))
-        page = report_text(self.session, file, text, OVERLAYS, has_previous=has_previous)
+        page = report_page(self.session, file, OVERLAYS, has_previous=has_previous)
         if not is_in_session:
             write_atomically(place / REPORT, page)
             return place / REPORT

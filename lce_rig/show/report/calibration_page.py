@@ -1,36 +1,34 @@
 """The report of a calibration: its verdict, its effect on a point, and the evidence, on one page."""
 
+import base64
 import hashlib
 import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
+import cv2
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.data import Events
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
 from lce_rig.core.phrasing import as_line, significant
 from lce_rig.detect.detection import Pair
+from lce_rig.detect.events.figures import outline_px
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import cause_words, weakest_words
 from lce_rig.rig import Rig
-from lce_rig.session import Session
+from lce_rig.session import Capture, Session
 from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.calibration_drawings import Evidence, gather
 from lce_rig.show.report.page import as_markup, render, style
-from lce_rig.show.report.thumbnails import picture_of, worst_first
-
-Overlays = Callable[[Calibration, str], Sequence[str]]
-"""Gives the paths of a capture's overlays, from the folder of the page."""
-
-Pictures = Callable[[Calibration, str], str]
-"""Gives the picture of a capture as a data URI; "" for none."""
 
 Row = Sequence[object]
 _STEP = 1e-6
@@ -42,35 +40,16 @@ _USUAL_M = 10.0
 _STANDS_OUT, _MOST_PICTURES = 2.0, 96
 
 
-def report_text(
-    session: Session,
-    file: ResultFile,
-    text: str,
-    overlays: str,
-    *,
-    has_previous: bool = False,
-) -> str:
-    """Write the report of a result; the same result gives the same bytes.
+def report_page(session: Session, file: ResultFile, overlays: str, *, has_previous: bool = False) -> str:
+    """Write the report of a result as one HTML file: the same result gives the same bytes.
 
     Args:
         session: whose result it is.
-        file: the result; text: the same as it is written.
-        overlays: the folder of overlays beside the report.
+        file: the result.
+        overlays: the folder of overlays beside the report, which shows them once they are drawn.
         has_previous: whether `previous/` beside the report holds a usable result.
     """
-    n_pairs = sum(len(c.channels) for c in file.pairs)
-
-    def paths(c: Calibration, capture: str) -> list[str]:
-        """Name a capture's overlays as `verify` of the session does."""
-        held = session.capture(capture)
-        paths = []
-        for channel in c.channels:
-            if held.has_image(c.camera, channel) or (channel == "events" and c.camera in held.event_cameras):
-                folder = f"{Pair(c.camera, channel, c.lidar).folder_name}/" if n_pairs > 1 else ""
-                paths.append(f"{overlays}/{folder}{capture}.png")
-        return paths
-
-    origin = file.provenance
+    origin, folder = file.provenance, session.path.resolve().name
     facts = [
         ("rig", file.rig),
         ("robot", origin.robot),
@@ -79,68 +58,37 @@ def report_text(
         ("method", ", ".join(dict.fromkeys(c.method for c in file.pairs))),
         ("made by", file.made_by),
         ("SHA-256 of the session", origin.session_sha256),
-        ("SHA-256 of result.json", hashlib.sha256(text.encode()).hexdigest()),
+        ("SHA-256 of result.json", hashlib.sha256(file.text().encode()).hexdigest()),
     ]
-    facts = [(name, value) for name, value in facts if value]
-
-    def picture(c: Calibration, capture: str) -> str:
-        with suppress(LceRigError):
-            board, lens = session.rig.board.to_board(), session.rig.cameras[c.camera].to_intrinsics()
-            return picture_of(session.capture(capture), c, board, lens)
-        return ""
-
-    def rejecting(capture: str) -> str:
-        return f"lce-rig calibrate {shlex.quote(session.path.resolve().name)} --without {capture}"
-
-    return calibration_page(
-        session.rig,
-        file.pairs,
-        facts=facts,
-        overlays=paths,
-        pictures=picture,
-        rejecting=rejecting,
-        folder=session.path.resolve().name,
-        has_previous=has_previous,
-    )
-
-
-def calibration_page(
-    rig: Rig,
-    calibrations: Sequence[Calibration],
-    *,
-    facts: Sequence[Row],
-    overlays: Overlays,
-    pictures: Pictures = lambda _c, _capture: "",
-    rejecting: Callable[[str], str] = lambda capture: f"lce-rig calibrate SESSION --without {capture}",
-    folder: str = "SESSION",
-    has_previous: bool = False,
-) -> str:
-    """Write the report of a result as one HTML file: the same result gives the same bytes.
-
-    Args:
-        rig: the profile.
-        calibrations: one for each camera and LiDAR.
-        facts: names and values that identify the result, for the end of the page.
-        overlays: gives the images of a capture; the page shows them once they are drawn.
-        pictures: gives the small picture of a capture.
-        rejecting: gives the command that rejects a capture.
-        folder: of the session, for commands.
-        has_previous: as of `report_text`.
-    """
+    has_folders = sum(len(c.channels) for c in file.pairs) > 1
     pairs = []
-    for k, c in enumerate(calibrations):
+    for k, c in enumerate(file.pairs):
         with style(f"pair-{k}"):
-            pair = _pair(rig, c, f"pair-{k}", overlays)
-            # As many of each camera, so that the whole page stays small.
-            pair["gallery"] = _gallery(c, pair["captures"], pictures, _MOST_PICTURES // len(calibrations))
-            pair["steps"] = _next_steps(c, folder, has_previous)
-            worst = pair["gallery"][:1]
-            pair["rejecting"] = rejecting(worst[0]["name"]) if worst else ""
-            pairs.append(pair)
-    return render("calibration.html", rig=rig.name, pairs=pairs, facts=facts)
+            pair = _pair(session.rig, c, f"pair-{k}")
+        for capture in pair["captures"]:
+            capture["overlays"] = _overlays(session.capture(capture["name"]), c, overlays, has_folders)
+        # As many of each camera, so that the whole page stays small.
+        pair["gallery"] = _gallery(session, c, pair["captures"], _MOST_PICTURES // len(file.pairs))
+        pair["steps"] = _next_steps(c, folder, has_previous)
+        pair["rejecting"] = ""
+        for worst in pair["gallery"][:1]:
+            pair["rejecting"] = f"lce-rig calibrate {shlex.quote(folder)} --without {worst['name']}"
+        pairs.append(pair)
+    facts = [(name, value) for name, value in facts if value]
+    return render("calibration.html", rig=session.rig.name, pairs=pairs, facts=facts)
 
 
-def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str, Any]:
+def _overlays(capture: Capture, c: Calibration, folder: str, has_folders: bool) -> list[str]:
+    """Name a capture's overlays as `verify` of the session does."""
+    return [
+        "/".join([folder, *([Pair(c.camera, channel, c.lidar).folder_name] if has_folders else []), name])
+        for channel in c.channels
+        if capture.has_image(c.camera, channel) or (channel == "events" and c.camera in capture.event_cameras)
+        for name in (f"{capture.name}.png",)
+    ]
+
+
+def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
     """List the content of one camera and one LiDAR's part of the page, by the template's names."""
     board, lens = rig.board.to_board(), rig.lens_of(c)
     evidence = gather(c, board, lens)
@@ -162,7 +110,6 @@ def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str
                     (name, f"{value:.{1 if unit == 'mm' else 2}f} {unit}" if math.isfinite(value) else "")
                     for name, value, unit in figures
                 ],
-                "overlays": overlays(c, residual.capture),
             }
         )
     return {
@@ -200,14 +147,15 @@ def _pair(rig: Rig, c: Calibration, anchor: str, overlays: Overlays) -> dict[str
 
 
 def _gallery(
-    c: Calibration, captures: Sequence[Mapping[str, Any]], pictures: Pictures, n_most: int
+    session: Session, c: Calibration, captures: Sequence[Mapping[str, Any]], n_most: int
 ) -> list[dict[str, Any]]:
     """List captures with their pictures, those with the largest residuals first."""
+    board, lens = session.rig.board.to_board(), session.rig.cameras[c.camera].to_intrinsics()
     order = worst_first([r.plane_mean_m for r in c.residuals], [r.edge_mean_m for r in c.residuals])
     return [
         {
             **captures[k],
-            "picture": pictures(c, c.residuals[k].capture),
+            "picture": picture_of(session.capture(c.residuals[k].capture), c, board, lens),
             "stands_out": f"{ratio:.1f} x the median" if ratio > _STANDS_OUT else "",
         }
         for k, ratio in order[: max(n_most, 1)]
@@ -355,3 +303,91 @@ def _camera_rows(c: Calibration) -> list[Row]:
             apart = f"{other.apart_rotation_deg:.3f} deg, {1000 * other.apart_translation_m:.1f} mm"
         rows.append((other.camera, other.n_captures, sigma, apart, f"{1000 * other.board_rms_m:.1f} mm"))
     return rows
+
+
+MOST_BYTES = 12_000
+"""Of one picture's data URI."""
+_WIDTH_PX, _OUTLINE_BGR = 320, (0, 140, 255)
+_QUALITIES = (75, 60, 45, 30, 15)
+# Events of this long make a picture in which the board's edges can be seen.
+_EVENTS_NS = 20_000_000
+
+
+def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics) -> str:
+    """Draw a capture's image with the board's outline; raw events where it holds no image.
+
+    Args:
+        capture: with the data.
+        c: the result, whose channels are looked at in their order.
+        board: of the outline.
+        lens: of the camera.
+
+    Returns:
+        A data URI of at most `MOST_BYTES`; "" where the capture holds no picture, or a damaged one.
+    """
+    observation = c.observations.get(capture.name)
+    outline, stamp_ns = np.empty((0, 2)), None
+    if observation is not None:
+        outline = outline_px(observation.image.T_cam_board, board, lens)
+        stamp_ns = observation.image.stamp_ns
+    with suppress(LceRigError):
+        for channel in c.channels:
+            if capture.has_image(c.camera, channel):
+                return data_uri(capture.image(c.camera, channel).pixels, outline)
+        if c.camera in capture.event_cameras:
+            return data_uri(_accumulated(capture.events(c.camera), stamp_ns), outline)
+    return ""
+
+
+def data_uri(pixels: NDArray[np.uint8], outline: Array) -> str:
+    """Shrink an image and draw an outline into it.
+
+    Args:
+        pixels: (H, W) grey or (H, W, 3) BGR.
+        outline: (N, 2) px; points that are not finite are left out.
+
+    Returns:
+        A JPEG of at most `MOST_BYTES` as a data URI.
+    """
+    height, width = pixels.shape[:2]
+    scale = min(1.0, _WIDTH_PX / width, _WIDTH_PX / height)
+    for shrink in (1.0, 0.7, 0.5, 0.3):
+        size = max(1, round(shrink * scale * width)), max(1, round(shrink * scale * height))
+        small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+        drawn = small if small.ndim == 3 else cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+        line = outline[np.isfinite(outline).all(axis=1)]
+        if len(line):
+            # Pixel centres are at whole numbers, before and after; 4 bits of fraction.
+            at = (line + 0.5) * size[0] / width - 0.5
+            points = np.round(16 * np.clip(at, -1e4, 1e4)).astype(np.int32)
+            cv2.polylines(drawn, [points], True, _OUTLINE_BGR, 2, cv2.LINE_AA, 4)
+        for quality in _QUALITIES:
+            content = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+            uri = "data:image/jpeg;base64," + base64.b64encode(content).decode()
+            if len(uri) <= MOST_BYTES:
+                return uri
+    return ""
+
+
+def _accumulated(events: Events, stamp_ns: int | None) -> NDArray[np.uint8]:
+    """Draw the events about a time, or the last ones, bright on dark."""
+    end_ns = int(events.t_ns[-1]) if len(events) else 0
+    middle_ns = end_ns - _EVENTS_NS // 2 if stamp_ns is None else stamp_ns
+    near = events.between(middle_ns - _EVENTS_NS // 2, middle_ns + _EVENTS_NS // 2)
+    counts = np.zeros((events.height_px, events.width_px))
+    np.add.at(counts, (near.y, near.x), 1.0)
+    return np.asarray(np.clip(40 + 70 * counts, 0, 255), dtype=np.uint8)
+
+
+def worst_first(planes_m: Sequence[float], edges_m: Sequence[float]) -> list[tuple[int, float]]:
+    """Order captures by their residuals, the largest first.
+
+    Returns:
+        The index of each, and how many times the median its planes or edges lie apart.
+    """
+    ratios = np.zeros(len(planes_m))
+    for values in (np.nan_to_num(np.array(planes_m)), np.nan_to_num(np.array(edges_m))):
+        middle = float(np.median(values)) if len(values) else 0.0
+        if middle > 0:
+            ratios = np.maximum(ratios, values / middle)
+    return [(int(k), float(ratios[k])) for k in np.argsort(-ratios, kind="stable")]

@@ -1,28 +1,44 @@
 """Results of simulated boards, with all that a report shows."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration
+from lce_rig.core.data import Image
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
-from lce_rig.show.report.calibration_page import calibration_page
+from lce_rig.session import Session
+from lce_rig.show.report.calibration_page import report_page
 from tests.calibrate.boards import simulate
 from tests.calibrate.two_cameras import simulate_two
+from tests.saved_results import result_file
 
 RLFS = load_rig("rlfs")
 TWO = load_rig(str(Path(__file__).parents[2] / "rigs" / "two_cameras.yaml"))
 
 
-def overlay_of(c: Calibration, capture: str) -> list[str]:
-    return [f"overlays/{c.camera}/{capture}.png"]
+@pytest.fixture(scope="session")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+    """Write the report of results of a rig, whose session holds an even image of each camera."""
 
+    def write(rig: Rig, *calibrations: Calibration, **options: Any) -> str:
+        path = tmp_path_factory.mktemp("report") / "s"
+        with Session.create(path, rig) as session:
+            for k in range(12):
+                images = [
+                    Image(name, "frames", k, np.full(camera.resolution_px[::-1], 80 + k, np.uint8))
+                    for name, camera in rig.cameras.items()
+                ]
+                session.add_capture(images, [], {})
+            return report_page(session, result_file(rig.name, calibrations), "overlays", **options)
 
-def page(rig: Rig, *calibrations: Calibration) -> str:
-    return calibration_page(rig, calibrations, facts=[("rig", rig.name)], overlays=overlay_of)
+    return write
 
 
 @pytest.fixture(scope="session")
@@ -47,10 +63,10 @@ def two() -> list[Calibration]:
 
 
 @pytest.fixture(scope="session")
-def one_page(one: Calibration) -> str:
+def one_page(page: Callable[..., str], one: Calibration) -> str:
     return page(RLFS, one)
 
 
 @pytest.fixture(scope="session")
-def two_page(two: list[Calibration]) -> str:
+def two_page(page: Callable[..., str], two: list[Calibration]) -> str:
     return page(TWO, *two)

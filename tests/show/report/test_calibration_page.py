@@ -10,10 +10,9 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import invert
 from lce_rig.rig import load_rig
 from lce_rig.show.report.calibration_drawings import gather
-from lce_rig.show.report.calibration_page import calibration_page
 from tests.export.conftest import calibration as without_boards
 
-from .conftest import RLFS, overlay_of, page
+from .conftest import RLFS
 
 _DRAWINGS = 8
 
@@ -36,9 +35,9 @@ def test_every_link_leads_to_one_place(which, request):
 
 def test_every_capture_s_bars_lead_to_its_overlay(one, one_page):
     for k, residual in enumerate(one.residuals):
-        # Planes, edges, outline, plate from above, residual by range; and the table.
-        assert one_page.count(f'href="#pair-0-capture-{k}"') == 6
-        assert f'src="overlays/cam/{residual.capture}.png"' in one_page
+        # Planes, edges, outline, plate from above, residual by range, picture; and the table.
+        assert one_page.count(f'href="#pair-0-capture-{k}"') == 7
+        assert f'src="overlays/{residual.capture}.png"' in one_page
 
 
 def test_points_on_the_board_lie_where_residuals_say(one):
@@ -57,7 +56,7 @@ def test_the_pose_is_that_of_the_camera_s_body_in_the_lidar_s_frame(one, one_pag
     assert [float(value) for _, value in found] == pytest.approx(invert(one.T_cam_lidar)[:3, 3], abs=1e-4)
 
 
-def test_a_failed_result_is_explained(one):
+def test_a_failed_result_is_explained(one, page):
     reasons = (
         Finding("verdict.text", "error", stored=("the <board> moved", "hold it `still`")),
         Finding("verdict.not_certified", "warning", figures={"gap": 0.1}),
@@ -69,19 +68,19 @@ def test_a_failed_result_is_explained(one):
 
 
 @pytest.mark.parametrize("has_previous", [True, False])
-def test_the_earlier_result_is_named_only_where_there_is_one(one, has_previous):
+def test_the_earlier_result_is_named_only_where_there_is_one(one, page, has_previous):
     failed = replace(one, verdict="fail")
-    text = calibration_page(RLFS, [failed], facts=[], overlays=overlay_of, has_previous=has_previous)
+    text = page(RLFS, failed, has_previous=has_previous)
     assert ("previous/" in text) is has_previous
 
 
-def test_a_result_that_was_read_from_a_file_lacks_only_its_boards():
+def test_a_result_that_was_read_from_a_file_lacks_only_its_boards(page):
     text = page(load_rig("rles"), without_boards())
     assert text.count("<svg ") == 1
     assert "näher – ¼ m" in text
 
 
-def test_causes_of_refusal_are_named(one):
+def test_causes_of_refusal_are_named(one, page):
     refused = {"<000007>": Refusal("image.too_dark", figures={"grey_99": 20.0})}
     text = page(RLFS, replace(one, captures_refused=refused))
     assert "&lt;000007&gt;" in text and "<000007>" not in text

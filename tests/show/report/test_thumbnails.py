@@ -2,6 +2,7 @@
 
 import base64
 import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -9,9 +10,8 @@ import numpy as np
 import pytest
 
 from lce_rig.core.calibration import Calibration
-from lce_rig.show.report.calibration_page import calibration_page
-from lce_rig.show.report.thumbnails import MOST_BYTES, data_uri, worst_first
-from tests.show.report.conftest import RLFS, overlay_of
+from lce_rig.show.report.calibration_page import MOST_BYTES, data_uri, worst_first
+from tests.show.report.conftest import RLFS
 
 
 def decoded(uri: str) -> np.ndarray:
@@ -41,20 +41,14 @@ def test_the_capture_that_stands_out_comes_first() -> None:
     assert worst_first([], []) == []
 
 
-def test_the_page_shows_every_capture_with_the_command_that_rejects_the_worst(one: Calibration) -> None:
+def test_the_page_shows_every_capture_with_the_command_that_rejects_the_worst(
+    one: Calibration, page: Callable[..., str]
+) -> None:
     residuals = list(one.residuals)
     residuals[3] = residuals[3]._replace(plane_mean_m=0.2)
-    picture = data_uri(np.zeros((72, 128), np.uint8), np.empty((0, 2)))
-    text = calibration_page(
-        RLFS,
-        [replace(one, residuals=tuple(residuals))],
-        facts=[],
-        overlays=overlay_of,
-        pictures=lambda _c, _capture: picture,
-        rejecting=lambda capture: f"lce-rig calibrate s --without {capture}",
-    )
+    text = page(RLFS, replace(one, residuals=tuple(residuals)))
     shown = re.findall(r'alt="Capture ([^"]+)"', text)
     assert sorted(shown) == sorted(r.capture for r in residuals)
     assert shown[0] == residuals[3].capture
     assert f"lce-rig calibrate s --without {shown[0]}" in text
-    assert text.count(picture) == len(residuals)
+    assert text.count("data:image/jpeg") == len(residuals)
