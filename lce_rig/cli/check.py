@@ -17,7 +17,7 @@ from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
 from lce_rig.detect.lidar.search import plane_limit_m
-from lce_rig.pipeline.matching import candidates_of, match_sensors
+from lce_rig.pipeline.detect_session import candidates_of, match_sensors
 from lce_rig.pipeline.verification import write_debug_images
 from lce_rig.rig import Rig
 

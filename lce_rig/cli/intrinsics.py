@@ -25,7 +25,7 @@ from lce_rig.pipeline.measure_intrinsics import MeasuredIntrinsics, measure_intr
 from lce_rig.pipeline.measure_lidar import measure_lidar, save_lidar
 from lce_rig.session import Session
 
-_MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
+_MODELS = ("radtan4", "radtan5", "rational", "equidistant")
 
 
 @click.command()
@@ -40,7 +40,7 @@ _MODELS = ("radtan4", "radtan5", "rational", "equidistant", "auto")
 @click.option(
     "--model",
     type=click.Choice(_MODELS),
-    help="Set the lens model; auto chooses by the error on held-out captures [default: the profile's].",
+    help="Set the lens model [default: the profile's].",
 )
 @click.option(
     "--save-profile",
@@ -154,7 +154,7 @@ def _table(measured: MeasuredIntrinsics) -> Any:
 
 
 def _explanation(measured: MeasuredIntrinsics) -> list[str]:
-    """State the board's shape, the choice of the model, what does not fit, and images that are not used."""
+    """State the board's shape, what does not fit, and images that are not used."""
     estimate = measured.estimate
     (along_width, along_height, aspect), sigma = estimate.pattern_shape
     # The board's deviation from its nominal shape, estimated with the intrinsics.
@@ -163,8 +163,6 @@ def _explanation(measured: MeasuredIntrinsics) -> list[str]:
         f"{100 * aspect:+.2f} +- {100 * sigma[2]:.2f} % too wide, "
         f"corner error {1000 * estimate.print_rms_m:.2f} mm",
     ]
-    if measured.choice is not None:
-        lines.append(f"  model     {show.escape(measured.choice.reason)}")
     if measured.check is not None:
         lines.append(f"  {figures_of(measured.check)}")
     if measured.misfit is not None:

@@ -8,14 +8,13 @@ import numpy as np
 from lce_rig.calibrate.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
 from lce_rig.collect.findings import IMAGE_NONE, LIDAR_ELSEWHERE, LIDAR_NONE
 from lce_rig.core.data import Scan
-from lce_rig.core.findings import Refusal
+from lce_rig.core.findings import Losses, Refusal
 from lce_rig.core.geometry import Array, invert
-from lce_rig.core.losses import Losses
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.detect.image.search import NOT_SEEN_AT_ONCE
 from lce_rig.rig import Rig
-from lce_rig.rig.poses import NominalExtrinsic
+from lce_rig.rig.profile import NominalExtrinsic
 from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]

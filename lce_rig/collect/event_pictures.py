@@ -5,8 +5,7 @@ from collections.abc import Collection, Iterable, Iterator
 
 from lce_rig.collect.findings import READ_EVENTS_GONE_BY, READ_EVENTS_NOT_BEGUN
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
-from lce_rig.core.findings import Refusal
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses, Refusal
 from lce_rig.detect.events.search import reconstructor_for
 from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import event_channel, rig_offset_ns, rig_time_ns

@@ -20,9 +20,8 @@ from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKe
 from lce_rig.collect.findings import IMAGE_MADE_FEW_EVENTS, IMAGE_STOOD_STILL, READ_NO_EVENTS_AT_SCAN
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.board import Board
-from lce_rig.core.findings import Refusal
+from lce_rig.core.findings import Losses, Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.losses import Losses
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.events.figures import MEMORY_NS, event_quality, outline_px
 from lce_rig.detect.limits_met import explain_missing_board, look_for_flicker, too_fast

@@ -12,8 +12,7 @@ from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments, still
 from lce_rig.collect.placement_dedupe import Placements, capture_poses, pose_figures
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
-from lce_rig.core.findings import Refusal
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses, Refusal
 from lce_rig.io.folder import FolderRecording
 from lce_rig.io.joining import join_recordings, require_sensors
 from lce_rig.io.protocol import (

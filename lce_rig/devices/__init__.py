@@ -7,8 +7,8 @@ from lce_rig.core import velodyne
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import Rig
+from lce_rig.rig.profile import BOARD
 from lce_rig.rig.sensors import CAMERA_DRIVERS, LIDAR_DRIVERS
-from lce_rig.rig.sync_settings import BOARD
 
 LIVE = {
     "vlp16": "lce_rig.devices.vlp16:Vlp16Source",

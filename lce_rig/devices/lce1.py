@@ -16,7 +16,7 @@ from lce_rig.core.data import Pulse
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 from lce_rig.devices.reading import ClockState
-from lce_rig.rig.sync_settings import PPS_LINE
+from lce_rig.rig.profile import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import ClockTracker
 

@@ -15,7 +15,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.devices import lce1
 from lce_rig.devices.lce1 import Arrival, BoardState
 from lce_rig.devices.reading import LiveSource, SourceStatus
-from lce_rig.rig.sync_settings import BOARD, SyncSettings
+from lce_rig.rig.profile import BOARD, SyncSettings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 
 # Opening the port may reset the board, and a VLP-16 takes 2.3 s to lock on its pulses again.

@@ -28,7 +28,7 @@ from lce_rig.devices.velodyne_web import VelodyneWeb, WebReport, find_problems
 from lce_rig.doctor import findings
 from lce_rig.doctor.observing import Examination, ObservedSensor, observe
 from lce_rig.rig import Rig
-from lce_rig.rig.sync_settings import BOARD, PPS_LINE
+from lce_rig.rig.profile import BOARD, PPS_LINE
 from lce_rig.timing.rig_clock import RigClock, edge_line
 from lce_rig.timing.triggers import TriggerMatcher
 

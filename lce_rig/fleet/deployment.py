@@ -56,7 +56,7 @@ from lce_rig.pipeline.result_files import RESULT
 from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
-from lce_rig.session.replacing import copy_over
+from lce_rig.session.durable import copy_over
 
 _OTHER = "Another deployment came first: look at `--status`, then run the same command again."
 

@@ -30,8 +30,7 @@ from lce_rig.fleet.findings import DAMAGED
 from lce_rig.fleet.storage import Storage
 from lce_rig.judge.reach import covariance_alone
 from lce_rig.pipeline.result_files import RESULT
-from lce_rig.session.durable import write_atomically
-from lce_rig.session.replacing import replacing
+from lce_rig.session.durable import replacing, write_atomically
 
 TABLE, ROWS = "fleet.parquet", "fleet.json"
 Status: TypeAlias = Literal["ok", "failed", "timed_out", "crashed", "out_of_memory"]

@@ -9,8 +9,7 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 from lce_rig.core.errors import LceRigError, SourceError, reason_of
-from lce_rig.session.durable import write_atomically
-from lce_rig.session.replacing import copy_over
+from lce_rig.session.durable import copy_over, write_atomically
 
 _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import Image, Scan, Stream
 from lce_rig.core.errors import SourceError, reading
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.decoding import DECODERS, LAS, SUFFIXES, read_cloud, read_image, require_las
 from lce_rig.io.findings import NOT_DECODED

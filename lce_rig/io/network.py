@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 import dpkt  # type: ignore[import-untyped]
 
 from lce_rig.core.errors import SourceError, reading, reason_of
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 
 _NS_PER_S = 1_000_000_000

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.files import read_json
+from lce_rig.core.findings import Losses
 from lce_rig.core.geometry import Array
-from lce_rig.core.losses import Losses
 from lce_rig.io import findings
 from lce_rig.io.network import PcapFile
 from lce_rig.io.protocol import SourceOptions, Span, choose_lidar, fingerprint

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import velodyne
-from lce_rig.core.findings import Figure, Finding, Kind
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Figure, Finding, Kind, Losses
 from lce_rig.io import findings
 from lce_rig.timing.clock import resolve_hour
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Finding
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Finding, Losses
 from lce_rig.io import findings
 from lce_rig.io.network import PcapFile
 from lce_rig.io.protocol import SourceOptions, Span, choose_lidar, fingerprint

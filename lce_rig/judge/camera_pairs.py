@@ -16,7 +16,14 @@ from lce_rig.calibrate.observations import group_placements, scan_key
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse, without_prior
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, difference, tangent_sizes
+from lce_rig.core.geometry import (
+    Array,
+    difference,
+    mean_pose,
+    relative_covariance,
+    relative_pose,
+    tangent_sizes,
+)
 from lce_rig.core.results import Observation
 from lce_rig.judge.findings import (
     CAMERAS_DIFFER,
@@ -26,7 +33,6 @@ from lce_rig.judge.findings import (
     failing,
 )
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
-from lce_rig.judge.relative_pose import mean_pose, relative_covariance, relative_pose
 from lce_rig.judge.split_consistency import contrast_halves, split_findings
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.rig import CalibrationSettings, NominalExtrinsic, Rig, VerdictSettings

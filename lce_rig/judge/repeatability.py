@@ -9,10 +9,9 @@ import numpy as np
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, difference, invert, log_so3
+from lce_rig.core.geometry import Array, difference, invert, log_so3, mean_pose
 from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE, RESULTS_AGREE, RESULTS_DISAGREE
 from lce_rig.judge.reach import covariance_alone
-from lce_rig.judge.relative_pose import mean_pose
 
 # Calibrations disagree if correct ones spread this far with less than this probability.
 _CHANCE = 0.01

@@ -1,7 +1,7 @@
 """Intrinsics of a camera from images of the board, with covariance and held-out errors."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from lce_rig.lens.fit import (
     solve_scaled,
 )
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
-from lce_rig.lens.models import MODELS, LensModel, LensPrior, convert, model_of
+from lce_rig.lens.models import LensModel, LensPrior, convert, model_of
 
 MIN_CAPTURES = 4
 N_FOLDS = 10
@@ -290,100 +290,3 @@ def _held_out(
         seen = refine_poses(setup.select(out), fitted.with_poses(state.T_cam_board[out]), tries_mirror=False)
         distances[out] = _distances(setup.select(out), seen)
     return distances
-
-
-# Models whose mean squared distances differ by less than this fraction are equivalent in practice.
-_ALIKE = 0.02
-
-
-@dataclass(frozen=True)
-class ModelScore:
-    """The errors of a model.
-
-    Attributes:
-        name: of the model.
-        n_parameters: number of its parameters.
-        rms_px: rms distance of corners it was fitted to.
-        held_out_px: the same for held-out captures.
-        excess_px2: its mean squared distance on these minus the best model's.
-        excess_sigma_px2: standard deviation of that, from the scatter of captures.
-    """
-
-    name: str
-    n_parameters: int
-    rms_px: float
-    held_out_px: float
-    excess_px2: float
-    excess_sigma_px2: float
-
-    @property
-    def is_as_good_as_the_best(self) -> bool:
-        """Whether its held-out error is not significantly or not relevantly worse than the best."""
-        return self.excess_px2 <= max(self.excess_sigma_px2, _ALIKE * self.held_out_px**2)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """The chosen model, the reason, and the scores of all models."""
-
-    name: str
-    reason: str
-    scores: tuple[ModelScore, ...]
-
-
-def choose_model(
-    views: Sequence[BoardView], board: Board, start: Intrinsics, *, n_folds: int = N_FOLDS
-) -> tuple[IntrinsicsEstimate, Choice]:
-    """Fit every model and choose one by its error on held-out captures.
-
-    Among models within one standard deviation of the best, choose the one with the fewest parameters; among
-    equals prefer the family of `start`, then the best.
-
-    Args:
-        views: of at least `MIN_CAPTURES` captures.
-        board: the board.
-        start: an initial guess, of any model.
-        n_folds: number of cross-validation folds.
-
-    Raises:
-        NotEnoughDataError: no model can be fitted.
-    """
-    fitted: dict[str, IntrinsicsEstimate] = {}
-    troubles = []
-    for name, model in MODELS.items():
-        try:
-            fitted[name] = estimate_intrinsics(views, board, start, model, n_folds=n_folds)
-        except NotEnoughDataError as error:
-            troubles.append(error)
-    if not fitted:
-        raise troubles[0]
-    # Models are compared on the captures that none of them refused.
-    squares = {name: _squares_by_capture(estimate) for name, estimate in fitted.items()}
-    shared = sorted(set.intersection(*(set(by_capture) for by_capture in squares.values())))
-    table = {name: np.array([squares[name][capture] for capture in shared]) for name in fitted}
-    best = min(table, key=lambda name: (float(table[name].mean()), name))
-    scores = []
-    for name, estimate in fitted.items():
-        excess, held_out_px = table[name] - table[best], float(np.sqrt(table[name].mean()))
-        sigma = float(excess.std(ddof=1) / np.sqrt(len(excess))) if len(excess) > 1 else 0.0
-        size, mean = estimate.model.size, float(excess.mean())
-        scores.append(ModelScore(name, size, estimate.rms_px, held_out_px, mean, sigma))
-    scores.sort(key=lambda score: score.held_out_px)
-    equals = [score for score in scores if score.is_as_good_as_the_best]
-    chosen = min(equals, key=lambda s: (s.n_parameters, MODELS[s.name].family != start.model, s.held_out_px))
-
-    def listed(some: Sequence[ModelScore]) -> str:
-        return ", ".join(f"{score.name} {score.held_out_px:.3f} px" for score in some)
-
-    reason = f"{chosen.name}: {chosen.held_out_px:.3f} px on held-out captures"
-    alike = [score for score in equals if score.name != chosen.name]
-    worse = [score for score in scores if score not in equals]
-    reason += f"; not significantly better: {listed(alike)}" if alike else ", the lowest"
-    reason += f"; worse: {listed(worse)}" if worse else ""
-    return fitted[chosen.name], Choice(chosen.name, reason, tuple(scores))
-
-
-def _squares_by_capture(estimate: IntrinsicsEstimate) -> dict[str, float]:
-    """Mean squared distance of each held-out capture's corners, px^2."""
-    captures = np.array([view.capture for view in estimate.views])
-    return {str(name): float(np.mean(estimate.held_out_px[captures == name] ** 2)) for name in set(captures)}

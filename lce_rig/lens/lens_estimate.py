@@ -9,7 +9,21 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard
+from lce_rig.lens.difference import LensCertainty
 from lce_rig.lens.models import LensModel
+
+ENOUGH_CAPTURES = 10
+# The border is undetermined if a pixel's standard deviation exceeds this, and this many times that in the
+# middle.
+_BORDER_PX, _BORDER_RATIO = 1.0, 4.0
+_BORDER_PERCENTILE = 98.0
+# A focal length error of this size moves boards at 3 m by 9 mm.
+_FOCAL_SIGMA = 0.003
+_TILTED_DEG, _TILTED_SHARE = 15.0, 0.5
+# Tilts about one axis determine the focal length in one direction only.
+_AXIS_SPREAD_DEG = 8.0
+_OVERFITTED = 1.5
+_BOW_M, _ASPECT = 0.002, 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,3 +117,92 @@ class IntrinsicsEstimate:
         """Corners (M, 2) of all views, without hidden ones."""
         corners_px = np.concatenate([view.board.corners_px for view in self.views])
         return np.asarray(corners_px[np.isfinite(corners_px[:, 0])])
+
+
+def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> tuple[str, ...]:
+    """List what the captures do not determine, with figures and actions, the most severe first.
+
+    Args:
+        estimate: of the lens.
+        certainty: of the same.
+    """
+    texts, n = [], len({view.capture for view in estimate.views})
+    if n < ENOUGH_CAPTURES:
+        texts.append(f"only {n} captures: standard deviations are rough; collect 15 or more")
+    blank = np.isnan(certainty.sigma_px)
+    if blank.any():
+        texts.append(
+            f"the distortion folds back: {100 * blank.mean():.0f} % of the image, at its border, has no ray; "
+            "place the board there too, or choose a model with fewer parameters"
+        )
+    inside = float(np.sqrt(np.nanmean(certainty.sigma_px[certainty.is_covered] ** 2)))
+    outside = float(np.nanpercentile(certainty.sigma_px, _BORDER_PERCENTILE))
+    if outside >= max(_BORDER_PX, _BORDER_RATIO * inside):
+        texts.append(
+            f"boards reach {100 * reach(estimate):.0f} % of the way to the image's corners, the distortion "
+            f"is not determined beyond (pixel standard deviation {outside:.1f} px there, {inside:.1f} px "
+            "where boards were seen); place boards in all four corners"
+        )
+    texts += _tilts(estimate)
+    if estimate.held_out_rms_px >= _OVERFITTED * estimate.rms_px:
+        texts.append(
+            f"held-out captures fit worse ({estimate.held_out_rms_px:.2f} px) than captures used "
+            f"({estimate.rms_px:.2f} px): add captures, or choose a model with fewer parameters"
+        )
+    shape, shape_sigma = estimate.pattern_shape
+    bow_m = max(shape[:2], key=abs)
+    if abs(bow_m) > _BOW_M:
+        way = "towards" if bow_m > 0 else "away from"
+        texts.append(
+            f"the board is bent: its middle is {1000 * abs(bow_m):.1f} mm {way} the viewer; "
+            "use a stiffer plate"
+        )
+    aspect, sigma = float(shape[2]), float(shape_sigma[2])
+    if abs(aspect) > _ASPECT + 2 * sigma:
+        way = "width" if aspect > 0 else "height"
+        texts.append(
+            f"the pattern is {100 * abs(aspect):.2f} +- {100 * sigma:.2f} % too long along the plate's "
+            f"{way}, compared with the other side: measure the squares both ways"
+        )
+    return tuple(texts)
+
+
+def tilts_deg(estimate: IntrinsicsEstimate) -> Array:
+    """Measure each board's tilt (K, 2) deg from the line of sight, by the axes of the image.
+
+    A board that faces the camera has no tilt; one whose right edge is farther away than its left has (+, 0).
+    """
+    normals, centres = estimate.T_cam_board[:, :3, 2], estimate.T_cam_board[:, :3, 3]
+    sight = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+    facing = -np.sum(normals * sight, axis=1)
+    lateral = normals + facing[:, None] * sight
+    size = np.degrees(np.arctan2(np.linalg.norm(lateral, axis=1), facing))
+    direction = lateral[:, :2] / np.maximum(np.linalg.norm(lateral[:, :2], axis=1, keepdims=True), 1e-12)
+    return np.asarray(direction * size[:, None])
+
+
+def reach(estimate: IntrinsicsEstimate) -> float:
+    """Measure how far boards reach from the principal point to the image's farthest corner, 0..1."""
+    i = estimate.intrinsics
+    centre = np.array([i.cx_px, i.cy_px])
+    ends = np.array([[u, v] for u in (0, i.width_px - 1) for v in (0, i.height_px - 1)])
+    farthest = np.linalg.norm(ends - centre, axis=1).max()
+    return float(np.linalg.norm(estimate.corners_px - centre, axis=1).max() / farthest)
+
+
+def _tilts(estimate: IntrinsicsEstimate) -> list[str]:
+    focal_sigma = float(estimate.sigma[0] / estimate.intrinsics.fx_px)
+    if focal_sigma < _FOCAL_SIGMA:
+        return []
+    tilts = tilts_deg(estimate)
+    known = f"focal length and distance trade off (standard deviation {100 * focal_sigma:.1f} %)"
+    share = float(np.mean(np.linalg.norm(tilts, axis=1) > _TILTED_DEG))
+    if share < _TILTED_SHARE:
+        n = round(share * len(tilts))
+        text = f"{n} of {len(tilts)} boards are tilted by more than {_TILTED_DEG:.0f} deg: {known}"
+        return [f"{text}; tilt the board by 30 to 45 deg, left and right as well as up and down"]
+    _, spread, axes = np.linalg.svd(tilts / np.sqrt(len(tilts)))
+    if spread[1] < _AXIS_SPREAD_DEG:
+        way = "left and right" if abs(axes[1, 0]) > abs(axes[1, 1]) else "up and down"
+        return [f"boards are hardly tilted {way} ({spread[1]:.0f} deg rms): {known}; tilt them that way too"]
+    return [f"{known}: add captures, nearer and tilted by 30 to 45 deg"]

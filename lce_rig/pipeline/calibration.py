@@ -30,7 +30,7 @@ from lce_rig.collect.guidance.planner import plan_captures
 from lce_rig.core.calibration import Calibration, OtherCamera, SceneShare
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.geometry import Array, invert, sigma_sizes, tangent_sizes
+from lce_rig.core.geometry import Array, invert, relative_pose, sigma_sizes, tangent_sizes
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
@@ -39,14 +39,12 @@ from lce_rig.judge.camera_pairs import CameraEvidence, CameraPair, camera_findin
 from lce_rig.judge.contributions import profile_covariance
 from lce_rig.judge.findings import lacks_captures
 from lce_rig.judge.reach import point_uncertainties, with_lens
-from lce_rig.judge.relative_pose import relative_pose
 from lce_rig.judge.session_check import find_meetings
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, share_findings, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
-from lce_rig.pipeline.detect_session import detect
+from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE
-from lce_rig.pipeline.matching import boards_in, candidates_of
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.witness import by_boards, hear_scene, sharpen
 from lce_rig.rig import Rig

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lce_rig.collect.offline import CollectOptions, CollectReport, collect
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.core.progress import Progress, silent
 from lce_rig.io import open_recordings
 from lce_rig.io.protocol import Recording, SourceOptions

@@ -165,7 +165,7 @@ def document(rig: Rig, measured: Sequence[MeasuredIntrinsics]) -> dict[str, Any]
 def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
     """List one camera's intrinsics; its profile's are null if they are for another resolution."""
     estimate, lens = measured.estimate, measured.intrinsics
-    choice, check, difference = measured.choice, measured.check, measured.difference
+    check, difference = measured.check, measured.difference
     profile = None
     if check is not None and difference is not None:
         profile = {
@@ -197,8 +197,6 @@ def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
             "print_rms_m": estimate.print_rms_m,
         },
         "covered": float(measured.certainty.is_covered.mean()),
-        "models": None if choice is None else [asdict(score) for score in choice.scores],
-        "reason": None if choice is None else choice.reason,
         "judgement": measured.judgement.as_json(),
         "weaknesses": list(measured.weaknesses),
         "views_used": [view.name for view in estimate.views],

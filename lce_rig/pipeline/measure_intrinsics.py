@@ -16,16 +16,14 @@ from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
-from lce_rig.lens.calibrate_lens import Choice, choose_model, estimate_intrinsics
+from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of, lens_errors
-from lce_rig.lens.lens_coverage import find_weaknesses
-from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
+from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
 from lce_rig.lens.models import MODELS, LensPrior, model_of
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 
-AUTO = "auto"
 Key = tuple[str, str]
 """Capture and channel of an image."""
 # A typical field of view, 64 deg, if the profile's intrinsics are unusable.
@@ -42,7 +40,6 @@ class MeasuredIntrinsics:
         channels: the channels whose images were used.
         given: the profile's intrinsics.
         estimate: the intrinsics from the boards.
-        choice: the chosen model and why, if models were compared.
         check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
         difference: per pixel; None likewise.
         certainty: of the estimate, per pixel.
@@ -56,7 +53,6 @@ class MeasuredIntrinsics:
     channels: tuple[str, ...]
     given: Intrinsics
     estimate: IntrinsicsEstimate
-    choice: Choice | None
     check: IntrinsicsCheck | None
     difference: LensDifference | None
     certainty: LensCertainty
@@ -107,7 +103,7 @@ def measure_intrinsics(
         camera: its name.
         channels: the channels whose images to use, as they share the lens; by default those of kind frames,
             or of events if there are no frames.
-        model: name of a lens model, or "auto" to compare all; the profile's if None.
+        model: name of a lens model; the profile's if None.
         progress: called with (done, total).
 
     Raises:
@@ -115,8 +111,8 @@ def measure_intrinsics(
         NotEnoughDataError: too few images show the board, or the focal length is undetermined.
     """
     rig = session.rig
-    if model not in (None, AUTO, *MODELS):
-        raise UsageError(f"there is no lens model {model!r}; there is {', '.join(MODELS)} and {AUTO}")
+    if model not in (None, *MODELS):
+        raise UsageError(f"there is no lens model {model!r}; there is {', '.join(MODELS)}")
     have = rig.cameras[camera].channels
     unknown = sorted(set(channels) - set(have))
     if unknown:
@@ -147,7 +143,7 @@ def measure_intrinsics(
         middle = (width - 1) / 2, (height - 1) / 2
         start = Intrinsics(focal, focal, *middle, width, height, given.model, straight)
         found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
-    estimate, choice = _fit(camera, found, rig, start, model)
+    estimate = _fit(camera, found, rig, start, model)
     # Wrong intrinsics may have caused a detection to fail: board, pose or single corners.
     limit_px = rig.quality.max_reprojection_px
     doubtful = {
@@ -160,7 +156,7 @@ def measure_intrinsics(
     if doubtful:
         again = [(capture, channel) for capture, channel in jobs if (capture.name, channel) in doubtful]
         found |= _look(rig, camera, again, estimate.intrinsics, limit_px, progress)
-        estimate, choice = _fit(camera, found, rig, estimate.intrinsics, model)
+        estimate = _fit(camera, found, rig, estimate.intrinsics, model)
     lens, target_deg = estimate.intrinsics, rig.calibration.target_sigma_deg
     certainty = certainty_of(lens, estimate.corners_px, estimate.cov, estimate.model)
     check, difference = None, None
@@ -172,7 +168,6 @@ def measure_intrinsics(
         channels=chosen,
         given=given,
         estimate=estimate,
-        choice=choice,
         check=check,
         difference=difference,
         certainty=certainty,
@@ -227,7 +222,7 @@ def _n_captures(found: Mapping[Key, ImageDetection]) -> int:
 
 def _fit(
     camera: str, found: Mapping[Key, ImageDetection], rig: Rig, start: Intrinsics, model: str | None
-) -> tuple[IntrinsicsEstimate, Choice | None]:
+) -> IntrinsicsEstimate:
     """Fit intrinsics to the boards.
 
     Raises:
@@ -248,11 +243,9 @@ def _fit(
         if isinstance(board, ImageBoard)
     ]
     board = rig.board.to_board()
-    if model == AUTO:
-        return choose_model(views, board, start)
     lens_model = model_of(start) if model is None else MODELS[model]
     # As `calibrate` weighs them; the profile's have no part in another model or resolution.
     prior = LensPrior.read(rig.cameras[camera], rig.board)
     sizes = [(lens.width_px, lens.height_px) for lens in (start, prior.lens)]
     is_comparable = sizes[0] == sizes[1] and lens_model == model_of(prior.lens)
-    return estimate_intrinsics(views, board, start, lens_model, prior=prior if is_comparable else None), None
+    return estimate_intrinsics(views, board, start, lens_model, prior=prior if is_comparable else None)

@@ -12,9 +12,8 @@ from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageErr
 from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import clocks_of
-from lce_rig.pipeline.detect_session import detect
+from lce_rig.pipeline.detect_session import candidates_of, detect
 from lce_rig.pipeline.intrinsics_files import write_profile
-from lce_rig.pipeline.matching import candidates_of
 from lce_rig.rig import set_value
 from lce_rig.session import Session
 

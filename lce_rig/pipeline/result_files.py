@@ -14,9 +14,8 @@ from lce_rig.export import export_formats, is_export, remove_exports
 from lce_rig.session import Session
 from lce_rig.session.capture import SAFE_NAME
 from lce_rig.session.capture_files import MANIFEST
-from lce_rig.session.durable import write_atomically
+from lce_rig.session.durable import check_folder, copy_over, write_atomically
 from lce_rig.session.provenance import provenance_of
-from lce_rig.session.replacing import check_folder, copy_over
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
 
 RESULT, REPORT, OVERLAYS, PREVIOUS = "result.json", "report.html", "overlays", "previous"

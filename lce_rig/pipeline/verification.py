@@ -17,9 +17,8 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.board_drift import watch_boards
 from lce_rig.judge.session_check import SessionCheck, check_session
 from lce_rig.pipeline.calibration import clocks_of
-from lce_rig.pipeline.detect_session import detect, event_channels, event_picture
+from lce_rig.pipeline.detect_session import detect, event_channels, event_picture, match_sensors
 from lce_rig.pipeline.findings import OTHER_PROFILE
-from lce_rig.pipeline.matching import match_sensors
 from lce_rig.pipeline.result_files import (
     OVERLAYS,
     RESULT,

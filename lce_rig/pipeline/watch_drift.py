@@ -15,8 +15,8 @@ from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.core.calibration import Calibration, ResultFile, read_result
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import SessionError, SourceError
+from lce_rig.core.findings import Losses
 from lce_rig.core.geometry import transform
-from lce_rig.core.losses import Losses
 from lce_rig.core.progress import Progress, silent
 from lce_rig.devices import edge_cameras
 from lce_rig.devices.reading import AttachedSensors, LiveSource

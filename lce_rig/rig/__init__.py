@@ -3,8 +3,7 @@
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.editing import derive_text, edit_text, set_value
 from lce_rig.rig.loading import dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
-from lce_rig.rig.poses import NominalExtrinsic
-from lce_rig.rig.profile import Rig
+from lce_rig.rig.profile import NominalExtrinsic, Rig, SyncSettings, TriggerSettings
 from lce_rig.rig.sensors import (
     CameraSettings,
     ChannelSettings,
@@ -16,7 +15,6 @@ from lce_rig.rig.sensors import (
     ReconstructionSettings,
     TimestampSettings,
 )
-from lce_rig.rig.sync_settings import SyncSettings, TriggerSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 __all__ = [

@@ -4,12 +4,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import UsageError
 from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import Array, pose, project_to_so3
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.findings import (
     DRIFTING_CLOCK,
@@ -18,19 +20,180 @@ from lce_rig.rig.findings import (
     SWAPPED_SIDES,
     UNKNOWN_MODEL,
 )
-from lce_rig.rig.poses import Mount, NominalExtrinsic
 from lce_rig.rig.sensors import (
     CameraSettings,
     ChannelSettings,
     LidarSettings,
 )
-from lce_rig.rig.settings import FrameName, Name, RigName, RobotName, Settings, Text, problem
-from lce_rig.rig.sync_settings import SyncSettings
+from lce_rig.rig.settings import (
+    Figure,
+    FrameName,
+    Name,
+    Positive,
+    RigName,
+    RobotName,
+    Row,
+    Settings,
+    Text,
+    problem,
+)
 from lce_rig.rig.target_settings import OutputFormat, TargetSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
 
 _MOST_SENSORS, _MOST_TARGETS = 64, 256
 _USUAL_RATE_HZ = 4.0, 40.0
+
+
+BOARD, PPS_LINE = "sync", "pps"
+"""Reserved names: the sync board among the sensors, and its pulse per second among the camera lines."""
+# CAD models and papers round to three digits, which changes a unit quaternion's norm by up to about 1e-3.
+_ROUNDING = 5e-3
+# Two sensors of one rig are not farther apart; larger figures are millimetres.
+_Metres = Annotated[float, Field(ge=-20, le=20)]
+
+
+class TriggerSettings(Settings):
+    """The pulses that trigger one camera.
+
+    Attributes:
+        channel: number of the board's line.
+        rate_hz: pulses per second.
+        phase_us: first pulse of a second after that second's beginning.
+        pulse_us: length of a pulse.
+        max_delay_s: maximum delay of an image's timestamp after its pulse; as short as the camera allows.
+    """
+
+    channel: Annotated[int, Field(ge=0, le=15)]
+    rate_hz: Annotated[float, Field(gt=0, le=1000)]
+    phase_us: Annotated[int, Field(ge=0, lt=1_000_000)] = 0
+    pulse_us: Annotated[int, Field(ge=1, lt=1_000_000)] = 100
+    max_delay_s: Annotated[float, Field(gt=0, le=1)] = 0.1
+
+    @model_validator(mode="after")
+    def _pulses_fit_into_their_period(self) -> "TriggerSettings":
+        period_us = 1e6 / self.rate_hz
+        if self.pulse_us >= period_us:
+            what = f"pulses of {self.pulse_us} us exceed the period of {period_us:.0f} us"
+            raise problem(what, "pulse_us")
+        if self.phase_us >= period_us:
+            what = f"{self.phase_us} us is beyond the period of {period_us:.0f} us"
+            raise problem(what, "phase_us")
+        return self
+
+
+class SyncSettings(Settings):
+    """A board that generates the pulse per second and triggers cameras.
+
+    Attributes:
+        type: its protocol: lce-rig's own (docs/sync-protocol.md).
+        device: its serial port.
+        baud: speed of the port; None for 115200, any over USB.
+        triggers: the trigger lines, by the camera's name.
+    """
+
+    type: Literal["lce1"] = "lce1"
+    device: Annotated[str, Field(min_length=1, max_length=4096)]
+    baud: Annotated[int, Field(ge=1200, le=4_000_000)] | None = None
+    triggers: dict[Name, TriggerSettings] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _lines_are_used_once(self) -> "SyncSettings":
+        cameras: dict[int, str] = {}
+        for camera, trigger in self.triggers.items():
+            if trigger.channel in cameras:
+                what = f"line {trigger.channel} triggers {cameras[trigger.channel]} already"
+                raise problem(what, f"triggers.{camera}.channel")
+            cameras[trigger.channel] = camera
+        return self
+
+    @property
+    def port_baud(self) -> int:
+        """The speed of the port."""
+        return self.baud or 115_200
+
+
+class Mount(Settings):
+    """The pose of one sensor on the robot, which makes the sensors part of the robot's tree of frames.
+
+    Attributes:
+        parent: a frame of the robot, such as base_link.
+        of: the frame of the LiDAR, or of a camera's body, whose pose is given.
+        xyz_m: its origin in the parent's frame.
+        rpy_deg: (roll, pitch, yaw) about the parent's fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
+    """
+
+    parent: FrameName
+    of: FrameName
+    xyz_m: Row
+    rpy_deg: Row = (0.0, 0.0, 0.0)
+
+    def to_matrix(self) -> Array:
+        """Build T_parent_of (4, 4)."""
+        from scipy.spatial.transform import Rotation
+
+        R = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_matrix()
+        return pose(R, np.array(self.xyz_m))
+
+
+class NominalExtrinsic(Settings):
+    """The expected pose of a camera; compared with the result, never used as an initial guess.
+
+    It takes points from the LiDAR's frame to the camera's optical frame: p_cam = R p_lidar + t. The rotation
+    is given in exactly one way.
+
+    Attributes:
+        quaternion_wxyz: unit quaternion of R, scalar first.
+        rpy_deg: (roll, pitch, yaw) about fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF.
+        matrix: the rows of R.
+        translation_m: t, the LiDAR's origin in the optical frame.
+        source: "cad", this rig's CAD model, with which the result must agree; or "typical", how such rigs are
+            built: for guidance and simulation, and no test of a result.
+        tolerance_deg: larger differences from the result are reported.
+        tolerance_m: larger differences from the result are reported.
+    """
+
+    camera: Name
+    lidar: Name
+    quaternion_wxyz: tuple[Figure, Figure, Figure, Figure] | None = None
+    rpy_deg: Row | None = None
+    matrix: tuple[Row, Row, Row] | None = None
+    translation_m: tuple[_Metres, _Metres, _Metres]
+    source: Literal["cad", "typical"] = "cad"
+    tolerance_deg: Positive = 5.0
+    tolerance_m: Positive = 0.1
+
+    @model_validator(mode="after")
+    def _is_a_pose(self) -> "NominalExtrinsic":
+        rotations = [
+            key for key in ("quaternion_wxyz", "rpy_deg", "matrix") if getattr(self, key) is not None
+        ]
+        if len(rotations) != 1:
+            names = " and ".join(rotations) if rotations else "none"
+            raise problem(f"{names} given; give the rotation as one of quaternion_wxyz, rpy_deg, matrix")
+        if self.quaternion_wxyz is not None:
+            norm = float(np.linalg.norm(self.quaternion_wxyz))
+            if abs(norm - 1) > _ROUNDING:
+                raise problem(f"not a unit quaternion: its norm is {norm:.4g}", "quaternion_wxyz")
+        if self.matrix is not None:
+            R = np.array(self.matrix)
+            error = float(np.abs(R @ R.T - np.eye(3)).max())
+            if error > 2 * _ROUNDING:
+                raise problem(f"not a rotation: R R^T differs from the identity by {error:.3g}", "matrix")
+            if np.linalg.det(R) < 0:
+                raise problem("not a rotation but a mirroring: its determinant is -1", "matrix")
+        return self
+
+    def to_matrix(self) -> Array:
+        """Build T_cam_lidar (4, 4)."""
+        from scipy.spatial.transform import Rotation
+
+        if self.quaternion_wxyz is not None:
+            R = Rotation.from_quat(np.roll(self.quaternion_wxyz, -1)).as_matrix()
+        elif self.rpy_deg is not None:
+            R = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_matrix()
+        else:
+            R = project_to_so3(np.array(self.matrix))
+        return pose(R, np.array(self.translation_m))
 
 
 class Rig(Settings):

@@ -26,7 +26,9 @@ from lce_rig.session.durable import (
     WriterLock,
     append_line,
     flush_folder,
+    recover,
     replace_file,
+    replacing,
     write_atomically,
     writing,
 )
@@ -39,7 +41,6 @@ from lce_rig.session.identity import (
     marker_of,
     read_marker,
 )
-from lce_rig.session.replacing import recover, replacing
 
 PROFILE, JOURNAL, LOCK = "rig.yaml", "journal.jsonl", ".lock"
 PROFILE_TEXT = "profile.yaml"
@@ -424,7 +425,7 @@ class Session:
 
         Args:
             folder: to replace, in the session.
-            finish: see `lce_rig.session.replacing`.
+            finish: see `lce_rig.session.durable`.
 
         Raises:
             SessionError: the disk is full or read-only; the earlier folder is untouched.

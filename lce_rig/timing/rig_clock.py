@@ -15,7 +15,7 @@ import numpy as np
 from lce_rig.core.data import Events, Image, LiveSample, Pulse, Sample, Scan
 from lce_rig.core.findings import Finding
 from lce_rig.rig import Rig
-from lce_rig.rig.sync_settings import BOARD, PPS_LINE
+from lce_rig.rig.profile import BOARD, PPS_LINE
 from lce_rig.timing import findings
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import MIN_PAIRS, Stamps, fit_clock, match_edges

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from lce_rig.core.data import Events, Image, Sample, Scan, join_events
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.rig import Rig
 from lce_rig.timing.findings import READ_NO_IMAGE_AT_SCAN
 from lce_rig.timing.rig_time import rig_offset_ns, rig_time_ns, stream_of

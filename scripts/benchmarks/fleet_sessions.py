@@ -22,7 +22,7 @@ from benchmarks.kept import kept_folder
 from lce_rig.core.calibration import MOTIONS
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.rig import Rig, dump_rig, load_rig
-from lce_rig.rig.poses import NominalExtrinsic
+from lce_rig.rig.profile import NominalExtrinsic
 from lce_rig.session import Session
 from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
 

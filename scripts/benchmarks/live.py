@@ -28,7 +28,7 @@ from lce_rig.devices import open_live
 from lce_rig.devices.davis import DavisSource, OpenedCamera
 from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.rig import Rig, load_rig
-from lce_rig.rig.sync_settings import SyncSettings
+from lce_rig.rig.profile import SyncSettings
 from lce_rig.session import Session
 
 LOOPS_PER_HOLD = 10

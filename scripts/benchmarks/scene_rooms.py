@@ -18,7 +18,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
-from lce_rig.rig.poses import NominalExtrinsic
+from lce_rig.rig.profile import NominalExtrinsic
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import build_view, without_board
 from lce_rig.session import Session

@@ -8,7 +8,7 @@ import pytest
 
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.core.data import Image, Sample, Scan
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.detect.events.search import reconstructor_for
 from lce_rig.io.joining import merge_by_time
 from lce_rig.rig import ReconstructionSettings, Rig, load_rig

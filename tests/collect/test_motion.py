@@ -10,8 +10,7 @@ from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
 from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.board import Board
-from lce_rig.core.findings import Refusal
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses, Refusal
 from lce_rig.rig import Rig, load_rig
 
 from .event_sightings import event_stream, watch

@@ -8,7 +8,7 @@ from fake_board import HELLO, FakeBoard
 
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.sync_board import SyncBoard
-from lce_rig.rig.sync_settings import SyncSettings
+from lce_rig.rig.profile import SyncSettings
 
 
 def settings(path, **more):

@@ -26,7 +26,7 @@ from lce_rig.devices.lce1 import (
     write_sentence,
 )
 from lce_rig.devices.sync_board import SyncBoard
-from lce_rig.rig.sync_settings import SyncSettings
+from lce_rig.rig.profile import SyncSettings
 
 FIRMWARE = Path(__file__).parents[2] / "scripts" / "firmware"
 STRICT = [

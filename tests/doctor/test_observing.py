@@ -10,7 +10,7 @@ from lce_rig.devices.reading import LiveSource
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.doctor.observing import observe
 from lce_rig.rig import load_rig
-from lce_rig.rig.sync_settings import SyncSettings
+from lce_rig.rig.profile import SyncSettings
 from tests.devices.fake_board import FakeBoard
 
 

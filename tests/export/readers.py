@@ -24,7 +24,7 @@ from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
 from lce_rig.export import EXPORTS, export_formats
 from lce_rig.export.other_tools import fit_coefficients
 from lce_rig.rig import Rig, load_rig
-from lce_rig.rig.poses import Mount
+from lce_rig.rig.profile import Mount
 from lce_rig.session import Session
 from tests.saved_results import made_calibration
 

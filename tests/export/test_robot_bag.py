@@ -19,7 +19,7 @@ from lce_rig.export.robot_tree import build_trees, fit_tree
 from lce_rig.export.urdf import read_robot, read_robot_bag
 from lce_rig.export.writing import R_BODY_OPTICAL
 from lce_rig.rig import Rig
-from lce_rig.rig.poses import Mount
+from lce_rig.rig.profile import Mount
 
 Make = Callable[..., Calibration]
 Transform = tuple[str, str, Array]

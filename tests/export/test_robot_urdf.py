@@ -16,7 +16,7 @@ from lce_rig.export import export
 from lce_rig.export.robot_tree import fit_tree
 from lce_rig.export.urdf import read_robot_urdf, write_into_urdf
 from lce_rig.rig import Rig
-from lce_rig.rig.poses import Mount
+from lce_rig.rig.profile import Mount
 
 Make = Callable[..., Calibration]
 NOW = datetime(2026, 5, 4, 10, 15)

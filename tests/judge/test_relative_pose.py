@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from lce_rig.core.geometry import difference, exp_so3, perturb, pose
-from lce_rig.judge.relative_pose import relative_covariance, relative_pose
+from lce_rig.core.geometry import difference, exp_so3, perturb, pose, relative_covariance, relative_pose
 
 RNG = np.random.default_rng(0)
 T_SECOND, T_FIRST = (

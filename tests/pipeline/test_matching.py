@@ -7,8 +7,7 @@ import pytest
 import lce_rig as lce
 from lce_rig.core.findings import Refusal
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.pipeline.detect_session import detect
-from lce_rig.pipeline.matching import expected_poses, match_sensors
+from lce_rig.pipeline.detect_session import detect, expected_poses, match_sensors
 from lce_rig.session import Session
 
 RIGS = Path(__file__).parents[1] / "rigs"

@@ -10,11 +10,11 @@ import time
 import pytest
 
 from lce_rig.session import Session
-from lce_rig.session.replacing import copy_over, recover, replacing
+from lce_rig.session.durable import copy_over, recover, replacing
 
 ENDLESS = """
 import sys, pathlib
-from lce_rig.session.replacing import replacing
+from lce_rig.session.durable import replacing
 root, exchanges = pathlib.Path(sys.argv[1]), sys.argv[2] == "1"
 print("started", flush=True)
 for k in range(10**6):

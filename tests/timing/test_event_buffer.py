@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.data import Events, Image, Sample, Scan
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.rig_time import rig_time_ns
 from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, Frame, pair_by_time

@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.core.data import Image, Pulse, Scan
 from lce_rig.rig import Rig, load_rig
-from lce_rig.rig.sync_settings import SyncSettings
+from lce_rig.rig.profile import SyncSettings
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import TimePairs, fit_clock
 from lce_rig.timing.rig_clock import RigClock

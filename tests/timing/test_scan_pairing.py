@@ -3,7 +3,7 @@
 import numpy as np
 
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.timing.scan_pairing import PATIENCE_NS, pair_by_time
 
 MS = 1_000_000

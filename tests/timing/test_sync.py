@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Events, Image, Pulse, Scan
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.rig import load_rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import TimePairs, fit_clock

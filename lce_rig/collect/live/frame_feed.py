@@ -8,7 +8,7 @@ from types import TracebackType
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.core.data import Sample
 from lce_rig.core.errors import LceRigError, SourceError
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.devices.reading import AttachedSensors, Inbox
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig import Rig

@@ -19,9 +19,8 @@ from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.collect.live.state import Phase
 from lce_rig.collect.placement_dedupe import Placements, capture_poses
 from lce_rig.core.errors import LceRigError, ProfileError
-from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.findings import Finding, Losses, Refusal
 from lce_rig.core.geometry import Array
-from lce_rig.core.losses import Losses
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session

@@ -7,7 +7,7 @@ from pkgutil import resolve_name
 
 from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded

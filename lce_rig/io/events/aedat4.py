@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import MAX_TIME_NS, EventColumns, join_events
 from lce_rig.core.errors import SourceError, reading, reason_of
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.events.event_recording import NS_PER_US, EventStream, NoEventsError, parse_size, to_ns
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import MAX_TIME_NS, EventColumns, Events, join_events
 from lce_rig.core.errors import SourceError
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.protocol import Span
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.events.event_recording import NS_PER_US, EventStream, parse_size
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading, reason_of
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.events.event_recording import EventStream, parse_size, to_ns
 

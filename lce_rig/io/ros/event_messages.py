@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.events.event_recording import NS_PER_US, EventStream, seconds_in
 from lce_rig.io.events.prophesee import EVT3, LIBCAER_CMP, WordDecoder

@@ -10,7 +10,7 @@ import numpy as np
 
 from lce_rig.core.data import Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded

@@ -8,8 +8,7 @@ import pytest
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.observations import group_placements, group_shared_placements
 from lce_rig.calibrate.together import calibrate_together
-from lce_rig.core.geometry import difference
-from lce_rig.judge.relative_pose import relative_pose
+from lce_rig.core.geometry import difference, relative_pose
 from tests.calibrate.boards import BOARD, simulate
 from tests.calibrate.test_tolerances import KNOWN
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, only, simulate_two

@@ -17,7 +17,7 @@ from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.state import LiveOptions, LiveState
 from lce_rig.devices import open_live
 from lce_rig.devices.lce1 import write_sentence
-from lce_rig.rig.sync_settings import SyncSettings, TriggerSettings
+from lce_rig.rig.profile import SyncSettings, TriggerSettings
 from lce_rig.session import Session
 from tests.collect.live.sent import check_sent, check_whole, read_sent
 

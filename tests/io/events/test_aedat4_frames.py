@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io.events.aedat4 import Aedat4File, Aedat4Frame, decode_frame
 from tests.io.events.aedat4_files import RawFrame, flatbuffer, write_davis
 from tests.io.events.encoders import random_events

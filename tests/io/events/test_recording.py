@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.core.losses import Losses
+from lce_rig.core.findings import Losses
 from lce_rig.io.events.event_recording import REORDER_NS, EventRecording, EventStream
 from tests.io.events.encoders import random_events
 from tests.notes import has_note
