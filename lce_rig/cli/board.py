@@ -47,16 +47,6 @@ _MOUNTING = (
     "--size", "square_m", type=float, required=True, metavar="M", help="Set the side of a square or tag."
 )
 @click.option(
-    "--marker", "marker_m", type=float, metavar="M", help="charuco: set the side of a marker [default: 3/4]."
-)
-@click.option(
-    "--spacing", type=float, metavar="RATIO", help="aprilgrid: set the gap over the tag [default: 0.3]."
-)
-@click.option(
-    "--dictionary", metavar="NAME", help="charuco: choose the markers [default: 5X5, as small as fits]."
-)
-@click.option("--first-id", type=int, metavar="ID", help="Set the id of the first marker [default: 0].")
-@click.option(
     "--plate", metavar="WIDTHxHEIGHT", help="Set the plate's size in m [default: a white margin of a square]."
 )
 @click.option("-o", "--output", default="board.pdf", show_default=True, help="File to write: PDF or SVG.")
@@ -64,10 +54,6 @@ def board(
     kind: BoardType,
     squares: str,
     square_m: float,
-    marker_m: float | None,
-    spacing: float | None,
-    dictionary: str | None,
-    first_id: int | None,
     plate: str | None,
     output: str,
 ) -> None:
@@ -81,19 +67,20 @@ def board(
     if counts is None or outline is None or Path(output).suffix not in (".pdf", ".svg"):
         raise UsageError("give --squares as 9x7, --plate as 0.8x0.6, and an output that ends in .pdf or .svg")
     cols, rows = map(int, counts.groups())
-    more: dict[str, object] = {"marker_m": marker_m, "tag_spacing": spacing, "dictionary": dictionary}
+    more: dict[str, object] = {}
     if kind == "charuco":
-        more["marker_m"] = round(_MARKER_SHARE * square_m, 6) if marker_m is None else marker_m
-        more["dictionary"] = dictionary or _smallest("5X5", (first_id or 0) + cols * rows // 2)
+        more = {
+            "marker_m": round(_MARKER_SHARE * square_m, 6),
+            "dictionary": _smallest("5X5", cols * rows // 2),
+        }
     elif kind == "aprilgrid":
-        more["tag_spacing"] = _TAG_SPACING if spacing is None else spacing
+        more = {"tag_spacing": _TAG_SPACING}
     less = 1 if kind == "checkerboard" else 0
     document = {
         "type": kind,
         KEYS_OF_TYPE[kind][0]: (cols - less, rows - less),
         "square_m": square_m,
         **more,
-        "first_id": first_id,
         "width_m": 5.0,
         "height_m": 5.0,
     }

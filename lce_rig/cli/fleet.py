@@ -119,7 +119,7 @@ def run(
     show.note(f"{show.counted(len(jobs), 'session')} in {root}")
     with patience(_GRACE_S), cluster(n_workers, memory_limit, scheduler) as client:
         show.note(f"Dask dashboard: {client.dashboard_link}")
-        with show.progress_bar("sessions", has_rate=True) as progress:
+        with show.progress_bar("sessions") as progress:
             done = run_fleet(jobs, settings, client, progress=progress)
     if as_json:
         show.print_json(

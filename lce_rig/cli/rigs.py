@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -34,29 +33,15 @@ from lce_rig.session.durable import replace_file
 def rigs(ctx: click.Context) -> None:
     """List, show, check and derive rig profiles (default: list)."""
     if ctx.invoked_subcommand is None:
-        ctx.invoke(list_profiles, as_json=False)
+        ctx.invoke(list_profiles)
 
 
 @rigs.command("list")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-def list_profiles(as_json: bool) -> None:
+def list_profiles() -> None:
     """List the shipped profiles."""
-    profiles = [load_rig(name) for name in shipped_profiles()]
-    summaries: list[dict[str, Any]] = [
-        {
-            "name": rig.name,
-            "description": rig.description,
-            "lidars": list(rig.lidars),
-            "cameras": {name: list(camera.channels) for name, camera in rig.cameras.items()},
-        }
-        for rig in profiles
-    ]
-    if as_json:
-        show.print_json({"rigs": summaries})
-        return
     table = show.plain_table("", "rig", "LiDARs", "cameras (channels)", "board", "description")
-    for rig, summary in zip(profiles, summaries, strict=True):
-        cameras = (f"{name} ({', '.join(channels)})" for name, channels in summary["cameras"].items())
+    for rig in map(load_rig, shipped_profiles()):
+        cameras = (f"{name} ({', '.join(camera.channels)})" for name, camera in rig.cameras.items())
         board = rig.board.to_board()
         pattern = f"{board.cols}x{board.rows} corners, {1e3 * board.square_m:g} mm"
         table.add_row(rig.name, ", ".join(rig.lidars), ", ".join(cameras), pattern, rig.description)
@@ -83,28 +68,10 @@ def show_profile(rig_name: str, is_whole: bool, as_json: bool) -> None:
 
 @rigs.command("check")
 @click.argument("file", metavar="FILE")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-def check_profile(file: str, as_json: bool) -> None:
+def check_profile(file: str) -> None:
     """Check the profile FILE and list every problem with its line. Exits with 3 if there is one."""
-    try:
-        rig = load_rig(file)
-        check_networks(rig)
-    except ProfileError as error:
-        if as_json:
-            problems = error.hint.splitlines() if error.hint else [error.what]
-            show.print_json({"is_valid": False, "problems": problems, "warnings": [], "findings": []})
-        raise
-    if as_json:
-        warnings = list(rig.warnings())
-        show.print_json(
-            {
-                "is_valid": True,
-                "problems": [],
-                "warnings": [warning.sentence for warning in warnings],
-                "findings": [warning.as_json() for warning in warnings],
-            }
-        )
-        return
+    rig = load_rig(file)
+    check_networks(rig)
     click.echo(f"{find_profile(file)}: a valid profile of rig {rig.name}")
     _print_warnings(rig)
 

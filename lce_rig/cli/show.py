@@ -13,8 +13,6 @@ from typing import Any
 
 import click
 
-from lce_rig.core.phrasing import significant
-
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
 _MOST_UNBROKEN, _WIDTH = 24, 80
@@ -167,30 +165,22 @@ class ProgressBar:
 
     def __init__(self, bar: Any, title: str) -> None:
         self._bar, self._title = bar, title
-        self._task = bar.add_task(title, total=None, rate="")
+        self._task = bar.add_task(title, total=None)
 
     def __call__(self, done: int, total: int) -> None:
         """Show how many are done."""
-        speed = self._bar.tasks[0].speed
-        self._bar.update(
-            self._task, completed=done, total=total, rate=f"{significant(speed)}/s" if speed else ""
-        )
+        self._bar.update(self._task, completed=done, total=total)
 
     def begin(self, step: str) -> None:
         """Name the step; the bar moves to and fro until its (done, total) are known."""
         # A task's total cannot be unset.
         self._bar.remove_task(self._task)
-        self._task = self._bar.add_task(f"{self._title}: {step}", total=None, rate="")
+        self._task = self._bar.add_task(f"{self._title}: {step}", total=None)
 
 
 @contextmanager
-def progress_bar(title: str, *, has_rate: bool = False) -> Iterator[ProgressBar]:
-    """Show a progress bar on stderr; nothing if stderr is not a terminal.
-
-    Args:
-        title: of the bar.
-        has_rate: whether to show how many are done per second, too.
-    """
+def progress_bar(title: str) -> Iterator[ProgressBar]:
+    """Show a progress bar of this title on stderr; nothing if stderr is not a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
@@ -199,7 +189,6 @@ def progress_bar(title: str, *, has_rate: bool = False) -> Iterator[ProgressBar]
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        *([TextColumn("{task.fields[rate]}")] if has_rate else []),
         TimeRemainingColumn(compact=True),
     ]
     console = Console(stderr=True)

@@ -106,18 +106,6 @@ def test_calibrate_gives_the_same_extrinsics_verdict_and_reasons(run_twice, spoi
     assert document["pairs"][0]["findings"]
 
 
-@pytest.mark.long
-def test_calibrate_fails_for_the_same_reasons(run_twice, session):
-    profile = session / "rig.yaml"
-    wrong = profile.read_text().replace("square_m: 0.068", "square_m: 0.075")
-    assert wrong != profile.read_text()
-    profile.write_text(wrong)
-    code, document = run_twice("calibrate", session)
-    assert code == 7
-    assert document["pairs"][0]["verdict"] == "fail"
-    assert "error" in {each["severity"] for each in document["pairs"][0]["findings"]}
-
-
 def test_verify_is_contradicted_by_the_same_captures(run_twice, calibrated_few):
     code, document = run_twice("verify", moved(calibrated_few))
     assert code == 7
@@ -133,12 +121,6 @@ def halves(simulated, tmp_path) -> list[Path]:
         for k in range(half, 16, 2):
             shutil.rmtree(folder / "captures" / f"{k:06d}")
     return halves
-
-
-@pytest.mark.long
-def test_repeat_finds_the_same_agreement(run_twice, halves):
-    code, document = run_twice("repeat", *halves)
-    assert (code, codes(document)) == (0, {"repeat.agree"})
 
 
 @pytest.mark.long
