@@ -272,7 +272,7 @@ def calibrate(
         with show.progress_bar("drawing the report"):
             result.write_report(name=name)
     n_others, page = len(written.files) - 1, "" if no_report else ", report.html"
-    others = f" and {n_others} for the robot" if n_others else ""
+    others = f", {n_others} for the robot" if n_others else ""
     show.note(f"  files        {written.files[0].parent}/: result.json{page}{others}")
     if any(finding.code == GUIDE_ADD.code for c in result.pairs for finding in c.findings):
         show.note(f"  next         {_collect_command(opened)}")

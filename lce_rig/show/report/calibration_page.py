@@ -264,7 +264,9 @@ def _axis_rows(cov: Array, unit: str, kind: str) -> list[Row]:
 
 
 def _clock_rows(c: Calibration) -> list[Row]:
-    """List figures of the channels, a column each."""
+    """List figures of the channels, a column each; none where one channel saw still boards."""
+    if len(c.channel_results) < 2 and all(r.time_offset_s is None for r in c.channel_results):
+        return []
     offsets = [
         "boards stood still"
         if r.time_offset_s is None or r.time_offset_sigma_s is None
