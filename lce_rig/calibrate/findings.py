@@ -63,6 +63,11 @@ TWO_PLACES = Kind(
     "{first} and {second} give different board positions in the scan",
     "remove other things of the board's size, or cover them",
 )
+TURNED = Kind(
+    "pair.turned",
+    "the plate is turned by {rotation_deg:1deg} about its normal between both LiDARs",
+    "keep other plates and boxes out of view",
+)
 OUTLIER = Kind(
     "calibrate.outlier",
     "outlier: plane {plane_m:mm}, edges {edges_m:mm} rms from the other captures' prediction "

@@ -116,9 +116,21 @@ class Quadratics:
             prior_gradient=self.prior_gradient[unknowns],
         )
 
-    def settled(self) -> "Quadratics":
-        """Hold all unknowns but the first six at their estimate: quadratics in these, about their optimum."""
-        x = self.optimum()
+    def weighted(self, weight: Array) -> "Quadratics":
+        """Multiply each capture's cost by its weight (F,)."""
+        return replace(
+            self,
+            gradients=weight[:, None] * self.gradients,
+            hessians=weight[:, None, None] * self.hessians,
+        )
+
+    def settled(self, x: Array | None = None) -> "Quadratics":
+        """Hold all unknowns but the first six at their estimate: quadratics in these, about their optimum.
+
+        Args:
+            x: (p,) estimate of all unknowns; None for the optimum.
+        """
+        x = self.optimum() if x is None else x
         return replace(
             self,
             gradients=(self.gradients + self.hessians @ x)[:, :6],

@@ -186,11 +186,19 @@ def inflate(
     Returns:
         The covariance and the factor, 1 if model and spread agree.
     """
-    cov = joint.cov[camera]
     n = int(placement.max()) + 1 if n_seen is None else n_seen
-    ratio = float(np.trace(symmetric_inverse(cov) @ jackknife(joint, placement, camera))) / len(cov)
+    return widen(joint.cov[camera], jackknife(joint, placement, camera), n)
+
+
+def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:
+    """Multiply a covariance (6, 6) where the spread (6, 6) over placements significantly exceeds it.
+
+    Returns:
+        The covariance and the factor, 1 if they agree.
+    """
+    ratio = float(np.trace(symmetric_inverse(cov) @ spread)) / len(cov)
     # A mean of 6 chi squares over n - 1 freedoms each.
-    chance = np.sqrt(2 / (len(cov) * max(n - 1, 1)))
+    chance = np.sqrt(2 / (len(cov) * max(n_placements - 1, 1)))
     factor = ratio if ratio > 1 + _SURE * chance else 1.0
     return factor * cov, factor
 

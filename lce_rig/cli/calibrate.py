@@ -37,6 +37,7 @@ from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
 
 _AXES = ("x right", "y down", "z forward")
+_AXES_OF_LIDAR = ("x forward", "y left", "z up")
 _OPINIONS = {"agrees": "agrees", "contradicts": "[red]contradicts[/]", "unknown": "cannot tell"}
 _UNITS = {"deg": "deg", "m": "mm"}
 _CORRECTED = {"verdict.intrinsics", "verdict.scale"}
@@ -50,8 +51,8 @@ def _uncertainty_lines(c: Calibration, *, is_explained: bool) -> list[str]:
     lines = [_sigma_line(c.sigma_rotation_deg, c.sigma_translation_m)]
     if c.verdict == "fail" and not is_explained:
         return lines
-    lines += [f"    about      {_by_axis(np.degrees(sigmas[3:]), '.3f')} deg"]
-    lines += [f"    along      {_by_axis(1000 * sigmas[:3], '.1f')} mm"]
+    lines += [f"    about      {_by_axis(c, np.degrees(sigmas[3:]), '.3f')} deg"]
+    lines += [f"    along      {_by_axis(c, 1000 * sigmas[:3], '.1f')} mm"]
     if not is_explained:
         return lines + [
             f"  {_FAR_M:g} m away    a point is off by {point.centre_px:.1f} px, "
@@ -78,8 +79,9 @@ def _sigma_line(sigma_deg: float, sigma_m: float) -> str:
     return f"  uncertainty  {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)"
 
 
-def _by_axis(values: Array, digits: str) -> str:
-    return ", ".join(f"{axis} {value:{digits}}" for axis, value in zip(_AXES, values, strict=True))
+def _by_axis(c: Calibration, values: Array, digits: str) -> str:
+    axes = _AXES_OF_LIDAR if c.is_of_lidars else _AXES
+    return ", ".join(f"{axis} {value:{digits}}" for axis, value in zip(axes, values, strict=True))
 
 
 def scene_texts(opinion: SceneOpinion) -> list[str]:
@@ -386,7 +388,9 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
     if len(causes) > _N_REASONS and not is_explained:
         lines.append(f"  {show.counted(len(causes) - _N_REASONS, 'more reason')}: --explain, or report.html")
     if is_explained or not has_failed:
-        lines += ["  T_cam_lidar (p_cam = R p_lidar + t)", *show.matrix_lines(c.T_cam_lidar, "    ")]
+        target, source = (c.camera, c.lidar) if c.is_of_lidars else ("cam", "lidar")
+        title = show.escape(f"  T_cam_lidar (p_{target} = R p_{source} + t)")
+        lines += [title, *show.matrix_lines(c.T_cam_lidar, "    ")]
     lines += _uncertainty_lines(c, is_explained=is_explained)
     if not is_explained:
         # Lens and squares that the result has corrected go with its extrinsics.
@@ -405,7 +409,8 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
 def _explanation(c: Calibration) -> list[str]:
     """State residuals, certificate, channels, cameras, the scene, unused captures and notes."""
     metrics = c.metrics
-    held_out = f"held out {1000 * c.held_out_m:.1f} mm, " if math.isfinite(c.held_out_m) else ""
+    corners = "" if c.is_of_lidars else f", corners {metrics.reprojection_px:.2f} px"
+    held_out = f", held out {1000 * c.held_out_m:.1f} mm" if math.isfinite(c.held_out_m) else ""
     certificate = f"none (method {c.method} has no certificate)"
     if math.isfinite(c.certificate.gap):
         certificate = "global minimum" if c.certificate.is_optimal else "[red]not proven[/]"
@@ -413,8 +418,8 @@ def _explanation(c: Calibration) -> list[str]:
         certificate += f", gap {c.certificate.gap:.0e}"
     lines = [
         f"  detected     board found by both sensors in {c.n_detected}",
-        f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm, "
-        f"{held_out}corners {metrics.reprojection_px:.2f} px",
+        f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm"
+        f"{held_out}{corners}",
         f"  certificate  {certificate}",
         *show.titled_lines("channels", _channel_texts(c)),
         *together_lines(c),

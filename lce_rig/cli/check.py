@@ -43,36 +43,38 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
         with show.progress_bar("drawing") as progress:
             folder = write_debug_images(opened, detections, progress=progress)
         show.note(f"debug images: {folder}")
-    refusals = {pair: match_sensors(opened.rig, detections, pair)[0] for pair in detections.pairs}
-    plates = {pair: _plates(opened.rig, detections, pair, refused) for pair, refused in refusals.items()}
-    placements = {pair: _placements(detections, pair, refused) for pair, refused in refusals.items()}
+    pairs = [*detections.pairs, *detections.lidar_pairs(opened.rig.lidars)]
+    by_pair = {pair: detections.between(pair) for pair in pairs}
+    refusals = {pair: match_sensors(opened.rig, by_pair[pair], pair)[0] for pair in pairs}
+    plates = {pair: _plates(opened.rig, by_pair[pair], pair, refusals[pair]) for pair in pairs}
+    placements = {pair: _placements(by_pair[pair], pair, refusals[pair]) for pair in pairs}
     records = {
         pair: {
-            name: _record(*detections.of(pair, name), refused.get(name))
+            name: _record(*seen.of(pair, name), refusals[pair].get(name))
             | {"placement": placements[pair].get(name)}
-            for name in detections.captures(pair)
+            for name in seen.captures(pair)
         }
-        for pair, refused in refusals.items()
+        for pair, seen in by_pair.items()
     }
     if as_json:
-        pairs = [
+        documents = [
             {
                 **{"camera": pair.camera, "channel": pair.channel, "lidar": pair.lidar, "captures": captures},
                 "findings": [finding.as_json() for finding in plates[pair]],
             }
             for pair, captures in records.items()
         ]
-        show.print_json({"format_version": 1, "rig": opened.rig.name, "pairs": pairs})
+        show.print_json({"format_version": 1, "rig": opened.rig.name, "pairs": documents})
     else:
         for pair, refused in refusals.items():
             if explain:
-                show.print_table(_table(detections, pair, records[pair]))
-                show.print_lines(_limits(opened.rig, detections, pair, refused))
-            names, needed = detections.captures(pair), opened.rig.quality.min_captures
+                show.print_table(_table(by_pair[pair], pair, records[pair]))
+                show.print_lines(_limits(opened.rig, by_pair[pair], pair, refused))
+            names, needed = by_pair[pair].captures(pair), opened.rig.quality.min_captures
             show.print_lines(_head(pair, names, refused, needed))
             show.print_lines(_causes(names, refused, plates[pair], str(session), is_whole=explain))
             show.print_lines(_repeated(placements[pair], is_whole=explain))
-    n_usable = max(len(detections.captures(pair)) - len(refused) for pair, refused in refusals.items())
+    n_usable = max((len(records[pair]) - len(refused) for pair, refused in refusals.items()), default=0)
     is_contradicted = any(each.severity == "error" for findings in plates.values() for each in findings)
     if n_usable >= opened.rig.quality.min_captures and not is_contradicted:
         show.name_next("calibrate", session)
@@ -98,7 +100,7 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
     both = candidates_of(detections, pair)[0]
     in_camera = np.array([each.image.T_cam_board[:3, 3] for each in both]).reshape(-1, 3)
     in_lidar = np.array([each.lidar.T_lidar_board[:3, 3] for each in both]).reshape(-1, 3)
-    of_distances = distance_findings(in_camera, in_lidar, rig.board.square_m)
+    of_distances = distance_findings(in_camera, in_lidar, rig.board.square_m) if pair.channel else []
     return [*of_distances, *plate_findings(scans, rig.board.to_board())]
 
 

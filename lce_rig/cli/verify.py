@@ -118,8 +118,8 @@ def _lines(checked: SessionCheck, session: str, *, is_explained: bool) -> list[s
     if checked.metrics is not None:
         m = checked.metrics
         lines.append(
-            f"  residuals    planes {1000 * m.mpe_m:.1f} mm, edges {1000 * m.mee_m:.1f} mm, "
-            f"corners {m.reprojection_px:.2f} px (means)"
+            f"  residuals    planes {1000 * m.mpe_m:.1f} mm, edges {1000 * m.mee_m:.1f} mm"
+            f"{'' if c.is_of_lidars else f', corners {m.reprojection_px:.2f} px'} (means)"
         )
     scene = scene_texts(checked.scene)
     if checked.scene.state != "unknown" or is_explained:
@@ -155,6 +155,9 @@ def view(session: Path, name: str | None, capture: str | None, output: Path | No
     """
     opened = lce.Session.open(session)
     pairs = lce.read_result(result_folder(opened.path, name) / RESULT).pairs
+    pairs = tuple(c for c in pairs if not c.is_of_lidars)
+    if not pairs:
+        raise UsageError("the result has no camera whose colours could be shown", "Look at `lce-rig verify`.")
     # Cameras that share the first one's LiDAR.
     calibrations = [c for c in pairs if c.lidar == pairs[0].lidar]
     cameras = [CameraIn3D(opened.rig.lens_of(c), c.T_cam_lidar) for c in calibrations]

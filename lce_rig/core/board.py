@@ -8,12 +8,14 @@ from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array
 
-BoardType = Literal["checkerboard", "charuco", "aprilgrid"]
+BoardType = Literal["checkerboard", "charuco", "aprilgrid", "plain"]
 
 
 @dataclass(frozen=True)
 class Board:
-    """A pattern on a plate: a checkerboard, a ChArUco board (OpenCV) or an AprilGrid (Kalibr).
+    """A pattern on a plate: a checkerboard, a ChArUco board (OpenCV), an AprilGrid (Kalibr), or none.
+
+    A plain plate has no corners and squares of no size. Only LiDARs see its pose.
 
     Frame board: origin at the centre of the plate, x along its width, y up along its height (as the pattern
         is
@@ -48,7 +50,7 @@ class Board:
     @property
     def has_markers(self) -> bool:
         """Whether each corner is identified, so that the pattern may be hidden in part."""
-        return self.type != "checkerboard"
+        return self.type in ("charuco", "aprilgrid")
 
     @property
     def n_markers(self) -> int:
@@ -60,6 +62,8 @@ class Board:
     @property
     def summary(self) -> str:
         """Name the pattern, such as "9x7 squares of 70 mm"."""
+        if self.type == "plain":
+            return f"plain plate of {self.width_m:g} x {self.height_m:g} m"
         if self.type == "aprilgrid":
             return f"{self.cols // 2}x{self.rows // 2} tags of {1e3 * self.square_m:g} mm"
         return f"{self.cols + 1}x{self.rows + 1} squares of {1e3 * self.square_m:g} mm"

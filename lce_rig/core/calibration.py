@@ -353,6 +353,9 @@ class SceneOpinion:
 class Calibration:
     """The extrinsics of one camera and one LiDAR, with everything needed to judge it.
 
+    Of two LiDARs, `camera` names the first of the profile, which has no channel: T_cam_lidar takes points
+    from the second one's frame to the first's, and all axes of the camera are those of the first LiDAR.
+
     result.json keeps all of it but the last four attributes, which are empty if it is read back.
 
     Attributes:
@@ -394,7 +397,9 @@ class Calibration:
     channels: Annotated[
         tuple[str, ...],
         Field(alias="channel"),
-        BeforeValidator(lambda names: names.split("+") if isinstance(names, str) else names),
+        BeforeValidator(
+            lambda names: list(filter(None, names.split("+"))) if isinstance(names, str) else names
+        ),
         PlainSerializer("+".join),
     ]
     lidar: str
@@ -437,6 +442,11 @@ class Calibration:
     held_out_m: Annotated[float, _ANY, _IN_MEMORY] = math.nan
     residuals: Annotated[tuple[CaptureResidual, ...], _ANY, _IN_MEMORY] = ()
     observations: Annotated[Mapping[str, Observation], _ANY, _IN_MEMORY] = field(default_factory=dict)
+
+    @property
+    def is_of_lidars(self) -> bool:
+        """Whether both sensors are LiDARs."""
+        return not self.channels
 
     @property
     def is_start_certified(self) -> bool:

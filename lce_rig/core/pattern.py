@@ -107,6 +107,8 @@ def is_dark(board: Board, xy_m: Array) -> NDArray[np.bool_]:
         board: the board.
         xy_m: (..., 2) x and y, frame board.
     """
+    if board.type == "plain":
+        return np.zeros(xy_m.shape[:-1], dtype=np.bool_)
     # From the upper left end of the print, right and down.
     width_m, height_m = board.pattern_size_m
     right = (xy_m[..., 0] - board.pattern_offset_m[0] + width_m / 2) / board.square_m

@@ -60,7 +60,7 @@ def motion_words(motion: str) -> str:
     kind, _, axis = motion.partition("_")
     if axis not in _CAMERA_AXES:
         return motion
-    return f"{kind} {'along' if kind == 'translation' else 'about'} the camera's {_CAMERA_AXES[axis]}"
+    return f"{kind} {'along' if kind == 'translation' else 'about'} the {_CAMERA_AXES[axis]}"
 
 
 def fill(template: str, figures: Mapping[str, Any]) -> str:

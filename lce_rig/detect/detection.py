@@ -2,8 +2,9 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,7 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]]) -> ImageDetection | LidarDet
 
 @dataclass(frozen=True)
 class Pair:
-    """One camera channel and one LiDAR of a rig."""
+    """One camera channel and one LiDAR of a rig; or two LiDARs, the first as the camera, without channel."""
 
     camera: str
     channel: str
@@ -86,10 +87,10 @@ class Pair:
     @property
     def folder_name(self) -> str:
         """Name of the folder of this pair's files if there are several pairs."""
-        return f"{self.camera}.{self.channel}.{self.lidar}"
+        return ".".join(filter(None, (self.camera, self.channel, self.lidar)))
 
     def __str__(self) -> str:
-        return f"{self.camera}.{self.channel} and {self.lidar}"
+        return f"{self.camera}{'.' if self.channel else ''}{self.channel} and {self.lidar}"
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,24 @@ class Detections:
             if images.keys() & scans.keys()
         ]
 
+    def lidar_pairs(self, lidars: Iterable[str]) -> list[Pair]:
+        """List every two of the LiDARs named that share captures, in their order."""
+        return [
+            Pair(first, "", second)
+            for first, second in combinations(lidars, 2)
+            if self.lidars.get(first, {}).keys() & self.lidars.get(second, {}).keys()
+        ]
+
+    def between(self, pair: Pair) -> "Detections":
+        """Put the first of two LiDARs into a camera's place: its boards are poses, as those in images are.
+
+        Other pairs are given back unchanged.
+        """
+        if pair.channel:
+            return self
+        images = {name: _as_image(found) for name, found in self.lidars[pair.camera].items()}
+        return replace(self, images={(pair.camera, ""): images})
+
     def captures(self, pair: Pair) -> list[str]:
         """Name the captures in which both sensors of a pair have a sample, sorted."""
         return sorted(self.images[pair.camera, pair.channel].keys() & self.lidars[pair.lidar].keys())
@@ -121,3 +140,22 @@ class Detections:
     def of(self, pair: Pair, capture: str) -> tuple[ImageDetection, LidarDetection]:
         """Return the detections of both sensors of a pair in one capture."""
         return self.images[pair.camera, pair.channel][capture], self.lidars[pair.lidar][capture]
+
+
+def _as_image(found: LidarDetection) -> ImageDetection:
+    """Give the poses of the two likeliest boards in a scan as those that an image leaves open."""
+    if isinstance(found, Refusal):
+        return found
+    T, other = found[0].T_lidar_board, found[1].T_lidar_board if len(found) > 1 else None
+    nothing, unknown = np.zeros((0, 2)), float("nan")
+    return ImageBoard(
+        nothing,
+        T,
+        np.zeros((6, 6)),
+        other,
+        0.0,
+        other is not None,
+        unknown,
+        unknown,
+        stamp_ns=found[0].stamp_ns,
+    )

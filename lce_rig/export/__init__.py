@@ -45,6 +45,11 @@ class ExportJob:
         """One calibration of each camera and LiDAR."""
         return choose_channels(self.calibrations, self.rig)
 
+    @property
+    def of_cameras(self) -> list[Calibration]:
+        """Those of them that are not of two LiDARs."""
+        return [c for c in self.chosen if not c.is_of_lidars]
+
     @cached_property
     def trees(self) -> list[FrameTree]:
         """The trees of frames in which outputs place the sensors."""
@@ -70,7 +75,8 @@ class ExportJob:
         """
         lines = [f"{content} of rig {self.rig.name}, written by {MADE_BY}"]
         for calibration in calibrations:
-            pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
+            sensor = "/".join(filter(None, (calibration.camera, calibration.channel)))
+            pair = f"{sensor} and {calibration.lidar}"
             deg, mm = calibration.sigma_rotation_deg, 1e3 * calibration.sigma_translation_m
             lines.append(f"{pair}: {calibration.verdict}, standard deviation {deg:.3f} deg, {mm:.2f} mm")
             if calibration.verdict == "fail":

@@ -45,7 +45,7 @@ def _write(job: ExportJob, name: str, *, is_split: bool) -> list[Path]:
         job.findings.append(NO_SESSION(format=name))
         return []
     paths = []
-    for calibration in job.chosen:
+    for calibration in job.of_cameras:
         clouds = {}
         for capture in job.session.captures:
             channels = [channel for camera, channel in capture.image_keys if camera == calibration.camera]

@@ -21,8 +21,28 @@ def export_extrinsics(job: ExportJob) -> list[Path]:
     lines = [f"# {line}" for line in job.head("extrinsics", *job.calibrations)]
     lines += ["format_version: 1", f"rig: {quoted(job.rig.name)}", f"made_by: {quoted(MADE_BY)}", "pairs:"]
     for calibration in job.calibrations:
-        lines += _pair(calibration, job.rig)
+        lines += (_lidars if calibration.is_of_lidars else _pair)(calibration, job.rig)
     return [job.write("extrinsics.yaml", lines)]
+
+
+def _lidars(calibration: Calibration, rig: Rig) -> list[str]:
+    """List the pose of two LiDARs, as `_pair` does."""
+    first, second = rig.lidars[calibration.camera].frame, rig.lidars[calibration.lidar].frame
+    lines = [
+        f"  - lidar: {quoted(calibration.camera)}",
+        f"    other_lidar: {quoted(calibration.lidar)}",
+        f"    lidar_frame: {quoted(first)}",
+        f"    other_lidar_frame: {quoted(second)}",
+        f"    verdict: {calibration.verdict}",
+        f"    reasons: {texts(finding.sentence for finding in calibration.findings)}",
+    ]
+    T, inverse = calibration.T_cam_lidar, invert(calibration.T_cam_lidar)
+    forward = (
+        f"takes points from {second} to {first}: p_lidar = R p_other + t; the pose of {second} in {first}"
+    )
+    backward = f"takes points from {first} to {second}: p_other = R p_lidar + t"
+    lines += _pose_block("T_lidar_other", forward, T) + _pose_block("T_other_lidar", backward, inverse)
+    return lines + _judgement(calibration, "T_lidar_other", f"the axes of {first}")
 
 
 def _pair(calibration: Calibration, rig: Rig) -> list[str]:
@@ -61,7 +81,7 @@ def _pair(calibration: Calibration, rig: Rig) -> list[str]:
         f"        p_cam_m: {numbers(point_camera[0])}",
         f"        p_lidar_m: {numbers(point_lidar[0])}",
     ]
-    return lines + _judgement(calibration)
+    return lines + _judgement(calibration, "T_cam_lidar", "the optical frame's axes")
 
 
 def _pose_block(name: str, meaning: str, T: Array) -> list[str]:
@@ -77,9 +97,9 @@ def _pose_block(name: str, meaning: str, T: Array) -> list[str]:
     ]
 
 
-def _judgement(calibration: Calibration) -> list[str]:
+def _judgement(calibration: Calibration, pose: str, axes: str) -> list[str]:
     meaning = (
-        "of T_cam_lidar: translation in m, then rotation vector in rad, both along the optical frame's axes, "
+        f"of {pose}: translation in m, then rotation vector in rad, both along {axes}, "
         "with R = exp(phi) R0 and t = t0 + tau, as in ROS PoseWithCovariance"
     )
     proven = "start_is_globally_optimal" if calibration.is_start_certified else "is_globally_optimal"

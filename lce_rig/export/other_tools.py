@@ -137,8 +137,10 @@ def export_kalibr(job: ExportJob) -> list[Path]:
 
     Kalibr has four radtan coefficients; a camera with more gets the four that fit best.
     """
-    lenses = {name: lens_for(job, "kalibr", name, 4) for name in dict.fromkeys(c.camera for c in job.chosen)}
-    chains = {lidar: [c for c in job.chosen if c.lidar == lidar] for lidar in job.rig.lidars}
+    lenses = {
+        name: lens_for(job, "kalibr", name, 4) for name in dict.fromkeys(c.camera for c in job.of_cameras)
+    }
+    chains = {lidar: [c for c in job.of_cameras if c.lidar == lidar] for lidar in job.rig.lidars}
     return [
         job.write(f"camchain_{lidar}.yaml", _camchain(chain, lenses, job))
         for lidar, chain in chains.items()
@@ -176,7 +178,7 @@ def _camchain(chain: Sequence[Calibration], lenses: dict[str, FittedLens], job: 
 def export_koide3(job: ExportJob) -> list[Path]:
     """Write calib_CAMERA.json of each camera and LiDAR."""
     paths = []
-    for calibration in job.chosen:
+    for calibration in job.of_cameras:
         lens = lens_for(job, "koide3", calibration.camera, 5)
         text = json.dumps(_document(calibration, lens, job), indent=2, ensure_ascii=False, allow_nan=False)
         paths.append(job.write(f"calib_{job.name_of(calibration)}.json", [text]))
@@ -212,7 +214,7 @@ def _document(calibration: Calibration, lens: FittedLens, job: ExportJob) -> dic
 def export_fast_livo2(job: ExportJob) -> list[Path]:
     """Write fast_livo2_CAMERA.yaml and fast_livo2_camera_CAMERA.yaml of each camera."""
     paths = []
-    for calibration in job.chosen:
+    for calibration in job.of_cameras:
         lens = lens_for(job, "fast_livo2", calibration.camera, 4)
         name = job.name_of(calibration)
         paths.append(job.write(f"fast_livo2_{name}.yaml", _livo2_extrinsics(calibration, job)))
@@ -256,7 +258,7 @@ def _livo2_camera(calibration: Calibration, lens: FittedLens, job: ExportJob) ->
 
 def export_opencv(job: ExportJob) -> list[Path]:
     """Write opencv_CAMERA.yaml of each camera and LiDAR."""
-    return [job.write(f"opencv_{job.name_of(c)}.yaml", _content(c, job)) for c in job.chosen]
+    return [job.write(f"opencv_{job.name_of(c)}.yaml", _content(c, job)) for c in job.of_cameras]
 
 
 def _content(calibration: Calibration, job: ExportJob) -> list[str]:

@@ -215,6 +215,8 @@ def require_known(calibration: Calibration, rig: Rig) -> None:
     """
     camera = rig.cameras.get(calibration.camera)
     is_known = camera is not None and set(calibration.channels) <= set(camera.channels)
+    if calibration.is_of_lidars:
+        is_known = calibration.camera in rig.lidars
     if not is_known or calibration.lidar not in rig.lidars:
         pair = f"{calibration.camera}/{calibration.channel} and {calibration.lidar}"
         what = f"the result is for {pair}, which rig {rig.name} does not have"
@@ -264,7 +266,7 @@ def fit_tree(
         for anchor in placed:  # which grows
             for calibration in chosen:
                 lidar = rig.lidars[calibration.lidar].frame
-                camera = rig.cameras[calibration.camera].frame
+                camera = bodies[calibration.camera]
                 if anchor in (lidar, camera) and not {lidar, camera} <= set(placed):
                     tree, placing = _placed(tree, calibration, rig, anchor)
                     changes += placing
@@ -341,7 +343,13 @@ def _placed(
     tree: RobotTree, calibration: Calibration, rig: Rig, anchor: str
 ) -> tuple[RobotTree, list[JointChange]]:
     """Put the other sensor of a calibration where it belongs, beside the one that is placed."""
-    lidar, camera = rig.lidars[calibration.lidar].frame, rig.cameras[calibration.camera]
+    lidar = rig.lidars[calibration.lidar].frame
+    if calibration.is_of_lidars:
+        first, T = rig.lidars[calibration.camera].frame, calibration.T_cam_lidar
+        joint = _place(tree, first, lidar, T) if anchor == first else _place(tree, lidar, first, invert(T))
+        above = tree.above.get(joint.child)
+        return tree.with_joint(joint), [JointChange(joint, None if above is None else above.T_parent_child)]
+    camera = rig.cameras[calibration.camera]
     # The robot's own optical frame, or the standard rotation.
     T_body_optical = T_BODY_OPTICAL
     if camera.optical_frame in tree.frames:

@@ -104,9 +104,9 @@ def export_mcap(job: ExportJob) -> list[Path]:
                 topics.write(topic, IMAGE_TYPE, time_ns, data)
                 info = _camera_info(job, image.sensor, image.stamp_ns or 0)
                 topics.write(f"{topic.rpartition('/')[0]}/camera_info", _INFO_TYPE, time_ns, info)
-            for calibration in job.chosen:
+            for calibration in job.of_cameras:
                 _write_projected(topics, calibration, scans, images, time_ns, limits_m, job)
-    for name in dict.fromkeys(c.camera for c in job.chosen):
+    for name in dict.fromkeys(c.camera for c in job.of_cameras):
         if name not in shown:
             job.findings.append(NO_IMAGES(name, format="mcap"))
     return sorted(folder.iterdir())

@@ -24,7 +24,7 @@ _OPENCV = b"%YAML:1.0"
 def export_camera_info(job: ExportJob) -> list[Path]:
     """Write a file for each calibrated camera."""
     paths = []
-    for name, calibration in {c.camera: c for c in job.chosen}.items():
+    for name, calibration in {c.camera: c for c in job.of_cameras}.items():
         path = job.folder / f"camera_info_{name}.yaml"
         head = job.head("camera_info", calibration, of_one_camera=True)
         write_atomically(path, camera_info_text(name, job.rig.cameras[name].to_intrinsics(), head))

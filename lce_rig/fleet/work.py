@@ -223,7 +223,8 @@ def _calibrate(
     verification = lce.verify(session, result, detections)
     row = row | {"profile_sha256": saved.inputs_sha256[PROFILE]}
     solved = {(c.camera, c.lidar) for c in result.pairs}
-    pairs = dict.fromkeys((pair.camera, pair.lidar) for pair in detections.pairs)
+    every = [*detections.pairs, *detections.lidar_pairs(session.rig.lidars)]
+    pairs = dict.fromkeys((pair.camera, pair.lidar) for pair in every)
     # Shortages stand in the order of the pairs they belong to.
     lacking = [
         without_result(row | {"camera": camera, "lidar": lidar}, "failed", why)

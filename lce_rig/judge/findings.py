@@ -23,6 +23,7 @@ _OF_POSES = _OF_DISTANCES + (
 _OF_SIGMAS = ["verdict.rotation_uncertain", "verdict.translation_uncertain"]
 _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.cameras_exchanged": f"{_OF_POSES}verdict.intrinsics".split(),
+    "verdict.lidars_exchanged": _OF_POSES.split(),
     "verdict.moved": _OF_POSES.split(),
     "verdict.changed": _OF_POSES.split(),
     "verdict.camera_changed": _OF_POSES.split(),
@@ -425,6 +426,27 @@ CAMERAS_DIFFER = Kind(
     "{subject}: board positions differ by {rms_m:mm} rms ({images_rms_m:mm} from the images alone), "
     "relative poses from extrinsics and images by " + _APART,
     "check whether a camera has moved, and the intrinsics",
+)
+LIDARS_DIFFER = Kind(
+    "verdict.lidars_differ",
+    "{subject}: their pose to each other and that by their poses to {camera} differ by " + _APART,
+    "check whether a sensor has moved, and the board's size",
+)
+LIDARS_EXCHANGED = Kind(
+    "verdict.lidars_exchanged",
+    "{subject} are exchanged: their nominal pose in the profile fits the other way round",
+    "check topics, ports or files of the LiDARs, and collect again",
+)
+LIDARS_UNNAMED = Kind(
+    "verdict.lidars_unnamed",
+    "{subject}: without a nominal pose in the profile, exchanged names are not noticed",
+    "enter a rough pose in nominal_extrinsics",
+    severity="note",
+)
+OTHER_MODEL = Kind(
+    "verdict.other_model",
+    "{subject}: the scans have a ring {ring}; a {model} has {n_lasers} rings, counted from 0",
+    "correct the model, or the topics and files if LiDARs are exchanged",
 )
 LARGEST_CAUSE = Kind("verdict.largest_cause", _largest_cause, severity="note", actions=_MEASURE)
 MAY_BE_OFF = Kind(

@@ -62,6 +62,7 @@ class Validation:
         cov_agreed: (6, 6) the same without what checks contradict.
         cov_shared: (6, 6) the part of `cov` from errors of the profile's board and LiDAR.
         contributions: its causes, the largest first.
+        captures: their names, in the order of the contrasts.
         contrasts: subsets of the captures that should agree.
         scale: as `scale_of`; None for too few placements.
         laser_angles: errors of the lasers' angles in deg, as `estimate_angles`.
@@ -72,6 +73,7 @@ class Validation:
     cov_agreed: Array
     cov_shared: Array
     contributions: tuple[Contribution, ...]
+    captures: tuple[str, ...]
     contrasts: tuple[Contrast, ...]
     scale: tuple[float, float] | None
     laser_angles: Mapping[str, float]
@@ -82,8 +84,9 @@ def validate(
     estimate: CalibrationEstimate,
     rig: Rig,
     lidar: LidarSettings,
-    lens: Intrinsics,
+    lens: Intrinsics | None,
     rejected: Sequence[Observation] = (),
+    recount: Array | None = None,
 ) -> Validation:
     """Check a result on its own captures.
 
@@ -91,12 +94,14 @@ def validate(
         estimate: the result of any method.
         rig: board, targets and limits.
         lidar: its range error settings.
-        lens: of the camera, as the profile says.
+        lens: of the camera, as the profile says; None where a LiDAR is in its place.
         rejected: captures in which both sensors see the board, that the estimate does not use.
+        recount: (F,) factor of each capture in the estimate's own cost, where that is to judge subsets: of
+            boards in two scans, whose poses are less accurate than those in images. There is no scale, too.
     """
     board, known = rig.board.to_board(), estimate.sensitivities
     fitted = None if estimate.lens is None else estimate.lens.estimate
-    intrinsics = None if fitted is None else compare_with_given(fitted, lens, board)[0]
+    intrinsics = None if fitted is None or lens is None else compare_with_given(fitted, lens, board)[0]
     scale = None
     contrasts: tuple[Contrast, ...] = ()
     laser_angles: Mapping[str, float] = {}
@@ -108,12 +113,16 @@ def validate(
         laser_bias_sigma_m=lidar.laser_bias_sigma_m,
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
+    own_cost = None if recount is None else estimate.cost
     if len(expansion.groups) >= _MIN_PLACEMENTS:
         settled = expansion.hold(SCALE).settled()
+        if own_cost is not None and recount is not None:
+            # Outliers may be captures of another mounting.
+            settled = own_cost.weighted(recount).settled(own_cost.optimum())
         centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
         of_rejected = find_moved(observations, rejected, board, estimate.T_cam_lidar, lidar)
         contrasts = (*of_rejected, *contrast_halves(settled, centres), *find_groups(settled))
-        scale = scale_of(expansion)
+        scale = scale_of(expansion) if own_cost is None else None
         # Captures of another mounting would look like other angles.
         apart = {
             name
@@ -131,6 +140,7 @@ def validate(
         # Each session has fitted its own lens.
         cov_shared=profile_covariance([each for each in known if each.source != "intrinsics"]),
         contributions=list_contributions(estimate.diagnostics, known, contradictions),
+        captures=estimate.used,
         contrasts=contrasts,
         scale=scale,
         laser_angles=laser_angles,

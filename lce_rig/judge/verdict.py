@@ -10,7 +10,7 @@ from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, Calibration, Metrics, SceneOpinion, SceneShare, WeakestMotion
 from lce_rig.core.findings import Finding, Refusal, Severity
-from lce_rig.core.geometry import Array, largest_sizes, rotation_angle, sigma_sizes, tangent_sizes
+from lce_rig.core.geometry import Array, invert, largest_sizes, rotation_angle, sigma_sizes, tangent_sizes
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.contributions import largest, measure_action, uncertainty_notes
@@ -70,6 +70,7 @@ def judge(
     lidar: str,
     n_captures: int,
     others: Sequence[Finding] = (),
+    T_view: Array | None = None,
 ) -> tuple[Verdict, tuple[Finding, ...]]:
     """Judge extrinsics by all checks.
 
@@ -81,24 +82,25 @@ def judge(
         lidar: name of the LiDAR.
         n_captures: number of captures, including those without a board.
         others: of other evidence: contradictions between cameras, what the scene did to the result.
+        T_view: (4, 4) from the frame of the nominal extrinsic to that of the estimate; None for the same.
 
     Returns:
         The verdict, and the reasons for anything but a pass: worst first, causes before symptoms.
     """
-    board = rig.board.to_board()
+    board, nominal = rig.board.to_board(), rig.nominal(camera, lidar)
     findings = [
         *_certificate(estimate),
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
         *angle_findings(examination.laser_angles),
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
         *_scale(examination.scale, estimate, board, rig.verdict.max_scale_error),
-        *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
+        *split_findings(examination.contrasts, examination.captures, rig.calibration, rig.verdict),
         *others,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
         *_channels(estimate, rig),
         *residuals_beyond(estimate.metrics, rig.quality),
         *_captures(estimate, n_captures, rig.quality),
-        *_nominal(estimate, rig.nominal(camera, lidar)),
+        *_nominal(estimate.T_cam_lidar if T_view is None else invert(T_view) @ estimate.T_cam_lidar, nominal),
         *_precision(estimate, examination, rig),
     ]
     findings += uncertainty_notes(examination.contributions, rig.calibration)
@@ -130,6 +132,12 @@ def _verdict(findings: Sequence[Finding], cov: Array) -> tuple[Verdict, tuple[Fi
     return verdict, by_cause([MAY_BE_OFF(rotation_deg=rotation_deg, translation_m=translation_m), *others])
 
 
+def with_findings(calibration: Calibration, found: Sequence[Finding]) -> Calibration:
+    """Add findings to judged extrinsics, which change the verdict unless they are notes."""
+    verdict, findings = _verdict([*calibration.findings, *found], calibration.cov)
+    return replace(calibration, findings=findings, verdict=verdict)
+
+
 def with_opinion(calibration: Calibration, opinion: SceneOpinion) -> Calibration:
     """Add the scene's opinion to judged extrinsics; only a contradiction changes the verdict.
 
@@ -137,9 +145,7 @@ def with_opinion(calibration: Calibration, opinion: SceneOpinion) -> Calibration
         calibration: judged by its boards.
         opinion: of the scene without the board.
     """
-    told = [*calibration.findings, *scene_findings(opinion, calibration)]
-    verdict, findings = _verdict(told, calibration.cov)
-    return replace(calibration, scene=opinion, findings=findings, verdict=verdict)
+    return with_findings(replace(calibration, scene=opinion), scene_findings(opinion, calibration))
 
 
 def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str = "") -> list[Finding]:
@@ -316,11 +322,10 @@ def _captures(estimate: CalibrationEstimate, n_captures: int, limits: QualitySet
         yield FEW_PLACEMENTS(n_used=n_used, n_placements=n_placements, n_needed=limits.min_captures)
 
 
-def _nominal(estimate: CalibrationEstimate, nominal: NominalExtrinsic | None) -> list[Finding]:
+def _nominal(T: Array, nominal: NominalExtrinsic | None) -> list[Finding]:
     if nominal is None or nominal.source == "typical":
         return []
     expected = nominal.to_matrix()
-    T = estimate.T_cam_lidar
     angle_deg = float(np.degrees(rotation_angle(T[:3, :3], expected[:3, :3])))
     shift_m = float(np.linalg.norm(T[:3, 3] - expected[:3, 3]))
     if angle_deg <= nominal.tolerance_deg and shift_m <= nominal.tolerance_m:

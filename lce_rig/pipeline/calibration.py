@@ -1,10 +1,9 @@
 """Estimate and judge the extrinsics of every camera with every LiDAR of a session.
 
 detections -> estimate of each camera with each LiDAR -> cameras of one LiDAR, together -> checks, verdict ->
-the scene's opinion
+two LiDARs (`lidar_pairs`) -> the scene's opinion
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,7 +43,8 @@ from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, share_findings, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect
-from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE
+from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE, few_detected
+from lce_rig.pipeline.lidar_pairs import calibrate_lidar_pairs, compare_with_cameras
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.witness import by_boards, hear_scene, sharpen
 from lce_rig.rig import Rig
@@ -131,7 +131,9 @@ def calibrate(
     use_scene: bool = False,
     progress: Progress = silent,
 ) -> Result:
-    """Estimate and judge the extrinsics of every camera with every LiDAR; nothing is written.
+    """Estimate and judge the extrinsics of every camera with every LiDAR, and of every two LiDARs.
+
+    Nothing is written.
 
     Args:
         session: its folder, or one that is open for reading.
@@ -164,6 +166,9 @@ def calibrate(
     begin(progress, "comparing with the scene")
     judged = []
     for c in calibrations:
+        if c.is_of_lidars:
+            judged.append(c)
+            continue
         c = with_opinion(c, hear_scene(session, detections, by_boards(c)))
         if lacks_captures(c.findings):
             held = boards_in(detections, c.camera, c.lidar, c.captures_used)
@@ -216,12 +221,16 @@ def calibrate_detections(
                     where = tuple(plan.figures[key] for key in ("n_captures", "is_enough", "placements"))
                     shortage = replace(shortage, figures={**shortage.figures, "where": where})
             shortages.append(shortage if shortage.subject else replace(shortage, subject=sensors))
-    if not alone and not shortages:
+    between: list[Calibration] = []
+    if cameras is None and channels is None:
+        between, lacking = calibrate_lidar_pairs(rig, detections, options or CalibrateOptions(), progress)
+        shortages += lacking
+    if not alone and not between and not shortages:
         of_cameras = f" of {' or '.join(cameras)}" if cameras else ""
         raise NotEnoughDataError(
             f"the session has no capture with an image{of_cameras} and a scan", "Collect captures first."
         )
-    if not alone:
+    if not alone and not between:
         raise join_shortages([NotEnoughDataError.of(shortage) for shortage in shortages])
     if len(alone) > 1:
         begin(progress, "comparing and joining cameras")
@@ -235,6 +244,7 @@ def calibrate_detections(
             share = scene(replace(c, cov_shared=c.cov_shared + solved[k].cov_lens))
             solved[k] = _with_scene(rig, solved[k], share)
         calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
+    calibrations = compare_with_cameras([*calibrations, *between], rig)
     for k, c in enumerate(calibrations):
         truth = None if reference is None else reference.of(c.camera, c.lidar)
         if truth is not None:
@@ -278,16 +288,7 @@ def _solve(
         if len(of_channel) >= n_needed:
             candidates[pair.channel] = of_channel
             continue
-        counts = Counter((why.code, f"{why.stage}: {why.sentence}") for why in own_refused.values())
-        shortages.append(
-            FEW_DETECTED(
-                str(pair),
-                n_detected=len(of_channel),
-                n_captures=len(of_channel) + len(own_refused),
-                n_needed=n_needed,
-                causes=tuple((n, code, text) for (code, text), n in counts.most_common(3)),
-            )
-        )
+        shortages.append(few_detected(str(pair), len(of_channel), own_refused, n_needed))
     if not candidates:
         raise NotEnoughDataError.of(shortages[0])
     detected = {item.capture for items in candidates.values() for item in items}

@@ -1,6 +1,9 @@
 """Kinds of findings of the verbs: sensors without a result, and results that cannot be compared."""
 
-from lce_rig.core.findings import Finding, Kind
+from collections import Counter
+from collections.abc import Mapping
+
+from lce_rig.core.findings import Finding, Kind, Refusal
 from lce_rig.core.phrasing import captures_to_add
 
 
@@ -24,6 +27,20 @@ FEW_DETECTED = Kind(
     _commonest,
     severity="warning",
 )
+
+
+def few_detected(subject: str, n_detected: int, refused: Mapping[str, Refusal], n_needed: int) -> Finding:
+    """Report too few captures with the board in both sensors, and the commonest causes of refusal."""
+    counts = Counter((why.code, f"{why.stage}: {why.sentence}") for why in refused.values())
+    return FEW_DETECTED(
+        subject,
+        n_detected=n_detected,
+        n_captures=n_detected + len(refused),
+        n_needed=n_needed,
+        causes=tuple((n, code, text) for (code, text), n in counts.most_common(3)),
+    )
+
+
 SHORTAGE = Kind("shortage.text", "{text}", "{advice}", severity="warning")
 NO_AGREEMENT = Kind(
     "pair.no_agreement",

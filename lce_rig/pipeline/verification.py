@@ -5,12 +5,14 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
+from itertools import combinations
 from pathlib import Path
 
 from lce_rig.calibrate import Clocks
-from lce_rig.core.calibration import Calibration, ResultFile, read_result
+from lce_rig.core.calibration import Calibration, ResultFile, SceneOpinion, read_result
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding, Refusal
+from lce_rig.core.geometry import Array
 from lce_rig.core.progress import Progress, silent
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, Pair
@@ -33,6 +35,7 @@ from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Capture, Session
 from lce_rig.session.identity import differing_keys
 from lce_rig.session.session import DEBUG, PROFILE
+from lce_rig.show.overlays.lidar_pair import draw_cloud, seen_through_window
 from lce_rig.show.overlays.overlay import ImageWithEvents
 from lce_rig.show.overlays.overlay_files import draw_check, is_overlay
 
@@ -96,12 +99,16 @@ class Verification:
                     f"Run `lce-rig verify {session.path}` again.",
                 )
             # Files that `verify` did not draw are kept, beside its images and in its folders.
-            folders = {
-                Pair(camera, channel, lidar).folder_name
-                for camera, sensor in session.rig.cameras.items()
-                for channel in sensor.channels
-                for lidar in session.rig.lidars
-            }
+            pairs = [
+                *(
+                    Pair(camera, channel, lidar)
+                    for camera, sensor in session.rig.cameras.items()
+                    for channel in sensor.channels
+                    for lidar in session.rig.lidars
+                ),
+                *(Pair(first, "", second) for first, second in combinations(session.rig.lidars, 2)),
+            ]
+            folders = {pair.folder_name for pair in pairs}
             keep_foreign(earlier, draft, lambda path: path.name in folders or is_overlay(path))
             for name in folders:
                 if not (earlier / name).is_symlink():
@@ -112,17 +119,24 @@ class Verification:
         return tuple(each.moved(draft, place) for each in drawn)
 
     def _draw(self, base: Path, progress: Progress) -> tuple[SessionCheck, ...]:
-        return tuple(
-            draw_check(
+        drawn = []
+        for check in self.checks:
+            pair, c = check.pair, check.calibration
+            folder = base if len(self.checks) == 1 else base / pair.folder_name
+            view_of = partial(_view, self.session, pair.camera, pair.channel)
+            if c.is_of_lidars:
+                check, T_view = seen_through_window(check)
+                view_of = partial(_view_of_cloud, pair.camera, T_view)
+            done = draw_check(
                 self.session,
-                self.detections,
+                self.detections.between(pair),
                 check,
-                base if len(self.checks) == 1 else base / check.pair.folder_name,
-                view_of=partial(_view, self.session, check.pair.camera, check.pair.channel),
+                folder,
+                view_of=view_of,
                 progress=progress,
             )
-            for check in self.checks
-        )
+            drawn.append(replace(done, calibration=c))
+        return tuple(drawn)
 
 
 def verify(
@@ -155,6 +169,13 @@ def verify(
     detections = detections or detect(session, progress=progress)
     checks = []
     for c in calibrations:
+        if c.is_of_lidars:
+            pair = Pair.of(c)
+            if pair in detections.lidar_pairs(session.rig.lidars):
+                seen = detections.between(pair)
+                check = check_session(session.rig, seen, c, "", Clocks(), SceneOpinion(0, 0))
+                checks.append(check if c.captures_used else _with_boards(session.rig, seen, check, Clocks()))
+            continue
         scene, clocks = hear_scene(session, detections, c), clocks_of(session.rig, c.camera, c.lidar)
         for channel in sorted(c.channels):
             pair = Pair(c.camera, channel, c.lidar)
@@ -296,6 +317,13 @@ def write_debug_images(
         write_picture(place / f"{name}.png", picture)
         progress(done, len(jobs))
     return base
+
+
+def _view_of_cloud(lidar: str, T_view: Array, capture: Capture) -> ImageWithEvents | None:
+    """Return a LiDAR's cloud as an image; None if it is damaged."""
+    with suppress(SessionError):
+        return ImageWithEvents(draw_cloud(capture.scan(lidar), T_view))
+    return None
 
 
 def _view(session: Session, camera: str, channel: str, capture: Capture) -> ImageWithEvents | None:

@@ -80,12 +80,17 @@ class SceneCaptures:
         if result.rig != rig.name or not result.pairs:
             what = f"the result belongs to rig {result.rig!r}" if result.pairs else "the result holds no pair"
             raise SessionError(f"{what}; {source} belongs to rig {rig.name!r}")
-        for c in result.pairs:
+        of_cameras = tuple(c for c in result.pairs if not c.is_of_lidars)
+        if not of_cameras:
+            raise SessionError(
+                "the result is of LiDARs alone", "Compare two sessions: `lce-rig verify --result`."
+            )
+        for c in of_cameras:
             if c.camera not in rig.cameras or c.lidar not in rig.lidars:
                 raise SessionError(f"the result names {c.camera} and {c.lidar}, which rig {rig.name!r} lacks")
         self._rig, self._source = rig, source
-        self._pairs = result.pairs
-        self.kept: list[Thinned[Seen]] = [Thinned() for _ in result.pairs]
+        self._pairs = of_cameras
+        self.kept: list[Thinned[Seen]] = [Thinned() for _ in of_cameras]
         self.notes: list[str] = []
         self._last: dict[str, Scan] = {}
 

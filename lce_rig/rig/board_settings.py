@@ -11,6 +11,7 @@ from lce_rig.rig.settings import Figure, Settings, problem
 # Beyond these the figure is in millimetres.
 _Side = Annotated[float, Field(ge=0.005, le=5)]
 _Deviation = Annotated[float, Field(ge=0, le=0.2)]
+_LEAST_SQUARE_M = 0.001
 _Count = Annotated[int, Field(ge=2, le=100)]
 _TagCount = Annotated[int, Field(ge=1, le=50)]
 # The keys of each type of pattern beside those of all; the first counts its parts.
@@ -18,6 +19,7 @@ KEYS_OF_TYPE: dict[BoardType, tuple[str, ...]] = {
     "checkerboard": ("inner_corners",),
     "charuco": ("squares", "marker_m", "dictionary"),
     "aprilgrid": ("tags", "tag_spacing"),
+    "plain": (),
 }
 # Corners by the parts that the profile counts: factor, and what is added.
 _CORNERS_OF_TYPE: dict[BoardType, tuple[int, int]] = {
@@ -29,10 +31,11 @@ APRILGRID_FAMILY = "APRILTAG_36h11"
 
 
 class BoardSettings(Settings):
-    """A pattern printed on a rectangular plate.
+    """A pattern printed on a rectangular plate, or a plain plate.
 
     Attributes:
-        type: of the pattern: checkerboard, charuco (OpenCV) or aprilgrid (Kalibr).
+        type: of the pattern: checkerboard, charuco (OpenCV) or aprilgrid (Kalibr); plain for a plate without
+            any, which only LiDARs see.
         inner_corners: checkerboard: (cols, rows) where four squares meet, one fewer each way than there are
             squares.
         squares: charuco: (cols, rows) of squares.
@@ -55,7 +58,7 @@ class BoardSettings(Settings):
     inner_corners: tuple[_Count, _Count] | None = None
     squares: tuple[_Count, _Count] | None = None
     tags: tuple[_TagCount, _TagCount] | None = None
-    square_m: Annotated[float, Field(ge=0.001, le=1)]
+    square_m: Annotated[float, Field(ge=0, le=1)] = 0.0
     marker_m: Annotated[float, Field(ge=0.001, le=1)] | None = None
     tag_spacing: Annotated[float, Field(ge=0.1, le=1)] | None = None
     dictionary: str | None = None
@@ -78,11 +81,16 @@ class BoardSettings(Settings):
     @model_validator(mode="after")
     def _keys_are_of_the_type(self) -> "BoardSettings":
         wanted = KEYS_OF_TYPE[self.type]
+        if self.type == "plain" and self.square_m:
+            raise problem("does not belong to a plain plate; correct board.type, or remove it", "square_m")
+        if self.type != "plain" and self.square_m < _LEAST_SQUARE_M:
+            what = f"{self.square_m:g} m: a square has {_LEAST_SQUARE_M:g} m or more"
+            raise problem(what if "square_m" in self.model_fields_set else "is missing", "square_m")
         for key in wanted:
             if getattr(self, key) is None:
                 raise problem(f"is missing: a {self.type} has it", key)
         others = {key for keys in KEYS_OF_TYPE.values() for key in keys} - set(wanted)
-        others |= {"first_id"} if self.type == "checkerboard" else set()
+        others |= {"first_id"} if self.type in ("checkerboard", "plain") else set()
         for key in sorted(others):
             if getattr(self, key) is not None:
                 raise problem(f"does not belong to a {self.type}; correct board.type, or remove it", key)
@@ -105,6 +113,8 @@ class BoardSettings(Settings):
     @model_validator(mode="after")
     def _pattern_fits_on_plate(self) -> "BoardSettings":
         board = self.to_board()
+        if board.type == "plain":
+            return self
         width, height = board.pattern_size_m
         offset_x, offset_y = (2 * abs(offset) for offset in self.pattern_offset_m)
         # If the pattern fills the plate, both are measured to a millimetre.
@@ -127,6 +137,8 @@ class BoardSettings(Settings):
 
     def to_board(self) -> Board:
         """Build the board for the algorithms."""
+        if self.type == "plain":
+            return Board(0, 0, 0.0, self.width_m, self.height_m, type="plain")
         cols, rows = getattr(self, KEYS_OF_TYPE[self.type][0])
         factor, extra = _CORNERS_OF_TYPE[self.type]
         return Board(
@@ -146,6 +158,8 @@ class BoardSettings(Settings):
 
 def board_block(board: Board) -> dict[str, Any]:
     """List the keys of a board in a profile, without standard deviations."""
+    if board.type == "plain":
+        return {"type": "plain", "width_m": board.width_m, "height_m": board.height_m}
     factor, extra = _CORNERS_OF_TYPE[board.type]
     counts = [(n - extra) // factor for n in (board.cols, board.rows)]
     of_type = {

@@ -209,7 +209,7 @@ class Rig(Settings):
         mount: the pose of one sensor on the robot; the root is then a frame of the robot.
         exports: formats that `calibrate` and `export` write; empty for the usual ones.
         lidars: settings by the LiDAR's name.
-        cameras: settings by the camera's name.
+        cameras: settings by the camera's name; none where LiDARs are calibrated with each other alone.
         nominal_extrinsics: the CAD model's values, a sanity check only.
         targets: where `lce-rig deploy` writes results, by name.
         sync: the board that makes the pulse per second and triggers cameras; None without one.
@@ -224,7 +224,9 @@ class Rig(Settings):
     exports: tuple[OutputFormat, ...] = ()
     board: BoardSettings
     lidars: Annotated[dict[Name, LidarSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
-    cameras: Annotated[dict[Name, CameraSettings], Field(min_length=1, max_length=_MOST_SENSORS)]
+    cameras: Annotated[dict[Name, CameraSettings], Field(max_length=_MOST_SENSORS)] = Field(
+        default_factory=dict
+    )
     nominal_extrinsics: tuple[NominalExtrinsic, ...] = ()
     sync: SyncSettings | None = None
     targets: Annotated[dict[RobotName, TargetSettings], Field(max_length=_MOST_TARGETS)] = Field(
@@ -303,10 +305,16 @@ class Rig(Settings):
         for name in self.cameras:
             if name in self.lidars:
                 raise problem(f"{name} is the name of a LiDAR already", f"cameras.{name}")
+        if not self.cameras and len(self.lidars) < 2:
+            raise problem("a rig has a camera, or two LiDARs", "cameras")
+        if self.cameras and self.board.type == "plain":
+            what = f"a plain plate has no pattern for {next(iter(self.cameras))}"
+            raise problem(f"{what}; name the print of your board, or remove the cameras", "board.type")
         used: set[tuple[str, str]] = set()
         for index, entry in enumerate(self.nominal_extrinsics):
+            of_lidars = [name for name in self.lidars if name != entry.lidar]
             for kind, name, names_of_rig in (
-                ("camera", entry.camera, list(self.cameras)),
+                ("camera", entry.camera, [*self.cameras, *of_lidars]),
                 ("lidar", entry.lidar, list(self.lidars)),
             ):
                 if name not in names_of_rig:

@@ -107,12 +107,12 @@ def _profile(rig: Rig) -> dict[str, Any]:
         mode="json", exclude_defaults=True, exclude={"description", "robot", "targets", "exports"}
     )
     for kind in ("lidars", "cameras"):
-        for sensor in profile[kind].values():
+        for sensor in profile.get(kind, {}).values():
             sensor.pop("driver", None)
             sensor.pop("serial", None)
     for key in ("device", "baud"):
         profile.get("sync", {}).pop(key, None)
-    for camera in profile["cameras"].values():
+    for camera in profile.get("cameras", {}).values():
         for channel in camera.get("channels", {}).values():
             settings = channel.get("reconstruction") or {}
             if settings.get("model"):

@@ -31,7 +31,7 @@ _SPREAD = (1 / 1.2207440846057596) ** np.arange(1, 4)
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """A camera and a LiDAR; the board must be visible to both."""
+    """A camera and a LiDAR; the board must be visible to both. A rig without cameras looks from a LiDAR."""
 
     camera: str
     intrinsics: Intrinsics
@@ -41,8 +41,8 @@ class CameraView:
     T_world_lidar: Array
 
     def is_in_image(self, board: Board, T_world_board: Array) -> bool:
-        """Return whether the camera sees the whole pattern."""
-        pattern = board.corners()
+        """Return whether the camera sees the whole pattern, or the whole plate of a plain one."""
+        pattern = board.outline() if board.type == "plain" else board.corners()
         middle = pattern.mean(axis=0)
         # The outer squares reach one square beyond the inner corners.
         reach = np.array(board.pattern_size_m) / 2

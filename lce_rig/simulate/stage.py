@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import combinations, product
 from typing import Any, Literal
 
 import numpy as np
 
 from lce_rig.core.board import Board
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import DATA_SHEETS, DataSheet
 from lce_rig.core.errors import ProfileError
@@ -27,6 +29,8 @@ TRUTH, ROOM, LASERS, START, PLACEMENT, SCAN, IMAGE, PIXELS, HAND, CARRIER, PHASE
 _FORWARD = pose(
     np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([0.0, -0.08, -0.08])
 )
+# What is placed for a rig without cameras lies in the view of this lens, ahead of its first LiDAR.
+_WINDOW = Intrinsics(600.0, 600.0, 640.0, 360.0, 1280, 720)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +103,7 @@ class Stage:
 def truth_extrinsics(
     rig: Rig, seed: int, options: SimulationOptions | None = None
 ) -> dict[tuple[str, str], Array]:
-    """Draw the true T_cam_lidar (4, 4) of every camera and LiDAR.
+    """Draw the true T_cam_lidar (4, 4) of every camera and LiDAR, and of every two LiDARs.
 
     The nominal extrinsics of the profile, each moved by a seeded few degrees and centimetres, so that no
     solver can pass by returning the nominal. Pairs without an entry follow from the others; a camera without
@@ -113,9 +117,8 @@ def truth_extrinsics(
     options = options or SimulationOptions.for_rig(rig.name)
     T_base_sensor = _sensor_poses(rig, seed, options)
     return {
-        (camera, lidar): invert(T_base_sensor[camera]) @ T_base_sensor[lidar]
-        for camera in rig.cameras
-        for lidar in rig.lidars
+        (first, second): invert(T_base_sensor[first]) @ T_base_sensor[second]
+        for first, second in [*product(rig.cameras, rig.lidars), *combinations(rig.lidars, 2)]
     }
 
 
@@ -137,17 +140,21 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     if options.motion == "moving":
         kinds = ("frames", "events")
     cameras = [name for name, camera in rig.cameras.items() if any(map(camera.first_channel, kinds))]
-    if not cameras:
+    if rig.cameras and not cameras:
         hint = "Of a board held still, only frames can be simulated: events need motion."
         raise ProfileError(f"rig {rig.name}: no camera has a channel of kind {' or '.join(kinds)}", hint)
-    sight = T_world_sensor[cameras[0]][:3, 2]
+    lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
+    eyes = [(name, lenses[name], T_world_sensor[name]) for name in cameras]
+    if not eyes:
+        first = next(iter(rig.lidars))
+        eyes = [(first, _WINDOW, T_world_sensor[first] @ invert(_FORWARD))]
+    sight = eyes[0][2][:3, 2]
     room = build_room(
         float(np.arctan2(sight[1], sight[0])),
         np.random.default_rng([seed, OF_SESSION, ROOM]),
         rig.board.to_board() if options.has_decoy_plate else None,
         options.furnish,
     )
-    lenses = {name: rig.cameras[name].to_intrinsics() for name in cameras}
     sheets: dict[str, DataSheet] = {}
     for name, settings in rig.lidars.items():
         sheet = settings.data_sheet()
@@ -172,11 +179,7 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
         if options.motion == "moving" and rig.cameras[name].first_channel("events")
     }
     views = [
-        CameraView(
-            camera, lenses[camera], T_world_sensor[camera], lidar, models[lidar], T_world_sensor[lidar]
-        )
-        for camera in cameras
-        for lidar in rig.lidars
+        CameraView(*eye, lidar, models[lidar], T_world_sensor[lidar]) for eye in eyes for lidar in rig.lidars
     ]
     backdrops = {name: build_backdrop(room, T_world_sensor[name], lenses[name]) for name in cameras}
     board = rig.board.to_board()
@@ -215,12 +218,15 @@ def rig_truth(rig: Rig, seed: int, options: SimulationOptions) -> dict[str, Any]
     """Return the extrinsics and clocks of a simulated rig.
 
     Returns:
-        `pairs` of camera and lidar with T_cam_lidar (p_cam = T p_lidar), the first pair's alone, and how much
-        more the timestamps of images and events read than the rig's clock, which is the LiDAR's.
+        `pairs` of camera, or another LiDAR, and lidar with T_cam_lidar (p_cam = T p_lidar), the first pair's
+        alone, and how much more the timestamps of images and events read than the rig's clock, which is the
+        LiDAR's.
     """
     pairs = [
         {"camera": camera, "lidar": lidar, "T_cam_lidar": T.tolist()}
-        for (camera, lidar), T in sorted(truth_extrinsics(rig, seed, options).items())
+        for (camera, lidar), T in sorted(
+            truth_extrinsics(rig, seed, options).items(), key=lambda pair: (pair[0][0] in rig.lidars, pair[0])
+        )
     ]
     return {
         "seed": seed,

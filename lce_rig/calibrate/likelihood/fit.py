@@ -20,7 +20,7 @@ from lce_rig.calibrate.observations import group_shared_placements
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, perturb
-from lce_rig.core.results import Observation
+from lce_rig.core.results import LidarBoard, Observation
 
 # Steps between changes of the levels, and their maximum at the end.
 _STEPS, _LAST_STEPS = 3, 20
@@ -139,6 +139,35 @@ def stack_camera(observations: Sequence[Observation], order: Mapping[str, int]) 
     """Stack one camera's images; `order` gives each capture's place by name."""
     capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
     return stack_images(capture, [o.image for o in observations])
+
+
+def fit_boards(
+    lidars: Sequence[LidarBoard], board: Board, priors: Priors, usual: Levels
+) -> tuple[Terms, Levels, Reduced]:
+    """Estimate the pose of each board and the constant errors from the scans of one LiDAR alone.
+
+    Args:
+        lidars: the boards in F scans.
+        board: the board.
+        priors: of the constant errors.
+        usual: typical noise levels.
+
+    Returns:
+        The terms, without cameras, and the levels at the optimum, and the normal equations there.
+    """
+    usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
+    scans = stack_scans([interior(lidar, board) for lidar in lidars], board)
+    T_lidar_board = np.array([lidar.T_lidar_board for lidar in lidars])
+    state = State.without_errors(np.zeros((0, 4, 4)), T_lidar_board, len(scans.rings))
+    search, levels = _Search(scans, (), board, priors), usual
+    terms = linearise(scans, (), board, state)
+    for blur_rad in _BLURS_RAD:
+        terms = search.settle(terms, levels.blurred(blur_rad), _STEPS, _NEAR)
+    for n_rounds in _LEVEL_ROUNDS:
+        terms = search.settle(terms, levels, _STEPS, _NEAR)
+        levels = fit_levels(terms, levels, usual, priors, n_rounds)
+    terms = search.settle(terms, levels, _LAST_STEPS, _SETTLED)
+    return terms, levels, assemble(terms, levels, priors)
 
 
 @dataclass(frozen=True, eq=False)

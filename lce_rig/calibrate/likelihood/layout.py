@@ -56,7 +56,7 @@ class Columns:
     def of(self, names: Iterable[str]) -> Indices:
         """List the columns of several names, in their order."""
         slices = [self._slices[name] for name in names]
-        return np.concatenate([np.arange(part.start, part.stop) for part in slices])
+        return np.array([k for part in slices for k in range(part.start, part.stop)], dtype=np.intp)
 
 
 _OF_LASER = dict.fromkeys(LASER, 1)
@@ -100,7 +100,7 @@ class Layout:
     @property
     def cameras(self) -> Indices:
         """Places in z of all cameras' tangents (C, 6)."""
-        return np.stack([self.camera(c) for c in range(self.n_cameras)])
+        return np.array([self.camera(c) for c in range(self.n_cameras)], dtype=np.intp).reshape(-1, 6)
 
     @property
     def scales(self) -> Indices:

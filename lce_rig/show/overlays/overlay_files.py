@@ -257,7 +257,8 @@ def draw_check(
 
 
 def _residual_words(plane_m: float, edge_m: float, corner_px: float) -> str:
-    return f"planes {1000 * plane_m:.1f} mm, edges {1000 * edge_m:.1f} mm, corners {corner_px:.2f} px"
+    words = f"planes {1000 * plane_m:.1f} mm, edges {1000 * edge_m:.1f} mm"
+    return words if math.isnan(corner_px) else f"{words}, corners {corner_px:.2f} px"
 
 
 def _draw(
@@ -312,8 +313,9 @@ def _legend(
         figures = {
             "planes (mm)": round(1000 * residual.plane_mean_m, 1),
             "edges (mm)": round(1000 * residual.edge_mean_m, 1),
-            "corners (px)": round(residual.reprojection_px, 2),
         }
+        if math.isfinite(residual.reprojection_px):
+            figures["corners (px)"] = round(residual.reprojection_px, 2)
     if meeting is not None and meeting.way_m > 0:
         figures["moved (mm)"] = round(1000 * meeting.way_m, 1)
     refusal = calibration.captures_refused.get(name)

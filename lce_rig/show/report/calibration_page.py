@@ -60,7 +60,7 @@ def report_page(session: Session, file: ResultFile, overlays: str, *, has_previo
         ("SHA-256 of the session", origin.session_sha256),
         ("SHA-256 of result.json", hashlib.sha256(file.text().encode()).hexdigest()),
     ]
-    has_folders = sum(len(c.channels) for c in file.pairs) > 1
+    has_folders = sum(max(len(c.channels), 1) for c in file.pairs) > 1
     pairs = []
     for k, c in enumerate(file.pairs):
         with style(f"pair-{k}"):
@@ -82,16 +82,18 @@ def _overlays(capture: Capture, c: Calibration, folder: str, has_folders: bool) 
     """Name a capture's overlays as `verify` of the session does."""
     return [
         "/".join([folder, *([Pair(c.camera, channel, c.lidar).folder_name] if has_folders else []), name])
-        for channel in c.channels
-        if capture.has_image(c.camera, channel) or (channel == "events" and c.camera in capture.event_cameras)
+        for channel in c.channels or ("",)
+        if not channel
+        or capture.has_image(c.camera, channel)
+        or (channel == "events" and c.camera in capture.event_cameras)
         for name in (f"{capture.name}.png",)
     ]
 
 
 def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
     """List the content of one camera and one LiDAR's part of the page, by the template's names."""
-    board, lens = rig.board.to_board(), rig.lens_of(c)
-    evidence = gather(c, board, lens)
+    board, lens = rig.board.to_board(), None if c.is_of_lidars else rig.lens_of(c)
+    evidence = None if lens is None else gather(c, board, lens)
     captures = []
     for k, residual in enumerate(c.residuals):
         figures = [
@@ -116,7 +118,10 @@ def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
         "calibration": c,
         "anchor": anchor,
         "statement": _statement(c),
-        "body_frames": (rig.lidars[c.lidar].frame, rig.cameras[c.camera].frame),
+        "body_frames": (
+            rig.lidars[c.lidar].frame,
+            (rig.lidars if lens is None else rig.cameras)[c.camera].frame,
+        ),
         "pose": _pose_rows(c),
         "uncertainty": [
             (
@@ -150,12 +155,16 @@ def _gallery(
     session: Session, c: Calibration, captures: Sequence[Mapping[str, Any]], n_most: int
 ) -> list[dict[str, Any]]:
     """List captures with their pictures, those with the largest residuals first."""
-    board, lens = session.rig.board.to_board(), session.rig.cameras[c.camera].to_intrinsics()
+    board, lens = session.rig.board.to_board(), None
+    if not c.is_of_lidars:
+        lens = session.rig.cameras[c.camera].to_intrinsics()
     order = worst_first([r.plane_mean_m for r in c.residuals], [r.edge_mean_m for r in c.residuals])
     return [
         {
             **captures[k],
-            "picture": picture_of(session.capture(c.residuals[k].capture), c, board, lens),
+            "picture": ""
+            if lens is None
+            else picture_of(session.capture(c.residuals[k].capture), c, board, lens),
             "stands_out": f"{ratio:.1f} x the median" if ratio > _STANDS_OUT else "",
         }
         for k, ratio in order[: max(n_most, 1)]
@@ -163,18 +172,19 @@ def _gallery(
 
 
 def _drawings(
-    c: Calibration, board: Board, lens: Intrinsics, evidence: Evidence | None, anchor: str
+    c: Calibration, board: Board, lens: Intrinsics | None, evidence: Evidence | None, anchor: str
 ) -> dict[str, Markup]:
     """Draw a result; without its boards its uncertainty alone."""
-    drawn = {"by_distance": drawings.draw_by_distance(c, lens)}
+    drawn = {} if lens is None else {"by_distance": drawings.draw_by_distance(c, lens)}
     if c.contributions:
         drawn["causes"] = drawings.draw_causes(c)
-    if evidence is not None:
-        links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}
+    links = {r.capture: f"#{anchor}-capture-{k}" for k, r in enumerate(c.residuals)}
+    if links:
+        drawn["by_capture"] = drawings.draw_by_capture(c, links)
+    if evidence is not None and lens is not None:
         drawn |= {
             "in_image": drawings.draw_in_image(evidence, board, lens, links),
             "from_above": drawings.draw_from_above(c, evidence, board, lens, links),
-            "by_capture": drawings.draw_by_capture(c, links),
             "by_ring": drawings.draw_by_ring(evidence),
             "by_range": drawings.draw_by_range(evidence, links),
             "corners": drawings.draw_corners(evidence, lens),
@@ -184,8 +194,9 @@ def _drawings(
 
 def _statement(c: Calibration) -> str:
     """Sum a result up in one paragraph that anyone can sign, with its figures."""
+    sensor = c.camera if c.is_of_lidars else f"camera {c.camera}"
     known = (
-        f"The pose of camera {c.camera} relative to {c.lidar} has a standard deviation of "
+        f"The pose of {sensor} relative to {c.lidar} has a standard deviation of "
         f"{significant(c.sigma_rotation_deg)} deg and {significant(1000 * c.sigma_translation_m)} mm, from "
         f"{len(c.captures_used)} of {c.n_captures} captures of the board"
     )
@@ -223,6 +234,9 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
     return [
         *steps,
         f"Look at the overlays (`lce-rig verify {shlex.quote(folder)}`): "
+        "both clouds must show the board in one place."
+        if c.is_of_lidars
+        else f"Look at the overlays (`lce-rig verify {shlex.quote(folder)}`): "
         "ring ends must lie on the board's outline on all sides.",
         "Collect a second session on another day and compare both: "
         f"`lce-rig repeat {shlex.quote(folder)} OTHER_SESSION`.",
@@ -230,11 +244,15 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
 
 
 def _pose_rows(c: Calibration) -> list[Row]:
-    """State the pose of the camera's body in the LiDAR's frame, with standard deviations."""
+    """State the pose of the camera's body in the LiDAR's frame, or of two LiDARs the second's in the first's.
+
+    Standard deviations belong to it.
+    """
 
     def pose(tangent: Array) -> Array:
-        T_lidar_body = invert(perturb(c.T_cam_lidar, tangent)) @ invert(T_BODY_OPTICAL)
-        return np.concatenate([T_lidar_body[:3, 3], rpy(T_lidar_body[:3, :3])])
+        T = perturb(c.T_cam_lidar, tangent)
+        T = T if c.is_of_lidars else invert(T) @ invert(T_BODY_OPTICAL)
+        return np.concatenate([T[:3, 3], rpy(T[:3, :3])])
 
     moved = np.array([pose(step) - pose(-step) for step in _STEP * np.eye(6)]).T
     moved[3:] = (moved[3:] + np.pi) % (2 * np.pi) - np.pi

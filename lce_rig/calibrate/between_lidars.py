@@ -1,0 +1,305 @@
+"""The pose of two LiDARs to each other, from boards that both see; no camera takes part.
+
+    place_boards      the boards' poses by each LiDAR alone, of maximum likelihood, with its constant errors
+    find_consensus    the captures that agree on one rigid transform
+    solve             Algorithm 1: the outliers, and where the estimate starts
+    below             poses of both LiDARs of maximum likelihood
+
+The first LiDAR takes the camera's place: the boards' poses in its scans are what the poses in images are to
+a camera. Its points keep their errors common to all captures, which the extrinsics share. With T_1 and T_2 a
+board's poses, x the tangent of T_12, e their errors and d the constant errors of unit variance that both
+LiDARs have in all captures,
+
+    log(T_12 T_2 T_1^-1) = A x + B (S_2 d_2 + e_2) - (S_1 d_1 + e_1)                                     (1)
+
+whose squares in units of cov(e_1) + B cov(e_2) B^T are least, with d^2 added.
+
+A plate without print looks the same turned by 180 deg, a square one by 90 deg. Normals and middles of several
+boards decide T_12 without that turn, which then follows by capture.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from lce_rig.calibrate.algorithm_1.algorithm import solve
+from lce_rig.calibrate.consensus import find_consensus
+from lce_rig.calibrate.findings import FEW_AGREE, OUTLIER, TURNED
+from lce_rig.calibrate.likelihood.fit import fit_boards
+from lce_rig.calibrate.likelihood.layout import OWN
+from lce_rig.calibrate.likelihood.levels import what_is_known
+from lce_rig.calibrate.likelihood.rays import lens_fields
+from lce_rig.calibrate.observations import group_placements
+from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
+from lce_rig.calibrate.result import CalibrationEstimate, Start, error_to_reference, report, with_parts
+from lce_rig.calibrate.uncertainty import widen
+from lce_rig.core.board import Board
+from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.geometry import Array, difference, exp_so3, perturb, pose, rotation_angle, skew
+from lce_rig.core.results import LidarBoard, Observation
+
+# Plates whose sides differ by less than this share look the same turned by 90 deg.
+_NEARLY_SQUARE = 0.1
+# A board in the two scans may differ by so much about its normal; more is another thing of its size.
+_MOST_TURN_RAD = np.radians(15.0)
+_STEPS = 5
+# Captures farther off than this many standard deviations, or medians of all, count less than in full (Huber),
+# outliers hardly.
+_HUBER, _FARTHEST, _OUTLIER = 1.5, 5.0, 1e-3
+# Constant errors that move no pose by more than this share of the largest are left out.
+_NEGLIGIBLE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedBoards:
+    """Poses of F boards by one LiDAR alone.
+
+    Attributes:
+        T: (F, 4, 4) T_lidar_board.
+        cov: (F, 6, 6) of each, tangent (translation m, rotation rad): of errors that differ between captures.
+        shared: (F, 6, m) tangents by m independent errors of unit variance, common to all captures.
+    """
+
+    T: Array
+    cov: Array
+    shared: Array
+
+    def of(self, captures: Sequence[int]) -> "PlacedBoards":
+        """Choose captures by index."""
+        chosen = np.array(captures, dtype=np.intp)
+        return PlacedBoards(self.T[chosen], self.cov[chosen], self.shared[chosen])
+
+
+class PairEstimate(NamedTuple):
+    """Two LiDARs' pose to each other, in an optical frame of the first.
+
+    Attributes:
+        estimate: of T_optical_second; its captures include outliers, which the checks are to see.
+        trust: (F,) weight of each capture in its cost.
+        T_view: (4, 4) T_optical_first.
+    """
+
+    estimate: CalibrationEstimate
+    trust: Array
+    T_view: Array
+
+    @property
+    def recount(self) -> Array:
+        """Factors (F,) by which captures count in full; outliers only where they agree among themselves.
+
+        Captures after a sensor moved fit one other mounting; other things of the plate's size fit none.
+        """
+        cost = self.estimate.cost
+        assert cost is not None
+        in_full = cost.weighted(1 / self.trust)
+        H, g = in_full.hessians[:, :6, :6], in_full.gradients[:, :6]
+        alone, covs = -np.linalg.solve(H, g[..., None])[..., 0], np.linalg.inv(H)
+        apart = alone[:, None] - alone
+        off = np.sqrt(np.einsum("abi,abij,abj->ab", apart, np.linalg.inv(covs[:, None] + covs), apart) / 6)
+        is_outlier = self.trust <= _OUTLIER
+        usual = max(float(np.median(off[~is_outlier][:, ~is_outlier])), 1.0)
+        agrees = (off < _FARTHEST * usual) & is_outlier & is_outlier[:, None]
+        is_alone = is_outlier & (agrees.sum(axis=0) < 2)
+        return np.where(is_alone, 1.0, 1 / self.trust)
+
+    @property
+    def without_outliers(self) -> CalibrationEstimate:
+        """The estimate with outliers among the refused captures."""
+        residuals = self.estimate.residuals
+        plane_m, edges_m = (
+            float(np.median([getattr(r, name) for r in residuals])) for name in ("plane_rms_m", "edge_rms_m")
+        )
+        outliers = {
+            r.capture: OUTLIER.refusal(
+                plane_m=r.plane_rms_m, edges_m=r.edge_rms_m, plane_median_m=plane_m, edges_median_m=edges_m
+            )
+            for r, trust in zip(residuals, self.trust, strict=True)
+            if trust <= _OUTLIER
+        }
+        kept = {name: o for name, o in self.estimate.observations.items() if name not in outliers}
+        return replace(
+            self.estimate,
+            observations=kept,
+            fitted=kept,
+            residuals=tuple(r for r in residuals if r.capture in kept),
+            refused=dict(sorted({**self.estimate.refused, **outliers}.items())),
+        )
+
+
+def place_boards(lidars: Sequence[LidarBoard], board: Board, settings: EstimateSettings) -> PlacedBoards:
+    """Estimate the poses of the boards in the scans of one LiDAR, for points as its driver gives them.
+
+    Args:
+        lidars: of F captures.
+        board: the plate.
+        settings: what the profile says of this LiDAR.
+    """
+    terms, _, reduced = fit_boards(lidars, board, *what_is_known(settings))
+    state, pose_of = terms.state, OWN["pose"]
+    by_errors = -reduced.own_steps[:, pose_of, :-1]
+    # The points lie where the driver puts them, displaced by the lens (`likelihood.rays`).
+    T, lens = state.T_lidar_board.copy(), state.layout.z["lens"]
+    fields = lens_fields(T[:, :3, 3])
+    T[:, :3, 3] += fields @ state.z[lens]
+    by_errors[:, :3, lens] += fields
+    shared = by_errors @ np.linalg.cholesky(reduced.cost.covariance())
+    values, vectors = np.linalg.eigh(np.einsum("fij,fik->jk", shared, shared))
+    kept = vectors[:, values > _NEGLIGIBLE**2 * values[-1]]
+    of_own = np.asarray(np.linalg.inv(reduced.of_own), dtype=np.float64)
+    return PlacedBoards(T, of_own[:, pose_of, pose_of], np.asarray(shared @ kept))
+
+
+def estimate_between_lidars(
+    candidates: Sequence[Observation],
+    first: Mapping[str, Sequence[LidarBoard]],
+    board: Board,
+    settings: tuple[EstimateSettings, EstimateSettings],
+) -> PairEstimate:
+    """Estimate the pose of the second LiDAR in an optical frame of the first.
+
+    The optical frame has the first LiDAR's origin, z level towards the boards and y down: for all checks,
+    the first LiDAR is a camera.
+
+    Args:
+        candidates: of each capture with the board in both scans; the first LiDAR's are the images' poses, in
+            its own frame.
+        first: by capture the places in its scan where the board may be.
+        board: the plate.
+        settings: what the profile says of each LiDAR.
+
+    Raises:
+        NotEnoughDataError: too few captures, captures that agree with no extrinsics, or captures that leave a
+            direction undetermined, which is named.
+    """
+    consensus = find_consensus(candidates, board)
+    agreed, T_consensus = consensus.observations, consensus.T_cam_lidar
+    seen = [min(first[o.capture], key=partial(_apart_m, o.image.T_cam_board)) for o in agreed]
+    one = place_boards(seen, board, settings[0])
+    other = place_boards([o.lidar for o in agreed], board, settings[1])
+    turns = _turned_alike(one.T, T_consensus @ other.T, board)
+    other = replace(other, T=other.T @ turns)
+    apart = difference(T_consensus @ other.T, one.T)
+    spins_rad = np.abs(np.einsum("fi,fi->f", apart[:, 3:], one.T[:, :3, 2]))
+    T_view = optical_frame(one.T[:, :3, 3])
+    one = _rotated(one, T_view)
+    refused, observations = dict(consensus.refused), []
+    for k, o in enumerate(agreed):
+        if spins_rad[k] > _MOST_TURN_RAD:
+            refused[o.capture] = TURNED.refusal(rotation_deg=float(np.degrees(spins_rad[k])))
+            continue
+        image = replace(o.image, T_cam_board=one.T[k], cov=one.cov[k], T_cam_board_alternative=None)
+        lidar = replace(o.lidar, T_lidar_board=o.lidar.T_lidar_board @ turns[k])
+        observations.append(replace(o, image=image, lidar=lidar))
+    if len(observations) < len(agreed) / 2:
+        raise NotEnoughDataError.of(
+            FEW_AGREE(n_agreeing=len(observations), n_captures=len(candidates), n_needed=len(agreed))
+        )
+    solved = solve(observations, board, 0, settings[1].seed)
+    # Without held-out residuals; outliers stay for the checks.
+    start = Start(
+        solved.T_cam_lidar,
+        solved.certificate,
+        observations,
+        refused,
+        np.full(len(observations), np.nan),
+        solved.diagnostics,
+    )
+    place = {o.capture: k for k, o in enumerate(agreed)}
+    used = [place[o.capture] for o in observations]
+    estimate, trust = _fit_poses(start, one.of(used), other.of(used), board)
+    return PairEstimate(estimate, trust, T_view)
+
+
+def optical_frame(middles: Array) -> Array:
+    """Turn the axes of a LiDAR (x forward, z up) into a camera's (z forward, y down) that looks at boards.
+
+    Args:
+        middles: (F, 3) of the boards, frame of the LiDAR.
+
+    Returns:
+        T_optical_lidar (4, 4).
+    """
+    towards = np.append(middles[:, :2].sum(axis=0), 0.0)
+    length = float(np.linalg.norm(towards))
+    forward = towards / length if length > 0 else np.array([1.0, 0.0, 0.0])
+    down = np.array([0.0, 0.0, -1.0])
+    return pose(np.stack([np.cross(down, forward), down, forward]), np.zeros(3))
+
+
+def _apart_m(T: Array, lidar: LidarBoard) -> float:
+    return float(np.linalg.norm(T[:3, 3] - lidar.T_lidar_board[:3, 3]))
+
+
+def _rotated(placed: PlacedBoards, T: Array) -> PlacedBoards:
+    """Express poses in a frame of the same origin."""
+    R = np.kron(np.eye(2), T[:3, :3])
+    return PlacedBoards(T @ placed.T, R @ placed.cov @ R.T, R @ placed.shared)
+
+
+def _turned_alike(T: Array, other: Array, board: Board) -> Array:
+    """Choose the turns (F, 4, 4) about the plate's normal that bring poses `other` (F, 4, 4) next to T."""
+    sides = board.width_m, board.height_m
+    n_fold = 4 if max(sides) < (1 + _NEARLY_SQUARE) * min(sides) else 2
+    steps = 2 * np.pi / n_fold * np.arange(n_fold)
+    turns = pose(exp_so3(steps[:, None] * np.array([0.0, 0.0, 1.0])), np.zeros((n_fold, 3)))
+    angles = [
+        [rotation_angle(a[:3, :3], (b @ turn)[:3, :3]) for turn in turns]
+        for a, b in zip(T, other, strict=True)
+    ]
+    return np.asarray(turns[np.argmin(angles, axis=1)])
+
+
+def _fit_poses(
+    start: Start, one: PlacedBoards, other: PlacedBoards, board: Board
+) -> tuple[CalibrationEstimate, Array]:
+    """Minimise (1) from Algorithm 1's solution; return also the weights (F,) of the captures.
+
+    Args:
+        start: with the F captures used.
+        one, other: their boards in both LiDARs.
+        board: the plate.
+    """
+    placement = group_placements(start.observations)
+    once = 1 / np.bincount(placement)[placement]
+    T, trust = start.T_cam_lidar, once
+    n_one, n_other = one.shared.shape[2], other.shared.shape[2]
+    prior = np.diag(np.r_[np.zeros(6), np.ones(n_one + n_other)])
+    errors = np.zeros(n_one + n_other)
+    for _ in range(_STEPS):
+        R = np.kron(np.eye(2), T[:3, :3])
+        J = np.concatenate([np.zeros((len(one.T), 6, 6)), -one.shared, R @ other.shared], axis=2)
+        J[:, :, :6] = np.eye(6)
+        J[:, :3, 3:6] = -skew(other.T[:, :3, 3] @ T[:3, :3].T)
+        residual = difference(T @ other.T, one.T) + J[:, :, 6:] @ errors
+        information = np.linalg.inv(one.cov + R @ other.cov @ R.T)
+        chi2 = np.einsum("fi,fij,fj->f", residual, information, residual)
+        off = np.sqrt(np.maximum(chi2 / 6, 1e-12))
+        off /= max(float(np.median(off)), 1.0)
+        trust = np.where(off > _FARTHEST, _OUTLIER, np.minimum(1, _HUBER / off))
+        weighted = (once * trust)[:, None, None] * np.swapaxes(J, 1, 2) @ information
+        cost = Quadratics(
+            (weighted @ residual[..., None])[..., 0],
+            weighted @ J,
+            prior,
+            prior @ np.r_[np.zeros(6), errors],
+            placement,
+        )
+        step = cost.optimum()
+        T, errors = perturb(T, step[:6]), errors + step[6:]
+    inverse = cost.covariance()
+    scatter = (inverse @ cost.hessians.sum(axis=0) @ inverse)[:6, :6]
+    constants = (inverse @ prior @ inverse)[:6, :6]
+    left_out = jackknife_scatter(cost.moves()[:, :6])
+    cov, inflation = widen(scatter + constants, left_out, len(cost.groups))
+    offset_deg, offset_m = error_to_reference(T, start.T_cam_lidar)
+    figures = replace(
+        with_parts(start.diagnostics, scatter, constants),
+        covariance_inflation=inflation,
+        algorithm_1_offset_deg=offset_deg,
+        algorithm_1_offset_m=offset_m,
+    )
+    return replace(report(start, T, cov, board, figures), method="ml", cost=cost), trust
