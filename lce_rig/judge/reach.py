@@ -11,7 +11,7 @@ import numpy as np
 
 from lce_rig.core.calibration import Calibration, PointUncertainty
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, skew
+from lce_rig.core.geometry import Array, perturb, skew
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.models import LensModel, model_of
 
@@ -32,6 +32,20 @@ def covariance_alone(calibration: Calibration) -> Array:
     turn = turn_of_lens(c.intrinsics)
     M = np.hstack([np.eye(6), np.vstack([np.zeros_like(turn), -turn])])
     return np.asarray(M @ with_lens(c.cov, c.intrinsics_cross_cov, c.intrinsics_cov) @ M.T)
+
+
+def as_used(calibration: Calibration, lens: Intrinsics) -> Array:
+    """Give the extrinsics (4, 4) that draw points with another lens as a result's own do with its intrinsics.
+
+    Args:
+        calibration: with its intrinsics, else its extrinsics are given as they are.
+        lens: of the same camera model.
+    """
+    fitted, model = calibration.intrinsics, model_of(lens)
+    if fitted is None:
+        return calibration.T_cam_lidar
+    turn = turn_of_lens(lens) @ (model.vector(fitted) - model.vector(lens))
+    return perturb(calibration.T_cam_lidar, np.append(np.zeros(3), turn))
 
 
 def with_lens(cov: Array, cross: Array, cov_lens: Array) -> Array:

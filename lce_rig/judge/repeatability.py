@@ -1,7 +1,7 @@
 """Compare calibrations of one rig with their reported uncertainties."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
@@ -11,7 +11,7 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, invert, log_so3, mean_pose
 from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE, RESULTS_AGREE, RESULTS_DISAGREE
-from lce_rig.judge.reach import covariance_alone
+from lce_rig.judge.reach import as_used, covariance_alone
 
 # Calibrations disagree if correct ones spread this far with less than this probability.
 _CHANCE = 0.01
@@ -49,7 +49,7 @@ class Repeatability:
     Attributes:
         names: of the sessions, or of the results of one session.
         camera, lidar: the calibrated sensors.
-        T_cam_lidar: (4, 4) mean with equal weights.
+        T_cam_lidar: (4, 4) mean with equal weights, of extrinsics for the first one's intrinsics.
         deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
         spread_rotation_deg, spread_translation_m: standard deviation of one calibration, from these.
         reported_rotation_deg, reported_translation_m: the same as reported by the calibrations, rms.
@@ -127,7 +127,7 @@ class Repeatability:
 def compare_calibrations(
     calibrations: Mapping[str, Calibration], *, are_independent: bool = True
 ) -> Repeatability:
-    """Compare calibrations of the same camera and LiDAR.
+    """Compare calibrations of the same camera and LiDAR, each with its own lens, as they draw points.
 
     Results of the same captures share errors to an unknown extent. For any correlation, the covariance of
     a - b is at most 2 (cov_a + cov_b), because that of a + b is not negative: this bound is used for them.
@@ -142,8 +142,15 @@ def compare_calibrations(
     if len(calibrations) < 2:
         raise ValueError("a comparison requires two calibrations, 1 given")
     names = tuple(calibrations)
+    lenses = [calibrations[name].intrinsics for name in names]
+    lens, models = lenses[0], {each and (each.model, len(each.distortion)) for each in lenses}
+    if lens is not None and len(models) == 1:
+        # What one session's lens turns, its own extrinsics take back.
+        calibrations = {name: replace(c, T_cam_lidar=as_used(c, lens)) for name, c in calibrations.items()}
+        cov = np.array([calibrations[name].cov for name in names])
+    else:
+        cov = np.array([covariance_alone(calibrations[name]) for name in names])
     T = np.array([calibrations[name].T_cam_lidar for name in names])
-    cov = np.array([covariance_alone(calibrations[name]) for name in names])
     if are_independent:
         # Errors of a lens and board that all sessions share do not make their results differ.
         cov = cov - np.array([calibrations[name].cov_shared for name in names])

@@ -9,6 +9,8 @@ from lce_rig.core.calibration import Calibration
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.geometry import exp_so3, perturb, pose
 from lce_rig.judge.repeatability import compare_calibrations
+from lce_rig.lens.difference import turn_of_lens
+from tests.calibrate.boards import CAMERA
 from tests.saved_results import made_calibration
 
 TRUTH = pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.1, -0.06, -0.08]))
@@ -39,6 +41,20 @@ def test_sound_calibrations_spread_as_their_covariance_says():
     assert np.mean(distances) == pytest.approx(6, rel=0.12)
     spread = np.mean([one.spread_translation_m**2 for one in compared])
     assert spread == pytest.approx(np.mean([one.reported_translation_m**2 for one in compared]), rel=0.15)
+
+
+def test_a_principal_point_that_one_session_takes_for_a_rotation_is_no_difference():
+    """Sessions with lenses of their own are compared as they draw points."""
+    moved = replace(CAMERA, cx_px=CAMERA.cx_px + 4.0)
+    turn = -turn_of_lens(CAMERA)[:, 2] * 4.0
+    assert np.degrees(np.linalg.norm(turn)) > 0.2
+    turned = perturb(TRUTH, np.append(np.zeros(3), turn))
+    first, second = (
+        replace(calibration(T), intrinsics=lens) for T, lens in ((TRUTH, CAMERA), (turned, moved))
+    )
+    assert compare_calibrations({"monday": first, "tuesday": second}).max_rotation_deg < 0.005
+    same_lens = compare_calibrations({"monday": first, "tuesday": replace(second, intrinsics=CAMERA)})
+    assert same_lens.max_rotation_deg == pytest.approx(np.degrees(np.linalg.norm(turn)), rel=1e-6)
 
 
 def test_agreement_is_a_note_with_both_figures():
