@@ -19,6 +19,7 @@ from lce_rig.session import Session
 from tests.collect.live.replay import Show, placements, rig
 
 QUICK = LiveOptions(n_wanted=3, timeout_s=120.0, hold_s=0.3)
+HERE = "000000 shows the board here"
 
 
 @pytest.mark.long
@@ -59,13 +60,18 @@ def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Pat
 
 @pytest.mark.long
 def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path: Path) -> None:
-    asked: list[Key | None] = [None] * 15 + ["next", "capture"] + [None] * 25 + ["stop"]
+    asked: list[Key] = ["next", "capture"]
     states: list[LiveState] = []
     show = Show(placements()[:1], each_s=100.0)
+
+    def key() -> Key | None:
+        if not states or not states[-1].streams or not states[-1].streams[0].sees_board:
+            return None
+        return asked.pop(0) if asked else "stop" if states[-1].n_captures else None
+
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
-        options = LiveOptions(hold_s=20.0)
         report = collect_live(
-            session, show.sources, options, states.append, lambda: asked.pop(0) if asked else "stop"
+            session, show.sources, LiveOptions(hold_s=60.0, timeout_s=50.0), states.append, key
         )
         assert report.ending == "stopped"
         assert [capture.meta.get("by_hand") for capture in session.captures] == [1.0]
@@ -135,18 +141,19 @@ def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(
 
 @pytest.mark.long
 def test_a_board_that_stands_where_it_was_captured_is_captured_no_more_by_key_neither(tmp_path: Path) -> None:
-    states: list[LiveState] = []
+    states, told_s = list[LiveState](), list[float]()
     show = Show(placements()[:1], each_s=100.0)
 
     def key() -> Key | None:
-        if states and states[-1].elapsed_s > 8.0:
-            return "stop"
-        return "capture" if states and states[-1].n_captures else None
+        if not states or not states[-1].n_captures:
+            return None
+        told_s.extend(state.elapsed_s for state in states[-1:] if any(HERE in line for line in state.log))
+        return "stop" if told_s and states[-1].elapsed_s > told_s[0] + 3.0 else "capture"
 
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
         report = collect_live(session, show.sources, replace(QUICK, n_wanted=None), states.append, key)
     assert report.captured == ["000000"]
-    assert any("000000 shows the board here" in line for line in states[-1].log)
+    assert any(HERE in line for line in states[-1].log)
     assert states[-2].drawing is not None and states[-2].drawing.wanted_px is not None
 
 
@@ -192,13 +199,13 @@ def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(
 @pytest.mark.long
 def test_a_run_that_nobody_looks_after_ends_when_nothing_new_is_shown(tmp_path: Path) -> None:
     show = Show(placements()[:1], each_s=100.0)
-    options = replace(QUICK, n_wanted=5, idle_s=3.0)
+    options = replace(QUICK, n_wanted=5, idle_s=8.0)
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
         report = collect_live(session, show.sources, options)
     assert report.ending == "exhausted" and not report.is_enough
     assert len(report.captured) == 1
     (waited_s,) = (float(s) for note in report.notes for s in re.findall(r"last (\d+) s", note))
-    assert waited_s >= 3
+    assert waited_s >= 8
 
 
 @pytest.fixture

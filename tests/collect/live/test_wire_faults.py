@@ -55,7 +55,7 @@ def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(
         rig.tell("loss 0.3")
         collecting.wait_for("% of the packets lost")
         rig.tell("loss 0")
-        time.sleep(0.2)
+        time.sleep(1.0)
         rig.tell("pause 5")
         collecting.wait_for("lidar is lost: lidar: data packets")
         n_before = collecting.n_captures

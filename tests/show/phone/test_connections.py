@@ -52,10 +52,11 @@ def test_strangers_have_so_many_connections_and_for_so_long(monkeypatch: pytest.
     with Preview(port=0) as preview, Watcher(preview.urls[0]) as early:
         early.watch()
         with connected(preview, MAX_CONNECTIONS + 20) as lines:
-            time.sleep(0.5)
-            assert n_open(lines) <= MAX_CONNECTIONS
-            time.sleep(1.7)
-            assert n_open(lines) == 0
+            for n_most in (MAX_CONNECTIONS, 0):
+                deadline_s = time.monotonic() + 8
+                while n_open(lines) > n_most:
+                    assert time.monotonic() < deadline_s
+                    time.sleep(0.05)
             # An open page is kept, and there is room for another.
             preview.publish(state())
             assert early.next_state()[0]["n_captures"] == 7
@@ -70,7 +71,7 @@ def test_what_is_sent_half_ends_in_time(monkeypatch: pytest.MonkeyPatch, sent: b
         line.sendall(sent)
         began_s = time.monotonic()
         while not is_ended(line, 0.05):
-            assert time.monotonic() < began_s + 3
+            assert time.monotonic() < began_s + 8
             with contextlib.suppress(OSError):
                 line.sendall(b"x" if sent else b"")
 

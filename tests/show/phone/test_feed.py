@@ -124,7 +124,7 @@ def test_a_page_that_vanished_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> N
             status, _, _ = watcher.get("live")
             assert status == 503
             # It answers no ping, and its place is free again.
-            deadline_s = time.monotonic() + 5
+            deadline_s = time.monotonic() + 20
             while watcher.get("live")[0] == 503:
                 assert time.monotonic() < deadline_s
                 time.sleep(0.1)
@@ -141,7 +141,7 @@ def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview: Preview) -> N
         assert preview.asked() is None
         for name in ("000006", "000005"):
             watcher.send(json.dumps({"take_back": name}))
-        deadline_s, asked = time.monotonic() + 5, list[str]()
+        deadline_s, asked = time.monotonic() + 20, list[str]()
         while len(asked) < 2:
             assert time.monotonic() < deadline_s
             if (each := preview.asked()) is not None:
