@@ -273,13 +273,6 @@ def report(registry: str, output: Path, json_file: Path | None) -> None:
     metavar="CONDITION",
     help="Choose robots by a condition in SQL, as `fleet table` does.",
 )
-@click.option(
-    "--check",
-    default="",
-    metavar="COMMAND",
-    help="Run this here after each deployment, without a shell; {robot}, {result} and {to} are filled in. "
-    "Exit code 7, as of `drift`, contradicts the result; 6 cannot tell and passes.",
-)
 @click.option("--dry-run", is_flag=True, help="Print which result would go where; change nothing.")
 @click.option("--status", is_flag=True, help="Ask every robot for what it holds; change nothing.")
 @click.option(
@@ -294,7 +287,6 @@ def deploy(
     target: str,
     targets: Path,
     where: str,
-    check: str,
     dry_run: bool,
     status: bool,
     rollback: bool,
@@ -303,8 +295,8 @@ def deploy(
 ) -> None:
     """Put the newest result of each robot in a registry onto the robot, one after the other.
 
-    Stops at the first robot that fails: not reached, not written, result refused, command failed, or --check
-    contradicts. Run it again to continue; robots that hold their result are not written again. To pass over a
+    Stops at the first robot that fails: not reached, not written, result refused, or command failed. Run it
+    again to continue; robots that hold their result are not written again. To pass over a
     robot, use --where. Robots whose newest session failed are left out. Exits with 7 if it was stopped.
     """
     from lce_rig.fleet.registry import Registry
@@ -320,7 +312,7 @@ def deploy(
             table.add_row(*map(show.escape, (robot, state.folder, state.detail)))
         show.print_table(table)
         return
-    robots = FleetDeployment(Registry(Storage.at(registry)), target, targets, check)
+    robots = FleetDeployment(Registry(Storage.at(registry)), target, targets)
     with show.progress_bar("robots") as progress:
         if status:
             rollout = robots.status(newest, progress=progress)

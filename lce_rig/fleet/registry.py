@@ -34,7 +34,6 @@ from lce_rig.session.durable import replacing, write_atomically
 
 TABLE, ROWS = "fleet.parquet", "fleet.json"
 Status: TypeAlias = Literal["ok", "failed", "timed_out", "crashed", "out_of_memory"]
-STATUSES: tuple[Status, ...] = ("ok", "failed", "timed_out", "crashed", "out_of_memory")
 Row: TypeAlias = dict[str, Any]
 """Values by column; a column that is absent or None is not known. docs/fleets.md describes the columns."""
 

@@ -5,9 +5,6 @@ continues after an interrupt, and a rollback restores what such robots held befo
 """
 
 import hashlib
-import re
-import shlex
-import subprocess
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -16,11 +13,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, TypeAlias
 
-from lce_rig.core.errors import CommandError, LceRigError, NotEnoughDataError, UsageError
+from lce_rig.core.errors import CommandError, LceRigError, UsageError
 from lce_rig.core.progress import Progress, silent
 from lce_rig.fleet import deployment
 from lce_rig.fleet.jobs import folder_name
-from lce_rig.fleet.place import run_bounded
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.releases import read_targets
 from lce_rig.pipeline.result_files import RESULT
@@ -29,8 +25,6 @@ from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session.session import PROFILE
 
 State: TypeAlias = Literal["waiting", "in_place", "left_out", "failed", "rolled_back", "not_rolled_back"]
-_CHECK_LIMIT_S = 1800.0
-_MOST_SAID = 2000
 _COLUMNS = ("robot", "folder", "date", "finished", "status", "verdict", "cause")
 
 
@@ -45,7 +39,7 @@ class RobotState:
         to: the place of its files.
         release: the release that is current there; "" if there is none or it was not asked.
         replaces: the release that it replaced; "" if there was none.
-        detail: cause and action, or the output of a check.
+        detail: cause and action.
     """
 
     robot: str
@@ -116,21 +110,13 @@ class FleetDeployment:
         registry: with the results.
         target: name of the target in the file; `{robot}` in its `to` stands for each robot's name.
         file: that lists targets.
-        check: program and arguments run on this computer after each deployment, without a shell; `{robot}`,
-            `{result}` and `{to}` are filled in. Its exit code 7 contradicts the result, 6 cannot tell, as of
-            `drift`.
-
     Raises:
-        UsageError: the target's name, or the check, cannot be used.
+        UsageError: there is no target of this name.
         ProfileError: the file with the targets is invalid.
     """
 
-    def __init__(self, registry: Registry, target: str, file: Path, check: str = "") -> None:
+    def __init__(self, registry: Registry, target: str, file: Path) -> None:
         self._registry, self._name = registry, target
-        try:
-            self._check = shlex.split(check)
-        except ValueError as error:
-            raise UsageError(f"--check {check!r}: {error}", "Close the quotes.") from error
         targets = read_targets(file)
         if target not in targets:
             raise UsageError(f"no target is called {target!r}", f"Known targets: {', '.join(targets)}.")
@@ -212,7 +198,7 @@ class FleetDeployment:
         return state.ended("in_place")
 
     def _deploy(self, state: RobotState, target: TargetSettings) -> RobotState:
-        """Deploy to a robot, and run the check, if there is one."""
+        """Deploy to a robot."""
         with TemporaryDirectory(prefix="lce-rig-") as scratch:
             place, folder = self._registry.place / state.folder, Path(scratch) / "result"
             place.fetch(folder)
@@ -223,18 +209,4 @@ class FleetDeployment:
                     state = self._ask(state, target)
                 return state.ended("failed", error)
             state = replace(state, release=done.release.name, replaces=done.replaces)
-            return self._checked(state, folder) if self._check else state.ended("in_place")
-
-    def _checked(self, state: RobotState, folder: Path) -> RobotState:
-        values = {"{robot}": state.robot, "{result}": str(folder / RESULT), "{to}": state.to}
-        words = [re.sub(r"\{(robot|result|to)\}", lambda name: values[name[0]], word) for word in self._check]
-        try:
-            ran = run_bounded(words, _CHECK_LIMIT_S)
-        except (OSError, subprocess.TimeoutExpired) as error:
-            return state.ended("failed", f"the check cannot run: {error}")
-        output = (ran.out + ran.err).strip()[-_MOST_SAID:]
-        if ran.code == 0:
             return state.ended("in_place")
-        if ran.code == NotEnoughDataError.exit_code:
-            return state.ended("in_place", f"the check cannot tell: {output}")
-        return state.ended("failed", f"the check ended with exit code {ran.code}: {output}")
