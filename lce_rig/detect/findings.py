@@ -226,6 +226,12 @@ LIDAR_TOO_THICK = Kind(
     "the board moved during the scan or is not flat",
     "hold the board still, or put it on a stand",
 )
+LIDAR_SMEARED = Kind(
+    "lidar.smeared",
+    "border of the board at {distance_m:.1f} m smeared by {smear_m:mm} (limit {max_smear_m:mm}): "
+    "board or LiDAR moved while scans were accumulated",
+    "keep board and LiDAR still for each placement",
+)
 LIDAR_TOUCHING = Kind(
     "lidar.touching",
     "the board at {distance_m:.1f} m touches another surface: "

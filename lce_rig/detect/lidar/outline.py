@@ -25,11 +25,12 @@ _OUTLIERS = 0.02
 _BAND_M = 0.10
 # Blurs of the first rounds, which catch a start that is off; wider ones for a plate that is only about there.
 _ANNEALED_M, _WIDE_M = (0.04, 0.02), (0.2, 0.2, 0.15, 0.1, 0.1, 0.06, 0.06, 0.04)
-_FEW_RAYS, _MOST_RAYS = 800, 15_000
+_FEW_RAYS, _SMEAR_RAYS, _MOST_RAYS = 800, 4_000, 15_000
 _ROUNDS = 12
 STRIP_M = 0.07
 """Length of border whose place is measured on its own."""
 _CORNER_M = 0.04
+_SMEARS_M = np.array([0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.045, 0.06])
 _OFFSETS_M, _LEAST_SIGMA_M = np.linspace(-0.05, 0.05, 41), 0.001
 
 
@@ -148,6 +149,29 @@ def register_rays(rays: Rays, half_m: tuple[float, float], n_best: int = 2) -> l
             share = float(misses / max(np.count_nonzero(on & (distance <= 0.02)), 1))
             placements.append(replace(fit.placement, error_m=share))
     return sorted(placements, key=lambda placement: placement.error_m)[:n_best]
+
+
+def measure_smear(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> float:
+    """Measure how far the border is smeared along width or height, m: a blur beyond that of the beam.
+
+    A plate that moved in its plane while scans were accumulated has sharp edges nowhere.
+
+    Args:
+        rays: about the plate.
+        outline: fitted to them.
+        blur_m: as of `fit_outline`.
+    """
+    placement = outline.placement
+    near = rays.select(np.abs(placement.distance_m(rays.uv)) < _BAND_M)
+    near = near.select(np.arange(len(near.uv)) % (1 + len(near.uv) // _SMEAR_RAYS) == 0)
+    local, half = placement.local(near.uv), np.array(placement.half_m) + outline.growth_m
+    cosine, sine = np.cos(placement.angle_rad), np.sin(placement.angle_rad)
+    beam_m = blur_m(np.array([[cosine, sine], [-sine, cosine]]))
+    smears = []
+    for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0])):
+        ps = (_probability(local, half, np.hypot(beam_m, smear * axis))[0] for smear in _SMEARS_M)
+        smears.append(int(np.argmax([np.sum(np.log(np.where(near.is_on, p, 1 - p))) for p in ps])))
+    return float(_SMEARS_M[max(smears)])
 
 
 def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:

@@ -19,6 +19,7 @@ from lce_rig.detect.findings import (
     LIDAR_NOTHING_WHERE_EXPECTED,
     LIDAR_OTHER_PLATE,
     LIDAR_OUT_OF_VIEW,
+    LIDAR_SMEARED,
     LIDAR_TOO_FEW_POINTS,
     LIDAR_TOUCHING,
     LIDAR_TURNED,
@@ -30,6 +31,7 @@ from lce_rig.detect.lidar.outline import (
     Rays,
     Strips,
     fit_outline,
+    measure_smear,
     measure_strips,
     register_rays,
 )
@@ -74,6 +76,8 @@ _MOST_MISSES, _MOST_GROWTH_M = 0.35, 0.04
 _COARSE_M, _FINE_M, _LEAST_MEAN_M, _MIN_CELL_RETURNS = 0.25, 0.10, 0.002, 3
 _TOUCHED_SHARE = 0.2
 _STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
+# Of boards that stood still, 5 mm at most on recordings.
+_MOST_SMEAR_M = 0.008
 # Fewer located places on upright or on level edges, or fewer means on the plate, leave its pose open.
 _MIN_STRIPS, _MIN_MEANS = 2, 10
 
@@ -447,6 +451,9 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     if hidden > _HIDDEN_SHARE:
         return LIDAR_HIDDEN.refusal(distance_m=distance_m, hidden_share=hidden)
     rays = view.rays(placement.half_m, placement)
+    smear_m = measure_smear(rays, outline, view.blur_m)
+    if smear_m > _MOST_SMEAR_M:
+        return LIDAR_SMEARED.refusal(distance_m=distance_m, smear_m=smear_m, max_smear_m=_MOST_SMEAR_M)
     strips = measure_strips(rays, outline, view.blur_m)
     # A strip that lies elsewhere than its neighbours shows what touches the border, or hides it.
     is_good = (strips.sigma_m < _STRIP_SIGMA_M) & (
