@@ -44,6 +44,10 @@ PARTS: dict[str, tuple[str, Part]] = {
         "extrinsics checked without a board, on recordings by others",
         lambda bench, a: bench(min(a.splits, 2), a.only),
     ),
+    "scene_without_rings": (
+        "the same for KITTI's clouds and a simulated Mid-360",
+        lambda bench, a: bench(a.seeds or 20, a.only),
+    ),
     "scene_sharpen": (
         "boards and scene in one estimate: simulated rooms, recordings",
         lambda bench, a: bench(a.seeds or 100, min(a.splits, 10), a.only),

@@ -1,20 +1,24 @@
 """`drift` and the scene's opinion with a LiDAR that scans in no rings, against a simulated room's truth."""
 
 import json
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lce_rig.cli.main import run
-from lce_rig.core.geometry import perturb
+from lce_rig.core.geometry import exp_so3, perturb, pose
 from lce_rig.pipeline.detect_session import detect
+from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.pipeline.witness import hear_scene
+from lce_rig.rig import load_rig
 from lce_rig.scene.alignment import AXES
 from lce_rig.scene.drift import watch
 from lce_rig.scene.views import build_view
 from lce_rig.session import Session
 from lce_rig.simulate import simulate_captures, truth_extrinsics
-from tests.saved_results import write_result
+from tests.saved_results import made_calibration, result_file, write_result
 from tests.scene.conftest import Seen, deployed, small_rig
 
 SEED = 3
@@ -64,3 +68,45 @@ def test_drift_and_calibrate_hear_the_scene_beside_the_boards(seen, tmp_path, ca
     assert pair["n_edges"] > 300 and pair["scene_state"] != "changed"
     session = Session.open(tmp_path / "room")
     assert hear_scene(session, detect(session), seen.truth).state in ("agrees", "unknown")
+
+
+KITTI = Path(__file__).parents[1] / "rigs" / "kitti.yaml"
+
+
+@pytest.fixture(scope="module")
+def drives(recordings):
+    """KITTI's views, with their trusted extrinsics as a result of 3 mm, 0.03 deg."""
+    folder = recordings / "kitti_drives"
+    trusted = json.loads((folder / "gt.json").read_text())["extrinsics"]
+    w, *v = trusted["rotation"]
+    turn = 2 * np.arctan2(np.linalg.norm(v), w) * np.array(v) / np.linalg.norm(v)
+    T = pose(exp_so3(turn), np.array(trusted["translation"]))
+    rig = load_rig(str(KITTI))
+    c = made_calibration(T, np.diag([0.003] * 3 + [0.0005] * 3) ** 2)
+    captures = SceneCaptures(rig, result_file(rig.name, [c]), str(folder))
+    captures.take_recordings([folder], lambda done, of: None)
+    return Seen(rig, [], c, [build_view(rig, c, k.name, k.image, k.scan) for k in captures.kept[0]])
+
+
+@pytest.mark.dataset
+@pytest.mark.parametrize("axis", [None, *range(6)])
+def test_drives_have_no_false_alarm_and_1_deg_or_20_cm_is_never_called_unchanged(drives, axis) -> None:
+    for views in list(combinations(drives.views, 3))[::7]:
+        three = drives._replace(views=list(views))
+        if axis is None:
+            assert judge(three).state != "changed"
+            continue
+        for sign in (-1, 1):
+            size = sign * (0.2 if axis < 3 else np.radians(1.0))
+            drift = judge(three, size * np.eye(6)[axis])
+            assert drift.state == "changed" or (axis == 5 and drift.state == "unknown")
+
+
+@pytest.mark.dataset
+def test_drift_reads_a_folder_of_drives(drives, recordings, tmp_path, capsys) -> None:
+    write_result(tmp_path / "result.json", drives.rig.name, [drives.truth])
+    result, folder = str(tmp_path / "result.json"), str(recordings / "kitti_drives")
+    words = ["drift", folder, "--rig", str(KITTI), "--result", result]
+    assert run([*words, "--json"]) == 0
+    (pair,) = json.loads(capsys.readouterr().out)["pairs"]
+    assert pair["n_captures"] == 7 and pair["state"] == "unchanged"
