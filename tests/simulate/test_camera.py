@@ -64,26 +64,6 @@ def test_rays_through_pixels_project_back_onto_them(model: str) -> None:
     assert np.abs(pixels - np.stack([u, v], axis=-1))[is_valid].max() < 2e-3
 
 
-def test_the_outer_square_at_the_top_left_is_dark(room: Room, board: Board, backdrop: Backdrop) -> None:
-    T = placed(1.3, 0.0, 0.0, 0.0, 0.0)
-    picture = render_image(
-        Scene(room.raycaster, [], board, T), backdrop, PERFECT, np.random.default_rng(0)
-    ).grey
-    square = board.square_m
-    columns, rows = np.meshgrid(np.arange(board.cols + 1), np.arange(board.rows + 1))
-    middles = np.stack(
-        [(columns - board.cols / 2) * square, (board.rows / 2 - rows) * square, 0 * columns], axis=-1
-    )
-    pixels, _ = backdrop.intrinsics.project(
-        transform(invert(backdrop.T_world_cam) @ T, middles.reshape(-1, 3))
-    )
-    u, v = np.rint(pixels).astype(int).T
-    value = picture[v, u].reshape(columns.shape)
-    is_dark = (columns + rows) % 2 == 0
-    assert value[is_dark].max() < 80 < 120 < value[~is_dark].min()
-    assert (u[-1], v[-1]) > (u[0], v[0]), "the print reads from left to right, top to bottom"
-
-
 def test_noise_follows_shot_and_read_noise(room: Room, board: Board, backdrop: Backdrop) -> None:
     scene = Scene(room.raycaster, [], board, PLACEMENTS[0])
     noise = CameraNoise(blur_px=0.0, vignetting=0.0)
