@@ -83,7 +83,8 @@ class SceneCaptures:
         of_cameras = tuple(c for c in result.pairs if not c.is_of_lidars)
         if not of_cameras:
             raise SessionError(
-                "the result is of LiDARs alone", "Compare two sessions: `lce-rig verify --result`."
+                "the result is of LiDARs alone",
+                "Compare two sessions: `lce-rig verify SESSION --result FILE`.",
             )
         for c in of_cameras:
             if c.camera not in rig.cameras or c.lidar not in rig.lidars:
