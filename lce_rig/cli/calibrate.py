@@ -273,9 +273,9 @@ def calibrate(
     if not no_report:
         with show.progress_bar("drawing the report"):
             result.write_report(name=name)
-    n_others, page = len(written.files) - 1, "" if no_report else ", report.html"
-    others = f", {n_others} for the robot" if n_others else ""
-    show.note(f"  files        {written.files[0].parent}/: result.json{page}{others}")
+    files = [] if no_report else ["report.html"]
+    files += [f"{len(written.files) - 1} for the robot"] if len(written.files) > 1 else []
+    show.note(f"  files        {written.files[0].parent}/ ({', '.join(files) or 'result.json'})")
     if any(finding.code == GUIDE_ADD.code for c in result.pairs for finding in c.findings):
         show.note(f"  next         {_collect_command(opened)}")
     elif all(c.verdict != "fail" for c in result.pairs):

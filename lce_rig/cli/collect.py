@@ -10,6 +10,7 @@ from lce_rig.cli import show
 from lce_rig.cli.collect_live import run_live, show_next
 from lce_rig.cli.options import FiniteRange, require_sensors, robot_option
 from lce_rig.cli.simulate import require_kind
+from lce_rig.collect.findings import IMAGE_NONE
 from lce_rig.collect.live.guide import predict
 from lce_rig.collect.offline import CollectOptions
 from lce_rig.core.errors import NotEnoughDataError, UsageError
@@ -203,7 +204,11 @@ def collect(
     _tell(report, session, n_captures)
     if n_captures == 0:
         hint = "Hold the board still for 1 s in view of both sensors, and check that their clocks agree."
-        if report.has_events:
+        if report.refused and all(why.code == IMAGE_NONE.code for why in report.refused.values()):
+            hint = (
+                "Compare `board` in the profile with an image: count inner corners, or squares with markers."
+            )
+        elif report.has_events:
             hint = "Move the board slowly, about 10 cm/s, in view of both sensors; the causes are above."
         raise NotEnoughDataError(f"{session}: no capture from {', '.join(map(str, paths))}", hint)
     show_next(session, rig, predict(Session.open(session)), n_captures)

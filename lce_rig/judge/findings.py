@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 from lce_rig.core.calibration import WeakestMotion
-from lce_rig.core.findings import Finding, Kind, Severity, worst
+from lce_rig.core.findings import Figure, Finding, Kind, Severity, worst
 from lce_rig.core.phrasing import figures_apart, fill
 
 Verdict = Literal["pass", "marginal", "fail"]
@@ -149,27 +149,36 @@ def _size(finding: Finding, name: str, sign: str = "") -> str:
     return f"{1000 * finding.figure(f'{name}_m'):{sign}.1f} mm"
 
 
+def _correction(q: Mapping[str, Figure]) -> str:
+    """State by how much pixels move and the camera turns, where that is significant."""
+    parts = [
+        fill(text, q)
+        for name, text in (
+            ("is_bent", "{displacement_px:.1f} +- {displacement_sigma_px:.1f} px"),
+            ("is_turned", "{turn_deg:.2f} +- {turn_sigma_deg:deg}"),
+        )
+        if q[name]
+    ]
+    return f" by {', '.join(parts)}" if parts else ""
+
+
 def _intrinsics(finding: Finding) -> str:
     """Intrinsics do not fit: {rms_px}, {possible_px}, {displacement_px}, {turn_deg}, {focal_ratio}."""
     q = finding.figures
-    parts = ["corners fit, but only with wrong board poses"]
-    if q["is_visible"]:
-        parts = [fill("reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px", q)]
-    displacement_px = q["displacement_px"]
-    if not isinstance(displacement_px, float) or not math.isfinite(displacement_px):
-        parts.append("they project to no pixels where boards were seen")
-    elif q["is_bent"]:
-        parts.append(fill("pixels displaced by {displacement_px:.1f} +- {displacement_sigma_px:.1f} px", q))
-    if q["is_turned"]:
-        parts.append(fill("that alone rotates the extrinsics by {turn_deg:.2f} +- {turn_sigma_deg:deg}", q))
-    if q["is_focal_off"]:
-        percent, sigma = 100 * (finding.figure("focal_ratio") - 1), 100 * finding.figure("focal_sigma")
-        larger = "larger" if percent > 0 else "smaller"
-        parts.append(f"focal length {abs(percent):.1f} +- {sigma:.1f} % {larger}")
     if finding.severity == "note":
-        return f"the boards correct the profile's intrinsics: {'; '.join(parts[1:]) or parts[0]}"
-    how = "do not fit" if finding.severity == "error" else "fit only roughly"
-    return f"the profile's intrinsics {how}: {'; '.join(parts)}"
+        return f"the boards correct the profile's intrinsics{_correction(q)}"
+    fit = "do not fit" if finding.severity == "error" else "fit only roughly"
+    displacement_px, correction = q["displacement_px"], _correction(q)
+    if not isinstance(displacement_px, float) or not math.isfinite(displacement_px):
+        reason = "they project to no pixels where boards were seen"
+    elif correction:
+        reason = f"off{correction}"
+    elif q["is_visible"]:
+        reason = fill("reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px", q)
+    else:
+        percent, sigma = 100 * (finding.figure("focal_ratio") - 1), 100 * finding.figure("focal_sigma")
+        reason = f"focal length {abs(percent):.1f} +- {sigma:.1f} % {'larger' if percent > 0 else 'smaller'}"
+    return f"the profile's intrinsics {fit}: {reason}"
 
 
 def _reach(finding: Finding) -> str:
@@ -185,10 +194,8 @@ def _scale(finding: Finding) -> str:
     """Camera distances differ by {scale} +- {scale_sigma}: squares {square_m}, not {profile_square_m}."""
     scale, sigma = 100 * finding.figure("scale"), 100 * finding.figure("scale_sigma")
     squares = fill("squares of {square_m:1mm}, not {profile_square_m:1mm}", finding.figures)
-    return (
-        f"camera distances are {abs(scale):.1f} +- {sigma:.1f} % {'longer' if scale > 0 else 'shorter'} than "
-        f"the LiDAR's: {squares}, or another lens"
-    )
+    side = "far" if scale > 0 else "near"
+    return f"{squares}, or another lens: boards {abs(scale):.1f} +- {sigma:.1f} % too {side}"
 
 
 def _largest_cause(finding: Finding) -> str:

@@ -52,7 +52,7 @@ BOARDS_MUST_STAND = _note(
         "see_lines": "see the lines of these sensors and of the sync board",
     },
 )
-NO_BOARD = _warning("sync.no_board", "no sync board synchronises cameras and LiDAR", actions={"named": ""})
+NO_BOARD = _warning("sync.no_board", "no sync board", actions={"named": ""})
 NONE_IN_PROFILE = _warning("sync.none_in_profile", "{key} is none", actions={"named": ""})
 NOT_TIED = _warning(
     "sync.not_tied",
