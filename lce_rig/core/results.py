@@ -68,7 +68,7 @@ class LidarQuality:
         width_sigma_m, height_sigma_m: standard deviation of these.
         size_ratio: both sides together over the nominal ones.
         n_rings, n_points: on the plate.
-        n_ring_ends: at its outline.
+        n_ring_ends: at its outline; without rings, pieces of the border of about 7 cm that were located.
         n_ring_ends_dropped: that do not fit the outline.
         plane_rms_m: rms of the points' distances from the plane.
         edge_rms_m: of the ring ends' distances from the outline; NaN without ring ends.
