@@ -14,7 +14,6 @@ stray  anything else (the neighbouring ray hit an object just behind the board),
 """
 
 from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 
@@ -98,8 +97,11 @@ def edge_system(
         J = edges.rows[:, :-1]
         weighted = np.concatenate([J * weight[:, None], score[:, None]], axis=1)
         bounds = np.flatnonzero(np.diff(edges.group, prepend=-1, append=-1))
-        groups = edges.group[bounds[:-1]]
-        system[groups, :-1] = [J[a:b].T @ weighted[a:b] for a, b in pairwise(bounds.tolist())]
+        groups, counts = edges.group[bounds[:-1]], np.diff(bounds)
+        # A ring has two ends on a board, and more where it is hidden in part.
+        for n in np.unique(counts).tolist():
+            at = bounds[:-1][counts == n, None] + np.arange(n)
+            system[groups[counts == n], :-1] = np.swapaxes(J[at], 1, 2) @ weighted[at]
         system[groups, -1, :-1] = system[groups, :-1, -1]
         system[groups, -1, -1] = np.add.reduceat(value, bounds[:-1])
     return system.reshape(n_captures, edges.n_rings, size, size)

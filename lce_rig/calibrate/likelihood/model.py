@@ -145,11 +145,16 @@ class Reduced:
         """
         z, y = self.step
         F, G = len(y), len(z)
-        by_z = np.concatenate([-self.own_steps[:, :, :G], np.broadcast_to(np.eye(G), (F, G, G))], axis=1)
+        own, common, by_z = slice(0, OWN.size), slice(OWN.size, -1), -self.own_steps[:, :, :G]
         v = np.column_stack([y, np.broadcast_to(np.append(z, 1.0), (F, G + 1))])
         moments = v[:, :, None] * v[:, None, :]
-        moments[:, :-1, :-1] += by_z @ np.linalg.inv(self.cost.information) @ np.swapaxes(by_z, 1, 2)
-        moments[:, : OWN.size, : OWN.size] += self.trust[:, None, None] * np.linalg.inv(self.of_own)
+        cov = np.linalg.inv(self.cost.information)
+        cross = by_z @ cov
+        moments[:, common, common] += cov
+        moments[:, own, common] += cross
+        moments[:, common, own] += np.swapaxes(cross, 1, 2)
+        moments[:, own, own] += cross @ np.swapaxes(by_z, 1, 2)
+        moments[:, own, own] += self.trust[:, None, None] * np.linalg.inv(self.of_own)
         return np.asarray(moments)
 
 
