@@ -32,7 +32,7 @@ _MOUNTING = (
 @click.option(
     "--type",
     "kind",
-    type=click.Choice(list(KEYS_OF_TYPE)),
+    type=click.Choice([kind for kind, keys in KEYS_OF_TYPE.items() if keys]),
     default="checkerboard",
     show_default=True,
     help="Choose the pattern.",

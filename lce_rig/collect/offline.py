@@ -171,6 +171,11 @@ class _Collector:
             SourceError: it lacks a LiDAR or a camera, or their clocks do not overlap; or it is torn: what
                 came before has been captured.
         """
+        if not self._session.rig.cameras:
+            raise SourceError(
+                f"{recording.path}: collect needs a camera that sees the board, and the rig has none",
+                "Add placements from Python: `session.add_capture([], scans, {})` (docs/own-rig.md).",
+            )
         require_sensors(recording)
         options = self._options
         known = Placements(options.min_move_m, options.min_turn_deg)

@@ -115,7 +115,7 @@ def choose_topics(
     failures = []
     for is_lidar, what in enumerate(("images", "point clouds")):
         of_kind = [target for target in targets if (target.channel is None) == is_lidar]
-        if set(of_kind) & set(chosen.values()):
+        if not of_kind or set(of_kind) & set(chosen.values()):
             continue
         target, profile_topic = of_kind[0], targets[of_kind[0]]
         # Packets are read where a driver's point clouds of them were not recorded.
