@@ -204,7 +204,7 @@ def collect(
     _tell(report, session, n_captures)
     if n_captures == 0:
         hint = "Hold the board still for 1 s in view of both sensors, and check that their clocks agree."
-        if report.refused and all(why.code == IMAGE_NONE.code for why in report.refused.values()):
+        if [why.code for why, _ in report.counts.counts()] == [IMAGE_NONE.code]:
             hint = (
                 "Compare `board` in the profile with an image: count inner corners, or squares with markers."
             )
