@@ -110,9 +110,6 @@ def _differences(comparison: Repeatability) -> Any:
 def _lines(comparison: Repeatability, session: str) -> list[str]:
     """State whether the sessions agree, the mean extrinsics, and the spread with the reported one."""
     c = comparison
-    scatter = ""
-    if c.scatter_rotation_deg is not None and c.scatter_translation_m is not None:
-        scatter = f" (independent {c.scatter_rotation_deg:.3f} deg, {1000 * c.scatter_translation_m:.1f} mm)"
     shared = "" if c.are_independent else ", at least: the results share captures"
     colour = "green" if c.agrees else "red"
     lines = [f"[bold]{_sensors(c)}[/]: [{colour}]{show.escape(as_line(c.finding.text))}[/]"]
@@ -124,8 +121,7 @@ def _lines(comparison: Repeatability, session: str) -> list[str]:
         *show.matrix_lines(c.T_cam_lidar, "    "),
         f"  spread       {c.spread_rotation_deg:.3f} deg, {1000 * c.spread_translation_m:.1f} mm "
         "(1 sigma of one session)",
-        f"  reported     {c.reported_rotation_deg:.3f} deg, {1000 * c.reported_translation_m:.1f} mm"
-        + scatter,
+        f"  reported     {c.reported_rotation_deg:.3f} deg, {1000 * c.reported_translation_m:.1f} mm",
         f"  chance       {significant(c.p)}{shared} (chi2 {c.chi2:.1f}, {c.dof} degrees of freedom)",
     ]
 

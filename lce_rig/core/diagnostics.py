@@ -33,13 +33,6 @@ class Diagnostics:
     edge_shift_echo_m: float = _NONE
     edge_shift_blended_m: float = _NONE
     edge_shift_blended_echo_m: float = _NONE
-    best_subset_size: float = _NONE  # captures in the subsets of Algorithm 1 that fit held-out captures best
-    n_solved: float = _NONE  # subsets that were solved
-    certified_share: float = _NONE  # 0..1 of them that are proven to be global minima
-    draw_mean_offset_deg: float = _NONE  # how far the mean of the best subsets lies from the result
-    draw_mean_offset_m: float = _NONE
-    draw_spread_rotation_deg: float = _NONE  # how far these subsets lie from their mean, rms
-    draw_spread_translation_m: float = _NONE
     algorithm_1_offset_deg: float = _NONE  # how far the joint estimate lies from Algorithm 1's
     algorithm_1_offset_m: float = _NONE
     covariance_inflation: float = _NONE  # of the joint estimate's covariance, from leave-one-out results

@@ -103,12 +103,6 @@ def significant(value: float, digits: int = 2) -> str:
 _SMALLEST = 0.0001
 
 
-def figures_apart(value: float, limit: float) -> tuple[str, str]:
-    """Print a figure and its limit with two significant digits, or as many as show that they differ."""
-    texts = [(significant(value, 2 + more), significant(limit, 2 + more)) for more in range(_MOST_DIGITS)]
-    return next((each for each in texts if each[0] != each[1]), texts[-1])
-
-
 def captures_to_add(n_captures: Any, is_enough: Any, groups: Any) -> str:
     """Say how many captures to add, where to stand and how to tilt the board.
 

@@ -28,7 +28,6 @@ from lce_rig.core.results import Observation
 from lce_rig.judge.findings import (
     CAMERAS_DIFFER,
     CAMERAS_EXCHANGED,
-    CAMERAS_SCATTER,
     SURPRISING_CHI2,
     failing,
 )
@@ -43,8 +42,6 @@ _MIN_PLACEMENTS = 4
 _MIN_JACKKNIFE = 10
 # Degrees of freedom of the Student distribution that weights single boards, as some may be outliers.
 _STUDENT = 5.0
-# Scatter of boards above this multiple of the typical value has a cause.
-_MAX_SCATTER = 2.0
 # Exchanged cameras fit the nominal poses better by at least this, a likelihood ratio of 400.
 _EXCHANGED_CHI2 = 12.0
 
@@ -264,9 +261,7 @@ def camera_findings(
     halves = contrast_halves(pair.from_images.expansion, pair.from_images.centres)
     cameras = " to ".join(names)
     findings = split_findings(halves, pair.from_images.captures, target, strict, cameras)
-    scatter, images_rms_m = pair.from_images.scatter, pair.from_images.board_rms_m
-    if scatter > _MAX_SCATTER and images_rms_m > limits.max_plane_misfit_m:
-        findings.append(CAMERAS_SCATTER(cameras, rms_m=images_rms_m, scatter=scatter))
+    images_rms_m = pair.from_images.board_rms_m
     rotation_deg, translation_m = tangent_sizes(pair.apart)
     excess = target.in_targets(rotation_deg, translation_m) / limits.max_camera_difference
     if pair.surprise > SURPRISING_CHI2 and excess > 1:

@@ -6,13 +6,13 @@ from typing import Literal
 
 from lce_rig.core.calibration import WeakestMotion
 from lce_rig.core.findings import Figure, Finding, Kind, Severity, worst
-from lce_rig.core.phrasing import figures_apart, fill
+from lce_rig.core.phrasing import fill
 
 Verdict = Literal["pass", "marginal", "fail"]
 SURPRISING_CHI2 = 16.81
 """99 % of the chi-squared distribution with six degrees of freedom: differences beyond it are significant."""
 _OF_DISTANCES = (
-    "verdict.two_groups verdict.shares_differ verdict.camera_shares_differ "
+    "verdict.two_groups verdict.shares_differ "
     "verdict.plane_residual verdict.edge_residual verdict.rotation_uncertain "
     "verdict.translation_uncertain verdict.scene verdict.scene_not_used "
 )
@@ -185,8 +185,8 @@ def _reach(finding: Finding) -> str:
     """The session covers {covered}, determines pixels near the border to {image_sigma_px}, {limit_px}."""
     sigma_px, known = finding.figures["image_sigma_px"], "does not determine pixels near its border"
     if isinstance(sigma_px, float) and math.isfinite(sigma_px):
-        sigma_text, limit_text = figures_apart(sigma_px, finding.figure("limit_px"))
-        known = f"determines pixels near its border to {sigma_text} px (limit {limit_text} px)"
+        known = "determines pixels near its border to {image_sigma_px:.2f} px (limit {limit_px:.2f} px)"
+        known = fill(known, finding.figures)
     return f"the session covers {100 * finding.figure('covered'):.0f} % of the image and {known}"
 
 
@@ -409,19 +409,6 @@ CAMERA_CHANGED = Kind(
     "verdict.camera_changed",
     "{subject}: relative pose from the images changes significantly at capture {capture}, by " + _APART,
     "fasten the cameras, one may have moved, and collect again",
-)
-CAMERA_SHARES_DIFFER = Kind(
-    "verdict.camera_shares_differ",
-    "{subject}: relative poses from images of {first} and {second} boards differ significantly, by " + _APART,
-    _LENS,
-    actions=_NEAR,
-)
-CAMERAS_SCATTER = Kind(
-    "verdict.cameras_scatter",
-    "{subject}: board positions from the images differ by {rms_m:mm} rms for any relative pose "
-    "({scatter:.1f} times the typical value)",
-    "hold the board still between the images and check the intrinsics",
-    severity="warning",
 )
 CAMERAS_EXCHANGED = Kind(
     "verdict.cameras_exchanged",

@@ -25,7 +25,7 @@ from lce_rig.judge.findings import (
     failing,
 )
 from lce_rig.lens.calibrate_lens import CONTRADICTION, distances_under, estimate_intrinsics
-from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses, lens_errors
+from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import model_of
 
@@ -66,9 +66,6 @@ class IntrinsicsCheck:
         covered: share of the image in which boards were seen.
         image_sigma_px: standard deviation of the fitted intrinsics, as `LensCertainty.image_sigma_px`.
         surprise: of the fitted intrinsics, as `IntrinsicsEstimate.surprise`.
-        errors: (4,) of the given intrinsics, as `Intrinsics.differentiate_by_errors`; None if they project
-            too little.
-        errors_cov: (4, 4) of these.
     """
 
     n_captures: int
@@ -85,8 +82,6 @@ class IntrinsicsCheck:
     covered: float
     image_sigma_px: float
     surprise: float | None = None
-    errors: tuple[float, ...] | None = None
-    errors_cov: tuple[tuple[float, ...], ...] | None = None
 
     def verdict(self, target_deg: float = 0.2) -> Verdict:
         """Judge the given intrinsics; they pass unless significantly different from the fitted ones.
@@ -172,10 +167,6 @@ def compare_with_given(
     by_focal = np.zeros(fitted.model.size)
     by_focal[:2] = 0.5 / given_focal
     certainty = certainty_of(fitted.intrinsics, corners_px, fitted.cov, fitted.model)
-    errors, errors_cov = None, None
-    with suppress(ValueError):
-        found, cov = lens_errors(intrinsics, fitted.intrinsics, corners_px, fitted.cov, fitted.model)
-        errors, errors_cov = tuple(found.tolist()), tuple(map(tuple, cov.tolist()))
     n_captures, chance = len({view.capture for view in fitted.views}), None
     with suppress(ValueError):
         # All parameters at once by the F distribution, as the deviations come from few captures.
@@ -199,8 +190,6 @@ def compare_with_given(
         covered=certainty.covered,
         image_sigma_px=certainty.image_sigma_px,
         surprise=fitted.surprise,
-        errors=errors,
-        errors_cov=errors_cov,
     )
     return check, difference
 
@@ -257,7 +246,7 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
     """
     judgement = judge_lens(check.covered, check.image_sigma_px, check, target_deg)
     figures: dict[str, Any] = {
-        **{name: value for name, value in asdict(check).items() if not name.startswith("errors")},
+        **asdict(check),
         **judgement.figures,
         "is_visible": check.rms_px >= _VISIBLE * check.possible_px,
         "is_bent": check.is_bent,

@@ -1,6 +1,6 @@
 """Compare calibrations of one rig with their reported uncertainties."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -53,8 +53,6 @@ class Repeatability:
         deviations: (K, 6) tangents from the mean to each, translation m, rotation rad.
         spread_rotation_deg, spread_translation_m: standard deviation of one calibration, from these.
         reported_rotation_deg, reported_translation_m: the same as reported by the calibrations, rms.
-        scatter_rotation_deg, scatter_translation_m: the part of it that is independent between sessions; None
-            if a calibration does not report it. All share the rest, constant errors of the LiDAR.
         chi2: least sum of squared distances from one common extrinsic, in units of the reported covariances.
         dof: its mean if these are right.
         p: probability that correct calibrations spread this far or farther.
@@ -73,8 +71,6 @@ class Repeatability:
     spread_translation_m: float
     reported_rotation_deg: float
     reported_translation_m: float
-    scatter_rotation_deg: float | None
-    scatter_translation_m: float | None
     chi2: float
     dof: int
     p: float
@@ -182,8 +178,6 @@ def compare_calibrations(
             if _tail(_spread(T[rest], cov[rest]), 6 * (len(names) - 2)) >= _CHANCE:
                 blamed.append(name)
     first = calibrations[names[0]]
-    scatter_deg = _rms([c.diagnostics.sigma_scatter_rotation_deg for c in calibrations.values()])
-    scatter_m = _rms([c.diagnostics.sigma_scatter_translation_m for c in calibrations.values()])
     spread = np.sum(deviations**2, axis=0) / (len(names) - 1)
     return Repeatability(
         names=names,
@@ -195,8 +189,6 @@ def compare_calibrations(
         spread_translation_m=float(np.sqrt(spread[:3].sum())),
         reported_rotation_deg=float(np.degrees(np.sqrt(np.mean(np.trace(cov[:, 3:, 3:], axis1=1, axis2=2))))),
         reported_translation_m=float(np.sqrt(np.mean(np.trace(cov[:, :3, :3], axis1=1, axis2=2)))),
-        scatter_rotation_deg=scatter_deg,
-        scatter_translation_m=scatter_m,
         chi2=chi2,
         dof=dof,
         p=p,
@@ -226,11 +218,6 @@ def _spread(T: Array, cov: Array) -> float:
     weights = np.asarray(np.linalg.inv(cov))
     deviations = difference(T, mean_pose(T, weights)[0])
     return float(np.einsum("ki,kij,kj->", deviations, weights, deviations))
-
-
-def _rms(values: Sequence[float]) -> float | None:
-    """Give None where one of them is unknown."""
-    return float(np.sqrt(np.mean(np.square(values)))) if np.isfinite(values).all() else None
 
 
 def _tail(chi2: float, dof: int) -> float:

@@ -17,7 +17,6 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, tangent_sizes
 from lce_rig.judge.findings import (
     CAMERA_CHANGED,
-    CAMERA_SHARES_DIFFER,
     CHANGED,
     MOVED,
     SHARES_DIFFER,
@@ -361,11 +360,9 @@ def split_findings(
         elif c.group:
             names = tuple(captures[k] for k in c.group)
             findings.append(TWO_GROUPS(captures=names, n_captures=c.n_first, **apart))
-        else:
-            kind = CAMERA_SHARES_DIFFER if of_cameras else SHARES_DIFFER
+        elif not of_cameras:
             findings.append(
-                kind(
-                    of_cameras,
+                SHARES_DIFFER(
                     severity=severity,
                     action="near" if c.first == "near" else "",
                     first=c.first,

@@ -170,10 +170,7 @@ def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
     if check is not None and difference is not None:
         profile = {
             "intrinsics": _settings(measured.given),
-            **{
-                name: value if isinstance(value, tuple) else _figure(value)
-                for name, value in asdict(check).items()
-            },
+            **{name: _figure(value) for name, value in asdict(check).items()},
             "displacement_max_px": _figure(difference.max_px),
             "turn_rad": np.asarray(difference.turn_rad).tolist(),
             "verdict": verdict_of([] if measured.misfit is None else [measured.misfit]),

@@ -112,8 +112,6 @@ def test_of_many_captures_those_whose_board_moved_are_refused_too():
     estimate = fit_extrinsic(spoil(simulate(100, 9), numbers), BOARD, replace(FAST, n_draws=2))
     assert set(estimate.refused) == {f"{k:06d}" for k in numbers}
     assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 0.1
-    # Sizes of random subsets are limited to 40, twice three rounds each.
-    assert estimate.diagnostics.n_solved == 40 * 2 * 3
 
 
 def test_a_board_that_moved_between_the_sensors_is_refused_with_its_figures():

@@ -6,7 +6,6 @@ import pytest
 
 import lce_rig
 from lce_rig.core.findings import Finding, Kind, ranked, worst
-from lce_rig.core.phrasing import figures_apart
 
 PACKAGE = Path(lce_rig.__file__).parent
 RINGS = Kind("t.rings", "{n} rings at {distance_m:.1f} m", "come {closer_m:1cm} closer")
@@ -37,12 +36,6 @@ def test_a_figure_is_printed_so_that_it_differs_from_its_limit(
     error_m: float, limit_m: float, tilt_deg: float, words: str
 ) -> None:
     assert LIMIT(error_m=error_m, limit_m=limit_m, tilt_deg=tilt_deg, max_tilt_deg=60.0).text == words
-
-
-def test_two_significant_digits_suffice_unless_figure_and_limit_agree_in_them() -> None:
-    assert figures_apart(0.2034, 0.2) == ("0.203", "0.2")
-    assert figures_apart(112.0, 10.0) == ("112", "10")
-    assert figures_apart(0.2, 0.2) == ("0.2", "0.2")
 
 
 def test_a_finding_read_from_a_file_keeps_the_words_of_the_file() -> None:

@@ -7,14 +7,14 @@ References:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.background import estimate_shifts, move_ends
 from lce_rig.calibrate.algorithm_1.certificate import solve_globally
-from lce_rig.calibrate.algorithm_1.moments import N_ROUNDS, Problem, Solutions, Weights
+from lce_rig.calibrate.algorithm_1.moments import Problem, Solutions, Weights
 from lce_rig.calibrate.algorithm_1.registration import (
     eliminate_linear,
     linear_unknowns,
@@ -26,12 +26,12 @@ from lce_rig.calibrate.observability import require_observable
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS
 from lce_rig.calibrate.quadratics import Quadratics
-from lce_rig.calibrate.result import Start, error_to_reference
+from lce_rig.calibrate.result import Start
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Certificate
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, pose, project_to_so3
+from lce_rig.core.geometry import Array, pose
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import Observation
 
@@ -121,7 +121,7 @@ def solve(
     # Draws judge the solution and do not choose it; without any, the folds of the outliers' search do.
     held_out_m = plane_m + edge_m
     if n_draws and problem.n_captures > _MIN_SUBSET:
-        held_out_m, figures = draw_subsets(problem, T_planes, solution.T[0], n_draws, seed, figures, progress)
+        held_out_m = draw_subsets(problem, T_planes, n_draws, seed, progress)
     certificates = solution.certificates
     return Algorithm1(
         T_cam_lidar=solution.T[0],
@@ -247,12 +247,10 @@ def _excess(errors: Array) -> Array:
 def draw_subsets(
     problem: Problem,
     T_start: Array,
-    T_solution: Array,
     n_draws: int,
     seed: int,
-    figures: Diagnostics,
     progress: Progress = silent,
-) -> tuple[Array, Diagnostics]:
+) -> Array:
     """Judge a solution by `n_draws` random subsets of each size 3..F-1, of many captures of 40 sizes.
 
     Each candidate is judged on the captures it was not fitted to, as fitted noise would bias the judgement.
@@ -261,14 +259,12 @@ def draw_subsets(
     Args:
         problem: F captures.
         T_start: (4, 4) planar initialisation; candidates and solution begin at the same place.
-        T_solution: (4, 4) of all captures.
         n_draws: I.
         seed: of the draws.
-        figures: diagnostics, to which those of the draws are added.
         progress: called with (subsets done, subsets in all).
 
     Returns:
-        Mean error (F,) of each capture in candidates of the best size that did not use it; the diagnostics.
+        Mean error (F,) of each capture in candidates of the best size that did not use it.
     """
     n = problem.n_captures
     sizes = np.arange(_MIN_SUBSET, n)
@@ -278,14 +274,14 @@ def draw_subsets(
     # A capture takes part if its rank in the shuffled order is below the subset's size.
     selection = (order < np.repeat(sizes, n_draws)[:, None]).astype(np.float64)
     chunk = max(min(_CHUNK, _CHUNK_ENDS // max(len(problem.edge_capture), 1)), 1)
-    parts: list[tuple[Array, ...]] = []
+    parts: list[Array] = []
     begin(progress, "Algorithm 1 on random subsets")
     for start in range(0, len(selection), chunk):
         solutions = problem.solve(selection[start : start + chunk], T_start)
         plane, edge = problem.errors(solutions.x)
-        parts.append((solutions.T, plane + edge, solutions.certificates.is_optimal.astype(np.float64)))
+        parts.append(plane + edge)
         progress(min(start + chunk, len(selection)), len(selection))
-    T, errors, is_certified = (np.concatenate(part) for part in zip(*parts, strict=True))
+    errors = np.concatenate(parts)
 
     by_size = len(sizes), n_draws
     is_held_out = selection.reshape(*by_size, n) == 0
@@ -295,20 +291,4 @@ def draw_subsets(
     overall = total.sum(axis=0) / np.maximum(count.sum(axis=0), 1)
     per_capture = np.where(count > 0, total / np.maximum(count, 1), overall)
     best = int(np.argmin(per_capture.mean(axis=1)))
-
-    T_best = T.reshape(*by_size, 4, 4)[best]
-    T_mean = pose(project_to_so3(T_best[:, :3, :3].mean(axis=0)), T_best[:, :3, 3].mean(axis=0))
-    half_sine = np.linalg.norm(T_best[:, :3, :3] - T_mean[:3, :3], axis=(-2, -1)) / np.sqrt(8)
-    angles = 2 * np.arcsin(np.clip(half_sine, 0, 1))
-    distances = np.linalg.norm(T_best[:, :3, 3] - T_mean[:3, 3], axis=-1)
-    offset_deg, offset_m = error_to_reference(T_mean, T_solution)
-    return per_capture[best], replace(
-        figures,
-        best_subset_size=float(sizes[best]),
-        n_solved=float(N_ROUNDS * len(selection)),
-        certified_share=float(np.mean(is_certified)),
-        draw_mean_offset_deg=offset_deg,
-        draw_mean_offset_m=offset_m,
-        draw_spread_rotation_deg=float(np.degrees(np.sqrt(np.mean(angles**2)))),
-        draw_spread_translation_m=float(np.sqrt(np.mean(distances**2))),
-    )
+    return np.asarray(per_capture[best])
