@@ -122,7 +122,7 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
     camera = calibration.camera
     others = {other.camera: other for other in calibration.other_cameras}
     lines: list[str] = []
-    for earlier in calibrations[: calibrations.index(calibration)]:
+    for earlier in () if calibration.is_of_lidars else calibrations[: calibrations.index(calibration)]:
         name = earlier.camera
         if earlier.lidar != calibration.lidar:
             continue
