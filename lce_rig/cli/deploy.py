@@ -27,6 +27,7 @@ from lce_rig.rig.target_settings import TargetSettings
 )
 @click.option("--name", metavar="NAME", help="Deploy this result of SESSION (see `lce-rig results`).")
 @click.option("--dry-run", is_flag=True, help="Print what would change; change nothing.")
+@click.option("--diff", is_flag=True, help="With --dry-run: print the lines that would change.")
 @click.option("--status", is_flag=True, help="Print what is at the target; change nothing.")
 @click.option("--rollback", is_flag=True, help="Restore the files that were there before.")
 @click.option("--release", metavar="NAME", help="With --rollback: restore this release (see --status).")
@@ -39,6 +40,7 @@ def deploy(
     targets: Path | None,
     name: str | None,
     dry_run: bool,
+    diff: bool,
     status: bool,
     rollback: bool,
     release: str | None,
@@ -58,6 +60,8 @@ def deploy(
     """
     if sum((dry_run, status, rollback)) > 1:
         raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
+    if diff and not dry_run:
+        raise UsageError("--diff applies to --dry-run only", "Add --dry-run.")
     if release is not None and not rollback:
         raise UsageError("--release applies to --rollback only", "Add --rollback.")
     if force and not reason.strip():
@@ -80,7 +84,7 @@ def deploy(
     result = result_folder(opened.path, name)
     if dry_run:
         plan = deployment.plan(result, opened.rig, target, session=opened)
-        _show_plan(plan, target, as_json=as_json)
+        _show_plan(plan, target, has_diff=diff, as_json=as_json)
         return
     if target.run is not None:
         show.note(f"afterwards there: {target.run}")
@@ -88,7 +92,7 @@ def deploy(
     _show_done(done, target, as_json=as_json)
 
 
-def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
+def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: bool) -> None:
     if as_json:
         show.print_json(
             {
@@ -101,6 +105,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
                 "sensors": plan.sensors,
                 "objections": plan.objections,
                 "remarks": plan.remarks,
+                **({"diff": plan.diff} if has_diff else {}),
             }
         )
         return
@@ -121,6 +126,9 @@ def _show_plan(plan: Plan, target: TargetSettings, *, as_json: bool) -> None:
         show.note(each.text)
     for each in plan.objections:
         show.warn(f"would be refused: {each.text}")
+    if has_diff:
+        for line in plan.diff:
+            click.echo(line)
 
 
 _CHANGES = {"added": "new:", "missing": "removed:", "changed": "changed:"}
