@@ -65,8 +65,8 @@ BOARD_FORM = (
     "such as aprilgrid:4x3,0.13,0.3,0.767x0.626"
 )
 _ROUGH_LENS = (
-    "Not measured yet? Rough ones will do: FX = FY = 0.8 times the width, CX and CY the image's middle, and "
-    "zeros; `lce-rig intrinsics` measures them later from the same captures."
+    "Not measured yet? Rough ones will do: FX = FY = 0.8 times the width (fisheye: equidistant, 0.5 times), "
+    "CX and CY the image's middle, and zeros; `lce-rig intrinsics` measures them later from these captures."
 )
 _LENS_FORM = (
     "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0"
