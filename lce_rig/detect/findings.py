@@ -329,5 +329,8 @@ IMAGE_SIZE_OTHER = Kind(
     "image.size_other",
     f"{_SIZES}: cannot be used",
     _OTHER_MODE,
-    actions={"scaled": "multiply fx, fy, cx, cy by {factor:.4g} if the image is only scaled"},
+    actions={
+        "scaled": "multiply fx, fy, cx, cy by {factor:.4g} if the image is only scaled",
+        "swapped": "set resolution_px: [{width_px}, {height_px}], and check fx, fy, cx, cy",
+    },
 )

@@ -183,9 +183,7 @@ class Vlp16Source(LiveSource):
         sensor, port, address, flaws = self.sensor, self._port, self._address, self._stream.flaws()
         whose = f" from {address}" if address else ""
         began = (
-            "data packets{} on UDP port {} have stopped"
-            if has_sent
-            else "no data packets{} on UDP port {} come"
+            "data packets{} on UDP port {} have stopped" if has_sent else "no data packets{} on UDP port {}"
         )
         what = f"{sensor}: {began.format(whose, port)} (for {self._silence_s:g} s)"
         for model, _ in self._stream.other_models.most_common(1):

@@ -308,7 +308,7 @@ class ImagesRecording:
         """Find the images; nothing is decoded yet.
 
         Raises:
-            SourceError: there are none, their camera is not known, or their names are no times.
+            SourceError: there are none, their camera is not known, or their names are not timestamps.
         """
         self.path = path
         self.notes: list[str] = []
@@ -322,7 +322,7 @@ class ImagesRecording:
             )
             if not timed:
                 raise SourceError(
-                    f"{path}: the names of the images are no times ({images[0].path.name})",
+                    f"{path}: the names of the images are not timestamps ({images[0].path.name})",
                     "Name each after its time on the clock of the other recording, in seconds since 1970 "
                     "(1760000000.046122.jpg) or in ns; or put the point clouds into pcd/ beside them.",
                 )

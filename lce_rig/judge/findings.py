@@ -357,7 +357,7 @@ INTRINSICS = Kind(
     _intrinsics,
     "if the lens was changed: " + _SAVE,
     actions={
-        "refocused": "if it was refocused: " + _SAVE,
+        "refocused": "if rough or refocused: " + _SAVE,
         "collect": "cover the corners, then " + _SAVE,
         "weighed": "use the result's, or " + _SAVE,
     },

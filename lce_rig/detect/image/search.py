@@ -205,7 +205,9 @@ def compare_size(image: Image, intrinsics: Intrinsics) -> Finding | None:
         if len(outside) and np.percentile(outside, 99) <= max(0.3 * inside, 2.0):
             return IMAGE_SIZE_CANVAS(subject, **figures)
     is_scaled = abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width
-    return IMAGE_SIZE_OTHER(subject, action="scaled" if is_scaled else "", **figures)
+    is_swapped = (width, height) == (wanted_height, wanted_width)
+    action = "scaled" if is_scaled else "swapped" if is_swapped else ""
+    return IMAGE_SIZE_OTHER(subject, action=action, **figures)
 
 
 def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
