@@ -253,7 +253,9 @@ def report(registry: str, output: Path, json_file: Path | None) -> None:
     if len(made.findings) > _MOST_FINDINGS:
         show.note(f"{len(made.findings) - _MOST_FINDINGS} more in the report")
     states = [*made.history.robots.values()]
-    show.note(f"{states.count('moved')} of {show.counted(len(states), 'robot')} moved; written: {output}")
+    unknown = states.count("cannot_tell")
+    moved = f"{states.count('moved')} of {show.counted(len(states), 'robot')} moved"
+    show.note(f"{moved}{f', cannot tell of {unknown} yet' if unknown else ''}; written: {output}")
 
 
 @fleet.command()

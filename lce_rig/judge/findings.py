@@ -365,7 +365,7 @@ INTRINSICS = Kind(
 INTRINSICS_BETTER = Kind(
     "intrinsics.better",
     "the session determines the intrinsics better than the profile: it covers {covered:percent} of the image "
-    "and determines pixels near its border to {image_sigma_px:.2f} px (limit {limit_px:.2f} px)",
+    "and determines pixels near its border to {image_sigma_px:.2f} px",
     "write them into one: `lce-rig intrinsics {session} --save-profile FILE`",
     severity="note",
 )

@@ -227,7 +227,7 @@ def judge_lens(
     figures: dict[str, Any] = {"covered": covered, "image_sigma_px": image_sigma_px, "limit_px": limit_px}
     if check is not None and check.verdict(target_deg) == "pass":
         return INTRINSICS_FIT(**figures)
-    if check is not None and check.surprise is not None:
+    if check is not None and check.surprise is not None and np.isfinite(image_sigma_px):
         return INTRINSICS_BETTER(**figures)
     return INTRINSICS_UNDETERMINED(**figures) if image_sigma_px > limit_px else INTRINSICS_BETTER(**figures)
 
