@@ -29,7 +29,7 @@ _BAGS = frozenset({".bag", ".db3", ".mcap"})
 _PACKETS = frozenset({".pcap", ".pcapng"})
 _EVENTS = frozenset({".aedat4", ".raw", ".h5", ".hdf5"})
 _KINDS = (_BAGS, _PACKETS, _EVENTS)
-_CLOUDS = frozenset({".pcd", ".ply", ".las", ".laz"})
+_CLOUDS = frozenset({".pcd", ".ply", ".las"})
 
 
 def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = None) -> Recording:

@@ -122,7 +122,7 @@ def decode_ply(data: bytes) -> NDArray[Any]:
 
 
 def decode_las(data: bytes) -> NDArray[Any]:
-    """Decode the points of a LAS or LAZ file: coordinates in metres, intensity and dimensions of its own.
+    """Decode the points of a LAS file: coordinates in metres, intensity and dimensions of its own.
 
     Returns:
         Structured (N,), by lower-case names.
@@ -134,7 +134,8 @@ def decode_las(data: bytes) -> NDArray[Any]:
     require_las()
     import laspy
 
-    cloud = laspy.read(io.BytesIO(data))
+    # Decompressors of LAZ abort the process on damaged files.
+    cloud = laspy.read(io.BytesIO(data), laz_backend=())
     if len(cloud.points) != cloud.header.point_count:
         raise ValueError(
             f"it is truncated: {len(cloud.points)} of {cloud.header.point_count} points are there"
@@ -148,25 +149,24 @@ def decode_las(data: bytes) -> NDArray[Any]:
 
 
 def require_las() -> None:
-    """Refuse LAS and LAZ files where their reader is not installed.
+    """Refuse LAS files where their reader is not installed.
 
     Raises:
         SourceError: laspy is not installed.
     """
     if find_spec("laspy") is None:
-        raise SourceError("LAS and LAZ files need laspy", "pip install 'lce-rig[las]'")
+        raise SourceError("LAS files need laspy", "pip install 'lce-rig[las]'")
 
 
-LAS = frozenset({".las", ".laz"})
 DECODERS: dict[str, Callable[[bytes], NDArray[Any]]] = {
     ".pcd": decode_pcd,
     ".ply": decode_ply,
-    **dict.fromkeys(sorted(LAS), decode_las),
+    ".las": decode_las,
 }
 
 
 def read_cloud(path: Path) -> NDArray[Any]:
-    """Read a PCD, PLY, LAS or LAZ file unchanged.
+    """Read a PCD, PLY or LAS file unchanged.
 
     Returns:
         Structured (N,) with the file's own fields.

@@ -16,7 +16,7 @@ from lce_rig.core.data import Image, Scan, Stream
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Losses
 from lce_rig.io.cloud import to_scan
-from lce_rig.io.decoding import DECODERS, LAS, SUFFIXES, read_cloud, read_image, require_las
+from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image, require_las
 from lce_rig.io.findings import NOT_DECODED
 from lce_rig.io.protocol import (
     PairMethod,
@@ -377,7 +377,7 @@ class FolderRecording:
         lidar = choose_lidar(rig, options, self.notes)
         images = _images(path, rig, options, self.notes)
         clouds = _list(path, CLOUD_FOLDERS, frozenset(DECODERS), "point clouds", self.notes)
-        if any(cloud.suffix.lower() in LAS for cloud in clouds):
+        if any(cloud.suffix.lower() == ".las" for cloud in clouds):
             require_las()
         cloud_ns = parse_times([cloud.stem for cloud in clouds])
         # The second image of one camera that goes with a point cloud makes a pair of its own.

@@ -171,9 +171,9 @@ def test_a_run_without_result_leaves_the_earlier_one_untouched(lce_rig, calibrat
 def test_another_result_moves_the_earlier_one_and_its_overlays_to_previous(lce_rig, calibrated):
     lce_rig("verify", calibrated)
     folder = calibrated / "calibration"
-    before = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert lce_rig("calibrate", calibrated).code == 0
     assert (folder / "overlays" / "contact_sheet.png").exists()
+    before = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     outcome = lce_rig("calibrate", calibrated, "--use-scene", "--explain")
     assert str(folder / "previous") in outcome.err.replace("\n", "")
     kept = folder / "previous"
