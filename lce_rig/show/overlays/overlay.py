@@ -89,8 +89,8 @@ def draw_event_key(
 MARKS = (
     ("board, LiDAR points", "point"),
     ("board, ring ends", "end"),
-    ("board outline, camera", "line"),
-    ("corners, camera", "corner"),
+    ("board outline", "line"),
+    ("corners", "corner"),
 )
 """What the legend calls each mark, those of the LiDAR first."""
 
