@@ -139,6 +139,8 @@ _TOKEN = re.compile(r"[A-Za-z0-9_-]{8,128}")
 _STOP_S, _SHUTDOWN_S, _KEEP_ALIVE_S = 1.5, 0.5, 5.0
 # For the rest of a request that was answered before its end.
 _LINGERING_S = 1.0
+# asyncio sets up a connection in the three turns of its loop after it has accepted it.
+_TURNS_TO_SET_UP = 4
 _LOG = logging.getLogger("lce_rig.preview")
 
 
@@ -268,20 +270,22 @@ class Preview:
         server = await self._pages.listen(runner, opened)
         self._is_ready.set()
         await self._stop.wait()
+        # A connection that is being set up when the server closes would never be closed itself.
+        self._loop.remove_reader(opened)
+        for _ in range(_TURNS_TO_SET_UP):
+            await asyncio.sleep(0)
         server.close()
         await self._pages.close()
-        handlers = runner.server
-        assert handlers is not None
-        for handler in list(handlers.connections):
-            # A stuck page would keep its connection for ever.
+        assert runner.server is not None
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(_cut(runner.server), _SHUTDOWN_S)
+        await runner.cleanup()
+
+
+async def _cut(handlers: web.Server) -> None:
+    """Cut every connection, as a stuck page would keep its own for ever, and wait until all have closed."""
+    while handlers.connections:
+        for handler in handlers.connections:
             if handler.transport is not None:
                 handler.transport.abort()
-        await runner.cleanup()
-        with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(_closed(handlers), _SHUTDOWN_S)
-
-
-async def _closed(server: web.Server) -> None:
-    """Wait until each connection has closed: one that was cut does so in the next turns of the loop."""
-    while server.connections:
         await asyncio.sleep(1e-3)
