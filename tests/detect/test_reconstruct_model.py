@@ -66,23 +66,19 @@ def test_another_network_with_the_same_kind_of_inputs_is_accepted(tmp_path):
         ([("v", [1, 5, 64, 64])], [[1, 1, 64, 64]]),
         ([VOXELS, STATE], [[1, 1, "height", "width"]]),
         ([VOXELS, ("s", [1, 3, "a", "b"])], [[1, 1, "height", "width"], [1, 3, "a", "b"]]),
+        ([VOXELS, STATE], [[1, 1, "height", "width"], [1, 3, 1, "width_2"]]),
     ],
 )
-def test_other_inputs_are_refused(tmp_path, inputs, outputs):
+def test_other_inputs_and_outputs_are_refused_at_the_first_step_at_the_latest(tmp_path, inputs, outputs):
     with pytest.raises(ProfileError):
-        ReconstructionModel(write_network(tmp_path / "m.onnx", inputs, outputs))
-
-
-def test_a_network_whose_states_change_their_size_is_refused_at_its_first_step(tmp_path):
-    outputs = [[1, 1, "height", "width"], [1, 3, 1, "width_2"]]
-    model = ReconstructionModel(write_network(tmp_path / "m.onnx", [VOXELS, STATE], outputs, drops_rows=True))
-    with pytest.raises(ProfileError):
+        model = ReconstructionModel(write_network(tmp_path / "m.onnx", inputs, outputs, drops_rows=True))
         model.step(np.ones((5, 7, 9), np.float32), model.initial_states(7, 9))
 
 
-@pytest.mark.parametrize(("channels", "scale"), [(10**9, "2"), (3, "997"), (3, "9" * 30)])
+@pytest.mark.parametrize(("channels", "scale"), [(10**9, "2"), (3, "9" * 30)])
 def test_states_beyond_all_networks_are_refused(tmp_path, channels, scale):
     dims = [1, channels, f"height_{scale}", f"width_{scale}"]
     with pytest.raises(ProfileError):
         path = write_network(tmp_path / "m.onnx", [VOXELS, ("s", dims)], [[1, 1, "height", "width"], dims])
-        ReconstructionModel(path).initial_states(260, 346)
+        model = ReconstructionModel(path)
+        model.step(np.ones((5, 7, 9), np.float32), model.initial_states(7, 9))

@@ -1,13 +1,12 @@
 """The recurrent network that makes images of events, and images of a stream at any requested time."""
 
 import math
-import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,6 @@ from lce_rig.detect.findings import (
 )
 
 States = tuple[FloatArray, ...]
-_MAX_MULTIPLE = 256
 
 _EXPECTED = (
     "expected the inputs voxels (1, bins, height, width) and states (1, channels, height_2, width_2) with "
@@ -43,11 +41,9 @@ _EXPECTED = (
 )
 
 
-@dataclass(frozen=True)
-class StateSpec:
+class StateSpec(NamedTuple):
     """A recurrent state's channels and its size as a fraction of the image's: 2 is half."""
 
-    name: str
     n_channels: int
     divisor: int
 
@@ -80,15 +76,19 @@ class ReconstructionModel:
             self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises classes of its own, one for each status
             raise self._refused(f"cannot be loaded: {reason_of(error)}") from error
-        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
-        if len(inputs) < 1 or len(inputs) != len(outputs):
-            raise self._refused(f"{len(inputs)} inputs and {len(outputs)} outputs")
-        self.n_bins = self._check_voxels(inputs[0])
-        self.states = tuple(self._read_state(item) for item in inputs[1:])
+        voxels, *states = self._session.get_inputs()
+        try:
+            # (1, bins, "height", "width"), and (1, channels, "height_2", "width_2") of a state at half size.
+            self.n_bins = int(voxels.shape[1])
+            divisors = [int(state.shape[2].partition("_")[2] or 1) for state in states]
+            self.states = tuple(
+                StateSpec(int(state.shape[1]), n) for state, n in zip(states, divisors, strict=True)
+            )
+        except (ValueError, TypeError, IndexError, AttributeError):
+            shapes = [item.shape for item in (voxels, *states)]
+            raise self._refused(f"its inputs have the shapes {shapes}") from None
         # The image is padded so that every state has a whole number of rows and columns.
         self.size_multiple = math.lcm(2, *(state.divisor for state in self.states))
-        if self.size_multiple > _MAX_MULTIPLE:
-            raise self._refused(f"images would be padded to multiples of {self.size_multiple} px")
 
     def initial_states(self, height_px: int, width_px: int) -> States:
         """Make the states before the first window for a sensor of this size: zeros.
@@ -117,9 +117,9 @@ class ReconstructionModel:
         """
         _, height, width = voxels.shape
         rows, cols = self._padded(height) - height, self._padded(width) - width
-        grid = np.pad(voxels, ((0, 0), (0, rows), (0, cols)))[None]
         names = (item.name for item in self._session.get_inputs())
         try:
+            grid = np.pad(voxels, ((0, 0), (0, rows), (0, cols)))[None]
             outputs = self._session.run(None, dict(zip(names, (grid, *states), strict=True)))
         except Exception as error:  # see __init__
             raise self._refused(f"a step of {width} x {height} px fails: {reason_of(error)}") from error
@@ -132,23 +132,6 @@ class ReconstructionModel:
 
     def _padded(self, size_px: int) -> int:
         return -(-size_px // self.size_multiple) * self.size_multiple
-
-    def _check_voxels(self, item: Any) -> int:
-        shape = tuple(item.shape or ())
-        is_fixed = len(shape) == 4 and any(isinstance(size, int) for size in shape[2:])
-        if len(shape) != 4 or not isinstance(shape[1], int) or shape[1] < 2 or is_fixed:
-            raise self._refused(f"its first input {item.name} has the shape {shape}")
-        return int(shape[1])
-
-    def _read_state(self, item: Any) -> StateSpec:
-        shape = tuple(item.shape or ())
-        if len(shape) != 4 or not isinstance(shape[1], int) or shape[1] < 1:
-            raise self._refused(f"its input {item.name} has the shape {shape}")
-        divisors = [re.fullmatch(r"(?:height|width)(?:_(\d{1,4}))?", str(size)) for size in shape[2:]]
-        values = [int(match.group(1) or 1) if match else 0 for match in divisors]
-        if values[0] == 0 or values[0] != values[1]:
-            raise self._refused(f"its input {item.name} has the shape {shape}")
-        return StateSpec(item.name, shape[1], values[0])
 
     def _refused(self, what: str, hint: str = "") -> ProfileError:
         return ProfileError(f"reconstruction model {self.name}: {what}", hint or _EXPECTED)
