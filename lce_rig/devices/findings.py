@@ -64,10 +64,7 @@ ROTOR_RATE = _warning(
     "set rate_hz in the profile, or rpm {expected_rpm:.0f} on the web page",
 )
 DAMAGED_IMAGES = _warning(
-    "stream.damaged_images",
-    "{n} damaged images",
-    "check the camera's cable and `dmesg | tail`",
-    actions={"command": "check the command"},
+    "stream.damaged_images", "{n} damaged images", "check the camera's cable and `dmesg | tail`"
 )
 MESSAGES_SKIPPED = _warning(
     "stream.messages_skipped",

@@ -1,10 +1,9 @@
 """Images from a command's standard output: GStreamer, ffmpeg or any program that writes them.
 
-They come one behind the other: Y4M, JPEG, or raw.
+They come one behind the other: Y4M, or raw.
 
 References:
     https://wiki.multimedia.cx/index.php/YUV4MPEG2
-    ITU-T T.81, annex B (the segments of a JPEG)
 """
 
 import os
@@ -23,29 +22,24 @@ from lce_rig.core.errors import SourceError
 from lce_rig.devices import findings
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, Pixels, find_format
 from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
-from lce_rig.io.decoding import decode_image
 from lce_rig.rig import CameraSettings
 from lce_rig.rig.sensors import MAX_PIXELS
 
 _WAIT_S = 0.25
 _PATIENCE_S = 2.0
 _PIPE_BYTES = 1 << 20
-_N_BEGIN = 16
 _TAIL_BYTES = 2000
 _MAX_HEADER = 4096
-_MAX_JPEG = 1 << 26
+_Y4M = b"YUV4MPEG2 "
 # They differ in where a chroma sample sits.
 _Y4M_COLOURS = ("mono", "420", "420jpeg", "420mpeg2", "420paldv")
-_SOI, _EOI, _SOS = b"\xff\xd8", b"\xff\xd9", 0xDA
-_EXAMPLE = (
-    "gst-launch-1.0 -q v4l2src device=/dev/video0 ! videoconvert ! video/x-raw,format=I420 ! y4menc ! fdsink"
-)
+_EXAMPLE = "ffmpeg -loglevel error -f v4l2 -i /dev/video0 -pix_fmt yuv420p -f yuv4mpegpipe -"
 
 
 class ImagePipeSource(LiveSource):
     """A camera read by a command of the profile; see `LiveSource`.
 
-    The command writes Y4M or JPEG images, one behind the other, or raw ones of a pixel_format.
+    The command writes Y4M, or raw images of a pixel_format.
     Such a stream carries no usable timestamps: those given are the arrival of an image's last byte
     as it is, and the status says so.
 
@@ -61,10 +55,8 @@ class ImagePipeSource(LiveSource):
         self._settings = settings
         self._channel = settings.first_channel("frames") or "frames"
         self._stack = ExitStack()
-        self._stream: ImageStream | None = None
-        self._begin = b""
         self._complaints = b""
-        self._n_images = self._n_damaged_before = 0
+        self._n_images = 0
 
     def open(self) -> None:
         """Start the command.
@@ -77,19 +69,16 @@ class ImagePipeSource(LiveSource):
             line = "driver: {type: command, command: [PROGRAM, ARGUMENT, ...]}"
             hint = f"Add to cameras.{self.sensor}: {line}\nAn example of a command: {_EXAMPLE}"
             raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
-        self._n_damaged_before += self._stream.n_damaged if self._stream else 0
-        self._begin, self._complaints, self._n_images = b"", b"", 0
-        # Raw images where the profile names their format; else their first bytes tell.
-        self._stream = None
+        self._complaints, self._n_images = b"", 0
+        self._stream: ImageStream = Y4mImages()
         wanted = self._settings.driver.pixel_format
         if wanted is not None:
             code = find_format(wanted)
-            if code is None:
-                what = f"{self._who}: driver.pixel_format {wanted!r} is not read here"
-                known = ", ".join(code.strip() for code in FORMATS)
-                raise SourceError(what, f"It can be {known}, or missing for Y4M and JPEG.")
-            size = self._settings.resolution_px
-            self._stream = JpegImages() if FORMATS[code].is_compressed else RawImages(code, *size)
+            if code is None or FORMATS[code].is_compressed:
+                what = f"{self._who}: raw images of driver.pixel_format {wanted!r} are not read"
+                raw = ", ".join(code.strip() for code, form in FORMATS.items() if not form.is_compressed)
+                raise SourceError(what, f"It can be {raw}, or missing for Y4M.")
+            self._stream = RawImages(code, *self._settings.resolution_px)
         with ExitStack() as stack:
             try:
                 self._process = subprocess.Popen(
@@ -119,17 +108,8 @@ class ImagePipeSource(LiveSource):
 
     def describe(self) -> SourceStatus:
         """Report the state of the camera."""
-        n_damaged = self._n_damaged_before + (self._stream.n_damaged if self._stream else 0)
-        problems = []
-        if n_damaged:
-            problems.append(findings.DAMAGED_IMAGES(n=n_damaged, action="command"))
-        return SourceStatus(
-            self.sensor,
-            n_lost=n_damaged,
-            clock=ClockState(findings.ARRIVAL()),
-            problems=tuple(problems),
-            device=" ".join(self._settings.driver.command),
-        )
+        clock, device = ClockState(findings.ARRIVAL()), " ".join(self._settings.driver.command)
+        return SourceStatus(self.sensor, clock=clock, device=device)
 
     def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
         assert self._process.stdout is not None and self._process.stderr is not None  # both are pipes
@@ -152,16 +132,6 @@ class ImagePipeSource(LiveSource):
         return samples
 
     def _to_images(self, data: bytes) -> Iterator[Image]:
-        if len(self._begin) < _N_BEGIN:
-            self._begin = data = self._begin + data
-            if len(data) < _N_BEGIN:
-                return
-        if self._stream is None:
-            self._stream = find_stream(self._begin)
-            if self._stream is None:
-                begin = self._begin[:16]
-                what = f"{self._who}: its command writes no Y4M or JPEG; it begins {begin!r}"
-                raise SourceError(what, f"For raw images set driver.pixel_format. An example: {_EXAMPLE}")
         try:
             for pixels in self._stream.feed(data):
                 host_ns = time.time_ns()
@@ -172,11 +142,11 @@ class ImagePipeSource(LiveSource):
                         f"{wanted[0]}x{wanted[1]} px",
                         "Set the size in the command, or measure intrinsics at this size.",
                     )
-                count = self._n_images + self._stream.n_damaged
                 self._n_images += 1
-                yield Image(self.sensor, self._channel, host_ns, pixels, host_ns, count)
+                yield Image(self.sensor, self._channel, host_ns, pixels, host_ns, self._n_images - 1)
         except ValueError as error:
-            raise SourceError(f"{self._who}: its command's images: {error}", self._complaint()) from None
+            hint = f"{self._complaint()}\nRaw images need driver.pixel_format. A command for Y4M: {_EXAMPLE}"
+            raise SourceError(f"{self._who}: its command's images: {error}", hint) from None
 
     def _raise_end(self, pictures: IO[bytes]) -> None:
         """Report the end of the command.
@@ -216,15 +186,11 @@ def _end_process(process: "subprocess.Popen[bytes]") -> None:
 
 
 class ImageStream(ABC):
-    """Bytes in as they come, images out.
+    """Bytes in as they come, images out."""
 
-    Attributes:
-        n_damaged: images that were there and could not be decoded.
-    """
+    _decode: Callable[[bytes], Pixels]
 
-    def __init__(self, decode: Callable[[bytes], Pixels] = decode_image) -> None:
-        self.n_damaged = 0
-        self._decode = decode
+    def __init__(self) -> None:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Pixels]:
@@ -235,12 +201,7 @@ class ImageStream(ABC):
         """
         self._rest += data
         while (payload := self._cut()) is not None:
-            try:
-                pixels = self._decode(payload)
-            except ValueError:
-                self.n_damaged += 1
-                continue
-            yield pixels
+            yield self._decode(payload)
 
     @abstractmethod
     def _cut(self) -> bytes | None:
@@ -258,9 +219,9 @@ class RawImages(ImageStream):
     """Images of one pixel format and size, with nothing between them and no padding of rows."""
 
     def __init__(self, code: str, width: int, height: int) -> None:
+        super().__init__()
         decoder = PixelDecoder(code, width, height)
-        super().__init__(decoder.decode)
-        self._n_bytes = decoder.n_bytes
+        self._n_bytes, self._decode = decoder.n_bytes, decoder.decode
 
     def _cut(self) -> bytes | None:
         return self._take(self._n_bytes)
@@ -276,6 +237,9 @@ class Y4mImages(ImageStream):
 
     def _cut(self) -> bytes | None:
         if not self._n_bytes:
+            begin = bytes(self._rest[: len(_Y4M)])
+            if not _Y4M.startswith(begin):
+                raise ValueError(f"no Y4M: they begin {begin!r}")
             header = self._line()
             if header is None:
                 return None
@@ -285,7 +249,7 @@ class Y4mImages(ImageStream):
             if line is None:
                 return None
             if not line.startswith("FRAME"):
-                raise ValueError(f"a Y4M frame was expected, {line[:20]!r} came (GStreamer: use jpegenc)")
+                raise ValueError(f"a Y4M frame was expected, {line[:20]!r} came (GStreamer pads rows)")
             self._is_in_frame = True
         payload = self._take(self._n_bytes)
         self._is_in_frame = payload is None
@@ -312,51 +276,3 @@ class Y4mImages(ImageStream):
             raise ValueError(f"Y4M images of {width}x{height} px in colour: both must be even")
         decoder = PixelDecoder("GREY" if colour == "mono" else "YU12", width, height)
         self._n_bytes, self._decode = decoder.n_bytes, decoder.decode
-
-
-class JpegImages(ImageStream):
-    """JPEG files, one behind the other; anything between them is skipped."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._searched = 0
-
-    def _cut(self) -> bytes | None:
-        start = self._rest.find(_SOI + b"\xff")
-        if start < 0:
-            del self._rest[: max(0, len(self._rest) - 2)]
-            return None
-        if start:
-            del self._rest[:start]
-            self._searched = 0
-        end = self._find_end()
-        if end is None:
-            if len(self._rest) > _MAX_JPEG:
-                raise ValueError(f"a JPEG image does not end within {_MAX_JPEG >> 20} MiB")
-            return None
-        self._searched = 0
-        return self._take(end)
-
-    def _find_end(self) -> int | None:
-        """Walk the segments, which may hold small images, to the data, which ends at the first EOI."""
-        at = 2
-        while at + 4 <= len(self._rest) and self._rest[at] == 0xFF:
-            kind, n_bytes = self._rest[at + 1], int.from_bytes(self._rest[at + 2 : at + 4], "big")
-            at += 2 + n_bytes
-            if kind == _SOS:
-                found = self._rest.find(_EOI, max(at, self._searched - 1))
-                self._searched = len(self._rest)
-                return None if found < 0 else found + 2
-        if at + 4 <= len(self._rest):  # damaged: go on at the next image
-            following = self._rest.find(_SOI + b"\xff", 2)
-            return following if following > 0 else None
-        return None
-
-
-def find_stream(begin: bytes) -> ImageStream | None:
-    """Choose the kind of a stream by its first bytes; None where they fit none."""
-    if begin.startswith(b"YUV4MPEG2 "):
-        return Y4mImages()
-    if begin.startswith(_SOI) or begin.startswith(b"--"):  # "--": the boundary of a multipart stream
-        return JpegImages()
-    return None
