@@ -136,8 +136,9 @@ def report(
         board: the board.
         diagnostics: the method's own figures.
     """
+    scale = squares_scale(diagnostics)
     residuals = tuple(
-        capture_residual(T_cam_lidar, observation, board, float(error))
+        capture_residual(T_cam_lidar, observation, board, float(error), scale)
         for observation, error in zip(start.observations, start.held_out_m, strict=True)
     )
     observations = {observation.capture: observation for observation in start.observations}
@@ -172,8 +173,18 @@ def lever_arm(observations: Sequence[Observation]) -> float:
     return float(np.sqrt(np.mean([centre @ centre for centre in centres])))
 
 
+def squares_scale(diagnostics: Diagnostics) -> float:
+    """Compute the size of the board's squares by profile and LiDAR, relative to the profile's."""
+    scale = diagnostics.camera_scale
+    return 2.0 - scale if np.isfinite(scale) else 1.0
+
+
 def capture_residual(
-    T_cam_lidar: Array, observation: Observation, board: Board, held_out_m: float = float("nan")
+    T_cam_lidar: Array,
+    observation: Observation,
+    board: Board,
+    held_out_m: float = float("nan"),
+    squares: float = 1.0,
 ) -> CaptureResidual:
     """Measure the residuals of one capture under given extrinsics.
 
@@ -185,7 +196,11 @@ def capture_residual(
         observation: the boards of both sensors.
         board: its size.
         held_out_m: passed through.
+        squares: size of the squares relative to that by which the image's board was posed.
     """
+    T_cam_board = observation.image.T_cam_board.copy()
+    T_cam_board[:3, 3] *= squares
+    observation = replace(observation, image=replace(observation.image, T_cam_board=T_cam_board))
     features = extract_features(observation, board, half_step=False)
     plane = np.abs(plane_residuals(features, T_cam_lidar, observation.lidar.points))
     edge = board.outline_distance(ends_on_board(features, T_cam_lidar))

@@ -35,7 +35,8 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
     opened = lce.Session.open(session)
     if not opened.captures:
         raise NotEnoughDataError(
-            f"{session} holds no captures", f"Add some: `lce-rig collect --rig RIG {session}`, or with `--from RECORDING`."
+            f"{session} holds no captures",
+            f"Add some: `lce-rig collect --rig RIG {session}`, or with `--from RECORDING`.",
         )
     with show.progress_bar("detecting") as progress:
         detections = lce.detect(opened, progress=progress)

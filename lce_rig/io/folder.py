@@ -258,11 +258,7 @@ class PairOnDisk:
         images = tuple(image.read() for image in self.images)
         cloud = read_cloud(self.cloud_path)
         reading = to_scan(cloud, self.lidar, self.settings, str(self.cloud_path), self.cloud_stamp_ns)
-        notes = list(reading.notes)
-        if reading.n_without_return:
-            n = reading.n_without_return
-            notes.append(f"{self.cloud_path.name}: {n} points without a return skipped")
-        return images, reading.scan, notes
+        return images, reading.scan, list(reading.notes)
 
 
 def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) -> list[list[ImageOnDisk]]:

@@ -22,7 +22,7 @@ from lce_rig.calibrate import (
 )
 from lce_rig.calibrate.findings import UNDETERMINED
 from lce_rig.calibrate.observability import find_weakest
-from lce_rig.calibrate.result import capture_residual, error_to_reference
+from lce_rig.calibrate.result import capture_residual, error_to_reference, squares_scale
 from lce_rig.calibrate.together import TogetherEstimate, calibrate_together
 from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.collect.guidance.planner import plan_captures
@@ -390,7 +390,13 @@ def _with_scene(rig: Rig, solved: _Solved, share: SceneShare) -> _Solved:
     estimate, board = solved.estimate, rig.board.to_board()
     # Residuals of the boards under the extrinsics of both.
     residuals = tuple(
-        capture_residual(share.T_cam_lidar, estimate.observations[each.capture], board, each.held_out_m)
+        capture_residual(
+            share.T_cam_lidar,
+            estimate.observations[each.capture],
+            board,
+            each.held_out_m,
+            squares_scale(estimate.diagnostics),
+        )
         for each in estimate.residuals
     )
     return replace(
@@ -427,8 +433,7 @@ def _judged(
     for name, why in estimate.refused.items():
         refused |= dict.fromkeys(estimate.captures_of([name]), why)
     lens = None if estimate.lens is None else estimate.lens.intrinsics
-    scale = estimate.diagnostics.camera_scale
-    square_m = rig.board.square_m * (2 - scale if np.isfinite(scale) else 1.0)
+    square_m = rig.board.square_m * squares_scale(estimate.diagnostics)
     # The scene moves extrinsics, not the lens.
     is_of_scene = own.share is not None and own.share.state == "used"
     cov_lens = np.zeros((0, 0)) if estimate.lens is None else estimate.lens.estimate.cov
