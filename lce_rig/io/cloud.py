@@ -119,13 +119,13 @@ def _nearest_line(rho: Array, z: Array, lines: Array) -> tuple[NDArray[np.intp],
     return nearest, miss
 
 
-def _refine_lines(rho: Array, z: Array, lines: Array, n_rounds: int = 3) -> Array:
+def _refine_lines(rho: Array, z: Array, lines: Array) -> Array:
     """Fit z / rho = slope + offset / rho to the points of each line, least squares in elevation."""
     n = len(lines)
     if n < 2:
         return lines
     x, y = 1.0 / rho, z / rho
-    for _ in range(n_rounds):
+    for _ in range(3):
         ring, _ = _nearest_line(rho, z, lines)
         count = np.maximum(np.bincount(ring, minlength=n), 1)
         mean_x, mean_y = np.bincount(ring, x, n) / count, np.bincount(ring, y, n) / count

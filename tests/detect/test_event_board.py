@@ -152,9 +152,9 @@ def test_pictures_made_by_others_are_judged_without_figures_of_events(detection)
 
 
 def test_the_profile_says_how_pictures_are_made(tmp_path):
-    by_count = reconstructor_for(ReconstructionSettings(window_events=5_000), "dvs").options
-    assert (by_count.windows.kind, by_count.windows.n_events, by_count.channel) == ("count", 5_000, "dvs")
-    by_time = reconstructor_for(ReconstructionSettings(window_s=0.03), "dvs").options
-    assert (by_time.windows.kind, by_time.windows.duration_s) == ("time", 0.03)
+    by_count = reconstructor_for(ReconstructionSettings(window_events=5_000), "dvs")
+    assert (by_count.windows, by_count.channel) == ((None, 5_000), "dvs")
+    by_time = reconstructor_for(ReconstructionSettings(window_s=0.03), "dvs")
+    assert by_time.windows == (0.03, None)
     with pytest.raises(ProfileError):
         reconstructor_for(ReconstructionSettings(model=str(tmp_path / "gone.onnx")), "dvs")

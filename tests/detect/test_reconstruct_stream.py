@@ -8,9 +8,9 @@ import pytest
 from moving_board import COLS, ROWS, Motion, board_events, cut, events_of, inner_corners_px
 
 from lce_rig.core.data import Image
-from lce_rig.core.errors import SourceError, UsageError
+from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Refusal
-from lce_rig.detect.events.reconstructor import ReconstructionOptions, Reconstructor
+from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.detect.events.windows import WindowOptions, active_share, window_rule
 
 MS = 1_000_000
@@ -18,15 +18,12 @@ DURATION_S = 1.6
 STAMPS = [round((0.9 + 0.07 * k) * 1e9) for k in range(10)]
 STEADY = Motion()
 PAUSE = Motion(pause_s=1.0)
+AUTO, BY_TIME, BY_COUNT = WindowOptions(), WindowOptions(0.05), WindowOptions(n_events=6720)
 
 
 @pytest.fixture(scope="module")
 def stream():
     return board_events(STEADY, DURATION_S)
-
-
-def options(**changes):
-    return ReconstructionOptions(**changes)
 
 
 def corner_rms_px(image, truth_px):
@@ -39,14 +36,14 @@ def corner_rms_px(image, truth_px):
 
 
 def errors_px(events, windows, motion=STEADY, stamps=STAMPS):
-    pictures = Reconstructor(options=options(windows=windows)).reconstruct([events], stamps)
+    pictures = Reconstructor(windows=windows).reconstruct([events], stamps)
     truth = [inner_corners_px(motion, stamp / 1e9) for stamp in stamps]
     return np.array([corner_rms_px(image, corners) for image, corners in zip(pictures, truth, strict=True)])
 
 
-@pytest.mark.parametrize("kind", ["auto", "time", "count"])
-def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream, kind):
-    errors = errors_px(stream, WindowOptions(kind))
+@pytest.mark.parametrize("windows", [AUTO, BY_TIME, BY_COUNT])
+def test_the_board_is_found_where_it_truly_is_at_each_stamp(stream, windows):
+    errors = errors_px(stream, windows)
     assert np.isfinite(errors).mean() >= 0.9
     assert np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2)) < 0.5
 
@@ -114,12 +111,12 @@ def test_events_that_go_back_in_time_are_an_error(stream):
         list(Reconstructor().reconstruct([stream, stream], [9_000 * MS]))
 
 
-@pytest.mark.parametrize("kind", ["auto", "time"])
-def test_an_hour_of_silence_costs_no_hour_of_steps(stream, kind):
+@pytest.mark.parametrize("windows", [AUTO, BY_TIME])
+def test_an_hour_of_silence_costs_no_hour_of_steps(stream, windows):
     first, rest = stream.between(0, 800 * MS), stream.between(800 * MS, 10_000 * MS)
     hour_ns = 3_600 * 1_000 * MS
     later = replace(rest, t_ns=rest.t_ns + hour_ns)
-    reconstructor = Reconstructor(options=options(windows=WindowOptions(kind)))
+    reconstructor = Reconstructor(windows=windows)
     answers = list(reconstructor.reconstruct([first, later], [hour_ns + 1_500 * MS]))
     assert isinstance(answers[0], Image)
     assert reconstructor.n_steps < 100
@@ -162,9 +159,3 @@ def test_a_small_active_part_gets_proportionally_smaller_windows():
     assert small == pytest.approx(1 / 16, rel=0.05)
     full = window_rule(WindowOptions(), 256, 256, 1.0).n_events
     assert window_rule(WindowOptions(), 256, 256, small).n_events == pytest.approx(full / 4, rel=0.05)
-
-
-@pytest.mark.parametrize("bad", [{"duration_s": 0.0}, {"duration_s": -1.0}, {"n_events": 0}])
-def test_windows_that_never_end_are_refused(bad):
-    with pytest.raises(UsageError):
-        WindowOptions("time", **bad)

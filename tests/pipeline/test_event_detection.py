@@ -160,7 +160,7 @@ def test_another_network_is_found_beside_the_profile_and_makes_its_own_pictures(
     assert len(list((tmp_path / "session" / "detections").rglob("*.picture.npz"))) == n_before + 1
 
 
-@pytest.mark.parametrize("content", [None, b"hxight_2", b""])
+@pytest.mark.parametrize("content", [None, b"heightX2", b""])
 def test_a_network_that_cannot_be_used_is_named(tmp_path, stream, content):
     path = tmp_path / "mine.onnx"
     if content is not None:

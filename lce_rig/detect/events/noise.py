@@ -56,10 +56,10 @@ def hot_pixels(n_events: NDArray[np.uint16]) -> NDArray[np.bool_]:
     return np.asarray((n_events >= _HOT_MIN_EVENTS) & (n_events > _HOT_FACTOR * (typical + 1)))
 
 
-def without_background_activity(events: Events, support_ns: int = _SUPPORT_NS) -> Events:
+def without_background_activity(events: Events) -> Events:
     """Remove events without a neighbouring event.
 
-    Time is cut into slices of `support_ns`; an event stays where its 3 x 3 neighbourhood holds another
+    Time is cut into slices of 10 ms; an event stays where its 3 x 3 neighbourhood holds another
     pixel's event in the same slice, the one before or the one after: the nearest-neighbour filter of [1] with
     slices in place of a map of timestamps.
 
@@ -68,8 +68,8 @@ def without_background_activity(events: Events, support_ns: int = _SUPPORT_NS) -
     """
     if not len(events):
         return events
-    n_slices = int((events.t_ns[-1] - events.t_ns[0]) // support_ns) + 1
-    bounds = np.searchsorted(events.t_ns, events.t_ns[0] + support_ns * np.arange(n_slices + 1))
+    n_slices = int((events.t_ns[-1] - events.t_ns[0]) // _SUPPORT_NS) + 1
+    bounds = np.searchsorted(events.t_ns, events.t_ns[0] + _SUPPORT_NS * np.arange(n_slices + 1))
     active = np.zeros((n_slices + 2, events.height_px, events.width_px), bool)
     for index in range(n_slices):
         cut = slice(bounds[index], bounds[index + 1])
@@ -86,6 +86,7 @@ def without_background_activity(events: Events, support_ns: int = _SUPPORT_NS) -
 
 
 _MAX_FLICKER_BINS = 20_000
+_BIN_NS = 1_000_000
 # Motion in the scene lies below, lamps and screens above.
 _MIN_FLICKER_HZ = 20.0
 # A storm: this share of all events comes in bursts of one polarity, and these bursts are regular.
@@ -117,21 +118,20 @@ class Flicker:
         return is_regular or self.coherence > _ONE_SIDED_COHERENCE
 
 
-def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
+def measure_flicker(events: Events) -> Flicker:
     """Measure the flicker of lamps in a stretch of about a second.
 
     Mains lamps flicker at 100 or 120 Hz: all pixels that see them turn brighter together, then darker.
 
     Args:
         events: at least 0.2 s; of longer stretches the first 20 s are looked at.
-        bin_ns: twice the bins' length is the shortest period seen.
     """
     if len(events) < 2:
         return Flicker(0.0, 0.0, 0.0)
     # Events come in order of time: where each bin ends is found without looking at them one by one.
-    t_ns = events.t_ns[: np.searchsorted(events.t_ns, events.t_ns[0] + bin_ns * _MAX_FLICKER_BINS)]
-    n_bins = int((t_ns[-1] - t_ns[0]) // bin_ns) + 1
-    ends = np.searchsorted(t_ns, t_ns[0] + bin_ns * np.arange(1, n_bins + 1))
+    t_ns = events.t_ns[: np.searchsorted(events.t_ns, events.t_ns[0] + _BIN_NS * _MAX_FLICKER_BINS)]
+    n_bins = int((t_ns[-1] - t_ns[0]) // _BIN_NS) + 1
+    ends = np.searchsorted(t_ns, t_ns[0] + _BIN_NS * np.arange(1, n_bins + 1))
     counts = np.diff(ends, prepend=0)
     is_filled = counts > 0
     n_brighter = np.zeros(n_bins, dtype=np.int64)
@@ -142,7 +142,7 @@ def measure_flicker(events: Events, bin_ns: int = 1_000_000) -> Flicker:
     n_pairs = float((counts * (counts - 1)).sum())
     coherence = float(np.sqrt(max((signed**2 - counts).sum() / n_pairs, 0.0))) if n_pairs else 0.0
     power = np.abs(np.fft.rfft(signed - signed.mean())) ** 2
-    duration_s = len(signed) * bin_ns * 1e-9
+    duration_s = len(signed) * _BIN_NS * 1e-9
     slowest = int(np.ceil(_MIN_FLICKER_HZ * duration_s))
     # Below four periods a line and its leakage are most of the spectrum.
     if slowest < 4 or len(power) <= slowest + 1 or power.sum() == 0:

@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -53,14 +53,13 @@ class ReconstructionModel:
 
     Args:
         path: ONNX file; None for the one shipped with the package.
-        n_threads: threads of onnxruntime.
 
     Raises:
         ProfileError: the file cannot be loaded, or has other inputs or outputs than expected.
         SourceError: onnxruntime is not installed.
     """
 
-    def __init__(self, path: Path | None = None, n_threads: int = 1) -> None:
+    def __init__(self, path: Path | None = None) -> None:
         self.name = "the shipped model" if path is None else str(path)
         content = model_bytes(path)
         try:
@@ -69,7 +68,7 @@ class ReconstructionModel:
         except ImportError as error:
             raise SourceError("onnxruntime is not installed", "Run: pip install onnxruntime") from error
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = n_threads
+        options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
         options.log_severity_level = 4
         try:
@@ -156,24 +155,20 @@ def model_bytes(path: Path | None) -> bytes:
 _PERCENTILES = (1.0, 99.0)
 # Smallest spread that is stretched to the full range: below it there is noise, not contrast.
 _MIN_SPREAD = 0.05
+_SCALE_MEMORY = 0.8
 
 
 class IntensityScale:
-    """Robust minimum and maximum, smoothed over images.
+    """Robust minimum and maximum, smoothed over images."""
 
-    Args:
-        memory: weight of the past, per image, in [0, 1).
-    """
-
-    def __init__(self, memory: float = 0.8) -> None:
-        self._memory = memory
+    def __init__(self) -> None:
         self._smooth: NDArray[np.float64] | None = None
 
     def follow(self, picture: FloatArray) -> None:
         """Take the next image of the stream into account, (H, W)."""
         bounds = _bounds(picture)
         if self._smooth is not None:
-            bounds = self._memory * self._smooth + (1 - self._memory) * bounds
+            bounds = _SCALE_MEMORY * self._smooth + (1 - _SCALE_MEMORY) * bounds
         self._smooth = bounds
 
     def to_grey(self, picture: FloatArray) -> NDArray[np.uint8]:
@@ -197,25 +192,8 @@ _LONGEST_SILENCE_NS = 2_000_000_000
 # A stream cut off at the timestamp ends with its last event, a little before.
 _MAX_AFTER_END_NS = 100_000_000
 _SHARE_MEMORY = 0.8
-
-
-@dataclass(frozen=True)
-class ReconstructionOptions:
-    """How events become images.
-
-    Attributes:
-        windows: how the stream is cut.
-        n_warm_up: steps until the states have settled; 12 on a real DAVIS346 recording.
-        is_filtered: leave out hot pixels and background activity.
-        channel: the channel of the images.
-        n_threads: threads of onnxruntime.
-    """
-
-    windows: WindowOptions = field(default_factory=WindowOptions)
-    n_warm_up: int = 12
-    is_filtered: bool = True
-    channel: str = "events"
-    n_threads: int = 1
+# Steps until the states have settled, on a real DAVIS346 recording.
+N_WARM_UP = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +214,8 @@ class Reconstructor:
 
     Args:
         model: ONNX file; None takes the one shipped with the package.
-        options: windows, filters.
+        windows: how the stream is cut.
+        channel: the channel of the images.
 
     Raises:
         ProfileError: the model cannot be used.
@@ -244,10 +223,10 @@ class Reconstructor:
     """
 
     def __init__(
-        self, model: Path | None = None, options: ReconstructionOptions = ReconstructionOptions()
+        self, model: Path | None = None, windows: WindowOptions | None = None, channel: str = "events"
     ) -> None:
-        self.options = options
-        self._model = ReconstructionModel(model, options.n_threads)
+        self.windows, self.channel = windows or WindowOptions(), channel
+        self._model = ReconstructionModel(model)
         self.reset()
 
     def reset(self) -> None:
@@ -264,7 +243,7 @@ class Reconstructor:
     @property
     def is_warm(self) -> bool:
         """Whether enough of the stream has been seen for images to count."""
-        return self.n_steps >= self.options.n_warm_up
+        return self.n_steps >= N_WARM_UP
 
     def reconstruct(self, batches: Iterable[Events], stamps_ns: Sequence[int]) -> Iterator[Image | Refusal]:
         """Return one image, or the reason for none, for every timestamp, in the order of the timestamps.
@@ -324,15 +303,12 @@ class Reconstructor:
             return READ_NO_EVENTS.refusal()
         return self._picture_at(stamp_ns, is_step=is_step)
 
-    def _begin(self, events: Events) -> None:
-        self._first_ns = int(events.t_ns[0]) if len(events) else 0
-        states = self._model.initial_states(events.height_px, events.width_px)
-        self._current = _Window(self._first_ns, events, states)
-
     def _take(self, batch: Events, last_ns: int | None) -> None:
         """Append a batch to the current window."""
         if self._current is None:
-            self._begin(batch)
+            self._first_ns = int(batch.t_ns[0])
+            states = self._model.initial_states(batch.height_px, batch.width_px)
+            self._current = _Window(self._first_ns, batch, states)
             return
         pending = self._current.events
         size, expected = (batch.width_px, batch.height_px), (pending.width_px, pending.height_px)
@@ -351,7 +327,7 @@ class Reconstructor:
     def _rule(self) -> WindowRule:
         assert self._current is not None
         events = self._current.events
-        return window_rule(self.options.windows, events.height_px, events.width_px, self._share)
+        return window_rule(self.windows, events.height_px, events.width_px, self._share)
 
     def _advance(self, until_ns: int) -> None:
         """Take every step whose window is complete by then."""
@@ -370,7 +346,7 @@ class Reconstructor:
         window = self._current
         events = window.events.between(window.start_ns, end_ns)
         self._noise.learn(events)
-        events = self._cleaned(events)
+        events = self._noise.clean(events)
         picture, states = self._picture(events, window.start_ns, end_ns, window.states)
         self._scale.follow(picture)
         memory = _SHARE_MEMORY if self.n_steps else 0.0
@@ -388,20 +364,17 @@ class Reconstructor:
         voxels = normalise_voxels(voxel_grid(events, self._model.n_bins, start_ns, end_ns))
         return self._model.step(voxels, states)
 
-    def _cleaned(self, events: Events) -> Events:
-        return self._noise.clean(events) if self.options.is_filtered else events
-
     def _picture_at(self, stamp_ns: int, *, is_step: bool = False) -> Image | Refusal:
         assert self._first_ns is not None
         if stamp_ns <= self._first_ns:
             return READ_BEFORE_EVENTS.refusal(gap_s=1e-9 * (self._first_ns - stamp_ns))
         self._advance(stamp_ns)
         if not self.is_warm:
-            seen_s, n_warm_up = 1e-9 * (stamp_ns - self._first_ns), self.options.n_warm_up
-            return READ_NETWORK_SETTLING.refusal(n_steps=self.n_steps, n_warm_up=n_warm_up, seen_s=seen_s)
+            seen_s = 1e-9 * (stamp_ns - self._first_ns)
+            return READ_NETWORK_SETTLING.refusal(n_steps=self.n_steps, n_warm_up=N_WARM_UP, seen_s=seen_s)
         window = self._current
         assert window is not None
-        events = self._cleaned(window.events.between(window.start_ns, stamp_ns))
+        events = self._noise.clean(window.events.between(window.start_ns, stamp_ns))
         is_thin = self._rule().fill(len(events), stamp_ns - window.start_ns) < _MIN_FILL
         if is_thin and self._previous is not None:
             events = join_events([self._previous.events, events])
@@ -410,4 +383,4 @@ class Reconstructor:
             picture = self._commit(stamp_ns)
         else:
             picture, _ = self._picture(events, window.start_ns, stamp_ns, window.states)
-        return Image(events.sensor, self.options.channel, stamp_ns, self._scale.to_grey(picture))
+        return Image(events.sensor, self.channel, stamp_ns, self._scale.to_grey(picture))

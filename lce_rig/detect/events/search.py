@@ -14,7 +14,7 @@ from lce_rig.core.geometry import Array, exp_so3, pose, rotation_angle, skew
 from lce_rig.core.planar_pose import pose_covariance
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.figures import event_quality, outline_px, with_motion
-from lce_rig.detect.events.reconstructor import ReconstructionOptions, Reconstructor
+from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.detect.events.windows import WindowOptions
 from lce_rig.detect.image.search import find_image_board, region_around
 from lce_rig.detect.limits_met import explain_missing_board, gate_event_board, gate_image_board
@@ -129,14 +129,8 @@ def reconstructor_for(settings: ReconstructionSettings | None, channel: str) -> 
         SourceError: onnxruntime is not installed.
     """
     settings = settings or ReconstructionSettings()
-    windows = WindowOptions()
-    if settings.window_s is not None:
-        windows = WindowOptions("time", duration_s=settings.window_s)
-    elif settings.window_events is not None:
-        windows = WindowOptions("count", n_events=settings.window_events)
-    options = ReconstructionOptions(windows=windows, channel=channel)
     model = None if settings.model is None else Path(settings.model)
-    return Reconstructor(model, options)
+    return Reconstructor(model, WindowOptions(settings.window_s, settings.window_events), channel)
 
 
 def find_event_board(

@@ -1,14 +1,12 @@
 """Windows of events: how long they are gathered, and the arrays that they are summed into."""
 
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.data import Events
-from lce_rig.core.errors import UsageError
 
 # What the network was trained on, and E2VID's habit: about 0.35 events per pixel a step.
 _EVENTS_PER_PIXEL = 0.35
@@ -21,29 +19,21 @@ _AUTO_SHORTEST_NS = 20_000_000
 _FOREVER_NS = 1 << 62
 
 
-@dataclass(frozen=True)
-class WindowOptions:
+class WindowOptions(NamedTuple):
     """How the stream is cut into windows.
 
+    By default they hold as many events as the active part of the sensor calls for, but last 20 to 60 ms.
+
     Attributes:
-        kind: "time" (constant duration), "count" (constant number of events) or "auto": as many events as the
-            active part of the sensor calls for, but 20 to 60 ms.
-        duration_s: of "time"; 0.05 is what the paper used.
-        n_events: of "count"; None takes 0.35 events per pixel of the sensor.
+        duration_s: of each window instead; the paper used 0.05 s.
+        n_events: in each window instead.
     """
 
-    kind: Literal["auto", "time", "count"] = "auto"
-    duration_s: float = 0.05
+    duration_s: float | None = None
     n_events: int | None = None
 
-    def __post_init__(self) -> None:
-        """Refuse windows that never end or hold nothing."""
-        if not self.duration_s > 0 or (self.n_events is not None and self.n_events < 1):
-            raise UsageError("a window must hold at least one event and last longer than 0 s")
 
-
-@dataclass(frozen=True)
-class WindowRule:
+class WindowRule(NamedTuple):
     """When the current window ends: at n_events and shortest_ns both, or at longest_ns."""
 
     n_events: int
@@ -72,12 +62,12 @@ class WindowRule:
 
 def window_rule(options: WindowOptions, height_px: int, width_px: int, share: float) -> WindowRule:
     """Settle the next window's end from the options and the share of the sensor that is active."""
-    if options.kind == "time":
+    if options.duration_s is not None:
         duration_ns = max(1, round(options.duration_s * 1e9))
         return WindowRule(1 << 62, 0, duration_ns)
+    if options.n_events is not None:
+        return WindowRule(options.n_events, 0, _FOREVER_NS)
     usual = _EVENTS_PER_PIXEL * height_px * width_px
-    if options.kind == "count":
-        return WindowRule(options.n_events or max(1, round(usual)), 0, _FOREVER_NS)
     relative = min(1.0, max(share, _MIN_ACTIVE_SHARE) / _USUAL_ACTIVE_SHARE)
     return WindowRule(max(1, round(usual * relative)), _AUTO_SHORTEST_NS, _AUTO_LONGEST_NS)
 
@@ -124,7 +114,7 @@ def voxel_grid(
     duration_ns = max(1, end_ns - start_ns)
     position = np.clip((events.t_ns - start_ns) * ((n_bins - 1) / duration_ns), 0.0, n_bins - 1)
     sign = np.where(events.polarity, 1.0, -1.0)
-    pixel = _pixel_index(events)
+    pixel = events.y.astype(np.intp) * events.width_px + events.x
     n_pixels = events.height_px * events.width_px
     voxels = np.zeros((n_bins, n_pixels))
     # Events are in time order: those between two bins form a slice, counted into two images.
@@ -149,10 +139,3 @@ def normalise_voxels(voxels: FloatArray) -> FloatArray:
     if len(values):
         voxels[is_hit] = (values - values.mean(dtype=np.float64)) / max(values.std(dtype=np.float64), 1e-3)
     return voxels
-
-
-def _pixel_index(events: Events) -> NDArray[np.intp]:
-    index = events.y.astype(np.intp)
-    index *= events.width_px
-    index += events.x
-    return index

@@ -195,7 +195,7 @@ class Beam:
         return self.aperture_m + np.array([self.divergence_rad, upright_rad]) * distance_m
 
 
-def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: int = 3) -> Array:
+def fit_plane_to_ranges(points: Array, start: Array, scale_m: float) -> Array:
     """Fit a plane to ranges: minimise sum rho_T(r_i - 1 / (m . u_i)) over m, n = -m / |m|, d = 1 / |m|.
 
     The beams' directions u_i are exact and the noise lies along them. Orthogonal least squares would turn the
@@ -205,7 +205,6 @@ def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: i
         points: (N, 3) m, frame lidar.
         start: (4,) plane as (n, d).
         scale_m: noise of a range.
-        n_rounds: Gauss-Newton rounds.
 
     Returns:
         (4,) plane as (n, d), n towards the LiDAR.
@@ -213,7 +212,7 @@ def fit_plane_to_ranges(points: Array, start: Array, scale_m: float, n_rounds: i
     range_m = np.linalg.norm(points, axis=1)
     rays = points / range_m[:, None]
     m = -start[:3] / start[3]
-    for _ in range(n_rounds):
+    for _ in range(3):  # Gauss-Newton
         predicted = 1.0 / (rays @ m)
         residual = range_m - predicted
         weight = np.maximum(1.0 - (residual / (4.7 * scale_m)) ** 2, 0.0) ** 2

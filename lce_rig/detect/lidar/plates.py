@@ -13,6 +13,7 @@ from lce_rig.detect.lidar.template import Placement, plane_axes, register_ends
 MAX_PAIRS = 400
 CELL = 0.5  # of the board's diagonal: where there are more pairs, those of one cell count as alike
 N_ROUNDS = 2
+MAX_PLATES = 10
 MAX_JOINT = 4  # returns between two segments of one chord: noise, a hand's edge, a dropped firing
 
 
@@ -40,7 +41,7 @@ class Plates:
 
 
 def propose_plates(
-    scan: OrderedScan, segments: Segments, board: Board, n_plates: int = 10, is_any_size: bool = False
+    scan: OrderedScan, segments: Segments, board: Board, is_any_size: bool = False
 ) -> tuple[Plates, Array]:
     """Grow plates from pairs of neighbouring segments and keep different ones of plausible size.
 
@@ -51,7 +52,6 @@ def propose_plates(
         scan: gives the noise.
         segments: straight segments of all lengths.
         board: gives the reach.
-        n_plates: the most plates to return.
         is_any_size: whether to keep plates that cannot be the board.
 
     Returns:
@@ -86,7 +86,7 @@ def propose_plates(
         is_kept &= np.asarray(
             (ratio[:, 0] > 0.5) & (ratio[:, 0] < 1.5) & (ratio[:, 1] > 0.25) & (ratio[:, 1] < 1.5)
         )
-    best = _different(plates, np.flatnonzero(is_kept), board, n_plates)
+    best = _different(plates, np.flatnonzero(is_kept), board)
     ends = []
     for k in best:
         members = column[row == k]
@@ -224,20 +224,20 @@ def _faces_lidar(plates: Plates) -> NDArray[np.bool_]:
     return np.asarray(plates.plane[:, 3] > np.cos(MAX_INCIDENCE_RAD) * distance)
 
 
-def _different(plates: Plates, candidates: Indices, board: Board, n_plates: int) -> Indices:
+def _different(plates: Plates, candidates: Indices, board: Board) -> Indices:
     """Choose the most board-like plate of each place and orientation, the best first."""
     long_m, short_m = max(board.width_m, board.height_m), min(board.width_m, board.height_m)
     misfit = np.abs(np.log(np.maximum(plates.size_m[candidates], 1e-3) / [long_m, short_m])).sum(axis=1)
     # Few rings say little about a size; many returns on a wrong size say no.
     rank = candidates[np.argsort(misfit - 0.1 * np.minimum(plates.n_rings[candidates], 8), kind="stable")]
-    rank = rank[: 20 * n_plates]
+    rank = rank[: 20 * MAX_PLATES]
     centre, normal = plates.centre[rank], plates.plane[rank, :3]
     apart = np.linalg.norm(centre[:, None] - centre, axis=2)
     offset = np.abs(centre @ normal.T + plates.plane[rank, 3])
     is_same = (apart <= 0.3 * np.hypot(long_m, short_m)) & (normal @ normal.T >= 0.95) & (offset <= 0.05)
     is_open = np.ones(len(rank), dtype=np.bool_)
     chosen: list[int] = []
-    while is_open.any() and len(chosen) < n_plates:
+    while is_open.any() and len(chosen) < MAX_PLATES:
         best = int(np.argmax(is_open))
         chosen.append(int(rank[best]))
         is_open &= ~is_same[best]

@@ -13,6 +13,7 @@ Floats = NDArray[np.float32]
 
 # The board is found up to this angle between its normal and the beam; more is not a useful view.
 MAX_INCIDENCE_RAD = np.radians(70.0)
+MIN_POINTS = 4  # returns that make a segment
 MAX_STEPS = 3.6  # firings from one return to the next on the same surface; dark squares drop single ones
 RANGE_NOISE_FLOOR_M = 0.004
 
@@ -175,9 +176,7 @@ def _range_noise(turn: Floats, range_m: Floats, ring: NDArray[np.int16]) -> floa
     return max(quartile / (0.3186 * float(np.sqrt(6.0))), RANGE_NOISE_FLOOR_M)
 
 
-def cut_segments(
-    scan: OrderedScan, max_range_m: float, max_length_m: float = np.inf, min_points: int = 4
-) -> Segments:
+def cut_segments(scan: OrderedScan, max_range_m: float, max_length_m: float = np.inf) -> Segments:
     """Cut the rings at gaps and jumps, then at bends, and keep the straight pieces.
 
     A run whose returns leave its chord is cut where they leave it most, as a polyline is simplified.
@@ -186,7 +185,6 @@ def cut_segments(
         scan: all returns.
         max_range_m: runs whose first return is farther are dropped.
         max_length_m: longer pieces are dropped: walls hold most of a scan's returns.
-        min_points: runs with fewer returns are dropped.
 
     References:
         D. Douglas and T. Peucker, "Algorithms for the reduction of the number of points required to represent
@@ -195,7 +193,7 @@ def cut_segments(
     start = np.flatnonzero(scan.is_break)
     end = np.append(start[1:], len(scan.index))
     tolerance_m = 4.0 * scan.sigma_m + 0.01
-    is_kept = (end - start >= min_points) & (scan.range_m[start] <= max_range_m) if len(start) else start > 0
+    is_kept = (end - start >= MIN_POINTS) & (scan.range_m[start] <= max_range_m) if len(start) else start > 0
     start, end = start[is_kept], end[is_kept]
     xyz = np.ascontiguousarray(scan.points.T)
     done = []
@@ -209,7 +207,7 @@ def cut_segments(
         bent = ~is_straight
         start, middle, end = start[bent], worst[bent], end[bent]
         start, end = np.concatenate([start, middle]), np.concatenate([middle, end])
-        is_kept = end - start >= min_points
+        is_kept = end - start >= MIN_POINTS
         start, end = start[is_kept], end[is_kept]
     bounds = np.concatenate([*done, np.stack([start, end])], axis=1)
     bounds = bounds[:, np.argsort(bounds[0])]
