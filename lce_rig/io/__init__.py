@@ -7,7 +7,7 @@ from pkgutil import resolve_name
 
 from lce_rig.core.errors import SourceError
 from lce_rig.io import findings as findings  # Readers may name their kinds by code.
-from lce_rig.io.protocol import CONVERT_EVENTS, Recording, SourceOptions, choose_lidar
+from lce_rig.io.protocol import Recording, SourceOptions, choose_lidar
 from lce_rig.io.ros.bag_file import kind_of
 from lce_rig.rig import Rig
 
@@ -20,11 +20,14 @@ RECORDINGS = {
     ".pcapng": "lce_rig.io.velodyne_scans:PcapRecording",
     ".aedat4": "lce_rig.io.events:EventCameraFile",
     ".raw": "lce_rig.io.events:EventCameraFile",
+    ".h5": "lce_rig.io.events:EventCameraFile",
+    ".hdf5": "lce_rig.io.events:EventCameraFile",
+    ".txt": "lce_rig.io.events:EventCameraFile",
 }
 """Reader by suffix, or "folder"; imported when wanted."""
 _BAGS = frozenset({".bag", ".db3", ".mcap"})
 _PACKETS = frozenset({".pcap", ".pcapng"})
-_EVENTS = frozenset({".aedat4", ".raw"})
+_EVENTS = frozenset({".aedat4", ".raw", ".h5", ".hdf5"})
 _KINDS = (_BAGS, _PACKETS, _EVENTS)
 _CLOUDS = frozenset({".pcd", ".ply", ".las"})
 
@@ -41,7 +44,7 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
     kind = kind_of(path)
     if kind not in RECORDINGS:
         known = ", ".join(suffix for suffix in RECORDINGS if suffix != "folder")
-        hint = f"Give a folder with img/ and pcd/, or a file ({known}). {CONVERT_EVENTS}"
+        hint = f"Give a folder with img/ and pcd/, a bag, or a file of events ({known})."
         raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
     options = options or SourceOptions()
     reader = RECORDINGS[kind]

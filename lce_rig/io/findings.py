@@ -18,6 +18,7 @@ EVENTS_BEFORE_CLOCK_SET = _loss(
 EVENTS_STRAY = _loss("events_stray", "{n} events with stray timestamps skipped (first: {where})")
 EVENTS_SORTED = _loss("events_sorted", "{n} places where timestamps decrease by up to 20 ms, sorted")
 EVENTS_OFF_SENSOR = _loss("events_off_sensor", "{n} events off the sensor skipped (first: {where})")
+BROKEN_LINES = _loss("broken_lines", "{n} broken lines skipped (first: {where})")
 FRAMES_OUT_OF_ORDER = _loss("frames_out_of_order", "{n} out of order skipped")
 POINTS_WITHOUT_RETURN = _loss("points_without_return", "{n} points without a return")
 SENT_TWICE = _loss("sent_twice", "{n} sent twice (equal timestamps)")

@@ -14,7 +14,6 @@ from lce_rig.timing.rig_time import event_channel
 PairMethod: TypeAlias = Literal["auto", "stem", "order", "time"]
 Span: TypeAlias = tuple[int, int]
 """First and last timestamp, ns, the sensor's own clock."""
-CONVERT_EVENTS = "Convert events of other formats to AEDAT4, for example with faery."
 _END_BYTES = 65536
 
 

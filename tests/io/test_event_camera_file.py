@@ -85,7 +85,7 @@ def test_frames_out_of_order_are_left_out_and_counted(tmp_path: Path, rig: Rig) 
     assert has_note(recording.notes, "a.aedat4", "frames: 1 out")
 
 
-@pytest.mark.parametrize("name", ["a.aedat4", "a.raw"])
+@pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.raw", "a.txt"])
 def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path: Path, rig: Rig, name: str) -> None:
     WRITERS[name](tmp_path / name, EVENTS)
     assert len(events_of(opened(tmp_path / name, rig))) == len(EVENTS)

@@ -102,7 +102,7 @@ def test_files_named_after_a_sensor_belong_to_it(tmp_path: Path, rles: Rig) -> N
 @pytest.mark.parametrize(
     "files",
     [
-        ("img/0.png", "pcd/0.pcd", "events.raw"),
+        ("img/0.png", "pcd/0.pcd", "raw.h5"),
         ("a_0.mcap", "a_1.mcap"),
         ("a.mcap", "metadata.yaml"),
         ("0.png", "0.pcd"),

@@ -12,7 +12,7 @@ from lce_rig.io import findings
 from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
 from lce_rig.io.joining import merge_by_time
-from lce_rig.io.protocol import CONVERT_EVENTS, SourceOptions, Span, choose_event_camera, fingerprint
+from lce_rig.io.protocol import SourceOptions, Span, choose_event_camera, fingerprint
 from lce_rig.io.ros.bag_file import kind_of
 from lce_rig.rig import Rig
 
@@ -22,6 +22,9 @@ READERS = {
     ".db3": "lce_rig.io.ros.event_messages:BagEvents",
     ".mcap": "lce_rig.io.ros.event_messages:BagEvents",
     ".raw": "lce_rig.io.events.prophesee:PropheseeEvents",
+    ".h5": "lce_rig.io.events.tables:Hdf5Events",
+    ".hdf5": "lce_rig.io.events.tables:Hdf5Events",
+    ".txt": "lce_rig.io.events.tables:TextEvents",
 }
 """Reader by suffix; a folder is a ROS 2 bag. Imported when wanted."""
 
@@ -38,7 +41,7 @@ def open_events(
     """Open a recording of events.
 
     Args:
-        path: an AEDAT4 or Prophesee .raw file, or a ROS 1 or ROS 2 bag.
+        path: an AEDAT4, Prophesee .raw, HDF5 (DSEC) or text file, or a ROS 1 or ROS 2 bag.
         sensor: name of the camera that its events are taken for.
         resolution: (width, height) px of that camera; None takes the file's, or the extent of its events.
         topic: of a bag; None takes the only one with events.
@@ -52,7 +55,7 @@ def open_events(
         raise SourceError(f"{path} does not exist")
     kind = kind_of(path)
     if kind not in READERS:
-        hint = f"Give a ROS 2 bag's folder or a file ({', '.join(READERS)}). {CONVERT_EVENTS}"
+        hint = f"Give a ROS 2 bag's folder or a file of one of these kinds: {', '.join(READERS)}."
         raise SourceError(f"{path} is not an event recording that lce-rig reads", hint)
     reader = resolve_name(READERS[kind])
     stream = reader(path, topic) if reader.__name__ == "BagEvents" else reader(path)

@@ -26,7 +26,7 @@ from lce_rig.core.data import MAX_TIME_NS, EventColumns, join_events
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import NS_PER_US, EventStream, NoEventsError, parse_size
+from lce_rig.io.events.event_recording import NS_PER_US, EventStream, NoEventsError, parse_size, to_ns
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 EVENT = np.dtype({"names": ["t", "x", "y", "on"], "formats": ["<i8", "<i2", "<i2", "?"], "itemsize": 16})
@@ -224,10 +224,7 @@ def _decode_events(table: bytes) -> EventColumns:
     at, n_events = _vector_at(table, 0)
     events = np.frombuffer(table, EVENT, n_events, at) if n_events else np.empty(0, EVENT)
     x, y = events["x"].astype(np.uint16), events["y"].astype(np.uint16)
-    # `in_time_order` skips times beyond any clock.
-    limit_us = MAX_TIME_NS // NS_PER_US + 1
-    t_ns = np.clip(events["t"], -limit_us, limit_us) * NS_PER_US
-    return EventColumns(t_ns, x, y, events["on"].view(np.uint8) != 0)
+    return EventColumns(to_ns(events["t"]), x, y, events["on"].view(np.uint8) != 0)
 
 
 def _streams(xml: str) -> dict[int, tuple[str, dict[str, str]]]:

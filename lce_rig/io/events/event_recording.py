@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,19 @@ def parse_size(width: str, height: str) -> tuple[int, int] | None:
         return None
     size = int(width), int(height)
     return size if 0 < size[0] * size[1] <= MAX_EVENT_PIXELS else None
+
+
+def to_ns(times_us: NDArray[Any], offset_us: int = 0) -> NDArray[np.int64]:
+    """Convert whole microseconds; times beyond any clock become MAX_TIME_NS, which `in_time_order` skips.
+
+    Args:
+        times_us: (N,) integers of any type, or finite numbers.
+        offset_us: added to each.
+    """
+    limit_us = MAX_TIME_NS // NS_PER_US
+    is_time = (times_us > -limit_us - offset_us) & (times_us < limit_us - offset_us)
+    t_us = np.where(is_time, times_us, 0).astype(np.int64)
+    return np.where(is_time, (t_us + offset_us) * NS_PER_US, MAX_TIME_NS)
 
 
 class EventRecording:

@@ -1,7 +1,7 @@
 """Small encoders for the formats that cameras and drivers write, one event after the other."""
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -33,6 +33,16 @@ def random_events(
             x[i], y[i] = min(x[i - 1] + rng.integers(1, 4), size[0] - 1), y[i - 1]
     polarity = rng.random(n) < 0.5
     return Events("events", t_us * 1000, x.astype(np.uint16), y.astype(np.uint16), polarity, *size)
+
+
+def evt2(events: Iterable[Event]) -> bytes:
+    words, high = [], -1
+    for t, x, y, p in events:
+        if t >> 6 != high:
+            high = t >> 6
+            words.append(8 << 28 | high & 0xFFFFFFF)
+        words.append(int(p) << 28 | (t & 0x3F) << 22 | x << 11 | y)
+    return struct.pack(f"<{len(words)}I", *words)
 
 
 def evt3(events: Sequence[Event], with_vectors: bool = True) -> bytes:

@@ -29,6 +29,24 @@ def everything(recording: EventRecording) -> list[encoders.Event]:
     return [event for stretch in recording for event in listed(stretch)]
 
 
+def write_text(path: Path, events: Events, with_size: bool = True) -> None:
+    lines = [f"{t // 10**6}.{t % 10**6:06d} {x} {y} {p:d}" for t, x, y, p in listed(events)]
+    head = [f"{events.width_px} {events.height_px}"] if with_size else []
+    path.write_text("\n".join(head + lines) + "\n")
+
+
+def write_dsec(path: Path, events: Events) -> None:
+    import h5py
+
+    t_us = events.t_ns // 1000
+    with h5py.File(path, "w") as file:
+        file["events/t"] = (t_us - START_US).astype(np.uint32)
+        file["events/x"], file["events/y"] = events.x, events.y
+        file["events/p"] = events.polarity.astype(np.uint8)
+        file["t_offset"] = START_US
+        file["ms_to_idx"] = np.zeros(1, np.uint64)
+
+
 def write_raw(path: Path, events: Events) -> None:
     head = "% evt 3.0\n% geometry 346x260\n% end\n"
     # The raw formats count from the sensor's start, and so do their stamps here.
@@ -40,6 +58,8 @@ WRITERS: dict[str, Callable[[Path, Events], object]] = {
     "a.aedat4": lambda path, events: write_aedat4(path, [events]),
     "a.bag": lambda path, events: write_event_bag(path, [events]),
     "ros2": lambda path, events: write_event_bag(path, [events]),
+    "a.h5": write_dsec,
+    "a.txt": write_text,
     "a.raw": write_raw,
 }
 
@@ -100,23 +120,47 @@ def test_a_damaged_packet_costs_only_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "head", ["% evt 3.0\n% geometry 640x480\n", "% format EVT3;height=480;width=640\n% end\n"]
+    ("head", "encode"),
+    [
+        ("% evt 2.0\n% geometry 640x480\n", encoders.evt2),
+        ("% format EVT2;height=480;width=640\n% end\n", encoders.evt2),
+        ("% format EVT3;height=480;width=640\n% end\n", encoders.evt3),
+    ],
 )
-def test_raw_files_of_every_header_are_read(tmp_path: Path, head: str) -> None:
+def test_raw_files_of_every_version_and_header_are_read(
+    tmp_path: Path, head: str, encode: Callable[[list[encoders.Event]], bytes]
+) -> None:
     truth = listed(random_events(500, 8, (640, 480)))
-    (tmp_path / "a.raw").write_bytes(head.encode() + encoders.evt3(truth))
+    (tmp_path / "a.raw").write_bytes(head.encode() + encode(truth))
     recording = open_events(tmp_path / "a.raw")
     assert recording.resolution_px == (640, 480)
     assert everything(recording) == truth
 
 
-def test_raw_files_of_another_encoding_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.raw").write_bytes(b"% evt 2.0\n% geometry 640x480\n% end\n" + bytes(1000))
-    with pytest.raises(SourceError, match="EVT3"):
-        open_events(tmp_path / "a.raw")
+def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path: Path) -> None:
+    few = EVENTS.select(slice(0, 100))
+    write_text(tmp_path / "a.txt", few, with_size=False)
+    lines = (tmp_path / "a.txt").read_text().splitlines()
+    lines[40:40] = ["# a comment", "nan 1 1 1", "1 -1 1 1"]
+    (tmp_path / "a.txt").write_text("\n".join(lines) + "\n1700000000.1 3")
+    recording = open_events(tmp_path / "a.txt", resolution=(346, 260))
+    assert everything(recording) == listed(few)
+    assert has_note(recording.notes, "2 broken lines") and has_note(recording.notes, "1 torn", "line 104")
+    (tmp_path / "a.txt").write_text("\n".join([*lines, "what is this?", ""]))
+    with pytest.raises(SourceError, match=r"a\.txt"):
+        everything(open_events(tmp_path / "a.txt", resolution=(346, 260)))
 
 
-@pytest.mark.parametrize("name", ["a.aedat4", "a.bag", "a.raw"])
+def test_hdf5_compressed_by_a_plugin_is_read(tmp_path: Path) -> None:
+    h5py, hdf5plugin = pytest.importorskip("h5py"), pytest.importorskip("hdf5plugin")
+    write_dsec(tmp_path / "a.h5", EVENTS)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["events/x"]
+        file.create_dataset("events/x", data=EVENTS.x, **hdf5plugin.Blosc())
+    assert everything(open_events(tmp_path / "a.h5")) == listed(EVENTS)
+
+
+@pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.txt", "a.bag", "a.raw"])
 def test_rubbish_by_any_name_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     for rubbish in (b"", b"rubbish\n" * 100, bytes(1000)):
         (tmp_path / name).write_bytes(rubbish)
@@ -125,9 +169,9 @@ def test_rubbish_by_any_name_is_refused_in_one_line(tmp_path: Path, name: str) -
         assert "\n" not in caught.value.what
 
 
-@pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "img"])
+@pytest.mark.parametrize("name", ["a.aedat4", "a.mp4", "img"])
 def test_paths_that_are_no_recording_are_refused(tmp_path: Path, name: str) -> None:
-    (tmp_path / "a.h5").touch()
+    (tmp_path / "a.mp4").touch()
     (tmp_path / "img").mkdir()
     with pytest.raises(SourceError):
         open_events(tmp_path / name)
@@ -142,7 +186,7 @@ def whole(folder: Path, name: str) -> bytes:
     return (folder / name).read_bytes()
 
 
-@pytest.mark.parametrize("name", ["a.aedat4", "a.raw"])
+@pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.raw", "a.txt"])
 @given(data=st.data())
 def test_damaged_events_are_read_or_refused_in_one_line(
     tmp_path_factory: pytest.TempPathFactory, name: str, data: st.DataObject
