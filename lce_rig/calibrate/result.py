@@ -179,6 +179,13 @@ def squares_scale(diagnostics: Diagnostics) -> float:
     return 2.0 - scale if np.isfinite(scale) else 1.0
 
 
+def with_squares(observation: Observation, squares: float) -> Observation:
+    """Move the image's board to the distance that squares of `squares` times the size mean."""
+    T_cam_board = observation.image.T_cam_board.copy()
+    T_cam_board[:3, 3] *= squares
+    return replace(observation, image=replace(observation.image, T_cam_board=T_cam_board))
+
+
 def capture_residual(
     T_cam_lidar: Array,
     observation: Observation,
@@ -198,9 +205,7 @@ def capture_residual(
         held_out_m: passed through.
         squares: size of the squares relative to that by which the image's board was posed.
     """
-    T_cam_board = observation.image.T_cam_board.copy()
-    T_cam_board[:3, 3] *= squares
-    observation = replace(observation, image=replace(observation.image, T_cam_board=T_cam_board))
+    observation = with_squares(observation, squares)
     features = extract_features(observation, board, half_step=False)
     plane = np.abs(plane_residuals(features, T_cam_lidar, observation.lidar.points))
     edge = board.outline_distance(ends_on_board(features, T_cam_lidar))

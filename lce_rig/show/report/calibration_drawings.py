@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.plane_and_ends import plane_residuals
+from lce_rig.calibrate.result import squares_scale, with_squares
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
@@ -54,9 +55,9 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
         return None
     T = calibration.T_cam_lidar
     corners = board.corners()
-    plane_m = [
-        plane_residuals(extract_features(o, board, half_step=False), T, o.lidar.points) for o in observations
-    ]
+    squares = squares_scale(calibration.diagnostics)
+    features = [extract_features(with_squares(o, squares), board, half_step=False) for o in observations]
+    plane_m = [plane_residuals(f, T, o.lidar.points) for f, o in zip(features, observations, strict=True)]
     residuals_px = []
     for o in observations:
         # A board that moved has its pose at the LiDAR's time; its corners are those of the image.
