@@ -16,6 +16,8 @@ import click
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
 _MOST_UNBROKEN, _WIDTH = 24, 80
+# Lines that go on stand below the text after "-> ".
+_HANG = 3
 
 
 def note(text: str) -> None:
@@ -214,12 +216,17 @@ def escape(text: str) -> str:
 
 
 def print_lines(lines: list[str]) -> None:
-    """Print lines with rich markup on stdout; a terminal gets them wrapped at words, indented alike."""
+    """Print lines with rich markup on stdout; a terminal gets them wrapped at words, indented."""
     from rich.console import Console
-    from rich.padding import Padding
+    from rich.text import Text
 
-    console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
+    is_terminal = sys.stdout.isatty()
+    console = Console(highlight=False, soft_wrap=not is_terminal)
     for line in lines:
-        indent = len(line) - len(line.lstrip(" "))
-        is_wrapped = sys.stdout.isatty() and indent <= 2
-        console.print(Padding(line.lstrip(" "), (0, 0, 0, indent)) if is_wrapped else line)
+        if not is_terminal:
+            console.print(line)
+            continue
+        text = Text.from_markup(line.lstrip(" "))
+        indent = " " * min(len(line) - len(line.lstrip(" ")), console.width // 2)
+        for k, part in enumerate(text.wrap(console, console.width - len(indent) - _HANG) or [text]):
+            console.print(Text(indent + " " * (_HANG if k else 0)) + part)

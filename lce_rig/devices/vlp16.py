@@ -200,7 +200,7 @@ class Vlp16Source(LiveSource):
             "Check its power and cable, that this computer has an address in its network (192.168.1.x, mask "
             f"255.255.255.0), driver.address, and that the firewall lets UDP port {port} in."
         )
-        return SourceError(what, f"{hint} `lce-rig doctor --rig RIG` compares its web page with the profile.")
+        return SourceError(what, hint)
 
     def _take(self, datagram: Datagram, stream: Vlp16Stream, *, is_data: bool) -> Scan | None:
         if self._address and datagram.source != self._address:

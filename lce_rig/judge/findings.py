@@ -166,7 +166,7 @@ def _intrinsics(finding: Finding) -> str:
     """Intrinsics do not fit: {rms_px}, {possible_px}, {displacement_px}, {turn_deg}, {focal_ratio}."""
     q = finding.figures
     if finding.severity == "note":
-        return f"the boards correct the profile's intrinsics{_correction(q)}"
+        return f"boards correct the profile's intrinsics{_correction(q)}"
     fit = "do not fit" if finding.severity == "error" else "fit only roughly"
     displacement_px, correction = q["displacement_px"], _correction(q)
     if not isinstance(displacement_px, float) or not math.isfinite(displacement_px):
@@ -286,15 +286,13 @@ NOT_CERTIFIED = Kind(
 )
 ROTATION_UNCERTAIN = Kind(
     "verdict.rotation_uncertain",
-    "rotation standard deviation {sigma_deg:deg}, target {target_deg:deg} "
-    "(x right, y down, z forward {by_axis_deg:.2g} deg)",
+    "rotation standard deviation {sigma_deg:deg}, target {target_deg:deg} (x, y, z {by_axis_deg:.2g} deg)",
     "add captures; least determined: {weakest:motion}",
     actions={"measure_ranges": _RANGES, **_MEASURE},
 )
 TRANSLATION_UNCERTAIN = Kind(
     "verdict.translation_uncertain",
-    "translation standard deviation {sigma_m:1mm}, target {target_m:1mm} "
-    "(x right, y down, z forward {by_axis_m:1mm})",
+    "translation standard deviation {sigma_m:1mm}, target {target_m:1mm} (x, y, z {by_axis_m:1mm})",
     "add captures; least determined: {weakest:motion}",
     actions={"measure_ranges": _RANGES, **_MEASURE},
 )
