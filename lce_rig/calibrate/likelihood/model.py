@@ -4,7 +4,7 @@ A capture's own unknowns y enter only its own terms: the matrix is an arrow head
 by capture (Schur complement). `layout` names the unknowns.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.end_density import edge_system, expand_ends
 from lce_rig.calibrate.likelihood.images import StackedImages, image_rows
-from lce_rig.calibrate.likelihood.layout import END, LASER, OWN, RING, Columns, Layout, State
+from lce_rig.calibrate.likelihood.layout import END, LASER, OWN, RING, Columns, Indices, Layout, State
 from lce_rig.calibrate.likelihood.levels import Levels, PoseLevels, Priors
 from lce_rig.calibrate.likelihood.rays import (
     EdgeRows,
@@ -219,7 +219,10 @@ class Assembly:
         terms, reduced = self._terms, self.at(levels)
         moments = reduced.second_moments()
         weighted = moments * terms.trust[:, None, None]
-        of_ends = lru_cache(_end_costs(terms, weighted))
+        of_parts = (_range_costs, _image_costs, _own_shift_costs, _end_costs)
+        ranges, images, own_shifts, ends = (lru_cache(part(terms, weighted)) for part in of_parts)
+        by_level = {"range_m": ranges, "ring_m": ranges, "own_shift_m": own_shifts}
+        by_level |= dict.fromkeys(PoseLevels._fields, images)
         prior, mean, prior_volume = _prior(terms, levels, self._priors)
         # All captures have the same z; the mean of the square of its distance from that of the prior.
         z = terms.state.z - mean
@@ -229,40 +232,68 @@ class Assembly:
 
         def change(name: str) -> float:
             there = replace(levels, **{name: getattr(levels, name) * np.exp(_LOG_STEP)})
-            if name in ("range_m", "ring_m"):
-                before, volume_before = self._range_block(levels.range_m, levels.ring_m)
-                after, volume = _range_block(terms, there.range_m, there.ring_m)
-            elif name in PoseLevels._fields:
-                before, volume_before = self._image_block(levels.pose)
-                after, volume = _image_block(terms, there.pose)
-            elif name == "own_shift_m":
-                before, volume_before = _own_shift_block(terms, levels.own_shift_m)
-                after, volume = _own_shift_block(terms, there.own_shift_m)
-            elif name == "laser_m":
+            if name == "laser_m":
                 moved, _, log_volume = _prior(terms, there, self._priors)
                 return float(np.vdot(squares, moved - prior)) + log_volume - prior_volume
-            else:
-                return of_ends(there) - of_ends(levels)
-            return float(np.vdot(weighted, after - before) + terms.trust @ (volume - volume_before))
+            cost = by_level.get(name, ends)
+            return cost(there) - cost(levels)
 
         slopes = np.array([change(name) for name in names]) / _LOG_STEP
         return reduced.minus_2_log_evidence, slopes
 
 
+def _ring_places(columns: Columns, layout: Layout) -> Indices:
+    """List the places (L, c) in [y, z, residual] of each ring's columns."""
+    laser = dict(zip(LASER, layout.row.of(LASER).reshape(len(LASER), -1), strict=True))
+    n_rings = len(laser[LASER[0]])
+    return np.column_stack(
+        [laser[name] if name in laser else np.tile(layout.row.of([name]), (n_rings, 1)) for name in columns]
+    )
+
+
+def _range_costs(terms: Terms, moments: Array) -> Callable[[Levels], float]:
+    """Return the returns' part of -2 ln p for moments (F, n, n) of all unknowns, by level."""
+    place = _ring_places(RING, terms.state.layout)
+    of_rings = moments[:, place[:, :, None], place[:, None, :]]
+
+    def cost(levels: Levels) -> float:
+        weighted, log_volumes = weigh_ranges(terms.ranges, levels.range_m, levels.ring_m)
+        return float(np.vdot(of_rings, ring_systems(terms.ranges, weighted)) + terms.trust @ log_volumes)
+
+    return cost
+
+
+def _image_costs(terms: Terms, moments: Array) -> Callable[[Levels], float]:
+    """Return the images' part of -2 ln p for moments (F, n, n) of all unknowns, by level."""
+
+    def cost(levels: Levels) -> float:
+        total = 0.0
+        for capture, place, products, log_volumes in _image_products(terms, levels.pose):
+            total += np.vdot(moments[capture[:, None, None], place[:, None], place], products)
+            total += terms.trust[capture] @ log_volumes
+        return float(total)
+
+    return cost
+
+
+def _own_shift_costs(terms: Terms, moments: Array) -> Callable[[Levels], float]:
+    """Return the part of -2 ln p of the captures' own shifts for moments (F, n, n), by level."""
+    at, shift_m = terms.state.layout.row["own_shift"].start, terms.state.own_shift_m
+    square_m2 = moments[:, at, at] + 2 * moments[:, at, -1] * shift_m + moments[:, -1, -1] * shift_m**2
+
+    def cost(levels: Levels) -> float:
+        sigma_m = levels.own_shift_m
+        return float(square_m2.sum() / sigma_m**2 + terms.trust.sum() * 2 * np.log(sigma_m))
+
+    return cost
+
+
 def _end_costs(terms: Terms, moments: Array) -> Callable[[Levels], float]:
     """Return the ring ends' part of -2 ln p for moments (F, n, n) of all unknowns, by level."""
     edges, row = terms.edges, terms.state.layout.row
-    laser = row.of(LASER).reshape(len(LASER), -1)
-    alike = row.of([name for name in END if name not in (*LASER, "pose", "residual")])
-    M, k = len(edges.rows), edges.capture
-    place = np.column_stack(
-        [
-            np.broadcast_to(row.of(["pose"]), (M, 6)),
-            laser[:, edges.ring].T,
-            np.broadcast_to(alike, (M, len(alike))),
-            np.broadcast_to(row.of(["own_shift"]), (M, 1)),
-        ]
-    )
+    k = edges.capture
+    own_shift = np.tile(row.of(["own_shift"]), (len(k), 1))
+    place = np.hstack([_ring_places(END, terms.state.layout)[edges.ring, :-1], own_shift])
     J = np.column_stack([edges.rows[:, :-1], edges.rows[:, END["shifts"].start]])
     squares = np.einsum("mi,mij,mj->m", J, moments[k[:, None, None], place[:, :, None], place[:, None, :]], J)
     firsts = np.sum(J * moments[k[:, None], place, -1], axis=1)
@@ -332,12 +363,18 @@ def _image_block(terms: Terms, pose_levels: PoseLevels) -> tuple[Array, Array]:
     """Weight the images' terms; also the log determinants (F,) of their covariances."""
     layout, log_volumes = terms.state.layout, np.zeros_like(terms.trust)
     block = np.zeros((len(terms.trust), layout.row.size, layout.row.size))
-    for c, (images, rows) in enumerate(zip(terms.images, terms.image_rows, strict=True)):
-        cov, place = images.total_cov(pose_levels), layout.image_row(c)
-        products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
-        block[images.capture[:, None, None], place[:, None], place] += products
-        log_volumes[images.capture] += np.linalg.slogdet(cov)[1]
+    for capture, place, products, volumes in _image_products(terms, pose_levels):
+        block[capture[:, None, None], place[:, None], place] += products
+        log_volumes[capture] += volumes
     return block, log_volumes
+
+
+def _image_products(terms: Terms, pose_levels: PoseLevels) -> Iterator[tuple[Indices, Indices, Array, Array]]:
+    """Weight each camera's rows: captures (V,), places (c,), products (V, c, c), log determinants (V,)."""
+    for c, (images, rows) in enumerate(zip(terms.images, terms.image_rows, strict=True)):
+        cov = images.total_cov(pose_levels)
+        products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
+        yield images.capture, terms.state.layout.image_row(c), products, np.linalg.slogdet(cov)[1]
 
 
 def _prior(terms: Terms, levels: Levels, priors: Priors) -> tuple[Array, Array, float]:
