@@ -19,6 +19,8 @@ def main() -> None:
     try:
         watch_for_interrupts()
         limit_memory()
+        # Its matrices are small: threads of BLAS would only wait for each other.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         from lce_rig.cli.main import run
 
         code = run(sys.argv[1:])
