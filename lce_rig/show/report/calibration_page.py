@@ -3,8 +3,10 @@
 import base64
 import hashlib
 import math
+import os
 import shlex
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
 
@@ -159,15 +161,20 @@ def _gallery(
     if not c.is_of_lidars:
         lens = session.rig.cameras[c.camera].to_intrinsics()
     order = worst_first([r.plane_mean_m for r in c.residuals], [r.edge_mean_m for r in c.residuals])
+    order = order[: max(n_most, 1)]
+
+    def picture(k: int) -> str:
+        return "" if lens is None else picture_of(session.capture(c.residuals[k].capture), c, board, lens)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the time goes into decoding
+        pictures = list(pool.map(picture, (k for k, _ in order)))
     return [
         {
             **captures[k],
-            "picture": ""
-            if lens is None
-            else picture_of(session.capture(c.residuals[k].capture), c, board, lens),
+            "picture": shown,
             "stands_out": f"{ratio:.1f} x the median" if ratio > _STANDS_OUT else "",
         }
-        for k, ratio in order[: max(n_most, 1)]
+        for (k, ratio), shown in zip(order, pictures, strict=True)
     ]
 
 
