@@ -14,7 +14,7 @@ from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
 from lce_rig.core.findings import Losses, Refusal
 from lce_rig.io.folder import FolderRecording
-from lce_rig.io.joining import join_recordings, require_sensors
+from lce_rig.io.joining import check_overlap, join_recordings, require_sensors
 from lce_rig.io.protocol import (
     ContinuousRecording,
     Recording,
@@ -312,7 +312,7 @@ class _Collector:
         """Yield samples up to a tear, whose error goes to `torn`: moments before it are still captured."""
         done = 0
         try:
-            for sample in recording.samples():
+            for sample in check_overlap(recording.samples(), self._session.rig, recording.notes):
                 yield sample
                 if not isinstance(sample, Events):
                     done += 1

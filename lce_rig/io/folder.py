@@ -21,7 +21,6 @@ from lce_rig.io.findings import NOT_DECODED
 from lce_rig.io.protocol import (
     PairMethod,
     SourceOptions,
-    Span,
     choose_camera,
     choose_lidar,
     fingerprint,
@@ -297,7 +296,7 @@ class ImagesRecording:
         notes: what was chosen, and after reading the images that could not be read.
         key: fingerprint of the first and the last image of each camera, and of their number.
         n_samples: number of images.
-        streams: the images of each camera, with the times of the first and the last.
+        streams: the images of each camera.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
@@ -309,7 +308,7 @@ class ImagesRecording:
         self.path = path
         self.notes: list[str] = []
         self._images: list[tuple[int, ImageOnDisk]] = []
-        self.streams: dict[Stream, Span | None] = {}
+        self.streams: set[Stream] = set()
         ends: list[Path] = []
         for images in _images(path, rig, options, self.notes):
             timed = sorted(
@@ -322,8 +321,8 @@ class ImagesRecording:
                     "Name each after its time on the clock of the other recording, in seconds since 1970 "
                     "(1760000000.046122.jpg) or in ns; or put the point clouds into pcd/ beside them.",
                 )
-            (first_ns, first), (last_ns, last) = timed[0], timed[-1]
-            self.streams[Stream(first.camera, first.channel, "images")] = (first_ns, last_ns)
+            (_, first), (_, last) = timed[0], timed[-1]
+            self.streams.add(Stream(first.camera, first.channel, "images"))
             self._images += timed
             ends += [first.path, last.path]
         self._images.sort(key=lambda item: item[0])

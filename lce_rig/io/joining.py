@@ -1,18 +1,19 @@
 """Simultaneous streams merged by the rig's time, and recordings of several recorders read as one."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from heapq import merge
+from itertools import product
 from pathlib import Path
 
 from lce_rig.core.data import Sample, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io.protocol import ContinuousRecording, Recording, Span, serials_of
+from lce_rig.io.protocol import ContinuousRecording, Recording, serials_of
 from lce_rig.rig import Rig
-from lce_rig.timing.rig_time import rig_offset_ns, rig_time_ns, stream_of
+from lce_rig.timing.rig_time import rig_time_ns, stream_of
 
 _MAX_OFFSET_S = 3600.0
-# Spans are read from a recording's ends, without reading what lies between.
+# Packets of events count by their first timestamp.
 _ROUGH_S = 0.2
 # Sensors are switched on and off one after the other.
 _USUAL_LAG_S = 2.0
@@ -45,60 +46,58 @@ def merge_by_time(parts: Iterable[Iterable[Sample]], rig: Rig) -> Iterator[Sampl
         raise torn[0]
 
 
-def check_overlap(
-    scans: Mapping[Stream, Span | None], others: Mapping[Stream, Span | None], rig: Rig
-) -> list[str]:
-    """Check that images and events run while the LiDAR does.
+def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iterator[Sample]:
+    """Pass samples on; at their end, check that images and events ran while a LiDAR did.
 
     Args:
-        scans: streams of LiDARs.
-        others: streams of cameras.
+        samples: of a whole recording.
         rig: its `expected_offset_s` are added to the timestamps.
-
-    Returns:
-        Notes on streams that cover only a part of the scans.
+        notes: receives the streams that cover only a part of the scans.
 
     Raises:
         SourceError: a stream lies wholly before or after the scans, with the distance and the remedy.
     """
-    notes = []
-    for lidar, lidar_span in sorted(scans.items()):
-        for camera, camera_span in sorted(others.items()):
-            if lidar_span is None or camera_span is None:
-                continue
-            (scan_0, scan_1), (first, last) = (
-                tuple((t_ns + rig_offset_ns(stream, rig)) * 1e-9 for t_ns in span)
-                for stream, span in ((lidar, lidar_span), (camera, camera_span))
-            )
-            overlap_s, length_s = min(last, scan_1) - max(first, scan_0), scan_1 - scan_0
-            if overlap_s < -_ROUGH_S:
-                key = f"cameras.{camera.sensor}.channels.{camera.channel}.timestamps.expected_offset_s"
-                hint = "Record both at the same time on one computer's clock, preferably into one bag."
-                if abs(scan_0 - first) <= _MAX_OFFSET_S:
-                    hint = (
-                        "If they were recorded together, add the difference of their clocks to "
-                        f"{key} in the profile ({scan_0 - first:+.1f} s if both were started at once)."
-                    )
-                raise SourceError(
-                    f"{camera}: {camera.kind} run from {first:.3f} to {last:.3f} s, "
-                    f"scans from {scan_0:.3f} to {scan_1:.3f} s: {-overlap_s:.1f} s apart",
-                    hint,
+    spans_ns: dict[Stream, tuple[int, int]] = {}
+    for sample in samples:
+        time_ns = rig_time_ns(sample, rig)
+        if time_ns is not None:
+            stream = stream_of(sample, rig)
+            first_ns, last_ns = spans_ns.get(stream, (time_ns, time_ns))
+            spans_ns[stream] = min(first_ns, time_ns), max(last_ns, time_ns)
+        yield sample
+    spans = {stream: (1e-9 * span[0], 1e-9 * span[1]) for stream, span in sorted(spans_ns.items())}
+    scans = {stream: span for stream, span in spans.items() if stream.kind == "scans"}
+    for (lidar, (scan_0, scan_1)), (camera, (first, last)) in product(scans.items(), spans.items()):
+        if camera in scans:
+            continue
+        overlap_s, length_s = min(last, scan_1) - max(first, scan_0), scan_1 - scan_0
+        if overlap_s < -_ROUGH_S:
+            key = f"cameras.{camera.sensor}.channels.{camera.channel}.timestamps.expected_offset_s"
+            hint = "Record both at the same time on one computer's clock, preferably into one bag."
+            if abs(scan_0 - first) <= _MAX_OFFSET_S:
+                hint = (
+                    "If they were recorded together, add the difference of their clocks to "
+                    f"{key} in the profile ({scan_0 - first:+.1f} s if both were started at once)."
                 )
-            if length_s - overlap_s > _USUAL_LAG_S:
-                covered = f"{max(overlap_s, 0.0):.1f} of the {length_s:.1f} s of {lidar}'s scans"
-                notes.append(f"{camera}: {camera.kind} cover {covered}")
-    return notes
+            raise SourceError(
+                f"{camera}: {camera.kind} run from {first:.3f} to {last:.3f} s, "
+                f"scans from {scan_0:.3f} to {scan_1:.3f} s: {-overlap_s:.1f} s apart",
+                hint,
+            )
+        if length_s - overlap_s > _USUAL_LAG_S:
+            covered = f"{max(overlap_s, 0.0):.1f} of the {length_s:.1f} s of {lidar}'s scans"
+            notes.append(f"{camera}: {camera.kind} cover {covered}")
 
 
-def join_recordings(recordings: Iterable[Recording], rig: Rig) -> list[Recording]:
+def join_recordings(recordings: Sequence[Recording], rig: Rig) -> list[Recording]:
     """Join continuous recordings of the same moment, in the order given.
 
-    A recording is of the same moment as those before it where it repeats no LiDAR, and adds a sensor or runs
-    while their LiDAR does; what else it repeats is skipped.
+    A recording is of the same moment as those before it where it repeats no LiDAR, and adds a sensor or no
+    lone LiDAR follows that it could belong to; what else it repeats is skipped.
     """
     groups: list[list[Recording]] = []
-    for recording in recordings:
-        if groups and _belongs(recording, groups[-1], rig):
+    for place, recording in enumerate(recordings):
+        if groups and _belongs(recording, groups[-1], recordings[place + 1 :]):
             groups[-1].append(recording)
         else:
             groups.append([recording])
@@ -110,24 +109,15 @@ def join_recordings(recordings: Iterable[Recording], rig: Rig) -> list[Recording
     ]
 
 
-def _belongs(recording: Recording, group: Sequence[Recording], rig: Rig) -> bool:
+def _belongs(recording: Recording, group: Sequence[Recording], later: Sequence[Recording]) -> bool:
     parts = [other for other in group if isinstance(other, ContinuousRecording)]
     if not isinstance(recording, ContinuousRecording) or len(parts) < len(group):
         return False
-    held = {stream: span for part in parts for stream, span in part.streams.items()}
-    scans = {stream: span for stream, span in held.items() if stream.kind == "scans"}
-    if scans.keys() & recording.streams.keys():
+    held = {stream for part in parts for stream in part.streams}
+    if any(stream.kind == "scans" for stream in held & recording.streams):
         return False
-    if recording.streams.keys() - held.keys():
-        return True
-    # All its cameras are there already: a copy, where it runs while a LiDAR does.
-    if not any(scans.values()) or not all(recording.streams.values()):
-        return False
-    try:
-        check_overlap(scans, recording.streams, rig)
-    except SourceError:
-        return False
-    return True
+    kinds_later = [{s.kind for s in r.streams} for r in later if isinstance(r, ContinuousRecording)]
+    return bool(recording.streams - held) or {"scans"} not in kinds_later
 
 
 def require_sensors(recording: ContinuousRecording) -> None:
@@ -169,27 +159,18 @@ class JoinedRecording:
         self._rig = rig
         self._owner: dict[Stream, ContinuousRecording] = {}
         for part in parts:
-            for stream in part.streams:
+            for stream in sorted(part.streams):
                 owner = self._owner.setdefault(stream, part)
                 if owner is not part:
                     self.notes.append(f"{stream}: taken from {owner.path.name}, not from {part.path.name}")
-        self.streams: dict[Stream, Span | None] = {s: part.streams[s] for s, part in self._owner.items()}
+        self.streams = frozenset(self._owner)
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples of all parts, merged by the rig's time.
 
         Raises:
-            SourceError: images or events of one part lie wholly before or after the scans of another; or,
-                after everything that can be read, a part is torn.
+            SourceError: after everything that can be read, a part is torn.
         """
-        for part in self._parts:
-            scans = {s: span for s, span in part.streams.items() if s.kind == "scans"}
-            others = {
-                stream: self.streams[stream]
-                for stream, owner in self._owner.items()
-                if owner is not part and stream.kind != "scans"
-            }
-            self.notes += check_overlap(scans, others, self._rig)
         try:
             yield from merge_by_time([self._owned(part) for part in self._parts], self._rig)
         finally:

@@ -6,7 +6,7 @@ References:
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from lce_rig.core.findings import Losses
 from lce_rig.core.geometry import Array
 from lce_rig.io import findings
 from lce_rig.io.network import PcapFile
-from lce_rig.io.protocol import SourceOptions, Span, choose_lidar, fingerprint
+from lce_rig.io.protocol import SourceOptions, choose_lidar, fingerprint
 from lce_rig.rig import LidarSettings, Rig
 
 # A scan with more of its columns lost is not worth looking at.
@@ -177,7 +177,7 @@ class OusterRecording:
         notes: the metadata's file and profile, and after reading the losses.
         key: fingerprint of the file and its metadata.
         n_samples: number of scans to come, estimated from the file's size.
-        streams: the LiDAR's scans; their span is not known beforehand.
+        streams: the LiDAR's scans.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
@@ -203,7 +203,7 @@ class OusterRecording:
         self.notes.append(f"{path.name}: metadata of {beside.name}, profile {self._metadata.name}")
         self._sender = self._choose_sender()
         self.key = fingerprint([path, beside])
-        self.streams: Mapping[Stream, Span | None] = {Stream(self._lidar, "", "scans"): None}
+        self.streams = frozenset([Stream(self._lidar, "", "scans")])
         n_packets = -(-self._metadata.n_columns // self._metadata.columns_per_packet)
         self.n_samples = max(1, path.stat().st_size // (n_packets * self._layout.itemsize))
 

@@ -1,7 +1,7 @@
 """The interface of every recording, and the sensors of the rig that its data belong to."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
@@ -12,8 +12,6 @@ from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import event_channel
 
 PairMethod: TypeAlias = Literal["auto", "stem", "order", "time"]
-Span: TypeAlias = tuple[int, int]
-"""First and last timestamp, ns, the sensor's own clock."""
 _END_BYTES = 65536
 
 
@@ -58,12 +56,12 @@ class ContinuousRecording(Recording, Protocol):
     Attributes:
         key: fingerprint of the recording.
         n_samples: number of images and scans to come, for progress.
-        streams: what is in it, with the span of its timestamps where they need not all be read.
+        streams: what is in it.
     """
 
     key: str
     n_samples: int
-    streams: Mapping[Stream, Span | None]
+    streams: Set[Stream]
 
     def samples(self) -> Iterator[Sample]:
         """Yield what the sensors saw, in order of time; events in packets."""

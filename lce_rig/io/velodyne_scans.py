@@ -8,7 +8,7 @@ cuts revolutions at packets, hands on partial ones, and keeps both returns of a 
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding, Losses
 from lce_rig.io import findings
 from lce_rig.io.network import PcapFile
-from lce_rig.io.protocol import SourceOptions, Span, choose_lidar, fingerprint
+from lce_rig.io.protocol import SourceOptions, choose_lidar, fingerprint
 from lce_rig.io.velodyne_packets import (
     BadPacketError,
     DataPacket,
@@ -311,7 +311,7 @@ class PcapRecording:
         notes: the sensor whose packets are taken, and after reading the losses.
         key: fingerprint of the file.
         n_samples: number of scans to come, estimated from the file's size.
-        streams: the LiDAR's scans; their span, by arrival, is found only where they are part of a recording.
+        streams: the LiDAR's scans.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
@@ -329,11 +329,7 @@ class PcapRecording:
         self._product = Vlp16Stream(self._lidar, self._settings).product
         self._address, n_packets = self._choose_sender()
         self.key = fingerprint([path])
-        span_ns: Span | None = None
-        if options.is_part:
-            arrivals_ns = [d.host_ns for d in self._file.datagrams() if d.source == self._address]
-            span_ns = (min(arrivals_ns), max(arrivals_ns)) if any(arrivals_ns) else None
-        self.streams: Mapping[Stream, Span | None] = {Stream(self._lidar, "", "scans"): span_ns}
+        self.streams = frozenset([Stream(self._lidar, "", "scans")])
         sweep_s = n_packets * self._product.packet_ns(is_dual=False) * 1e-9
         self.n_samples = max(1, round(sweep_s * self._settings.rate_hz))
 

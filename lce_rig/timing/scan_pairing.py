@@ -202,7 +202,11 @@ class _Pairing:
                 self._waiting.append((time_ns, half_ns, sample))
             else:
                 key = (sample.sensor, sample.channel if isinstance(sample, Image) else "")
-                self._buffers.setdefault(key, deque()).append((time_ns, sample))
+                buffer = self._buffers.setdefault(key, deque())
+                buffer.append((time_ns, sample))
+                # Of a recording whose scans come later, or never.
+                while buffer[0][0] < time_ns - self._kept_ns:
+                    buffer.popleft()
         self._position_ns = max(self._position_ns, time_ns)
         self._events.forget_before(self._position_ns - self._kept_ns)
 

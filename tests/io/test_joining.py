@@ -10,8 +10,8 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Sample, Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io.joining import JoinedRecording, join_recordings, merge_by_time, require_sensors
-from lce_rig.io.protocol import ContinuousRecording, Span
+from lce_rig.io.joining import JoinedRecording, check_overlap, join_recordings, merge_by_time, require_sensors
+from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.rig import Rig, load_rig
 from tests.notes import has_note
 
@@ -39,17 +39,13 @@ class Listed:
 
     name: str
     contents: list[tuple[Stream, float]]
-    span_s: tuple[float, float] | None = (0.0, 10.0)
     torn: str = ""
     notes: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.path, self.key = Path(self.name), self.name
         self.n_samples = sum(stream.kind != "events" for stream, _ in self.contents)
-        span: Span | None = None
-        if self.span_s is not None:
-            span = T0_NS + round(self.span_s[0] * S), T0_NS + round(self.span_s[1] * S)
-        self.streams = dict.fromkeys((stream for stream, _ in self.contents), span)
+        self.streams = {stream for stream, _ in self.contents}
 
     def samples(self) -> Iterator[Sample]:
         yield from (sample(stream, time_s) for stream, time_s in self.contents)
@@ -63,13 +59,13 @@ def rig() -> Rig:
     return load_rig("rles")
 
 
-def lidar(name: str = "lidar.bag", **kwargs: object) -> Listed:
-    return Listed(name, [(LIDAR, 0.0), (LIDAR, 0.1), (LIDAR, 0.2)], **kwargs)
+def lidar(name: str = "lidar.bag", step_s: float = 0.1, **kwargs: object) -> Listed:
+    return Listed(name, [(LIDAR, k * step_s) for k in range(3)], **kwargs)
 
 
-def camera(name: str = "events.aedat4", **kwargs: object) -> Listed:
+def camera(name: str = "events.aedat4", after_s: float = 0.0) -> Listed:
     contents = [(EVENTS, 0.01), (FRAMES, 0.05), (EVENTS, 0.12), (FRAMES, 0.15)]
-    return Listed(name, contents, **kwargs)
+    return Listed(name, [(stream, time_s + after_s) for stream, time_s in contents])
 
 
 def whole(name: str, *more: Stream) -> Listed:
@@ -91,14 +87,8 @@ def test_each_recording_joins_those_before_it_that_lack_its_sensors(rig: Rig) ->
         ([whole("a"), whole("b", EVENTS)], [["a"], ["b"]]),
         ([whole("a"), events_only], [["a", "e"]]),
         ([whole("a"), camera("c")], [["a", "c"]]),
-        (
-            [lidar("1"), camera("2", span_s=None), lidar("3"), camera("4", span_s=None)],
-            [["1", "2"], ["3", "4"]],
-        ),
-        (
-            [camera("1", span_s=None), lidar("2"), camera("3", span_s=None), lidar("4")],
-            [["1", "2"], ["3", "4"]],
-        ),
+        ([lidar("1"), camera("2"), lidar("3"), camera("4")], [["1", "2"], ["3", "4"]]),
+        ([camera("1"), lidar("2"), camera("3"), lidar("4")], [["1", "2"], ["3", "4"]]),
     ]:
         assert names(join_recordings(given, rig)) == wanted
 
@@ -108,8 +98,6 @@ def test_a_copy_of_what_is_there_already_is_left_out_and_it_is_said(rig: Rig) ->
     assert isinstance(joined, JoinedRecording)
     assert has_note(joined.notes, "davis.events", "a.bag, not", "c.aedat4")
     assert len(list(joined.samples())) == 3
-    later = camera("c.aedat4", span_s=(20.0, 30.0))
-    assert names(join_recordings([whole("a.bag", EVENTS), later], rig)) == [["a.bag"], ["c.aedat4"]]
 
 
 def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rig: Rig) -> None:
@@ -134,24 +122,26 @@ def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rig: Rig)
     assert one.key == other.key != JoinedRecording([lidar(), camera("x")], rig).key
 
 
-def test_clocks_that_do_not_overlap_are_said_by_how_much_before_anything_is_read(rig: Rig) -> None:
-    parts = [lidar(span_s=(0.0, 30.0)), camera(span_s=(1264.5, 1300.0))]
-    with pytest.raises(
-        SourceError,
-    ) as caught:
-        next(iter(JoinedRecording(parts, rig).samples()))
-    assert "channels.events.timestamps.expected_offset_s" in caught.value.hint
-    assert "-1264.5 s" in caught.value.hint
-    since_start = camera(span_s=(-1_699_999_999.0, -1_699_999_990.0))
-    with pytest.raises(SourceError, match=r"1699999990\.0 s apart") as caught:
-        next(iter(JoinedRecording([lidar(), since_start], rig).samples()))
-    assert "one computer's" in caught.value.hint
+@pytest.mark.parametrize(
+    ("after_s", "words"),
+    [
+        (1264.5, ["channels.events.timestamps.expected_offset_s", "-1264.5 s"]),
+        (-1_699_999_999.0, ["one computer's"]),
+    ],
+)
+def test_clocks_that_do_not_overlap_are_said_by_how_much(rig: Rig, after_s: float, words: list[str]) -> None:
+    joined = JoinedRecording([lidar(), camera(after_s=after_s)], rig)
+    passed = []
+    with pytest.raises(SourceError) as caught:
+        for one in check_overlap(joined.samples(), rig, []):
+            passed.append(one)
+    assert len(passed) == 7 and all(word in caught.value.hint for word in words)
 
 
 def test_a_partial_overlap_is_noted(rig: Rig) -> None:
-    joined = JoinedRecording([lidar(span_s=(0.0, 30.0)), camera(span_s=(20.0, 60.0))], rig)
-    assert len(list(joined.samples())) == 7
-    assert has_note(joined.notes, "davis.events", "10.0 of", "30.0 s", "lidar's")
+    joined = JoinedRecording([lidar(step_s=15.0), camera(after_s=20.0)], rig)
+    assert len(list(check_overlap(joined.samples(), rig, joined.notes))) == 7
+    assert has_note(joined.notes, "davis.events", "0.1 of", "30.0 s", "lidar's")
 
 
 def test_a_part_that_is_torn_does_not_end_the_others(rig: Rig) -> None:

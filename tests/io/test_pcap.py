@@ -138,12 +138,9 @@ def test_a_recording_is_found_by_its_suffix(
     recording = open_recording(write_pcap(tmp_path / "a.PCAP", frames), rig)
     assert isinstance(recording, ContinuousRecording)
     assert recording.n_samples == 3
-    assert recording.streams == {Stream("lidar", "", "scans"): None}
+    assert recording.streams == {Stream("lidar", "", "scans")}
     part = open_recording(tmp_path / "a.PCAP", rig, SourceOptions(is_part=True))
     assert isinstance(part, ContinuousRecording) and part.key == recording.key
-    (span_ns,) = part.streams.values()
-    assert span_ns is not None and T0_NS < span_ns[0] < T0_NS + 2_000_000
-    assert span_ns[1] - span_ns[0] == pytest.approx(0.3e9, rel=0.01)
 
 
 def test_notes_say_what_was_taken_and_what_the_stamps_are(

@@ -9,7 +9,7 @@ import pytest
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import list_parts, open_recordings
-from lce_rig.io.joining import JoinedRecording, join_recordings
+from lce_rig.io.joining import JoinedRecording, check_overlap, join_recordings
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
 from lce_rig.io.ros.bag_recorder import BagRecorder
@@ -158,9 +158,9 @@ def test_two_days_of_pictures_and_packets_stay_apart(tmp_path: Path, rlfs: Rig) 
         file.rename(file.with_name(f"{int(file.name[:10]) + 86400}{file.name[10:]}"))
     joined = join_recordings(open_recordings([tmp_path / "monday", tmp_path / "tuesday"], rlfs), rlfs)
     assert len(joined) == 2
-    list(joined[0].samples())  # type: ignore[attr-defined]
+    list(check_overlap(joined[0].samples(), rlfs, []))  # type: ignore[attr-defined]
     with pytest.raises(SourceError):  # The packets are still monday's.
-        list(joined[1].samples())  # type: ignore[attr-defined]
+        list(check_overlap(joined[1].samples(), rlfs, []))  # type: ignore[attr-defined]
 
 
 def test_pictures_without_times_or_without_scans_are_refused(tmp_path: Path, rlfs: Rig) -> None:

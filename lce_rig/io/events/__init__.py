@@ -12,7 +12,7 @@ from lce_rig.io import findings
 from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
 from lce_rig.io.joining import merge_by_time
-from lce_rig.io.protocol import SourceOptions, Span, choose_event_camera, fingerprint
+from lce_rig.io.protocol import SourceOptions, choose_event_camera, fingerprint
 from lce_rig.io.ros.bag_file import kind_of
 from lce_rig.rig import Rig
 
@@ -85,7 +85,7 @@ class EventCameraFile:
         self.notes: list[str] = []
         self.key = fingerprint([path])
         self.n_samples = 0
-        self.streams: dict[Stream, Span | None] = {}
+        self.streams: set[Stream] = set()
         self._rig = rig
         self._camera, channel = choose_event_camera(rig, options, self.notes)
         aedat4 = Aedat4File(path) if path.suffix.lower() == ".aedat4" else None
@@ -96,10 +96,8 @@ class EventCameraFile:
             size = rig.cameras[self._camera].resolution_px
             self._events = open_events(path, sensor=self._camera, resolution=size)
             self._events.tie_to_host()
-            first_ns, last_ns = self._events.span_ns
-            self.streams[Stream(self._camera, channel, "events")] = first_ns, last_ns
-            length_s = (last_ns - first_ns) * 1e-9
-            self.notes.append(f"{path.name}: {length_s:.1f} s of {self._camera}.{channel}")
+            self.streams.add(Stream(self._camera, channel, "events"))
+            self.notes.append(f"{path.name}: {self._camera}.{channel}")
             serial = serial or self._events.serial
         except NoEventsError as error:
             if self._frames is None:
@@ -130,15 +128,14 @@ class EventCameraFile:
         if number is None:
             return None
         first = next(file.packets(number, Losses(), decode_frame), None)
-        last = file.last_packet(number, decode_frame)
-        if first is None or last is None:
+        if first is None:
             return None
         channel = self._rig.cameras[self._camera].first_channel("frames")
         if channel is None:
             note = f"frames skipped; {self._camera} has no channel of kind frames"
             self.notes.append(f"{self.path.name}: {note}")
             return None
-        self.streams[Stream(self._camera, channel, "images")] = first.mid_exposure_ns, last.mid_exposure_ns
+        self.streams.add(Stream(self._camera, channel, "images"))
         self.n_samples = len(file.places[number])
         meaning = "has no exposure time; its timestamps are used as mid exposure"
         if first.exposure_ns:

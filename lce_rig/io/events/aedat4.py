@@ -123,17 +123,6 @@ class Aedat4File:
         if self._torn:
             losses.add(findings.TORN_END(where=self._torn))
 
-    def last_packet(self, stream: int, decode: Callable[[bytes], _Content]) -> _Content | None:
-        """Decode the last whole packet of a stream; None if there is none."""
-        with reading(self.path), self.path.open("rb") as file:
-            for at, n_bytes in reversed(self.places[stream]):
-                file.seek(at)
-                try:
-                    return decode(_decompress(file.read(n_bytes))[4:])
-                except Exception:  # as above; the packet before it is close enough
-                    continue
-        return None
-
     def _walk(self, file: BinaryIO, position: int, end: int) -> str:
         """Note the places of all packets; returns where a damaged head ends them, "" if none does."""
         while position < end:
@@ -177,13 +166,6 @@ class Aedat4Events(EventStream):
                 waiting = []
         if waiting:
             yield join_events(waiting)
-
-    def duration_ns(self) -> int | None:
-        """Compare the first packet with the last; None if they are damaged."""
-        last = self._file.last_packet(self._number, _decode_events)
-        packets = self._file.packets(self._number, Losses(), _decode_events)
-        first = next((packet for packet in packets if len(packet)), None)
-        return int(last.t_ns[-1]) - int(first.t_ns[0]) if first is not None and last else None
 
 
 def decode_frame(table: bytes) -> Aedat4Frame:

@@ -15,7 +15,6 @@ from lce_rig.core.data import MAX_TIME_NS, EventColumns, Events, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
-from lce_rig.io.protocol import Span
 
 NS_PER_US = 1000
 MAX_EVENT_PIXELS = 1 << 22
@@ -68,10 +67,6 @@ class EventStream:
             SourceError: nothing more can be read for a reason the user can repair.
         """
         raise NotImplementedError
-
-    def duration_ns(self) -> int | None:
-        """Return the time from the first event to the last, about; None where only reading all tells."""
-        return None
 
 
 def seconds_in(t_ns: int, first_ns: int) -> str:
@@ -156,12 +151,9 @@ class EventRecording:
         return int(first.t_ns[0])
 
     @cached_property
-    def span_ns(self) -> Span:
-        """First and last timestamp; the last within some ms where that saves reading the recording."""
-        start_ns, duration_ns = self.start_ns, self._stream.duration_ns()
-        if duration_ns is None:
-            duration_ns = max(int(stretch.t_ns[-1]) for stretch in self) - start_ns
-        return start_ns, start_ns + duration_ns
+    def span_ns(self) -> tuple[int, int]:
+        """First and last timestamp; the whole recording is read."""
+        return self.start_ns, max(int(stretch.t_ns[-1]) for stretch in self)
 
     def tie_to_host(self) -> None:
         """Move timestamps that count from the sensor's start to the host's clock, where arrivals are known.

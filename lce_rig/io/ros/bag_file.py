@@ -15,7 +15,6 @@ from lce_rig.io.protocol import fingerprint
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _MAX_LISTED = 40
-_END_WINDOWS_NS = (10**9, 10**11)
 
 
 class RawMessage(NamedTuple):
@@ -42,6 +41,7 @@ class BagFile:
         files: those of the bag that hold messages.
         topics: (message type, number of messages) by topic.
         damages: errors of files that cannot be opened, beside others that can.
+        end_ns: when the recorder received the last message.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,10 +54,10 @@ class BagFile:
         self.topics: dict[str, tuple[str, int]] = {}
         self.damages: list[SourceError] = []
         self.files = sorted(file for file in path.iterdir() if is_bag_file(file)) if path.is_dir() else [path]
-        self._end_ns = 0
+        self.end_ns = 0
         with self._readers() as readers:
             for reader in readers:
-                self._end_ns = max(self._end_ns, reader.end_time)
+                self.end_ns = max(self.end_ns, reader.end_time)
                 for connection in reader.connections:
                     n_before = self.topics.get(connection.topic, ("", 0))[1]
                     self.topics[connection.topic] = _type_of(connection), n_before + connection.msgcount
@@ -68,18 +68,7 @@ class BagFile:
         """Hash names, sizes and both ends of the files: enough to know a recording again."""
         return fingerprint(file for file in self.files if file.is_file())
 
-    def end_ns(self, topic: str) -> int | None:
-        """Find when the recorder received a topic's last message, from the back; None where it has none."""
-        for start_ns in [*(self._end_ns - window_ns for window_ns in _END_WINDOWS_NS), None]:
-            try:
-                times_ns = [message.log_ns for message in self.messages({topic}, start_ns)]
-            except SourceError:  # Reported when the bag is read.
-                return None
-            if times_ns:
-                return max(times_ns)
-        return None
-
-    def messages(self, topics: Collection[str], start_ns: int | None = None) -> Iterator[RawMessage]:
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield the messages of some topics in the order the recorder received them.
 
         Raises:
@@ -91,7 +80,7 @@ class BagFile:
                 passes = []
                 for reader in readers:
                     wanted = [c for c in reader.connections if c.topic in topics]
-                    passes += [reader.messages(wanted, start_ns)] if wanted else []
+                    passes += [reader.messages(wanted)] if wanted else []
                 for connection, log_ns, data in merge(*passes, key=lambda entry: int(entry[1])):
                     encoding = getattr(connection.ext, "serialization_format", "ros1")
                     yield RawMessage(

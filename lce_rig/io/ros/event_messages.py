@@ -160,12 +160,6 @@ class BagEvents(EventStream):
                 self.resolution_px = (head.width_px, head.height_px) if head.width_px else None
                 break
 
-    def duration_ns(self) -> int | None:
-        """Count from the receipt of the first message to that of the last."""
-        first = next((message for _, message in self._messages(self._topic, Losses())), None)
-        end_ns = self._bag.end_ns(self._topic)
-        return None if first is None or end_ns is None else end_ns - first.log_ns
-
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events, one or several messages at a time."""
         decoder = PacketDecoder()

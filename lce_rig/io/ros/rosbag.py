@@ -1,8 +1,6 @@
 """A bag as a stream of images, scans and events, by the timestamps in their headers."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +12,8 @@ from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
-from lce_rig.io.joining import check_overlap, merge_by_time
-from lce_rig.io.protocol import SourceOptions, Span
+from lce_rig.io.joining import merge_by_time
+from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import BagEvents
 from lce_rig.io.ros.messages import (
@@ -34,8 +32,6 @@ from lce_rig.rig import CameraSettings, LidarSettings, Rig
 CLOCK_JUMP_NS = 1_000_000_000
 # Scans come by this share of the period too early, at most.
 _EARLY = 0.05
-# Drivers start within this many messages of each other; the span of a later one is not known beforehand.
-_N_PROBED = 500
 
 
 class TopicDecoder:
@@ -189,7 +185,7 @@ class BagRecording:
         notes: the topics of each sensor, and after reading the losses.
         key: fingerprint of the bag.
         n_samples: number of messages with images and scans on these topics.
-        streams: of the sensors, with their spans where the bag holds events or is a part of a recording.
+        streams: of the sensors.
     """
 
     def __init__(self, path: Path, rig: Rig, options: SourceOptions) -> None:
@@ -206,14 +202,8 @@ class BagRecording:
         self._events = self._open_events()
         self.n_samples = sum(self._bag.topics[topic][1] for topic in self._targets)
         self.key = self._bag.fingerprint()
-        self.streams: dict[Stream, Span | None] = {s: events.span_ns for s, events in self._events.items()}
-        spans = self._find_spans() if self._events or options.is_part else {}
-        for topic, target in self._targets.items():
-            self.streams[target.stream(self._bag.topics[topic][0])] = spans.get(topic)
-        events, scans = (
-            {s: span for s, span in self.streams.items() if s.kind == kind} for kind in ("events", "scans")
-        )
-        self.notes += check_overlap(scans, events, rig)
+        others = (target.stream(self._bag.topics[topic][0]) for topic, target in self._targets.items())
+        self.streams = frozenset([*self._events, *others])
         for file in self._bag.files:
             journal = file.with_name(f"{file.name}-wal")
             if journal.exists() and journal.stat().st_size:
@@ -282,22 +272,3 @@ class BagRecording:
                     raise SourceError(f"{topic} of {error.what}", list_topics(self._bag.topics)) from None
                 self.notes.append(f"{topic} of {error.what}; read without")
         return opened
-
-    def _find_spans(self) -> dict[str, Span]:
-        """Find the spans of topics that begin early, by the first timestamp and the times of receipt."""
-        first: dict[str, tuple[int, int]] = {}
-        # Damage is reported once everything before it has been read.
-        with suppress(SourceError):
-            for message in islice(self._bag.messages(self._targets.keys()), _N_PROBED):
-                if message.topic not in first:
-                    with suppress(ValueError):
-                        stamp_ns = header_stamp_ns(deserialize(message)) or message.log_ns
-                        first[message.topic] = stamp_ns, message.log_ns
-                if len(first) == len(self._targets):
-                    break
-        ends_ns = {topic: self._bag.end_ns(topic) for topic in first}
-        return {
-            topic: (stamp_ns, stamp_ns + end_ns - log_ns)
-            for topic, (stamp_ns, log_ns) in first.items()
-            if (end_ns := ends_ns[topic]) is not None
-        }

@@ -166,7 +166,7 @@ class SensorTopic:
         topic: its name.
         kind: "scans", "frames" or "events".
         n_messages: how many there are.
-        rate_hz: by the times of receipt of the first and the last; None for a single one.
+        rate_hz: from the receipt of the first to the bag's end; None for a single one.
         frame: of the first message's header, "" without.
         size_px: (width, height) of images and event arrays; None where they do not say.
         n_rings: number of rings of a scan; None where points have none.
@@ -229,9 +229,8 @@ def survey_bag(path: Path) -> list[SensorTopic]:
             sensor = _probe(message, n)
         except (SourceError, ValueError):
             continue  # No image or scan that can be used.
-        last_ns = bag.end_ns(topic)
-        if n > 1 and last_ns is not None and last_ns > message.log_ns:
-            sensor = replace(sensor, rate_hz=(n - 1) / ((last_ns - message.log_ns) * 1e-9))
+        if n > 1 and bag.end_ns > message.log_ns:
+            sensor = replace(sensor, rate_hz=(n - 1) / ((bag.end_ns - message.log_ns) * 1e-9))
         if sensor.kind != "scans":
             beside = [info for info in infos & first.keys() if _namespace(info) == sensor.namespace]
             sensor = _with_lens(sensor, first[min(beside)]) if beside else sensor
