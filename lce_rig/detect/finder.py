@@ -11,8 +11,7 @@ from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
-from lce_rig.detect.events.search import find_in_reconstruction
-from lce_rig.detect.image.search import find_image_board, region_around
+from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.measurement import Beam
 from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board, track_lidar_board
 from lce_rig.detect.lidar.unstructured import find_unstructured_boards, look_for_unstructured_board
@@ -112,22 +111,19 @@ class BoardFinder:
         Raises:
             ProfileError: the intrinsics belong to images of another size.
         """
-        region = None if last is None else region_around(last, image)
         limits = self.rig.quality
         if max_reprojection_px is not None:
             limits = limits.model_copy(update={"max_reprojection_px": max_reprojection_px})
         channel = self.rig.cameras[image.sensor].channels.get(image.channel)
-        if channel is not None and channel.kind == "events":
-            return find_in_reconstruction(image, self.board, intrinsics, limits, region)
+        is_from_events = channel is not None and channel.kind == "events"
         return find_image_board(
             image,
             self.board,
             intrinsics,
-            region=region,
             last=last,
-            max_reprojection_px=limits.max_reprojection_px,
-            min_square_px=limits.min_square_px,
-            is_thorough=is_thorough,
+            limits=limits,
+            is_from_events=is_from_events,
+            is_thorough=is_thorough or is_from_events,
         )
 
     def search_scan(self, scan: Scan) -> ScanSearch:

@@ -23,7 +23,8 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.events.search import TRACK_NS, find_event_board, find_in_reconstruction, reconstructor_for
+from lce_rig.detect.events.search import TRACK_NS, find_event_board, reconstructor_for
+from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.limits_met import gate_event_board
 from lce_rig.rig import QualitySettings, ReconstructionSettings
 
@@ -139,7 +140,7 @@ def test_hot_pixels_are_named_with_their_share_and_do_not_hide_a_moving_board(st
 )
 def test_limits_of_the_profile_refuse_with_their_figures(detection, limit, code, figure):
     limits = LIMITS.model_copy(update=limit)
-    board = find_in_reconstruction(detection.picture, BOARD, CAMERA, limits)
+    board = find_image_board(detection.picture, BOARD, CAMERA, limits=limits, is_from_events=True)
     if isinstance(board, ImageBoard):
         board = gate_event_board(detection.board, limits)
     assert isinstance(board, Refusal)
@@ -147,7 +148,7 @@ def test_limits_of_the_profile_refuse_with_their_figures(detection, limit, code,
 
 
 def test_pictures_made_by_others_are_judged_without_figures_of_events(detection):
-    bare = find_in_reconstruction(detection.picture, BOARD, CAMERA, LIMITS)
+    bare = find_image_board(detection.picture, BOARD, CAMERA, limits=LIMITS, is_from_events=True)
     assert gate_event_board(bare, LIMITS) is bare
 
 

@@ -16,7 +16,7 @@ from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, difference, pose, rotation_angle, transform
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.image.search import find_image_board, region_around
+from lce_rig.detect.image.search import find_image_board
 from tests.detect.drawn_boards import (
     ASYMMETRIC,
     DAVIS,
@@ -111,7 +111,7 @@ def test_a_board_that_is_followed_is_found_as_if_it_were_not(
     T_moved[:3, 3] += FOLLOWED_FROM[:3, :2] @ shift
     moved = picture(draw(board, WIDE, T_moved, noise=1.0))
     whole = find_image_board(moved, board, WIDE)
-    followed = find_image_board(moved, board, WIDE, region=region_around(first, moved), last=first)
+    followed = find_image_board(moved, board, WIDE, last=first)
     assert isinstance(followed, ImageBoard) and isinstance(whole, ImageBoard)
     off_px = followed.corners_px - whole.corners_px
     assert np.sqrt(np.mean(off_px**2)) < 0.03 and np.abs(off_px).max() < 0.15
@@ -134,16 +134,15 @@ def test_a_quick_search_finds_a_board_that_moved_on_and_turned_a_little(
     T_moved = looking(10, 80, 5 + turn_deg, (shift_m, shift_m, closer * z_m))
     moved = picture(draw(ASYMMETRIC, camera, T_moved, noise=1.0))
     whole = find_image_board(moved, ASYMMETRIC, camera)
-    quick = find_image_board(
-        moved, ASYMMETRIC, camera, region=region_around(first, moved), last=first, is_thorough=False
-    )
+    quick = find_image_board(moved, ASYMMETRIC, camera, last=first, is_thorough=False)
     assert isinstance(quick, ImageBoard) and isinstance(whole, ImageBoard)
     assert np.abs(quick.corners_px - whole.corners_px).max() < 0.15
 
 
-def test_a_board_that_left_the_region_is_found_in_the_whole_picture() -> None:
+def test_a_board_that_went_far_is_found_in_the_whole_picture() -> None:
     pixels = draw(SYMMETRIC, WIDE, looking(25, 80, 40, (0.5, 0, 2.2)))
-    result = find_image_board(picture(pixels), SYMMETRIC, WIDE, region=(0, 0, 200, 200))
+    before = found(draw(SYMMETRIC, WIDE, looking(25, 80, 40, (-0.7, 0, 2.2))), SYMMETRIC, WIDE)
+    result = find_image_board(picture(pixels), SYMMETRIC, WIDE, last=before)
     assert isinstance(result, ImageBoard)
 
 

@@ -78,4 +78,4 @@ def test_what_is_no_board_is_none_where_one_is_predicted_either():
 def test_a_prediction_of_a_scan_without_returns_is_refused():
     empty = view(place(2.6, 60)).select(np.zeros(0, dtype=np.intp))
     refusal = look_for_board(empty, BOARD, place(2.6, 60), LIMITS)
-    assert isinstance(refusal, Refusal) and refusal.code == "lidar.no_returns"
+    assert isinstance(refusal, Refusal) and refusal.code == "lidar.not_where_expected"

@@ -16,7 +16,7 @@ from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.figures import event_quality, outline_px, with_motion
 from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.detect.events.windows import WindowOptions
-from lce_rig.detect.image.search import find_image_board, region_around
+from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.limits_met import explain_missing_board, gate_event_board, gate_image_board
 from lce_rig.rig import QualitySettings, ReconstructionSettings
 
@@ -164,39 +164,17 @@ def find_event_board(
     picture = pictures.pop(stamp_ns)
     if isinstance(picture, Refusal):
         return EventSighting(picture, explain_missing_board(events, stamp_ns, picture, limits))
-    found = find_in_reconstruction(picture, board, intrinsics, limits)
+    found = find_image_board(picture, board, intrinsics, limits=limits, is_from_events=True)
     if isinstance(found, Refusal):
         return EventSighting(picture, explain_missing_board(events, stamp_ns, found, limits))
-    found = _followed(replace(found, stamp_ns=stamp_ns), picture, pictures, board, intrinsics, limits)
+    found = _followed(replace(found, stamp_ns=stamp_ns), pictures, board, intrinsics, limits)
     made = event_quality(events, stamp_ns, outline_px(found.T_cam_board, board, intrinsics))
     gated = gate_image_board(replace(found, events=with_motion(made, found, sweep_s)), limits)
     return EventSighting(picture, gate_event_board(gated, limits) if isinstance(gated, ImageBoard) else gated)
 
 
-def find_in_reconstruction(
-    picture: Image,
-    board: Board,
-    intrinsics: Intrinsics,
-    limits: QualitySettings,
-    region: tuple[int, int, int, int] | None = None,
-) -> ImageBoard | Refusal:
-    """Find the board in an image that was made from events, ours or another's."""
-    return find_image_board(
-        picture,
-        board,
-        intrinsics,
-        region=region,
-        max_reprojection_px=limits.max_reprojection_px,
-        min_contrast=limits.min_event_contrast,
-        min_sharpness=limits.min_event_sharpness,
-        min_square_px=limits.min_square_px,
-        is_from_events=True,
-    )
-
-
 def _followed(
     main: ImageBoard,
-    picture: Image,
     others: Mapping[int, Image | Refusal],
     board: Board,
     intrinsics: Intrinsics,
@@ -214,7 +192,7 @@ def _followed(
             other = others[stamp]
             if isinstance(other, Refusal):
                 continue
-            seen = find_in_reconstruction(other, board, intrinsics, limits, region_around(last, picture))
+            seen = find_image_board(other, board, intrinsics, last=last, limits=limits, is_from_events=True)
             if isinstance(seen, Refusal):
                 continue
             seen = align_corner_order(seen, main, board)

@@ -23,6 +23,7 @@ from lce_rig.detect.findings import (
 )
 from lce_rig.detect.image.corners import seen_grid, square_size_px, square_values
 from lce_rig.detect.image.saddle import Crossings
+from lce_rig.rig import QualitySettings
 
 # 10 to 90 % of an edge blurred by a Gaussian span 2.56 sigma.
 _EDGE_WIDTH_PER_SIGMA = 2.56
@@ -30,6 +31,8 @@ LEAST_SQUARE_PX = 5.0
 """Least side of a square, foreshortened by the tilt, from which corners are found without fail."""
 LEAST_MARKED_PX = 20.0
 """Least side of a square with a marker, or of a tag, from which markers are read without fail."""
+# Of camera images: least difference of black and white, grey values, and fewest edge widths in a square.
+_MIN_CONTRAST, _MIN_SHARPNESS = 12.0, 1.5
 # The outer squares of a line that is not on the board are all alike.
 _MIN_OUTER_CONTRAST = 0.35
 # Wider images are searched at this width at most.
@@ -193,10 +196,12 @@ def explain_other_grid(
 
 
 def quality_problem(
-    quality: ImageQuality, min_contrast: float, min_sharpness: float, is_from_events: bool = False
+    quality: ImageQuality, limits: QualitySettings, is_from_events: bool = False
 ) -> Refusal | None:
     """Judge the figures of a detected grid; None if they are sufficient."""
     action = "events" if is_from_events else ""
+    min_contrast = limits.min_event_contrast if is_from_events else _MIN_CONTRAST
+    min_sharpness = limits.min_event_sharpness if is_from_events else _MIN_SHARPNESS
     if quality.contrast < min_contrast:
         figures = {"contrast": quality.contrast, "min_contrast": min_contrast}
         return IMAGE_LOW_CONTRAST.refusal(action=action, **figures)

@@ -32,8 +32,9 @@ from lce_rig.detect.image.quality import (
     quality_problem,
 )
 from lce_rig.detect.image.saddle import Crossings, fit_crossings
+from lce_rig.rig import QualitySettings
 
-Region = tuple[int, int, int, int]
+STANDARD = QualitySettings()
 NOT_SEEN_AT_ONCE = IMAGE_NOT_AT_FIRST_SIGHT.refusal()
 """Of a search that was not thorough."""
 
@@ -59,12 +60,8 @@ def find_image_board(
     board: Board,
     intrinsics: Intrinsics,
     *,
-    region: Region | None = None,
     last: ImageBoard | None = None,
-    max_reprojection_px: float = 1.0,
-    min_contrast: float = 12.0,
-    min_sharpness: float = 1.5,
-    min_square_px: float = 0.0,
+    limits: QualitySettings = STANDARD,
     is_from_events: bool = False,
     is_thorough: bool = True,
 ) -> ImageBoard | Refusal:
@@ -78,15 +75,10 @@ def find_image_board(
         image: the image.
         board: the board as the profile describes it.
         intrinsics: of the camera, at the image's resolution.
-        region: (u0, v0, u1, v1) px to search first, from `region_around` the board in the last live image;
-            the whole image follows where it is not there.
-        last: the board in the last live image: where it is there still, or within a third of a square,
-            nothing is searched.
-        max_reprojection_px: refuse where the corners' rms distance from the board's image is larger.
-        min_contrast: refuse where black and white differ by fewer grey values.
-        min_sharpness: refuse where fewer edge widths fit into a square.
-        min_square_px: the profile's minimum, named where squares are too small to find all corners.
-        is_from_events: whether the image was reconstructed from events, which changes the action.
+        last: the board in the image before: where it is there still, or within a third of a square, nothing
+            is searched; else its surroundings are searched first.
+        limits: `quality` of the rig profile.
+        is_from_events: whether the image was reconstructed from events, ours or another's.
         is_thorough: whether a board that is not found at once is searched for at other scales, and its
             absence explained, which takes most of a second.
 
@@ -101,22 +93,22 @@ def find_image_board(
             return marked
         crossings = marked
     else:
-        followed = _follow(grey, board, last)
+        followed = None if is_from_events else _follow(grey, board, last)
         crossings = (
             followed
-            or _find_in_region(grey, board, region, last, is_thorough=is_thorough)
+            or _find_near(grey, board, last, is_thorough=is_thorough)
             or find_grid(grey, board, is_thorough=is_thorough)
         )
     if crossings is None and not is_thorough:
         return NOT_SEEN_AT_ONCE
     if crossings is None or not (board.has_markers or np.mean(crossings.is_fitted) >= _MIN_FITTED):
-        return explain_absence(grey, board, is_from_events, min_square_px)
+        return explain_absence(grey, board, is_from_events, limits.min_square_px)
     quality = grid_quality(grey, crossings)
     if not board.has_markers and not is_whole(grey, crossings.grid_px):
         seen = seen_grid(grey)
         seen = crossings.grid_px if seen is None else seen
-        return explain_other_grid(grey, board, seen, is_from_events, min_square_px)
-    problem = quality_problem(quality, min_contrast, min_sharpness, is_from_events)
+        return explain_other_grid(grey, board, seen, is_from_events, limits.min_square_px)
+    problem = quality_problem(quality, limits, is_from_events)
     if problem is not None:
         return problem
 
@@ -130,8 +122,8 @@ def find_image_board(
     lens = {"model": intrinsics.model, "width_px": intrinsics.width_px, "height_px": intrinsics.height_px}
     if solved is None:
         return IMAGE_NO_POSE.refusal(**lens)
-    if solved.reprojection_px > max_reprojection_px:
-        errors = {"rms_px": solved.reprojection_px, "max_rms_px": max_reprojection_px}
+    if solved.reprojection_px > limits.max_reprojection_px:
+        errors = {"rms_px": solved.reprojection_px, "max_rms_px": limits.max_reprojection_px}
         return IMAGE_MISFIT.refusal(**lens, **errors)
     quality = replace(quality, n_corners=int(crossings.is_fitted.sum()))
     return board_from_pose(crossings.grid_px.reshape(-1, 2), solved, quality)
@@ -156,20 +148,6 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
         sigma_px=solved.sigma_px,
         quality=quality,
     )
-
-
-def region_around(found: ImageBoard, image: Image, margin: float = 0.5) -> Region:
-    """Name the part of the next image to search: the corners' box, larger by `margin` of its size.
-
-    Returns:
-        (u0, v0, u1, v1) px, within the image.
-    """
-    height, width = image.pixels.shape[:2]
-    low, high = np.nanmin(found.corners_px, axis=0), np.nanmax(found.corners_px, axis=0)
-    reach = margin * (high - low).max() + 8
-    u0, v0 = np.maximum(np.floor(low - reach), 0).astype(int)
-    u1, v1 = np.minimum(np.ceil(high + reach) + 1, [width, height]).astype(int)
-    return int(u0), int(v0), int(u1), int(v1)
 
 
 def compare_size(image: Image, intrinsics: Intrinsics) -> Finding | None:
@@ -241,29 +219,26 @@ def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> C
     return crossings if is_in_order and is_whole(grey, crossings.grid_px) else None
 
 
-def _find_in_region(
-    grey: NDArray[np.uint8],
-    board: Board,
-    region: Region | None,
-    last: ImageBoard | None,
-    *,
-    is_thorough: bool,
+def _find_near(
+    grey: NDArray[np.uint8], board: Board, last: ImageBoard | None, *, is_thorough: bool
 ) -> Crossings | None:
     """Search about where the board was; a quick search looks for squares of the size they had there only."""
-    if region is None:
+    if last is None:
         return None
-    u0, v0, u1, v1 = region
-    part = grey[max(v0, 0) : v1, max(u0, 0) : u1]
+    # The corners' box, larger by half its size.
+    low, high = np.nanmin(last.corners_px, axis=0), np.nanmax(last.corners_px, axis=0)
+    reach = 0.5 * (high - low).max() + 8
+    u0, v0 = np.maximum(np.floor(low - reach), 0).astype(int)
+    u1, v1 = np.ceil(high + reach).astype(int) + 1
+    part = grey[v0:v1, u0:u1]
     if min(part.shape) < 16:
         return None
     square_px = None
-    if not is_thorough and last is not None:
+    if not is_thorough:
         grid_px = last.corners_px.reshape(board.rows, board.cols, 2)
         square_px = float(np.median(np.linalg.norm(np.diff(grid_px, axis=1), axis=-1)))
     crossings = find_grid(np.ascontiguousarray(part), board, is_thorough=is_thorough, square_px=square_px)
-    if crossings is None:
-        return None
-    return replace(crossings, grid_px=crossings.grid_px + [max(u0, 0), max(v0, 0)])
+    return None if crossings is None else replace(crossings, grid_px=crossings.grid_px + [u0, v0])
 
 
 def _solve(

@@ -304,7 +304,6 @@ def _penalty(found: LidarBoard, board: Board) -> float:
 WORSE_M = 0.003  # by how much the outline of a board held still may fit worse than before
 # Farther from its last pose a board did not stand still: the search is the safer start.
 STILL_M, STILL_TURN = 0.02, np.cos(np.radians(1.5))
-STILL_SHARE = 0.9  # of the board's returns must lie where it was for a closer look
 MAX_TURN = np.cos(np.radians(45.0))
 MARGIN_M = 0.25  # by how much the box that is searched reaches beyond the board on every side
 
@@ -332,8 +331,9 @@ def track_lidar_board(
         LCE-Calib, "Checkerboard Tracking".
     """
     nearby = scan.select(_near(scan, board, previous.T_lidar_board))
-    still = _measure_again(nearby, board, previous, limits)
-    if still is not None:
+    as_well = replace(limits, template_m=min(limits.template_m, previous.quality.template_m + WORSE_M))
+    still = _measure_at(nearby, board, previous.T_lidar_board, as_well)
+    if isinstance(still, LidarBoard) and _is_at(still, previous.T_lidar_board, STILL_M, STILL_TURN):
         return still
     found = find_lidar_boards(nearby, board, replace(limits, max_range_m=np.inf))
     if isinstance(found, Refusal):
@@ -366,37 +366,40 @@ def look_for_board(
     Returns:
         The board, or why none is there.
     """
-    ordered = order_scan(scan, limits.min_range_m)
-    if len(ordered.index) == 0:
-        return LIDAR_NO_RETURNS.refusal(n_points=len(scan.points), min_range_m=limits.min_range_m)
-    normal, centre = T_lidar_board[:3, 2], T_lidar_board[:3, 3]
-    plane = np.append(normal, -normal @ centre) * (-1.0 if normal @ centre > 0 else 1.0)
-    start = plane, centre, _placed(board, plane, T_lidar_board)
-    at_once = measure_plate(ordered, scan, board, start, limits.widened(ordered.sigma_m))
-    if isinstance(at_once, LidarBoard) and _is_at(at_once, plane, centre):
+    at_once = _measure_at(scan, board, T_lidar_board, limits)
+    if isinstance(at_once, LidarBoard) and _is_at(at_once, T_lidar_board, MARGIN_M, LOOK_TURN):
         return at_once
     nearby = scan.select(_near(scan, board, T_lidar_board))
     found = find_lidar_boards(nearby, board, replace(limits, max_range_m=np.inf))
     if not isinstance(found, Refusal):
+        distance_m = float(np.linalg.norm(T_lidar_board[:3, 3]))
         return next(
-            (candidate for candidate in found if _is_at(candidate, plane, centre)),
-            LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=float(np.linalg.norm(centre))),
+            (candidate for candidate in found if _is_at(candidate, T_lidar_board, MARGIN_M, LOOK_TURN)),
+            LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=distance_m),
         )
     cause = at_once if isinstance(at_once, Refusal) else found
     return LIDAR_NOT_WHERE_EXPECTED.refusal(**cause.figures, cause=cause.code)
 
 
-def _is_at(found: LidarBoard, plane: Array, centre: Array) -> bool:
-    """Return whether a board lies where it was predicted."""
-    away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - centre))
-    return away_m < MARGIN_M and float(found.plane[:3] @ plane[:3]) > LOOK_TURN
-
-
-def _placed(board: Board, plane: Array, T_lidar_board: Array) -> Placement:
-    """Place the outline in its own plane at a pose."""
+def _measure_at(
+    scan: Scan, board: Board, T_lidar_board: Array, limits: Limits
+) -> LidarBoard | Refusal | None:
+    """Register and measure the outline from a pose; returns what `measure_plate` does."""
+    ordered = order_scan(scan, limits.min_range_m)
+    if len(ordered.index) == 0:
+        return LIDAR_NO_RETURNS.refusal(n_points=len(scan.points), min_range_m=limits.min_range_m)
+    normal, centre = T_lidar_board[:3, 2], T_lidar_board[:3, 3]
+    plane = np.append(normal, -normal @ centre) * (-1.0 if normal @ centre > 0 else 1.0)
     width_axis = plane_axes(plane[:3]).T @ T_lidar_board[:3, 0]
     half_m = (board.width_m / 2, board.height_m / 2)
-    return Placement(0.0, 0.0, float(np.arctan2(width_axis[1], width_axis[0])), half_m)
+    outline = Placement(0.0, 0.0, float(np.arctan2(width_axis[1], width_axis[0])), half_m)
+    return measure_plate(ordered, scan, board, (plane, centre, outline), limits.widened(ordered.sigma_m))
+
+
+def _is_at(found: LidarBoard, T_lidar_board: Array, reach_m: float, cos_turn: float) -> bool:
+    """Return whether a board lies where a pose has it."""
+    away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - T_lidar_board[:3, 3]))
+    return away_m < reach_m and abs(float(found.plane[:3] @ T_lidar_board[:3, 2])) > cos_turn
 
 
 def _near(scan: Scan, board: Board, T_lidar_board: Array) -> Indices:
@@ -410,22 +413,3 @@ def _near(scan: Scan, board: Board, T_lidar_board: Array) -> Indices:
         near = np.flatnonzero((away * away).sum(axis=0) < float(half @ half))
     is_inside = (np.abs(away[:, near].T @ rotation) <= half).all(axis=1)
     return np.asarray(near[is_inside])
-
-
-def _measure_again(nearby: Scan, board: Board, previous: LidarBoard, limits: Limits) -> LidarBoard | None:
-    """Start from the last pose, valid for a still board; None unless it fits as well again."""
-    T = previous.T_lidar_board
-    half = np.array([board.width_m / 2, board.height_m / 2, 3.0 * previous.sigma_m])
-    is_on = (np.abs((nearby.points - T[:3, 3]) @ T[:3, :3]) <= half).all(axis=1)
-    if np.count_nonzero(is_on) < max(STILL_SHARE * len(previous.points), 1):
-        return None
-    ordered = order_scan(nearby, limits.min_range_m)
-    if len(ordered.index) == 0:
-        return None
-    start = previous.plane, T[:3, 3], _placed(board, previous.plane, T)
-    limits = replace(limits, template_m=min(limits.template_m, previous.quality.template_m + WORSE_M))
-    measured = measure_plate(ordered, nearby, board, start, limits.widened(ordered.sigma_m))
-    if not isinstance(measured, LidarBoard):
-        return None
-    is_still = np.linalg.norm(measured.T_lidar_board[:3, 3] - T[:3, 3]) < STILL_M
-    return measured if is_still and measured.plane[:3] @ previous.plane[:3] > STILL_TURN else None
