@@ -1,6 +1,5 @@
 """Files that survive a power failure, and the lock against a second writer."""
 
-import ctypes
 import errno
 import fcntl
 import io
@@ -18,9 +17,6 @@ from numpy.typing import NDArray
 from lce_rig.core.errors import SessionError
 
 DRAFT, ASIDE = ".new-", ".old-"
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
-# Errors if this kernel, C library or file system (NFS, FAT) cannot exchange.
-_NO_EXCHANGE = {errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EPERM}
 
 
 def write_new_file(path: Path, data: bytes) -> None:
@@ -117,28 +113,19 @@ def flush_folder(path: Path) -> None:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Append one line and flush it; undo a partial write if the disk is full.
+    """Append one line and flush it.
 
-    A torn last line of an earlier run that was killed is closed by a line break first.
+    A torn last line of an earlier run, which was killed or found the disk full, is closed first.
 
     Raises:
         OSError: a full disk, no permission.
     """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    try:
-        size = os.lseek(descriptor, 0, os.SEEK_END)
-        is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
-        data = (b"\n" if is_torn else b"") + line.encode() + b"\n"
-        try:
-            written = 0
-            while written < len(data):
-                written += os.write(descriptor, data[written:])
-            os.fsync(descriptor)
-        except OSError:
-            os.ftruncate(descriptor, size)
-            raise
-    finally:
-        os.close(descriptor)
+    with path.open("a+b") as file:
+        file.seek(max(file.tell() - 1, 0))
+        is_torn = file.read(1) not in (b"", b"\n")
+        file.write((b"\n" if is_torn else b"") + line.encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
 
 
 class WriterLock:
@@ -175,22 +162,18 @@ class WriterLock:
 
 @contextmanager
 def replacing(
-    root: Path,
-    folder: Path,
-    finish: Callable[[Path, Path], None] = lambda _old, _draft: None,
-    *,
-    can_exchange: bool = True,
+    root: Path, folder: Path, finish: Callable[[Path, Path], None] = lambda _old, _draft: None
 ) -> Iterator[Path]:
-    """Yield an empty draft that replaces a folder when the block ends.
+    """Yield an empty draft that replaces a folder when the block ends, by two renames.
 
-    If the block raises, or anything fails before the exchange, the folder stays unchanged.
+    If the block raises, or anything fails before them, the folder stays unchanged. Where a process is killed
+    between the two, `recover` puts the earlier folder back.
 
     Args:
         root: the session's folder, in which drafts are made.
         folder: the folder to replace, anywhere below `root`; need not exist.
-        finish: called with the folder and the draft just before the exchange, while no other process may
+        finish: called with the folder and the draft just before the renames, while no other process may
             replace folders of this session; it copies files to be kept into the draft.
-        can_exchange: False uses the method for file systems that cannot exchange two folders in one step.
 
     Raises:
         OSError: a full disk, no permission; or a file, or a link, is in the folder's place.
@@ -214,7 +197,13 @@ def replacing(
                 for path, _, _ in os.walk(draft):
                     flush_folder(Path(path))
                 folder.parent.mkdir(exist_ok=True)
-                _change_places(draft, folder, root, can_exchange=can_exchange)
+                aside = root / (ASIDE + "+".join(folder.relative_to(root).parts))
+                if folder.exists():
+                    folder.rename(aside)
+                draft.rename(folder)
+                shutil.rmtree(aside, ignore_errors=True)
+                for parent in {folder.parent, root}:
+                    flush_folder(parent)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
 
@@ -223,7 +212,7 @@ def check_folder(path: Path) -> None:
     """Check that a path is a folder or does not exist.
 
     Raises:
-        NotADirectoryError: there is a file or a link, which an exchange would move away.
+        NotADirectoryError: there is a file or a link, which a rename would move away.
     """
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         what = "link" if path.is_symlink() else "file"
@@ -231,7 +220,7 @@ def check_folder(path: Path) -> None:
 
 
 def recover(root: Path) -> None:
-    """Restore a folder after a process was killed, on file systems that cannot exchange two.
+    """Restore a folder after a process was killed while it replaced it.
 
     Raises:
         OSError: no permission.
@@ -260,34 +249,6 @@ def _link_or_copy(source: str, target: str) -> None:
         if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK, errno.EXDEV):
             raise
         shutil.copy2(source, target, follow_symlinks=False)
-
-
-def _change_places(draft: Path, folder: Path, root: Path, *, can_exchange: bool) -> None:
-    if not folder.exists():
-        draft.rename(folder)
-    elif not (can_exchange and _exchange(draft, folder)):
-        aside = root / (ASIDE + "+".join(folder.relative_to(root).parts))
-        folder.rename(aside)
-        # A process that is killed here has left both: `recover` puts the earlier folder back.
-        draft.rename(folder)
-        shutil.rmtree(aside, ignore_errors=True)
-    flush_folder(folder.parent)
-    if folder.parent != root:
-        flush_folder(root)
-
-
-def _exchange(a: Path, b: Path) -> bool:
-    """Exchange two folders in one step; False if the system cannot."""
-    try:
-        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
-    except AttributeError:
-        return False
-    if renameat2(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE) == 0:
-        return True
-    number = ctypes.get_errno()
-    if number in _NO_EXCHANGE:
-        return False
-    raise OSError(number, os.strerror(number), str(a), None, str(b))
 
 
 def _put_back(root: Path) -> None:
