@@ -1,7 +1,8 @@
 """UDP datagrams in recordings of a network (pcap, pcapng), read and written by dpkt."""
 
 import socket
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from decimal import Decimal
@@ -13,9 +14,14 @@ import dpkt  # type: ignore[import-untyped]
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
+from lce_rig.rig import DriverSettings
 
 _NS_PER_S = 1_000_000_000
 _MAX_FRAME_BYTES = 65535
+FRAME_BYTES = 58
+"""Of a recorded datagram beside its payload: headers of pcap, Ethernet, IP and UDP."""
+# So many packets, per second or less of one sensor, show which sensors were recorded.
+_N_SURVEYED, _MAX_SHOWN = 800, 6
 # The sensor's own maker; what the sensor broadcasts goes to every card.
 _SENSOR_CARD, _EVERY_CARD = bytes.fromhex("607688000000"), b"\xff" * 6
 # Class of a frame by link type, https://www.tcpdump.org/linktypes.html.
@@ -91,6 +97,42 @@ class PcapFile:
                         yield datagram
             except Exception as error:  # dpkt's own, struct's, and others that damage leads to.
                 self.damage = f"{reason_of(error)}; read up to byte {self.n_bytes_read}"
+
+    def choose_sender(
+        self, explain: Callable[[Datagram], str], what: str, lidar: str, driver: DriverSettings
+    ) -> tuple[str, int]:
+        """Choose the sensor (address, port sent to) by the start of the file: the profile's, or the only one.
+
+        Args:
+            explain: returns why a datagram is none of the LiDAR's, in words; "" for those that are.
+            what: the LiDAR whose packets are wanted, in words.
+            lidar: its name in the profile.
+            driver: its `driver` there.
+
+        Raises:
+            SourceError: there is none, or there are several of which none has the profile's address.
+        """
+        senders, others = Counter[tuple[str, int]](), Counter[str]()
+        for n, datagram in enumerate(self.datagrams()):
+            reason = explain(datagram)
+            if reason:
+                others[reason] += 1
+            else:
+                senders[datagram.source, datagram.port] += 1
+            if senders.total() >= _N_SURVEYED or n >= 50 * _N_SURVEYED:
+                break
+        wanted = [s for s in senders if driver.address in (None, s[0]) and driver.port in (None, s[1])]
+        wanted = wanted or list(senders)
+        if len(wanted) == 1:
+            return wanted[0]
+        if wanted:
+            several = ", ".join(f"{address} to port {port}" for address, port in sorted(wanted))
+            hint = f"Set driver.address and driver.port of {lidar!r} in the profile to one of them."
+            raise SourceError(f"{self.path}: packets of several LiDARs: {several}", hint)
+        holds = [f"{n} {reason}" for reason, n in others.most_common(_MAX_SHOWN)] + self.account()
+        hint = f"Record whole packets (tcpdump -s 0), or correct the model of {lidar!r} in the profile."
+        causes = "; ".join(holds) or "no UDP packets at all"
+        raise SourceError(f"{self.path}: holds no packets of {what}: {causes}", hint)
 
     def account(self) -> list[str]:
         """List the losses in words."""

@@ -5,7 +5,6 @@ References:
     https://static.ouster.dev/sensor-docs.
 """
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +19,12 @@ from lce_rig.core.files import read_json
 from lce_rig.core.findings import Losses
 from lce_rig.core.geometry import Array
 from lce_rig.io import findings
-from lce_rig.io.network import PcapFile
+from lce_rig.io.network import FRAME_BYTES, Datagram, PcapFile
 from lce_rig.io.protocol import SourceOptions, choose_lidar, fingerprint
 from lce_rig.rig import LidarSettings, Rig
 
 # A scan with more of its columns lost is not worth looking at.
 _MIN_COVERAGE = 0.5
-_N_SURVEYED, _MAX_SHOWN = 5000, 6
 
 
 class Profile(NamedTuple):
@@ -201,11 +199,13 @@ class OusterRecording:
         self._metadata = read_metadata(beside)
         self._layout = self._metadata.packet
         self.notes.append(f"{path.name}: metadata of {beside.name}, profile {self._metadata.name}")
-        self._sender = self._choose_sender()
+        what = f"{self._layout.itemsize} bytes, as in {beside.name}"
+        driver = self._settings.driver
+        self._sender = self._file.choose_sender(self._explain, what, self._lidar, driver)
         self.key = fingerprint([path, beside])
         self.streams = frozenset([Stream(self._lidar, "", "scans")])
         n_packets = -(-self._metadata.n_columns // self._metadata.columns_per_packet)
-        self.n_samples = max(1, path.stat().st_size // (n_packets * self._layout.itemsize))
+        self.n_samples = max(1, path.stat().st_size // (n_packets * (self._layout.itemsize + FRAME_BYTES)))
 
     def samples(self) -> Iterator[Scan]:
         """Yield the scans, in order of time.
@@ -271,29 +271,6 @@ class OusterRecording:
         intensity = pixels["reflectivity"].astype(np.float32)[kept]
         return Scan(self._lidar, stamp_ns, points, intensity, ring, offset_ns, first_host_ns or None)
 
-    def _choose_sender(self) -> tuple[str, int]:
-        """Choose the sender (address, port) of packets of the layout's size: the profile's, or the only one.
-
-        Raises:
-            SourceError: there is none, or there are several.
-        """
-        senders, sizes = Counter[tuple[str, int]](), Counter[int]()
-        for n, datagram in enumerate(self._file.datagrams()):
-            sizes[len(datagram.payload)] += 1
-            if len(datagram.payload) == self._layout.itemsize:
-                senders[datagram.source, datagram.port] += 1
-            if n >= _N_SURVEYED:
-                break
-        if not senders:
-            counts = [f"{n} of {size} bytes" for size, n in sizes.most_common(_MAX_SHOWN)]
-            what = f"no packets of {self._layout.itemsize} bytes, as the metadata say; there are"
-            hint = "Give the metadata of this recording."
-            raise SourceError(f"{self.path}: {what} {', '.join(counts) or 'none'}", hint)
-        driver = self._settings.driver
-        wanted = [s for s in senders if driver.address in (None, s[0]) and driver.port in (None, s[1])]
-        wanted = wanted or list(senders)
-        if len(wanted) > 1:
-            several = ", ".join(f"{address} to port {port}" for address, port in sorted(wanted))
-            hint = f"Set driver.address and driver.port of {self._lidar!r} in the profile to one of them."
-            raise SourceError(f"{self.path}: packets of several sensors: {several}", hint)
-        return wanted[0]
+    def _explain(self, datagram: Datagram) -> str:
+        n_bytes = len(datagram.payload)
+        return "" if n_bytes == self._layout.itemsize else f"of {n_bytes} bytes"

@@ -20,7 +20,7 @@ from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding, Losses
 from lce_rig.io import findings
-from lce_rig.io.network import PcapFile
+from lce_rig.io.network import FRAME_BYTES, Datagram, PcapFile
 from lce_rig.io.protocol import SourceOptions, choose_lidar, fingerprint
 from lce_rig.io.velodyne_packets import (
     BadPacketError,
@@ -37,9 +37,6 @@ OFFSETS_NOTE = "points include the lasers' vertical offsets (VLP-16: up to 11 mm
 DUAL_NOTE = "dual returns: of each firing the brighter one is kept"
 _CONTROLS = ("position_port", "cut_deg")
 _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "VLP-32C": "VLP32C"}
-# So many data packets, per second or less of one sensor, show which sensors were recorded.
-_SURVEY_PACKETS = 800
-_MAX_SHOWN = 6
 # A scan with more of its packets lost is not worth looking at.
 _MIN_COVERAGE = 0.5
 # Timestamps by arrival and by the sensor may differ by 0.1 s when one takes over from the other.
@@ -308,7 +305,7 @@ class PcapRecording:
 
     Attributes:
         path: the file.
-        notes: the sensor whose packets are taken, and after reading the losses.
+        notes: after reading, the losses.
         key: fingerprint of the file.
         n_samples: number of scans to come, estimated from the file's size.
         streams: the LiDAR's scans.
@@ -327,9 +324,11 @@ class PcapRecording:
         self._lidar = choose_lidar(rig, options, self.notes)
         self._settings: LidarSettings = rig.lidars[self._lidar]
         self._product = Vlp16Stream(self._lidar, self._settings).product
-        self._address, n_packets = self._choose_sender()
+        driver = self._settings.driver
+        self._address, _ = self._file.choose_sender(self._explain, self._product.name, self._lidar, driver)
         self.key = fingerprint([path])
         self.streams = frozenset([Stream(self._lidar, "", "scans")])
+        n_packets = path.stat().st_size // (velodyne.DATA_BYTES + FRAME_BYTES)
         sweep_s = n_packets * self._product.packet_ns(is_dual=False) * 1e-9
         self.n_samples = max(1, round(sweep_s * self._settings.rate_hz))
 
@@ -362,42 +361,9 @@ class PcapRecording:
             causes = "; ".join(stream.account()) or f"{stream.n_data} packets are less than a revolution"
             raise SourceError(f"{self.path}: no whole revolution in it: {causes}", "Record at least 1 s.")
 
-    def _choose_sender(self) -> tuple[str, float]:
-        """Choose the sensor whose packets are taken by the start of the file.
-
-        Returns:
-            Its IP address, and the number of its data packets in the whole file, about.
-
-        Raises:
-            SourceError: there is none of the profile's model, or several of which none has its address.
-        """
-        senders, others, ports = Counter[str](), Counter[str](), Counter[int]()
-        for datagram in self._file.datagrams():
-            ports[datagram.port] += 1
-            try:
-                read_data_packet(datagram.payload, datagram.host_ns, self._product)
-                senders[datagram.source] += 1
-            except BadPacketError as error:
-                others.update([error.model] if error.model else [])
-            n_sound = senders.total() + others.total()
-            if n_sound >= _SURVEY_PACKETS or (n_sound and ports.total() >= 50 * _SURVEY_PACKETS):
-                break
-        name, wanted = self._product.name, self._settings.driver.address
-        if wanted not in senders and len(senders) == 1:
-            wanted = next(iter(senders))
-            self.notes.append(f"{self.path.name}: packets of {wanted}, the only {name} in it")
-        if wanted in senders:
-            share = self._file.n_bytes_read / self.path.stat().st_size
-            return str(wanted), senders[str(wanted)] / share
-        if senders:
-            addresses = ", ".join(sorted(senders))
-            hint = f"Set driver.address of {self._lidar!r} in the profile to one of them."
-            what = f"{self.path}: packets of several LiDARs, none of them {wanted}: {addresses}"
-            raise SourceError(what, hint)
-        by_port = [f"{n} to port {port}" for port, n in ports.most_common(_MAX_SHOWN)]
-        holds = [f"{n} packets of {model}" for model, n in others.most_common()] or by_port
-        causes = "; ".join([*holds, *self._file.account()]) or "no UDP packets at all"
-        what = f"{self.path}: holds no packets of a {name}: {causes}"
-        read = ", ".join(product.name for product in velodyne.READ)
-        hint = f"Record whole packets (tcpdump -s 0), or set the model of {self._lidar!r}; read are {read}."
-        raise SourceError(what, hint)
+    def _explain(self, datagram: Datagram) -> str:
+        try:
+            read_data_packet(datagram.payload, datagram.host_ns, self._product)
+        except BadPacketError as error:
+            return f"of {error.model}" if error.model else f"to port {datagram.port}"
+        return ""

@@ -219,8 +219,9 @@ def test_of_several_sensors_the_profiles_is_taken(
     lidar = rig.lidars["lidar"]
     driver = lidar.driver.model_copy(update={"address": "192.168.1.9"})
     other = rig.model_copy(update={"lidars": {"lidar": lidar.model_copy(update={"driver": driver})}})
-    with pytest.raises(SourceError, match=r"192\.168\.1\.201, 192\.168\.1\.77"):
+    with pytest.raises(SourceError) as caught:
         read(path, other)
+    assert all(address in caught.value.what for address in (SENSOR, "192.168.1.77"))
 
 
 def test_no_packets_whole_ones_or_whole_revolutions_are_errors(
