@@ -252,7 +252,7 @@ def refine(
     for k in range(3):
         centre = centre + plane_axes(plane[:3]) @ [placement.u_m, placement.v_m]
         placement = replace(placement, u_m=0.0, v_m=0.0)
-        view = view_plane(scan, near, plane, centre, radius_m, tolerance_m, dark_m)
+        view = view_plane(scan.points, near, plane, centre, radius_m, tolerance_m, dark_m)
         if k == 0:
             error_m = rate(scan, view, placement)
             if error_m > 2.0 * limit_m:
@@ -267,7 +267,7 @@ def refine(
         plane = fit_plane_to_ranges(points, plane, scale_m * float(np.linalg.norm(centre)) / plane[3])
         height = points @ plane[:3] + plane[3]
         tolerance_m = 3.5 * 1.4826 * median(np.abs(height)) + 0.004
-        view = view_plane(scan, near, plane, view.origin, radius_m, tolerance_m, dark_m)
+        view = view_plane(scan.points, near, plane, view.origin, radius_m, tolerance_m, dark_m)
         registered = register(scan, view, placement)
         if registered is None:
             return None

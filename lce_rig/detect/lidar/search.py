@@ -121,7 +121,7 @@ def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
     plates, ends = propose_plates(coarse, cut_segments(coarse, limits.max_range_m), board, is_any_size=True)
     for plane, centre, placement in screen_plates(plates, ends, board, limits.template_m):
         radius_m = float(np.hypot(*placement.half_m))
-        view = view_plane(scan, beams_about(scan, centre, radius_m), plane, centre, radius_m, LAYER_M)
+        view = view_plane(scan.points, beams_about(scan, centre, radius_m), plane, centre, radius_m, LAYER_M)
         distance = placement.distance_m(view.uv)
         heights_m = view.height_m[(distance < -0.03) & view.is_on]
         if len(heights_m) > 0.8 * (distance < -0.03).sum() and np.std(heights_m) > 2.0 * scan.sigma_m + 0.008:

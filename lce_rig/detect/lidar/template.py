@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
-from lce_rig.detect.lidar.segments import MAX_STEPS, Indices, OrderedScan
+from lce_rig.detect.lidar.segments import MAX_STEPS, Floats, Indices, OrderedScan
 
 N_ANGLES = 12
 CAP_M = 0.10
@@ -26,7 +26,7 @@ class PlaneView:
         plane: (4,) as (n, d), n towards the LiDAR.
         axes: (3, 2) unit vectors u (level) and v (up) in the plane, right-handed with n.
         origin: (3,) m, the point of the plane from which u and v are counted.
-        member: (M,) index in the `OrderedScan`.
+        member: (M,) index among all returns.
         uv: (M, 2) where each beam pierces the plane, m.
         height_m: (M,) distance of each return from the plane, positive before it.
         tolerance_m: returns within it lie on the plane.
@@ -93,7 +93,7 @@ def beams_about(scan: OrderedScan, centre: Array, radius_m: float) -> Indices:
 
 
 def view_plane(
-    scan: OrderedScan,
+    points: Array | Floats,
     among: Indices,
     plane: Array,
     centre: Array,
@@ -104,8 +104,8 @@ def view_plane(
     """Pierce a plane by those beams that do so within a radius of a point.
 
     Args:
-        scan: all returns.
-        among: (K,) beams that are tried, of `beams_about`.
+        points: (N, 3) m, all returns.
+        among: (K,) of them that are tried.
         plane: (4,) as (n, d), n towards the LiDAR.
         centre: (3,) m, near the plane.
         radius_m: of the disc that is looked at.
@@ -113,10 +113,10 @@ def view_plane(
     """
     normal, d = plane[:3], plane[3]
     origin = centre - (centre @ normal + d) * normal
-    points = scan.points.take(among, axis=0).astype(np.float64)
-    along_normal = points @ normal
+    tried = points.take(among, axis=0).astype(np.float64)
+    along_normal = tried @ normal
     with np.errstate(divide="ignore", invalid="ignore"):
-        pierced = points * (-d / along_normal)[:, None] - origin
+        pierced = tried * (-d / along_normal)[:, None] - origin
     is_near = (along_normal < 0) & (np.einsum("ij,ij->i", pierced, pierced) <= radius_m**2)
     axes = plane_axes(normal)
     uv = pierced[is_near] @ axes

@@ -46,7 +46,7 @@ from lce_rig.detect.lidar.search import (
     too_thick,
 )
 from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD
-from lce_rig.detect.lidar.template import Placement, plane_axes
+from lce_rig.detect.lidar.template import Placement, PlaneView, view_plane
 
 # Cells per short side of the board: of 7 cm for a plate of 0.76 m.
 _CELLS = 11.0
@@ -245,46 +245,24 @@ def _planes(sums: Array) -> tuple[Array, Array]:
     return plane, np.maximum(eigenvalues, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """Rays about a plate as they pierce its plane.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _View(PlaneView):
+    """The view of a plate in a point cloud without rings.
 
     Attributes:
-        plane: (4,) as (n, d), n towards the LiDAR.
-        axes: (3, 2) of the plane.
-        origin: (3,) m.
-        points: (M, 3) their returns.
-        intensity: (M,) of these; all the same where the point cloud has none.
-        uv: (M, 2) where they pierce it.
-        height_m: (M,) of the returns over the plane.
-        tolerance_m: returns within it lie on the plane.
+        returns: (M, 4) x, y, z, intensity; intensities are all the same where the point cloud has none.
         beam: the LiDAR's.
     """
 
-    plane: Array
-    axes: Array
-    origin: Array
-    points: Array
-    intensity: Array
-    uv: Array
-    height_m: Array
-    tolerance_m: float
+    returns: Array
     beam: Beam
 
     @classmethod
     def of(cls, returns: Array, plane: Array, centre: Array, tolerance_m: float, limits: Limits) -> "_View":
-        """Pierce a plane near a point by the rays of returns (N, 4) x, y, z, intensity."""
-        origin, axes = centre - (centre @ plane[:3] + plane[3]) * plane[:3], plane_axes(plane[:3])
-        along = returns[:, :3] @ plane[:3]
-        returns, along = returns[along < 0], along[along < 0]
-        points = returns[:, :3]
-        uv = (points * (-plane[3] / along)[:, None] - origin) @ axes
-        return cls(plane, axes, origin, points, returns[:, 3], uv, along + plane[3], tolerance_m, limits.beam)
-
-    @property
-    def is_on(self) -> NDArray[np.bool_]:
-        """Which rays return from the plane (M,)."""
-        return np.abs(self.height_m) <= self.tolerance_m
+        """Pierce a plane near a point by the rays of returns (N, 4)."""
+        among = np.arange(len(returns))
+        view = view_plane(returns[:, :3], among, plane, centre, np.inf, tolerance_m)
+        return cls(**vars(view), returns=returns[view.member], beam=limits.beam)
 
     def beam_parts_m(self, normals: Array, uv: Array) -> Array:
         """Split half the beam's width on the plane along unit normals (K, 2) at uv (K, 2) by its two axes.
@@ -408,7 +386,7 @@ def measure_unstructured(
         inside = np.zeros(0) if outline is None else view.is_on & (outline.placement.distance_m(view.uv) < 0)
         if outline is None or np.count_nonzero(inside) < _MIN_POINTS:
             return _too_few(int(np.count_nonzero(inside)), distance_m)
-        on_plate = view.points[inside]
+        on_plate = view.returns[:, :3][inside]
         scale_m = 1.4826 * median(np.abs(view.height_m[inside] - median(view.height_m[inside]))) + 0.001
         plane = fit_plane_to_ranges(on_plate, view.plane, scale_m * distance_m / view.plane[3])
         spread_m = 1.4826 * median(np.abs(on_plate @ plane[:3] + plane[3]))
@@ -470,7 +448,9 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     edge_rms_m = float(np.sqrt(np.mean(strips.off_m[is_good] ** 2)))
     growth, size_sigma = outline.growth_m, 2 * np.sqrt(np.diag(outline.cov)[3:])
     sigma_m = np.hypot(size_sigma, view.beam.widths_m(distance_m).max() / 2)
-    points, point_sigma_m = _average(view.points[is_board], placement.local(view.uv[is_board]), view.plane)
+    points, point_sigma_m = _average(
+        view.returns[:, :3][is_board], placement.local(view.uv[is_board]), view.plane
+    )
     if len(points) < _MIN_MEANS:
         n_needed = int(np.ceil(_MIN_CELL_RETURNS * board.width_m * board.height_m / _FINE_M**2))
         return _too_few(n_on, distance_m, n_needed)
@@ -528,7 +508,7 @@ def _look_beyond(view: _View, strips: Strips, placement: Placement) -> tuple[NDA
     behind_m, echo = np.full(len(strips.uv), np.inf), np.zeros(len(strips.uv))
     is_touched = np.zeros(len(strips.uv), dtype=np.bool_)
     # The power received falls with the square of the range.
-    power = np.maximum(view.intensity, 1e-9) / (view.points**2).sum(axis=1)
+    power = np.maximum(view.returns[:, 3], 1e-9) / (view.returns[:, :3] ** 2).sum(axis=1)
     away = placement.distance_m(view.uv)
     of_plate = float(np.median(power[view.is_on & (away < -0.01) & (away > -STRIP_M)]))
     beyond = strips.uv + strips.outwards * STRIP_M / 2
