@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import VLP_16
-from lce_rig.core.geometry import Array, pose
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, LidarQuality
 from lce_rig.detect.lidar.segments import MAX_STEPS, Indices, OrderedScan
 from lce_rig.detect.lidar.template import (
@@ -342,11 +342,6 @@ def build_board(
     brightness = intensity[ends.beyond] / of_board if of_board > 0 else np.ones(len(end))
     echo = brightness * (scan.range_m[end] / scan.range_m[ends.beyond]) ** 2
     echo = np.where(np.isfinite(ends.behind_m), echo / (1 + echo), 0.0)
-    # y points upwards where the rectangle leaves the choice.
-    direction = np.array([np.cos(fitted.angle_rad), np.sin(fitted.angle_rad)])
-    x = view.axes @ (-direction if direction[0] < 0 else direction)
-    normal = view.plane[:3]
-    R = np.stack([x, np.cross(normal, x), normal], axis=1)
     return LidarBoard(
         points=points,
         ring=scan.ring[kept],
@@ -358,7 +353,7 @@ def build_board(
         azimuth_step_rad=scan.step_rad,
         plane=view.plane,
         sigma_m=rms_m,
-        T_lidar_board=pose(R, view.origin + view.axes @ [fitted.u_m, fitted.v_m]),
+        T_lidar_board=view.pose_of(fitted),
         offset_ns=None if source.offset_ns is None else source.offset_ns[scan.index[kept]],
         quality=quality,
     )

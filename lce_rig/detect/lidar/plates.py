@@ -24,7 +24,7 @@ class Plates:
     Attributes:
         plane: (K, 4) as (n, d), n.p + d = 0, n towards the LiDAR.
         centre: (K, 3) mean of the plate's returns, m.
-        n_rings: (K,).
+        n_rings: (K,); 0 without rings.
         size_m: (K, 2) long and short side of the rectangle with the same second moments.
         thickness_m: (K,) rms distance of the returns from the plane.
     """
@@ -34,6 +34,19 @@ class Plates:
     n_rings: Indices
     size_m: Array
     thickness_m: Array
+
+    @staticmethod
+    def none() -> "Plates":
+        """Give no plate at all."""
+        return Plates.of(np.ones((0, 13)), np.zeros(0, dtype=np.intp))
+
+    @staticmethod
+    def of(sums: Array, n_rings: Indices) -> "Plates":
+        """Fit plates to sums (K, 13) of 1, p and p p^T over their returns."""
+        plane, centre, eigenvalues = fit_planes(sums)
+        return Plates(
+            plane, centre, n_rings, np.sqrt(12.0 * eigenvalues[:, [2, 1]]), np.sqrt(eigenvalues[:, 0])
+        )
 
     def select(self, keep: NDArray[np.bool_] | Indices) -> "Plates":
         """Keep the plates of a mask or index."""
@@ -170,20 +183,22 @@ def _fit(row: Indices, column: Indices, segments: Segments, sums: Array) -> Plat
     """
     start = np.flatnonzero(np.diff(row, prepend=-1))
     if len(start) == 0:
-        none = np.zeros(0)
-        return Plates(np.zeros((0, 4)), np.zeros((0, 3)), start, np.zeros((0, 2)), none)
-    total = np.add.reduceat(sums[column], start)
-    count = total[:, 0]
-    centre = total[:, 1:4] / count[:, None]
-    spread = total[:, 4:].reshape(-1, 3, 3) / count[:, None, None] - centre[:, :, None] * centre[:, None, :]
-    eigenvalues, eigenvectors = np.linalg.eigh(spread)
-    eigenvalues = np.maximum(eigenvalues, 0.0)
-    normal = eigenvectors[:, :, 0]
+        return Plates.none()
+    is_new_ring = (np.diff(row, prepend=-1) != 0) | (np.diff(segments.ring[column], prepend=-1) != 0)
+    return Plates.of(
+        np.add.reduceat(sums[column], start), np.add.reduceat(is_new_ring.astype(np.intp), start)
+    )
+
+
+def fit_planes(sums: Array) -> tuple[Array, Array, Array]:
+    """Fit planes (K, 4), n towards the LiDAR, to sums (K, 13); also centres (K, 3), eigenvalues (K, 3)."""
+    mean = sums[:, 1:] / sums[:, :1]
+    centre, second = mean[:, :3], mean[:, 3:].reshape(-1, 3, 3)
+    eigenvalues, vectors = np.linalg.eigh(second - centre[:, :, None] * centre[:, None, :])
+    normal = vectors[:, :, 0]
     d = -np.einsum("ij,ij->i", normal, centre)
     plane = np.concatenate([normal, d[:, None]], axis=1) * np.where(d < 0, -1.0, 1.0)[:, None]
-    is_new_ring = (np.diff(row, prepend=-1) != 0) | (np.diff(segments.ring[column], prepend=-1) != 0)
-    n_rings = np.add.reduceat(is_new_ring.astype(np.intp), start)
-    return Plates(plane, centre, n_rings, np.sqrt(12.0 * eigenvalues[:, [2, 1]]), np.sqrt(eigenvalues[:, 0]))
+    return plane, centre, np.maximum(eigenvalues, 0.0)
 
 
 def _members(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, pose
 from lce_rig.detect.lidar.segments import MAX_STEPS, Floats, Indices, OrderedScan
 
 N_ANGLES = 12
@@ -52,6 +52,14 @@ class PlaneView:
     def is_behind(self) -> NDArray[np.bool_]:
         """Which beams pass through the plane (M,), and not through a dark square."""
         return self.height_m < -(max(self.tolerance_m, DARK_DEPTH_M) if self.dark_m else self.tolerance_m)
+
+    def pose_of(self, placement: "Placement") -> Array:
+        """Build T_lidar_board (4, 4) of a placed board; y points upwards where that is left open."""
+        direction = np.array([np.cos(placement.angle_rad), np.sin(placement.angle_rad)])
+        x = self.axes @ (-direction if direction[0] < 0 else direction)
+        normal = self.plane[:3]
+        R = np.stack([x, np.cross(normal, x), normal], axis=1)
+        return pose(R, self.origin + self.axes @ [placement.u_m, placement.v_m])
 
 
 @dataclass(frozen=True)

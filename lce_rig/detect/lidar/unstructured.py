@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.data import NO_RING, Scan
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, pose
+from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, LidarQuality
 from lce_rig.detect.findings import (
     LIDAR_HIDDEN,
@@ -35,6 +35,7 @@ from lce_rig.detect.lidar.outline import (
     measure_strips,
     register_rays,
 )
+from lce_rig.detect.lidar.plates import Plates, fit_planes
 from lce_rig.detect.lidar.search import (
     LOOK_TURN,
     MARGIN_M,
@@ -80,21 +81,6 @@ _STRIP_SIGMA_M, _STRIP_OFF = 0.012, 4.0
 _MOST_SMEAR_M = 0.008
 # Fewer located places on upright or on level edges, or fewer means on the plate, leave its pose open.
 _MIN_STRIPS, _MIN_MEANS = 2, 10
-
-
-@dataclass(frozen=True, eq=False)
-class Patches:
-    """Flat pieces of surface grown from neighbouring cells, K of them.
-
-    Attributes:
-        plane: (K, 4) as (n, d), n towards the LiDAR.
-        centre: (K, 3) m.
-        size_m: (K, 2) long and short side of the rectangle with the same second moments.
-    """
-
-    plane: Array
-    centre: Array
-    size_m: Array
 
 
 def find_unstructured_boards(
@@ -176,7 +162,7 @@ def look_for_unstructured_board(
     return LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=float(np.linalg.norm(centre)))
 
 
-def grow_patches(points: Array, cell_m: float) -> Patches:
+def grow_patches(points: Array, cell_m: float) -> Plates:
     """Join neighbouring cells of points (N, 3) that lie in one plane, the largest patch first.
 
     Each cell's plane is that of its points and those of the cells about it.
@@ -185,20 +171,19 @@ def grow_patches(points: Array, cell_m: float) -> Patches:
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    none = Patches(np.zeros((0, 4)), np.zeros((0, 3)), np.zeros((0, 2)))
     if len(points) < _MIN_POINTS:
-        return none
+        return Plates.none()
     sums = _sum_cells(points, cell_m)
     centres = sums[:, 1:4] / sums[:, :1]
     pairs = cKDTree(centres).query_pairs(1.8 * cell_m, output_type="ndarray")
     n_cells = len(centres)
     near = coo_array((np.ones(len(pairs)), pairs.T), shape=(n_cells, n_cells)).tocsr()
     around = np.asarray((near + near.T + eye_array(n_cells)) @ sums, dtype=np.float64)
-    plane, eigenvalues = _planes(around)
+    plane, _, eigenvalues = fit_planes(around)
     thickness_m = np.sqrt(eigenvalues[:, 0])
     flat = (around[:, 0] >= _MIN_CELL_POINTS) & (eigenvalues[:, 1] > (0.35 * cell_m) ** 2)
     if not flat.any():
-        return none
+        return Plates.none()
     flat &= thickness_m < 2.0 * _NOISE_M
     i, j = pairs.T
     apart = centres[j] - centres[i]
@@ -217,12 +202,11 @@ def grow_patches(points: Array, cell_m: float) -> Patches:
     totals = np.zeros((n_patches, alike.shape[1]))
     np.add.at(totals, label, alike)
     totals = totals[large]
-    plane, eigenvalues = _planes(totals)
-    return Patches(plane, totals[:, 1:4] / totals[:, :1], np.sqrt(12 * eigenvalues[:, [2, 1]]))
+    return Plates.of(totals, np.zeros(len(totals), dtype=np.intp))
 
 
 def _sum_cells(points: Array, cell_m: float) -> Array:
-    """Sum 1, p and p p^T of the points in each cell of space: (V, 10)."""
+    """Sum 1, p and p p^T of the points in each cell of space: (V, 13)."""
     cells = np.floor(points / cell_m).astype(np.int64)
     cells -= cells.min(axis=0)
     extent = cells.max(axis=0) + 1
@@ -230,19 +214,9 @@ def _sum_cells(points: Array, cell_m: float) -> Array:
     order = np.argsort(key)
     starts = np.flatnonzero(np.diff(key[order], prepend=-1))
     x, y, z = points[order].T
-    columns = (np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+    xy, xz, yz = x * y, x * z, y * z
+    columns = (np.ones(len(x)), x, y, z, x * x, xy, xz, xy, y * y, yz, xz, yz, z * z)
     return np.stack([np.add.reduceat(column, starts) for column in columns], axis=1)
-
-
-def _planes(sums: Array) -> tuple[Array, Array]:
-    """Fit planes (K, 4), n towards the LiDAR, to sums (K, 10); also the eigenvalues (K, 3), ascending."""
-    mean = sums[:, 1:] / sums[:, :1]
-    centre, second = mean[:, :3], mean[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
-    eigenvalues, vectors = np.linalg.eigh(second - centre[:, :, None] * centre[:, None, :])
-    normal = vectors[:, :, 0]
-    d = -np.einsum("ij,ij->i", normal, centre)
-    plane = np.concatenate([normal, d[:, None]], axis=1) * np.where(d < 0, -1.0, 1.0)[:, None]
-    return plane, np.maximum(eigenvalues, 0.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -476,10 +450,6 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     beam_m = view.beam_parts_m(strips.outwards, strips.uv)
     inwards = beam_m.sum(axis=1)[:, None] * strips.outwards
     edge = view.origin + (strips.uv - inwards)[is_good] @ view.axes.T
-    # y points upwards where the rectangle leaves the choice.
-    x = view.axes @ (-width_axis if width_axis[0] < 0 else width_axis)
-    normal = view.plane[:3]
-    R = np.stack([x, np.cross(normal, x), normal], axis=1)
     return LidarBoard(
         points=points,
         ring=np.full(len(points), NO_RING, dtype=np.int16),
@@ -492,7 +462,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
         azimuth_step_rad=0.0,
         plane=view.plane,
         sigma_m=point_sigma_m,
-        T_lidar_board=pose(R, view.origin + view.axes @ [placement.u_m, placement.v_m]),
+        T_lidar_board=view.pose_of(placement),
         quality=quality,
     )
 
