@@ -143,7 +143,10 @@ def _in_order(scan: Scan) -> _Rows:
     step_rad = 0.0
     if not np.any(row != NO_RING):
         elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
-        step_rad = _spacing_rad(azimuth, elevation)
+        # Give the mean angle between returns: the root of the solid angle in view by how many share it.
+        counts, _, _ = np.histogram2d(azimuth, elevation, bins=(360, 180), range=_SPHERE_RAD)
+        is_seen, middle = counts > 0, np.radians(np.arange(-89.5, 90.0))
+        step_rad = float(np.radians(1.0) * np.sqrt((is_seen @ np.cos(middle)).sum() / max(len(azimuth), 1)))
         row = np.floor(elevation / step_rad).astype(np.intp)
     order = np.lexsort((azimuth, row))
     points, row, azimuth = points[order], row[order], azimuth[order]
@@ -154,13 +157,6 @@ def _in_order(scan: Scan) -> _Rows:
     is_next &= gap < _GAP_STEPS * step_rad
     intensity = np.asarray(scan.intensity, dtype=np.float64)[order]
     return _Rows(points, row, azimuth, np.linalg.norm(points, axis=1), intensity, is_next, step_rad)
-
-
-def _spacing_rad(azimuth: Array, elevation: Array) -> float:
-    """Give the mean angle between returns: the root of the solid angle in view by how many share it."""
-    counts, _, _ = np.histogram2d(azimuth, elevation, bins=(360, 180), range=_SPHERE_RAD)
-    is_seen, middle = counts > 0, np.radians(np.arange(-89.5, 90.0))
-    return float(np.radians(1.0) * np.sqrt((is_seen @ np.cos(middle)).sum() / max(len(azimuth), 1)))
 
 
 def _find_jumps(rows: _Rows, beam: Beam) -> tuple[Array, Array]:

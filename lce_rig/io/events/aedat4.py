@@ -112,7 +112,11 @@ class Aedat4File:
             for number, (at, n_bytes) in enumerate(self.places[stream]):
                 file.seek(at)
                 try:
-                    content = decode(_decompress(file.read(n_bytes))[4:])
+                    data = file.read(n_bytes)
+                    module = {_LZ4_MAGIC: "lz4.frame", _ZSTD_MAGIC: "compression.zstd"}.get(data[:4])
+                    if module == "compression.zstd" and sys.version_info < (3, 14):
+                        module = "backports.zstd"
+                    content = decode((bytes(import_module(module).decompress(data)) if module else data)[4:])
                 except OSError:
                     raise
                 except Exception as error:  # of lz4, zstd, struct or numpy
@@ -241,10 +245,3 @@ def _vector_at(table: bytes, index: int) -> tuple[int, int]:
         return 0, 0
     at += struct.unpack_from("<I", table, at)[0]
     return at + 4, int(struct.unpack_from("<I", table, at)[0])
-
-
-def _decompress(data: bytes) -> bytes:
-    module = {_LZ4_MAGIC: "lz4.frame", _ZSTD_MAGIC: "compression.zstd"}.get(data[:4])
-    if module == "compression.zstd" and sys.version_info < (3, 14):
-        module = "backports.zstd"
-    return bytes(import_module(module).decompress(data)) if module else data
