@@ -19,7 +19,7 @@ from lce_rig.core.files import read_json
 from lce_rig.core.findings import Losses
 from lce_rig.core.geometry import Array
 from lce_rig.io import findings
-from lce_rig.io.network import FRAME_BYTES, Datagram, PcapFile
+from lce_rig.io.network import FRAME_BYTES, PcapFile
 from lce_rig.io.protocol import SourceOptions, choose_lidar, fingerprint
 from lce_rig.rig import LidarSettings, Rig
 
@@ -201,7 +201,13 @@ class OusterRecording:
         self.notes.append(f"{path.name}: metadata of {beside.name}, profile {self._metadata.name}")
         what = f"{self._layout.itemsize} bytes, as in {beside.name}"
         driver = self._settings.driver
-        self._sender = self._file.choose_sender(self._explain, what, self._lidar, driver)
+        n_bytes = self._layout.itemsize
+        self._sender = self._file.choose_sender(
+            lambda d: "" if len(d.payload) == n_bytes else f"of {len(d.payload)} bytes",
+            what,
+            self._lidar,
+            driver,
+        )
         self.key = fingerprint([path, beside])
         self.streams = frozenset([Stream(self._lidar, "", "scans")])
         n_packets = -(-self._metadata.n_columns // self._metadata.columns_per_packet)
@@ -270,7 +276,3 @@ class OusterRecording:
         stamp_ns = first_host_ns - sent_ns if is_host else int(ns[0])
         intensity = pixels["reflectivity"].astype(np.float32)[kept]
         return Scan(self._lidar, stamp_ns, points, intensity, ring, offset_ns, first_host_ns or None)
-
-    def _explain(self, datagram: Datagram) -> str:
-        n_bytes = len(datagram.payload)
-        return "" if n_bytes == self._layout.itemsize else f"of {n_bytes} bytes"

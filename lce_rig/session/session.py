@@ -462,22 +462,10 @@ def discard_if_empty(path: Path) -> bool:
     Returns:
         Whether it was removed. A folder with a capture or any other file is left unchanged.
     """
-    with suppress(OSError):
-        if {entry.name for entry in path.iterdir()} - {
-            MARKER,
-            PROFILE,
-            PROFILE_TEXT,
-            JOURNAL,
-            LOCK,
-            CAPTURES,
-        }:
-            return False
-        if (path / CAPTURES).is_dir():
-            (path / CAPTURES).rmdir()  # fails where there is a capture
-        # The marker last, so that an interrupted removal leaves a session.
-        for name in (LOCK, JOURNAL, PROFILE_TEXT, PROFILE, MARKER):
-            (path / name).unlink(missing_ok=True)
-        path.rmdir()
+    made = {MARKER, PROFILE, PROFILE_TEXT, JOURNAL, LOCK, CAPTURES}
+    is_empty = path.is_dir() and {entry.name for entry in path.iterdir()} <= made
+    if is_empty and not any((path / CAPTURES).glob("*")):
+        shutil.rmtree(path, ignore_errors=True)
         return True
     return False
 

@@ -70,21 +70,16 @@ class ClockModel:
         return np.asarray(self.reference_ns + elapsed_ns + drifted_ns)
 
     def sigma_ns(self, source_ns: int) -> float:
-        """Return the standard deviation of `convert`, within the data or beyond them."""
-        return float(self.sigmas_ns(np.array([source_ns], dtype=np.int64))[0])
-
-    def sigmas_ns(self, source_ns: NDArray[np.int64]) -> Array:
-        """Return the standard deviations (N,) of `convert_all`.
+        """Return the standard deviation of `convert`.
 
             sigma(t)^2 = c00 + 2 c01 dt + c11 dt^2 + bias^2 + (WANDER outside)^2
 
         with dt from the anchor, and `outside` how far t lies before or after the data.
         """
-        source_ns = np.asarray(source_ns, dtype=np.int64)
-        elapsed_ns = (source_ns - self.anchor_ns).astype(np.float64)
-        outside_ns = np.maximum(np.maximum(self.first_ns - source_ns, source_ns - self.last_ns), 0)
+        elapsed_ns = float(source_ns - self.anchor_ns)
+        outside_ns = max(self.first_ns - source_ns, source_ns - self.last_ns, 0)
         line = self.cov[0, 0] + 2 * self.cov[0, 1] * elapsed_ns + self.cov[1, 1] * elapsed_ns**2
-        return np.asarray(np.sqrt(line + self.bias_sigma_ns**2 + (WANDER * outside_ns) ** 2))
+        return float(np.sqrt(line + self.bias_sigma_ns**2 + (WANDER * outside_ns) ** 2))
 
     def inverse(self) -> "ClockModel":
         """Build the model that reads the source's clock on the reference's."""
