@@ -19,9 +19,6 @@ _BORDER_PX, _BORDER_RATIO = 1.0, 4.0
 _BORDER_PERCENTILE = 98.0
 # A focal length error of this size moves boards at 3 m by 9 mm.
 _FOCAL_SIGMA = 0.003
-_TILTED_DEG, _TILTED_SHARE = 15.0, 0.5
-# Tilts about one axis determine the focal length in one direction only.
-_AXIS_SPREAD_DEG = 8.0
 _OVERFITTED = 1.5
 _BOW_M, _ASPECT = 0.002, 0.002
 
@@ -143,7 +140,12 @@ def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> t
             f"is not determined beyond (pixel standard deviation {outside:.1f} px there, {inside:.1f} px "
             "where boards were seen); place boards in all four corners"
         )
-    texts += _tilts(estimate)
+    focal_sigma = float(estimate.sigma[0] / estimate.intrinsics.fx_px)
+    if focal_sigma >= _FOCAL_SIGMA:
+        texts.append(
+            f"focal length and distance trade off (standard deviation {100 * focal_sigma:.1f} %): "
+            "tilt the board by 30 to 45 deg, left and right as well as up and down, and come nearer"
+        )
     if estimate.held_out_rms_px >= _OVERFITTED * estimate.rms_px:
         texts.append(
             f"held-out captures fit worse ({estimate.held_out_rms_px:.2f} px) than captures used "
@@ -167,20 +169,6 @@ def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> t
     return tuple(texts)
 
 
-def tilts_deg(estimate: IntrinsicsEstimate) -> Array:
-    """Measure each board's tilt (K, 2) deg from the line of sight, by the axes of the image.
-
-    A board that faces the camera has no tilt; one whose right edge is farther away than its left has (+, 0).
-    """
-    normals, centres = estimate.T_cam_board[:, :3, 2], estimate.T_cam_board[:, :3, 3]
-    sight = centres / np.linalg.norm(centres, axis=1, keepdims=True)
-    facing = -np.sum(normals * sight, axis=1)
-    lateral = normals + facing[:, None] * sight
-    size = np.degrees(np.arctan2(np.linalg.norm(lateral, axis=1), facing))
-    direction = lateral[:, :2] / np.maximum(np.linalg.norm(lateral[:, :2], axis=1, keepdims=True), 1e-12)
-    return np.asarray(direction * size[:, None])
-
-
 def reach(estimate: IntrinsicsEstimate) -> float:
     """Measure how far boards reach from the principal point to the image's farthest corner, 0..1."""
     i = estimate.intrinsics
@@ -188,21 +176,3 @@ def reach(estimate: IntrinsicsEstimate) -> float:
     ends = np.array([[u, v] for u in (0, i.width_px - 1) for v in (0, i.height_px - 1)])
     farthest = np.linalg.norm(ends - centre, axis=1).max()
     return float(np.linalg.norm(estimate.corners_px - centre, axis=1).max() / farthest)
-
-
-def _tilts(estimate: IntrinsicsEstimate) -> list[str]:
-    focal_sigma = float(estimate.sigma[0] / estimate.intrinsics.fx_px)
-    if focal_sigma < _FOCAL_SIGMA:
-        return []
-    tilts = tilts_deg(estimate)
-    known = f"focal length and distance trade off (standard deviation {100 * focal_sigma:.1f} %)"
-    share = float(np.mean(np.linalg.norm(tilts, axis=1) > _TILTED_DEG))
-    if share < _TILTED_SHARE:
-        n = round(share * len(tilts))
-        text = f"{n} of {len(tilts)} boards are tilted by more than {_TILTED_DEG:.0f} deg: {known}"
-        return [f"{text}; tilt the board by 30 to 45 deg, left and right as well as up and down"]
-    _, spread, axes = np.linalg.svd(tilts / np.sqrt(len(tilts)))
-    if spread[1] < _AXIS_SPREAD_DEG:
-        way = "left and right" if abs(axes[1, 0]) > abs(axes[1, 1]) else "up and down"
-        return [f"boards are hardly tilted {way} ({spread[1]:.0f} deg rms): {known}; tilt them that way too"]
-    return [f"{known}: add captures, nearer and tilted by 30 to 45 deg"]

@@ -87,7 +87,13 @@ class Aedat4File:
                 raise ValueError("its header is cut off")
             table_at = _number(table, 1, "q", _NOT_CLOSED)
             at, n_bytes = _vector_at(table, 2)
-            self.streams = _streams(table[at : at + n_bytes].decode())
+            self.streams: dict[int, tuple[str, dict[str, str]]] = {}
+            xml = ElementTree.fromstring(table[at : at + n_bytes].decode())
+            for node in xml.iterfind("./node[@name='outInfo']/node"):
+                entries = node.iterfind("./node[@name='info']/attr")
+                attributes = {entry.get("key", ""): entry.text or "" for entry in entries}
+                kind = node.findtext("./attr[@key='typeIdentifier']") or ""
+                self.streams[int(node.get("name", ""))] = kind, attributes
             self.places: dict[int, list[tuple[int, int]]] = {number: [] for number in self.streams}
             self._torn = self._walk(file, begin, end if table_at < begin else min(table_at, end))
 
@@ -211,16 +217,6 @@ def _decode_events(table: bytes) -> EventColumns:
     events = np.frombuffer(table, EVENT, n_events, at) if n_events else np.empty(0, EVENT)
     x, y = events["x"].astype(np.uint16), events["y"].astype(np.uint16)
     return EventColumns(to_ns(events["t"]), x, y, events["on"].view(np.uint8) != 0)
-
-
-def _streams(xml: str) -> dict[int, tuple[str, dict[str, str]]]:
-    """Read the streams from the header's XML: type and attributes by number."""
-    streams = {}
-    for node in ElementTree.fromstring(xml).iterfind("./node[@name='outInfo']/node"):
-        attributes = {a.get("key", ""): a.text or "" for a in node.iterfind("./node[@name='info']/attr")}
-        kind = node.findtext("./attr[@key='typeIdentifier']") or ""
-        streams[int(node.get("name", ""))] = kind, attributes
-    return streams
 
 
 def _field_at(table: bytes, index: int) -> int | None:

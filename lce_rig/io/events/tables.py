@@ -142,7 +142,8 @@ class TextEvents(EventStream):
                     losses.add(findings.TORN_END(where=f"line {n_lines + len(lines)}"))
                     lines.pop()
                 n_lines += len(lines)
-                table = np.loadtxt(lines, ndmin=2, comments="#") if any(map(_has_event, lines)) else _NO_LINES
+                has_events = any(line.partition(b"#")[0].strip() for line in lines)
+                table = np.loadtxt(lines, ndmin=2, comments="#") if has_events else _NO_LINES
                 if table.shape[1] != 4:
                     raise ValueError(f"lines up to {n_lines} have {table.shape[1]} numbers, not 4")
                 t_s, x, y, polarity = table.T
@@ -152,7 +153,3 @@ class TextEvents(EventStream):
                 # Doubles hold today's seconds to 0.24 us: rounding gives the microsecond that was written.
                 t_ns, pixels = to_ns(np.rint(t_s[is_event] * 1e6)), table[is_event, 1:3].astype(np.uint16)
                 yield EventColumns(t_ns, pixels[:, 0], pixels[:, 1], polarity[is_event] > 0)
-
-
-def _has_event(line: bytes) -> bool:
-    return bool(line.partition(b"#")[0].strip())
