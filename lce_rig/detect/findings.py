@@ -315,20 +315,11 @@ TOO_NEAR_OR_FAR: dict[Stage, tuple[Kind, Kind]] = {
     "image": _distance_kinds("image", "camera"),
     "lidar": _distance_kinds("lidar", "LiDAR"),
 }
-_SIZES = (
-    "{width_px}x{height_px} px, the profile's intrinsics belong to {wanted_width_px}x{wanted_height_px} px"
-)
-_OTHER_MODE = "use the intrinsics of this mode, or record in the mode of the intrinsics"
-IMAGE_SIZE_CUT = Kind(
-    "image.size_cut", f"{_SIZES}: the readout ended early, used as far as it reaches", severity="note"
-)
-IMAGE_SIZE_CANVAS = Kind(
-    "image.size_canvas", f"{_SIZES}: blank beyond the sensor, cropped to it", severity="note"
-)
 IMAGE_SIZE_OTHER = Kind(
     "image.size_other",
-    f"{_SIZES}: cannot be used",
-    _OTHER_MODE,
+    "{width_px}x{height_px} px cannot be used, the profile's intrinsics belong to "
+    "{wanted_width_px}x{wanted_height_px} px",
+    "use the intrinsics of this mode, or record in the mode of the intrinsics",
     actions={
         "scaled": "multiply fx, fy, cx, cy by {factor:.4g} if the image is only scaled",
         "swapped": "set resolution_px: [{width_px}, {height_px}], and check fx, fy, cx, cy",

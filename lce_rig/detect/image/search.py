@@ -10,7 +10,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.findings import Figure, Finding, Refusal
+from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, transform
 from lce_rig.core.planar_pose import PlanarPose, solve_planar_pose
 from lce_rig.core.results import ImageBoard, ImageQuality
@@ -18,8 +18,6 @@ from lce_rig.detect.findings import (
     IMAGE_MISFIT,
     IMAGE_NO_POSE,
     IMAGE_NOT_AT_FIRST_SIGHT,
-    IMAGE_SIZE_CANVAS,
-    IMAGE_SIZE_CUT,
     IMAGE_SIZE_OTHER,
 )
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
@@ -150,30 +148,22 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
     )
 
 
-def compare_size(image: Image, intrinsics: Intrinsics) -> Finding | None:
-    """Say what is done with an image of another size than that of the intrinsics; None for the same size.
+def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
+    """Return the grey image at the size of the intrinsics, as far as it reaches.
 
-    Two harmless differences occur in recordings: a readout that ends a few lines early ("image.size_cut"),
-    and a canvas larger than the sensor, blank beyond it ("image.size_canvas", images reconstructed from
-    events). Any other size ("image.size_other", an error) cannot be used.
+    Two harmless differences occur in recordings: a readout that ends a few lines early, and a canvas larger
+    than the sensor, blank beyond it, of images reconstructed from events.
+
+    Raises:
+        ProfileError: a size that cannot be used, naming both.
     """
     height, width = image.pixels.shape[:2]
     wanted_width, wanted_height = intrinsics.width_px, intrinsics.height_px
-    if (width, height) == (wanted_width, wanted_height):
-        return None
-    figures: dict[str, Figure] = {
-        "width_px": width,
-        "height_px": height,
-        "wanted_width_px": wanted_width,
-        "wanted_height_px": wanted_height,
-        "factor": width / wanted_width,
-    }
-    subject = f"{image.sensor}.{image.channel}"
+    grey = image.grey[:wanted_height, :wanted_width]
     missing_u, missing_v = 1 - width / wanted_width, 1 - height / wanted_height
     if 0 <= missing_u <= _CUT_FRACTION and 0 <= missing_v <= _CUT_FRACTION:
-        return IMAGE_SIZE_CUT(subject, **figures)
-    is_canvas = -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0
-    if is_canvas:
+        return grey
+    if -_CANVAS_FRACTION <= missing_u <= 0 and -_CANVAS_FRACTION <= missing_v <= 0:
         # Right of and below the sensor's size there is only a smooth background; the columns next to the
         # sensor's are not judged.
         steps = np.abs(np.diff(image.grey.astype(np.int16), axis=1))
@@ -181,23 +171,19 @@ def compare_size(image: Image, intrinsics: Intrinsics) -> Finding | None:
         beyond = (steps[wanted_height:].ravel(), steps[:wanted_height, wanted_width + 8 :].ravel())
         outside = np.concatenate(beyond)
         if len(outside) and np.percentile(outside, 99) <= max(0.3 * inside, 2.0):
-            return IMAGE_SIZE_CANVAS(subject, **figures)
+            return grey
     is_scaled = abs(width / wanted_width - height / wanted_height) < 0.01 * width / wanted_width
     is_swapped = (width, height) == (wanted_height, wanted_width)
-    action = "scaled" if is_scaled else "swapped" if is_swapped else ""
-    return IMAGE_SIZE_OTHER(subject, action=action, **figures)
-
-
-def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """Return the grey image at the size of the intrinsics, as far as it reaches; see `compare_size`.
-
-    Raises:
-        ProfileError: a size that cannot be used, naming both.
-    """
-    found = compare_size(image, intrinsics)
-    if found is not None and found.severity == "error":
-        raise ProfileError(f"{found.subject}: {found.text}", found.advice)
-    return image.grey[: intrinsics.height_px, : intrinsics.width_px]
+    other_size = IMAGE_SIZE_OTHER(
+        f"{image.sensor}.{image.channel}",
+        action="scaled" if is_scaled else "swapped" if is_swapped else "",
+        width_px=width,
+        height_px=height,
+        wanted_width_px=wanted_width,
+        wanted_height_px=wanted_height,
+        factor=width / wanted_width,
+    )
+    raise ProfileError(f"{other_size.subject}: {other_size.text}", other_size.advice)
 
 
 def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> Crossings | None:
