@@ -21,7 +21,7 @@ from lce_rig.pipeline.measure_intrinsics import MeasuredIntrinsics
 from lce_rig.pipeline.result_files import keep_foreign
 from lce_rig.rig import Rig, parse_rig, set_value
 from lce_rig.session import Session
-from lce_rig.session.durable import write_atomically
+from lce_rig.session.durable import replacing, write_atomically
 from lce_rig.session.session import INTRINSICS
 
 DOCUMENT = "intrinsics.json"
@@ -55,7 +55,7 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
         write_atomically(draft / DOCUMENT, json.dumps(content, indent=2) + "\n")
         keep_foreign(earlier, draft, lambda path: path.name in names)
 
-    with session.replacing(session.path / INTRINSICS, finish=finish) as draft:
+    with replacing(session.path, session.path / INTRINSICS, finish) as draft:
         for one in measured:
             block, info, page = f"{one.camera}.yaml", f"camera_info_{one.camera}.yaml", f"{one.camera}.png"
             write_atomically(draft / block, profile_block(session.rig, one))

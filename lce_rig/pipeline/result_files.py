@@ -14,7 +14,7 @@ from lce_rig.export import export_formats, is_export, remove_exports
 from lce_rig.session import Session
 from lce_rig.session.capture import SAFE_NAME
 from lce_rig.session.capture_files import MANIFEST
-from lce_rig.session.durable import check_folder, copy_over, write_atomically
+from lce_rig.session.durable import check_folder, copy_over, replacing, write_atomically
 from lce_rig.session.provenance import provenance_of
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
 
@@ -122,7 +122,7 @@ class Result:
         """
         place, is_in_session = self._place(folder, name)
         if is_in_session:
-            with self.session.replacing(place, finish=_keep_earlier) as draft:
+            with replacing(self.session.path, place, _keep_earlier) as draft:
                 names, findings = self._write_into(draft, force=force)
         else:
             names, findings = self._write_into(place, force=force)
@@ -164,7 +164,7 @@ class Result:
                 )
             keep_foreign(earlier, draft, lambda path: path.name == REPORT)
 
-        with self.session.replacing(place, finish=finish) as draft:
+        with replacing(self.session.path, place, finish) as draft:
             write_atomically(draft / REPORT, page)
         return place / REPORT
 

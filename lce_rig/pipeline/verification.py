@@ -33,6 +33,7 @@ from lce_rig.pipeline.result_files import (
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import Rig, load_rig
 from lce_rig.session import Capture, Session
+from lce_rig.session.durable import replacing
 from lce_rig.session.identity import differing_keys
 from lce_rig.session.session import DEBUG, PROFILE
 from lce_rig.show.overlays.lidar_pair import draw_cloud, seen_through_window
@@ -114,7 +115,7 @@ class Verification:
                 if not (earlier / name).is_symlink():
                     keep_foreign(earlier / name, draft / name, is_overlay)
 
-        with session.replacing(place, finish=finish) as draft:
+        with replacing(session.path, place, finish) as draft:
             drawn = self._draw(draft, progress)
         return tuple(each.moved(draft, place) for each in drawn)
 

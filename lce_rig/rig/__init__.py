@@ -3,10 +3,9 @@
 from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.editing import derive_text, edit_text, set_value
 from lce_rig.rig.loading import dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
-from lce_rig.rig.profile import NominalExtrinsic, Rig, SyncSettings, TriggerSettings
+from lce_rig.rig.profile import NominalExtrinsic, Rig
 from lce_rig.rig.sensors import (
     CameraSettings,
-    ChannelSettings,
     DriverSettings,
     FrameTimingSettings,
     IntrinsicsSettings,
@@ -21,7 +20,6 @@ __all__ = [
     "BoardSettings",
     "CalibrationSettings",
     "CameraSettings",
-    "ChannelSettings",
     "DriverSettings",
     "FrameTimingSettings",
     "IntrinsicsSettings",
@@ -31,9 +29,7 @@ __all__ = [
     "QualitySettings",
     "ReconstructionSettings",
     "Rig",
-    "SyncSettings",
     "TimestampSettings",
-    "TriggerSettings",
     "VerdictSettings",
     "derive_text",
     "dump_rig",

@@ -135,7 +135,7 @@ class WriterLock:
     stale. The file names the holder, for the message only.
 
     Raises:
-        BlockingIOError: another process writes; the argument is its process id, or "".
+        SessionError: another process writes.
     """
 
     def __init__(self, path: Path) -> None:
@@ -144,9 +144,11 @@ class WriterLock:
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            holder = os.pread(self._descriptor, 20, 0).decode("ascii", errors="replace").strip()
+            number = os.pread(self._descriptor, 20, 0).decode("ascii", errors="replace").strip()
             self.release()
-            raise BlockingIOError(holder) from None
+            holder = f"process {number}" if number else "another process"
+            hint = "Wait for it to end, or stop it."
+            raise SessionError(f"{path.parent} is being written by {holder}", hint) from None
         os.ftruncate(self._descriptor, 0)
         os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
 
@@ -176,9 +178,9 @@ def replacing(
             replace folders of this session; it copies files to be kept into the draft.
 
     Raises:
-        OSError: a full disk, no permission; or a file, or a link, is in the folder's place.
+        SessionError: a full disk, no permission; or a file, or a link, is in the folder's place.
     """
-    with ExitStack() as lock:
+    with writing(folder), ExitStack() as lock:
         check_folder(folder)
         draft = root / f"{DRAFT}{folder.name}-{secrets.token_hex(4)}"
         with _locked(root):

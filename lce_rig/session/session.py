@@ -9,8 +9,8 @@ not at all, whenever the power goes. A rejected capture is its folder moved to r
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime, timezone
 from itertools import count
 from pathlib import Path
@@ -28,7 +28,6 @@ from lce_rig.session.durable import (
     flush_folder,
     recover,
     replace_file,
-    replacing,
     write_atomically,
     writing,
 )
@@ -90,7 +89,7 @@ class Session:
                     f"{path} is not empty and not a session: it holds {sorted(others)[0]}",
                     "Choose another folder.",
                 )
-            lock = _take_lock(path)
+            lock = WriterLock(path / LOCK)
             (path / CAPTURES).mkdir(exist_ok=True)
             replace_file(path / PROFILE, dump_rig(rig).encode())
             # Last, because its presence is what makes the folder a session.
@@ -125,7 +124,7 @@ class Session:
         if not writable:
             return cls(path, rig, None)
         with writing(path):
-            lock = _take_lock(path)
+            lock = WriterLock(path / LOCK)
             (path / CAPTURES).mkdir(exist_ok=True)
             for draft in sorted((path / CAPTURES).glob(f"{DRAFT_PREFIX}*")):
                 shutil.rmtree(draft)
@@ -415,24 +414,6 @@ class Session:
         """Give the file of arrays kept under a key such as "3f9a1c/000012"."""
         return self.path / DETECTIONS / f"{key}.npz"
 
-    @contextmanager
-    def replacing(
-        self, folder: Path, finish: Callable[[Path, Path], None] = lambda _old, _draft: None
-    ) -> Iterator[Path]:
-        """Yield an empty folder that replaces one of the session's when the block ends.
-
-        Readers find the earlier folder or the new one, complete, at any time.
-
-        Args:
-            folder: to replace, in the session.
-            finish: see `lce_rig.session.durable`.
-
-        Raises:
-            SessionError: the disk is full or read-only; the earlier folder is untouched.
-        """
-        with writing(folder), replacing(self.path, folder, finish) as draft:
-            yield draft
-
     def _contents(self) -> dict[str, str]:
         if self._names_by_content is None:
             self._names_by_content = {}
@@ -476,13 +457,3 @@ def _captures_in(folder: Path) -> list[Capture]:
     numbered = [name for name in names if re.fullmatch(r"[0-9]{6,}", name)]
     # By number: 1000000 follows 999999.
     return [Capture(folder / name) for name in sorted(numbered, key=lambda name: (len(name), name))]
-
-
-def _take_lock(path: Path) -> WriterLock:
-    try:
-        return WriterLock(path / LOCK)
-    except BlockingIOError as error:
-        holder = f"process {error.args[0]}" if error.args and error.args[0] else "another process"
-        raise SessionError(
-            f"{path} is being written by {holder}", "Wait for it to end, or stop it."
-        ) from None

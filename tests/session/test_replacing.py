@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from lce_rig.core.errors import SessionError
 from lce_rig.session import Session
 from lce_rig.session.durable import copy_over, recover, replacing
 
@@ -56,7 +57,7 @@ def test_the_session_itself_may_be_a_link_but_not_what_is_replaced(tmp_path):
         assert contents(tmp_path / "real" / "out") == {text}
     (tmp_path / "real" / "out").rename(tmp_path / "real" / "may")
     (tmp_path / "real" / "out").symlink_to("may")
-    with pytest.raises(NotADirectoryError):
+    with pytest.raises(SessionError):
         fill(tmp_path / "link", "three")
     assert {path.name for path in (tmp_path / "real").iterdir()} == {"out", "may"}
     assert contents(tmp_path / "real" / "may") == {"two"}
