@@ -70,10 +70,7 @@ def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
         peaks = np.tan(_elevation_peaks(np.arctan(slope[is_left])))
         lines = np.concatenate([lines, np.stack([peaks, np.zeros_like(peaks)], axis=1)])
         if not len(lines):
-            raise SourceError(
-                f"no rings in the point cloud: its {len(rho)} points are too few or too scattered",
-                "Give the point cloud with its ring field, or as the LiDAR's driver publishes it",
-            )
+            raise SourceError(f"no rings: its {len(rho)} points are too few or too scattered")
         lines = _refine_lines(rho, z, lines[np.argsort(lines[:, 0])])
         ring, miss = _nearest_line(rho, z, lines)
         is_left = (miss > MAX_OFFSET_M) & (miss > 5 * BIN_RAD * rho)
@@ -82,9 +79,8 @@ def _assign(rho: Array, z: Array) -> NDArray[np.int16]:
     seen, ring_of_seen = np.unique(ring, return_inverse=True)
     if len(seen) > MAX_RINGS or np.mean(is_left) > 0.1:
         raise SourceError(
-            f"no rings in the point cloud: {100 * np.mean(is_left):.0f} % of its points lie on none of the "
-            f"{len(seen)} elevations found",
-            "Give the point cloud with its ring field, or in the LiDAR's frame as its driver publishes it",
+            f"no rings: {100 * np.mean(is_left):.0f} % of its points lie on none of the {len(seen)} "
+            "elevations found"
         )
     return ring_of_seen.astype(np.int16)
 

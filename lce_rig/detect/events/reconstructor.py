@@ -132,8 +132,8 @@ class ReconstructionModel:
     def _padded(self, size_px: int) -> int:
         return -(-size_px // self.size_multiple) * self.size_multiple
 
-    def _refused(self, what: str, hint: str = "") -> ProfileError:
-        return ProfileError(f"reconstruction model {self.name}: {what}", hint or _EXPECTED)
+    def _refused(self, what: str) -> ProfileError:
+        return ProfileError(f"reconstruction model {self.name}: {what}", _EXPECTED)
 
 
 def model_bytes(path: Path | None) -> bytes:

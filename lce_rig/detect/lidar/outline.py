@@ -121,15 +121,14 @@ def fit_outline(
     return Outline(placement, x[3:], np.asarray(np.linalg.inv(information), dtype=np.float64))
 
 
-def register_rays(rays: Rays, half_m: tuple[float, float], n_best: int = 2) -> list[Placement]:
-    """Fit the rectangle from all angles about the origin and keep the placements that fit best, best first.
+def register_rays(rays: Rays, half_m: tuple[float, float]) -> list[Placement]:
+    """Fit the rectangle from all angles about the origin and keep the two best placements, best first.
 
     `error_m` is the share of rays that contradict a placement, per return on the plate.
 
     Args:
         rays: about a plate whose middle is near the origin.
         half_m: half width and half height.
-        n_best: how many to return.
     """
     radius_m = 1.25 * float(np.hypot(*half_m))
     about = rays.select((rays.uv**2).sum(axis=1) < radius_m**2)
@@ -148,7 +147,7 @@ def register_rays(rays: Rays, half_m: tuple[float, float], n_best: int = 2) -> l
             )
             share = float(misses / max(np.count_nonzero(on & (distance <= 0.02)), 1))
             placements.append(replace(fit.placement, error_m=share))
-    return sorted(placements, key=lambda placement: placement.error_m)[:n_best]
+    return sorted(placements, key=lambda placement: placement.error_m)[:2]
 
 
 def measure_smear(rays: Rays, outline: Outline, blur_m: Callable[[Array], Array]) -> float:

@@ -13,6 +13,7 @@ from lce_rig.detect.lidar.template import Placement, plane_axes, register_ends
 MAX_PAIRS = 400
 CELL = 0.5  # of the board's diagonal: where there are more pairs, those of one cell count as alike
 N_ROUNDS = 2
+BLOCK = 32  # of centres, whose distances fit the cache
 MAX_PLATES = 10
 MAX_JOINT = 4  # returns between two segments of one chord: noise, a hand's edge, a dropped firing
 
@@ -219,14 +220,14 @@ def _members(
     return np.cumsum(np.diff(row, prepend=row[:1]) != 0), column
 
 
-def _within_reach(centres: Array, others: Array, reach_m: float, block: int = 32) -> tuple[Indices, Indices]:
+def _within_reach(centres: Array, others: Array, reach_m: float) -> tuple[Indices, Indices]:
     """List the pairs (row, column) of points closer than the reach, by blocks that fit the cache."""
     half_squared = np.einsum("ij,ij->i", others, others) / 2
     limit = (reach_m**2 - np.einsum("ij,ij->i", centres, centres)) / 2
     rows, columns = [], []
-    for begin in range(0, len(centres), block):
-        dot = centres[begin : begin + block] @ others.T
-        is_near = half_squared - dot < limit[begin : begin + block, None]
+    for begin in range(0, len(centres), BLOCK):
+        dot = centres[begin : begin + BLOCK] @ others.T
+        is_near = half_squared - dot < limit[begin : begin + BLOCK, None]
         row, column = np.divmod(np.flatnonzero(is_near), len(others))  # faster than nonzero in two dimensions
         rows.append(row + begin)
         columns.append(column)

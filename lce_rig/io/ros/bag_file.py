@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lce_rig.core.errors import SourceError, reading, reason_of
-from lce_rig.io.protocol import fingerprint
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _MAX_LISTED = 40
@@ -63,10 +62,6 @@ class BagFile:
                     self.topics[connection.topic] = _type_of(connection), n_before + connection.msgcount
             if not readers:
                 raise self.damages[0]
-
-    def fingerprint(self) -> str:
-        """Hash names, sizes and both ends of the files: enough to know a recording again."""
-        return fingerprint(file for file in self.files if file.is_file())
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield the messages of some topics in the order the recorder received them.

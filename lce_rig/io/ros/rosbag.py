@@ -13,7 +13,7 @@ from lce_rig.io import findings
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
 from lce_rig.io.joining import merge_by_time
-from lce_rig.io.protocol import SourceOptions
+from lce_rig.io.protocol import SourceOptions, fingerprint
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import BagEvents
 from lce_rig.io.ros.messages import (
@@ -201,7 +201,7 @@ class BagRecording:
         self._targets = choose_topics(path, self._bag.topics, rig, options, self.notes)
         self._events = self._open_events()
         self.n_samples = sum(self._bag.topics[topic][1] for topic in self._targets)
-        self.key = self._bag.fingerprint()
+        self.key = fingerprint(file for file in self._bag.files if file.is_file())
         others = (target.stream(self._bag.topics[topic][0]) for topic, target in self._targets.items())
         self.streams = frozenset([*self._events, *others])
         for file in self._bag.files:
