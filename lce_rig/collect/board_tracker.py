@@ -117,11 +117,11 @@ class BoardTracker:
                 continue
             is_thorough = self._is_thorough_due(key, frame.time_ns, was_seen=last is not None)
             search = self.finder.search_image(image, last, is_thorough=is_thorough)
-            if isinstance(search.board, Refusal):
-                if search.board is not NOT_SEEN_AT_ONCE:
-                    unseen[key] = search.board
+            if isinstance(search.located, Refusal):
+                if search.located is not NOT_SEEN_AT_ONCE:
+                    unseen[key] = search.located
                 continue
-            images[key] = self._seen[key] = search.board
+            images[key] = self._seen[key] = search.located
             if isinstance(search.usable, Refusal):
                 unfit[key] = search.usable
         return BoardDetection(frame, images, {}, unseen, {}, unfit)
@@ -194,17 +194,17 @@ class BoardTracker:
     def _find_in_scan(self, scan: Scan, time_ns: int) -> list[LidarBoard] | Refusal:
         known = self._candidates.get(scan.sensor, [])
         followed = self.finder.follow_scan(scan, known) if known else None
-        n_found = len(followed.boards) if followed is not None and isinstance(followed.boards, list) else 0
+        n_found = len(followed.located) if followed is not None and isinstance(followed.located, list) else 0
         are_all_there = n_found == self._n_candidates.get(scan.sensor)
         interval_s = max(self.search_interval_s, self.rescan_interval_s if are_all_there else 0.0)
         is_due = _is_due(self._searched_ns, scan.sensor, time_ns, interval_s)
         search = followed
         if search is None or not n_found or is_due:
             search = self.finder.search_scan(scan)
-        self._candidates[scan.sensor] = search.boards if isinstance(search.boards, list) else []
+        self._candidates[scan.sensor] = search.located if isinstance(search.located, list) else []
         if search is not followed:
             self._n_candidates[scan.sensor] = len(self._candidates[scan.sensor])
-        if isinstance(search.boards, list) and isinstance(search.usable, Refusal):
+        if isinstance(search.located, list) and isinstance(search.usable, Refusal):
             self.refusals.add(search.usable)
         return search.usable
 

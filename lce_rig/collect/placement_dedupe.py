@@ -81,7 +81,7 @@ def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
         return poses
     finder = BoardFinder(session.rig)
     for camera, channel in capture.image_keys:
-        board = finder.search_image(capture.image(camera, channel)).board
+        board = finder.search_image(capture.image(camera, channel)).located
         if isinstance(board, ImageBoard):
             poses[camera, channel] = board.T_cam_board
     return poses

@@ -5,6 +5,7 @@ All parts of the program detect boards here, live and offline, so that they agre
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image, Scan
@@ -18,32 +19,21 @@ from lce_rig.detect.lidar.unstructured import find_unstructured_boards, look_for
 from lce_rig.detect.limits_met import gate_image_board, gate_lidar_boards
 from lce_rig.rig import Rig
 
-
-@dataclass(frozen=True, eq=False)
-class ImageSearch:
-    """The result of a search in one image.
-
-    Attributes:
-        board: what can be followed into the next image; or why there is nothing.
-        usable: the same where the profile's limits admit it; else why they do not.
-    """
-
-    board: ImageBoard | Refusal
-    usable: ImageBoard | Refusal
+Boards = TypeVar("Boards", ImageBoard, list[LidarBoard])
 
 
 @dataclass(frozen=True, eq=False)
-class ScanSearch:
-    """The result of a search in one scan.
+class Search(Generic[Boards]):
+    """The result of a search in one image or scan.
 
     Attributes:
-        boards: surfaces of the board's size, likeliest first, which can be followed into the next scan; or
-            why there are none.
-        usable: those of them that the profile's limits admit; else why they do not.
+        located: the board in an image, or the surfaces of its size in a scan, likeliest first, which can be
+            followed into the next one; or why there are none.
+        usable: what of them the profile's limits admit; else why they do not.
     """
 
-    boards: list[LidarBoard] | Refusal
-    usable: list[LidarBoard] | Refusal
+    located: Boards | Refusal
+    usable: Boards | Refusal
 
 
 class BoardFinder:
@@ -73,7 +63,7 @@ class BoardFinder:
 
     def search_image(
         self, image: Image, last: ImageBoard | None = None, *, is_thorough: bool = True
-    ) -> ImageSearch:
+    ) -> Search[ImageBoard]:
         """Find the board in one image, near its last place first.
 
         Args:
@@ -86,9 +76,9 @@ class BoardFinder:
         """
         found = self.corners(image, self._intrinsics[image.sensor], last, is_thorough=is_thorough)
         if isinstance(found, Refusal):
-            return ImageSearch(found, found)
+            return Search(found, found)
         found = replace(found, stamp_ns=image.stamp_ns)
-        return ImageSearch(found, gate_image_board(found, self.rig.quality))
+        return Search(found, gate_image_board(found, self.rig.quality))
 
     def corners(
         self,
@@ -126,17 +116,17 @@ class BoardFinder:
             is_thorough=is_thorough or is_from_events,
         )
 
-    def search_scan(self, scan: Scan) -> ScanSearch:
+    def search_scan(self, scan: Scan) -> Search[list[LidarBoard]]:
         """Find the surfaces of the board's size in a whole scan."""
         find = find_lidar_boards if self.rig.lidars[scan.sensor].has_rings else find_unstructured_boards
         return self._compared(find(scan, self.board, self._limits(scan.sensor)), scan)
 
-    def follow_scan(self, scan: Scan, last: Sequence[LidarBoard]) -> ScanSearch:
+    def follow_scan(self, scan: Scan, last: Sequence[LidarBoard]) -> Search[list[LidarBoard]]:
         """Find surfaces near where they were in the scan before; lost ones are omitted.
 
         Args:
             scan: the next one of the same LiDAR.
-            last: `boards` of the search before, at least one.
+            last: what the search before located, at least one.
         """
         limits = self._limits(scan.sensor)
         if self.rig.lidars[scan.sensor].has_rings:
@@ -167,8 +157,8 @@ class BoardFinder:
             beam=Beam(lidar.beam_aperture_m, lidar.beam_divergence_rad, upright_rad),
         )
 
-    def _compared(self, found: list[LidarBoard] | Refusal, scan: Scan) -> ScanSearch:
+    def _compared(self, found: list[LidarBoard] | Refusal, scan: Scan) -> Search[list[LidarBoard]]:
         if isinstance(found, Refusal):
-            return ScanSearch(found, found)
+            return Search(found, found)
         boards = [replace(board, stamp_ns=scan.stamp_ns) for board in found]
-        return ScanSearch(boards, gate_lidar_boards(boards, self.board, self.rig.quality))
+        return Search(boards, gate_lidar_boards(boards, self.board, self.rig.quality))

@@ -49,7 +49,7 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
         milliseconds(lambda k: BoardFinder(rig).image(pictures[k])),
     )
     finder = BoardFinder(rig)
-    seen = [finder.search_image(picture).board for picture in pictures]
+    seen = [finder.search_image(picture).located for picture in pictures]
     lasts = [board if isinstance(board, ImageBoard) else None for board in seen]
     yield "tracked, median", milliseconds(lambda k: finder.search_image(pictures[k], lasts[k]))
     detections = lce.detect(session)

@@ -127,18 +127,20 @@ def no_plate(scan: OrderedScan, board: Board, limits: Limits) -> Refusal:
         if len(heights_m) > 0.8 * (distance < -0.03).sum() and np.std(heights_m) > 2.0 * scan.sigma_m + 0.008:
             return too_thick(heights_m, 2.0 * scan.sigma_m + 0.008)
     board_m = np.array([max(board.width_m, board.height_m), min(board.width_m, board.height_m)])
-    wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
     misfit = np.abs(np.log(np.maximum(plates.size_m, 1e-2) / board_m)).sum(axis=1)
     misfit[plates.n_rings < 3] += 1.0
     if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
         best = int(np.argmin(misfit))
-        return LIDAR_OTHER_PLATE.refusal(
-            width_m=float(plates.size_m[best, 0]),
-            height_m=float(plates.size_m[best, 1]),
-            distance_m=float(np.linalg.norm(plates.centre[best])),
-            **wanted,
-        )
+        return other_plate(plates.size_m[best], float(np.linalg.norm(plates.centre[best])), board)
+    wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
     return LIDAR_NO_PLATE.refusal(**wanted, min_range_m=limits.min_range_m, max_range_m=limits.max_range_m)
+
+
+def other_plate(size_m: Array, distance_m: float, board: Board) -> Refusal:
+    """Refuse a plate of another size (2,)."""
+    wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
+    width_m, height_m = size_m.tolist()
+    return LIDAR_OTHER_PLATE.refusal(width_m=width_m, height_m=height_m, distance_m=distance_m, **wanted)
 
 
 MAX_CANDIDATES = 4

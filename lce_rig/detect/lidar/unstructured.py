@@ -17,7 +17,6 @@ from lce_rig.detect.findings import (
     LIDAR_NO_RETURNS,
     LIDAR_NOT_WHERE_EXPECTED,
     LIDAR_NOTHING_WHERE_EXPECTED,
-    LIDAR_OTHER_PLATE,
     LIDAR_OUT_OF_VIEW,
     LIDAR_SMEARED,
     LIDAR_TOO_FEW_POINTS,
@@ -44,6 +43,7 @@ from lce_rig.detect.lidar.search import (
     TOUCHING_SHARE,
     Limits,
     distinct_boards,
+    other_plate,
     too_thick,
 )
 from lce_rig.detect.lidar.segments import MAX_INCIDENCE_RAD
@@ -123,15 +123,9 @@ def find_unstructured_boards(
         return min(misses, key=lambda miss: miss[0])[1]
     if len(misfit) and misfit.min() < MAX_SIZE_MISFIT:
         best = int(np.argmin(misfit))
-        return _other_plate(patches.size_m[best], float(np.linalg.norm(patches.centre[best])), board)
+        return other_plate(patches.size_m[best], float(np.linalg.norm(patches.centre[best])), board)
     wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
     return LIDAR_NO_PLATE.refusal(**wanted, min_range_m=limits.min_range_m, max_range_m=limits.max_range_m)
-
-
-def _other_plate(size_m: Array, distance_m: float, board: Board) -> Refusal:
-    wanted = {"board_width_m": board.width_m, "board_height_m": board.height_m}
-    width_m, height_m = size_m.tolist()
-    return LIDAR_OTHER_PLATE.refusal(width_m=width_m, height_m=height_m, distance_m=distance_m, **wanted)
 
 
 def _too_few(n_points: int, distance_m: float, min_points: int = _MIN_POINTS) -> Refusal:
@@ -350,7 +344,7 @@ def measure_unstructured(
         size_m = np.percentile(view.uv[view.is_on], 98, axis=0) - np.percentile(
             view.uv[view.is_on], 2, axis=0
         )
-        return _other_plate(size_m / 0.96, distance_m, board)
+        return other_plate(size_m / 0.96, distance_m, board)
     outline: Outline | None = None
     for _ in range(2):
         rays = view.rays(half_m, starts[0])
@@ -393,7 +387,7 @@ def _describe(view: _View, board: Board, outline: Outline) -> LidarBoard | Refus
     rms_m = float(np.sqrt(np.mean(sheet**2))) if len(sheet) else 0.0
     if np.abs(outline.growth_m - view.growth_m(placement)[0]).max() > _MOST_GROWTH_M:
         size_m = np.array([board.width_m, board.height_m]) + 2 * outline.growth_m
-        return _other_plate(size_m, distance_m, board)
+        return other_plate(size_m, distance_m, board)
     if rms_m > _MOST_THICK_M:
         return too_thick(sheet, _MOST_THICK_M)
     if dark_share > _DARK_SHARE:
