@@ -90,7 +90,10 @@ def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
     """Report the device that answers, or the reason of its failure."""
     seen = exam.seen[sensor]
     if seen.failure is not None:
-        yield findings.FAILED(what=seen.failure.what, hint=seen.failure.hint)
+        what = seen.failure.what  # without the sensor's name, which the line begins with
+        for start in (f"{sensor}: ", f"camera {sensor!r}: "):
+            what = what.removeprefix(start)
+        yield findings.FAILED(what=what, hint=seen.failure.hint)
         return
     assert seen.status is not None  # a sensor that neither opened nor failed has a failure of its own
     figures: dict[str, Any] = {"device": seen.status.device}

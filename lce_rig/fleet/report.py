@@ -11,6 +11,7 @@ any of the fleet's comparisons exceeds with a probability of `FALSE_ALARMS` if n
 """
 
 import json
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,7 +154,7 @@ class FleetReport:
     """The content of a report.
 
     Attributes:
-        registry: its name.
+        registry: its address.
         n_rows: of its table.
         history: results compared in time.
         findings: robots that moved.
@@ -185,7 +186,7 @@ class FleetReport:
             reasons = zip(row["severities"] or (), row["findings"] or (), strict=False)
             causes += [(reason, row["robot"]) for reason in reasons if reason[0] in ("error", "warning")]
         findings = tuple(history.finding(k) for k in history.moves)
-        return cls(registry.place.name, len(rows), history, findings, _counted(results), _counted(causes))
+        return cls(registry.place.url, len(rows), history, findings, _counted(results), _counted(causes))
 
     def write_json(self, path: Path) -> None:
         """Write findings, states and counts; raises SessionError."""
@@ -213,6 +214,7 @@ class FleetReport:
         return render(
             "fleet.html",
             registry=self.registry,
+            command=shlex.join(["lce-rig", "fleet", "report", "--registry", self.registry]),
             first=(dates["min"] or "")[:10],
             last=(dates["max"] or "")[:10],
             n_robots=len(states),
