@@ -8,26 +8,19 @@ from pkgutil import resolve_name
 from lce_rig.core.errors import SourceError
 from lce_rig.io import findings as findings  # Readers may name their kinds by code.
 from lce_rig.io.protocol import Recording, SourceOptions, choose_lidar
-from lce_rig.io.ros.bag_file import kind_of
+from lce_rig.io.ros.bag_file import SUFFIXES, kind_of
 from lce_rig.rig import Rig
 
-RECORDINGS = {
-    "folder": "lce_rig.io.folder:FolderRecording",
-    ".bag": "lce_rig.io.ros.rosbag:BagRecording",
-    ".db3": "lce_rig.io.ros.rosbag:BagRecording",
-    ".mcap": "lce_rig.io.ros.rosbag:BagRecording",
-    ".pcap": "lce_rig.io.velodyne_scans:PcapRecording",
-    ".pcapng": "lce_rig.io.velodyne_scans:PcapRecording",
-    ".aedat4": "lce_rig.io.events:EventCameraFile",
-    ".raw": "lce_rig.io.events:EventCameraFile",
-    ".h5": "lce_rig.io.events:EventCameraFile",
-    ".hdf5": "lce_rig.io.events:EventCameraFile",
-    ".txt": "lce_rig.io.events:EventCameraFile",
-}
-"""Reader by suffix, or "folder"; imported when wanted."""
-_BAGS = frozenset({".bag", ".db3", ".mcap"})
+_BAGS = frozenset(SUFFIXES)
 _PACKETS = frozenset({".pcap", ".pcapng"})
 _EVENTS = frozenset({".aedat4", ".raw", ".h5", ".hdf5"})
+RECORDINGS = {
+    "folder": "lce_rig.io.folder:FolderRecording",
+    **dict.fromkeys(SUFFIXES, "lce_rig.io.ros.rosbag:BagRecording"),
+    **dict.fromkeys(sorted(_PACKETS), "lce_rig.io.velodyne_scans:PcapRecording"),
+    **dict.fromkeys([*sorted(_EVENTS), ".txt"], "lce_rig.io.events:EventCameraFile"),
+}
+"""Reader by suffix, or "folder"; imported when wanted."""
 _KINDS = (_BAGS, _PACKETS, _EVENTS)
 _CLOUDS = frozenset({".pcd", ".ply", ".las"})
 
@@ -48,7 +41,7 @@ def open_recording(path: Path | str, rig: Rig, options: SourceOptions | None = N
         raise SourceError(f"{path} is not a recording that lce-rig reads", hint)
     options = options or SourceOptions()
     reader = RECORDINGS[kind]
-    if kind in (".pcap", ".pcapng"):
+    if kind in _PACKETS:
         model = rig.lidars[choose_lidar(rig, options, [])].model.upper().removeprefix("OUSTER").lstrip(" -_")
         reader = "lce_rig.io.ouster:OusterRecording" if model.startswith("OS") else reader
     if kind == "folder" and options.is_part and not _holds_clouds(path):

@@ -13,14 +13,12 @@ from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
 from lce_rig.io.joining import merge_by_time
 from lce_rig.io.protocol import SourceOptions, choose_event_camera, fingerprint
-from lce_rig.io.ros.bag_file import kind_of
+from lce_rig.io.ros.bag_file import SUFFIXES, kind_of
 from lce_rig.rig import Rig
 
 READERS = {
     ".aedat4": "lce_rig.io.events.aedat4:Aedat4Events",
-    ".bag": "lce_rig.io.ros.event_messages:BagEvents",
-    ".db3": "lce_rig.io.ros.event_messages:BagEvents",
-    ".mcap": "lce_rig.io.ros.event_messages:BagEvents",
+    **dict.fromkeys(SUFFIXES, "lce_rig.io.ros.event_messages:BagEvents"),
     ".raw": "lce_rig.io.events.prophesee:PropheseeEvents",
     ".h5": "lce_rig.io.events.tables:Hdf5Events",
     ".hdf5": "lce_rig.io.events.tables:Hdf5Events",
