@@ -35,7 +35,7 @@ from lce_rig.calibrate.likelihood.rays import lens_fields
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
-from lce_rig.calibrate.result import CalibrationEstimate, Start, error_to_reference, report, with_parts
+from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
 from lce_rig.calibrate.uncertainty import widen
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
@@ -298,11 +298,5 @@ def _fit_poses(
     left_out = jackknife_scatter(cost.moves()[:, :6])
     scatter, constants = _MEASURED * scatter, _MEASURED * constants
     cov, inflation = widen(scatter + constants, left_out, len(cost.groups))
-    offset_deg, offset_m = error_to_reference(T, start.T_cam_lidar)
-    figures = replace(
-        with_parts(start.diagnostics, scatter, constants),
-        covariance_inflation=inflation,
-        algorithm_1_offset_deg=offset_deg,
-        algorithm_1_offset_m=offset_m,
-    )
+    figures = replace(with_parts(start.diagnostics, scatter, constants), covariance_inflation=inflation)
     return replace(report(start, T, cov, board, figures), method="ml", cost=cost), trust

@@ -43,13 +43,11 @@ class Consensus:
         T_cam_lidar: (4, 4) rough extrinsics from normals and centres.
         observations: one per agreeing capture, sorted by name.
         refused: why each other capture is rejected.
-        n_alternative_poses: captures that use the second of the camera's poses.
     """
 
     T_cam_lidar: Array
     observations: tuple[Observation, ...]
     refused: dict[str, Refusal]
-    n_alternative_poses: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,13 +95,12 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
     if n_agreeing < needed:
         raise NotEnoughDataError.of(FEW_AGREE(n_agreeing=n_agreeing, n_captures=n_captures, n_needed=needed))
 
-    observations, refused, n_alternative = [], {}, 0
+    observations, refused = [], {}
     angle, distance = (values[0] for values in _misfit(pairs, R_best[None], t_best[None]))
     r2 = (angle / NORMAL_TOLERANCE_RAD) ** 2 + (distance / CENTRE_TOLERANCE_M) ** 2
     for k, item in enumerate(candidates):
         if chosen[k] >= 0:
             is_alternative = pairs.pose[chosen[k]] == 1
-            n_alternative += int(is_alternative)
             T_cam_board = camera_poses(item.image)[pairs.pose[chosen[k]]]
             image = replace(item.image, T_cam_board=T_cam_board) if is_alternative else item.image
             lidar = item.places[pairs.candidate[chosen[k]]]
@@ -118,7 +115,7 @@ def find_consensus(candidates: Sequence[Observation], board: Board) -> Consensus
                 rotation_deg=float(np.degrees(angle[nearest])),
                 action="hold_still" if distance[nearest] > _MOVED_M else "",
             )
-    return Consensus(pose(R_best, t_best), tuple(observations), refused, n_alternative)
+    return Consensus(pose(R_best, t_best), tuple(observations), refused)
 
 
 def camera_poses(image: ImageBoard) -> list[Array]:

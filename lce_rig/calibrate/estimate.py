@@ -207,12 +207,7 @@ def _with_consensus(estimate: CalibrationEstimate, agreed: Sequence[Consensus]) 
     refused = dict(estimate.refused)
     for consensus in agreed:
         refused = {**consensus.refused, **refused}
-    n_alternative = float(sum(consensus.n_alternative_poses for consensus in agreed))
-    return replace(
-        estimate,
-        refused=dict(sorted(refused.items())),
-        diagnostics=replace(estimate.diagnostics, n_alternative_poses=n_alternative),
-    )
+    return replace(estimate, refused=dict(sorted(refused.items())))
 
 
 def depth_scatter_m(T_cam_lidar: Array, observations: Sequence[Observation]) -> float:

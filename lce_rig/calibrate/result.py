@@ -144,8 +144,6 @@ def report(
     observations = {observation.capture: observation for observation in start.observations}
     figures = replace(
         diagnostics,
-        # The paper's code counts every ring end twice, which halves its mean.
-        paper_mee_m=summarise(residuals).mee_m / 2,
         held_out_m=float(np.mean(start.held_out_m)),
         n_placements=float(group_placements(start.observations).max() + 1),
     )

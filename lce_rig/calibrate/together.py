@@ -109,7 +109,7 @@ def _without(alone: CalibrationEstimate, conflicts: Mapping[str, Refusal]) -> St
         [alone.observations[residual.capture] for residual in kept],
         {**alone.refused, **mine},
         np.array([residual.held_out_m for residual in kept]),
-        replace(alone.diagnostics, algorithm_1_offset_deg=np.nan, algorithm_1_offset_m=np.nan),
+        alone.diagnostics,
     )
 
 

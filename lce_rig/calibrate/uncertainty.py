@@ -15,7 +15,7 @@ from lce_rig.calibrate.likelihood.rays import interior, stack_scans
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetric_inverse
-from lce_rig.calibrate.result import CalibrationEstimate, Start, error_to_reference, report, with_parts
+from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
 from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities, systematic_covariances
 from lce_rig.calibrate.tolerances import Variant, sensitivities_of, vary
 from lce_rig.core.board import Board
@@ -69,12 +69,7 @@ def by_likelihood(
     """
     placement = group_placements(start.observations)
     cov, inflation = inflate(joint, placement)
-    offset_deg, offset_m = error_to_reference(joint.T_cam_lidar[0], start.T_cam_lidar)
-    figures = replace(
-        add_figures(start.diagnostics, joint, 0, inflation),
-        algorithm_1_offset_deg=offset_deg,
-        algorithm_1_offset_m=offset_m,
-    )
+    figures = add_figures(start.diagnostics, joint, 0, inflation)
     estimate = report(start, joint.T_cam_lidar[0], cov, board, figures)
     cost = expand_joint(joint, 0, placement)
     estimate = replace(estimate, method="ml", lidar=lidar_of(joint), cost=cost, lens=settings.lens)
@@ -117,16 +112,9 @@ def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation
         edge_shift_blended_echo_m=shifts["d_3"],
         range_offset_m=float(np.mean(state.lasers[0])),
         laser_spread_m=float(np.std(state.lasers[0])),
-        lens_lateral_m=float(state.fields[0]),
         lens_vertical_m_per_rad=float(state.fields[1]),
-        bow_width_m=float(state.fields[-2]),
-        bow_height_m=float(state.fields[-1]),
         camera_scale=1.0 - float(state.scale[camera]),
         noise_range_m=levels.range_m,
-        noise_ring_m=levels.ring_m,
-        noise_ring_end_mrad=1e3 * levels.edge_rad,
-        ring_ends_lost=levels.lost_share,
-        noise_edge_shift_m=levels.own_shift_m,
         noise_tilt_deg=float(np.degrees(levels.tilt_rad)),
         noise_spin_deg=float(np.degrees(levels.spin_rad)),
         noise_depth_m=levels.depth_m,

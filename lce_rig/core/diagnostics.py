@@ -14,12 +14,8 @@ class Diagnostics:
     """
 
     n_placements: float = _NONE  # different placements of the board among the captures used
-    n_alternative_poses: float = _NONE  # captures in which the consensus took the image's other pose
-    paper_mee_m: float = _NONE  # mean distance of ring ends as the paper's code counts it
     held_out_m: float = _NONE  # mean over captures of their rms residual where they were not fitted
-    # Of Algorithm 1's residuals, in units of 1 / (10 mm)^2; and rms of these residuals over captures.
-    plane_weight: float = _NONE
-    edge_weight: float = _NONE
+    # Of Algorithm 1's residuals, rms over captures.
     fit_plane_rms_m: float = _NONE
     fit_edge_rms_m: float = _NONE
     # Parts of the standard deviations: from the scatter between captures, from errors common to all of them.
@@ -33,21 +29,12 @@ class Diagnostics:
     edge_shift_echo_m: float = _NONE
     edge_shift_blended_m: float = _NONE
     edge_shift_blended_echo_m: float = _NONE
-    algorithm_1_offset_deg: float = _NONE  # how far the joint estimate lies from Algorithm 1's
-    algorithm_1_offset_m: float = _NONE
     covariance_inflation: float = _NONE  # of the joint estimate's covariance, from leave-one-out results
     range_offset_m: float = _NONE  # mean over lasers of their range errors
     laser_spread_m: float = _NONE  # standard deviation of these
-    lens_lateral_m: float = _NONE  # displacement of the LiDAR's lens
-    lens_vertical_m_per_rad: float = _NONE
+    lens_vertical_m_per_rad: float = _NONE  # displacement of the LiDAR's lens
     camera_scale: float = _NONE  # of the camera's distances
-    bow_width_m: float = _NONE  # height of the plate's middle over its ends, along its width
-    bow_height_m: float = _NONE  # and along its height
     noise_range_m: float = _NONE  # of ranges
-    noise_ring_m: float = _NONE  # of a ring in one capture
-    noise_ring_end_mrad: float = _NONE  # of ring ends, along azimuth
-    ring_ends_lost: float = _NONE  # share 0..1
-    noise_edge_shift_m: float = _NONE  # of the edge shift from one capture to the next
     # Of the board's pose by the camera, beyond its corners' noise.
     noise_tilt_deg: float = _NONE
     noise_spin_deg: float = _NONE

@@ -91,7 +91,6 @@ def test_the_second_pose_is_taken_where_the_picture_chose_the_wrong_one():
     chosen = {observation.capture: observation.image.T_cam_board for observation in consensus.observations}
     for item in captures[:4]:
         np.testing.assert_array_equal(chosen[item.capture], item.image.T_cam_board)
-    assert consensus.n_alternative_poses >= 4
 
 
 def test_captures_that_agree_with_nothing_have_no_consensus():

@@ -109,8 +109,6 @@ def solve(
 
     plane, edge = problem.errors(solution.x)
     figures = Diagnostics(
-        plane_weight=problem.weights.plane * NOMINAL_SIGMA_M**2,
-        edge_weight=problem.weights.edge * NOMINAL_SIGMA_M**2,
         fit_plane_rms_m=float(np.sqrt(np.mean(plane**2))),
         fit_edge_rms_m=float(np.sqrt(np.mean(edge**2))),
         edge_shift_m=float(solution.linear[0, 3]),

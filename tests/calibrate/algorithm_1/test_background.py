@@ -95,12 +95,12 @@ def test_edges_that_no_background_moves_are_left_as_they_are():
     assert n_moved <= 1
 
 
-def test_weights_are_those_of_moved_ring_ends():
+def test_residuals_are_those_of_moved_ring_ends():
     plain = simulate(20, 3)
     captures = [held(c, (c.lidar.edge_side > 0) & (k % 4 != 0)) for k, c in enumerate(plain)]
     moved, clean = (fit_extrinsic(c, BOARD, OPTIONS).diagnostics for c in (captures, plain))
-    for weight in ("plane_weight", "edge_weight"):
-        assert getattr(moved, weight) == pytest.approx(getattr(clean, weight), rel=0.5)
+    for residual in ("fit_plane_rms_m", "fit_edge_rms_m"):
+        assert getattr(moved, residual) == pytest.approx(getattr(clean, residual), rel=0.3)
 
 
 def test_a_person_behind_few_boards_is_too_little_to_tell():
