@@ -12,6 +12,7 @@ as beams wider than a point return from a plate that they only touch.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +52,7 @@ class Rays:
         return Rays(self.uv[keep], self.is_on[keep])
 
 
-@dataclass(frozen=True, eq=False)
-class Outline:
+class Outline(NamedTuple):
     """A rectangle fitted to rays.
 
     Attributes:
@@ -189,8 +189,7 @@ def _probability(local: Array, half: Array, blur: Array) -> tuple[Array, Array]:
     return _OUTLIERS + (1 - 2 * _OUTLIERS) * inside, slopes
 
 
-@dataclass(frozen=True, eq=False)
-class Strips:
+class Strips(NamedTuple):
     """Short pieces of the border, each measured on its own: K of them.
 
     Attributes:
