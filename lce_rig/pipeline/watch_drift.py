@@ -23,7 +23,7 @@ from lce_rig.devices.reading import AttachedSensors, LiveSource
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.io import open_recordings
 from lce_rig.io.folder import FolderRecording
-from lce_rig.io.joining import join_recordings, require_sensors
+from lce_rig.io.joining import check_overlap, join_recordings, require_sensors
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.pipeline.pair_drift import EVENTS_NS, DriftReport, Seen, judge_pairs, own_offset_ns
 from lce_rig.pipeline.result_files import RESULT, result_folder
@@ -151,7 +151,7 @@ class SceneCaptures:
 
         def counted() -> Iterator[Sample]:
             done = 0
-            for sample in recording.samples():
+            for sample in check_overlap(recording.samples(), self._rig, recording.notes):
                 yield sample
                 if not isinstance(sample, Events):
                     done += 1
