@@ -154,15 +154,10 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
         seen: why there is no image, or no board in it.
         limits: `quality` of the rig profile.
     """
-    if len(events) and seen.stage == "read":
-        return seen
-    return events_problem(events, stamp_ns, limits) or seen
-
-
-def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Refusal | None:
-    """Say what about the events before a timestamp keeps a board from being found; None if nothing does."""
     if not len(events):
         return IMAGE_NO_EVENTS.refusal()
+    if seen.stage == "read":
+        return seen
     recent = events.between(stamp_ns - MEMORY_NS, stamp_ns)
     n_pixels = events.width_px * events.height_px
     if len(recent) < _MIN_EVENTS_PX * n_pixels:
@@ -182,7 +177,7 @@ def events_problem(events: Events, stamp_ns: int, limits: QualitySettings) -> Re
     if events_px < needed_px:
         figures = {"events_px": events_px, "min_events_px": needed_px}
         return IMAGE_STILL_SCENE.refusal(**figures)
-    return None
+    return seen
 
 
 def look_for_flicker(events: Events) -> Refusal | None:
