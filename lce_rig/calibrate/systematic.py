@@ -4,14 +4,15 @@ The scatter between captures shows their noise. A laser whose ranges are all 8 m
 in each capture: it causes no scatter, but moves the extrinsics.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lce_rig.calibrate.algorithm_1.moments import Problem, Solutions
+from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
+from lce_rig.calibrate.algorithm_1.moments import Problem
 from lce_rig.calibrate.features import CaptureFeatures, extract_features, see_lidar
 from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.calibrate.session_lens import SessionLens
@@ -26,13 +27,7 @@ STEP_M = 0.005
 _CHUNK = 16
 
 
-def ring_sensitivities(
-    observations: Sequence[Observation],
-    board: Board,
-    problem: Problem,
-    solution: Solutions,
-    information: Array,
-) -> Array:
+def ring_sensitivities(start: Algorithm1, board: Board) -> Array:
     """Differentiate the solution by the range offset of each ring, by one Newton step.
 
     With half gradient g and half Hessian H of the cost, both at the solution, a range error b in
@@ -45,84 +40,70 @@ def ring_sensitivities(
     by the sum of all s_r.
 
     Args:
-        observations: the F captures in `problem`.
+        start: the solution; its association is held.
         board: the board.
-        problem: their moments.
-        solution: of all of them; its association is held.
-        information: (7, 7) H with the prior.
 
     Returns:
         (7, L): a column for each of the L rings seen, tangent (translation m, rotation rad, edge shift m)
         per m of range.
     """
-    boards = [observation.lidar for observation in observations]
+    boards = [observation.lidar for observation in start.fitted]
     rings = [np.union1d(lidar.ring, lidar.edge_ring) for lidar in boards]
     ring, column = np.unique(np.concatenate(rings), return_inverse=True)
 
     def features_of(k: int) -> list[CaptureFeatures]:
-        features = extract_features(observations[k], board)
+        features = extract_features(start.fitted[k], board)
         return [see_lidar(features, lidar) for lidar in shift_rings(boards[k], rings[k], STEP_M)]
 
-    change = np.zeros((len(ring), len(information)))
-    np.add.at(change, column, _changes(features_of, board, problem, solution) / STEP_M)
-    return np.asarray(-symmetric_inverse(information) @ change.T)
+    change = np.zeros((len(ring), len(start.cost.information)))
+    np.add.at(change, column, _changes(features_of, board, start) / STEP_M)
+    return np.asarray(-symmetric_inverse(start.cost.information) @ change.T)
 
 
 def profile_sensitivities(
-    observations: Sequence[Observation],
-    board: Board,
-    problem: Problem,
-    solution: Solutions,
-    information: Array,
-    known: Tolerances,
-    lens: SessionLens | None,
+    start: Algorithm1, board: Board, known: Tolerances, lens: SessionLens | None
 ) -> tuple[Sensitivity, ...]:
     """Differentiate the solution by errors of lens and board, as (1) does by range offsets.
 
     Args:
-        observations, board, problem, solution, information: as of `ring_sensitivities`.
+        start, board: as of `ring_sensitivities`.
         known: standard deviations of the board.
         lens: of the session.
     """
-    variants = vary(observations, board, lens, bends_scans=True)
+    variants = vary(start.fitted, board, lens, bends_scans=True)
     changes = []
     for assumed, group in groupby(variants, key=lambda variant: variant.board):
-        same_board = [(variant.apply(observations), variant.board) for variant in group]
+        same_board = [(variant.apply(start.fitted), variant.board) for variant in group]
 
         def features_of(
             k: int, same_board: list[tuple[list[Observation], Board]] = same_board
         ) -> list[CaptureFeatures]:
             return [extract_features(moved[k], assumed) for moved, assumed in same_board]
 
-        by_capture = _changes(features_of, assumed, problem, solution)
-        changes.append(by_capture.reshape(len(observations), len(same_board), -1).sum(axis=0))
-    moves = -np.concatenate(changes) @ symmetric_inverse(information)[:, :6]
+        by_capture = _changes(features_of, assumed, start)
+        changes.append(by_capture.reshape(len(start.fitted), len(same_board), -1).sum(axis=0))
+    moves = -np.concatenate(changes) @ symmetric_inverse(start.cost.information)[:, :6]
     return sensitivities_of(variants, moves, known)
 
 
-def _changes(
-    features_of: Callable[[int], list[CaptureFeatures]],
-    board: Board,
-    problem: Problem,
-    solution: Solutions,
-) -> Array:
+def _changes(features_of: Callable[[int], list[CaptureFeatures]], board: Board, start: Algorithm1) -> Array:
     """Compute by how much half gradients (n, 7) differ from those of the captures as observed.
 
     Args:
         features_of: a capture's features, as they would be with each of some errors.
         board: that is assumed.
-        problem, solution: as of `ring_sensitivities`.
+        start: as of `ring_sensitivities`.
 
     Returns:
         Of the n features, capture by capture.
     """
-    x, edge_ids = solution.x[0], solution.edge_ids[0]
+    problem, x, edge_ids = start.problem, start.solution.x[0], start.solution.edge_ids[0]
     gradients = problem.quadratics(x, edge_ids).gradients
     starts = np.searchsorted(problem.edge_capture, np.arange(problem.n_captures + 1))
     own_ids = [edge_ids[first:last] for first, last in pairwise(starts)]
     differences = []
-    for start in range(0, problem.n_captures, _CHUNK):
-        by_capture = {k: features_of(k) for k in range(start, min(start + _CHUNK, problem.n_captures))}
+    for first_k in range(0, problem.n_captures, _CHUNK):
+        by_capture = {k: features_of(k) for k in range(first_k, min(first_k + _CHUNK, problem.n_captures))}
         features = [f for variants in by_capture.values() for f in variants]
         repeated = [k for k, variants in by_capture.items() for _ in variants]
         keep = None if problem.keep is None else [problem.keep[k] for k in repeated]

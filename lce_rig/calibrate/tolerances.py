@@ -80,10 +80,9 @@ class Sensitivity:
     sigma: float
     moves: Array
 
-    def covariance(self, sigma: float | None = None) -> Array:
-        """Compute the covariance (6, 6) for the source's standard deviation, or for another one."""
-        size = self.sigma if sigma is None else sigma
-        return np.asarray(size**2 * self.moves.T @ self.moves)
+    def covariance(self) -> Array:
+        """Compute the covariance (6, 6) for the source's standard deviation."""
+        return np.asarray(self.sigma**2 * self.moves.T @ self.moves)
 
 
 @dataclass(frozen=True, eq=False)

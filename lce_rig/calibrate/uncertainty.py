@@ -35,12 +35,11 @@ def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> C
         board: its specification.
         settings: priors and tolerances.
     """
-    captures = start.fitted, board, start.problem, start.solution, start.cost.information
     scatter = start.cost.jackknife_covariance()
     systematic = np.zeros_like(scatter)
     laser_m, offset_m = settings.laser_bias_sigma_m, settings.range_offset_sigma_m
     if laser_m or offset_m:
-        lasers, offset = systematic_covariances(ring_sensitivities(*captures), laser_m, offset_m)
+        lasers, offset = systematic_covariances(ring_sensitivities(start, board), laser_m, offset_m)
         systematic = lasers + offset
     cov = scatter + systematic
     figures = replace(start.diagnostics, edge_shift_sigma_m=float(np.sqrt(cov[6, 6])))
@@ -49,7 +48,7 @@ def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> C
     return replace(
         report(start, start.T_cam_lidar, cov[:6, :6], board, figures),
         fitted={observation.capture: observation for observation in start.fitted},
-        sensitivities=() if known is None else profile_sensitivities(*captures, known, settings.lens),
+        sensitivities=() if known is None else profile_sensitivities(start, board, known, settings.lens),
         lens=settings.lens,
     )
 

@@ -111,15 +111,11 @@ def captures_to_add(n_captures: Any, is_enough: Any, groups: Any) -> str:
         is_enough: whether they are predicted to suffice.
         groups: of each the number, the distance in m, the place in the image if that is aside, and the tilts.
     """
-    return f"add {n_captures}{'' if is_enough else '+'} captures: {', '.join(map(_placements, groups))}"
-
-
-def _placements(group: Any) -> str:
-    n, distance_m, place, sides = group
-    text = f"{n} at {distance_m:g} m"
-    if sides:
-        return f"{text} tilted {'/'.join(sides) if len(sides) < 3 else 'all ways'}"
-    return f"{text} {place}".rstrip()
+    placements = []
+    for n, distance_m, place, sides in groups:
+        how = f"tilted {'/'.join(sides) if len(sides) < 3 else 'all ways'}" if sides else place
+        placements.append(f"{n} at {distance_m:g} m {how}".rstrip())
+    return f"add {n_captures}{'' if is_enough else '+'} captures: {', '.join(placements)}"
 
 
 def as_line(text: str) -> str:

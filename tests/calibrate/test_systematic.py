@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.algorithm_1.algorithm import solve
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings, systematic_covariances
@@ -36,9 +37,9 @@ def linearised(captures):
     features = [extract_features(seen, BOARD) for seen in captures]
     problem = Problem(features, BOARD, Weights(3e4, 2e5))
     solution = problem.solve(np.ones((1, len(features))), T_FORWARD, 5)
-    information = problem.quadratics(solution.x[0], solution.edge_ids[0]).information
-    columns = ring_sensitivities(captures, BOARD, problem, solution, information)
-    return solution.T[0], solution.linear[0, 3], columns
+    cost = problem.quadratics(solution.x[0], solution.edge_ids[0])
+    start = replace(solve(captures, BOARD), fitted=captures, problem=problem, solution=solution, cost=cost)
+    return solution.T[0], solution.linear[0, 3], ring_sensitivities(start, BOARD)
 
 
 @pytest.mark.parametrize("rings", [[5], [11], list(range(16))])

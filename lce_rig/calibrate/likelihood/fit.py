@@ -94,7 +94,6 @@ def maximise_likelihood(
     T_cam_lidar: Sequence[Array],
     priors: Priors | None = None,
     usual: Levels | None = None,
-    levels: Levels | None = None,
     pose_ratios: Sequence[PoseLevels] | None = None,
 ) -> JointEstimate:
     """Estimate extrinsics of C cameras; captures of the same name share their scan and the board's pose.
@@ -105,8 +104,7 @@ def maximise_likelihood(
         T_cam_lidar: (4, 4) of each, accurate to some degrees and centimetres.
         priors: of the constant errors; a scale that contradicts its own is freed.
         usual: typical noise levels.
-        levels: of the noise, if known; else estimated.
-        pose_ratios: for each camera, ratio of its images' errors beyond corner noise to `levels`; 1 if None.
+        pose_ratios: for each camera, ratio of its images' errors beyond corner noise; 1 if None.
     """
     priors, usual = priors or Priors(), usual or Levels()
     usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
@@ -120,11 +118,11 @@ def maximise_likelihood(
     state = State.without_errors(np.array(T_cam_lidar), T_lidar_board, len(scans.rings))
     search = _Search(scans, images, board, priors)
     placement = group_shared_placements(cameras, order)
-    now = levels or usual
+    now = usual
     terms = linearise(scans, images, board, state, _once(placement, images))
     for blur_rad in _BLURS_RAD:
         terms = search.settle(terms, now.blurred(blur_rad), _STEPS, _NEAR)
-    for k, n_rounds in enumerate(_LEVEL_ROUNDS if levels is None else ()):
+    for k, n_rounds in enumerate(_LEVEL_ROUNDS):
         terms = search.settle(terms, now, _STEPS, _NEAR)
         if k == len(_LEVEL_ROUNDS) - 1:
             priors = priors.freed(terms.state.scale)

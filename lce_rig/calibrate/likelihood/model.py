@@ -88,16 +88,12 @@ def linearise(
         sum_ranges(scans, state),
         edge_rows(scans, board, state),
         tuple(images),
-        _rows_of_images(images, state),
+        tuple(
+            image_rows(of_camera, T, state.T_lidar_board, scale)
+            for of_camera, T, scale in zip(images, state.T_cam_lidar, state.scale.tolist(), strict=True)
+        ),
         np.ones(scans.n_captures) if trust is None else trust,
         scans.rings,
-    )
-
-
-def _rows_of_images(images: Sequence[StackedImages], state: State) -> tuple[Array, ...]:
-    return tuple(
-        image_rows(of_camera, T, state.T_lidar_board, scale)
-        for of_camera, T, scale in zip(images, state.T_cam_lidar, state.scale.tolist(), strict=True)
     )
 
 

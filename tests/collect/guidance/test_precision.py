@@ -64,13 +64,14 @@ def test_information_is_that_of_the_calibration(poses, linearised):
 
 def test_lasers_pull_as_in_the_calibration(poses, linearised):
     errors, observations, problem, x, edge_ids = linearised
-    information = problem.quadratics(x, edge_ids).information
+    cost = problem.quadratics(x, edge_ids)
     solution = SimpleNamespace(x=x[None], edge_ids=edge_ids[None])
-    sensitivities = ring_sensitivities(observations, BOARD, problem, solution, information)
+    start = SimpleNamespace(fitted=observations, problem=problem, solution=solution, cost=cost)
+    sensitivities = ring_sensitivities(start, BOARD)
     rings = np.unique(np.concatenate([each.lidar.ring for each in observations]))
-    predicted = -symmetric_inverse(information) @ weigh_placements(model(errors), poses, T_FORWARD).drift.sum(
-        axis=0
-    )
+    predicted = -symmetric_inverse(cost.information) @ weigh_placements(
+        model(errors), poses, T_FORWARD
+    ).drift.sum(axis=0)
     scale = np.linalg.norm(sensitivities, axis=1, keepdims=True)
     assert np.abs((predicted[:, rings] - sensitivities) / scale)[:6].max() < 0.15
 
