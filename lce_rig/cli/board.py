@@ -69,9 +69,13 @@ def board(
     cols, rows = map(int, counts.groups())
     more: dict[str, object] = {}
     if kind == "charuco":
+        # Name the smallest dictionary of a family that has so many markers, or its largest.
+        family = "5X5"
+        n_markers = cols * rows // 2
+        names = [name for name in DICTIONARIES if name.startswith(f"{family}_")]
         more = {
             "marker_m": round(_MARKER_SHARE * square_m, 6),
-            "dictionary": _smallest("5X5", cols * rows // 2),
+            "dictionary": next((name for name in names if n_markers_of(name) >= n_markers), names[-1]),
         }
     elif kind == "aprilgrid":
         more = {"tag_spacing": _TAG_SPACING}
@@ -103,12 +107,6 @@ def board(
     show.note(
         f"wrote {output}: print it at 100 %, mount it, measure it, and paste the block into the profile"
     )
-
-
-def _smallest(family: str, n_markers: int) -> str:
-    """Name the smallest dictionary of a family that has so many markers, or its largest."""
-    names = [name for name in DICTIONARIES if name.startswith(f"{family}_")]
-    return next((name for name in names if n_markers_of(name) >= n_markers), names[-1])
 
 
 def _draw(board: Board, block: str, output: str) -> None:

@@ -36,9 +36,8 @@ from lce_rig.session import Capture, Session
 from lce_rig.session.durable import replacing
 from lce_rig.session.identity import differing_keys
 from lce_rig.session.session import DEBUG, PROFILE
-from lce_rig.show.overlays.lidar_pair import draw_cloud, seen_through_window
 from lce_rig.show.overlays.overlay import ImageWithEvents
-from lce_rig.show.overlays.overlay_files import draw_check, is_overlay
+from lce_rig.show.overlays.overlay_files import draw_check, draw_cloud, is_overlay, seen_through_window
 
 
 @dataclass(frozen=True, eq=False)
