@@ -24,7 +24,7 @@ from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.motion.board_motion import sample_poses
 from lce_rig.calibrate.motion.time_offsets import MIN_MOVING, Motion, estimate_motion
-from lce_rig.calibrate.observations import Clocks, join_scans, pooled_noise_px
+from lce_rig.calibrate.observations import Clocks, join_scans
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.plane_and_ends import along_normals
 from lce_rig.calibrate.result import CalibrationEstimate
@@ -127,7 +127,6 @@ def fit_extrinsic(
     candidates: Sequence[Observation],
     board: Board,
     settings: EstimateSettings | None = None,
-    progress: Progress = silent,
 ) -> CalibrationEstimate:
     """Estimate T_cam_lidar from both sensors' detections of boards that stood still.
 
@@ -135,7 +134,6 @@ def fit_extrinsic(
         candidates: of each capture with detections of both sensors, in any order.
         board: its specification.
         settings: method, priors and tolerances.
-        progress: called with (subsets done, subsets in all).
 
     Raises:
         NotEnoughDataError: too few captures, captures that agree with no extrinsics, or captures that leave a
@@ -143,7 +141,7 @@ def fit_extrinsic(
     """
     by_channel, settings = _with_session_lens({"": candidates}, board, settings or EstimateSettings())
     consensus = find_consensus(by_channel[""], board)
-    estimate = estimate_observations(consensus.observations, board, settings, progress)
+    estimate = estimate_observations(consensus.observations, board, settings)
     return _with_consensus(estimate, [consensus])
 
 
@@ -198,7 +196,11 @@ def _agree(
             troubles.append(error)
     if not agreed:
         raise troubles[0]
-    noise = {name: pooled_noise_px([o.image for o in c.observations]) for name, c in agreed.items()}
+    # Of each channel's corners per coordinate, from the residuals of all its boards.
+    noise = {
+        name: float(np.sqrt(np.mean([o.image.sigma_px**2 for o in consensus.observations])))
+        for name, consensus in agreed.items()
+    }
     return {name: agreed[name] for name in sorted(agreed, key=lambda name: noise[name])}, noise
 
 

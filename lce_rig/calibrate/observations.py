@@ -104,11 +104,6 @@ def scan_key(observation: Observation) -> bytes:
     return observation.lidar.points.tobytes()
 
 
-def pooled_noise_px(images: Sequence[ImageBoard]) -> float:
-    """Estimate a channel's corner noise per coordinate from the residuals of all its boards."""
-    return float(np.sqrt(np.mean([image.sigma_px**2 for image in images])))
-
-
 def group_placements(observations: Sequence[Observation]) -> NDArray[np.intp]:
     """Number the board placements of captures; captures that stood in the same place share a number.
 

@@ -174,7 +174,8 @@ def inflate(
         The covariance and the factor, 1 if model and spread agree.
     """
     n = int(placement.max()) + 1 if n_seen is None else n_seen
-    return widen(joint.cov[camera], jackknife(joint, placement, camera), n)
+    moves = replace(joint.cost, placement=placement).moves() @ joint.to_extrinsics[camera].T
+    return widen(joint.cov[camera], jackknife_scatter(moves), n)
 
 
 def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:
@@ -188,9 +189,3 @@ def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:
     chance = np.sqrt(2 / (len(cov) * max(n_placements - 1, 1)))
     factor = ratio if ratio > 1 + _SURE * chance else 1.0
     return factor * cov, factor
-
-
-def jackknife(joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0) -> Array:
-    """Compute the jackknife covariance (6, 6) of a camera's extrinsics over placements."""
-    cost = replace(joint.cost, placement=placement)
-    return jackknife_scatter(cost.moves() @ joint.to_extrinsics[camera].T)

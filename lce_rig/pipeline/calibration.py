@@ -159,13 +159,16 @@ def calibrate(
         options,
         cameras=cameras,
         channels=channels,
-        reference=reference,
         scene=partial(sharpen, session, detections) if use_scene else None,
         progress=progress,
     )
     begin(progress, "comparing with the scene")
     judged = []
     for c in calibrations:
+        truth = None if reference is None else reference.of(c.camera, c.lidar)
+        if truth is not None:
+            rotation_deg, translation_m = error_to_reference(c.T_cam_lidar, truth)
+            c = replace(c, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
         if c.is_of_lidars:
             judged.append(c)
             continue
@@ -184,7 +187,6 @@ def calibrate_detections(
     *,
     cameras: Sequence[str] | None = None,
     channels: Sequence[str] | None = None,
-    reference: Reference | None = None,
     scene: Callable[[Calibration], SceneShare] | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Calibration], list[Finding]]:
@@ -196,7 +198,7 @@ def calibrate_detections(
     Args:
         rig: thresholds, targets and nominal extrinsics.
         detections: of one session.
-        options, cameras, channels, reference, progress: as of `calibrate`.
+        options, cameras, channels, progress: as of `calibrate`.
         scene: asks the scene about the boards' extrinsics; None for the boards alone.
 
     Returns:
@@ -244,13 +246,7 @@ def calibrate_detections(
             share = scene(replace(c, cov_shared=c.cov_shared + solved[k].cov_lens))
             solved[k] = _with_scene(rig, solved[k], share)
         calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
-    calibrations = compare_with_cameras([*calibrations, *between], rig)
-    for k, c in enumerate(calibrations):
-        truth = None if reference is None else reference.of(c.camera, c.lidar)
-        if truth is not None:
-            rotation_deg, translation_m = error_to_reference(c.T_cam_lidar, truth)
-            calibrations[k] = replace(c, egt_rotation_deg=rotation_deg, egt_translation_m=translation_m)
-    return calibrations, shortages
+    return compare_with_cameras([*calibrations, *between], rig), shortages
 
 
 def _pairs_by_sensors(

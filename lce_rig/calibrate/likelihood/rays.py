@@ -153,6 +153,7 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
     ends = ends[sorted_ends]
     angle = np.concatenate([board.edge_side * board.azimuth_step_rad for board in boards])[sorted_ends]
     end_rays = ends / np.linalg.norm(ends, axis=1, keepdims=True)
+    beams = [np.zeros((len(b.edge_points), 2)) if b.edge_beam_m is None else b.edge_beam_m for b in boards]
     return StackedScans(
         n_captures=len(boards),
         rings=rings,
@@ -168,12 +169,8 @@ def stack_scans(boards: Sequence[LidarBoard], board: Board) -> StackedScans:
         next_rays=turn_about_z(end_rays, angle),
         end_fields=_fields(ends, T_lidar_board[end_capture[sorted_ends]], board),
         end_background=np.concatenate([describe_background(board) for board in boards])[sorted_ends],
-        end_beam=np.concatenate([_beams(board) for board in boards])[sorted_ends],
+        end_beam=np.concatenate(beams)[sorted_ends],
     )
-
-
-def _beams(lidar: LidarBoard) -> Array:
-    return np.zeros((len(lidar.edge_points), 2)) if lidar.edge_beam_m is None else lidar.edge_beam_m
 
 
 def _fields(points: Array, T_lidar_board: Array, board: Board) -> Array:
