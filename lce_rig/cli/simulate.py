@@ -2,7 +2,6 @@
 
 import json
 import re
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -135,11 +134,8 @@ def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options:
                 name = writer.add_capture(capture.images, capture.scans, source, capture.events)
                 truth["captures"][name] = capture_truth(rig, capture, options)
                 progress(done, n_captures)
-        except BaseException:
-            with suppress(OSError):
-                write_truth(path / TRUTH, truth)
-            raise
-        write_truth(path / TRUTH, truth)
+        finally:  # an interrupted session has the truth of its captures, too
+            write_truth(path / TRUTH, truth)
     show.note(f"{path}: {n_captures} simulated captures of rig {rig.name}; truth in {path / TRUTH}")
 
 
