@@ -431,9 +431,9 @@ LIDARS_EXCHANGED = Kind(
 )
 LIDARS_UNNAMED = Kind(
     "verdict.lidars_unnamed",
-    "{subject}: without a nominal pose in the profile, exchanged names are not noticed",
-    "enter a rough pose in nominal_extrinsics",
-    severity="note",
+    "{subject}: the profile has no nominal pose, and nothing else shows whether their names are exchanged",
+    "enter their rough pose in nominal_extrinsics, and calibrate again",
+    severity="warning",
 )
 OTHER_MODEL = Kind(
     "verdict.other_model",

@@ -1,6 +1,6 @@
 """Checks of two LiDARs' pose to each other, beyond those that a camera and a LiDAR have as well."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -38,19 +38,24 @@ def find_other_model(name: str, lidar: LidarSettings, scans: Iterable[LidarDetec
     return [OTHER_MODEL(name, model=lidar.model, n_lasers=n_lasers, ring=highest)]
 
 
-def find_exchanged(T_first_second: Array, nominal: NominalExtrinsic | None, names: str) -> list[Finding]:
+def find_exchanged(
+    T_first_second: Array, nominal: NominalExtrinsic | None, names: str, lidars: Sequence[LidarSettings]
+) -> list[Finding]:
     """Find two LiDARs whose scans came under each other's name.
 
-    Exchanged, the estimate is the inverse. Where the profile has no nominal pose, a note says that names
-    are not checked: the boards fit either way.
+    Exchanged, the estimate is the inverse, and boards fit as well. Without a nominal pose only the scans of a
+    LiDAR with more rings show it; otherwise the result cannot pass.
 
     Args:
         T_first_second: (4, 4) the estimate.
         nominal: of the profile.
         names: of both.
+        lidars: their settings.
     """
     if nominal is None:
-        return [LIDARS_UNNAMED(names)]
+        sheets = [lidar.data_sheet() for lidar in lidars]
+        rings = {len(sheet.elevations_deg) for sheet in sheets if sheet is not None and sheet.has_rings}
+        return [] if len(rings) == len(sheets) else [LIDARS_UNNAMED(names)]
 
     def excess(T: Array) -> float:
         rotation_deg, translation_m = tangent_sizes(difference(T, nominal.to_matrix()))

@@ -44,7 +44,7 @@ from lce_rig.judge.verdict import judge, share_findings, with_opinion
 from lce_rig.lens.lens_estimate import BoardView
 from lce_rig.pipeline.detect_session import boards_in, candidates_of, detect
 from lce_rig.pipeline.findings import FEW_DETECTED, SHORTAGE, few_detected
-from lce_rig.pipeline.lidar_pairs import calibrate_lidar_pairs, compare_with_cameras
+from lce_rig.pipeline.lidar_pairs import calibrate_lidar_pairs, close
 from lce_rig.pipeline.result_files import Result
 from lce_rig.pipeline.witness import by_boards, hear_scene, sharpen
 from lce_rig.rig import Rig
@@ -246,7 +246,7 @@ def calibrate_detections(
             share = scene(replace(c, cov_shared=c.cov_shared + solved[k].cov_lens))
             solved[k] = _with_scene(rig, solved[k], share)
         calibrations = [_judged(rig, detections, solved, links, k) for k in range(len(solved))]
-    return compare_with_cameras([*calibrations, *between], rig), shortages
+    return close([*calibrations, *between], rig), shortages
 
 
 def _pairs_by_sensors(

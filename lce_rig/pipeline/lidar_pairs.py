@@ -12,12 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.calibrate import CalibrateOptions, EstimateSettings
-from lce_rig.calibrate.between_lidars import estimate_between_lidars
+from lce_rig.calibrate.between_lidars import close_loops, estimate_between_lidars
 from lce_rig.calibrate.observability import find_weakest
+from lce_rig.calibrate.result import capture_residual, summarise
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, invert
+from lce_rig.core.geometry import Array, invert, relative_pose
 from lce_rig.core.progress import Progress, begin
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections, Pair
@@ -55,25 +56,53 @@ def calibrate_lidar_pairs(
     return calibrations, shortages
 
 
-def compare_with_cameras(calibrations: Sequence[Calibration], rig: Rig) -> list[Calibration]:
-    """Compare each two LiDARs with the cameras calibrated to both.
+def close(calibrations: Sequence[Calibration], rig: Rig) -> list[Calibration]:
+    """Compare each two LiDARs with the sensors calibrated to both, and adjust poses that agree.
 
-    A contradiction is a reason against all three results.
+    A contradiction is a reason against all three results. Otherwise their poses compose exactly afterwards.
+    Covariances stay: the estimates share boards, so that the loop need not have made them better. Cameras'
+    method "paper" gives Algorithm 1's poses, which are not adjusted.
     """
     of_pair = {(c.camera, c.lidar): c for c in calibrations}
     reasons: dict[tuple[str, str], list[Finding]] = {}
-    for (first, second), between in of_pair.items():
-        for camera in rig.cameras if first in rig.lidars else ():
-            sides = [(camera, first), (camera, second)]
-            if not of_pair.keys() >= set(sides):
-                continue
-            found = loop_findings(between, of_pair[sides[0]], of_pair[sides[1]], rig)
-            for pair in (*sides, (first, second)):
-                reasons.setdefault(pair, []).extend(found)
-    return [
-        with_findings(c, reasons[c.camera, c.lidar]) if reasons.get((c.camera, c.lidar)) else c
-        for c in calibrations
-    ]
+    loops = [((a, b), (b, c), (a, c)) for a, b in of_pair for d, c in of_pair if d == b and (a, c) in of_pair]
+    for first, between, second in loops:
+        found = loop_findings(of_pair[between], of_pair[first], of_pair[second], rig)
+        for pair in (first, second, between):
+            reasons.setdefault(pair, []).extend(found)
+    judged = {
+        pair: with_findings(c, reasons[pair]) if reasons.get(pair) else c for pair, c in of_pair.items()
+    }
+    sound = {pair for pair, c in judged.items() if c.method == "ml" and c.verdict != "fail"}
+    sound -= {pair for pair, found in reasons.items() if found}
+    closed = close_loops({pair: (judged[pair].T_cam_lidar, judged[pair].cov) for pair in sound})
+    T = {pair: c.T_cam_lidar for pair, c in judged.items()} | closed
+    board, calibrations = rig.board.to_board(), []
+    for pair, c in judged.items():
+        others = {
+            name for loop in loops if pair in loop and closed.keys() >= set(loop) for name in sum(loop, ())
+        }
+        if not others:
+            calibrations.append(c)
+            continue
+        residuals = tuple(
+            capture_residual(T[pair], c.observations[r.capture], board, r.held_out_m) for r in c.residuals
+        )
+        composed = tuple(
+            replace(each, T_cam_other=relative_pose(T[pair], T[each.camera, c.lidar])[0])
+            for each in c.other_cameras
+        )
+        calibrations.append(
+            replace(
+                c,
+                T_cam_lidar=T[pair],
+                residuals=residuals,
+                metrics=summarise(residuals),
+                other_cameras=composed,
+                estimated_with=tuple(sorted({*c.estimated_with, *others} - set(pair))),
+            )
+        )
+    return calibrations
 
 
 def _calibrate(rig: Rig, detections: Detections, pair: Pair, options: CalibrateOptions) -> Calibration:
@@ -105,7 +134,9 @@ def _calibrate(rig: Rig, detections: Detections, pair: Pair, options: CalibrateO
     others = [
         *find_other_model(first, rig.lidars[first], scans[first].values()),
         *find_other_model(second, rig.lidars[second], scans[second].values()),
-        *find_exchanged(T, rig.nominal(first, second), f"{first} and {second}"),
+        *find_exchanged(
+            T, rig.nominal(first, second), f"{first} and {second}", [rig.lidars[first], rig.lidars[second]]
+        ),
     ]
     verdict, findings = judge(estimate, validation, rig, first, second, n_captures, others, T_view)
     R = np.kron(np.eye(2), T_view[:3, :3].T)
