@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -116,7 +117,7 @@ def simulate(
     if motion == "still":
         raise UsageError("--motion still: the board moves in a recording", "Omit --motion, or --recording.")
     options = replace(SimulationOptions.for_rig(rig.name, "moving"), mounting_seed=mounting)
-    _simulate_recording(recording, rig, duration or _DURATION_S, seed, options, int(ros or 1))
+    _simulate_recording(recording, rig, rig_name, duration or _DURATION_S, seed, options, int(ros or 1))
 
 
 def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options: SimulationOptions) -> None:
@@ -140,7 +141,7 @@ def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options:
 
 
 def _simulate_recording(
-    folder: Path, rig: Rig, duration_s: float, seed: int, options: SimulationOptions, ros: int
+    folder: Path, rig: Rig, profile: str, duration_s: float, seed: int, options: SimulationOptions, ros: int
 ) -> None:
     recording = simulate_recording(rig, duration_s=duration_s, seed=seed, options=options)
     with BagRecorder.in_folder(folder, rig, ros) as recorder, show.progress_bar("simulating, s") as progress:
@@ -150,7 +151,7 @@ def _simulate_recording(
             progress(max(0, stamp_of(sample) - recording.start_ns) // 10**9, round(duration_s))
     names = ", ".join(sorted(path.name for path in folder.iterdir()))
     show.note(f"{folder}: {duration_s:g} s of rig {rig.name}: {names}")
-    show.note(f"next: lce-rig collect --rig {rig.name} --from {recorder.path}")
+    show.note(f"next: lce-rig collect --rig {shlex.quote(profile)} --from {shlex.quote(str(recorder.path))}")
 
 
 def require_kind(session: Path, seed: int | None) -> None:

@@ -18,7 +18,9 @@ REFUSED = Kind("fleet.refused", "{what}", "{hint}")
 USAGE = Kind("fleet.usage", "{what}", "{hint}")
 OTHER_ERROR = Kind("fleet.other_error", "{what}", "{hint}")
 DAMAGED = Kind(
-    "fleet.damaged", "its files in the registry are damaged: {what}", "run the session again with `fleet run`"
+    "fleet.damaged",
+    "its files in the registry are damaged: {what}",
+    "write it again: `lce-rig fleet run ROOT --registry FOLDER`",
 )
 BUG = Kind("fleet.bug", "a bug in lce-rig: {what}", "report it with the session")
 TIMED_OUT = Kind(

@@ -1,8 +1,9 @@
-"""Every command that a finding, a hint or a page advises can be typed: its words exist, nothing lacks."""
+"""Every command that a finding, a hint or a page advises works when typed, with real values for its names."""
 
 import ast
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -11,8 +12,9 @@ import click
 import pytest
 
 import lce_rig
-from lce_rig.cli.main import cli
+from lce_rig.cli.main import cli, run
 from lce_rig.core.findings import KINDS
+from tests.shared import make_once
 
 PACKAGE = Path(lce_rig.__file__).parent
 # In backticks up to the closing one, else up to the end of the sentence or of the text.
@@ -99,3 +101,111 @@ def test_commands_are_found() -> None:
 @pytest.mark.parametrize(("place", "command"), ADVISED)
 def test_an_advised_command_can_be_typed(place: str, command: str) -> None:
     assert _lacking(command) == ""
+
+
+# `doctor` has no simulated sensors: it is parsed only. Without a recording `collect` has a simulated rig.
+PARSED_ONLY = {"doctor"}
+_VALUES = {
+    "--rig": "rig.yaml",
+    "--from": "recording",
+    "--save-profile": "new.yaml",
+    "--result": "session/calibration/result.json",
+    "--name": "second",
+    "--registry": "registry",
+    "--target": "kestrel",
+    "--formats": "opencv",
+    "--restore": "000001",
+    "-o": "new",
+}
+_PLACEHOLDERS = {
+    "X",
+    "R",
+    "RIG",
+    "FILE",
+    "FOLDER",
+    "NAME",
+    "TARGET",
+    "ROOT",
+    "SESSION",
+    "OTHER_SESSION",
+    "RECORDING",
+}
+
+
+def _typed(command: str) -> tuple[str, ...]:
+    """Put names of the workbench where an advised command has placeholders."""
+    words = shlex.split(command)
+    first = " ".join(words[:2])
+    typed: list[str] = []
+    for word in words:
+        before = typed[-1] if typed else ""
+        if word not in _PLACEHOLDERS:
+            value = word
+        elif before in _VALUES:
+            value = _VALUES[before]
+        elif first == "rigs new":
+            value = "mine"
+        elif first in ("rigs show", "rigs check"):
+            value = "rig.yaml"
+        elif first == "fleet run":
+            value = "sessions"
+        else:
+            value = "other" if word == "OTHER_SESSION" else "session"
+        typed.append(value)
+    if typed[0] == "collect" and "--from" not in typed:
+        typed += ["--simulated", "--plain", "--silent", "--captures", "1", "--timeout", "60"]
+    if first == "rigs new" and len(typed) == 3:
+        typed += ["--from", "rlfs"]
+    return tuple(typed)
+
+
+TYPED = sorted({_typed(command) for _, command in ADVISED if command.split()[0] not in PARSED_ONLY})
+
+
+@pytest.fixture(scope="module")
+def workbench() -> Path:
+    """Sessions, results, a recording, a registry and a robot: all that advised commands name."""
+
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        session, rig, recording = folder / "session", folder / "rig.yaml", folder / "recording"
+
+        def calls(*words: object) -> None:
+            assert run([str(word) for word in words]) in (0, 7), words
+
+        calls("rigs", "new", "rlfs", "--from", "rlfs", "-o", rig)
+        calls("simulate", "--rig", rig, session, "--captures", "10", "--seed", "3")
+        for file, kind in (("cam.frames.png", "img"), ("lidar.pcd", "pcd")):
+            (recording / kind).mkdir(parents=True)
+            for capture in sorted((session / "captures").iterdir())[:6]:
+                shutil.copy(capture / file, recording / kind / f"{capture.name}{Path(file).suffix}")
+        calls("captures", session, "--reject", "000001")
+        calls("calibrate", session, "--robot", "kestrel")
+        shutil.copytree(session, folder / "sessions" / "other")
+        calls(
+            "simulate", "--rig", rig, folder / "other", "--captures", "10", "--seed", "4", "--mounting", "3"
+        )
+        wrong = folder / "wrong.yaml"
+        # A focal length 3 % too long.
+        wrong.write_text(re.sub(r"(f[xy]_px): [0-9.]+", r"\1: 924.0", rig.read_text()))
+        shutil.copytree(session, folder / "refocused")
+        calls("calibrate", folder / "refocused", "--rig", wrong)
+        calls("calibrate", session, "--name", "second")
+        (folder / "deploy.yaml").write_text("targets: {kestrel: {to: robot, robot: kestrel}}\n")
+        calls("fleet", "run", folder / "sessions", "--registry", folder / "registry", "--workers", "1")
+        calls("deploy", session, "--target", "kestrel", "--targets", folder / "deploy.yaml")
+
+    return make_once("workbench", make)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", TYPED, ids=" ".join)
+def test_an_advised_command_works(command, workbench, tmp_path, monkeypatch, lce_rig) -> None:
+    shutil.copytree(workbench, tmp_path, dirs_exist_ok=True, symlinks=True)
+    monkeypatch.chdir(tmp_path)
+    if command[0] in ("collect", "simulate") or "--save-profile" in command:
+        shutil.rmtree("session")
+    if "--save-profile" in command:
+        Path("refocused").rename("session")
+    outcome = lce_rig(*command)
+    assert outcome.code == 0, outcome.err
