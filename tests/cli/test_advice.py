@@ -73,6 +73,8 @@ def _lacking(command: str) -> str:
         values, _, _ = at.make_parser(context).parse_args(words)
     except click.UsageError as error:
         return error.format_message()
+    if values.get("help"):
+        return ""
     missing = [
         param.human_readable_name
         for param in at.params
