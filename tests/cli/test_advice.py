@@ -69,12 +69,12 @@ def _lacking(command: str) -> str:
         if below is None:
             return f"the verb {name}"
         at, context = below, click.Context(below, info_name=name, parent=context)
+    if "--help" in words:
+        return ""
     try:
         values, _, _ = at.make_parser(context).parse_args(words)
     except click.UsageError as error:
         return error.format_message()
-    if values.get("help"):
-        return ""
     missing = [
         param.human_readable_name
         for param in at.params
