@@ -13,6 +13,7 @@ from lce_rig.cli import show
 from lce_rig.cli.contents import put_aside
 from lce_rig.cli.options import (
     cameras_option,
+    path_option,
     require_sensors,
     robot_option,
     session_argument,
@@ -150,11 +151,10 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
 
 @click.command()
 @session_argument
-@click.option(
+@path_option(
     "--reference",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Report the error from the T_cam_lidar of this JSON file; the estimate does not use it.",
+    "FILE",
+    "Report the error from the T_cam_lidar of this JSON file; the estimate does not use it.",
 )
 @cameras_option
 @click.option(

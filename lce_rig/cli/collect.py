@@ -8,7 +8,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.collect_live import run_live, show_next
-from lce_rig.cli.options import FiniteRange, require_sensors, robot_option
+from lce_rig.cli.options import FiniteRange, path_option, require_sensors, robot_option
 from lce_rig.cli.simulate import require_kind
 from lce_rig.collect.findings import IMAGE_NONE
 from lce_rig.collect.live.guide import predict
@@ -42,19 +42,16 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
 )
 @robot_option
 @click.argument("session", type=click.Path(path_type=Path), required=False)
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), metavar="SESSION", help="Name the session, as SESSION."
-)
-@click.option(
+@path_option("-o", "--output", "SESSION", "Name the session, as SESSION.")
+@path_option(
     "--from",
     "paths",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="PATH",
-    help="Read a recording: a folder with img/ (several cameras: img/CAMERA/) and pcd/, a folder of "
+    "PATH",
+    "Read a recording: a folder with img/ (several cameras: img/CAMERA/) and pcd/, a folder of "
     "--record, a ROS 1 or ROS 2 bag, an mcap or pcap file, an event camera's file (AEDAT4, Prophesee "
     "RAW, HDF5), or beside these a folder of images named after their times. "
     "Repeatable, also for simultaneous recordings of several sensors.",
+    multiple=True,
 )
 @click.option(
     "--pair",
@@ -126,12 +123,7 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     metavar="[HOST:PORT]",
     help="Live: serve a page for a phone [default address: 127.0.0.1:8765]. Its link has a token.",
 )
-@click.option(
-    "--record",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Live: also record the raw streams into a new folder, which --from reads.",
-)
+@path_option("--record", "FOLDER", "Live: also record the raw streams into a new folder, which --from reads.")
 @click.option("--simulated", is_flag=True, help="Live: collect from a simulated rig with a simulated person.")
 @click.option("--seed", type=click.IntRange(0), help="Set the seed of the simulated rig  [default: 0]")
 def collect(

@@ -10,7 +10,7 @@ import click
 
 import lce_rig as lce
 from lce_rig.cli import show
-from lce_rig.cli.options import json_option, session_argument
+from lce_rig.cli.options import json_option, path_option, session_argument
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import SessionError, UsageError
 from lce_rig.pipeline.result_files import CURRENT, StoredResult, stored_results
@@ -23,11 +23,10 @@ from lce_rig.session import Session
 @click.option(
     "--restore", metavar="NAMES", multiple=True, help="Restore these captures, separated by commas."
 )
-@click.option(
+@path_option(
     "--add",
-    type=click.Path(path_type=Path),
-    metavar="OTHER_SESSION",
-    help="Copy the captures of another session of this rig, if no sensor was moved in between.",
+    "OTHER_SESSION",
+    "Copy the captures of another session of this rig, if no sensor was moved in between.",
 )
 @click.option("--reason", metavar="TEXT", default="", help="Write this reason into the session's journal.")
 @json_option

@@ -7,7 +7,7 @@ import click
 
 import lce_rig as lce
 from lce_rig.cli import show
-from lce_rig.cli.options import json_option, session_argument
+from lce_rig.cli.options import json_option, path_option, result_option, session_argument
 from lce_rig.core.errors import UsageError
 from lce_rig.fleet import deployment
 from lce_rig.fleet.deployment import Deployed, Plan
@@ -19,13 +19,12 @@ from lce_rig.rig.target_settings import TargetSettings
 @click.command()
 @session_argument
 @click.option("--target", "target_name", required=True, metavar="NAME", help="Name the target.")
-@click.option(
+@path_option(
     "--targets",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Read targets from this file [default: deploy.yaml beside SESSION, and the session's profile].",
+    "FILE",
+    "Read targets from this file [default: deploy.yaml beside SESSION, and the session's profile].",
 )
-@click.option("--name", metavar="NAME", help="Deploy this result of SESSION (see `lce-rig results`).")
+@result_option("Deploy")
 @click.option("--dry-run", is_flag=True, help="Print what would change; change nothing.")
 @click.option("--diff", is_flag=True, help="With --dry-run: print the lines that would change.")
 @click.option("--status", is_flag=True, help="Print what is at the target; change nothing.")

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, explain_option, json_option, rig_option
+from lce_rig.cli.options import FiniteRange, explain_option, json_option, path_option, rig_option
 from lce_rig.core.findings import worst
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import sensors
@@ -29,14 +29,13 @@ _EXIT_ERROR = 5
     metavar="S",
     help="Read the sensors for S seconds; longer measures drifts better.",
 )
-@click.option(
+@path_option(
     "-o",
     "--output",
     "folder",
-    type=click.Path(path_type=Path),
+    "FOLDER",
+    "Measure the disk of this folder, in which sessions will be written  [default: the current one]",
     default=".",
-    metavar="FOLDER",
-    help="Measure the disk of this folder, in which sessions will be written  [default: the current one]",
 )
 def doctor(rig_name: str, explain: bool, as_json: bool, duration: float, folder: Path) -> int:
     """Check this computer and every sensor of a rig, and print faults with an action each.

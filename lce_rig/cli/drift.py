@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, explain_option, json_option
+from lce_rig.cli.options import FiniteRange, explain_option, json_option, path_option
 from lce_rig.core.calibration import ResultFile, read_result
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.interrupts import patience
@@ -27,12 +27,7 @@ from lce_rig.show.screen.keys import controls
 
 @click.command()
 @click.argument("recordings", nargs=-1, type=click.Path(path_type=Path), metavar="[RECORDING]...")
-@click.option(
-    "--result",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Check this result.json [default: that of the session].",
-)
+@path_option("--result", "FILE", "Check this result.json [default: that of the session].")
 @click.option(
     "--rig",
     "rig_name",
@@ -45,9 +40,7 @@ from lce_rig.show.screen.keys import controls
     metavar="S",
     help="Watch attached sensors for S seconds [default: until Ctrl-C].",
 )
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Write images into this folder."
-)
+@path_option("-o", "--output", "FOLDER", "Write images into this folder.")
 @explain_option
 @json_option
 def drift(

@@ -7,7 +7,7 @@ import click
 
 import lce_rig as lce
 from lce_rig.cli import show
-from lce_rig.cli.options import session_argument, split_names
+from lce_rig.cli.options import path_option, result_option, session_argument, split_names
 from lce_rig.core.errors import UsageError
 from lce_rig.export import EXPORTS, export_formats, require_usable
 from lce_rig.export.urdf import read_robot, write_into_urdf
@@ -25,7 +25,7 @@ def _list_formats(context: click.Context, _param: click.Parameter, is_asked: boo
 
 @click.command()
 @session_argument
-@click.option("--name", metavar="NAME", help="Export this result of SESSION (see `lce-rig results`).")
+@result_option("Export")
 @click.option(
     "--formats",
     callback=split_names,
@@ -41,26 +41,23 @@ def _list_formats(context: click.Context, _param: click.Parameter, is_asked: boo
     callback=_list_formats,
     help="List the formats and their files, and end.",
 )
-@click.option(
+@path_option(
     "--tree",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Fit the files into the robot's tree of frames: its URDF, or a recording with /tf_static (ROS 1, "
+    "FILE",
+    "Fit the files into the robot's tree of frames: its URDF, or a recording with /tf_static (ROS 1, "
     "ROS 2, mcap).",
 )
-@click.option(
+@path_option(
     "--into",
-    type=click.Path(path_type=Path),
-    metavar="URDF",
-    help="Set the sensors' joints in this URDF of the robot, in place of writing files; its earlier text "
+    "URDF",
+    "Set the sensors' joints in this URDF of the robot, in place of writing files; its earlier text "
     "stays beside it.",
 )
-@click.option(
+@path_option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Write the files into this folder; those of an earlier export there are removed.",
+    "FOLDER",
+    "Write the files into this folder; those of an earlier export there are removed.",
 )
 @click.option("--force", is_flag=True, help="Export a failed result, too.")
 def export(

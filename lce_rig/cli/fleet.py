@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, json_option, registry_option, split_names
+from lce_rig.cli.options import FiniteRange, json_option, path_option, registry_option, split_names
 from lce_rig.core.calibration import DEFAULT_METHOD, Method
 from lce_rig.core.errors import ResultRefusedError, SessionError, UsageError
 from lce_rig.core.interrupts import patience
@@ -218,22 +218,15 @@ def _cell(value: Any) -> str:
 
 @fleet.command()
 @registry_option
-@click.option(
-    "--output",
+@path_option(
     "-o",
+    "--output",
+    "FILE",
+    "Write the page to this file.",
     default=Path("fleet_report.html"),
     show_default=True,
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Write the page to this file.",
 )
-@click.option(
-    "--json",
-    "json_file",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Write findings, states and counts to this file.",
-)
+@path_option("--json", "json_file", "FILE", "Write findings, states and counts to this file.")
 def report(registry: str, output: Path, json_file: Path | None) -> None:
     """Report which robots moved, and why results are missing or failed, as one HTML page.
 
@@ -261,13 +254,12 @@ def report(registry: str, output: Path, json_file: Path | None) -> None:
 @fleet.command()
 @registry_option
 @click.option("--target", required=True, metavar="NAME", help="Name the target; each robot has its own.")
-@click.option(
+@path_option(
     "--targets",
+    "FILE",
+    "Read targets from this file; {robot} in `to` stands for the robot's name.",
     default=Path("deploy.yaml"),
     show_default=True,
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Read targets from this file; {robot} in `to` stands for the robot's name.",
 )
 @click.option(
     "--where",

@@ -12,6 +12,7 @@ from lce_rig.cli.options import (
     cameras_option,
     explain_option,
     json_option,
+    path_option,
     require_sensors,
     session_argument,
     split_names,
@@ -42,11 +43,10 @@ _MODELS = ("radtan4", "radtan5", "rational", "equidistant")
     type=click.Choice(_MODELS),
     help="Set the lens model [default: the profile's].",
 )
-@click.option(
+@path_option(
     "--save-profile",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write the session's profile to a new file, with the intrinsics that the session determines better.",
+    "FILE",
+    "Write the session's profile to a new file, with the intrinsics that the session determines better.",
 )
 @click.option("--force", is_flag=True, help="With --save-profile: write all estimated intrinsics.")
 @explain_option
@@ -177,11 +177,8 @@ def _explanation(measured: MeasuredIntrinsics) -> list[str]:
 @click.command(name="lidar-intrinsics")
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SESSION...")
 @click.option("--lidar", metavar="NAME", help="Choose the LiDAR [default: the profile's first].")
-@click.option(
-    "--save-profile",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write the first session's profile to a new file, with the estimated errors.",
+@path_option(
+    "--save-profile", "FILE", "Write the first session's profile to a new file, with the estimated errors."
 )
 @explain_option
 @json_option

@@ -24,6 +24,19 @@ def split_names(_ctx: click.Context, _param: click.Parameter, value: str | None)
     return None if value is None else [name.strip() for name in value.split(",")]
 
 
+def path_option(*names_metavar_help: str, **attributes: Any) -> Any:
+    """Declare an option whose value is a path: by its names, the name of its value and its help."""
+    *names, metavar, text = names_metavar_help
+    return click.option(*names, type=click.Path(path_type=Path), metavar=metavar, help=text, **attributes)
+
+
+def result_option(use: str) -> Any:
+    """Declare --name, which names a result of SESSION."""
+    return click.option(
+        "--name", metavar="NAME", help=f"{use} this result of SESSION (see `lce-rig results`)."
+    )
+
+
 session_argument = click.argument("session", type=click.Path(path_type=Path), default="session")
 
 rig_option = click.option(

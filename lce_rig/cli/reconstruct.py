@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange
+from lce_rig.cli.options import FiniteRange, path_option
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
@@ -27,14 +27,7 @@ _WARM_UP_NS = 1_500_000_000
 
 @click.command()
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Write the images into this folder.",
-)
+@path_option("-o", "--output", "FOLDER", "Write the images into this folder.", required=True)
 @click.option(
     "--every",
     default=0.05,
@@ -48,12 +41,7 @@ _WARM_UP_NS = 1_500_000_000
 )
 @click.option("--duration", type=FiniteRange(0.001), metavar="S", help="End S seconds after the beginning.")
 @click.option("--topic", metavar="/TOPIC", help="Choose the topic if a bag has several with events.")
-@click.option(
-    "--model",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Use this ONNX file instead of the shipped network.",
-)
+@path_option("--model", "FILE", "Use this ONNX file instead of the shipped network.")
 def reconstruct(
     recording: Path,
     output: Path,

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import click
 
 from lce_rig.cli import show
-from lce_rig.cli.options import FiniteRange, rig_option
+from lce_rig.cli.options import FiniteRange, path_option, rig_option
 from lce_rig.core.errors import SessionError, UsageError
 from lce_rig.core.files import read_json
 from lce_rig.io.ros.bag_recorder import BagRecorder
@@ -38,11 +38,10 @@ _CAPTURES, _DURATION_S = 30, 20.0
     type=click.IntRange(1, 10_000),
     help=f"Set the number of board placements [default: {_CAPTURES}].",
 )
-@click.option(
+@path_option(
     "--recording",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Write a recording instead of a session: recording.bag with images, scans and events.",
+    "FOLDER",
+    "Write a recording instead of a session: recording.bag with images, scans and events.",
 )
 @click.option(
     "--duration",

@@ -8,7 +8,7 @@ import click
 import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.calibrate import exit_by_verdict, scene_texts
-from lce_rig.cli.options import explain_option, json_option, session_argument
+from lce_rig.cli.options import explain_option, json_option, path_option, result_option, session_argument
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.findings import worst
 from lce_rig.detect.detection import Pair
@@ -21,20 +21,9 @@ from lce_rig.show.overlays.view_3d import CameraIn3D, CaptureIn3D, draw_picture,
 
 @click.command()
 @session_argument
-@click.option(
-    "--result",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Check the result.json of another session of this rig on these captures.",
-)
-@click.option("--name", metavar="NAME", help="Check this result of SESSION (see `lce-rig results`).")
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Write the images into this folder.",
-)
+@path_option("--result", "FILE", "Check the result.json of another session of this rig on these captures.")
+@result_option("Check")
+@path_option("-o", "--output", "FOLDER", "Write the images into this folder.")
 @explain_option
 @json_option
 def verify(
@@ -133,17 +122,11 @@ def _lines(checked: SessionCheck, session: str, *, is_explained: bool) -> list[s
 
 @click.command()
 @session_argument
-@click.option("--name", metavar="NAME", help="View this result of SESSION (see `lce-rig results`).")
+@result_option("View")
 @click.option(
     "--capture", metavar="NAME", help="Begin with this capture, such as 000003 [default: the first]."
 )
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="PNG",
-    help="Write a picture in place of opening a window; needs no display.",
-)
+@path_option("-o", "--output", "PNG", "Write a picture in place of opening a window; needs no display.")
 def view(session: Path, name: str | None, capture: str | None, output: Path | None) -> None:
     """Show the point cloud of SESSION (default: session/) in the colours of its cameras.
 
