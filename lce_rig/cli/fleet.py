@@ -225,8 +225,9 @@ def _cell(value: Any) -> str:
     "Write the page to this file.",
     default=Path("fleet_report.html"),
     show_default=True,
+    is_file=True,
 )
-@path_option("--json", "json_file", "FILE", "Write findings, states and counts to this file.")
+@path_option("--json", "json_file", "FILE", "Write findings, states and counts to this file.", is_file=True)
 def report(registry: str, output: Path, json_file: Path | None) -> None:
     """Report which robots moved, and why results are missing or failed, as one HTML page.
 
@@ -260,6 +261,7 @@ def report(registry: str, output: Path, json_file: Path | None) -> None:
     "Read targets from this file; {robot} in `to` stands for the robot's name.",
     default=Path("deploy.yaml"),
     show_default=True,
+    is_file=True,
 )
 @click.option(
     "--where",

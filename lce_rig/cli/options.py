@@ -1,11 +1,13 @@
 """Option types and options that several verbs share."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
+
+_Verb = TypeVar("_Verb", bound=Callable[..., Any])
 
 
 class FiniteRange(click.FloatRange):
@@ -24,13 +26,16 @@ def split_names(_ctx: click.Context, _param: click.Parameter, value: str | None)
     return None if value is None else [name.strip() for name in value.split(",")]
 
 
-def path_option(*names_metavar_help: str, **attributes: Any) -> Any:
+def path_option(
+    *names_metavar_help: str, is_file: bool = False, **attributes: Any
+) -> Callable[[_Verb], _Verb]:
     """Declare an option whose value is a path: by its names, the name of its value and its help."""
     *names, metavar, text = names_metavar_help
-    return click.option(*names, type=click.Path(path_type=Path), metavar=metavar, help=text, **attributes)
+    kind = click.Path(path_type=Path, dir_okay=not is_file)
+    return click.option(*names, type=kind, metavar=metavar, help=text, **attributes)
 
 
-def result_option(use: str) -> Any:
+def result_option(use: str) -> Callable[[_Verb], _Verb]:
     """Declare --name, which names a result of SESSION."""
     return click.option(
         "--name", metavar="NAME", help=f"{use} this result of SESSION (see `lce-rig results`)."

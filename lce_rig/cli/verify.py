@@ -126,7 +126,9 @@ def _lines(checked: SessionCheck, session: str, *, is_explained: bool) -> list[s
 @click.option(
     "--capture", metavar="NAME", help="Begin with this capture, such as 000003 [default: the first]."
 )
-@path_option("-o", "--output", "PNG", "Write a picture in place of opening a window; needs no display.")
+@path_option(
+    "-o", "--output", "PNG", "Write a picture in place of opening a window; needs no display.", is_file=True
+)
 def view(session: Path, name: str | None, capture: str | None, output: Path | None) -> None:
     """Show the point cloud of SESSION (default: session/) in the colours of its cameras.
 
