@@ -97,11 +97,19 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
     return _VERDICTS[worst(findings)]
 
 
-def consequences(findings: Iterable[Finding]) -> dict[str, str]:
-    """Map the codes of findings that follow from others to the code of their cause."""
-    codes = [finding.code for finding in findings if finding.severity != "note"]
-    causes = [code for code in _FOLLOWS if code in codes]
-    return {code: cause for cause in reversed(causes) for code in codes if code in _FOLLOWS[cause]}
+def consequences(findings: Sequence[Finding]) -> dict[str, str]:
+    """Map the codes of findings that follow from others to the code of their cause.
+
+    A cause that only warns, such as rough intrinsics, does not explain another that fails.
+    """
+    codes = dict.fromkeys(finding.code for finding in findings if finding.severity != "note")
+    fails = {finding.code for finding in findings if finding.severity == "error"}
+    causes = sorted((code for code in _FOLLOWS if code in codes), key=lambda code: code not in fails)
+    following: dict[str, str] = {}
+    for cause in causes:
+        outranked = set() if cause in fails else fails & _FOLLOWS.keys()
+        following = dict.fromkeys((codes.keys() & _FOLLOWS[cause]) - outranked, cause) | following
+    return following
 
 
 def lacks_captures(findings: Iterable[Finding]) -> bool:

@@ -36,6 +36,7 @@ from lce_rig.judge.findings import (
     SCENE_UNKNOWN,
     SCENE_USED,
     SENSORS_DISAGREE,
+    SHARES_DIFFER,
     SURPRISING_CHI2,
     TRANSLATION_UNCERTAIN,
     Verdict,
@@ -93,7 +94,7 @@ def judge(
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
         *angle_findings(examination.laser_angles),
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
-        *_scale(examination.scale, estimate, board, rig.verdict.max_scale_error),
+        *_scale(examination.scale, board, rig.verdict.max_scale_error),
         *split_findings(examination.contrasts, examination.captures, rig.calibration, rig.verdict),
         *others,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
@@ -104,23 +105,32 @@ def judge(
         *_precision(estimate, examination, rig),
     ]
     findings += uncertainty_notes(examination.contributions, rig.calibration)
-    return _verdict(_blame_scale(findings), examination.cov)
+    is_weighed = estimate.method == "ml" and estimate.lens is not None
+    return _verdict(_weigh_scale(findings, is_weighed), examination.cov)
 
 
-def _blame_scale(findings: Sequence[Finding]) -> list[Finding]:
-    """Make a corrected scale a reason again where planes or captures contradict: it is their cause.
+def _weigh_scale(findings: Sequence[Finding], is_weighed: bool) -> list[Finding]:
+    """Make squares of another size the cause where planes or captures contradict, a note where none does.
 
     Captures that fit another mounting, though not before or after the others, are a note beside it.
+
+    Args:
+        findings: against extrinsics.
+        is_weighed: whether the method estimates the squares.
     """
+    sizes = [f for f in findings if f.code == SCALE_OFF.code]
     scattered = [f for f in findings if f.code == MOVED.code and not f.figures["place"]]
-    blamed = [f for f in findings if f.code == PLANE_RESIDUAL.code] + scattered
-    if not blamed or all(f.code != SCALE_OFF.code for f in findings):
-        return list(findings)
-    severities: dict[str, Severity] = {SCALE_OFF.code: "error"}
-    return [
-        replace(f, severity="note" if f in scattered else severities.get(f.code, f.severity))
-        for f in findings
-    ]
+    is_blamed = any(f.code == PLANE_RESIDUAL.code for f in findings) or bool(scattered)
+    # Squares that fail by their size alone are seen in planes first.
+    is_seen = any(f.code in (PLANES_APART.code, SHARES_DIFFER.code) for f in findings)
+    severities: dict[int, Severity] = {}
+    for f in sizes:
+        if is_blamed:
+            severities[id(f)] = "error"
+            severities |= {id(other): "note" for other in scattered}
+        elif is_weighed and not (is_seen and f.severity == "error"):
+            severities[id(f)] = "note"
+    return [replace(f, severity=severities.get(id(f), f.severity)) for f in findings]
 
 
 def _verdict(findings: Sequence[Finding], cov: Array) -> tuple[Verdict, tuple[Finding, ...]]:
@@ -252,20 +262,14 @@ def residuals_beyond(metrics: Metrics, limits: QualitySettings) -> list[Finding]
     ]
 
 
-def _scale(
-    scale: tuple[float, float] | None, estimate: CalibrationEstimate, board: Board, limit: float
-) -> list[Finding]:
-    """Compare the camera's distances with the LiDAR's.
-
-    The likelihood estimates the squares, with which it is consistent: their size is a note then.
-    """
+def _scale(scale: tuple[float, float] | None, board: Board, limit: float) -> list[Finding]:
+    """Compare the camera's distances with the LiDAR's."""
     if scale is None or abs(scale[0]) <= max(limit, _SURE * scale[1]):
         return []
-    is_weighed = estimate.method == "ml" and estimate.lens is not None
     is_fail = abs(scale[0]) - _SURE * scale[1] > _SCALE_FAIL * limit
     return [
         SCALE_OFF(
-            severity="note" if is_weighed else failing(is_fail),
+            severity=failing(is_fail),
             scale=scale[0],
             scale_sigma=scale[1],
             square_m=board.square_m / (1 + scale[0]),

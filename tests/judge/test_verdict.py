@@ -245,6 +245,24 @@ def test_squares_of_the_wrong_size_are_told_from_the_distances():
     assert scale.figure("square_m") == pytest.approx(0.0735, abs=5e-4)
 
 
+def test_squares_that_are_wrong_come_before_a_lens_that_is_rough():
+    other = replace(CAMERA, fx_px=1.04 * CAMERA.fx_px, fy_px=1.04 * CAMERA.fy_px)
+    profile = RIG.board.model_copy(update={"square_m": 0.93 * BOARD.square_m})
+    known = replace(KNOWN, lens=LensPrior(other, 0.004, 3.6, 2.2))
+    settings = EstimateSettings("ml", laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005, tolerances=known)
+    wrong = fit_extrinsic(simulate(20, 1, REAL), profile.to_board(), settings)
+    rig = RIG.model_copy(update={"board": profile})
+    examination = validate(wrong, rig, rig.lidars["lidar"], other)
+    verdict, reasons = judge(wrong, examination, rig, "cam", "lidar", 20)
+    assert verdict == "fail"
+    assert [(reason.code, reason.severity) for reason in reasons[:2]] == [
+        ("verdict.scale", "error"),
+        ("verdict.intrinsics", "warning"),
+    ]
+    assert consequences(reasons)["verdict.planes_apart"] == "verdict.scale"
+    assert reasons[0].figure("square_m") == pytest.approx(BOARD.square_m, rel=0.02)
+
+
 @pytest.mark.parametrize(("focal", "severity"), [(1.01, "note"), (1.04, "warning")])
 def test_a_lens_that_the_profile_has_wrong_is_corrected_and_named(focal, severity):
     other = replace(CAMERA, fx_px=focal * CAMERA.fx_px, fy_px=focal * CAMERA.fy_px)
