@@ -143,8 +143,8 @@ def place_boards(lidars: Sequence[LidarBoard], board: Board, settings: EstimateS
         board: the plate.
         settings: what the profile says of this LiDAR.
     """
-    terms, _, reduced = fit_boards(lidars, board, *what_is_known(settings))
-    state, pose_of = terms.state, OWN["pose"]
+    joint = fit_boards(lidars, board, *what_is_known(settings))
+    state, reduced, pose_of = joint.state, joint.reduced, OWN["pose"]
     by_errors = -reduced.own_steps[:, pose_of, :-1]
     # The points lie where the driver puts them, displaced by the lens (`likelihood.rays`).
     T, lens = state.T_lidar_board.copy(), state.layout.z["lens"]

@@ -24,12 +24,12 @@ from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.motion.board_motion import sample_poses
 from lce_rig.calibrate.motion.time_offsets import MIN_MOVING, Motion, estimate_motion
-from lce_rig.calibrate.observations import Clocks, join_scans
+from lce_rig.calibrate.observations import Clocks, group_placements, join_scans
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.plane_and_ends import along_normals
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.session_lens import fit_session_lens
-from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter
+from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter, with_profile
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import ChannelResult
 from lce_rig.core.errors import NotEnoughDataError
@@ -169,7 +169,8 @@ def estimate_observations(
         return by_scatter(start, board, settings)
     priors, usual = what_is_known(settings)
     joint = maximise_likelihood([start.observations], board, [start.T_cam_lidar], priors, usual)
-    return by_likelihood(start, joint, board, settings)
+    estimate = by_likelihood(start, joint, board, group_placements(start.observations))
+    return with_profile(estimate, joint, board, settings)
 
 
 def _with_session_lens(

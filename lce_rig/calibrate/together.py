@@ -8,11 +8,10 @@ import numpy as np
 from lce_rig.calibrate.findings import TWO_PLACES
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import PoseLevels, what_is_known
-from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
 from lce_rig.calibrate.observations import group_shared_placements, scan_key
 from lce_rig.calibrate.options import EstimateSettings
-from lce_rig.calibrate.result import CalibrationEstimate, Start, report
-from lce_rig.calibrate.uncertainty import add_figures, expand_joint, inflate
+from lce_rig.calibrate.result import CalibrationEstimate, Start
+from lce_rig.calibrate.uncertainty import by_likelihood
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
@@ -80,21 +79,17 @@ def calibrate_together(
     for k, (name, start) in enumerate(zip(names, starts, strict=True)):
         own = alone[name]
         n_seen = len(np.unique(placement[[order[o.capture] for o in labelled[k]]]))
-        cov, inflation = inflate(joint, placement, k, n_seen)
-        scales.append(np.full(6, np.sqrt(inflation)))
-        with_noise = add_figures(start.diagnostics, joint, k, inflation)
+        estimate = by_likelihood(start, joint, board, placement, k, n_seen)
+        scales.append(np.full(6, np.sqrt(estimate.diagnostics.covariance_inflation)))
         estimates[name] = replace(
-            report(start, joint.T_cam_lidar[k], cov, board, with_noise),
-            method=own.method,
-            lidar=lidar_of(joint),
+            estimate,
             sensitivities=own.sensitivities,
             lens=own.lens,
-            cost=expand_joint(joint, k, placement),
             estimated_with=tuple(other for other in names if other != name),
             same_scan=own.same_scan,
         )
     scale = np.concatenate(scales)
-    cov = scale[:, None] * (J @ (joint.cov_scatter + joint.cov_constants) @ J.T) * scale
+    cov = scale[:, None] * (J @ joint.cov_z @ J.T) * scale
     return TogetherEstimate(names, estimates, cov)
 
 

@@ -12,7 +12,6 @@ from lce_rig.calibrate.likelihood.layout import OWN, SHIFTS
 from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
 from lce_rig.calibrate.likelihood.model import assemble, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
-from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetric_inverse
 from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
@@ -54,32 +53,46 @@ def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> C
 
 
 def by_likelihood(
-    start: Start, joint: JointEstimate, board: Board, settings: EstimateSettings
+    start: Start,
+    joint: JointEstimate,
+    board: Board,
+    placement: NDArray[np.intp],
+    camera: int = 0,
+    n_seen: int | None = None,
 ) -> CalibrationEstimate:
-    """Report the joint estimate of one camera.
+    """Report the joint estimate of a camera, without errors of its lens and the board.
 
     Certificate, outliers and held-out residuals are those of Algorithm 1, from whose solution it starts.
 
     Args:
         start: Algorithm 1's solution.
-        joint: of the captures that it used.
+        joint: of F captures.
         board: its specification.
-        settings: tolerances.
+        placement: (F,) number of each capture's placement.
+        camera: its number.
+        n_seen: number of placements that it saw; all if None.
     """
-    placement = group_placements(start.observations)
-    cov, inflation = inflate(joint, placement)
-    figures = add_figures(start.diagnostics, joint, 0, inflation)
-    estimate = report(start, joint.T_cam_lidar[0], cov, board, figures)
-    cost = expand_joint(joint, 0, placement)
-    estimate = replace(estimate, method="ml", lidar=lidar_of(joint), cost=cost, lens=settings.lens)
+    cov, inflation = inflate(joint, placement, camera, n_seen)
+    figures = _add_figures(start.diagnostics, joint, camera, inflation)
+    estimate = report(start, joint.T_cam_lidar[camera], cov, board, figures)
+    return replace(estimate, method="ml", lidar=lidar_of(joint), cost=_expand_joint(joint, camera, placement))
+
+
+def with_profile(
+    estimate: CalibrationEstimate, joint: JointEstimate, board: Board, settings: EstimateSettings
+) -> CalibrationEstimate:
+    """Add the effects of the errors of lens and board to the estimate of one camera."""
     if settings.tolerances is None:
         return estimate
-    variants = vary(start.observations, board, settings.lens, bends_scans=False)
-    moves = moves_under(joint, start.observations, variants, board)
-    return replace(estimate, sensitivities=sensitivities_of(variants, moves, settings.tolerances))
+    used = list(estimate.observations.values())
+    variants = vary(used, board, settings.lens, bends_scans=False)
+    sensitivities = sensitivities_of(
+        variants, _moves_under(joint, used, variants, board), settings.tolerances
+    )
+    return replace(estimate, lens=settings.lens, sensitivities=sensitivities)
 
 
-def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Quadratics:
+def _expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Quadratics:
     """Expand the cost about a joint estimate, in the extrinsics alone, the camera's own first.
 
     Constant errors are held fixed.
@@ -91,13 +104,13 @@ def expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp])
     """
     n_cameras = len(joint.T_cam_lidar)
     order = [camera, *(c for c in range(n_cameras) if c != camera)]
-    mine = np.concatenate([joint.layout.camera(c) for c in order])
+    mine = np.concatenate([joint.state.layout.camera(c) for c in order])
     # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
     prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
     return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)), placement=placement)
 
 
-def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:
+def _add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:
     """Replace the start's constant errors, noise levels and covariance parts by those of a joint estimate."""
     levels, state, J = joint.levels, joint.state, joint.to_extrinsics[camera]
     shifts = dict(zip(SHIFTS, state.shifts.tolist(), strict=True))
@@ -105,7 +118,7 @@ def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation
         start,
         covariance_inflation=inflation,
         edge_shift_m=shifts["d_0"],
-        edge_shift_sigma_m=float(joint.sigma[joint.layout.z["shifts"]][0]),
+        edge_shift_sigma_m=float(np.sqrt(np.diag(joint.cov_z)[state.layout.z["shifts"]][0])),
         edge_shift_echo_m=shifts["d_1"],
         edge_shift_blended_m=shifts["d_2"],
         edge_shift_blended_echo_m=shifts["d_3"],
@@ -119,10 +132,11 @@ def add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation
         noise_depth_m=levels.depth_m,
         noise_across_m=levels.across_m,
     )
-    return with_parts(figures, J @ joint.cov_scatter @ J.T, J @ joint.cov_constants @ J.T)
+    scatter, constants = joint.covariances
+    return with_parts(figures, J @ scatter @ J.T, J @ constants @ J.T)
 
 
-def moves_under(
+def _moves_under(
     joint: JointEstimate, used: Sequence[Observation], variants: Sequence[Variant], board: Board
 ) -> Array:
     """Compute how far errors of the profile move one camera's extrinsics, to first order.
@@ -136,22 +150,25 @@ def moves_under(
     Returns:
         (V, 6) tangents (translation m, rotation rad).
     """
-    reduced = assemble(joint.terms, joint.levels, joint.priors)
-    G = len(reduced.gradient)
+    terms, own_steps = joint.terms, joint.reduced.own_steps
+    G = joint.state.layout.z.size
     changes = np.zeros((len(variants), G))
     of_images = [k for k, variant in enumerate(variants) if variant.board == board]
     moves = np.array([variants[k].pose_moves for k in of_images])
-    by_moves = joint.terms.gradients_by_pose_moves(joint.levels, moves)
-    by_own, by_common = by_moves[:, : OWN.size], by_moves[:, OWN.size :]
-    changes[of_images] = np.sum(by_common - np.swapaxes(reduced.own_steps[:, :, :G], 1, 2) @ by_own, axis=0).T
-    lidars = {o.capture: o.lidar for o in used}
+    # The gradients by [y, z] move by J^T C^-1 times how far the images' poses do.
+    images, rows, place = terms.images[0], terms.image_rows[0], joint.state.layout.image_row(0)[:-1]
+    weighted = -np.linalg.solve(images.total_cov(joint.levels.pose), np.moveaxis(moves, 0, -1))
+    gradients = np.zeros((len(terms.trust), OWN.size + G, len(moves)))
+    gradients[images.capture[:, None], place] = np.swapaxes(rows[:, :, :-1], 1, 2) @ weighted
+    gradients *= terms.trust[:, None, None]
+    by_own, by_common = gradients[:, : OWN.size], gradients[:, OWN.size :]
+    changes[of_images] = np.sum(by_common - np.swapaxes(own_steps[:, :, :G], 1, 2) @ by_own, axis=0).T
+    lidars = [o.lidar for o in sorted(used, key=lambda o: o.capture)]
     for k, variant in enumerate(variants):
         if variant.board != board:
-            scans = stack_scans(
-                [interior(lidars[name], variant.board) for name in sorted(lidars)], variant.board
-            )
-            terms = linearise(scans, joint.terms.images, variant.board, joint.state, joint.trust)
-            moved = assemble(terms, joint.levels, joint.priors).cost
+            scans = stack_scans([interior(lidar, variant.board) for lidar in lidars], variant.board)
+            assumed = linearise(scans, terms.images, variant.board, joint.state, terms.trust)
+            moved = assemble(assumed, joint.levels, joint.priors).cost
             changes[k] = (moved.gradients - joint.cost.gradients).sum(axis=0)
     return np.asarray(-(joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, changes.T)).T)
 

@@ -16,7 +16,7 @@ from benchmarks.still_sessions import StillSession, still_session
 from benchmarks.tables import print_head, print_row, rms
 from lce_rig.calibrate import CalibrateOptions, EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.likelihood.end_density import density
-from lce_rig.calibrate.likelihood.fit import to_extrinsic
+from lce_rig.calibrate.likelihood.fit import extrinsics_by_unknowns
 from lce_rig.calibrate.likelihood.images import stack_images
 from lce_rig.calibrate.likelihood.layout import END, SHIFTS, State
 from lce_rig.calibrate.likelihood.levels import MOST_LOST, Levels, Priors
@@ -217,11 +217,11 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[B
     priors = Priors(offset_m=options.range_offset_sigma_m, shift_m=EDGE_SHIFT_SIGMA_M)
     for session, terms in zip(sessions, at_truth, strict=True):
         estimate = fit_extrinsic(session.candidates, board, options)
-        bound = cramer_rao_bound(terms, levels, priors, session.T_cam_lidar)
+        bound = cramer_rao_bound(terms, levels, priors)
         yield BoundedRun(difference(estimate.T_cam_lidar, session.T_cam_lidar), estimate.cov, bound)
 
 
-def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: Array) -> Array:
+def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors) -> Array:
     """Compute the covariance (6, 6) below which no estimate gets on average, from a session's captures.
 
     The inverse of the information of ranges, ring ends and corners at the true poses, with the noise that
@@ -231,10 +231,9 @@ def cramer_rao_bound(terms: Terms, levels: Levels, priors: Priors, T_cam_lidar: 
         terms: at the truth.
         levels: of the simulated noise.
         priors: of the constant errors.
-        T_cam_lidar: (4, 4) the truth.
     """
     information = assemble(terms, levels, priors).cost.information
-    J = to_extrinsic(T_cam_lidar, 0, terms.state.layout)
+    (J,) = extrinsics_by_unknowns(terms.state)
     return np.asarray(J @ np.linalg.inv(information) @ J.T)
 
 

@@ -17,6 +17,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from lce_rig.calibrate.likelihood.layout import Indices
 from lce_rig.calibrate.likelihood.rays import EdgeRows
 from lce_rig.core.geometry import Array
 
@@ -81,39 +82,34 @@ def information(blur: Array, lost_share: float) -> Array:
     return np.asarray(inside * np.minimum(_BLURS[-1] / np.maximum(blur, _NARROWEST), 1.0) ** 2)
 
 
-def edge_system(
-    edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float, n_captures: int
-) -> Array:
-    """Expand -2 ln p of the ring ends to second order, by capture and ring: (F, L, 24, 24).
+def edge_products(
+    edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float
+) -> tuple[Indices, Array]:
+    """Expand -2 ln p of the ring ends to second order, by capture and ring.
 
     With J a row without its residual: J J^T times the information, J times the score in the last column, and
     -2 ln p itself in the corner. The information is the mean over all ring ends of such a blur, as that of a
     single one is zero in the middle of its interval and unusable as a Hessian.
+
+    Returns:
+        Numbers (n,) of pairs of capture and ring, `EdgeRows.group`, and the products (n, 25, 25) of each.
     """
-    size = edges.rows.shape[1]
-    system = np.zeros((n_captures * edges.n_rings, size, size))
-    if len(edges.rows):
-        weight, score, value = expand_ends(edges, edge_rad, backed_rad, lost_share)
-        J = edges.rows[:, :-1]
-        weighted = np.concatenate([J * weight[:, None], score[:, None]], axis=1)
-        bounds = np.flatnonzero(np.diff(edges.group, prepend=-1, append=-1))
-        groups, counts = edges.group[bounds[:-1]], np.diff(bounds)
-        # A ring has two ends on a board, and more where it is hidden in part.
-        for n in np.unique(counts).tolist():
-            at = bounds[:-1][counts == n, None] + np.arange(n)
-            system[groups[counts == n], :-1] = np.swapaxes(J[at], 1, 2) @ weighted[at]
-        system[groups, -1, :-1] = system[groups, :-1, -1]
-        system[groups, -1, -1] = np.add.reduceat(value, bounds[:-1])
-    return system.reshape(n_captures, edges.n_rings, size, size)
-
-
-def expand_ends(
-    edges: EdgeRows, edge_rad: float, backed_rad: float, lost_share: float
-) -> tuple[Array, Array, Array]:
-    """Compute the factors (M,) of J J^T and of J in `edge_system`, and -2 ln p."""
     D, blur = edges.step_m, edges.blur_m(edge_rad, backed_rad) / edges.step_m
     p, slope = density(edges.rows[:, -1] / D, blur, lost_share)
-    return information(blur, lost_share) / D**2, -slope / p / D, -2 * np.log(p / D)
+    weight, score = information(blur, lost_share) / D**2, -slope / p / D
+    J = edges.rows[:, :-1]
+    weighted = np.concatenate([J * weight[:, None], score[:, None]], axis=1)
+    first = np.flatnonzero(np.diff(edges.group, prepend=-1))
+    counts = np.diff(first, append=len(J))
+    products = np.zeros((len(first), J.shape[1] + 1, J.shape[1] + 1))
+    # A ring has two ends on a board, and more where it is hidden in part.
+    for n in np.unique(counts).tolist():
+        at = first[counts == n, None] + np.arange(n)
+        products[counts == n, :-1] = np.swapaxes(J[at], 1, 2) @ weighted[at]
+    products[:, -1, :-1] = products[:, :-1, -1]
+    if len(J):
+        products[:, -1, -1] = np.add.reduceat(-2 * np.log(p / D), first)
+    return edges.group[first], products
 
 
 @lru_cache(maxsize=1)

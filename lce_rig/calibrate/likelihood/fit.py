@@ -5,17 +5,18 @@ Fisher scoring: Gauss-Newton on ranges and images, mean information and score fo
 (restricted maximum likelihood), so that residuals reduced by the fit are not mistaken for small noise.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
-from lce_rig.calibrate.likelihood.layout import Layout, State
+from lce_rig.calibrate.likelihood.layout import State
 from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, PoseLevels, Priors
-from lce_rig.calibrate.likelihood.model import Assembly, Reduced, Terms, assemble, linearise
-from lce_rig.calibrate.likelihood.rays import StackedScans, interior, lens_fields, stack_scans
+from lce_rig.calibrate.likelihood.model import Reduced, Terms, assemble, evidence, linearise
+from lce_rig.calibrate.likelihood.rays import interior, lens_fields, stack_scans
 from lce_rig.calibrate.observations import group_shared_placements
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse
 from lce_rig.core.board import Board
@@ -43,28 +44,16 @@ _LONGEST = 5.0
 
 @dataclass(frozen=True, eq=False)
 class JointEstimate:
-    """The optimum.
+    """The optimum, with G unknowns z that the captures share.
 
     Attributes:
-        T_cam_lidar: (C, 4, 4) as reported, `to_extrinsic`.
-        cov: (C, 6, 6) of each, everything else marginalised, tangent (translation m, rotation rad).
-        cov_scatter, cov_constants: (G, G) of the unknowns z: the part that differs between sessions, and that
-            of constant errors.
-        to_extrinsics: (C, 6, G) derivative of each result's tangent by z.
-        levels: of the noise.
-        cost: of the F captures at the optimum, in z.
         terms: linearised there.
+        levels: of the noise.
         priors: of the constants.
     """
 
-    T_cam_lidar: Array
-    cov: Array
-    cov_scatter: Array
-    cov_constants: Array
-    to_extrinsics: Array
-    levels: Levels
-    cost: Quadratics
     terms: Terms
+    levels: Levels
     priors: Priors
 
     @property
@@ -72,20 +61,47 @@ class JointEstimate:
         """All unknowns at the optimum."""
         return self.terms.state
 
-    @property
-    def layout(self) -> Layout:
-        """Places of the unknowns."""
-        return self.terms.state.layout
+    @cached_property
+    def reduced(self) -> Reduced:
+        """The normal equations."""
+        return assemble(self.terms, self.levels, self.priors)
 
     @property
-    def sigma(self) -> Array:
-        """Standard deviations (G,) of z."""
-        return np.sqrt(np.diag(self.cov_scatter + self.cov_constants))
+    def cost(self) -> Quadratics:
+        """Of the F captures, in z."""
+        return self.reduced.cost
+
+    @cached_property
+    def covariances(self) -> tuple[Array, Array]:
+        """Parts of the covariance of z (G, G): what differs between sessions, and that of constant errors.
+
+        With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
+        """
+        inverse, claimed, scales = self.cost.covariance(), self.cost.prior.copy(), self.state.layout.scales
+        if not self.priors.scale_is_claimed:
+            claimed[scales, scales] = 0.0
+        return inverse @ self.cost.hessians.sum(axis=0) @ inverse, inverse @ claimed @ inverse
+
+    @cached_property
+    def cov_z(self) -> Array:
+        """Their sum (G, G)."""
+        return np.asarray(sum(self.covariances))
+
+    @cached_property
+    def to_extrinsics(self) -> Array:
+        """(C, 6, G) derivative of each camera's extrinsics, as reported, by z."""
+        return extrinsics_by_unknowns(self.state)
 
     @property
-    def trust(self) -> Array:
-        """Weight (F,) of each capture, by name."""
-        return self.terms.trust
+    def T_cam_lidar(self) -> Array:
+        """(C, 4, 4) as reported."""
+        return perturb(self.state.T_cam_lidar, self.to_extrinsics @ self.state.z)
+
+    @property
+    def cov(self) -> Array:
+        """(C, 6, 6) of each, everything else marginalised, tangent (translation m, rotation rad)."""
+        J = self.to_extrinsics
+        return np.asarray(J @ self.cov_z @ np.swapaxes(J, 1, 2))
 
 
 def maximise_likelihood(
@@ -106,122 +122,91 @@ def maximise_likelihood(
         usual: typical noise levels.
         pose_ratios: for each camera, ratio of its images' errors beyond corner noise; 1 if None.
     """
-    priors, usual = priors or Priors(), usual or Levels()
-    usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
     by_name = {o.capture: (o, T) for camera, T in zip(cameras, T_cam_lidar, strict=True) for o in camera}
     order = {name: k for k, name in enumerate(sorted(by_name))}
     scans = stack_scans([interior(by_name[name][0].lidar, board) for name in order], board)
-    images = tuple(stack_camera(camera, order) for camera in cameras)
+    images = [
+        stack_images(np.array([order[o.capture] for o in camera]), [o.image for o in camera])
+        for camera in cameras
+    ]
     if pose_ratios is not None:
-        images = tuple(p.with_larger_errors(r) for p, r in zip(images, pose_ratios, strict=True))
+        images = [each.with_larger_errors(ratios) for each, ratios in zip(images, pose_ratios, strict=True)]
     T_lidar_board = np.array([invert(T) @ o.image.T_cam_board for o, T in (by_name[name] for name in order)])
     state = State.without_errors(np.array(T_cam_lidar), T_lidar_board, len(scans.rings))
-    search = _Search(scans, images, board, priors)
     placement = group_shared_placements(cameras, order)
-    now = usual
     terms = linearise(scans, images, board, state, _once(placement, images))
-    for blur_rad in _BLURS_RAD:
-        terms = search.settle(terms, now.blurred(blur_rad), _STEPS, _NEAR)
-    for k, n_rounds in enumerate(_LEVEL_ROUNDS):
-        terms = search.settle(terms, now, _STEPS, _NEAR)
-        if k == len(_LEVEL_ROUNDS) - 1:
-            priors = priors.freed(terms.state.scale)
-            search = replace(search, priors=priors)
-        now = fit_levels(terms, now, usual, priors, n_rounds)
-        terms = replace(terms, trust=trust_captures(terms, now, priors, placement))
-    terms = search.settle(terms, now, _LAST_STEPS, _SETTLED)
-    return _summarise(terms, now, priors)
+    return _maximise(terms, priors or Priors(), usual or Levels(), placement)
 
 
-def stack_camera(observations: Sequence[Observation], order: Mapping[str, int]) -> StackedImages:
-    """Stack one camera's images; `order` gives each capture's place by name."""
-    capture = np.array([order[o.capture] for o in observations], dtype=np.intp)
-    return stack_images(capture, [o.image for o in observations])
-
-
-def fit_boards(
-    lidars: Sequence[LidarBoard], board: Board, priors: Priors, usual: Levels
-) -> tuple[Terms, Levels, Reduced]:
-    """Estimate the pose of each board and the constant errors from the scans of one LiDAR alone.
+def fit_boards(lidars: Sequence[LidarBoard], board: Board, priors: Priors, usual: Levels) -> JointEstimate:
+    """Estimate the pose of each board and the constant errors from F scans of one LiDAR alone.
 
     Args:
-        lidars: the boards in F scans.
+        lidars: the boards.
         board: the board.
         priors: of the constant errors.
         usual: typical noise levels.
-
-    Returns:
-        The terms, without cameras, and the levels at the optimum, and the normal equations there.
     """
-    usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
     scans = stack_scans([interior(lidar, board) for lidar in lidars], board)
     T_lidar_board = np.array([lidar.T_lidar_board for lidar in lidars])
     state = State.without_errors(np.zeros((0, 4, 4)), T_lidar_board, len(scans.rings))
-    search, levels = _Search(scans, (), board, priors), usual
-    terms = linearise(scans, (), board, state)
+    return _maximise(linearise(scans, (), board, state), priors, usual)
+
+
+def _maximise(
+    terms: Terms, priors: Priors, usual: Levels, placement: NDArray[np.intp] | None = None
+) -> JointEstimate:
+    """Alternate between steps towards the optimum and fits of the noise levels.
+
+    Captures are weighed by how they disagree where their placements (F,) are given.
+    """
+    now = usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
     for blur_rad in _BLURS_RAD:
-        terms = search.settle(terms, levels.blurred(blur_rad), _STEPS, _NEAR)
-    for n_rounds in _LEVEL_ROUNDS:
-        terms = search.settle(terms, levels, _STEPS, _NEAR)
-        levels = fit_levels(terms, levels, usual, priors, n_rounds)
-    terms = search.settle(terms, levels, _LAST_STEPS, _SETTLED)
-    return terms, levels, assemble(terms, levels, priors)
+        terms = settle(terms, now.blurred(blur_rad), priors, _STEPS, _NEAR)
+    for k, n_rounds in enumerate(_LEVEL_ROUNDS):
+        terms = settle(terms, now, priors, _STEPS, _NEAR)
+        if k == len(_LEVEL_ROUNDS) - 1:
+            priors = priors.freed(terms.state.scale)
+        now = fit_levels(terms, now, usual, priors, n_rounds)
+        if placement is not None:
+            terms = replace(terms, trust=trust_captures(terms, now, priors, placement))
+    return JointEstimate(settle(terms, now, priors, _LAST_STEPS, _SETTLED), now, priors)
 
 
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """Steps of Fisher scoring towards the optimum at given levels of noise."""
-
-    scans: StackedScans
-    images: tuple[StackedImages, ...]
-    board: Board
-    priors: Priors
-
-    def settle(self, terms: Terms, levels: Levels, n_steps: int, short: float) -> Terms:
-        """Find the optimum in at most so many steps, until the next one is short."""
-        mixing = _Mixing()
-        for _ in range(n_steps):
-            reduced = assemble(terms, levels, self.priors)
-            if reduced.decrement < short**2:
-                break
-            state = terms.state.moved(*mixing.mix(reduced))
-            terms = linearise(self.scans, self.images, self.board, state, terms.trust)
-        return terms
-
-
-class _Mixing:
-    """Corrects steps by how earlier ones turned out (Anderson mixing).
+def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: float) -> Terms:
+    """Find the optimum at given levels in at most so many steps, until the next one is short.
 
     The mean information of ring ends is not the curvature of their cost: plain steps are a fifth of what
-    they should be in some directions, and leap back and forth in others. From steps s_k and moves m_k,
+    they should be in some directions, and leap back and forth in others. Steps are therefore corrected by how
+    earlier ones turned out (Anderson mixing). From steps s_k and moves m_k,
 
         m = s - (dM + dS) gamma,    gamma = argmin |s - dS gamma|, in standard deviations of the unknowns
 
     References:
         Walker, Ni, "Anderson acceleration for fixed-point iterations", SIAM J. Numerical Analysis, 2011.
     """
-
-    def __init__(self) -> None:
-        self._steps: list[Array] = []
-        self._moves: list[Array] = []
-
-    def mix(self, reduced: Reduced) -> tuple[Array, Array]:
-        """Return the move z (G,), y (F, 7) for the step of normal equations."""
+    steps: list[Array] = []
+    moves: list[Array] = []
+    for _ in range(n_steps):
+        reduced = assemble(terms, levels, priors)
+        if reduced.decrement < short**2:
+            break
         z, y = reduced.step
-        step = np.append(z, y)
-        move = step
-        self._steps.append(step)
-        if len(self._steps) > _PLAIN:
+        move = step = np.append(z, y)
+        steps.append(step)
+        if len(steps) > _PLAIN:
             of_own = np.diagonal(reduced.of_own, axis1=1, axis2=2)
             weight = np.sqrt(np.append(np.diag(reduced.cost.information), of_own))
-            dS = np.diff(self._steps[-_MIXED - 1 :], axis=0).T
-            dM = np.transpose(self._moves[-dS.shape[1] :])
+            dS = np.diff(steps[-_MIXED - 1 :], axis=0).T
+            dM = np.transpose(moves[-dS.shape[1] :])
             gamma = np.linalg.lstsq(weight[:, None] * dS, weight * step, rcond=1e-6)[0]
             move = step - (dM + dS) @ gamma
             length, plain = (float(np.linalg.norm(weight * each)) for each in (move, step))
             move = move * min(1.0, _LONGEST * plain / max(length, np.finfo(float).tiny))
-        self._moves.append(move)
-        return move[: len(z)], move[len(z) :].reshape(y.shape)
+        moves.append(move)
+        state = terms.state.moved(move[: len(z)], move[len(z) :].reshape(y.shape))
+        terms = linearise(terms.scans, terms.images, terms.board, state, terms.trust)
+    return terms
 
 
 def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rounds: int) -> Levels:
@@ -239,7 +224,6 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rou
     names = [name for name in LOG_SIGMA if name != "laser_m" or usual.laser_m > NO_LASER_M]
     sigma = np.array([LOG_SIGMA[name] for name in names])
     middle = np.log([getattr(usual, name) for name in names])
-    assembly = Assembly(terms, priors)
     # Thousands of ranges and a few captures determine one level each: without a scale, the search zigzags.
     n_measured = _count_measurements(terms, start)
     scale = np.sqrt(4 * np.array([n_measured[name] for name in names]) + 2 / sigma**2)
@@ -248,9 +232,9 @@ def fit_levels(terms: Terms, start: Levels, usual: Levels, priors: Priors, n_rou
         return replace(usual, **dict(zip(names, np.exp(x / scale).tolist(), strict=True)))
 
     def cost(x: Array) -> tuple[float, Array]:
-        evidence, slopes = assembly.evidence(levels_at(x), names)
+        value, slopes = evidence(terms, levels_at(x), priors, names)
         off = (x / scale - middle) / sigma
-        return evidence + float(off @ off), (slopes + 2 * off / sigma) / scale
+        return value + float(off @ off), (slopes + 2 * off / sigma) / scale
 
     highest = np.where(np.array(names) == "lost_share", np.log(MOST_LOST), middle + _ABOVE)
     bounds = list(zip((middle + _BELOW) * scale, highest * scale, strict=True))
@@ -277,7 +261,7 @@ def _count_measurements(terms: Terms, levels: Levels) -> dict[str, float]:
         "spin_rad": 0.5 * n_images,
         "depth_m": float(n_images),
         "across_m": 2.0 * n_images,
-        "laser_m": float(len(terms.rings)),
+        "laser_m": float(len(terms.scans.rings)),
     }
 
 
@@ -299,7 +283,7 @@ def trust_captures(terms: Terms, levels: Levels, priors: Priors, placement: NDAr
     """
     once = _once(placement, terms.images)
     cost = replace(assemble(replace(terms, trust=once), levels, priors).cost, placement=placement)
-    J = np.concatenate(_to_extrinsics(terms.state))
+    J = np.concatenate(extrinsics_by_unknowns(terms.state))
     H, of_placement = cost.information, np.tensordot(cost.groups, cost.hessians, axes=1)
     without = symmetric_inverse(H - of_placement)
     moves = (without @ (cost.groups @ cost.gradients)[..., None])[..., 0] @ J.T
@@ -323,54 +307,17 @@ def _once(placement: NDArray[np.intp], images: Sequence[StackedImages]) -> Array
     return 1 / fewest
 
 
-def to_extrinsic(T_cam_lidar: Array, camera: int, layout: Layout) -> Array:
-    """Differentiate a camera's reported extrinsics by the unknowns z.
+def extrinsics_by_unknowns(state: State) -> Array:
+    """Differentiate the cameras' reported extrinsics by the unknowns z: (C, 6, G).
 
     Straight ahead of the camera, a lens beside the axis equals a shift of the whole LiDAR. That shift is part
     of the extrinsics, which apply to points as the driver gives them.
-
-    Args:
-        T_cam_lidar: (4, 4) for points without that displacement.
-        camera: its number.
-        layout: of the G unknowns.
-
-    Returns:
-        (6, G).
     """
-    J = np.zeros((6, layout.z.size))
-    J[:, layout.camera(camera)] = np.eye(6)
-    # The third row of R is the camera's line of sight in frame lidar.
-    beside = lens_fields(T_cam_lidar[2:3, :3])[0, :, 0]
-    J[:3, layout.z["lens"].start] = T_cam_lidar[:3, :3] @ beside
+    layout = state.layout
+    J = np.zeros((layout.n_cameras, 6, layout.z.size))
+    for c, T_cam_lidar in enumerate(state.T_cam_lidar):
+        J[c][:, layout.camera(c)] = np.eye(6)
+        # The third row of R is the camera's line of sight in frame lidar.
+        beside = lens_fields(T_cam_lidar[2:3, :3])[0, :, 0]
+        J[c, :3, layout.z["lens"].start] = T_cam_lidar[:3, :3] @ beside
     return J
-
-
-def _to_extrinsics(state: State) -> Array:
-    """Stack `to_extrinsic` of all cameras: (C, 6, G)."""
-    return np.array([to_extrinsic(T, c, state.layout) for c, T in enumerate(state.T_cam_lidar)])
-
-
-def _summarise(terms: Terms, levels: Levels, priors: Priors) -> JointEstimate:
-    """Split the covariance (G, G) by its causes: noise of the captures, and constant errors.
-
-    With information H = sum_k H_k + P, H^-1 = H^-1 (sum_k H_k) H^-1 + H^-1 P H^-1.
-    """
-    state, cost = terms.state, assemble(terms, levels, priors).cost
-    inverse, claimed = cost.covariance(), cost.prior
-    if not priors.scale_is_claimed:
-        claimed = claimed.copy()
-        claimed[state.layout.scales, state.layout.scales] = 0.0
-    scatter = inverse @ cost.hessians.sum(axis=0) @ inverse
-    constants = inverse @ claimed @ inverse
-    J = _to_extrinsics(state)
-    return JointEstimate(
-        T_cam_lidar=perturb(state.T_cam_lidar, J @ state.z),
-        cov=J @ (scatter + constants) @ np.swapaxes(J, 1, 2),
-        cov_scatter=scatter,
-        cov_constants=constants,
-        to_extrinsics=J,
-        levels=levels,
-        cost=cost,
-        terms=terms,
-        priors=priors,
-    )

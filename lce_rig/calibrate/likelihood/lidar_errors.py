@@ -66,20 +66,22 @@ def estimate_lidar(
     joint = maximise_likelihood(apart, board, T_cam_lidar, priors, usual)
     known, prior = lidar_of(joint), _prior_sigma(joint)
     rings = np.concatenate([o.lidar.ring for session in sessions for o in session])
-    n_points = np.array([np.count_nonzero(rings == ring) for ring in joint.terms.rings])
+    n_points = np.array([np.count_nonzero(rings == ring) for ring in known.rings])
     return LidarErrors(known, prior, tuple(len(session) for session in sessions), n_points)
 
 
 def lidar_of(joint: JointEstimate) -> KnownLidar:
     """Read the LiDAR's constant errors from a joint estimate; a laser's deviations are about the mean."""
-    layout, L = joint.layout, len(joint.terms.rings)
+    layout, rings = joint.state.layout, joint.terms.scans.rings.astype(np.intp)
+    L = layout.n_rings
     cov, about_mean = joint.cost.covariance(), np.eye(L) - 1 / L
     sigma = np.sqrt([np.diag(about_mean @ cov[at[:, None], at] @ about_mean) for at in layout.lasers])
     # Lasers that met few boards are known as well as without them.
     sigma = np.minimum(sigma * WIDENED[:, None], np.maximum(sigma, _prior_sigma(joint)[:, None]))
     lens = layout.z["lens"]
-    rings = joint.terms.rings.astype(np.intp)
-    return KnownLidar(rings, joint.state.lasers, sigma, joint.state.z[lens], joint.sigma[lens])
+    return KnownLidar(
+        rings, joint.state.lasers, sigma, joint.state.z[lens], np.sqrt(np.diag(joint.cov_z))[lens]
+    )
 
 
 def _prior_sigma(joint: JointEstimate) -> Array:

@@ -269,15 +269,14 @@ def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tupl
     With weights w_i, sigma^2 I is diag(sigma^2 / w_i^2), and n the sum of their squares.
 
     Returns:
-        The weighted sums (F, L, 11, 11) and the log (F,) of the covariance's determinant.
+        The weighted sums (F, L, 11, 11) and the logs (F, L) of the covariances' determinants.
     """
     n = ranges.n_returns
     shared = ranges.sums[..., RETURN["range"].start, :]
     total = sigma_m**2 + shared[..., RETURN["range"].start] * sigma_ring_m**2
     k = (sigma_ring_m**2 / total)[..., None, None]
     weighted = (ranges.sums - k * shared[..., :, None] * shared[..., None, :]) / sigma_m**2
-    log_volume = np.where(n > 0, (n - 1) * np.log(sigma_m**2) + np.log(total), 0.0)
-    return weighted, np.asarray(log_volume.sum(axis=1))
+    return weighted, np.where(n > 0, (n - 1) * np.log(sigma_m**2) + np.log(total), 0.0)
 
 
 def ring_systems(ranges: RangeSums, weighted: Array) -> Array:
@@ -295,7 +294,7 @@ class EdgeRows:
 
     Attributes:
         capture, ring: (M,).
-        rows: (M, 24) in columns of `END`, e in m.
+        rows: (M, 25) in columns of `END`, e in m.
         step_m: (M,) D.
         range_m: (M,) to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
@@ -358,7 +357,7 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     of_plate = outwards[:, 0] ** 2 - outwards[:, 1] ** 2
     by_azimuth = np.sum(sideways * scans.end_fields[:, :, 0], axis=1)
     by_shifts = np.column_stack([across * of_width, of_plate, -by_azimuth, -sideways[:, 2], scans.end_beam])
-    rows[:, END["shifts"]] = by_shifts
+    rows[:, END["shifts"]], rows[:, END["own_shift"]] = by_shifts, by_shifts[:, :1]
     rows[:, -1] = inside_m + rows[:, END.of(["shifts"])] @ state.shifts - step_m / 2
     rows[:, -1] += by_shifts[:, 0] * state.own_shift_m[scans.end_capture]
     is_backed = scans.end_background[:, BLENDS] > 0

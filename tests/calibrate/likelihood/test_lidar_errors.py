@@ -67,7 +67,7 @@ def test_errors_known_from_other_sessions_sharpen_a_later_one():
     off = difference(helped.T_cam_lidar[0], T_FORWARD)
     assert off @ np.linalg.solve(helped.cov[0], off) < 22.5
     ranges = [
-        joint.state.lasers[0] - joint.state.lasers[0].mean() - true_ranges(3)[joint.terms.rings]
+        joint.state.lasers[0] - joint.state.lasers[0].mean() - true_ranges(3)[joint.terms.scans.rings]
         for joint in (plain, helped)
     ]
     assert np.std(ranges[1]) < np.std(ranges[0])

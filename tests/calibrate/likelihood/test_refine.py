@@ -12,8 +12,9 @@ from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.layout import SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.observations import group_placements
+from lce_rig.calibrate.quadratics import jackknife_scatter
 from lce_rig.calibrate.tolerances import vary
-from lce_rig.calibrate.uncertainty import inflate
+from lce_rig.calibrate.uncertainty import inflate, widen
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, simulate
 
@@ -175,11 +176,13 @@ def test_hard_captures_are_no_worse_than_claimed(scenario):
 def test_captures_that_disagree_by_more_than_the_model_knows_widen_the_claim():
     seen = observations(20, 6, REAL)
     good = maximise_likelihood([seen], BOARD, [T_FORWARD])
-    assert inflate(good, group_placements(seen))[1] < 2
-    too_sure = replace(good, cov=good.cov / 20)
-    cov, factor = inflate(too_sure, group_placements(seen))
+    placement = group_placements(seen)
+    assert inflate(good, placement)[1] < 2
+    spread = jackknife_scatter(replace(good.cost, placement=placement).moves() @ good.to_extrinsics[0].T)
+    too_sure = good.cov[0] / 20
+    cov, factor = widen(too_sure, spread, placement.max() + 1)
     assert factor > 5
-    assert np.allclose(cov, factor * too_sure.cov[0])
+    assert np.allclose(cov, factor * too_sure)
 
 
 def test_edges_before_something_close_behind_have_a_shift_of_their_own():
