@@ -1,11 +1,14 @@
-"""What several workers of a test run need is made by the first of them, and read by the others."""
+"""What many tests share: values made once a run, changed profiles, waiting, full disks."""
 
 import fcntl
 import os
 import pickle
-from collections.abc import Callable
+import resource
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 
@@ -41,3 +44,57 @@ def compute_once(name: str, compute: Callable[[], T]) -> T:
     path = make_once(name, lambda path: path.write_bytes(pickle.dumps(compute())))
     value: T = pickle.loads(path.read_bytes())
     return value
+
+
+def changed(settings: Any, **values: object) -> Any:
+    """Copy a profile or a part of it with other values, as of cameras__cam__driver__device."""
+    for path, value in values.items():
+        key, _, rest = path.partition("__")
+        is_dict = isinstance(settings, dict)
+        if rest:
+            value = changed(settings[key] if is_dict else getattr(settings, key), **{rest: value})
+        settings = {**settings, key: value} if is_dict else settings.model_copy(update={key: value})
+    return settings
+
+
+def half_size(rig: Any) -> Any:
+    """Let cameras take images of half the size, which are rendered and searched in a quarter of the time."""
+    for name, camera in rig.cameras.items():
+        lens = camera.intrinsics.model_dump()
+        halves = {key: lens[key] / 2 for key in ("fx_px", "fy_px", "cx_px", "cy_px")}
+        small = tuple(length // 2 for length in camera.resolution_px)
+        half = changed(camera, resolution_px=small, intrinsics=changed(camera.intrinsics, **halves))
+        rig = changed(rig, **{f"cameras__{name}": half})
+    return rig
+
+
+def wait_until(is_so: Callable[[], object], patience_s: float = 20.0) -> None:
+    """Wait until something is so; a busy computer takes long."""
+    deadline_s = time.monotonic() + patience_s
+    while not is_so():
+        assert time.monotonic() < deadline_s, "it never came to be"
+        time.sleep(0.005)
+
+
+def has_ended(pid: str | int) -> bool:
+    """Tell whether a process is gone, or only waits to be reaped."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0] in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+@contextmanager
+def files_up_to(n_bytes: int) -> Iterator[None]:
+    """Let no file grow beyond a size, as on a disk that is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    """Read every file below a folder."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -17,7 +17,7 @@ import numpy as np
 from wire.davis import RandomDavis
 from wire.reel import Reel, make_reel
 from wire.rig import WireRig
-from wire.sync_board import WireSyncBoard
+from wire.sync_board import FakeBoard
 from wire.timing import LOOP_NS
 
 from benchmarks.tables import print_head, print_row
@@ -106,8 +106,8 @@ def run_load(
     camera_report = folder / "camera.json"
     with ExitStack() as stack:
         if has_board:
-            sync = SyncSettings(device=stack.enter_context(WireSyncBoard()).path)
-            rig = rig.model_copy(update={"sync": sync})
+            board = stack.enter_context(FakeBoard(drift=30e-6, period_s=0.1, knows_utc=True))
+            rig = rig.model_copy(update={"sync": SyncSettings(device=board.path)})
         wire = stack.enter_context(WireRig(folder, rig, reel, LOOPS_PER_HOLD, report=camera_report))
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()

@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from wire.vlp16_packets import Vlp16Clock
 from lce_rig.rig import dump_rig
 from tests.doctor.attached import Attached, attach, picture_of, scan_of
 from tests.doctor.observed import make_rig
+from tests.shared import has_ended, wait_until
 
 
 @pytest.fixture
@@ -82,20 +82,8 @@ def test_an_interrupted_examination_leaves_nothing_running(tmp_path):
         (tmp_path / "rig.yaml").write_text(dump_rig(type(rig).model_validate(document)))
         words = ["doctor", "--rig", str(tmp_path / "rig.yaml"), "--duration", "60"]
         with subprocess.Popen([sys.executable, "-m", "lce_rig", *words], stderr=subprocess.PIPE) as process:
-            wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+            wait_until(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
             process.send_signal(signal.SIGINT)
             assert process.wait(30) == 130
         pid = (tmp_path / "pid").read_text()
-        wait_for(lambda: is_gone(pid))
-
-
-def is_gone(pid: str) -> bool:
-    state = Path(f"/proc/{pid}/stat")
-    return not state.exists() or state.read_text().rpartition(") ")[2][0] in "ZX"
-
-
-def wait_for(is_so) -> None:
-    end_s = time.monotonic() + 30
-    while not is_so():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
+        wait_until(lambda: has_ended(pid))

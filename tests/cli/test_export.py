@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from yourdfpy import URDF
 
+from tests.shared import contents
+
 ROBOT = """<robot name="cart">
   <!-- base and mast -->
   <link name="base_link"/><link name="velodyne"/>
@@ -22,7 +24,7 @@ def extrinsics(session):
 def test_a_result_is_set_into_the_urdf_of_a_robot(lce_rig, calibrated, tmp_path):
     robot = tmp_path / "robot.urdf"
     robot.write_text(ROBOT)
-    before = {file: file.read_bytes() for file in calibrated.rglob("*") if file.is_file()}
+    before = contents(calibrated)
     outcome = lce_rig("export", calibrated, "--into", robot)
     assert outcome.code == 0, outcome.err
     T = URDF.load(str(robot), load_meshes=False).get_transform("velodyne", "davis_optical_frame")
@@ -30,7 +32,7 @@ def test_a_result_is_set_into_the_urdf_of_a_robot(lce_rig, calibrated, tmp_path)
     assert "<!--" in robot.read_text()
     (backup,) = tmp_path.glob("*.bak")
     assert backup.read_text() == ROBOT and str(backup) in outcome.out.replace("\n", "")
-    assert {file: file.read_bytes() for file in calibrated.rglob("*") if file.is_file()} == before
+    assert contents(calibrated) == before
 
 
 def test_formats_are_chosen_and_the_target_is_named(lce_rig, calibrated, tmp_path):

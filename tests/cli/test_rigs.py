@@ -1,13 +1,13 @@
 """`lce-rig rigs` as a user runs it."""
 
 import json
-import resource
 from pathlib import Path
 
 import pytest
 
 from lce_rig.cli.main import run
 from lce_rig.rig import find_profile, load_rig
+from tests.shared import files_up_to
 
 
 def test_called_bare_it_lists_the_profiles(capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,12 +77,8 @@ def test_new_writes_a_profile_and_never_over_another(
 
 def test_a_full_disk_leaves_no_part_of_a_profile(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
-    try:
+    with files_up_to(100):
         assert run(["rigs", "new", "mine", "-o", str(path)]) == 3
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert str(path) in capsys.readouterr().err
     assert not path.exists()
     assert run(["rigs", "new", "mine", "-o", str(path)]) == 0

@@ -10,6 +10,8 @@ import yaml
 
 from lce_rig.cli.main import run
 from lce_rig.core.geometry import difference, invert
+from lce_rig.rig import dump_rig, load_rig
+from tests.shared import half_size
 
 
 @pytest.fixture
@@ -81,22 +83,13 @@ def test_a_result_of_two_cameras_is_checked_on_captures_of_one(lce_rig, with_sec
     assert "captures agree" in outcome.out
 
 
-def half_size(document):
-    """Let cameras take pictures of half the size: they are rendered in a quarter of the time."""
-    for camera in document["cameras"].values():
-        camera["resolution_px"] = [length // 2 for length in camera["resolution_px"]]
-        lens = {key: value / 2 for key, value in camera["intrinsics"].items() if key.endswith("_px")}
-        camera["intrinsics"] = camera["intrinsics"] | lens
-    return document
-
-
 @pytest.fixture(scope="module")
 def of_two(tmp_path_factory):
     """A simulated session of two cameras."""
     folder = tmp_path_factory.mktemp("two")
     profile, session = folder / "rig.yaml", folder / "session"
-    given = Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"
-    profile.write_text(yaml.safe_dump(half_size(yaml.safe_load(given.read_text()))))
+    given = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
+    profile.write_text(dump_rig(half_size(given)))
     assert run(["simulate", "--rig", str(profile), str(session), "--captures", "10", "--seed", "2"]) == 0
     return session
 

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.shared import contents
+
 
 def read(path):
     return json.loads(path.read_text())
@@ -160,11 +162,11 @@ def test_captures_of_another_session_never_count_as_used(lce_rig, calibrated_few
 def test_a_run_without_result_leaves_the_earlier_one_untouched(lce_rig, calibrated_few):
     lce_rig("verify", calibrated_few)
     folder = calibrated_few / "calibration"
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    before = contents(folder)
     outcome = lce_rig("calibrate", calibrated_few)
     assert outcome.code == 6
     assert lce_rig("calibrate", calibrated_few, "--channels", "freams").code != 0
-    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert contents(folder) == before
 
 
 @pytest.mark.long

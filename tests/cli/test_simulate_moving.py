@@ -15,6 +15,7 @@ from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.rig import Rig, dump_rig, load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures
+from tests.shared import changed, contents, half_size
 
 # The placement is 1.3 m away: squares are 9 px wide, even to a camera of half the resolution.
 SEED = 9
@@ -23,13 +24,9 @@ OPTIONS = SimulationOptions.for_rig("rles", motion="moving")
 
 def small_rig(*channels: str) -> Rig:
     """The rig rles with a camera of half the resolution, which simulates in a quarter of the time."""
-    document = json.loads(load_rig("rles").model_dump_json())
-    camera = document["cameras"]["davis"]
-    camera["resolution_px"] = (173, 130)
-    for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
-        camera["intrinsics"][key] /= 2
-    camera["channels"] = {name: camera["channels"][name] for name in channels}
-    return Rig.model_validate(document)
+    rig = half_size(load_rig("rles"))
+    kept = {name: rig.cameras["davis"].channels[name] for name in channels}
+    return changed(rig, cameras__davis__channels=kept)
 
 
 def write_profile(folder: Path, *channels: str) -> Path:
@@ -157,9 +154,9 @@ def test_a_recording_is_read_by_the_readers_of_recordings(recorded: Path, rig: R
 
 
 def test_a_recording_overwrites_nothing(lce_rig: Any, recorded: Path, tmp_path: Path) -> None:
-    before = {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()}
+    before = contents(recorded)
     profile = write_profile(tmp_path, "frames", "events")
     outcome = lce_rig("simulate", "--rig", profile, "--recording", recorded)
     assert outcome.code == 5
     assert "exists already" in outcome.err
-    assert {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()} == before
+    assert contents(recorded) == before

@@ -13,6 +13,7 @@ from lce_rig.detect.events.search import reconstructor_for
 from lce_rig.io.joining import merge_by_time
 from lce_rig.rig import ReconstructionSettings, Rig, load_rig
 from tests.detect.onnx_file import write_network
+from tests.shared import changed
 
 from .event_sightings import T0_NS, event_stream
 
@@ -29,11 +30,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> ReconstructionSettings:
 
 @pytest.fixture(scope="module")
 def rig(quick: ReconstructionSettings) -> Rig:
-    rig = load_rig("rles")
-    davis = rig.cameras["davis"]
-    channel = davis.channels["events"]
-    channels = {**davis.channels, "events": channel.model_copy(update={"reconstruction": quick})}
-    return rig.model_copy(update={"cameras": {"davis": davis.model_copy(update={"channels": channels})}})
+    return changed(load_rig("rles"), cameras__davis__channels__events__reconstruction=quick)
 
 
 def scan(time_ms: float) -> Scan:

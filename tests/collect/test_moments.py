@@ -8,9 +8,9 @@ import pytest
 from lce_rig.collect.offline import CollectOptions, collect
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
-from lce_rig.rig import dump_rig, parse_rig
 from lce_rig.session import Session
 from tests.collect.live.replay import placements
+from tests.shared import changed
 
 # A board stands, is carried on, stands elsewhere, and is carried back.
 VISIT = [0] * 8 + [2, 3, 2, 3] + [1] * 8 + [3, 2, 3, 2] + [0] * 8
@@ -90,10 +90,8 @@ def test_clocks_that_are_apart_are_said_and_bridged_by_the_profile(tmp_path, wri
     with Session.create(tmp_path / "apart", rig) as session, pytest.raises(SourceError) as caught:
         collect(session, [open_recording(bag, rig)])
     assert "channels.frames.timestamps.expected_offset_s" in caught.value.hint
-    channel = rig.cameras["davis"].channels["frames"]
-    stamps = channel.timestamps.model_copy(update={"expected_offset_s": -3.0})
-    channels = {"frames": channel.model_copy(update={"timestamps": stamps})}
-    cameras = {"davis": rig.cameras["davis"].model_copy(update={"channels": channels})}
-    bridged = parse_rig(dump_rig(rig.model_copy(update={"cameras": cameras})))
+    channels = {"frames": rig.cameras["davis"].channels["frames"]}
+    alone = changed(rig, cameras__davis__channels=channels)
+    bridged = changed(alone, cameras__davis__channels__frames__timestamps__expected_offset_s=-3.0)
     with Session.create(tmp_path / "bridged", bridged) as session:
         assert len(collect(session, [open_recording(bag, bridged)]).captured) == 1

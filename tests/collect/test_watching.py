@@ -13,6 +13,7 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import Frame
 from tests.collect.live.replay import placements, rig
+from tests.shared import changed
 
 T0_NS = 1_700_000_000_000_000_000
 
@@ -57,7 +58,7 @@ def test_a_board_that_was_out_of_sight_is_searched_for_at_once() -> None:
 
 def strict(**limits: float) -> Rig:
     """Give the rig with other limits on boards."""
-    return rig().model_copy(update={"quality": rig().quality.model_copy(update=limits)})
+    return changed(rig(), quality=changed(rig().quality, **limits))
 
 
 def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> None:

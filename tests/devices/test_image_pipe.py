@@ -16,6 +16,7 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.pipe import ImagePipeSource, ImageStream, RawImages, Y4mImages
 from lce_rig.rig import CameraSettings, load_rig
+from tests.shared import has_ended, wait_until
 
 WIDTH, HEIGHT = 32, 18
 
@@ -169,13 +170,6 @@ def test_a_program_that_is_not_there_is_named() -> None:
         ImagePipeSource("cam", camera("true", pixel_format="H264")).__enter__()
 
 
-def has_ended(pid: str) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0] in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return True
-
-
 def test_a_talkative_stubborn_program_and_its_children_are_stopped(tmp_path: Path) -> None:
     then = (
         "import os, signal, subprocess; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
@@ -186,14 +180,9 @@ def test_a_talkative_stubborn_program_and_its_children_are_stopped(tmp_path: Pat
     command = child(tmp_path, y4m(grey_pictures(2)), then)
     with ImagePipeSource("cam", camera(*command)) as source:
         assert len(take(source, 2)) == 2
-        while not (tmp_path / "pictures.pids").exists():
-            time.sleep(0.01)
+        wait_until((tmp_path / "pictures.pids").exists)
     for pid in (tmp_path / "pictures.pids").read_text().split():
-        # A busy computer takes a moment to end what was killed.
-        deadline_s = time.monotonic() + 10.0
-        while not has_ended(pid):
-            assert time.monotonic() < deadline_s
-            time.sleep(0.01)
+        wait_until(lambda pid=pid: has_ended(pid))
 
 
 def test_ffmpeg_is_read() -> None:

@@ -9,7 +9,8 @@ from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import driver_of, open_live, sensors, source_of
 from lce_rig.devices.reading import AttachedSensors, LiveSource, RateMeter, SourceStatus
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
+from tests.shared import changed
 
 HINT = "Check the plug."
 
@@ -147,12 +148,6 @@ def test_a_rate_is_that_of_what_came_and_falls_when_nothing_comes() -> None:
     assert meter.rate_hz == 0
 
 
-def with_driver(rig: Rig, camera: str, **driver: Any) -> Rig:
-    settings = rig.cameras[camera]
-    changed = settings.model_copy(update={"driver": settings.driver.model_copy(update=driver)})
-    return rig.model_copy(update={"cameras": rig.cameras | {camera: changed}})
-
-
 @pytest.mark.parametrize(
     ("rig", "sources"),
     [
@@ -167,22 +162,22 @@ def test_the_shipped_rigs_get_their_drivers(rig: str, sources: list[tuple[str, s
 
 
 @pytest.mark.parametrize(
-    ("rig", "camera", "driver", "source"),
+    ("changes", "source"),
     [
-        ("rlfs", "cam", {"type": None, "command": ("true",), "device": None}, "ImagePipeSource"),
-        ("rles", "davis", {"type": "v4l2"}, "V4l2Source"),
-        ("rlfs", "cam", {"type": "ros2"}, "Ros2Source"),
+        ({"driver__type": None, "driver__command": ("true",), "driver__device": None}, "ImagePipeSource"),
+        ({"driver__type": "v4l2"}, "V4l2Source"),
+        ({"driver__type": "ros2"}, "Ros2Source"),
     ],
 )
-def test_the_profile_may_choose_the_driver(
-    rig: str, camera: str, driver: dict[str, Any], source: str
-) -> None:
-    assert type(open_live(with_driver(load_rig(rig), camera, **driver))[1]).__name__ == source
+def test_the_profile_may_choose_the_driver(changes: dict[str, Any], source: str) -> None:
+    rig = load_rig("rlfs")
+    rig = changed(rig, cameras__cam=changed(rig.cameras["cam"], **changes))
+    assert type(open_live(rig)[1]).__name__ == source
 
 
 @pytest.mark.parametrize("wanted", ["v4l", "vlp16", "sync_board"])
 def test_an_unknown_driver_or_one_of_another_kind_keeps_no_other_sensor_from_opening(wanted: str) -> None:
-    rig = with_driver(load_rig("rlfs"), "cam", type=wanted)
+    rig = changed(load_rig("rlfs"), cameras__cam__driver__type=wanted)
     with pytest.raises(SourceError) as caught:
         open_live(rig)
     assert repr(wanted) in caught.value.what and "v4l2, command, davis" in caught.value.hint
@@ -191,13 +186,8 @@ def test_an_unknown_driver_or_one_of_another_kind_keeps_no_other_sensor_from_ope
 
 def test_a_lidar_of_an_unknown_model_is_not_guessed() -> None:
     rig = load_rig("rlfs")
-    unknown, lite = (
-        rig.model_copy(update={"lidars": {"lidar": rig.lidars["lidar"].model_copy(update=changes)}})
-        for changes in (
-            {"model": "XY-32", "driver": rig.lidars["lidar"].driver.model_copy(update={"type": None})},
-            {"model": "Puck LITE"},
-        )
-    )
+    unknown = changed(rig, lidars__lidar__model="XY-32", lidars__lidar__driver__type=None)
     with pytest.raises(SourceError) as caught:
         driver_of(unknown, "lidar")
-    assert "XY-32" in caught.value.what and driver_of(lite, "lidar") == "vlp16"
+    assert "XY-32" in caught.value.what
+    assert driver_of(changed(rig, lidars__lidar__model="Puck LITE"), "lidar") == "vlp16"

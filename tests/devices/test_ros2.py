@@ -26,6 +26,7 @@ from lce_rig.devices.reading import AttachedSensors
 from lce_rig.devices.ros2 import Ros2Source
 from lce_rig.io.ros.bag_recorder import encode_image, encode_scan
 from lce_rig.rig import Rig, load_rig
+from tests.shared import changed
 
 IMAGES, POINTS = "/camera/image_raw", "/points"
 TOPICS = {
@@ -38,16 +39,13 @@ TOPICS = {
 @pytest.fixture
 def rig() -> Rig:
     """The rig rlfs with both sensors on ROS 2 topics."""
-    rig = load_rig("rlfs")
-    lidar, camera = rig.lidars["lidar"], rig.cameras["cam"]
-    ros2 = lidar.driver.model_copy(update={"type": "ros2"})
-    channels = {"frames": camera.channels["frames"].model_copy(update={"topic": IMAGES})}
-    return rig.model_copy(
-        update={
-            "lidars": {"lidar": lidar.model_copy(update={"driver": ros2, "topic": POINTS[1:]})},
-            "cameras": {"cam": camera.model_copy(update={"driver": ros2, "channels": channels})},
-            "sync": None,
-        }
+    return changed(
+        load_rig("rlfs"),
+        lidars__lidar__driver__type="ros2",
+        lidars__lidar__topic=POINTS[1:],
+        cameras__cam__driver__type="ros2",
+        cameras__cam__channels__frames__topic=IMAGES,
+        sync=None,
     )
 
 

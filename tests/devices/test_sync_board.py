@@ -1,14 +1,14 @@
 """A sync board on a real pty: heard, asked, tied to the computer's clock, and survived whatever it does."""
 
-import time
 from itertools import pairwise
 
 import pytest
-from fake_board import HELLO, FakeBoard
+from wire.sync_board import HELLO, FakeBoard
 
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig.profile import SyncSettings
+from tests.shared import wait_until
 
 
 def settings(path, **more):
@@ -28,13 +28,6 @@ def take(board, n, line="cam"):
 
 def codes(status):
     return [problem.code for problem in status.problems]
-
-
-def wait_until(condition, patience_s=20.0):
-    end_s = time.monotonic() + patience_s
-    while not condition() and time.monotonic() < end_s:
-        time.sleep(0.01)
-    assert condition()
 
 
 def assert_tells_the_time(model, fake):

@@ -1,6 +1,5 @@
 """A VLP-16 on a real socket: scans at full rate, and sentences for everything that goes wrong."""
 
-import resource
 import socket
 import threading
 import time
@@ -24,6 +23,7 @@ from lce_rig.rig import LidarSettings, Rig
 from lce_rig.rig.sensors import DriverSettings
 from tests.devices.test_vlp16_web import PAGES, serving
 from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of, room_scans, settings
+from tests.shared import changed, files_up_to, wait_until
 
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"
 PATIENT_S = 10.0
@@ -35,13 +35,6 @@ def lidar() -> LidarSettings:
     data, position = free_ports()
     driver = DriverSettings(port=data, address=HERE, controls={"position_port": position})
     return settings(driver=driver)
-
-
-def wait_for(is_so: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENT_S
-    while not is_so():
-        assert time.monotonic() < deadline_s, "it never came to be"
-        time.sleep(0.005)
 
 
 class Sender:
@@ -155,7 +148,7 @@ def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(li
 def test_the_serial_number_is_asked_of_the_web_page_beside_the_packets(lidar: LidarSettings) -> None:
     with serving(PAGES) as web, streaming(lidar, Room(3), web_port=web.port) as source:
         take(source, 1)
-        wait_for(lambda: source.status().serial == PAGES["info"]["serial"])
+        wait_until(lambda: source.status().serial == PAGES["info"]["serial"])
     with (
         serving({"info": b"<html>a camera</html>"}) as web,
         streaming(lidar, Room(5), web_port=web.port) as source,
@@ -168,12 +161,12 @@ def test_the_serial_number_is_asked_of_the_web_page_beside_the_packets(lidar: Li
 def test_only_packets_of_the_profiles_address_or_the_first_heard_are_taken(
     lidar: LidarSettings, address: str | None
 ) -> None:
-    driver, room = lidar.driver.model_copy(update={"address": address}), Room(3)
-    source = Vlp16Source("lidar", lidar.model_copy(update={"driver": driver}), silence_s=PATIENT_S)
+    room = Room(3)
+    source = Vlp16Source("lidar", changed(lidar, driver__address=address), silence_s=PATIENT_S)
     stranger = Sender(lidar, source, ELSEWHERE)
 
     def make_later(start_ns: int) -> list[SensorPacket]:
-        wait_for(lambda: HERE in source.status().device)
+        wait_until(lambda: HERE in source.status().device)
         return packets_of(room_scans(1))
 
     with stranger.sending(make_later), Sender(lidar, source).sending(room), source:
@@ -226,8 +219,7 @@ def test_another_model_is_refused_by_name(lidar: LidarSettings) -> None:
 
 
 def test_packets_of_another_address_are_named(lidar: LidarSettings) -> None:
-    driver = lidar.driver.model_copy(update={"address": ELSEWHERE})
-    error = explain(lidar.model_copy(update={"driver": driver}), packets_of(room_scans(1)))
+    error = explain(changed(lidar, driver__address=ELSEWHERE), packets_of(room_scans(1)))
     assert HERE in error.hint and "driver.address" in error.hint
 
 
@@ -267,14 +259,9 @@ def test_a_recording_is_never_written_over(lidar: LidarSettings, tmp_path: Path)
 
 
 def test_a_full_disk_ends_the_recording_and_nothing_else(lidar: LidarSettings, tmp_path: Path) -> None:
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
-    try:
-        with streaming(lidar, Room(6), record_to=tmp_path) as source:
-            scans = take(source, 5)
-            wait_for(lambda: any(p.code == "device.recording_stopped" for p in source.status().problems))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with files_up_to(200_000), streaming(lidar, Room(6), record_to=tmp_path) as source:
+        scans = take(source, 5)
+        wait_until(lambda: any(p.code == "device.recording_stopped" for p in source.status().problems))
     assert len(scans) == 5
 
 
@@ -297,7 +284,7 @@ def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken() -> None:
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         # The kernel takes a moment to begin; datagrams before that are stamped when they are taken.
-        wait_for(is_stamped_before_taken)
+        wait_until(is_stamped_before_taken)
     assert port.receive_many() == []
     port.close()
 

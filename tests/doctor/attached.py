@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from wire.sync_board import FakeBoard
 from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, free_ports
 
 from lce_rig.core import velodyne
@@ -21,7 +22,6 @@ from lce_rig.core.data import Scan
 from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.rig import Rig
 from tests.detect.scans import Plate
-from tests.devices.fake_board import FakeBoard
 from tests.devices.test_vlp16_web import PAGES, serving
 from tests.io.vlp16_room import T0_NS, room_scan
 
@@ -107,7 +107,6 @@ def attach(attached: Attached, folder: Path) -> Iterator[tuple[Rig, int]]:
             stack.callback(sender.join)
             stack.callback(sender.stop.set)
         if attached.has_board:
-            time.sleep(PERIOD_S - time.time() % PERIOD_S)
             document["sync"]["device"] = stack.enter_context(FakeBoard(period_s=PERIOD_S)).path
         yield Rig.model_validate(document), int(web.url.rpartition(":")[2])
 

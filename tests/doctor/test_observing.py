@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 import pytest
+from wire.sync_board import FakeBoard
 
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.reading import LiveSource
@@ -11,11 +12,10 @@ from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.doctor.observing import observe
 from lce_rig.rig import load_rig
 from lce_rig.rig.profile import SyncSettings
-from tests.devices.fake_board import FakeBoard
 
 
 def absent() -> LiveSource:
-    raise SourceError("it is not there", "Plug it in.")
+    raise SourceError("it is not there", "plug")
 
 
 def faulty() -> LiveSource:
@@ -28,7 +28,7 @@ def test_what_fails_is_said_and_the_others_are_watched_all_the_same() -> None:
             {"device": fake.path, "triggers": {"cam": {"channel": 0, "rate_hz": 20.0}}}
         )
         seen = observe({"gone": absent, "bad": faulty, "sync": lambda: SyncBoard(settings)}, 1.0)
-    assert seen["gone"].failure is not None and seen["gone"].failure.hint == "Plug it in."
+    assert seen["gone"].failure is not None and seen["gone"].failure.hint == "plug"
     assert seen["bad"].failure is not None and "ZeroDivisionError" in seen["bad"].failure.what
     board = seen["sync"]
     assert board.failure is None and board.status is not None and board.watched_s > 0.4

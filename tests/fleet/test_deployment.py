@@ -44,14 +44,14 @@ def test_a_result_is_deployed_asked_for_replaced_and_restored_byte_for_byte(
     found = standing(target)
     assert found.current == second.release and not found.changed
     assert [each.name for each in found.releases] == [second.release.name, first.release.name]
-    back = rollback(target, reason="it was better")
+    back = rollback(target, reason="better")
     assert back.release == first.release and content_of(robot / "current") == deployed
     assert [(entry["action"], entry["release"]) for entry in log_of(robot)] == [
         ("deploy", first.release.name),
         ("deploy", second.release.name),
         ("rollback", first.release.name),
     ]
-    assert log_of(robot)[-1]["reason"] == "it was better"
+    assert log_of(robot)[-1]["reason"] == "better"
     with pytest.raises(TargetError):
         rollback(target)
     assert rollback(target, second.release.name).release == second.release
@@ -112,9 +112,9 @@ def test_what_does_not_belong_there_is_refused_unless_a_reason_is_written_down(
     with pytest.raises(ResultRefusedError):
         deploy(folder, rig, local)
     assert content_of(robot / "current") == before
-    forced = deploy(folder, rig, local, reason="the LiDAR was replaced").release
+    forced = deploy(folder, rig, local, reason="new LiDAR").release
     assert standing(local).current == forced
-    assert (forced.forced, forced.reason) == ([code], "the LiDAR was replaced")
+    assert (forced.forced, forced.reason) == ([code], "new LiDAR")
     assert (log_of(robot)[-1]["forced"], log_of(robot)[-1]["reason"]) == ([code], forced.reason)
 
 
@@ -325,7 +325,7 @@ def test_a_release_with_a_link_to_an_endless_device_is_named_and_replaced(
     deploy(result("a"), rig, target)
     (robot / "current" / "extrinsics.yaml").unlink()
     (robot / "current" / "extrinsics.yaml").symlink_to("/dev/zero")
-    assert standing(target).changed == {"extrinsics.yaml": "no plain file"}
+    assert list(standing(target).changed) == ["extrinsics.yaml"]
     assert deploy(result("b", 0.15), rig, target).is_new and not standing(target).changed
     with pytest.raises(TargetError):
         rollback(target)

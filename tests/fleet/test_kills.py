@@ -7,13 +7,13 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 import psutil
 import pytest
 
 from lce_rig.fleet.registry import Registry
 from lce_rig.fleet.storage import Storage
+from tests.shared import wait_until
 
 
 @pytest.mark.long
@@ -26,11 +26,11 @@ def test_a_lost_worker_and_a_client_that_ends_lose_nothing(simulated, tmp_path, 
     command = [sys.executable, "-m", "lce_rig", "fleet", "run", str(root), "--workers", "2", "--json"]
     command += ["--registry", registry.place.url]
     first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    _wait_for(lambda: len(registry.folders()) >= 1)
+    wait_until(lambda: len(registry.folders()) >= 1, 300)
     for worker in workers_of(first.pid)[:1]:
         with contextlib.suppress(ProcessLookupError):
             os.kill(worker, signal.SIGKILL)
-    _wait_for(lambda: len(registry.folders()) >= 2)
+    wait_until(lambda: len(registry.folders()) >= 2, 300)
     first.send_signal(how)
     first.communicate(timeout=180)
     assert first.returncode in ((-signal.SIGKILL, 0) if how == signal.SIGKILL else (130, 0))
@@ -48,10 +48,3 @@ def workers_of(pid: int) -> list[int]:
         children = psutil.Process(pid).children()
         return sorted(child.pid for child in children if "spawn_main" in " ".join(child.cmdline()))
     return []
-
-
-def _wait_for(is_so) -> None:
-    deadline_s = time.monotonic() + 300
-    while not is_so():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.1)

@@ -14,6 +14,7 @@ from lce_rig.fleet.registry import poses
 from lce_rig.fleet.run import cluster, run_fleet, run_job
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.work import Settings
+from tests.shared import contents
 
 pytestmark = pytest.mark.long
 
@@ -29,12 +30,8 @@ def run(root, registry, client, **changes):
     return run_fleet(find_jobs(Storage.at(root)), settings, client), settings.opened()
 
 
-def content(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def test_each_session_has_a_row_a_folder_and_a_cause_where_there_is_no_result(fleet_root, tmp_path, client):
-    before = content(fleet_root)
+    before = contents(fleet_root)
     done, registry = run(fleet_root, tmp_path / "registry", client)
     assert (done.n_new, done.n_held) == (3, 0)
     assert done.statuses == {"ok": 1, "failed": 2}
@@ -47,7 +44,7 @@ def test_each_session_has_a_row_a_folder_and_a_cause_where_there_is_no_result(fl
     assert good["robot"] == "r1" and good["verdict"] == saved.pairs[0].verdict
     assert good["folder"].endswith(good["session_sha256"][:12])
     assert (registry.place.local / good["folder"] / "overlays" / "contact_sheet.png").exists()
-    assert content(fleet_root) == before, "nothing below the root is written"
+    assert contents(fleet_root) == before, "nothing below the root is written"
 
 
 def test_what_is_done_is_not_done_again(fleet_root, tmp_path, client):

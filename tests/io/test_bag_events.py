@@ -16,6 +16,7 @@ from lce_rig.timing.rig_time import rig_time_ns
 from tests.io.events import encoders
 from tests.io.events.encoders import listed
 from tests.notes import has_note
+from tests.shared import changed
 
 from .rig_samples import KINDS, T0_NS, one_second, picture, record, sweep
 
@@ -37,11 +38,8 @@ def events_of(samples: list[Sample]) -> list[encoders.Event]:
     return [event for sample in samples if isinstance(sample, Events) for event in listed(sample)]
 
 
-def with_camera(rig: Rig, **changes: object) -> Rig:
-    """The rig with other settings for the channel of events."""
-    camera = rig.cameras["davis"]
-    channels = {**camera.channels, "events": camera.channels["events"].model_copy(update=changes)}
-    return rig.model_copy(update={"cameras": {"davis": camera.model_copy(update={"channels": channels})}})
+def with_topic(rig: Rig, topic: str | None) -> Rig:
+    return changed(rig, cameras__davis__channels__events__topic=topic)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -53,20 +51,14 @@ def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(
     samples = list(recording.samples())
     assert events_of(samples) == events_of(given)
     assert {e.sensor for e in samples if isinstance(e, Events)} == {"davis"}
-    assert (
-        sum(isinstance(s, Image) for s in samples) == 20 and sum(isinstance(s, Scan) for s in samples) == 10
-    )
+    assert [sum(isinstance(s, kind) for s in samples) for kind in (Image, Scan)] == [20, 10]
     assert recording.n_samples == 30
-    # Scans are received 0.1 s after their first firing; nothing is handed out later than that.
-    times_ns = np.array([rig_time_ns(sample, rig) for sample in samples])
-    assert (np.maximum.accumulate(times_ns) - times_ns).max() <= 110_000_000
-
-
-def test_the_streams_are_told_before_anything_is_read(tmp_path: Path, rig: Rig) -> None:
-    recording = opened(record(tmp_path / "r.bag", rig, one_second()), rig)
     assert {str(stream): stream.kind for stream in recording.streams} == {
         "davis.events": "events", "davis.frames": "images", "lidar": "scans"
     }  # fmt: skip
+    # Scans are received 0.1 s after their first firing; nothing is handed out later than that.
+    times_ns = np.array([rig_time_ns(sample, rig) for sample in samples])
+    assert (np.maximum.accumulate(times_ns) - times_ns).max() <= 110_000_000
 
 
 def test_a_topic_of_pictures_that_others_reconstructed_is_read_as_such(tmp_path: Path, rig: Rig) -> None:
@@ -78,11 +70,11 @@ def test_a_topic_of_pictures_that_others_reconstructed_is_read_as_such(tmp_path:
 
 def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path: Path, rig: Rig) -> None:
     path = record(tmp_path / "r.bag", rig, one_second(50))
-    open_rig = with_camera(rig, topic=None)
+    open_rig = with_topic(rig, None)
     recording = opened(path, open_rig)
     assert has_note(recording.notes, "r.bag", "davis.events", "/davis/events", "only topic")
     assert len(events_of(list(recording.samples()))) == 2500
-    asked = opened(path, with_camera(rig, topic="/elsewhere"), topics={"davis.events": "/davis/events"})
+    asked = opened(path, with_topic(rig, "/elsewhere"), topics={"davis.events": "/davis/events"})
     assert Stream("davis", "events", "events") in asked.streams
     for wrong in ("/nowhere", "/velodyne_points"):
         with pytest.raises(SourceError, match=wrong):
@@ -99,9 +91,8 @@ def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_pat
         assert [stream.kind for stream in part.streams] == [name]
         assert all(isinstance(sample, kind) for sample in part.samples())
     nothing = record(tmp_path / "other.bag", rig, [sweep(0)])
-    elsewhere = rig.lidars["lidar"].model_copy(update={"topic": "/other"})
     with pytest.raises(SourceError) as caught:
-        opened(nothing, rig.model_copy(update={"lidars": {"lidar": elsewhere}}), is_part=True)
+        opened(nothing, changed(rig, lidars__lidar__topic="/other"), is_part=True)
     assert has_note([caught.value.hint], "/velodyne_points", "PointCloud2, 1")
 
 

@@ -1,9 +1,6 @@
 """What a rig delivers is recorded as bags that our readers, and others', give back as it was."""
 
-import resource
 import tracemalloc
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +12,7 @@ from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig, load_rig
+from tests.shared import changed, files_up_to
 
 from .rig_samples import KINDS, T0_NS, one_second, packet, picture, read, read_events, record, sweep
 
@@ -56,11 +54,8 @@ def test_colour_pictures_and_scans_without_times_come_back_too(tmp_path: Path, r
 
 
 @pytest.mark.parametrize("has_times", [True, False])
-def test_stamps_mark_the_firing_that_the_profile_says(tmp_path: Path, has_times: bool) -> None:
-    rig = load_rig("rles")
-    timestamps = rig.lidars["lidar"].timestamps.model_copy(update={"reference": "last_firing"})
-    lidar = rig.lidars["lidar"].model_copy(update={"timestamps": timestamps})
-    rig = rig.model_copy(update={"lidars": {"lidar": lidar}})
+def test_stamps_mark_the_firing_that_the_profile_says(tmp_path: Path, rles: Rig, has_times: bool) -> None:
+    rig = changed(rles, lidars__lidar__timestamps__reference="last_firing")
     given = sweep(3) if has_times else replace(sweep(3), offset_ns=None)
     _, (found,) = read(record(tmp_path / "r.bag", rig, [picture(0), given]), rig)
     assert found.stamp_ns == pytest.approx(given.stamp_ns, abs=4 if has_times else 0)
@@ -114,17 +109,6 @@ def test_memory_stays_flat_however_long_it_records(tmp_path: Path, rles: Rig, na
     written = sum(file.stat().st_size for file in tmp_path.rglob("*.*") if file.is_file())
     assert written > 40_000_000
     assert held < 3_000_000 and peak < 8_000_000
-
-
-@contextmanager
-def files_up_to(n_bytes: int) -> Iterator[None]:
-    """Let no file grow beyond a size, as on a disk that is full."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -16,6 +16,7 @@ from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 from tests.io.events.encoders import listed, random_events
 from tests.io.events.test_files import WRITERS
 from tests.notes import has_note
+from tests.shared import changed
 
 T0_US = 1_700_000_000_000_000
 EVENTS = replace(random_events(20_000, 3, start_us=T0_US, step_us=250), sensor="davis")
@@ -64,12 +65,9 @@ def test_frames_alone_are_a_recording_too(tmp_path: Path, rig: Rig) -> None:
 def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(
     tmp_path: Path, rig: Rig
 ) -> None:
-    camera = rig.cameras["davis"]
-    only_events = camera.model_copy(update={"channels": {"events": camera.channels["events"]}})
-    recording = opened(
-        write_davis(tmp_path / "a.aedat4", PIECES, FRAMES),
-        rig.model_copy(update={"cameras": {"davis": only_events}}),
-    )
+    channels = {"events": rig.cameras["davis"].channels["events"]}
+    path = write_davis(tmp_path / "a.aedat4", PIECES, FRAMES)
+    recording = opened(path, changed(rig, cameras__davis__channels=channels))
     assert images_of(recording) == [] and events_of(recording) == listed(EVENTS)
     assert has_note(recording.notes, "frames skipped", "davis", "no channel")
 
@@ -104,9 +102,8 @@ def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path: 
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     with pytest.raises(SourceError, match=r"none\.aedat4"):
         opened(tmp_path / "none.aedat4", rig)
-    camera = rig.cameras["davis"].model_copy(update={"resolution_px": (640, 480)})
     with pytest.raises(SourceError, match="346x260"):
-        opened(tmp_path / "a.aedat4", rig.model_copy(update={"cameras": {"davis": camera}}))
+        opened(tmp_path / "a.aedat4", changed(rig, cameras__davis__resolution_px=(640, 480)))
     with pytest.raises(SourceError) as caught:
         opened(tmp_path / "a.aedat4", load_rig("rlfs"))
     assert "kind: events" in caught.value.hint
@@ -116,8 +113,7 @@ def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path: 
 
 def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path: Path, rig: Rig) -> None:
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
-    davis = rig.cameras["davis"]
-    both = rig.model_copy(update={"cameras": {"davis": davis, "right": davis}})
+    both = changed(rig, cameras__right=rig.cameras["davis"])
     assert has_note(opened(tmp_path / "a.aedat4", both).notes, "events assigned", "camera davis")
     right = opened(tmp_path / "a.aedat4", both, camera="right")
     assert {s.sensor for s in right.samples()} == {"right"} and next(iter(right.streams)).sensor == "right"

@@ -14,6 +14,7 @@ from lce_rig.io.joining import JoinedRecording, check_overlap, join_recordings, 
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.rig import Rig, load_rig
 from tests.notes import has_note
+from tests.shared import changed
 
 S = 10**9
 T0_NS = 1_700_000_000 * S
@@ -107,11 +108,7 @@ def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rig: Rig
     assert kinds == ["Scan", "Events", "Image", "Scan", "Events", "Image", "Scan"]
     assert joined.n_samples == 5 and set(joined.streams) == {LIDAR, FRAMES, EVENTS}
     assert [note.split()[0] for note in joined.notes[-2:]] == ["lidar.bag", "events.aedat4"]
-    davis = rig.cameras["davis"]
-    frames = davis.channels["frames"]
-    timestamps = frames.timestamps.model_copy(update={"expected_offset_s": -0.06})
-    channels = {**davis.channels, "frames": frames.model_copy(update={"timestamps": timestamps})}
-    shifted = rig.model_copy(update={"cameras": {"davis": davis.model_copy(update={"channels": channels})}})
+    shifted = changed(rig, cameras__davis__channels__frames__timestamps__expected_offset_s=-0.06)
     frames_only = Listed("frames.bag", [(FRAMES, 0.05), (FRAMES, 0.15)])
     kinds = [type(s).__name__ for s in JoinedRecording([lidar(), frames_only], shifted).samples()]
     assert kinds == ["Image", "Scan", "Image", "Scan", "Scan"]

@@ -15,6 +15,7 @@ from lce_rig.io import open_recording
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
 from lce_rig.rig import Rig, load_rig
+from tests.shared import changed
 
 T0_NS = 1_700_000_000 * 10**9
 N_POINTS = 200
@@ -65,9 +66,7 @@ def scans_of(path: Path, rig: Rig) -> list[Scan]:
 
 
 def of_model(model: str, **changes: Any) -> Rig:
-    rig = load_rig("mid360")
-    lidar = rig.lidars["lidar"].model_copy(update={"model": model, **changes})
-    return rig.model_copy(update={"lidars": {"lidar": lidar}})
+    return changed(load_rig("mid360"), lidars__lidar__model=model, **changes)
 
 
 @pytest.mark.parametrize(("package", "is_ros1"), [("livox_ros_driver", True), ("livox_ros_driver2", False)])
@@ -84,7 +83,7 @@ def test_messages_of_both_drivers_are_read_without_noise_and_accumulated(
     np.testing.assert_allclose(np.unique(first.points[:, 0]), 3.0 + np.arange(10))
     assert first.offset_ns is not None
     assert first.offset_ns.min() == 0 and first.offset_ns.max() == pytest.approx(10**9, rel=1e-3)
-    assert len(scans_of(path, of_model("Avia", rate_hz=10.0))) == 25
+    assert len(scans_of(path, of_model("Avia", lidars__lidar__rate_hz=10.0))) == 25
 
 
 @pytest.mark.parametrize(("model", "n_kept"), [("Avia", 160), ("Mid-360", 80), ("unstructured", 160)])

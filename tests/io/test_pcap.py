@@ -19,6 +19,7 @@ from lce_rig.io.velodyne_scans import PcapRecording
 from lce_rig.rig import Rig
 from tests.damage import damaged
 from tests.notes import has_note
+from tests.shared import changed
 
 from .vlp16_room import NETWORK_NS, T0_NS, packets_of, room_scans
 
@@ -216,18 +217,15 @@ def test_of_several_sensors_the_profiles_is_taken(
     ]
     path = write_pcap(tmp_path / "a.pcap", both)
     check_scans(read(path, rig)[0])
-    lidar = rig.lidars["lidar"]
-    driver = lidar.driver.model_copy(update={"address": "192.168.1.9"})
-    other = rig.model_copy(update={"lidars": {"lidar": lidar.model_copy(update={"driver": driver})}})
     with pytest.raises(SourceError) as caught:
-        read(path, other)
+        read(path, changed(rig, lidars__lidar__driver__address="192.168.1.9"))
     assert all(address in caught.value.what for address in (SENSOR, "192.168.1.77"))
 
 
 def test_no_packets_whole_ones_or_whole_revolutions_are_errors(
     frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
 ) -> None:
-    with pytest.raises(SourceError, match="243 datagrams"):
+    with pytest.raises(SourceError, match="243"):
         read(write_pcap(tmp_path / "a.pcap", frames, snaplen=96), rig)
     mdns = build_frame(Datagram(T0_NS, "10.0.0.1", 5353, 5353, b"mdns"))
     for others in ([(T0_NS, mdns)] * 3, frames[:40]):

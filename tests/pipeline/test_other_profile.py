@@ -6,23 +6,20 @@ from pathlib import Path
 import numpy as np
 
 from lce_rig.pipeline.verification import profile_behind, with_lenses_of
-from lce_rig.rig import Rig, dump_rig, load_rig
+from lce_rig.rig import dump_rig, load_rig
 from tests.saved_results import made_calibration, result_file
+from tests.shared import changed
 
 RIG = load_rig("rlfs")
 
 
-def with_lens(**update: float) -> Rig:
-    camera = RIG.cameras["cam"]
-    lens = camera.intrinsics.model_copy(update=update)
-    return RIG.model_copy(update={"cameras": {"cam": camera.model_copy(update={"intrinsics": lens})}})
+OTHER = changed(RIG, cameras__cam__intrinsics__cx_px=660.0)
 
 
 def test_the_keys_that_differ_are_named_and_the_result_s_lens_counts() -> None:
-    board = RIG.board.model_copy(update={"square_m": 0.071})
-    rig, (note,) = with_lenses_of(with_lens(cx_px=660.0).model_copy(update={"board": board}), RIG)
+    rig, (note,) = with_lenses_of(changed(OTHER, board__square_m=0.071), RIG)
     assert note.code == "verify.other_profile"
-    assert note.figures["keys"] == "board.square_m, cameras.cam.intrinsics.cx_px"
+    assert str(note.figures["keys"]).split(", ") == ["board.square_m", "cameras.cam.intrinsics.cx_px"]
     assert rig.cameras["cam"].intrinsics == RIG.cameras["cam"].intrinsics
     assert rig.board.square_m == 0.071
 
@@ -43,7 +40,7 @@ def test_a_result_s_profile_is_that_of_its_session_if_it_is_still_the_same(tmp_p
     assert profile_behind(file, result) == load_rig(profile)
     earlier = load_rig(profile)
     profile.rename(tmp_path / "rig-1.yaml")
-    profile.write_text(dump_rig(with_lens(cx_px=660.0)))
+    profile.write_text(dump_rig(OTHER))
     assert profile_behind(file, result) == earlier
     (tmp_path / "rig-1.yaml").unlink()
     assert profile_behind(file, result) is None

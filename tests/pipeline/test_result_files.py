@@ -1,6 +1,5 @@
 """Results take an earlier one's place whole, and the last usable one is kept."""
 
-import resource
 from dataclasses import replace
 
 import pytest
@@ -11,6 +10,7 @@ from lce_rig.pipeline.result_files import Result, result_content
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from tests.export.conftest import calibration, reason, some_pose
+from tests.shared import changed, files_up_to
 
 GOOD = calibration(captures_used=())
 OTHER = calibration(some_pose((1.2, -1.3, 1.0)), captures_used=())
@@ -74,10 +74,10 @@ def test_no_number_of_failures_takes_the_last_usable_result_away(session, folder
 def test_no_number_of_runs_of_one_camera_takes_the_other_ones_result_away(tmp_path):
     rig = load_rig("rles")
     cameras = {
-        name: rig.cameras["davis"].model_copy(update={"frame": name, "optical_frame": f"{name}_optical"})
+        name: changed(rig.cameras["davis"], frame=name, optical_frame=f"{name}_optical")
         for name in ("left", "right")
     }
-    session = Session(tmp_path / "s", rig.model_copy(update={"cameras": cameras}), None)
+    session = Session(tmp_path / "s", changed(rig, cameras=cameras), None)
     folder = session.path / "calibration"
     session.path.mkdir()
     (session.path / "rig.yaml").touch()
@@ -139,13 +139,8 @@ def test_a_result_that_cannot_be_written_leaves_the_earlier_one(session, folder)
         write(session, calibration(OTHER.T_cam_lidar * float("nan"), captures_used=()))
     with pytest.raises(SessionError):
         write(session, calibration())
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
-    try:
-        with pytest.raises(SessionError):
-            write(session, OTHER)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with files_up_to(1000), pytest.raises(SessionError):
+        write(session, OTHER)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     assert not list(session.path.glob(".new-*"))
 

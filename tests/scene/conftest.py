@@ -8,12 +8,13 @@ import pytest
 from numpy.typing import NDArray
 
 from lce_rig.core.calibration import Calibration
-from lce_rig.rig import Rig, find_profile, parse_rig, set_value
+from lce_rig.rig import Rig, load_rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.views import build_view
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, simulate_captures, truth_extrinsics
 from tests.saved_results import made_calibration, write_result
+from tests.shared import half_size
 
 COV = np.diag([0.003] * 3 + [0.0015] * 3) ** 2
 SEED = 2
@@ -30,17 +31,7 @@ class Seen(NamedTuple):
 
 def small_rig(name: str = "rlfs") -> Rig:
     """A rig with a camera of half its resolution, which renders fast."""
-    text = find_profile(name).read_text(encoding="utf-8")
-    camera = "cameras.cam"
-    for key, value in {
-        "resolution_px": "[640, 360]",
-        "intrinsics.fx_px": "448.7",
-        "intrinsics.fy_px": "448.4",
-        "intrinsics.cx_px": "317.5",
-        "intrinsics.cy_px": "187.4",
-    }.items():
-        text = set_value(text, f"{camera}.{key}", value)
-    return parse_rig(text)
+    return half_size(load_rig(name))
 
 
 def deployed(T_cam_lidar: NDArray[np.float64]) -> Calibration:

@@ -1,6 +1,5 @@
 """Whatever happens to the disk or the process, captures made before are whole, and damage is named."""
 
-import resource
 import signal
 import subprocess
 import sys
@@ -13,6 +12,7 @@ import pytest
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError
 from lce_rig.session import Session
+from tests.shared import changed, files_up_to
 
 WRITER = """
 import sys, numpy as np
@@ -62,13 +62,8 @@ def test_a_writer_killed_at_any_moment_leaves_only_whole_captures(tmp_path):
 def test_a_file_that_may_not_grow_is_named_and_loses_nothing(tmp_path, rig, samples):
     session = Session.create(tmp_path / "s", rig)
     session.add_capture(*samples(0), {})
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
-    try:
-        with pytest.raises(SessionError):
-            session.add_capture(*samples(1), {})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with files_up_to(2000), pytest.raises(SessionError):
+        session.add_capture(*samples(1), {})
     assert [p.name for p in (tmp_path / "s" / "captures").iterdir()] == ["000000"]
     assert session.add_capture(*samples(1), {}) == "000001"
 
@@ -76,8 +71,7 @@ def test_a_file_that_may_not_grow_is_named_and_loses_nothing(tmp_path, rig, samp
 @pytest.mark.parametrize("name", ["cam.frames.png", "lidar.pcd", "cam.events.npz", "meta.json"])
 def test_every_damaged_byte_is_noticed_and_the_file_named(tmp_path, rig, samples, name):
     camera = rig.cameras["cam"]
-    streams = camera.channels | {"events": camera.channels["frames"].model_copy(update={"kind": "events"})}
-    rig = rig.model_copy(update={"cameras": {"cam": camera.model_copy(update={"channels": streams})}})
+    rig = changed(rig, cameras__cam__channels__events=changed(camera.channels["frames"], kind="events"))
     width, height = camera.resolution_px
     t_ns, x = 1000 * np.arange(500), np.arange(500).astype(np.uint16)
     events = [Events("cam", t_ns, x, x, x > 9, width, height)]

@@ -13,6 +13,7 @@ from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.session.provenance import content_sha256, provenance_of
+from tests.shared import changed
 
 Samples = Callable[..., tuple[list[Any], list[Any]]]
 
@@ -34,8 +35,7 @@ def fill(rig: Rig, samples: Samples) -> Callable[..., Session]:
 def test_what_captures_tell_and_what_the_profile_states_come_together(
     fill: Callable[..., Session], rig: Rig, tmp_path: Path
 ) -> None:
-    cameras = {name: each.model_copy(update={"serial": "C7"}) for name, each in rig.cameras.items()}
-    named = rig.of_robot("kestrel").model_copy(update={"cameras": cameras})
+    named = changed(rig.of_robot("kestrel"), cameras__cam__serial="C7")
     found = provenance_of(fill(tmp_path / "a", named, {}, {"lidar": "AG43510116"}))
     assert (found.robot, found.serials) == ("kestrel", {"cam": "C7", "lidar": "AG43510116"})
     # Of the last capture's scan, 10**18 ns and its seed.
@@ -59,18 +59,14 @@ def test_the_fingerprint_changes_with_inputs_only(
 ) -> None:
     first = fill(tmp_path / "a")
     shutil.copytree(tmp_path / "a", tmp_path / "elsewhere")
-    lidars = {name: each.model_copy(update={"serial": "S"}) for name, each in rig.lidars.items()}
-    driver = rig.lidars["lidar"].driver.model_copy(update={"address": "10.0.0.9"})
-    moved = {"lidar": rig.lidars["lidar"].model_copy(update={"driver": driver})}
     same = [
         Session.open(tmp_path / "elsewhere"),
-        fill(tmp_path / "b", rig.of_robot("r1").model_copy(update={"lidars": lidars}), {"cam": "C"}),
-        fill(tmp_path / "c", rig.model_copy(update={"description": "other", "lidars": moved})),
+        fill(tmp_path / "b", changed(rig.of_robot("r1"), lidars__lidar__serial="S"), {"cam": "C"}),
+        fill(tmp_path / "c", changed(rig, description="other", lidars__lidar__driver__address="10.0.0.9")),
     ]
     assert {content_sha256(each) for each in same} == {content_sha256(first)}
-    board = rig.board.model_copy(update={"square_m": rig.board.square_m * 1.001})
     other = [
-        fill(tmp_path / "d", rig.model_copy(update={"board": board})),
+        fill(tmp_path / "d", changed(rig, board__square_m=rig.board.square_m * 1.001)),
         fill(tmp_path / "e", seeds=(2, 1)),
         fill(tmp_path / "f", seeds=(1,)),
     ]

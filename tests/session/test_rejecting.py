@@ -4,6 +4,7 @@ import pytest
 
 from lce_rig.core.errors import SessionError
 from lce_rig.session import Session
+from tests.shared import changed
 
 
 @pytest.fixture
@@ -54,8 +55,7 @@ def test_another_sessions_captures_come_in_once_and_as_they_were(session, tmp_pa
     assert session.add_session(friday) == []
     copied, source = session.capture("000003"), friday.capture("000001")
     assert (copied.contents, copied.meta) == (source.contents, source.meta)
-    board = rig.board.model_copy(update={"width_m": 0.9})
-    with Session.create(tmp_path / "other", rig.model_copy(update={"board": board})) as other:
+    with Session.create(tmp_path / "other", changed(rig, board__width_m=0.9)) as other:
         other.add_capture(*samples(9), {})
     with pytest.raises(SessionError):
         session.add_session(other)

@@ -10,6 +10,7 @@ from lce_rig.core.errors import SessionError
 from lce_rig.rig import dump_rig, load_rig
 from lce_rig.session import Session, discard_if_empty
 from lce_rig.session.durable import load_arrays, store_arrays
+from tests.shared import changed
 
 
 def test_a_capture_comes_back_exactly_as_it_was_given(tmp_path, rig, samples):
@@ -56,9 +57,7 @@ def test_a_session_without_captures_takes_another_profile(tmp_path, rig):
 def test_a_session_goes_on_when_a_sensor_is_reached_otherwise(tmp_path, rig, samples):
     with Session.resume(tmp_path / "s", rig) as session:
         session.add_capture(*samples(0), {})
-    camera = rig.cameras["cam"]
-    elsewhere = camera.driver.model_copy(update={"device": "/dev/video7"})
-    moved = rig.model_copy(update={"cameras": {"cam": camera.model_copy(update={"driver": elsewhere})}})
+    moved = changed(rig, cameras__cam__driver__device="/dev/video7")
     with Session.resume(tmp_path / "s", moved) as session:
         assert session.rig == moved and len(session.captures) == 1
     assert Session.open(tmp_path / "s").rig.cameras["cam"].driver.device == "/dev/video7"

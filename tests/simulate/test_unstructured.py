@@ -13,12 +13,11 @@ from lce_rig.core.results import Observation
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig, load_rig
 from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
+from tests.shared import changed
 
 
 def of_model(model: str) -> Rig:
-    rig = load_rig("mid360")
-    lidar = rig.lidars["lidar"].model_copy(update={"model": model})
-    return rig.model_copy(update={"lidars": {"lidar": lidar}})
+    return changed(load_rig("mid360"), lidars__lidar__model=model)
 
 
 @pytest.mark.parametrize("model", ["Mid-360", "Avia"])

@@ -15,6 +15,7 @@ from lce_rig.core.findings import Losses
 from lce_rig.rig import Rig, load_rig
 from lce_rig.timing.rig_time import rig_time_ns
 from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, Frame, pair_by_time
+from tests.shared import changed
 
 T0_NS = 1_700_000_000 * 10**9
 MS = 1_000_000
@@ -109,7 +110,7 @@ def test_a_frame_waits_for_its_events_but_not_for_ever(rig: Rig) -> None:
 
 
 def test_two_event_cameras_get_a_stretch_each(rig: Rig) -> None:
-    both = rig.model_copy(update={"cameras": {"davis": rig.cameras["davis"], "right": rig.cameras["davis"]}})
+    both = changed(rig, cameras__right=rig.cameras["davis"])
     left, right = stream(0, 3000, 2000, 1), replace(stream(0, 3000, 2000, 2), sensor="right")
     samples = [
         *packets(left, range(90, 2000, 90)),

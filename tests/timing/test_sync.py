@@ -10,6 +10,7 @@ from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import TimePairs, fit_clock
 from lce_rig.timing.rig_clock import EdgeClock, RigClock
 from lce_rig.timing.scan_pairing import pair_by_time
+from tests.shared import changed
 
 MS, S = 1_000_000, 1_000_000_000
 UTC_NS = 1_753_000_000 * S
@@ -86,13 +87,8 @@ def test_a_rig_with_hardware_sync_and_good_clocks_may_move_its_board(rlfs):
 
 
 def test_a_rig_without_hardware_sync_needs_still_boards_and_says_why(rlfs):
-    camera = rlfs.cameras["cam"]
-    frames = camera.channels["frames"]
-    free = frames.model_copy(update={"timestamps": frames.timestamps.model_copy(update={"sync": "none"})})
-    cameras = {"cam": camera.model_copy(update={"channels": {"frames": free}})}
-    verdict = clock_of(
-        rlfs.model_copy(update={"cameras": cameras}), lidar=ClockModel.identity(1000.0, "")
-    ).verdict()
+    free = changed(rlfs, cameras__cam__channels__frames__timestamps__sync="none")
+    verdict = clock_of(free, lidar=ClockModel.identity(1000.0, "")).verdict()
     assert verdict.requires_still_boards
     (reason,) = verdict.reasons
     assert (reason.code, reason.subject) == ("sync.none_in_profile", "cam")

@@ -8,6 +8,7 @@ from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig, load_rig
+from tests.shared import changed
 
 
 def plan(rig: Rig, held: Array) -> dict:
@@ -43,10 +44,7 @@ def test_boards_that_face_one_way_are_followed_by_tilted_ones(placements: Array)
 def test_a_plan_needs_no_nominal_extrinsics_but_the_beams_of_the_lidar(placements: Array) -> None:
     rig = load_rig("rlfs").model_copy(update={"nominal_extrinsics": ()})
     assert plan(rig, placements)["n_captures"] >= 1
-    unknown = rig.lidars["lidar"].model_copy(update={"model": "other"})
-    assert not plan_captures(
-        rig.model_copy(update={"lidars": {"lidar": unknown}}), "cam", "lidar", placements
-    )
+    assert not plan_captures(changed(rig, lidars__lidar__model="other"), "cam", "lidar", placements)
 
 
 @pytest.mark.parametrize(

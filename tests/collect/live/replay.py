@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -72,11 +72,3 @@ class Show:
         self.sources[0].put(image)
         self.sources[1].put(replace(capture.scans[0], stamp_ns=stamp_ns, host_ns=stamp_ns + PERIOD_NS))
         self.stamps[k].append(stamp_ns)
-
-
-def wait_for(is_so: Callable[[], bool], patience_s: float = 15.0) -> None:
-    """Wait until something is so."""
-    deadline_s = time.monotonic() + patience_s
-    while not is_so():
-        assert time.monotonic() < deadline_s, "it never came to be"
-        time.sleep(0.01)

@@ -15,16 +15,13 @@ from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig
 from tests.collect.live.replay import rig
+from tests.shared import changed
 
 
 @pytest.fixture
 def guide() -> Guide:
     (guide,) = make_guides(rig())
     return guide
-
-
-def without_nominal() -> Rig:
-    return rig().model_copy(update={"nominal_extrinsics": ()})
 
 
 def test_each_capture_moves_the_wanted_placement_and_lowers_the_prediction(guide: Guide) -> None:
@@ -59,8 +56,8 @@ def test_a_capture_that_is_taken_back_is_forgotten(guide: Guide) -> None:
 
 
 def test_it_says_why_it_goes_on_and_for_how_long_until_there_are_enough() -> None:
-    modest = rig().calibration.model_copy(update={"target_sigma_deg": 5.0, "target_sigma_m": 0.5})
-    (guide,) = make_guides(rig().model_copy(update={"calibration": modest}))
+    modest = changed(rig(), calibration__target_sigma_deg=5.0, calibration__target_sigma_m=0.5)
+    (guide,) = make_guides(modest)
     assert guide.explain() is None and guide.predict() is None, "before the first capture nothing is known"
     for k in range(6):
         guide.plan(None, float(k))
@@ -78,8 +75,7 @@ def test_it_says_why_it_goes_on_and_for_how_long_until_there_are_enough() -> Non
 
 
 def test_what_more_captures_cannot_reach_is_said_without_their_number() -> None:
-    strict = rig().calibration.model_copy(update={"target_sigma_m": 0.005})
-    (guide,) = make_guides(rig().model_copy(update={"calibration": strict}))
+    (guide,) = make_guides(changed(rig(), calibration__target_sigma_m=0.005))
     for k in range(12):
         guide.plan(None, float(k))
         assert guide.wanted is not None
@@ -107,7 +103,7 @@ def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide: Guid
 
 
 def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(guide: Guide) -> None:
-    (blind,) = make_guides(without_nominal())
+    (blind,) = make_guides(changed(rig(), nominal_extrinsics=()))
     blind.plan(None, 0.0)
     assert blind.problem is not None and blind.problem.code == "guide.no_nominal"
     assert blind.wanted is None
@@ -124,8 +120,7 @@ def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(
 
 
 def test_a_lidar_whose_beams_are_not_known_is_collected_without_guidance() -> None:
-    lidar = rig().lidars["lidar"].model_copy(update={"model": "HDL-64"})
-    (guide,) = make_guides(rig().model_copy(update={"lidars": {"lidar": lidar}}))
+    (guide,) = make_guides(changed(rig(), lidars__lidar__model="HDL-64"))
     guide.plan(None, 0.0)
     assert guide.problem is not None and guide.problem.code == "guide.no_beams"
     assert guide.wanted is None and "HDL-64" in str(guide.problem.figures["cause"])

@@ -2,65 +2,39 @@
 
 import contextlib
 import os
-import select
-import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from wire.reel import Reel
 from wire.rig import WireRig, small_rig
+from wire.sync_board import FakeBoard
 
 from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.state import LiveOptions, LiveState
 from lce_rig.devices import open_live
-from lce_rig.devices.lce1 import write_sentence
 from lce_rig.rig.profile import SyncSettings, TriggerSettings
 from lce_rig.session import Session
 from tests.collect.live.sent import check_sent, check_whole, read_sent
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "devices"))
-from fake_board import FakeBoard
-
-PERIOD_NS = 100_000_000
 
 
 class TriggeringBoard(FakeBoard):
     """Sends a pulse to the camera ten times a second, on the tenths of a second of UTC."""
 
     def __init__(self, trigger: Path) -> None:
-        super().__init__(drift=30e-6)
+        super().__init__(drift=30e-6, period_s=0.1, knows_utc=True)
         self._trigger = trigger
         self._line = -1
         self.pulses_ns: dict[int, int] = {}
 
-    def _run(self) -> None:
+    def _pulse(self, due_ns: int) -> None:
         # A pipe can be written to when its reader is there; ours is the camera's process.
-        due, rest = time.time_ns() // PERIOD_NS + 1, b""
-        while not self.has_gone:
-            if self._has_said_something():
-                rest = self._answer(rest + self._read())
-            if time.time_ns() >= due * PERIOD_NS:
-                with self._lock:
-                    self._pulse_at(due * PERIOD_NS)
-                due += 1
-
-    def _has_said_something(self) -> bool:
-        return bool(select.select([self._master], [], [], 0.001)[0])
-
-    def _pulse_at(self, utc_ns: int) -> None:
         if self._line < 0:
             with contextlib.suppress(OSError):
                 self._line = os.open(self._trigger, os.O_WRONLY | os.O_NONBLOCK)
-        self.n_sent += 1
-        t_us = self.board_us(utc_ns)
-        self.pulses_ns[self.n_sent] = utc_ns
-        self._say(write_sentence(f"LCETG,0,{self.n_sent},{t_us},R"))
-        if utc_ns % 10**9 == 0:
-            self.n_pps += 1
-            self._say(write_sentence(f"LCEPP,{self.n_pps},{t_us},{utc_ns // 10**9},G"))
+        super()._pulse(due_ns)
+        self.pulses_ns[self.n_sent] = due_ns
         try:
             if self._line >= 0:
                 os.write(self._line, b"x")
