@@ -12,36 +12,32 @@ from lce_rig.core.findings import KINDS, Kind, Template
 
 PAGE = Path(__file__).parents[1] / "docs" / "findings.md"
 HEAD = """# Findings
-What lce-rig finds is a fact: a code, a severity, the figures and, where several actions are possible, an
-action code. `--json`, result.json and intrinsics.json hold these facts. Codes, figure names, units and action
-codes are stable; texts may change in any release.
+`--json`, result.json and intrinsics.json hold findings as facts. Codes, figure names, units and action codes
+are stable; texts may change in any release.
 
 | field | content |
 |---|---|
-| `code` | what was found, "family.name" |
+| `code` | "family.name" |
 | `severity` | `note`: changes nothing; `warning`: usable, less well; `error`: must not be used |
-| `subject` | what it is about: a sensor, a capture, a profile key or a file; "" where it is plain |
-| `figures` | by name with units: `_m`, `_deg`, `_s`, `_px`, `_mps`; null where a figure is not known |
+| `subject` | a sensor, a capture, a profile key or a file; "" where it is plain |
+| `figures` | by name with units (`_m`, `_deg`, `_s`, `_px`, `_mps`), *in italics* below; null if unknown |
 | `action_code` | which of several actions applies; "" for the usual one |
-| `text`, `action` | the same in words, for people |
+| `text`, `action` | the same in words |
 
 Refused captures have `stage` and `cause` in place of `severity` and `text`; the code begins with the stage:
 `read`, `image`, `lidar`, `pair` (camera and LiDAR disagree) or `calibrate`. Codes that end in `.text` come
-from results of earlier versions, which held words only.
+from results of earlier versions.
 
 | command | prints with `--json` |
 |---|---|
-| `check` | what was detected in each capture, or its refusal |
-| `calibrate` | the content of result.json, with `findings` and `captures_refused` of each camera and LiDAR |
+| `check` | the detections in each capture, or its refusal |
+| `calibrate` | result.json, with `findings` and `captures_refused` of each camera and LiDAR |
 | `verify` | residuals of each capture; `doubts`: findings by which captures contradict the extrinsics |
 | `drift` | for each camera and LiDAR its `state`, each axis with figures, `findings` |
 | `repeat` | `findings` on the sessions; for each camera and LiDAR figures and a `finding`, the verdict |
-| `rigs check` | `findings`: what the profile allows but rarely means |
 | `doctor` | each check with its `findings` ([more](doctor.md)) |
 
-Exit codes are the same with and without `--json`.
-
-`scripts/findings_page.py` writes this page from the kinds in `lce_rig/ROOM/findings.py`.
+Exit codes are the same with and without `--json`. `scripts/findings_page.py` writes this page.
 """
 
 
@@ -51,7 +47,7 @@ def page() -> str:
         import_module(f"lce_rig.{path.parent.name}.findings")
     parts = [HEAD]
     for family, codes in groupby(sorted(KINDS), key=lambda code: code.partition(".")[0]):
-        parts.append(f"## {family}\n| code | figures | text | action |\n|---|---|---|---|")
+        parts.append(f"## {family}\n| code | text | action |\n|---|---|---|")
         parts.extend(_row(KINDS[code]) for code in codes)
         parts.append("")
     return "\n".join(parts)
@@ -61,12 +57,10 @@ def _row(kind: Kind) -> str:
     actions = [_shown(kind.action), *(f"`{name}`: {_shown(action)}" for name, action in kind.actions.items())]
     templates = [kind.text, kind.action, *kind.actions.values()]
     names = dict.fromkeys(name for template in templates for name in _figures(template))
-    cells = (
-        f"`{kind.code}`",
-        ", ".join(names),
-        _shown(kind.text),
-        "<br>".join(action for action in actions if action),
-    )
+    text = _shown(kind.text)
+    hidden = [name for name in names if f"*{name}*" not in " ".join([text, *actions])]
+    text += f" ({', '.join(f'*{name}*' for name in hidden)})" if hidden else ""
+    cells = f"`{kind.code}`", text, "<br>".join(action for action in actions if action)
     return f"| {' | '.join(cell.replace('|', '/').replace(chr(10), '<br>') for cell in cells)} |"
 
 

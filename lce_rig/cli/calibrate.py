@@ -258,7 +258,7 @@ def calibrate(
             )
         except NotEnoughDataError as error:
             if error.finding is not None and error.finding.figures.get("where"):
-                error.hint += f"\n{_collect_command(opened)}"
+                error.hint += f"\n{collect_command(opened)}"
             raise
     for shortage in result.shortages:
         show.warn(str(NotEnoughDataError.of(shortage)))
@@ -277,7 +277,7 @@ def calibrate(
     files += [f"{len(written.files) - 1} for the robot"] if len(written.files) > 1 else []
     show.note(f"  files        {written.files[0].parent}/ ({', '.join(files) or 'result.json'})")
     if any(finding.code == GUIDE_ADD.code for c in result.pairs for finding in c.findings):
-        show.note(f"  next         {_collect_command(opened)}")
+        show.note(f"  next         {collect_command(opened)}")
     elif all(c.verdict != "fail" for c in result.pairs):
         show.name_next("verify", session, "" if name is None else f" --name {name}")
     exit_by_verdict(result.pairs, are_printed=not as_json)
@@ -285,7 +285,7 @@ def calibrate(
         raise lacking
 
 
-def _collect_command(session: lce.Session) -> str:
+def collect_command(session: lce.Session) -> str:
     """Write the command that adds captures to a session, from where its own come from."""
     from lce_rig.cli.simulate import TRUTH
 
@@ -386,7 +386,8 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
     if plan and not lacks_captures(causes[:1]):
         lines.append(f"  -> {plan}")
     if len(causes) > _N_REASONS and not is_explained:
-        lines.append(f"  {show.counted(len(causes) - _N_REASONS, 'more reason')}: --explain, or report.html")
+        more = show.counted(len(causes) - _N_REASONS, "more reason")
+        lines.append(f"  {more} in report.html and by lce-rig calibrate {path} --explain")
     if is_explained or not has_failed:
         target, source = (c.camera, c.lidar) if c.is_of_lidars else ("cam", "lidar")
         title = show.escape(f"  T_cam_lidar (p_{target} = R p_{source} + t)")

@@ -83,7 +83,9 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
         raise NotEnoughDataError(
             f"{session}: no capture is usable",
             "Follow the actions above"
-            + ("." if debug_images else ", or draw the detections with --debug-images."),
+            + (
+                "." if debug_images else f", or draw the detections: `lce-rig check {session} --debug-images`"
+            ),
         )
 
 

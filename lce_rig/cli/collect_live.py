@@ -179,7 +179,7 @@ def _tell(
         show.note("dropped: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
     ending = _ENDINGS[report.ending]
     if report.ending == "enough":
-        ending += " (--keep-going or --captures N collect more)"
+        ending += " (for more, add --keep-going)"
     elif report.ending == "exhausted" and n_wanted is not None:
         ending += f"; {n_captures} of {n_wanted} captures"
     show.note(f"ended: {ending}")
@@ -208,11 +208,18 @@ def show_next(path: Path, rig: Rig, predicted: Sequence[Finding], n_captures: in
         state = "target met" if are_enough and is_met(prediction) else "target not met"
         show.note(f"  {state}: {prediction.text}")
     if not are_enough:
-        show.note(f"  next         collect {rig.quality.min_captures - n_captures} more captures at least")
+        lacking = show.counted(rig.quality.min_captures - n_captures, "more capture")
+        show.note(f"  next         {lacking} at least: {_more(path)}")
         return
     if predicted and not all(map(is_met, predicted)):
-        show.note("  next         collect more, or see the result so far:")
-    show.note(f"  next         lce-rig calibrate {path}")
+        show.note(f"  more         {_more(path)}")
+    show.name_next("calibrate", path)
+
+
+def _more(path: Path) -> str:
+    from lce_rig.cli.calibrate import collect_command
+
+    return collect_command(Session.open(path))
 
 
 def is_met(prediction: Finding) -> bool:

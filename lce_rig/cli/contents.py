@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from datetime import datetime
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -133,11 +134,13 @@ def _records(session: Session, stored: Sequence[StoredResult]) -> list[dict[str,
 
 
 def _capture_table(records: list[dict[str, Any]]) -> Any:
+    """List captures, those in succession that differ by their name alone in one row."""
     table = show.plain_table("", "capture", "data", "source", "used by", "")
-    for record in records:
+    for _, alike in groupby(records, lambda record: [record[key] for key in record if key != "name"]):
+        record, *others = alike
         state = "[red]rejected[/]" if record["state"] == "rejected" else ""
         table.add_row(
-            record["name"],
+            show.name_ranges([each["name"] for each in (record, *others)]),
             show.escape(", ".join(record["streams"])) or "[red]damaged[/]",
             show.escape(record["damage"] or record["source"]),
             show.escape(", ".join(record["used_by"])) or "-",

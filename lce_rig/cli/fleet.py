@@ -203,7 +203,7 @@ def table(
         show.print_table(shown)
         is_whole = len(chosen) == len(rows)
         count = show.counted(len(chosen), "row")
-        show.note(count if is_whole else f"{len(rows)} of {count}; add --where, --csv or --json")
+        show.note(count if is_whole else f"{len(rows)} of {count}; --csv and --json print all")
 
 
 def _cell(value: Any) -> str:
@@ -334,7 +334,7 @@ def deploy(
         stopped = rollout.robots[rollout.stopped_by]
         raise ResultRefusedError(
             f"stopped at {stopped.robot}: {_line(stopped)}",
-            "Remove the cause and run it again, or restore every robot's earlier files with --rollback.",
+            "Remove the cause and run it again; the same with --rollback restores every robot's earlier files.",
         )
 
 

@@ -90,15 +90,16 @@ def intrinsics(
         for one in measured:
             is_followed = save_profile is not None and one.judgement.code == "intrinsics.better"
             advice = "" if is_followed else one.judgement.advice_at(str(session))
-            show.print_lines(_lines(one, advice, is_explained=explain))
+            whole = show.command("intrinsics", session, " --explain")
+            show.print_lines(_lines(one, advice, "" if explain else whole))
             if explain:
                 show.print_table(_table(one))
                 show.print_lines(_explanation(one))
     show.note(f"  files        {files[0].parent}/: {', '.join(path.name for path in files)}")
     if save_profile is not None:
         replaced = write_profile(opened, measured, save_profile, is_forced=force)
-        show.note(f"written: {save_profile}, with new intrinsics of {', '.join(replaced)}")
-        show.note(f"next: lce-rig calibrate {session} --rig {save_profile}")
+        show.note(f"  written      {save_profile}, with new intrinsics of {', '.join(replaced)}")
+        show.name_next("calibrate", session, f" --rig {save_profile}")
         for one in measured:
             if one.judgement.code != "intrinsics.better":
                 how = "new intrinsics forced" if one.camera in replaced else "intrinsics kept"
@@ -107,8 +108,14 @@ def intrinsics(
         raise join_shortages(troubles)
 
 
-def _lines(measured: MeasuredIntrinsics, advice: str, *, is_explained: bool) -> list[str]:
-    """State the judgement with its action, the fit, the intrinsics and the weakness that matters most."""
+def _lines(measured: MeasuredIntrinsics, advice: str, whole: str) -> list[str]:
+    """State the judgement with its action, the fit, the intrinsics and the weakness that matters most.
+
+    Args:
+        measured: of one camera.
+        advice: the action, or "".
+        whole: the command that explains all; "" if it is this one.
+    """
     estimate, lens, judgement = measured.estimate, measured.intrinsics, measured.judgement
     covered = f"{100 * measured.certainty.is_covered.mean():.0f}"
     colour = {"intrinsics.fit": "green", "intrinsics.better": "red"}.get(judgement.code, "yellow")
@@ -124,12 +131,12 @@ def _lines(measured: MeasuredIntrinsics, advice: str, *, is_explained: bool) -> 
         f"  values       fx {lens.fx_px:.1f}, fy {lens.fy_px:.1f}, cx {lens.cx_px:.1f}, "
         f"cy {lens.cy_px:.1f} px",
     ]
-    if is_explained or judgement.code == "intrinsics.fit":
+    if not whole or judgement.code == "intrinsics.fit":
         return lines
     weaknesses = [text for text in measured.weaknesses if text not in judgement.sentence]
     lines += [f"  [yellow]{show.escape(text)}[/]" for text in weaknesses[:1]]
     if len(weaknesses) > 1:
-        lines.append(f"  {len(weaknesses) - 1} more: --explain")
+        lines.append(f"  {len(weaknesses) - 1} more: {whole}")
     return lines
 
 

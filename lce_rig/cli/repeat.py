@@ -112,7 +112,7 @@ def _lines(comparison: Repeatability, session: str) -> list[str]:
     c = comparison
     shared = "" if c.are_independent else ", at least: the results share captures"
     colour = "green" if c.agrees else "red"
-    lines = [f"[bold]{_sensors(c)}[/]: [{colour}]{show.escape(as_line(c.finding.text))}[/]"]
+    lines = [f"[{colour}]{show.escape(c.finding.text)}[/]"]
     advice = c.finding.advice_at(session)
     lines += [f"  -> {show.escape(as_line(advice))}"] if advice else []
     return [

@@ -39,17 +39,13 @@ def rigs(ctx: click.Context) -> None:
 @rigs.command("list")
 def list_profiles() -> None:
     """List the shipped profiles."""
-    table = show.plain_table("", "rig", "LiDARs", "cameras (channels)", "board", "description")
+    table = show.plain_table("", "rig", "board", "description")
     for rig in map(load_rig, shipped_profiles()):
-        cameras = (f"{name} ({', '.join(camera.channels)})" for name, camera in rig.cameras.items())
         board = rig.board.to_board()
         pattern = f"{board.cols}x{board.rows} corners, {1e3 * board.square_m:g} mm"
-        table.add_row(rig.name, ", ".join(rig.lidars), ", ".join(cameras), pattern, rig.description)
+        table.add_row(rig.name, pattern, rig.description)
     show.print_table(table)
-    show.note(
-        "for your own rig: lce-rig rigs new NAME --from rlfs, "
-        "then pass --rig NAME.yaml to doctor and collect; sessions keep it"
-    )
+    show.note("for your own rig: lce-rig rigs new NAME --from rlfs, then --rig NAME.yaml")
 
 
 @rigs.command("show")

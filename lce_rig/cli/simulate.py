@@ -136,7 +136,8 @@ def _simulate_session(path: Path, rig: Rig, n_captures: int, seed: int, options:
                 progress(done, n_captures)
         finally:  # an interrupted session has the truth of its captures, too
             write_truth(path / TRUTH, truth)
-    show.note(f"{path}: {n_captures} simulated captures of rig {rig.name}; truth in {path / TRUTH}")
+    following = show.command("check", path)
+    show.note(f"{path}: {n_captures} simulated captures of rig {rig.name}; next: {following}")
 
 
 def _simulate_recording(

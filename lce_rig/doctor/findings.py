@@ -35,12 +35,14 @@ def _pulse(finding: Finding) -> str:
 
 DISK = _note("computer.disk", "{free_mb:.0f} MB free, {write_mbps:.0f} MB/s flushed, in {folder}")
 DISK_FULL = Kind(
-    "computer.disk_full", "too little space (minimum 5000 MB)", "make room, or choose another disk with -o"
+    "computer.disk_full",
+    "too little space (minimum 5000 MB)",
+    "make room, or `lce-rig collect --rig RIG -o FOLDER`",
 )
 DISK_SLOW = Kind(
     "computer.disk_slow",
     "too slow (minimum 20 MB/s)",
-    "write to an SSD (-o FOLDER), without --record",
+    "collect on an SSD: `lce-rig collect --rig RIG -o FOLDER`",
 )
 DISK_NOT_WRITABLE = Kind(
     "computer.disk_not_writable",

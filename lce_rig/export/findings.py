@@ -11,7 +11,7 @@ LENS_FITTED = Kind(
 NO_FRAME = Kind(
     "export.no_frame",
     "{format}: {file} is not written: it needs the frame {frame}, and the root is {root}",
-    "set `mount` in the profile, or give the robot's tree with --tree",
+    "set `mount` in the profile, or export with --tree ROBOT.urdf",
     severity="warning",
 )
 NO_SESSION = Kind(

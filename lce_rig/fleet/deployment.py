@@ -187,7 +187,7 @@ def deploy(
         if planned.objections and not reason:
             causes = "; ".join(finding.text for finding in planned.objections)
             advice = dict.fromkeys(finding.advice for finding in planned.objections)
-            hint = "\n".join([*advice, "To deploy it nevertheless: --force --reason TEXT"])
+            hint = "\n".join([*advice, "To deploy it nevertheless, add --force --reason TEXT"])
             raise ResultRefusedError(f"not deployed to {target.to}: {causes}", hint)
         record, current = planned.record, planned.state.current
         if planned.is_in_place and current is not None:

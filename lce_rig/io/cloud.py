@@ -324,7 +324,7 @@ def _times(
     ticks = None if name is None else _ticks(cloud[name])
     unit = None if ticks is None else _unit(ticks)
     if ticks is None or unit is None:
-        notes.append("no times of points" if name is None else f"field {name!r} has no times of points")
+        notes.append("points without times" if name is None else f"field {name!r} has no times of points")
         sweep_ns = round(1e9 / settings.rate_hz) if is_last else 0
         return None, None if stamp_ns is None else stamp_ns - sweep_ns
     first = ticks.min()

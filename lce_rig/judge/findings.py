@@ -20,6 +20,8 @@ _OF_POSES = _OF_DISTANCES + (
     "verdict.cameras_differ verdict.channels_differ verdict.planes_apart verdict.sensors_disagree "
     "verdict.few_used verdict.few_placements verdict.far_from_nominal verdict.scale "
 )
+# A chance at which sessions that agree are still said to differ more than predicted.
+_UNLIKELY = 0.05
 _OF_SIGMAS = ["verdict.rotation_uncertain", "verdict.translation_uncertain"]
 _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.cameras_exchanged": f"{_OF_POSES}verdict.intrinsics".split(),
@@ -163,11 +165,11 @@ def _correction(q: Mapping[str, Figure]) -> str:
         fill(text, q)
         for name, text in (
             ("is_bent", "{displacement_px:.1f} +- {displacement_sigma_px:.1f} px"),
-            ("is_turned", "{turn_deg:.2f} +- {turn_sigma_deg:deg}"),
+            ("is_turned", "a turn of {turn_deg:.2f} +- {turn_sigma_deg:deg}"),
         )
         if q[name]
     ]
-    return f" by {', '.join(parts)}" if parts else ""
+    return f" by {' and '.join(parts)}" if parts else ""
 
 
 def _intrinsics(finding: Finding) -> str:
@@ -202,6 +204,10 @@ def _scale(finding: Finding) -> str:
     """Camera distances differ by {scale} +- {scale_sigma}: squares {square_m}, not {profile_square_m}."""
     scale, sigma = 100 * finding.figure("scale"), 100 * finding.figure("scale_sigma")
     squares = fill("squares of {square_m:1mm}, not {profile_square_m:1mm}", finding.figures)
+    if finding.severity == "note":
+        return (
+            f"boards correct the distances by {abs(scale):.1f} +- {sigma:.1f} %: {squares}, or another lens"
+        )
     side = "far" if scale > 0 else "near"
     return f"{squares}, or another lens: boards {abs(scale):.1f} +- {sigma:.1f} % too {side}"
 
@@ -264,6 +270,8 @@ def _agree(finding: Finding) -> str:
         "{rotation_deg:3deg} and {translation_m:1mm}",
         finding.figures,
     )
+    if finding.figure("p") < _UNLIKELY:
+        return f"{apart}, more than their standard deviations predict (chance {finding.figure('p'):.2f})"
     how = "less than" if finding.figures["is_generous"] else "as"
     return f"{apart}, {how} their standard deviations predict"
 
@@ -286,7 +294,7 @@ _SCENE_CHANGE = (
 NO_CERTIFICATE = Kind(
     "verdict.no_certificate",
     "not certified: method {method} has no certificate",
-    "use --method paper",
+    "`lce-rig calibrate {session} --method paper`",
     severity="warning",
 )
 NOT_CERTIFIED = Kind(
@@ -324,7 +332,7 @@ PLANES_APART = Kind(
 CHANNELS_DIFFER = Kind(
     "verdict.channels_differ",
     "{first} and {second} of one camera differ by " + _APART + ", beyond their uncertainty",
-    "calibrate each alone (--channels), find the captures that contradict",
+    "each alone: `lce-rig calibrate {session} --channels frames --name frames`",
 )
 SENSORS_DISAGREE = Kind(
     "verdict.sensors_disagree",
@@ -370,8 +378,8 @@ INTRINSICS = Kind(
 )
 INTRINSICS_BETTER = Kind(
     "intrinsics.better",
-    "the session determines the intrinsics better than the profile: it covers {covered:percent} of the image "
-    "and determines pixels near its border to {image_sigma_px:.2f} px",
+    "the session determines the intrinsics better than the profile ({covered:percent} of the image covered, "
+    "{image_sigma_px:.2f} px near its border)",
     "write them into one: `lce-rig intrinsics {session} --save-profile FILE`",
     severity="note",
 )

@@ -136,9 +136,8 @@ def find_weaknesses(estimate: IntrinsicsEstimate, certainty: LensCertainty) -> t
     outside = float(np.nanpercentile(certainty.sigma_px, _BORDER_PERCENTILE))
     if outside >= max(_BORDER_PX, _BORDER_RATIO * inside):
         texts.append(
-            f"boards reach {100 * reach(estimate):.0f} % of the way to the image's corners, the distortion "
-            f"is not determined beyond (pixel standard deviation {outside:.1f} px there, {inside:.1f} px "
-            "where boards were seen); place boards in all four corners"
+            f"boards reach {100 * reach(estimate):.0f} % of the way to the image's corners (standard "
+            f"deviation {outside:.1f} px beyond, {inside:.1f} px within): place boards in all four corners"
         )
     focal_sigma = float(estimate.sigma[0] / estimate.intrinsics.fx_px)
     if focal_sigma >= _FOCAL_SIGMA:

@@ -13,7 +13,7 @@ from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.files import read_json
-from lce_rig.core.phrasing import as_line, significant
+from lce_rig.core.phrasing import significant
 from lce_rig.export.ros_files import camera_info_text
 from lce_rig.export.writing import number, numbers
 from lce_rig.judge.findings import verdict_of
@@ -26,7 +26,6 @@ from lce_rig.session.session import INTRINSICS
 
 DOCUMENT = "intrinsics.json"
 FORMAT_VERSION = 1
-_FORCE = "To write them nevertheless, add --force."
 
 
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
@@ -109,9 +108,11 @@ def save_profile(
     refused = [one for one in measured if one.judgement.code != "intrinsics.better" and not is_forced]
     measured = [one for one in measured if one not in refused]
     if not measured:
-        why = "; ".join(f"{one.camera}: {one.judgement.text}" for one in refused)
-        actions = dict.fromkeys(as_line(one.judgement.advice) for one in refused)
-        raise ResultRefusedError(f"{path} not written. {why}", " ".join([*actions, _FORCE]))
+        command = f"lce-rig intrinsics {session.path} --save-profile {path} --force"
+        raise ResultRefusedError(
+            f"{path} is not written: the session determines no intrinsics better than the profile",
+            f"To write them nevertheless: {command}",
+        )
     text = session.profile_text()
     for one in measured:
         lens, block = one.intrinsics, f"cameras.{one.camera}"

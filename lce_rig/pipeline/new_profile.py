@@ -17,7 +17,7 @@ from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.detect.lidar.segments import order_scan
 from lce_rig.export.ros_files import load_camera_info
 from lce_rig.io.cloud import to_scan
-from lce_rig.io.decoding import DECODERS, read_cloud
+from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
 from lce_rig.rig import BoardSettings, LidarSettings
 from lce_rig.rig.board_settings import KEYS_OF_TYPE
@@ -64,13 +64,10 @@ BOARD_FORM = (
     "charuco:9x7,0.07,0.0525,5X5_50,0.767x0.626; or aprilgrid:COLSxROWS,TAG,SPACING,WIDTHxHEIGHT of tags, "
     "such as aprilgrid:4x3,0.13,0.3,0.767x0.626"
 )
-_ROUGH_LENS = (
-    "Not measured yet? Rough ones will do: FX = FY = 0.8 times the width (fisheye: equidistant, 0.5 times), "
-    "CX and CY the image's middle, and zeros; `lce-rig intrinsics` measures them later from these captures."
-)
 _LENS_FORM = (
     "MODEL,WIDTHxHEIGHT,FX,FY,CX,CY,K1,..., such as radtan,1280x720,897.5,896.8,635.4,375.3,-0.44,0.23,0,0"
 )
+_USUAL_SIZE_PX = (1280, 720)
 
 
 def new_profile(
@@ -124,7 +121,7 @@ def new_profile(
             raise UsageError(
                 f"intrinsics of {len(intrinsics)} of {len(groups)} cameras given",
                 f"Give --intrinsics once for each --camera: a camera_info file, or {_LENS_FORM}.\n"
-                f"{_ROUGH_LENS}",
+                f"{_rough_lens(None if recording is None else _image_size(recording))}",
             )
     model = lidar_model or _UNKNOWN_MODEL
     notes = [_line(topic) for topic in topics]
@@ -345,7 +342,29 @@ def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
     why = next((each.note for each in group if each.note), f"no camera_info beside {topic.topic}")
     raise UsageError(
         f"no intrinsics of camera {camera} ({topic.topic}): {why}",
-        f"Give --intrinsics for every camera: a camera_info file, or {_LENS_FORM}.",
+        f"Give --intrinsics for every camera: a camera_info file, or {_LENS_FORM}.\n"
+        f"{_rough_lens(topic.size_px)}",
+    )
+
+
+def _image_size(folder: Path) -> tuple[int, int] | None:
+    """Return the width and height (px) of a folder's first image; None without one."""
+    images = sorted(path for path in folder.glob("img/**/*.*") if path.suffix.lower() in SUFFIXES)
+    if not images:
+        return None
+    height, width = read_image(images[0]).shape[:2]
+    return width, height
+
+
+def _rough_lens(size_px: tuple[int, int] | None) -> str:
+    """Advise intrinsics to start from where none were measured."""
+    width, height = size_px or _USUAL_SIZE_PX
+    middle = f"{width / 2:g},{height / 2:g},0,0,0,0"
+    lens = f"radtan,{width}x{height},{0.8 * width:.0f},{0.8 * width:.0f},{middle}"
+    fisheye = f"equidistant,{width}x{height},{width / 2:.0f},{width / 2:.0f},{middle}"
+    return (
+        f"Not measured yet? Begin with --intrinsics {lens}, or for a fisheye {fisheye}; "
+        "`lce-rig intrinsics` measures them later from these captures."
     )
 
 

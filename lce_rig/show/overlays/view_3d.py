@@ -95,7 +95,10 @@ def show_window(captures: Sequence[CaptureIn3D], cameras: Sequence[CameraIn3D], 
     if sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
-        raise SourceError("there is no display for a window", "Write a picture instead: --output view.png")
+        raise SourceError(
+            "there is no display for a window",
+            "Write a picture instead: `lce-rig view SESSION --output view.png`",
+        )
     o3d = _open3d()
     window = _opened(o3d.visualization.VisualizerWithKeyCallback(), is_visible=True)
     at = first
