@@ -334,7 +334,7 @@ def deploy(
         stopped = rollout.robots[rollout.stopped_by]
         raise ResultRefusedError(
             f"stopped at {stopped.robot}: {_line(stopped)}",
-            "Remove the cause and run it again; the same with --rollback restores every robot's earlier files.",
+            "Remove the cause and run it again; with --rollback it restores every robot's earlier files.",
         )
 
 

@@ -26,12 +26,12 @@ BUG = Kind("fleet.bug", "a bug in lce-rig: {what}", "report it with the session"
 TIMED_OUT = Kind(
     "fleet.timed_out",
     "not done after {limit_s:.0f} s (limit)",
-    "split it, or `lce-rig fleet run ROOT --registry FOLDER --retry --time-limit SECONDS`",
+    "`lce-rig fleet run ROOT --registry FOLDER --retry --time-limit SECONDS`",
 )
 OUT_OF_MEMORY = Kind(
     "fleet.out_of_memory",
     "needs more than {limit_mb:.0f} MB of memory (limit)",
-    "split it, or `lce-rig fleet run ROOT --registry FOLDER --retry --memory-limit MB`",
+    "`lce-rig fleet run ROOT --registry FOLDER --retry --memory-limit MB`",
 )
 SIGNAL = Kind(
     "fleet.signal", "its process was ended by signal {signal}: {what}", "calibrate the session alone"
