@@ -21,7 +21,7 @@ from lce_rig.core.data import Events, Image, LiveSample, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
-from lce_rig.devices.reading import ClockState, LiveSource, RateMeter, SourceStatus
+from lce_rig.devices.reading import LiveSource, RateMeter, SourceStatus
 from lce_rig.io.events.event_recording import NS_PER_US
 from lce_rig.rig import CameraSettings
 
@@ -120,7 +120,7 @@ class DavisSource(LiveSource):
         if self._delays_ns:
             # How old the freshest of the last events were on arrival.
             delay_ms = min(self._delays_ns.copy()) * 1e-6
-            clock = ClockState(findings.DAVIS_CLOCK(delay_ms=delay_ms))
+            clock = findings.DAVIS_CLOCK(delay_ms=delay_ms)
             if abs(delay_ms) > _MAX_CLOCK_ERROR_MS:
                 problems.append(findings.CLOCK_DIFFERS(difference_s=abs(delay_ms) / 1000))
         if self._n_resets:

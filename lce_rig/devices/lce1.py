@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, TypeAlias
 from lce_rig.core.data import Pulse
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
-from lce_rig.devices.reading import ClockState
 from lce_rig.rig.profile import PPS_LINE
 from lce_rig.timing.clock import NS_PER_S, ClockModel
 from lce_rig.timing.clock_fit import ClockTracker
@@ -321,7 +320,7 @@ class BoardState:
         """UTC on the board's clock, by the pulses per second; None where it does not know UTC."""
         return self.utc_tracker.model
 
-    def clock_state(self) -> ClockState:
+    def clock_state(self) -> Finding:
         """Report the clock of the timestamps and its synchronisation with others."""
         figures: dict[str, Any] = {}
         for name, model in (("host", self.host_clock), ("utc", self.utc_clock)):
@@ -333,7 +332,7 @@ class BoardState:
                 }
         if self.round_trip_ns is not None:
             figures["round_trip_ms"] = self.round_trip_ns / 1e6
-        return ClockState(findings.BOARD_CLOCK(**figures))
+        return findings.BOARD_CLOCK(**figures)
 
     def problems(self, now_ns: int) -> tuple[Finding, ...]:
         """List the problems at a moment of the steady clock."""

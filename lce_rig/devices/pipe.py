@@ -21,7 +21,7 @@ from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import findings
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, Pixels, find_format
-from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
+from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.rig import CameraSettings
 from lce_rig.rig.sensors import MAX_PIXELS
 
@@ -79,28 +79,26 @@ class ImagePipeSource(LiveSource):
                 raw = ", ".join(code.strip() for code, form in FORMATS.items() if not form.is_compressed)
                 raise SourceError(what, f"It can be {raw}, or missing for Y4M.")
             self._stream = RawImages(code, *self._settings.resolution_px)
-        with ExitStack() as stack:
-            try:
-                self._process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.PIPE,
-                    bufsize=0,
-                    start_new_session=True,  # Ctrl-C is ours; the command is stopped in its turn
-                )
-            except OSError as error:
-                hint = "Is the program installed? Give its full path."
-                what = f"{self._who}: {command[0]} cannot be started: {error.strerror}"
-                raise SourceError(what, hint) from None
-            stack.callback(_end_process, self._process)
-            self._selector = stack.enter_context(selectors.DefaultSelector())
-            for pipe in self._pipes():
-                os.set_blocking(pipe.fileno(), False)
-                self._selector.register(pipe, selectors.EVENT_READ)
-            with suppress(OSError):  # fewer, larger reads where the system allows
-                fcntl(self._pipes()[0].fileno(), F_SETPIPE_SZ, _PIPE_BYTES)
-            self._stack = stack.pop_all()
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+                start_new_session=True,  # Ctrl-C is ours; the command is stopped in its turn
+            )
+        except OSError as error:
+            hint = "Is the program installed? Give its full path."
+            what = f"{self._who}: {command[0]} cannot be started: {error.strerror}"
+            raise SourceError(what, hint) from None
+        self._stack.callback(_end_process, self._process)
+        self._selector = self._stack.enter_context(selectors.DefaultSelector())
+        for pipe in self._pipes():
+            os.set_blocking(pipe.fileno(), False)
+            self._selector.register(pipe, selectors.EVENT_READ)
+        with suppress(OSError):  # fewer, larger reads where the system allows
+            fcntl(self._pipes()[0].fileno(), F_SETPIPE_SZ, _PIPE_BYTES)
 
     def close(self) -> None:
         """Stop the command."""
@@ -108,7 +106,7 @@ class ImagePipeSource(LiveSource):
 
     def describe(self) -> SourceStatus:
         """Report the state of the camera."""
-        clock, device = ClockState(findings.ARRIVAL()), " ".join(self._settings.driver.command)
+        clock, device = findings.ARRIVAL(), " ".join(self._settings.driver.command)
         return SourceStatus(self.sensor, clock=clock, device=device)
 
     def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:

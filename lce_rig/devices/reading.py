@@ -4,9 +4,9 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Generic, TypeVar
@@ -15,28 +15,14 @@ from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices.disk_writer import DiskWriter
+from lce_rig.io.findings import LIDAR_UTC
 
-_TAKE_S = 0.2
 _RATE_WINDOW_S = 3.0
 # Two seconds of images, six of scans: longer than a busy computer lets them wait.
 _N_SLOTS = 64
 REOPEN_EVERY_S = 1.0
 
 T = TypeVar("T")
-AnySource = TypeVar("AnySource", bound="LiveSource")
-
-
-@dataclass(frozen=True)
-class ClockState:
-    """Whose time a sensor's timestamps are.
-
-    Attributes:
-        finding: whose time, and how it is tied to others.
-        is_utc: whether it is the sensor's own time, tied to UTC by pulses and sentences.
-    """
-
-    finding: Finding
-    is_utc: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,7 +35,7 @@ class SourceStatus:
         n_dropped: samples dropped because they were not taken in time.
         n_lost: samples or packets that never arrived, by the device's own counters or timestamps.
         rate_hz: samples a second over the last seconds; 0 before two have come.
-        clock: whose time the timestamps are; None before the first.
+        clock: whose time the timestamps are, and how it is tied to others; None before the first.
         problems: what is wrong now.
         device: what answers: its model, serial number and firmware as far as it tells them.
         serial: its serial number; "" where it tells none, or none yet.
@@ -63,13 +49,18 @@ class SourceStatus:
     n_dropped: int = 0
     n_lost: int = 0
     rate_hz: float = 0.0
-    clock: ClockState | None = None
+    clock: Finding | None = None
     problems: tuple[Finding, ...] = ()
     device: str = ""
     serial: str = ""
     rates_hz: Mapping[str, float] = field(default_factory=dict)
     n_packets: int | None = None
     n_lost_by_line: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def is_utc(self) -> bool:
+        """Whether timestamps are the sensor's own time, tied to UTC by pulses and sentences."""
+        return self.clock is not None and self.clock.code == LIDAR_UTC.code
 
 
 class Inbox(Generic[T]):
@@ -131,12 +122,6 @@ class Inbox(Generic[T]):
                 raise self._error
             return None
 
-    @property
-    def is_ended(self) -> bool:
-        """Whether the queue was closed and everything taken."""
-        with self._changed:
-            return self._is_closed and not self._items
-
 
 class RateMeter:
     """How many a second came over the last seconds; may be asked from any thread.
@@ -172,13 +157,15 @@ class RateMeter:
 
 
 class LiveSource(ABC):
-    """An attached sensor, read by a thread of its own while its `with` block lasts.
+    """An attached sensor, read by a thread of its own; see `AttachedSensors`.
 
-    A driver opens, reads, closes and describes its device; the thread, silence, rates, the queue and opening
-    again what was lost are here, the same for all.
+    A driver opens, reads, closes and describes its device; the thread, silence, rates and opening again what
+    was lost are here, the same for all.
 
     Attributes:
         sensor: its name in the profile.
+        lost: why the sensor is lost now, and since when by time.monotonic(); None while it is not.
+        opened_s: when it was opened first, by time.monotonic(); None before.
     """
 
     def __init__(
@@ -194,18 +181,19 @@ class LiveSource(ABC):
             n_slots: samples that may wait to be taken; when more do, the oldest is dropped.
         """
         self.sensor = sensor
+        self.lost: tuple[SourceError, float] | None = None
+        self.opened_s: float | None = None
         self._who = who
         self._n_slots, self._silence_s, self._what_to_check = n_slots, silence_s, what_to_check
-        self._inbox, self._is_shared, self._reopen_every_s = Inbox[LiveSample](), False, 0.0
+        self._inbox = Inbox[LiveSample]()
         self._stopping = threading.Event()
+        self._settled = threading.Event()
         self._rate = RateMeter()
         self._heard_s = 0.0
-        self._lost: tuple[SourceError, float] | None = None
-        self._thread: threading.Thread | None = None
 
     @abstractmethod
     def open(self) -> None:
-        """Open the device; it sends, or will be heard, when this returns.
+        """Open the device; it sends, or will be heard, when this returns. Where it fails, `close` follows.
 
         Raises:
             SourceError: it is absent, busy or of another model; the hint says what to check.
@@ -240,57 +228,32 @@ class LiveSource(ABC):
         what = "fell silent" if has_sent else "sends nothing"
         return SourceError(f"{self._who} {what}: nothing for {self._silence_s:g} s", self._what_to_check)
 
-    def feed(self, inbox: Inbox[LiveSample], reopen_every_s: float) -> None:
-        """Feed a shared queue, and reopen the device whenever it is lost; call before opening."""
-        self._inbox, self._is_shared, self._reopen_every_s = inbox, True, reopen_every_s
+    def start(self, inbox: Inbox[LiveSample], reopen_every_s: float | None) -> None:
+        """Open the device and read it into a queue, in a thread.
 
-    def __enter__(self: AnySource) -> AnySource:
-        """Open the device and start reading; what an own queue held and counted before is forgotten.
-
-        Raises:
-            SourceError: as `open` does.
+        Args:
+            inbox: takes the samples.
+            reopen_every_s: between attempts to open a lost device again; None for none.
         """
+        self._inbox, self.lost, self.opened_s, self._rate = inbox, None, None, RateMeter()
         self._stopping.clear()
-        if not self._is_shared:
-            self._inbox = Inbox()
-        self._rate = RateMeter()
-        self._open()
-        thread = threading.Thread(target=self._run, name=f"read {self.sensor}", daemon=True)
-        thread.start()
-        self._thread = thread  # Closing, which another thread may do meanwhile, waits for one that has begun.
-        return self
+        self._settled.clear()
+        run = partial(self._run, reopen_every_s)
+        self._thread = threading.Thread(target=run, name=f"read {self.sensor}", daemon=True)
+        self._thread.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop reading and close the device; never raises."""
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the device is open, or could not be opened; returns whether that was in time."""
+        return self._settled.wait(timeout_s)
+
+    def stop(self) -> None:
+        """Ask the thread to close the device."""
         self._stopping.set()
-        if self._thread is not None:
-            self._thread.join()
-        self.close()
-        if not self._is_shared:
-            self._inbox.close()
 
-    def take(self, timeout_s: float) -> LiveSample | None:
-        """Take the oldest sample; None where none came in time, or the source was closed.
-
-        Raises:
-            SourceError: why reading ended, unless it was stopped.
-        """
-        came = self._inbox.take(timeout_s)
-        return None if came is None else came[1]
-
-    def samples(self) -> Iterator[LiveSample]:
-        """Yield samples as they come, until the source is closed.
-
-        Raises:
-            SourceError: why reading ended, unless it was stopped.
-        """
-        while not self._inbox.is_ended:
-            sample = self.take(_TAKE_S)
-            if sample is not None:
-                yield sample
-        self.take(0)
+    def join(self, timeout_s: float | None = None) -> bool:
+        """Wait until the device is closed; returns whether that was in time."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
 
     def status(self) -> SourceStatus:
         """Report the state of the sensor; may be called from any thread."""
@@ -302,11 +265,6 @@ class LiveSource(ABC):
             rate_hz=self._rate.rate_hz,
         )
 
-    @property
-    def lost(self) -> tuple[SourceError, float] | None:
-        """Why the sensor is lost now, and since when by time.monotonic(); None while it is not."""
-        return self._lost
-
     def note_heard(self) -> None:
         """Call the device alive, though no sample is complete yet."""
         self._heard_s = time.monotonic()
@@ -316,17 +274,13 @@ class LiveSource(ABC):
         """Whether to give up what waits for the device."""
         return self._stopping.is_set()
 
-    def _open(self) -> None:
-        try:
-            self.open()
-        except BaseException:  # Ctrl-C while waiting, too.
-            self.close()
-            raise
-
-    def _run(self) -> None:
-        """Read until asked to stop; a lost device is reopened if the queue is shared."""
-        while True:
+    def _run(self, reopen_every_s: float | None) -> None:
+        """Open and read until asked to stop; a lost device is opened again."""
+        while not self.is_stopping:
             try:
+                self.open()
+                self.opened_s = self.opened_s or time.monotonic()
+                self._settled.set()
                 failure = self._read_on()
             except SourceError as error:
                 failure = error
@@ -335,25 +289,16 @@ class LiveSource(ABC):
                     f"{self._who}: its reader failed: {error!r}", "This is a bug: report it."
                 )
                 failure.__cause__ = error
-            if not self._is_shared:
-                self._inbox.close(failure)
-            if failure is None or not self._is_shared:
-                return
-            self._lost = failure, self._lost[1] if self._lost is not None else time.monotonic()
             self.close()
-            while True:
-                if self._stopping.wait(self._reopen_every_s):
-                    return
-                try:
-                    self._open()
-                    break
-                except SourceError as error:
-                    self._lost = error, self._lost[1]
+            if failure is not None:
+                self.lost = failure, time.monotonic() if self.lost is None else self.lost[1]
+                self._settled.set()
+                self._stopping.wait(reopen_every_s)
 
     def _read_on(self) -> SourceError | None:
         """Read until asked to stop, or until the device is silent for too long: then explain that."""
         heard_s, has_sent = time.monotonic(), False
-        while not self._stopping.is_set():
+        while not self.is_stopping:
             came = list(self.read())
             now_s = time.monotonic()
             if came:
@@ -361,7 +306,7 @@ class LiveSource(ABC):
                 self._rate.add(len(came))
                 heard_s, has_sent = now_s, True
                 # Back only now: a program that can be started may still find no camera.
-                self._lost = None
+                self.lost = None
             elif now_s - max(heard_s, self._heard_s) > self._silence_s:
                 return self.explain_silence(has_sent=has_sent)
         return None
@@ -370,18 +315,34 @@ class LiveSource(ABC):
 class AttachedSensors:
     """The attached sensors of a rig, read side by side into one queue; open while its `with` block lasts.
 
-    A sensor that fails is closed and opened again and again; meanwhile the others go on.
+    They are opened at the same time. A sensor that fails is closed and opened again and again; meanwhile the
+    others go on.
 
     Attributes:
         sources: by the sensor's name.
     """
 
-    def __init__(self, sources: Sequence[LiveSource], reopen_every_s: float = REOPEN_EVERY_S) -> None:
+    def __init__(self, sources: Sequence[LiveSource], reopen_every_s: float | None = REOPEN_EVERY_S) -> None:
         """Take the sources; none is opened yet."""
         self.sources = {source.sensor: source for source in sources}
         self._inbox = Inbox[LiveSample]()
-        for source in sources:
-            source.feed(self._inbox, reopen_every_s)
+        self._reopen_every_s = reopen_every_s
+
+    def start(self) -> None:
+        """Begin to open every sensor."""
+        for source in self.sources.values():
+            source.start(self._inbox, self._reopen_every_s)
+
+    def stop(self, timeout_s: float | None = None) -> list[str]:
+        """Close every sensor; returns those that do not close in time."""
+        until_s = None if timeout_s is None else time.monotonic() + timeout_s
+        for source in self.sources.values():
+            source.stop()
+        return [
+            name
+            for name, source in self.sources.items()
+            if not source.join(None if until_s is None else max(0.0, until_s - time.monotonic()))
+        ]
 
     def __enter__(self) -> "AttachedSensors":
         """Open every sensor.
@@ -389,18 +350,19 @@ class AttachedSensors:
         Raises:
             SourceError: of the first that cannot be opened; its hint names the others.
         """
-        with ExitStack() as stack:
-            failures: list[SourceError] = []
+        self.start()
+        try:
             for source in self.sources.values():
-                try:
-                    stack.enter_context(source)
-                except SourceError as error:
-                    failures.append(error)
+                source.wait()
+            closed = [source for source in self.sources.values() if source.opened_s is None]
+            failures = [source.lost[0] for source in closed if source.lost is not None]
             if failures:
                 hints = [failures[0].hint, *(f"Also: {other.what}" for other in failures[1:])]
                 hints.append("`lce-rig doctor --rig RIG` looks at every device.")
                 raise SourceError(failures[0].what, "\n  ".join(hint for hint in hints if hint))
-            self._stack = stack.pop_all()
+        except BaseException:  # Ctrl-C while waiting, too.
+            self.stop()
+            raise
         self._inbox.n_dropped.clear()  # What came too soon, while others were being opened, is no loss.
         return self
 
@@ -408,7 +370,7 @@ class AttachedSensors:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close every sensor."""
-        self._stack.close()
+        self.stop()
         self._inbox.close()
 
     def take(self, timeout_s: float) -> tuple[str, LiveSample] | None:

@@ -9,7 +9,7 @@ from typing import Any
 from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import findings
-from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
+from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.io.ros.bag_file import RawMessage
 from lce_rig.io.ros.rosbag import TopicDecoder
 from lce_rig.io.ros.topics import Target
@@ -72,24 +72,22 @@ class Ros2Source(LiveSource):
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import qos_profile_sensor_data
 
-        with ExitStack() as stack:
-            context = rclpy.Context()
-            # With a context of its own, rclpy leaves Ctrl-C to this program.
-            rclpy.init(context=context)
-            stack.callback(rclpy.try_shutdown, context=context)
-            # ROS 2 allows letters, digits and underscores of ASCII.
-            name = "lce_rig_" + re.sub(r"[^A-Za-z0-9_]", "_", self.sensor)
-            node = rclpy.create_node(name, context=context)
-            stack.callback(node.destroy_node)
-            self._executor = SingleThreadedExecutor(context=context)
-            self._executor.add_node(node)
-            stack.callback(self._executor.shutdown)
-            self._msgtype = self._find_type(node)
-            package, _, name = self._msgtype.partition("/")
-            kind = getattr(import_module(f"{package}.msg"), name)
-            node.create_subscription(kind, self._topic, self._receive, qos_profile_sensor_data, raw=True)
-            self._waiting.clear()
-            self._stack = stack.pop_all()
+        context = rclpy.Context()
+        # With a context of its own, rclpy leaves Ctrl-C to this program.
+        rclpy.init(context=context)
+        self._stack.callback(rclpy.try_shutdown, context=context)
+        # ROS 2 allows letters, digits and underscores of ASCII.
+        name = "lce_rig_" + re.sub(r"[^A-Za-z0-9_]", "_", self.sensor)
+        node = rclpy.create_node(name, context=context)
+        self._stack.callback(node.destroy_node)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(node)
+        self._stack.callback(self._executor.shutdown)
+        self._msgtype = self._find_type(node)
+        package, _, name = self._msgtype.partition("/")
+        kind = getattr(import_module(f"{package}.msg"), name)
+        node.create_subscription(kind, self._topic, self._receive, qos_profile_sensor_data, raw=True)
+        self._waiting.clear()
 
     def close(self) -> None:
         """Leave the ROS graph."""
@@ -110,14 +108,10 @@ class Ros2Source(LiveSource):
 
     def describe(self) -> SourceStatus:
         """Report the state of the topic."""
-        n_lost = sum(
-            int(str(loss.figures["n"]))
-            for loss in self._decoder.losses.findings()
-            if loss.code != "recording.points_without_return"
-        )
+        n_lost = sum(int(str(loss.figures["n"])) for loss in self._decoder.losses.findings())
         clock = None
         if self._delay_ms is not None:
-            clock = ClockState(findings.HEADER(delay_ms=self._delay_ms))
+            clock = findings.HEADER(delay_ms=self._delay_ms)
         problems = (findings.MESSAGES_SKIPPED(n=n_lost),) if n_lost else ()
         device = f"{self._topic} ({self._msgtype})" if self._msgtype else self._topic
         return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, problems=problems, device=device)

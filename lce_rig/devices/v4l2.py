@@ -21,7 +21,7 @@ from lce_rig.core.phrasing import significant
 from lce_rig.devices import findings
 from lce_rig.devices import v4l2_abi as abi
 from lce_rig.devices.pixel_formats import FORMATS, PixelDecoder, find_format
-from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
+from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.devices.video_device import (
     VideoDevice,
     apply_controls,
@@ -227,22 +227,20 @@ class V4l2Source(LiveSource):
             hint = f"Add to cameras.{self.sensor}: {line}\nVideo devices of this computer: {devices}."
             raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
         self._last_sequence = None
-        with ExitStack() as stack:
-            self._device = VideoDevice(driver.device, self.sensor)
-            stack.callback(self._device.close)
-            self._serial = serial_number(Path(driver.device).resolve().name)
-            self._decoder = self._set_up_images()
-            self._device_in_words = (
-                f"{self._device.card} at {self._device.path} ({self._device.driver}, {self._device.bus}), "
-                f"{self._decoder.code.strip()}"
-            )
-            self._known = list_controls(self._device)
-            self._notes = apply_controls(self._device, self.sensor, driver.controls)
-            if driver.frame_rate_hz is not None:
-                self._device.set_rate(driver.frame_rate_hz)
-            self._read_exposure()
-            self._device.start(N_BUFFERS)
-            self._stack = stack.pop_all()
+        self._device = VideoDevice(driver.device, self.sensor)
+        self._stack.callback(self._device.close)
+        self._serial = serial_number(Path(driver.device).resolve().name)
+        self._decoder = self._set_up_images()
+        self._device_in_words = (
+            f"{self._device.card} at {self._device.path} ({self._device.driver}, {self._device.bus}), "
+            f"{self._decoder.code.strip()}"
+        )
+        self._known = list_controls(self._device)
+        self._notes = apply_controls(self._device, self.sensor, driver.controls)
+        if driver.frame_rate_hz is not None:
+            self._device.set_rate(driver.frame_rate_hz)
+        self._read_exposure()
+        self._device.start(N_BUFFERS)
 
     def close(self) -> None:
         """Stop and close the camera."""
@@ -255,11 +253,10 @@ class V4l2Source(LiveSource):
             problems.append(findings.DAMAGED_IMAGES(n=self._n_damaged))
         clock = None
         if self._has_sent and self._clock.used is None:
-            clock = ClockState(findings.ARRIVAL())
+            clock = findings.ARRIVAL()
         elif self._has_sent:
             delay_ms = self._clock.delay_ns * 1e-6
-            moved = findings.MID_EXPOSURE(clock=self._clock.used, mark=self._mark, delay_ms=delay_ms)
-            clock = ClockState(moved)
+            clock = findings.MID_EXPOSURE(clock=self._clock.used, mark=self._mark, delay_ms=delay_ms)
             if self._exposure_us is None:
                 problems.append(findings.EXPOSURE_UNKNOWN())
         return SourceStatus(
@@ -301,24 +298,27 @@ class V4l2Source(LiveSource):
     def read(self) -> list[LiveSample]:
         """Return the image that came; see `LiveSource`."""
         try:
-            frame = self._device.read(_WAIT_S)
+            came = self._device.read(_WAIT_S)
         except OSError:
             # The kernel calls it temporary; should it last, the silence ends it.
             self._n_damaged += 1
             time.sleep(_WAIT_S)
             return []
-        if frame is None:
+        if came is None:
             return []
+        data, frame = came
         host_ns = time.time_ns()
-        utc_ns = self._clock.to_utc_ns(frame.stamp_ns)
+        utc_ns = self._clock.to_utc_ns(
+            1000 * (1_000_000 * frame.timestamp.seconds + frame.timestamp.microseconds)
+        )
         if self._last_sequence is not None and frame.sequence > self._last_sequence:
             self._n_lost += frame.sequence - self._last_sequence - 1
         self._last_sequence = frame.sequence
         self._has_sent = True
         try:
-            if frame.is_damaged:
+            if frame.flags & abi.BUFFER_ERROR:
                 raise ValueError("the driver says so")
-            pixels = self._decoder.decode(frame.data)
+            pixels = self._decoder.decode(data)
         except ValueError:
             self._n_damaged += 1
             return []

@@ -14,41 +14,20 @@ from ctypes import Structure, c_int32, pointer
 from fcntl import ioctl
 from mmap import MAP_SHARED, PROT_READ, PROT_WRITE, mmap
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 from lce_rig.devices import v4l2_abi as abi
 
-_US_NS = 1000
-_S_NS = 1_000_000_000
 Value = bool | int | float | str
+Control = tuple[int, int]
+"""Number of a setting, and its kind as in `v4l2_abi`."""
 _NUMBERS = (abi.INTEGER, abi.BOOLEAN, abi.MENU, abi.INTEGER64, abi.BITMASK, abi.INTEGER_MENU)
 _EXPOSURE_UNIT_US = 100
 _LIST_CONTROLS = "`v4l2-ctl --list-ctrls-menus` lists the settings and their numbers."
 _LOCKED = f"An automatic mode or a running stream may lock it: set that mode, too. {_LIST_CONTROLS}"
-
-
-class RawFrame(NamedTuple):
-    """One image as the kernel hands it over.
-
-    Attributes:
-        data: its bytes.
-        stamp_ns: on the driver's clock.
-        sequence: running number; gaps are lost images.
-        flags: the kernel's, see `v4l2_abi`.
-    """
-
-    data: bytes
-    stamp_ns: int
-    sequence: int
-    flags: int
-
-    @property
-    def is_damaged(self) -> bool:
-        """Whether the driver says that part of it is missing or wrong."""
-        return bool(self.flags & abi.BUFFER_ERROR)
 
 
 class VideoDevice:
@@ -164,8 +143,8 @@ class VideoDevice:
         request = abi.BufferRequest(count=0, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
         self.grants(abi.REQUEST_BUFFERS, request)
 
-    def read(self, timeout_s: float) -> RawFrame | None:
-        """Wait for an image; None where none came in time.
+    def read(self, timeout_s: float) -> tuple[bytes, Any] | None:
+        """Wait for an image; its bytes and the kernel's `v4l2_abi.Buffer`, None where none came in time.
 
         Raises:
             SourceError: the device is gone.
@@ -185,13 +164,11 @@ class VideoDevice:
                 raise
             raise self._explain(error, "stopped") from None
         data = self._buffers[buffer.index][: buffer.bytesused or buffer.length]
-        stamp_ns = buffer.timestamp.seconds * _S_NS + buffer.timestamp.microseconds * _US_NS
-        frame = RawFrame(data, stamp_ns, buffer.sequence, buffer.flags)
         try:
             self.ioctl(abi.QUEUE_BUFFER, _buffer(buffer.index))
         except OSError as error:
             raise self._explain(error, "stopped") from None
-        return frame
+        return data, buffer
 
     def _check_capabilities(self) -> None:
         said = abi.Capability()
@@ -267,13 +244,6 @@ def _attached() -> str:
     return f"Set driver.device to one of: {', '.join(devices)}."
 
 
-class Control(NamedTuple):
-    """One setting of a device: its number, and its kind as in `v4l2_abi`."""
-
-    id: int
-    type: int
-
-
 def list_controls(device: VideoDevice) -> dict[str, Control]:
     """List the settings that hold one number, by the names that v4l2-ctl shows."""
     controls = {}
@@ -282,7 +252,7 @@ def list_controls(device: VideoDevice) -> dict[str, Control]:
         if ask.type in _NUMBERS and not ask.flags & abi.CONTROL_DISABLED and ask.nr_of_dims == 0:
             # "Exposure Time, Absolute" is exposure_time_absolute.
             name = re.sub(r"[^a-z0-9]+", "_", ask.name.decode("utf-8", "replace").lower()).strip("_")
-            controls[name] = Control(ask.id, ask.type)
+            controls[name] = ask.id, ask.type
         ask.id |= abi.NEXT_CONTROL
     return controls
 
@@ -305,26 +275,27 @@ def apply_controls(device: VideoDevice, sensor: str, wanted: Mapping[str, Value]
         if isinstance(value, str) or value != int(value):
             raise SourceError(f"{where}.{name}: {value!r} is not a whole number", _LIST_CONTROLS)
     deviations = []
-    for name in sorted(wanted, key=lambda name: known[name].type in (abi.INTEGER, abi.INTEGER64)):
-        kind, value = known[name], int(wanted[name])
-        control = abi.V4l2Control(id=kind.id)
-        setattr(control.value, "value64" if kind.type == abi.INTEGER64 else "value", value)
+    for name in sorted(wanted, key=lambda name: known[name][1] in (abi.INTEGER, abi.INTEGER64)):
+        (number, kind), value = known[name], int(wanted[name])
+        control = abi.V4l2Control(id=number)
+        setattr(control.value, "value64" if kind == abi.INTEGER64 else "value", value)
         try:
             device.ioctl(abi.SET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control)))
         except OSError as error:
             raise SourceError(f"{where}.{name}: {value} is refused: {error.strerror}", _LOCKED) from None
-        given = read_control(device, kind)
+        given = read_control(device, known[name])
         if given is not None and given != value:
             deviations.append(findings.CONTROL_DIFFERS(control=name, given=given, expected=value))
     return deviations
 
 
-def read_control(device: VideoDevice, kind: Control) -> int | None:
+def read_control(device: VideoDevice, setting: Control) -> int | None:
     """Read one setting; None where the device does not say."""
-    control = abi.V4l2Control(id=kind.id)
+    number, kind = setting
+    control = abi.V4l2Control(id=number)
     if not device.grants(abi.GET_CONTROLS, abi.V4l2Controls(count=1, controls=pointer(control))):
         return None
-    return int(control.value.value64 if kind.type == abi.INTEGER64 else control.value.value)
+    return int(control.value.value64 if kind == abi.INTEGER64 else control.value.value)
 
 
 def read_exposure_us(device: VideoDevice, known: Mapping[str, Control]) -> float | None:
@@ -332,9 +303,9 @@ def read_exposure_us(device: VideoDevice, known: Mapping[str, Control]) -> float
 
     V4L2_CID_EXPOSURE counts in units of the driver's choice; Jetson's 64-bit setting of that name in us.
     """
-    for name, kind in known.items():
-        is_jetsons = name == "exposure" and kind.type == abi.INTEGER64
-        if is_jetsons or kind.id == abi.EXPOSURE_ABSOLUTE_ID:
-            value = read_control(device, kind)
+    for name, (number, kind) in known.items():
+        is_jetsons = name == "exposure" and kind == abi.INTEGER64
+        if is_jetsons or number == abi.EXPOSURE_ABSOLUTE_ID:
+            value = read_control(device, (number, kind))
             return None if value is None else float(value * (1 if is_jetsons else _EXPOSURE_UNIT_US))
     return None

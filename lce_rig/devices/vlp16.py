@@ -25,8 +25,8 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import findings
 from lce_rig.devices.disk_writer import DiskWriter, Sink
-from lce_rig.devices.reading import ClockState, LiveSource, SourceStatus
-from lce_rig.devices.velodyne_web import VelodyneWeb
+from lce_rig.devices.reading import LiveSource, SourceStatus
+from lce_rig.devices.velodyne_web import read_page
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
 from lce_rig.rig import LidarSettings
@@ -169,7 +169,7 @@ class Vlp16Source(LiveSource):
             return SourceStatus(
                 self.sensor,
                 n_lost=stream.losses.n("packet.lost") + self._n_lost_before,
-                clock=ClockState(state, stream.clock.is_utc),
+                clock=state,
                 problems=tuple(problems),
                 device=f"{stream.product.name} at {self._address}" if stream.n_data else "",
                 serial=self._serial,
@@ -240,9 +240,9 @@ class Vlp16Source(LiveSource):
 
     def _ask_serial(self, address: str) -> None:
         with contextlib.suppress(SourceError):
-            serial = VelodyneWeb(address, self._web_port, _WEB_TIMEOUT_S).read_serial()
+            info = read_page(address, self._web_port, _WEB_TIMEOUT_S, "info")
             if address == self._address:
-                self._serial = serial
+                self._serial = str(info.get("serial", "")).strip()
 
 
 class _Vector(ctypes.Structure):

@@ -10,9 +10,8 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +23,8 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Figure, Finding, Severity, worst
 from lce_rig.devices import sensors, source_of
 from lce_rig.devices.findings import BOARD_NOT_TIED
-from lce_rig.devices.velodyne_web import VelodyneWeb, WebReport, find_problems
+from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.velodyne_web import WebReport, find_problems, read_web
 from lce_rig.doctor import findings
 from lce_rig.doctor.observing import Examination, ObservedSensor, observe
 from lce_rig.rig import Rig
@@ -98,8 +98,8 @@ def check_device(exam: Examination, sensor: str) -> Iterator[Finding]:
     assert seen.status is not None  # a sensor that neither opened nor failed has a failure of its own
     figures: dict[str, Any] = {"device": seen.status.device}
     report = exam.web.get(sensor)
-    if isinstance(report, WebReport):
-        figures |= {name: getattr(report, name) for name in ("firmware", "serial")}
+    if isinstance(report, Mapping):
+        figures |= {name: report.get(name, "") for name in ("firmware", "serial")}
     yield findings.ANSWERS(**figures)
     yield from exam.problems(sensor, "device")
 
@@ -113,7 +113,7 @@ def check_settings(exam: Examination, sensor: str) -> Iterator[Finding]:
             yield findings.SETTINGS_UNKNOWN(what=report.what)
     elif report is not None:
         names = ("returns", "fov_deg", "host", "data_port")
-        figures: dict[str, Any] = {name: getattr(report, name) or None for name in names}
+        figures: dict[str, Any] = {name: report.get(name) for name in names}
         yield findings.SETTINGS(**figures)
         problems = find_problems(report, exam.rig.lidars[sensor])
         # The pulse has a line of its own.
@@ -198,7 +198,7 @@ def check_clock(exam: Examination, sensor: str) -> Iterator[Finding]:
     """Report the clock of a camera's or sync board's timestamps."""
     status = exam.seen[sensor].status
     if status is not None:
-        yield findings.NO_TIMESTAMPS() if status.clock is None else status.clock.finding
+        yield findings.NO_TIMESTAMPS() if status.clock is None else status.clock
         yield from exam.problems(sensor, "clock")
 
 
@@ -209,16 +209,16 @@ def check_pps(exam: Examination, sensor: str) -> Iterator[Finding]:
         return
     clock = status.clock
     figures: dict[str, Any] = {
-        "pps": (report.pps or None) if isinstance(report, WebReport) else None,
-        "has_position": "pps" in clock.finding.figures,
-        **clock.finding.figures,
+        "pps": report.get("pps") if isinstance(report, Mapping) else None,
+        "has_position": "pps" in clock.figures,
+        **clock.figures,
     }
     yield findings.PULSE(**figures)
-    if clock.is_utc or lidar.timestamps.clock != "utc":
-        yield replace(clock.finding, severity="note")
+    if status.is_utc or lidar.timestamps.clock != "utc":
+        yield replace(clock, severity="note")
         return
     severity: Severity = "error" if lidar.timestamps.sync == "hardware" else "warning"
-    yield replace(clock.finding, severity=severity)
+    yield replace(clock, severity=severity)
     yield findings.WITHOUT_PULSES()
 
 
@@ -422,8 +422,13 @@ def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
         A line for each thing looked at: the computer's, each sensor's, the rig's.
     """
     options = options or DoctorOptions()
-    seen = observe({sensor: partial(source_of, rig, sensor) for sensor in sensors(rig)}, options.duration_s)
-    exam = Examination(rig, options.folder, seen)
+    seen, sources = dict[str, ObservedSensor](), list[LiveSource]()
+    for sensor in sensors(rig):
+        try:
+            sources.append(source_of(rig, sensor))
+        except SourceError as error:
+            seen[sensor] = ObservedSensor(sensor, failure=error)
+    exam = Examination(rig, options.folder, seen | observe(sources, options.duration_s))
     web = {
         name: _read_web(rig, name, options.web_port) for name in rig.lidars if exam.driver(name) == "vlp16"
     }
@@ -442,6 +447,6 @@ def _read_web(rig: Rig, lidar: str, port: int) -> WebReport | SourceError:
     """Ask the web page of a VLP-16; why it says nothing where it does not."""
     address = rig.lidars[lidar].driver.address or velodyne.FACTORY_ADDRESS
     try:
-        return VelodyneWeb(address, port, _WEB_TIMEOUT_S).read()
+        return read_web(address, port, _WEB_TIMEOUT_S)
     except SourceError as error:
         return error

@@ -1,8 +1,7 @@
 """All sensors of a rig watched side by side for some seconds; one that is absent keeps no other from it."""
 
-import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from lce_rig.core.data import Events, Image, LiveSample, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import driver_of
-from lce_rig.devices.reading import LiveSource, SourceStatus
+from lce_rig.devices.reading import AttachedSensors, LiveSource, SourceStatus
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.devices.velodyne_web import WebReport
 from lce_rig.rig import Rig
@@ -57,7 +56,7 @@ class ObservedSensor:
     @property
     def is_utc(self) -> bool:
         """Whether its timestamps are its own clock's, which is tied to UTC."""
-        return self.status is not None and self.status.clock is not None and self.status.clock.is_utc
+        return self.status is not None and self.status.is_utc
 
     def take(self, sample: LiveSample) -> None:
         """Note a sample."""
@@ -107,69 +106,44 @@ class Examination:
             return ""
 
 
-def observe(sources: Mapping[str, Callable[[], LiveSource]], duration_s: float) -> dict[str, ObservedSensor]:
+def observe(sources: Sequence[LiveSource], duration_s: float) -> dict[str, ObservedSensor]:
     """Open every sensor and watch it, for a time that begins when the last one has opened or failed.
 
     Where none is open, nothing is waited for.
 
     Args:
-        sources: makes each sensor's source, by its name; may raise SourceError.
+        sources: of the sensors.
         duration_s: how long to watch.
 
     Returns:
         The observations by the sensor's name.
     """
-    seen = {sensor: ObservedSensor(sensor) for sensor in sources}
-    begun = {sensor: threading.Event() for sensor in sources}
-    stop = threading.Event()
-    threads: dict[str, threading.Thread] = {}
-    try:
-        for sensor, make in sources.items():
-            arguments = seen[sensor], make, begun[sensor], stop
-            threads[sensor] = threading.Thread(target=_watch, args=arguments, daemon=True)
-            threads[sensor].start()
-        until_s = time.monotonic() + _OPENING_S
-        for event in begun.values():
-            event.wait(max(0.0, until_s - time.monotonic()))
-        until_s = time.monotonic() + duration_s
-        while time.monotonic() < until_s and any(thread.is_alive() for thread in threads.values()):
-            time.sleep(_POLL_S)
-    finally:  # After Ctrl-C, too: no program that a source has started may outlive this one.
-        stop.set()
-        until_s = time.monotonic() + _CLOSING_S
-        for thread in threads.values():
-            thread.join(max(_POLL_S, until_s - time.monotonic()))
-    for sensor, thread in threads.items():
-        if thread.is_alive() and seen[sensor].failure is None:
-            hint = "Unplug it, plug it in again and repeat."
-            seen[sensor].failure = SourceError("it neither opens nor closes in time", hint)
-    return seen
+    seen = {source.sensor: ObservedSensor(source.sensor) for source in sources}
+    sensors = AttachedSensors(sources, reopen_every_s=None)
 
+    def watch(until_s: float, is_over: Callable[[], bool]) -> None:
+        while time.monotonic() < until_s and not is_over():
+            came = sensors.take(_POLL_S)
+            if came is not None:
+                seen[came[0]].take(came[1])
 
-def _watch(
-    seen: ObservedSensor, make: Callable[[], LiveSource], begun: threading.Event, stop: threading.Event
-) -> None:
-    """Open a sensor, take its samples until asked to stop, and close it."""
     try:
-        with make() as source:
-            opened_s = time.monotonic()
-            begun.set()
-            try:
-                while not stop.is_set():
-                    sample = source.take(_POLL_S)
-                    if sample is not None:
-                        seen.take(sample)
-            except SourceError as error:
-                seen.failure = error
+        sensors.start()
+        watch(time.monotonic() + _OPENING_S, lambda: all(source.wait(0) for source in sources))
+        watch(time.monotonic() + duration_s, lambda: len(sensors.lost()) == len(sources))
+        for source in sources:
+            each = seen[source.sensor]
+            each.failure = source.lost[0] if source.lost is not None else None
             # A sensor that never sent anything has no status.
-            if seen.failure is None or seen.arrivals_ns or seen.pulses:
-                seen.status = source.status()
-                seen.watched_s, seen.ended_ns = time.monotonic() - opened_s, time.time_ns()
+            if source.opened_s is not None and (each.failure is None or each.arrivals_ns or each.pulses):
+                each.status = source.status()
+                each.watched_s, each.ended_ns = time.monotonic() - source.opened_s, time.time_ns()
                 if isinstance(source, SyncBoard):
-                    seen.host_clock, seen.utc_clock = source.host_clock, source.utc_clock
-    except SourceError as error:
-        seen.failure = seen.failure or error
-    except Exception as error:  # A bug in one driver must not hide what is known of the others.
-        seen.failure = SourceError(f"its driver failed: {error!r}", "This is a bug: report it.")
-    finally:
-        begun.set()
+                    each.host_clock, each.utc_clock = source.host_clock, source.utc_clock
+    finally:  # After Ctrl-C, too: no program that a source has started may outlive this one.
+        stuck = sensors.stop(_CLOSING_S)
+    for name, each in seen.items():
+        if each.failure is None and (each.status is None or name in stuck):
+            hint = "Unplug it, plug it in again and repeat."
+            each.failure = SourceError("it neither opens nor closes in time", hint)
+    return seen

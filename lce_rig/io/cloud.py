@@ -1,6 +1,6 @@
 """Conversion of a point cloud with any fields to a `Scan`: names, units and conventions."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,20 +137,6 @@ def _refine_lines(rho: Array, z: Array, lines: Array) -> Array:
     return lines
 
 
-class CloudReading(NamedTuple):
-    """A scan, and the conversions applied to it.
-
-    Attributes:
-        scan: the points with a return.
-        n_without_return: the others: not finite, or at the origin, above or below it.
-        notes: what the point cloud lacks or how it was understood, in words; the same for like point clouds.
-    """
-
-    scan: Scan
-    n_without_return: int
-    notes: tuple[str, ...]
-
-
 # NaN and values beyond a type's range are checked where they matter.
 @np.errstate(over="ignore", invalid="ignore")
 def to_scan(
@@ -160,7 +146,8 @@ def to_scan(
     where: str,
     stamp_ns: int | None = None,
     host_ns: int | None = None,
-) -> CloudReading:
+    notes: set[str] | None = None,
+) -> Scan:
     """Build a scan from a point cloud with any fields.
 
     Args:
@@ -170,6 +157,10 @@ def to_scan(
         where: file or topic, for messages.
         stamp_ns: the point cloud's timestamp as recorded; None where there is none.
         host_ns: arrival at the host.
+        notes: receives what the point cloud lacks or how it was understood, in words.
+
+    Returns:
+        The points with a return: finite, and neither at the origin nor above or below it.
 
     Raises:
         SourceError: no coordinates, no valid point, coordinates that are not metres, or no rings and none
@@ -192,8 +183,7 @@ def to_scan(
     flat_m = np.hypot(x, y)
     # No laser of a spinning LiDAR looks along its axis: such a point has no ring.
     is_kept = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & (flat_m > MIN_RANGE_M)
-    n_dropped = int(np.count_nonzero(~is_kept))
-    if n_dropped == len(points):
+    if not is_kept.any():
         raise SourceError(f"{where}: the point cloud has no valid point ({len(points)} in all)")
     median_m = float(np.median(np.hypot(flat_m, z)[is_kept]))
     if median_m > _FARTHEST_MEDIAN * settings.max_range_m:
@@ -201,32 +191,28 @@ def to_scan(
             f"{where}: median range {round(median_m):.9g} m, the LiDAR reaches "
             f"{settings.max_range_m:g} m: points in millimetres must be converted to metres"
         )
-    notes: list[str] = []
+    notes = set() if notes is None else notes
     if not settings.has_rings and "tag" in fields:
-        is_noise = _is_noise(cloud[fields["tag"]], settings)
-        n_noise = int(np.count_nonzero(is_kept & is_noise))
-        if n_noise:
-            notes.append("returns whose tag says noise, rain or bleeding are dropped")
-        is_kept &= ~is_noise
-        n_dropped = int(np.count_nonzero(~is_kept))
-    if n_dropped:
-        points, cloud = points[is_kept], cloud[is_kept]
+        is_noise = is_kept & _is_noise(cloud[fields["tag"]], settings)
+        if is_noise.any():
+            notes.add("returns whose tag says noise, rain or bleeding are dropped")
+            is_kept &= ~is_noise
+    points, cloud = points[is_kept], cloud[is_kept]
     if settings.has_rings:
         ring = _ring(cloud, fields, points, where, notes)
     else:
         ring = np.full(len(points), NO_RING, dtype=np.int16)
     sheet, n_rings = settings.data_sheet(), len(np.unique(ring))
     if sheet is not None and sheet.has_rings and n_rings > sheet.n_rings:
-        notes.append(f"{n_rings} rings, a {sheet.name} has {sheet.n_rings}: check lidars.{lidar}.model")
+        notes.add(f"{n_rings} rings, a {sheet.name} has {sheet.n_rings}: check lidars.{lidar}.model")
     offset_ns, stamp_ns = _times(cloud, fields, settings, stamp_ns, notes)
     name = _find(fields, INTENSITY_FIELDS)
     if name is None:
-        notes.append("no intensity")
+        notes.add("no intensity")
         intensity = np.zeros(len(cloud), dtype=np.float32)
     else:
         intensity = np.nan_to_num(cloud[name].astype(np.float32), posinf=0.0, neginf=0.0)
-    scan = Scan(lidar, stamp_ns, points, intensity, ring, offset_ns, host_ns)
-    return CloudReading(scan, n_dropped, tuple(notes))
+    return Scan(lidar, stamp_ns, points, intensity, ring, offset_ns, host_ns)
 
 
 def _is_noise(tag: NDArray[Any], settings: LidarSettings) -> NDArray[np.bool_]:
@@ -254,7 +240,7 @@ def _find(fields: dict[str, str], candidates: tuple[str, ...]) -> str | None:
 
 
 def _ring(
-    cloud: NDArray[Any], fields: dict[str, str], points: NDArray[np.float32], where: str, notes: list[str]
+    cloud: NDArray[Any], fields: dict[str, str], points: NDArray[np.float32], where: str, notes: set[str]
 ) -> NDArray[np.int16]:
     name = _find(fields, RING_FIELDS)
     values = np.zeros(len(cloud)) if name is None else cloud[name].astype(np.float64)
@@ -277,17 +263,17 @@ def _ring(
         rises = bool(np.corrcoef(np.arange(len(rank)), rank)[0, 1] > 0.98)
     if is_whole and rises:
         return values.astype(np.int16)
-    notes.append(f"field {name!r} does not count rings from the lowest: renumbered by elevation")
+    notes.add(f"field {name!r} does not count rings from the lowest: renumbered by elevation")
     return rank[ring_of_point].astype(np.int16)
 
 
-def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: list[str]) -> NDArray[np.int16]:
+def _inferred(points: NDArray[np.float32], where: str, cause: str, notes: set[str]) -> NDArray[np.int16]:
     """Number the rings by elevation, because of a cause; say both in the error where there are none."""
     try:
         ring = rings_from_elevation(points)
     except SourceError as error:
         raise SourceError(f"{where}: {cause}, {error.what}", _NO_RINGS_HINT) from None
-    notes.append(f"{cause}: rings inferred from elevation angles")
+    notes.add(f"{cause}: rings inferred from elevation angles")
     return ring
 
 
@@ -316,7 +302,7 @@ def _times(
     fields: dict[str, str],
     settings: LidarSettings,
     stamp_ns: int | None,
-    notes: list[str],
+    notes: set[str],
 ) -> tuple[NDArray[np.int64] | None, int | None]:
     """Find each point's time after the first firing, and the timestamp of the first firing."""
     is_last = settings.timestamps.reference == "last_firing"
@@ -324,12 +310,12 @@ def _times(
     ticks = None if name is None else _ticks(cloud[name])
     unit = None if ticks is None else _unit(ticks)
     if ticks is None or unit is None:
-        notes.append("points without times" if name is None else f"field {name!r} has no times of points")
+        notes.add("points without times" if name is None else f"field {name!r} has no times of points")
         sweep_ns = round(1e9 / settings.rate_hz) if is_last else 0
         return None, None if stamp_ns is None else stamp_ns - sweep_ns
     first = ticks.min()
     if unit != _usual_unit(ticks):
-        notes.append(f"field {name!r} taken as {unit}")
+        notes.add(f"field {name!r} taken as {unit}")
     scale = NS_PER_UNIT[unit]
     offset_ns = np.rint((ticks - first) * scale).astype(np.int64)
     if stamp_ns is None:

@@ -9,20 +9,15 @@ def _loss(name: str, text: str) -> Kind:
 
 BROKEN_PACKETS = _loss("broken_packets", "{n} broken packets skipped (first: {where})")
 TORN_END = _loss("torn_end", "{n} torn ends of the file skipped (first: {where})")
-TIME_WORDS_REPAIRED = _loss("time_words_repaired", "{n} inconsistent time words repaired")
 PACKETS_LOST = _loss("packets_lost", "{n} packets lost in recording (first: {where})")
 BAG_TORN = _loss("bag_torn", "{n} places where the bag is torn (first: {where})")
 EVENTS_BEFORE_CLOCK_SET = _loss(
     "events_before_clock_set", "{n} events before the clock was set skipped (first: {where})"
 )
 EVENTS_STRAY = _loss("events_stray", "{n} events with stray timestamps skipped (first: {where})")
-EVENTS_SORTED = _loss("events_sorted", "{n} places where timestamps decrease by up to 20 ms, sorted")
 EVENTS_OFF_SENSOR = _loss("events_off_sensor", "{n} events off the sensor skipped (first: {where})")
 BROKEN_LINES = _loss("broken_lines", "{n} broken lines skipped (first: {where})")
-FRAMES_OUT_OF_ORDER = _loss("frames_out_of_order", "{n} out of order skipped")
-POINTS_WITHOUT_RETURN = _loss("points_without_return", "{n} points without a return")
-SENT_TWICE = _loss("sent_twice", "{n} sent twice (equal timestamps)")
-OUT_OF_ORDER = _loss("out_of_order", "{n} out of order (timestamps decrease)")
+OUT_OF_ORDER = _loss("out_of_order", "{n} sent twice or out of order, skipped")
 CLOCK_SET_BACK = _loss("clock_set_back", "{n} jumps of the clock back by more than 1 s")
 NOT_DECODED = _loss("not_decoded", "{n} could not be decoded (first: {where})")
 
@@ -38,14 +33,13 @@ SCAN_PARTIAL = Kind(
     "scan.partial", "{n} revolutions skipped: cut off at an end, or where the clock was set", severity="note"
 )
 SCAN_THIN = Kind(
-    "scan.thin", "{n} revolutions skipped: more than half of their packets are lost", severity="warning"
+    "scan.thin",
+    "{n} revolutions skipped: more than half of their packets or all returns are missing",
+    severity="warning",
 )
-SCAN_EMPTY = Kind("scan.empty", "{n} revolutions without a return", severity="warning")
-SCAN_NOT_RISING = Kind(
-    "scan.not_rising", "{n} scans skipped: their timestamps do not rise", severity="warning"
+CUT_SHORT = Kind(
+    "datagram.cut_short", "{n} datagrams skipped: fragments, or cut short by the recorder", severity="warning"
 )
-FRAGMENTED = Kind("datagram.fragmented", "{n} datagrams sent in fragments skipped", severity="warning")
-CUT_SHORT = Kind("datagram.cut_short", "{n} datagrams cut short by the recorder skipped", severity="warning")
 
 _BY_ARRIVAL = "scans are timestamped by arrival: "
 

@@ -255,9 +255,10 @@ class PairOnDisk:
             SourceError: one is missing, empty, truncated or damaged.
         """
         images = tuple(image.read() for image in self.images)
-        cloud = read_cloud(self.cloud_path)
-        reading = to_scan(cloud, self.lidar, self.settings, str(self.cloud_path), self.cloud_stamp_ns)
-        return images, reading.scan, list(reading.notes)
+        cloud, notes = read_cloud(self.cloud_path), set[str]()
+        where, stamp_ns = str(self.cloud_path), self.cloud_stamp_ns
+        scan = to_scan(cloud, self.lidar, self.settings, where, stamp_ns, notes=notes)
+        return images, scan, sorted(notes)
 
 
 def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) -> list[list[ImageOnDisk]]:

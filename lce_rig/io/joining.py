@@ -8,11 +8,14 @@ from pathlib import Path
 
 from lce_rig.core.data import Sample, Stream
 from lce_rig.core.errors import SourceError
+from lce_rig.core.findings import Losses
+from lce_rig.io.findings import CLOCK_SET_BACK, OUT_OF_ORDER
 from lce_rig.io.protocol import ContinuousRecording, Recording, serials_of
 from lce_rig.rig import Rig
 from lce_rig.timing.rig_time import rig_time_ns, stream_of
 
 _MAX_OFFSET_S = 3600.0
+_CLOCK_JUMP_NS = 1_000_000_000
 # Packets of events count by their first timestamp.
 _ROUGH_S = 0.2
 # Sensors are switched on and off one after the other.
@@ -44,6 +47,18 @@ def merge_by_time(parts: Iterable[Iterable[Sample]], rig: Rig) -> Iterator[Sampl
         yield sample
     if torn:
         raise torn[0]
+
+
+def follows(stamp_ns: int | None, last_ns: int | None, losses: Losses) -> bool:
+    """Return whether a sample comes after the one before it; count those sent twice or late, to be skipped.
+
+    A timestamp that is earlier by more than a second is that of a clock that was set: it begins again.
+    """
+    if stamp_ns is None or last_ns is None or stamp_ns > last_ns:
+        return True
+    is_set_back = last_ns - stamp_ns >= _CLOCK_JUMP_NS
+    losses.add(CLOCK_SET_BACK() if is_set_back else OUT_OF_ORDER())
+    return is_set_back
 
 
 def check_overlap(samples: Iterable[Sample], rig: Rig, notes: list[str]) -> Iterator[Sample]:

@@ -148,11 +148,9 @@ class PcapFile:
         ip = packet if isinstance(packet, dpkt.ip.IP) else packet.data
         if not isinstance(ip, dpkt.ip.IP) or ip.p != dpkt.ip.IP_PROTO_UDP:
             return None
-        if ip.mf or ip.offset:
-            self.losses.add(findings.FRAGMENTED())
-            return None
         udp = ip.data
-        if not isinstance(udp, dpkt.udp.UDP) or not 8 <= udp.ulen <= 8 + len(udp.data):
+        is_whole = isinstance(udp, dpkt.udp.UDP) and not (ip.mf or ip.offset)
+        if not is_whole or not 8 <= udp.ulen <= 8 + len(udp.data):
             self.losses.add(findings.CUT_SHORT())
             return None
         return Datagram(

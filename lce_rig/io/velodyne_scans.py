@@ -20,6 +20,7 @@ from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding, Losses
 from lce_rig.io import findings
+from lce_rig.io.joining import follows
 from lce_rig.io.network import FRAME_BYTES, Datagram, PcapFile
 from lce_rig.io.protocol import SourceOptions, choose_lidar, fingerprint
 from lce_rig.io.velodyne_packets import (
@@ -39,8 +40,6 @@ _CONTROLS = ("position_port", "cut_deg")
 _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "VLP-32C": "VLP32C"}
 # A scan with more of its packets lost is not worth looking at.
 _MIN_COVERAGE = 0.5
-# Timestamps by arrival and by the sensor may differ by 0.1 s when one takes over from the other.
-_MAX_OVERLAP_NS = 1_000_000_000
 
 
 def read_controls(sensor: str, settings: LidarSettings) -> tuple[int, float]:
@@ -228,16 +227,15 @@ class Vlp16Stream:
             keep_brighter(packets)
         points, intensity, ring, offset_ns = self._decoder.decode(packets, [p.elapsed_ns for p in pieces])
         if len(points) == 0:
-            self.losses.add(findings.SCAN_EMPTY())
+            self.losses.add(findings.SCAN_THIN())
             return None
         n_before = first.blocks.start // (2 if first.packet.is_dual else 1)
         lead_ns = self.product.block_ns * n_before
-        stamp_ns, last_ns = self.clock.stamp_ns(first.elapsed_ns + lead_ns), self._last_stamp_ns
-        # A clock that is set back far starts again.
-        if stamp_ns is not None and last_ns is not None and 0 <= last_ns - stamp_ns < _MAX_OVERLAP_NS:
-            self.losses.add(findings.SCAN_NOT_RISING())
+        # Timestamps by arrival and by the sensor may differ by 0.1 s when one takes over from the other.
+        stamp_ns = self.clock.stamp_ns(first.elapsed_ns + lead_ns)
+        if not follows(stamp_ns, self._last_stamp_ns, self.losses):
             return None
-        self._last_stamp_ns = last_ns if stamp_ns is None else stamp_ns
+        self._last_stamp_ns = self._last_stamp_ns if stamp_ns is None else stamp_ns
         self.n_scans += 1
         host_ns = packet.host_ns or None
         return Scan(self._sensor, stamp_ns, points, intensity, ring, offset_ns - lead_ns, host_ns)

@@ -176,7 +176,7 @@ def _lidar(
         cloud, where = topic.cloud, topic.topic
     if find_data_sheet(model) is None:
         if cloud is not None:
-            scan = to_scan(cloud, name, LidarSettings.model_validate({"model": model}), where).scan
+            scan = to_scan(cloud, name, LidarSettings.model_validate({"model": model}), where)
             elevations_deg, columns = measure_beams(scan)
             block["elevations_deg"] = [round(value, 2) for value in elevations_deg]
             block |= {} if columns is None else {"columns": columns}

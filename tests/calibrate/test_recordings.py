@@ -123,7 +123,7 @@ def test_a_lidar_without_rings_finds_the_board_and_halves_agree(recordings):
     for path in sorted((recordings / "livox_avia" / "img").glob("*.jpg")):
         image = finder.image(Image("cam", "frames", None, cv2.imread(str(path))))
         cloud = decode_pcd((recordings / "livox_avia" / "pcd" / f"{path.stem}.pcd").read_bytes())
-        places = finder.scan(to_scan(cloud, "lidar", lidar, path.stem).scan)
+        places = finder.scan(to_scan(cloud, "lidar", lidar, path.stem))
         if not isinstance(image, Refusal) and not isinstance(places, Refusal):
             seen.append(Observation.of(path.stem, image, places))
     assert len(seen) >= 18

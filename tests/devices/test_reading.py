@@ -1,15 +1,17 @@
 """Which driver a sensor gets; samples in order, the reason of the end, and reading again when it is back."""
 
 import time
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
 
-from lce_rig.core.data import Pulse
+from lce_rig.core.data import LiveSample, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import driver_of, open_live, sensors, source_of
 from lce_rig.devices.reading import AttachedSensors, LiveSource, RateMeter, SourceStatus
 from lce_rig.rig import load_rig
+from tests.devices.attached import attached
 from tests.shared import changed
 
 HINT = "Check the plug."
@@ -48,41 +50,45 @@ class Script(LiveSource):
         return SourceStatus(self.sensor)
 
 
-def counts(source: LiveSource) -> list[int]:
-    return [sample.count for sample in source.samples() if isinstance(sample, Pulse)]
+def counts(samples: Iterable[LiveSample]) -> list[int]:
+    return [sample.count for sample in samples if isinstance(sample, Pulse)]
 
 
 def test_samples_come_in_order_and_then_the_reason_of_the_end() -> None:
-    with Script([pulse(0), pulse(1)], [pulse(2)], SourceError("gone")) as source:
+    with attached(Script([pulse(0), pulse(1)], [pulse(2)], SourceError("gone"))) as (source, samples):
         came = []
         with pytest.raises(SourceError, match="gone"):
-            came.extend(source.samples())
+            came.extend(samples)
         assert [each.count for each in came if isinstance(each, Pulse)] == [0, 1, 2]
-        assert source.status().n_samples == 3 and source.is_open
+        assert source.status().n_samples == 3
     assert not source.is_open
 
 
 def test_nothing_for_too_long_is_an_error_with_a_hint() -> None:
-    with Script(silence_s=0.1) as source, pytest.raises(SourceError) as caught:
-        counts(source)
+    with attached(Script(silence_s=0.1)) as (_, samples), pytest.raises(SourceError) as caught:
+        counts(samples)
     assert caught.value.hint == HINT
 
 
 def test_what_nobody_takes_is_dropped_oldest_first_and_counted() -> None:
     came = []
-    with Script([pulse(k) for k in range(10)], SourceError("gone"), n_slots=4) as source:
+    with attached(Script(n_slots=4)) as (source, samples):
+        source.entries += [[pulse(k) for k in range(10)], SourceError("gone")]
         while source.status().n_samples < 10:
             time.sleep(0.005)
         with pytest.raises(SourceError, match="gone"):
-            for sample in source.samples():
+            for sample in samples:
                 came.append(sample)
         assert (source.status().n_samples, source.status().n_dropped) == (10, 6)
     assert [sample.count for sample in came if isinstance(sample, Pulse)] == [6, 7, 8, 9]
 
 
 def test_a_bug_in_a_driver_ends_the_samples_and_is_called_one() -> None:
-    with Script([pulse(0)], ZeroDivisionError("oops")) as source, pytest.raises(SourceError) as caught:
-        counts(source)
+    with (
+        attached(Script([pulse(0)], ZeroDivisionError("oops"))) as (_, samples),
+        pytest.raises(SourceError) as caught,
+    ):
+        counts(samples)
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 

@@ -26,6 +26,7 @@ from lce_rig.devices.reading import AttachedSensors
 from lce_rig.devices.ros2 import Ros2Source
 from lce_rig.io.ros.bag_recorder import encode_image, encode_scan
 from lce_rig.rig import Rig, load_rig
+from tests.devices.attached import attached
 from tests.shared import changed
 
 IMAGES, POINTS = "/camera/image_raw", "/points"
@@ -111,14 +112,14 @@ def test_images_and_scans_of_topics_come_as_from_a_bag(rig: Rig) -> None:
     assert (np.diff([each.stamp_ns for each in images]) % 20_000_000 == 0).all()
     assert all(len(each.points) == 1600 and set(each.ring) == set(range(16)) for each in scans)
     camera = statuses["cam"]
-    assert camera.clock is not None and camera.clock.finding.code == "clock.header"
+    assert camera.clock is not None and camera.clock.code == "clock.header"
     assert [each.code for each in camera.problems] == ["stream.messages_skipped"]
     assert camera.n_lost == camera.problems[0].figures["n"] >= 1
     assert statuses["lidar"].n_lost == 0 and POINTS in statuses["lidar"].device
 
 
 def refusal(source: Ros2Source) -> SourceError:
-    with pytest.raises(SourceError) as caught, source:
+    with pytest.raises(SourceError) as caught, attached(source):
         pass
     return caught.value
 

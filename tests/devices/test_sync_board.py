@@ -8,6 +8,7 @@ from wire.sync_board import HELLO, FakeBoard
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig.profile import SyncSettings
+from tests.devices.attached import attached
 from tests.shared import wait_until
 
 
@@ -16,9 +17,9 @@ def settings(path, **more):
     return SyncSettings.model_validate({"device": path, "triggers": triggers, **more})
 
 
-def take(board, n, line="cam"):
+def take(samples, n, line="cam"):
     pulses = []
-    for pulse in board.samples():
+    for pulse in samples:
         if pulse.sensor == line:
             pulses.append(pulse)
         if len(pulses) == n:
@@ -37,8 +38,8 @@ def assert_tells_the_time(model, fake):
 
 
 def test_pulses_come_one_by_one_with_the_boards_own_stamps():
-    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
-        pulses = take(board, 50)
+    with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
+        pulses = take(samples, 50)
         assert [pulse.count for pulse in pulses] == list(range(pulses[0].count, pulses[0].count + 50))
         assert all(5 * 10**9 < pulse.stamp_ns < 15 * 10**9 for pulse in pulses)
         assert all(pulse.host_ns > fake.host_ns(pulse.stamp_ns) for pulse in pulses)
@@ -48,7 +49,7 @@ def test_pulses_come_one_by_one_with_the_boards_own_stamps():
 
 
 def test_its_clock_is_tied_to_the_computers_by_asking():
-    with FakeBoard(drift=2000e-6) as fake, SyncBoard(settings(fake.path)) as board:
+    with FakeBoard(drift=2000e-6) as fake, attached(SyncBoard(settings(fake.path))) as (board, _):
         wait_until(lambda: (clock := board.host_clock) is not None and clock.n_used >= 8)
         model = board.host_clock
         error_ns = model.convert(model.last_ns) - fake.host_ns(model.last_ns)
@@ -57,14 +58,14 @@ def test_its_clock_is_tied_to_the_computers_by_asking():
         # On a busy machine any answer may come some milliseconds late.
         assert model.drift == pytest.approx(-2000e-6, abs=200e-6 + 4e6 / (model.last_ns - model.first_ns))
         told = board.status().clock
-        assert told is not None and told.finding.figure("host_drift_ppm") == pytest.approx(-2000, rel=0.5)
+        assert told is not None and told.figure("host_drift_ppm") == pytest.approx(-2000, rel=0.5)
 
 
 def test_its_lines_are_set_and_started_as_the_profile_says():
     with FakeBoard() as fake:
         given = settings(fake.path)
         given.triggers["cam"] = given.triggers["cam"].model_copy(update={"phase_us": 2500, "pulse_us": 50})
-        with SyncBoard(given) as board:
+        with attached(SyncBoard(given)) as (board, _):
             wait_until(lambda: "LCEGO" in fake.commands)
             assert fake.commands.index("LCERT,0,100.000000,2500,50") < fake.commands.index("LCEGO")
             board.start_triggers(rate_hz=4.0)
@@ -73,7 +74,7 @@ def test_its_lines_are_set_and_started_as_the_profile_says():
 
 
 def test_a_board_without_a_receiver_is_told_when_a_second_begins():
-    with FakeBoard() as fake, SyncBoard(settings(fake.path)):
+    with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))):
         wait_until(lambda: any(command.startswith("LCEUT") for command in fake.commands))
         command = next(command for command in fake.commands if command.startswith("LCEUT"))
         t_us, utc_s = (int(field) for field in command.split(",")[1:])
@@ -81,8 +82,8 @@ def test_a_board_without_a_receiver_is_told_when_a_second_begins():
 
 
 def test_garbage_between_lines_is_survived_counted_and_told():
-    with FakeBoard(garbage_every=3) as fake, SyncBoard(settings(fake.path)) as board:
-        pulses = take(board, 60)
+    with FakeBoard(garbage_every=3) as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
+        pulses = take(samples, 60)
         assert [b.count - a.count for a, b in pairwise(pulses)] == [1] * 59
         status = board.status()
     (damaged,) = [each for each in status.problems if each.code == "stream.damaged_lines"]
@@ -90,12 +91,12 @@ def test_garbage_between_lines_is_survived_counted_and_told():
 
 
 def test_pulses_whose_lines_are_lost_are_counted_and_told():
-    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
-        pulses = take(board, 10)
+    with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
+        pulses = take(samples, 10)
         fake.n_to_lose = 4
         wait_until(lambda: board.status().n_lost == 4)
         while pulses[-1].count < fake.n_sent - 1:
-            pulses += take(board, 1)
+            pulses += take(samples, 1)
         assert sorted(b.count - a.count for a, b in pairwise(pulses))[-2:] == [1, 5]
         status = board.status()
     assert status.n_lost == status.n_lost_by_line["cam"] == 4
@@ -105,8 +106,8 @@ def test_pulses_whose_lines_are_lost_are_counted_and_told():
 
 @pytest.mark.parametrize("says_hello", [True, False])
 def test_a_board_that_begins_anew_is_set_again_and_told(says_hello):
-    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
-        take(board, 20)
+    with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
+        take(samples, 20)
         fake.reset(says_hello)
         wait_until(lambda: fake.commands.count("LCEGO") == 2)
         wait_until(lambda: board.host_clock is not None and board.host_clock.n_used >= 4)
@@ -117,11 +118,11 @@ def test_a_board_that_begins_anew_is_set_again_and_told(says_hello):
 
 
 def test_a_board_that_is_unplugged_is_named_with_its_port():
-    with FakeBoard() as fake, SyncBoard(settings(fake.path)) as board:
-        take(board, 10)
+    with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))) as (board, samples):
+        take(samples, 10)
         fake.unplug()
         with pytest.raises(SourceError, match=fake.path) as caught:
-            take(board, 10**6)
+            take(samples, 10**6)
         assert "cable" in caught.value.hint
         board.status()
 
@@ -129,7 +130,7 @@ def test_a_board_that_is_unplugged_is_named_with_its_port():
 def test_a_silent_board_is_an_error_with_what_to_check():
     with FakeBoard(is_mute=True) as fake:
         with pytest.raises(SourceError, match=r"0\.3 s") as caught:
-            SyncBoard(settings(fake.path), hello_s=0.3).__enter__()
+            attached(SyncBoard(settings(fake.path), hello_s=0.3)).__enter__()
         assert "firmware" in caught.value.hint
         assert "LCEHI?" in fake.commands
 
@@ -139,17 +140,17 @@ def test_a_silent_board_is_an_error_with_what_to_check():
 )
 def test_a_board_that_talks_otherwise_is_refused(hello, named):
     with FakeBoard(hello=hello) as fake, pytest.raises(SourceError, match=named):
-        SyncBoard(settings(fake.path), hello_s=0.3).__enter__()
+        attached(SyncBoard(settings(fake.path), hello_s=0.3)).__enter__()
 
 
 def test_a_port_that_is_absent_busy_or_no_port_says_so(tmp_path):
     with pytest.raises(SourceError, match="/dev/ttyLCE9") as caught:
-        SyncBoard(settings("/dev/ttyLCE9")).__enter__()
+        attached(SyncBoard(settings("/dev/ttyLCE9"))).__enter__()
     assert "sync.device" in caught.value.hint
     (tmp_path / "file").write_text("")
     with pytest.raises(SourceError, match="file"):
-        SyncBoard(settings(str(tmp_path / "file"))).__enter__()
-    with FakeBoard() as fake, SyncBoard(settings(fake.path)):
+        attached(SyncBoard(settings(str(tmp_path / "file")))).__enter__()
+    with FakeBoard() as fake, attached(SyncBoard(settings(fake.path))):
         with pytest.raises(SourceError, match=fake.path) as caught:
-            SyncBoard(settings(fake.path)).__enter__()
+            attached(SyncBoard(settings(fake.path))).__enter__()
         assert "fuser" in caught.value.hint

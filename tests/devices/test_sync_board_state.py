@@ -100,7 +100,7 @@ def test_utc_comes_from_pulses_that_know_their_second():
     assert [pulse.sensor for pulse in found] == ["pps"] * 10
     assert state.utc_clock.drift == pytest.approx(-40e-6, abs=0.1e-6)
     assert abs(state.utc_clock.convert(100 * S) - DAY_NS) < 1000
-    told = state.clock_state().finding
+    told = state.clock_state()
     assert told.code == "clock.board" and told.figure("utc_drift_ppm") == pytest.approx(-40, abs=0.1)
 
 
@@ -131,7 +131,7 @@ def test_whatever_is_said_in_whatever_order_breaks_nothing(said):
         for pulse in state.take(message, Arrival(DAY_NS + steady_ns, steady_ns)):
             assert pulse.sensor in ("cam", "davis", "pps")
     shown = problems(state, now_s=steady_ns / S, heard_s=steady_ns / S)
-    assert all(finding.sentence for finding in (state.clock_state().finding, *shown))
+    assert all(finding.sentence for finding in (state.clock_state(), *shown))
 
 
 BODIES = {

@@ -27,6 +27,7 @@ from lce_rig.devices.lce1 import (
 )
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.rig.profile import SyncSettings
+from tests.devices.attached import attached
 
 FIRMWARE = Path(__file__).parents[2] / "scripts" / "firmware"
 STRICT = [
@@ -232,9 +233,9 @@ def running(host_board):
 
 def test_our_live_source_and_the_firmware_understand_each_other(running):
     given = {"device": running.path, "triggers": {"cam": {"channel": 1, "rate_hz": 50.0, "phase_us": 3000}}}
-    with SyncBoard(SyncSettings.model_validate(given)) as board:
+    with attached(SyncBoard(SyncSettings.model_validate(given))) as (board, samples):
         pulses, told, end_s = [], [], time.monotonic() + 30
-        for pulse in board.samples():
+        for pulse in samples:
             pulses += [pulse] if pulse.sensor == "cam" else []
             told += [pulse] if pulse.sensor == "pps" else []
             if (len(told) >= 3 and len(pulses) > 50) or time.monotonic() > end_s:

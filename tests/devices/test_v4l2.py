@@ -17,6 +17,7 @@ from lce_rig.devices import v4l2_abi as abi
 from lce_rig.devices.v4l2 import V4l2Source
 from lce_rig.devices.video_device import serial_number
 from lce_rig.rig import CameraSettings, load_rig
+from tests.devices.attached import attached
 from tests.notes import has_note
 
 HEADER = Path("/usr/include/linux/videodev2.h")
@@ -28,7 +29,7 @@ def camera(device: str | None) -> CameraSettings:
 
 
 def refusal(device: str | None) -> SourceError:
-    with pytest.raises(SourceError) as caught, V4l2Source("cam", camera(device)):
+    with pytest.raises(SourceError) as caught, attached(V4l2Source("cam", camera(device))):
         pass
     return caught.value
 
@@ -143,18 +144,19 @@ from itertools import islice
 import numpy as np
 from lce_rig.devices.v4l2 import V4l2Source
 from lce_rig.rig import load_rig
+from tests.devices.attached import attached
 
 settings = load_rig("rlfs").cameras["cam"]
 plain = {"device": "/dev/null", "controls": {}, "frame_rate_hz": None, "pixel_format": None}
 driver = settings.driver.model_copy(update=plain)
 settings = settings.model_copy(update={"driver": driver, "resolution_px": (64, 48)})
 for _ in range(2):  # opened a second time, the buffers are given back and asked for again
-    with V4l2Source("cam", settings) as source:
-        images = list(islice(source.samples(), 5))
+    with attached(V4l2Source("cam", settings)) as (source, samples):
+        images = list(islice(samples, 5))
         status = source.status()
 print(json.dumps({
     "pixels": [image.pixels.tolist() for image in images], "counts": [image.count for image in images],
-    "stamps_ns": [image.stamp_ns for image in images], "clock": status.clock.finding.code,
+    "stamps_ns": [image.stamp_ns for image in images], "clock": status.clock.code,
     "device": status.device, "problems": [each.code for each in status.problems]}))
 """
 

@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from wire.vlp16_packets import SensorPacket, Vlp16Clock, free_ports
 
 from lce_rig.core import velodyne
-from lce_rig.core.data import Scan
+from lce_rig.core.data import LiveSample, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.vlp16 import N_AT_ONCE, UdpPort, Vlp16Source
@@ -21,6 +22,7 @@ from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.velodyne_scans import PcapRecording
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.rig.sensors import DriverSettings
+from tests.devices.attached import attached
 from tests.devices.test_vlp16_web import PAGES, serving
 from tests.io.vlp16_room import PERIOD_NS, T0_NS, packets_of, room_scans, settings
 from tests.shared import changed, files_up_to, wait_until
@@ -94,14 +96,14 @@ def streaming(
     make_packets: Callable[[int], list[SensorPacket]],
     record_to: Path | None = None,
     **options: Any,
-) -> Iterator[Vlp16Source]:
-    """An open source that packets come to."""
+) -> Iterator[tuple[Vlp16Source, Iterator[LiveSample]]]:
+    """An open source that packets come to, and its samples."""
     source = Vlp16Source("lidar", lidar, **{"silence_s": PATIENT_S, **options})
     with DiskWriter() as disk:
         if record_to is not None:
             assert source.record_packets(record_to, disk)
-        with Sender(lidar, source).sending(make_packets), source:
-            yield source
+        with Sender(lidar, source).sending(make_packets), attached(source) as opened:
+            yield opened
 
 
 class Room:
@@ -117,9 +119,8 @@ class Room:
         return packets_of(self.scans, mode, clock)
 
 
-def take(source: Vlp16Source, n: int) -> list[Scan]:
-    scans = source.samples()
-    return [next(scans) for _ in range(n)]
+def take(samples: Iterator[LiveSample], n: int) -> list[Scan]:
+    return [sample for sample in islice(samples, n) if isinstance(sample, Scan)]
 
 
 def stamps(scans: list[Scan]) -> np.ndarray:
@@ -131,14 +132,14 @@ def stamps(scans: list[Scan]) -> np.ndarray:
 
 def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(lidar: LidarSettings) -> None:
     room = Room(13)
-    with streaming(lidar, room) as source:
-        scans = take(source, 12)
+    with streaming(lidar, room) as (source, samples):
+        scans = take(samples, 12)
         status = source.status()
     assert np.abs(stamps(scans) - stamps(room.scans[:12])).max() <= 1000
     assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:12]]
     assert (status.n_lost, status.n_dropped) == (0, 0) and (status.n_packets or 0) >= 900
-    assert status.clock is not None and status.clock.is_utc
-    assert status.clock.finding.code == "clock.lidar_utc" and HERE in status.device
+    assert status.is_utc
+    assert status.clock.code == "clock.lidar_utc" and HERE in status.device
     assert {problem.code for problem in status.problems} <= {"buffer.small"}
     for scan in scans:
         # The last packet of a scan ends after it; the sender is up to 2 ms early.
@@ -146,14 +147,14 @@ def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(li
 
 
 def test_the_serial_number_is_asked_of_the_web_page_beside_the_packets(lidar: LidarSettings) -> None:
-    with serving(PAGES) as web, streaming(lidar, Room(3), web_port=web.port) as source:
-        take(source, 1)
+    with serving(PAGES) as port, streaming(lidar, Room(3), web_port=port) as (source, samples):
+        take(samples, 1)
         wait_until(lambda: source.status().serial == PAGES["info"]["serial"])
     with (
-        serving({"info": b"<html>a camera</html>"}) as web,
-        streaming(lidar, Room(5), web_port=web.port) as source,
+        serving({"info": b"<html>a camera</html>"}) as port,
+        streaming(lidar, Room(5), web_port=port) as (source, samples),
     ):
-        take(source, 4)
+        take(samples, 4)
         assert source.status().serial == ""
 
 
@@ -169,17 +170,16 @@ def test_only_packets_of_the_profiles_address_or_the_first_heard_are_taken(
         wait_until(lambda: HERE in source.status().device)
         return packets_of(room_scans(1))
 
-    with stranger.sending(make_later), Sender(lidar, source).sending(room), source:
-        scans = take(source, 2)
+    with stranger.sending(make_later), Sender(lidar, source).sending(room), attached(source) as (_, samples):
+        scans = take(samples, 2)
     assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:2]]
 
 
 def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar: LidarSettings) -> None:
     source = Vlp16Source("lidar", lidar, silence_s=PATIENT_S)
     for _ in range(2):
-        with Sender(lidar, source).sending(Room(3)), source:
-            take(source, 1)
-        assert len(list(source.samples())) <= 5
+        with Sender(lidar, source).sending(Room(3)), attached(source) as (_, samples):
+            take(samples, 1)
         assert f"read {source.sensor}" not in {thread.name for thread in threading.enumerate()}
 
 
@@ -189,7 +189,8 @@ def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar: Li
 def explain(lidar: LidarSettings, packets: list[SensorPacket] | None = None, **options: Any) -> SourceError:
     """The error of opening a source that nothing good comes to."""
     source = Vlp16Source("lidar", lidar, **{"silence_s": 0.3, "web_port": 9, **options})
-    with pytest.raises(SourceError) as caught, Sender(lidar, source).sending(lambda _: packets or []), source:
+    sending = Sender(lidar, source).sending(lambda _: packets or [])
+    with pytest.raises(SourceError) as caught, sending, attached(source):
         pass
     return caught.value
 
@@ -202,11 +203,13 @@ def test_an_absent_sensor_is_an_error_that_says_what_to_check(lidar: LidarSettin
 
 
 def test_a_sensor_that_falls_silent_is_an_error_after_what_it_sent(lidar: LidarSettings) -> None:
-    with streaming(lidar, lambda _: packets_of(room_scans(3)), silence_s=1.0, web_port=9) as source:
-        scans = source.samples()
-        assert len([next(scans) for _ in range(2)]) == 2
+    with streaming(lidar, lambda _: packets_of(room_scans(3)), silence_s=1.0, web_port=9) as (
+        _,
+        samples,
+    ):
+        assert len(take(samples, 2)) == 2
         with pytest.raises(SourceError, match=str(lidar.driver.port)):
-            list(scans)
+            list(samples)
 
 
 def test_another_model_is_refused_by_name(lidar: LidarSettings) -> None:
@@ -240,8 +243,8 @@ def test_a_port_that_another_program_holds_is_named(lidar: LidarSettings) -> Non
 
 def test_what_was_recorded_replays_to_the_same_scans(lidar: LidarSettings, rig: Rig, tmp_path: Path) -> None:
     path = tmp_path / "lidar.pcap"
-    with streaming(lidar, Room(6), record_to=tmp_path) as source:
-        live = take(source, 5)
+    with streaming(lidar, Room(6), record_to=tmp_path) as (_, samples):
+        live = take(samples, 5)
     replayed = list(PcapRecording(path, rig, SourceOptions()).samples())[:5]
     for a, b in zip(live, replayed, strict=True):
         assert (a.stamp_ns, a.host_ns) == (b.stamp_ns, b.host_ns)
@@ -259,8 +262,8 @@ def test_a_recording_is_never_written_over(lidar: LidarSettings, tmp_path: Path)
 
 
 def test_a_full_disk_ends_the_recording_and_nothing_else(lidar: LidarSettings, tmp_path: Path) -> None:
-    with files_up_to(200_000), streaming(lidar, Room(6), record_to=tmp_path) as source:
-        scans = take(source, 5)
+    with files_up_to(200_000), streaming(lidar, Room(6), record_to=tmp_path) as (source, samples):
+        scans = take(samples, 5)
         wait_until(lambda: any(p.code == "device.recording_stopped" for p in source.status().problems))
     assert len(scans) == 5
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.velodyne_web import VelodyneWeb, find_problems
+from lce_rig.devices.velodyne_web import find_problems, read_web
 from tests.io.vlp16_room import settings
 
 INFO = {
@@ -36,8 +36,8 @@ PAGES: dict[str, Any] = {"info": INFO, "status": STATUS, "settings": SETTINGS}
 
 
 @contextmanager
-def serving(pages: dict[str, Any]) -> Iterator[VelodyneWeb]:
-    """Serve a sensor's pages by name; bytes are sent as they are."""
+def serving(pages: dict[str, Any]) -> Iterator[int]:
+    """Serve a sensor's pages by name on a port; bytes are sent as they are."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -57,20 +57,20 @@ def serving(pages: dict[str, Any]) -> Iterator[VelodyneWeb]:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         try:
-            yield VelodyneWeb("127.0.0.1", server.server_port)
+            yield server.server_port
         finally:
             server.shutdown()
             thread.join()
 
 
 def test_the_page_of_a_healthy_sensor_is_read_without_a_complaint() -> None:
-    with serving(PAGES) as web:
-        report = web.read()
-    assert (report.model, report.serial, report.firmware) == ("VLP-16", "AG43510116", "3.0.41.1")
-    assert (report.pps, report.returns, report.host) == ("locked", "strongest", "255.255.255.255")
-    assert report.is_motor_on and report.is_laser_on
-    assert report.rpm == 600
-    assert (report.fov_deg, report.data_port, report.position_port) == ((0, 359), 2368, 8308)
+    with serving(PAGES) as port:
+        report = read_web("127.0.0.1", port)
+    assert (report["model"], report["serial"], report["firmware"]) == ("VLP-16", "AG43510116", "3.0.41.1")
+    assert (report["pps"], report["returns"], report["host"]) == ("locked", "strongest", "255.255.255.255")
+    assert report["is_motor_on"] and report["is_laser_on"]
+    assert report["rpm"] == 600
+    assert (report["fov_deg"], report["data_port"], report["position_port"]) == ((0, 359), 2368, 8308)
     assert find_problems(report, settings()) == []
 
 
@@ -86,29 +86,29 @@ def test_types_that_differ_by_firmware_do_not_matter() -> None:
         },
     }
     odd["settings"]["host"] = {"addr": "192.168.1.100", "dport": "2368", "tport": "8308"}
-    with serving(odd) as web:
-        report = web.read()
-    assert (report.firmware, report.serial) == ("3.0.29.0", "43510116")
-    assert report.is_motor_on and report.is_laser_on
-    assert (report.rpm, report.returns, report.data_port) == (600, "strongest", 2368)
+    with serving(odd) as port:
+        report = read_web("127.0.0.1", port)
+    assert (report["firmware"], report["serial"]) == ("3.0.29.0", "43510116")
+    assert report["is_motor_on"] and report["is_laser_on"]
+    assert (report["rpm"], report["returns"], report["data_port"]) == (600, "strongest", 2368)
     assert find_problems(report, settings()) == []
 
 
 @pytest.mark.parametrize("body", [b"<html>router</html>", b"[1, 2]", b"\xff\xfe", b"", b"[" * 100_000])
 def test_another_device_at_the_address_is_told_from_a_sensor(body: bytes) -> None:
     with (
-        serving({**PAGES, "info": body}) as web,
+        serving({**PAGES, "info": body}) as port,
         pytest.raises(SourceError, match="cgi/info"),
     ):
-        web.read()
+        read_web("127.0.0.1", port)
 
 
 def test_an_address_where_nothing_answers_is_an_error_with_what_to_check() -> None:
     with pytest.raises(SourceError, match=":9/") as caught:
-        VelodyneWeb("127.0.0.1", 9, 0.5).read()
+        read_web("127.0.0.1", 9, 0.5)
     assert "192.168.1.x" in caught.value.hint
     with pytest.raises(SourceError):
-        VelodyneWeb("no such host").read()
+        read_web("no such host")
 
 
 WRONG: list[tuple[dict[str, Any], tuple[str, Any, Any]]] = [
@@ -127,7 +127,7 @@ WRONG: list[tuple[dict[str, Any], tuple[str, Any, Any]]] = [
 def test_what_keeps_scans_from_coming_is_found_with_its_figures(
     changes: dict[str, Any], figures: tuple[str, Any, Any]
 ) -> None:
-    with serving({key: {**page, **changes.get(key, {})} for key, page in PAGES.items()}) as web:
-        (problem,) = find_problems(web.read(), settings())
+    with serving({key: {**page, **changes.get(key, {})} for key, page in PAGES.items()}) as port:
+        (problem,) = find_problems(read_web("127.0.0.1", port), settings())
     assert problem.code == "settings.differs"
     assert tuple(problem.figures[name] for name in ("setting", "value", "expected")) == figures

@@ -108,7 +108,7 @@ def attach(attached: Attached, folder: Path) -> Iterator[tuple[Rig, int]]:
             stack.callback(sender.stop.set)
         if attached.has_board:
             document["sync"]["device"] = stack.enter_context(FakeBoard(period_s=PERIOD_S)).path
-        yield Rig.model_validate(document), int(web.url.rpartition(":")[2])
+        yield Rig.model_validate(document), web
 
 
 def scan_of(board: Board, distance_m: float) -> Scan:

@@ -7,7 +7,7 @@ import numpy as np
 
 from lce_rig.core.data import Image, Pulse, Scan
 from lce_rig.core.findings import Figure, Finding
-from lce_rig.devices.reading import ClockState, SourceStatus
+from lce_rig.devices.reading import SourceStatus
 from lce_rig.doctor.checks import Check
 from lce_rig.doctor.observing import Examination, ObservedSensor
 from lce_rig.rig import Rig
@@ -16,8 +16,8 @@ from lce_rig.timing.clock import ClockModel
 S = 1_000_000_000
 START_NS = 1_753_000_000 * S
 UTC_FIGURES: dict[str, Figure] = {"pps": "locked", "is_fix": True, "nmea_past_hour_s": 754, "ahead_s": 0.0003}
-LOCKED = ClockState(Finding("clock.lidar_utc", "note", figures=UTC_FIGURES), True)
-UNLOCKED = ClockState(Finding("clock.pps_not_locked", "warning", figures={"pps": "absent"}))
+LOCKED = Finding("clock.lidar_utc", "note", figures=UTC_FIGURES)
+UNLOCKED = Finding("clock.pps_not_locked", "warning", figures={"pps": "absent"})
 BOARD_NS = 5 * S
 """What the board's clock shows at START_NS."""
 

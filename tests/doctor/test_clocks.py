@@ -8,7 +8,6 @@ import pytest
 from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices.reading import ClockState
 from lce_rig.doctor.checks import check_clock, check_edges, check_sync, tie
 from lce_rig.doctor.observing import ObservedSensor
 from lce_rig.rig import Rig
@@ -88,7 +87,7 @@ def test_absent_sensors_are_left_out_of_the_verdict() -> None:
 
 def test_doubts_of_a_driver_about_its_clock_stand_in_its_line() -> None:
     problem = Finding("clock.missing", "warning", figures={"clock": "tsc"})
-    arrival = ClockState(Finding("clock.arrival", "note"))
+    arrival = Finding("clock.arrival", "note")
     line = look(check_clock, examination(camera(clock=arrival, problems=(problem,))), "cam")
     assert line is not None and line.severity == "warning"
     assert codes(line) == ["clock.arrival", "clock.missing"]

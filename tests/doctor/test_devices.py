@@ -6,7 +6,6 @@ import pytest
 
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
-from lce_rig.devices.velodyne_web import WebReport
 from lce_rig.doctor.checks import check_computer_clock, check_device, check_disk, check_stream, wanted_rate_hz
 from lce_rig.doctor.observing import Examination, ObservedSensor
 from lce_rig.rig import load_rig
@@ -25,7 +24,7 @@ def test_what_does_not_open_is_red_with_what_to_check() -> None:
 
 
 def test_a_lidar_is_named_with_what_its_web_page_says() -> None:
-    web = {"lidar": WebReport(model="VLP-16", serial="AG43510116", firmware="3.0.41.1")}
+    web = {"lidar": {"model": "VLP-16", "serial": "AG43510116", "firmware": "3.0.41.1"}}
     line = look(check_device, examination(lidar(device="VLP-16 at 127.0.0.1"), web=web), "lidar")
     assert codes(line) == ["sensor.answers"] and line.severity == "note"
     told = ("device", "firmware", "serial")

@@ -6,20 +6,36 @@ from pathlib import Path
 import pytest
 from wire.sync_board import FakeBoard
 
+from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.reading import LiveSource
+from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.devices.sync_board import SyncBoard
 from lce_rig.doctor.observing import observe
 from lce_rig.rig import load_rig
 from lce_rig.rig.profile import SyncSettings
 
 
-def absent() -> LiveSource:
-    raise SourceError("it is not there", "plug")
+class Unusable(LiveSource):
+    """A sensor that cannot be opened."""
+
+    def __init__(self, sensor: str, error: Exception) -> None:
+        super().__init__(sensor, sensor, 5.0)
+        self.error = error
+
+    def open(self) -> None:
+        raise self.error
+
+    def read(self) -> list[LiveSample]:
+        return []
+
+    def close(self) -> None:
+        pass
+
+    def describe(self) -> SourceStatus:
+        return SourceStatus(self.sensor)
 
 
-def faulty() -> LiveSource:
-    raise ZeroDivisionError("a slip")
+ABSENT = Unusable("gone", SourceError("it is not there", "Plug it in."))
 
 
 def test_what_fails_is_said_and_the_others_are_watched_all_the_same() -> None:
@@ -27,8 +43,8 @@ def test_what_fails_is_said_and_the_others_are_watched_all_the_same() -> None:
         settings = SyncSettings.model_validate(
             {"device": fake.path, "triggers": {"cam": {"channel": 0, "rate_hz": 20.0}}}
         )
-        seen = observe({"gone": absent, "bad": faulty, "sync": lambda: SyncBoard(settings)}, 1.0)
-    assert seen["gone"].failure is not None and seen["gone"].failure.hint == "plug"
+        seen = observe([ABSENT, Unusable("bad", ZeroDivisionError("a slip")), SyncBoard(settings)], 1.0)
+    assert seen["gone"].failure is not None and seen["gone"].failure.hint == "Plug it in."
     assert seen["bad"].failure is not None and "ZeroDivisionError" in seen["bad"].failure.what
     board = seen["sync"]
     assert board.failure is None and board.status is not None and board.watched_s > 0.4
@@ -38,7 +54,7 @@ def test_what_fails_is_said_and_the_others_are_watched_all_the_same() -> None:
 
 def test_where_nothing_opens_nothing_is_waited_for() -> None:
     start_s = time.monotonic()
-    seen = observe({"gone": absent}, 60.0)
+    seen = observe([ABSENT], 60.0)
     assert time.monotonic() - start_s < 10 and seen["gone"].status is None
 
 
@@ -49,9 +65,7 @@ def test_a_davis_over_the_network_has_its_events_counted(tmp_path: Path) -> None
 
     assert load_rig("rles").cameras["davis"].model == "DAVIS346"
     with sender(10_000) as (_, port):
-        seen = observe({"davis": lambda: DavisSource("davis", only_events(), over_network(port))}, 1.0)[
-            "davis"
-        ]
+        seen = observe([DavisSource("davis", only_events(), over_network(port))], 1.0)["davis"]
     assert seen.failure is None
     assert seen.n_events > 0 and seen.n_events % 50 == 0
     assert len(seen.arrivals_ns["events"]) > 1

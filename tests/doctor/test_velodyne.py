@@ -5,7 +5,6 @@ from typing import Any
 import pytest
 
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.velodyne_web import WebReport
 from lce_rig.doctor.checks import check_pps, check_settings
 from lce_rig.rig import Rig
 
@@ -34,20 +33,20 @@ def test_a_locked_sensor_is_green_with_the_time_it_was_told() -> None:
 def test_a_sensor_without_pulses_is_judged_by_what_the_profile_promises(
     timestamps: dict[str, str], severity: str
 ) -> None:
-    seen = lidar(clock=UNLOCKED, problems=(UNLOCKED.finding,))
+    seen = lidar(clock=UNLOCKED, problems=(UNLOCKED,))
     line = look(check_pps, examination(seen, rig=with_timestamps(**timestamps)), "lidar")
     assert line is not None and line.severity == severity
     assert codes(line)[:2] == ["clock.pulse", "clock.pps_not_locked"]
 
 
 def test_settings_that_differ_from_the_profile_are_named_once() -> None:
-    report = WebReport(
-        pps="absent",
-        rpm=1200.0,
-        returns="strongest",
-        fov_deg=(10, 350),
-        data_port=2369,
-    )
+    report = {
+        "pps": "absent",
+        "rpm": 1200.0,
+        "returns": "strongest",
+        "fov_deg": (10, 350),
+        "data_port": 2369,
+    }
     line = look(check_settings, examination(lidar(), web={"lidar": report}), "lidar")
     assert line is not None and line.severity == "warning"
     # The pulse has a line of its own.

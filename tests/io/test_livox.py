@@ -93,7 +93,8 @@ def test_tags_are_read_as_the_model_means_them_and_may_be_missing(model: str, n_
     cloud["x"], cloud["y"], cloud["tag"] = 3.0, 0.01 * index, 16 * (index % 2) + (index % 5 == 2)
     cloud["timestamp"] = T0_NS + index * 500_000.0
     settings = of_model(model).lidars["lidar"]
-    reading = to_scan(cloud, "lidar", settings, "here", T0_NS)
-    assert len(reading.scan.points) == n_kept and any("tag" in note for note in reading.notes)
+    notes = set[str]()
+    scan = to_scan(cloud, "lidar", settings, "here", T0_NS, notes=notes)
+    assert len(scan.points) == n_kept and any("tag" in note for note in notes)
     untagged = to_scan(cloud[["x", "y", "z"]], "lidar", settings, "here", T0_NS)
-    assert len(untagged.scan.points) == N_POINTS
+    assert len(untagged.points) == N_POINTS

@@ -111,8 +111,7 @@ class FrameFeed:
         while not self._stop.is_set():
             if time.monotonic() - self._refreshed_s > _REFRESH_S:
                 self._refreshed_s = time.monotonic()
-                states = {name: status.clock for name, status in self.sensors.statuses().items()}
-                locked = [name for name, state in states.items() if state is not None and state.is_utc]
+                locked = [name for name, status in self.sensors.statuses().items() if status.is_utc]
                 host, utc = (None, None) if board is None else (board.host_clock, board.utc_clock)
                 self.clock.refresh(host, utc, locked)
                 if board is not None and self.clock.needs_slow_triggers != self._is_slow:

@@ -24,7 +24,7 @@ from lce_rig.collect.worker import start_without_interrupts
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
-from lce_rig.devices.reading import ClockState, Inbox, LiveSource, SourceStatus
+from lce_rig.devices.reading import Inbox, LiveSource, SourceStatus
 from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
@@ -73,7 +73,7 @@ class SimulatedSource(LiveSource):
 
     def describe(self) -> SourceStatus:
         """Say how the sensor does."""
-        clock, n_lost = ClockState(CLOCK_SIMULATED()), self._taken.n_dropped[self.sensor]
+        clock, n_lost = CLOCK_SIMULATED(), self._taken.n_dropped[self.sensor]
         return SourceStatus(self.sensor, n_lost=n_lost, clock=clock, device="simulated")
 
     def put(self, sample: Image | Scan) -> None:

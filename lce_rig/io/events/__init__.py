@@ -8,10 +8,9 @@ from pkgutil import resolve_name
 from lce_rig.core.data import Image, Sample, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Losses
-from lce_rig.io import findings
 from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
-from lce_rig.io.joining import merge_by_time
+from lce_rig.io.joining import follows, merge_by_time
 from lce_rig.io.protocol import SourceOptions, choose_event_camera, fingerprint
 from lce_rig.io.ros.bag_file import SUFFIXES, kind_of
 from lce_rig.rig import Rig
@@ -145,8 +144,6 @@ class EventCameraFile:
     def _images(self, file: Aedat4File, number: int, channel: str, losses: Losses) -> Iterator[Sample]:
         last_ns: int | None = None
         for frame in file.packets(number, losses, decode_frame):
-            if last_ns is not None and frame.mid_exposure_ns <= last_ns:
-                losses.add(findings.FRAMES_OUT_OF_ORDER())
-                continue
-            last_ns = frame.mid_exposure_ns
-            yield Image(self._camera, channel, last_ns, frame.pixels)
+            if follows(frame.mid_exposure_ns, last_ns, losses):
+                last_ns = frame.mid_exposure_ns
+                yield Image(self._camera, channel, last_ns, frame.pixels)

@@ -314,9 +314,7 @@ def _sorted(events: EventColumns, first_ns: int, delivered_ns: int | None, losse
         is_late = events.t_ns < delivered_ns
         losses.add(findings.EVENTS_STRAY(where="too late"), int(np.count_nonzero(is_late)))
         events = events.select(~is_late)
-    n_back = int(np.count_nonzero(np.diff(events.t_ns) < 0))
-    losses.add(findings.EVENTS_SORTED(), n_back)
-    return events.select(np.argsort(events.t_ns, kind="stable")) if n_back else events
+    return events.select(np.argsort(events.t_ns, kind="stable"))
 
 
 def _stray(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Losses
-from lce_rig.io import findings
 from lce_rig.io.events.event_recording import NS_PER_US, EventStream, parse_size
 
 _BLOCK_BYTES = 1 << 18
@@ -38,23 +37,20 @@ class WrappingCounter:
         n_bits: the counter wraps at 2**n_bits.
         max_step_back: smaller steps back are not wraps; cameras mix their words a little.
         last: value of the last word, wraps included; None before the first.
-        n_repaired: words that did not fit those around them and were replaced by the one before.
     """
 
     n_bits: int
     max_step_back: int
     last: int | None = None
-    n_repaired: int = 0
 
     def unwrap(self, values: NDArray[np.int64]) -> NDArray[np.int64]:
         """Add the wraps to the next values (N,) of the counter."""
         if not len(values):
             return values
-        # A single word that leaps out of a steady row would add a wrap for good.
+        # A single word that leaps out of a steady row would add a wrap for good: the one before replaces it.
         before, word, after = values[:-2], values[1:-1], values[2:]
         is_steady = (after >= before) & (after - before <= self.max_step_back)
         is_odd = is_steady & (np.abs(word - before) > self.max_step_back)
-        self.n_repaired += int(np.count_nonzero(is_odd))
         values = np.concatenate((values[:1], np.where(is_odd, before, word), values[1:][-1:]))
         last = int(values[0]) if self.last is None else self.last
         previous = np.concatenate(([last % (1 << self.n_bits)], values[:-1]))
@@ -235,7 +231,6 @@ class PropheseeEvents(EventStream):
             while block := file.read(_BLOCK_BYTES):
                 words: NDArray[Any] = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
                 yield decoder.decode(words)
-        losses.add(findings.TIME_WORDS_REPAIRED(), decoder.clock.n_repaired)
 
 
 def _read_header(file: BinaryIO) -> dict[str, str]:

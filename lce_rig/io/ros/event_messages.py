@@ -122,11 +122,6 @@ class PacketDecoder:
                 yield EventColumns(events.t_ns, events.x, events.y, events.polarity, host_ns)
                 host_ns = None
 
-    @property
-    def n_repaired(self) -> int:
-        """Time words that did not fit those around them and were replaced by the one before."""
-        return self._evt3.clock.n_repaired + self._compressed.clock.n_repaired
-
 
 def _pieces(words: NDArray[np.uint16]) -> Iterator[NDArray[np.uint16]]:
     return (words[at : at + _WORDS_AT_ONCE] for at in range(0, len(words), _WORDS_AT_ONCE))
@@ -185,7 +180,6 @@ class BagEvents(EventStream):
                 losses.add(lost, packet.number - last_number - 1)
             last_number = packet.number
         yield from decoder.finish()
-        losses.add(findings.TIME_WORDS_REPAIRED(), decoder.n_repaired)
 
     def _check_size(self, head: EventHead) -> None:
         if self.resolution_px and (head.width_px, head.height_px) != self.resolution_px:

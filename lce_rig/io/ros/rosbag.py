@@ -12,7 +12,7 @@ from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
-from lce_rig.io.joining import merge_by_time
+from lce_rig.io.joining import follows, merge_by_time
 from lce_rig.io.protocol import SourceOptions, fingerprint
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
 from lce_rig.io.ros.event_messages import BagEvents
@@ -28,8 +28,6 @@ from lce_rig.io.ros.topics import PACKET_TYPES, Target, choose_topics
 from lce_rig.io.velodyne_scans import OFFSETS_NOTE, Vlp16Stream
 from lce_rig.rig import CameraSettings, LidarSettings, Rig
 
-# A timestamp this much earlier than the one before is a clock that was set, not a message that came late.
-CLOCK_JUMP_NS = 1_000_000_000
 # Scans come by this share of the period too early, at most.
 _EARLY = 0.05
 
@@ -114,10 +112,7 @@ class TopicDecoder:
                 )
             return Image(sensor, channel, stamp_ns, decode_ros_image(content), message.log_ns)
         cloud = (decode_livox if message.msgtype in LIVOX_TYPES else decode_pointcloud2)(content)
-        reading = to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns)
-        self.notes.update(reading.notes)
-        self.losses.add(findings.POINTS_WITHOUT_RETURN(), reading.n_without_return)
-        return reading.scan
+        return to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns, self.notes)
 
     def _accumulate(self, samples: list[Image | Scan]) -> list[Image | Scan]:
         """Join scans without rings, which are sparse, to scans of the profile's rate; pass others on."""
@@ -162,17 +157,9 @@ class TopicDecoder:
         """Keep the samples with timestamps later than their predecessor's; count the others."""
         kept = []
         for sample in samples:
-            stamp_ns, last_ns = sample.stamp_ns, self._last_ns
-            if stamp_ns is not None and last_ns is not None and stamp_ns <= last_ns:
-                if stamp_ns == last_ns:
-                    self.losses.add(findings.SENT_TWICE())
-                    continue
-                if last_ns - stamp_ns < CLOCK_JUMP_NS:
-                    self.losses.add(findings.OUT_OF_ORDER())
-                    continue
-                self.losses.add(findings.CLOCK_SET_BACK())
-            self._last_ns = stamp_ns
-            kept.append(sample)
+            if follows(sample.stamp_ns, self._last_ns, self.losses):
+                self._last_ns = sample.stamp_ns
+                kept.append(sample)
         self.n_yielded += len(kept)
         return kept
 

@@ -69,7 +69,7 @@ def test_a_time_word_that_steps_back_a_little_is_no_wrap() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(WORDS))
-def test_a_damaged_time_word_is_repaired_and_counted(name: str) -> None:
+def test_a_damaged_time_word_is_repaired(name: str) -> None:
     encode, dtype = WORDS[name]
     truth = [(5000 * i, i, i, True) for i in range(100)]
     words = np.frombuffer(encode(truth), dtype).copy()
@@ -78,7 +78,6 @@ def test_a_damaged_time_word_is_repaired_and_counted(name: str) -> None:
     words[high[50]] ^= words.dtype.type(1 << {"evt2": 20, "evt3": 10}[name])
     decoder = decoder_of(name)
     found = columns_listed(decoder.decode(words))
-    assert decoder.clock.n_repaired == 1
     assert found[:50] + found[51:] == truth[:50] + truth[51:]
     assert abs(found[50][0] - truth[50][0]) < 10_000
 

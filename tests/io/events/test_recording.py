@@ -62,7 +62,6 @@ def test_stamps_mixed_a_little_are_sorted_and_none_is_lost(
     parts = np.split(t_us, sorted({c // 100 * 100 for c in cuts} - {0}))
     recording = record(*(columns(part) for part in parts))
     assert stamps_us(recording) == sorted(t_us.tolist())
-    assert any("decrease" in note for note in recording.notes) == bool((np.diff(t_us) < 0).any())
 
 
 def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound() -> None:
