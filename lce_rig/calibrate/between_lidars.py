@@ -204,7 +204,7 @@ def estimate_between_lidars(
         raise NotEnoughDataError.of(
             FEW_AGREE(n_agreeing=len(observations), n_captures=len(candidates), n_needed=len(agreed))
         )
-    solved = solve(observations, board, 0, settings[1].seed)
+    solved = solve(observations, board)
     # Without held-out residuals; outliers stay for the checks.
     start = Start(
         solved.T_cam_lidar,

@@ -55,7 +55,7 @@ def estimate_extrinsics(
         board: its specification.
         settings: method, priors and tolerances.
         clocks: of the sensors.
-        progress: called with (subsets done, subsets in all).
+        progress: told of each step.
 
     Raises:
         NotEnoughDataError: no channel has enough captures, or they leave a direction undetermined.
@@ -86,7 +86,7 @@ def estimate_extrinsics(
     estimate = estimate_observations(motion.observations(), board, settings, progress)
     estimate = _with_consensus(estimate, list(agreed.values()))
 
-    fast = replace(settings, n_draws=0, tolerances=None, lens=None)
+    fast = replace(settings, tolerances=None, lens=None)
     by_channel = {name: motion.observations(name if len(agreed) > 1 else None) for name in sorted(agreed)}
     channels = []
     for name, observations in by_channel.items():
@@ -157,13 +157,13 @@ def estimate_observations(
         observations: one per capture.
         board: its specification.
         settings: method, priors and tolerances.
-        progress: called with (subsets done, subsets in all).
+        progress: told of each step.
 
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
     """
     begin(progress, "Algorithm 1")
-    start = solve(observations, board, settings.n_drawn, settings.seed, progress)
+    start = solve(observations, board)
     begin(progress, "uncertainty" if settings.method == "paper" else "maximum likelihood")
     if settings.method == "paper":
         return by_scatter(start, board, settings)

@@ -1,6 +1,6 @@
 """Points, planes and lines of a pair of detected boards."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -52,32 +52,13 @@ def extract_features(observation: Observation, board: Board, *, half_step: bool 
     """
     return CaptureFeatures(
         capture=observation.capture,
-        **_of_lidar(observation.lidar, half_step),
-        **_of_camera(observation.image.T_cam_board, observation.image.cov, board),
+        **features_of_lidar(observation.lidar, half_step=half_step),
+        **features_of_camera(observation.image.T_cam_board, observation.image.cov, board),
     )
 
 
-def see_lidar(features: CaptureFeatures, lidar: LidarBoard) -> CaptureFeatures:
-    """Build the features of another scan of the board that the camera sees."""
-    return replace(features, **_of_lidar(lidar, half_step=True))
-
-
-def place_features(
-    features: CaptureFeatures, T_cam_board: Array, cov: Array, board: Board
-) -> CaptureFeatures:
-    """Build the features of the same LiDAR's board, seen by the camera elsewhere.
-
-    Args:
-        features: of a capture.
-        T_cam_board: (4, 4).
-        cov: (6, 6) of that pose.
-        board: its size.
-    """
-    return replace(features, **_of_camera(T_cam_board, cov, board))
-
-
-def _of_lidar(lidar: LidarBoard, half_step: bool) -> dict[str, Any]:
-    """Compute the features of the LiDAR's side, by the names of `CaptureFeatures`."""
+def features_of_lidar(lidar: LidarBoard, *, half_step: bool = True) -> dict[str, Any]:
+    """Compute the features of the LiDAR's side, by the names of `CaptureFeatures`; as `extract_features`."""
     ends = np.asarray(lidar.edge_points, dtype=np.float64)
     if half_step:
         ends = turn_about_z(ends, lidar.edge_side * lidar.azimuth_step_rad / 2)
@@ -88,8 +69,8 @@ def _of_lidar(lidar: LidarBoard, half_step: bool) -> dict[str, Any]:
     }
 
 
-def _of_camera(T_cam_board: Array, cov: Array, board: Board) -> dict[str, Any]:
-    """Compute the features of the camera's side, by the names of `CaptureFeatures`.
+def features_of_camera(T_cam_board: Array, cov: Array, board: Board) -> dict[str, Any]:
+    """Compute the features of the camera's side from a pose and its covariance (6, 6).
 
     With R = exp(phi^) R0 the normal moves by phi x n = -n^ phi, hence cov_n = n^ cov_phi n^T (the paper's
     equation for the left perturbation).

@@ -11,9 +11,6 @@ from lce_rig.core.calibration import DEFAULT_METHOD, Method
 from lce_rig.core.geometry import Array
 from lce_rig.rig import LidarIntrinsicsSettings, LidarSettings
 
-# Subsets of each size that judge a result of the paper's method, as in the paper.
-_USUAL_DRAWS = 100
-
 
 @dataclass(frozen=True)
 class CalibrateOptions:
@@ -22,19 +19,11 @@ class CalibrateOptions:
     Attributes:
         method: "ml" (Algorithm 1, then maximum likelihood of extrinsics, all board poses and the sensors'
             constant errors) or "paper" (Algorithm 1 of LCE-Calib alone).
-        n_draws: I, subsets drawn for each subset size; they judge Algorithm 1's solution and do not change
-            it. None for 100 with "paper" and none with "ml".
-        seed: of the draws.
+        seed: of the halves of a session by which two channels of a moving board are compared.
     """
 
     method: Method = DEFAULT_METHOD
-    n_draws: int | None = None
     seed: int = 0
-
-    @property
-    def n_drawn(self) -> int:
-        """I."""
-        return (_USUAL_DRAWS if self.method == "paper" else 0) if self.n_draws is None else self.n_draws
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +91,6 @@ class EstimateSettings(CalibrateOptions):
         """Add what the profile says of a LiDAR, and of lens and board, to a user's options."""
         return cls(
             options.method,
-            options.n_draws,
             options.seed,
             laser_bias_sigma_m=lidar.laser_bias_sigma_m,
             range_offset_sigma_m=lidar.range_offset_sigma_m,

@@ -4,27 +4,27 @@ The scatter between captures shows their noise. A laser whose ranges are all 8 m
 in each capture: it causes no scatter, but moves the extrinsics.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import replace
-from itertools import groupby, pairwise
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.algorithm_1.moments import Problem
-from lce_rig.calibrate.features import CaptureFeatures, extract_features, see_lidar
+from lce_rig.calibrate.features import CaptureFeatures, extract_features, features_of_lidar
 from lce_rig.calibrate.quadratics import symmetric_inverse
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.calibrate.tolerances import Sensitivity, Tolerances, sensitivities_of, vary
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import LidarBoard, Observation
+from lce_rig.core.results import LidarBoard
 
 # Of the order of the errors themselves, so that the difference quotient represents their effect.
 STEP_M = 0.005
-# Captures whose rings are shifted at once: few, as each counts as often as it has rings.
-_CHUNK = 16
+# Captures at once: few, as every ring of a capture makes another one.
+_CHUNK = 256
 
 
 def ring_sensitivities(start: Algorithm1, board: Board) -> Array:
@@ -50,13 +50,13 @@ def ring_sensitivities(start: Algorithm1, board: Board) -> Array:
     boards = [observation.lidar for observation in start.fitted]
     rings = [np.union1d(lidar.ring, lidar.edge_ring) for lidar in boards]
     ring, column = np.unique(np.concatenate(rings), return_inverse=True)
-
-    def features_of(k: int) -> list[CaptureFeatures]:
-        features = extract_features(start.fitted[k], board)
-        return [see_lidar(features, lidar) for lidar in shift_rings(boards[k], rings[k], STEP_M)]
-
+    shifted = (
+        (k, replace(f, **features_of_lidar(lidar)))
+        for k, f in enumerate(extract_features(observation, board) for observation in start.fitted)
+        for lidar in shift_rings(boards[k], rings[k], STEP_M)
+    )
     change = np.zeros((len(ring), len(start.cost.information)))
-    np.add.at(change, column, _changes(features_of, board, start) / STEP_M)
+    np.add.at(change, column, _changes(shifted, board, start) / STEP_M)
     return np.asarray(-symmetric_inverse(start.cost.information) @ change.T)
 
 
@@ -72,44 +72,31 @@ def profile_sensitivities(
     """
     variants = vary(start.fitted, board, lens, bends_scans=True)
     changes = []
-    for assumed, group in groupby(variants, key=lambda variant: variant.board):
-        same_board = [(variant.apply(start.fitted), variant.board) for variant in group]
-
-        def features_of(
-            k: int, same_board: list[tuple[list[Observation], Board]] = same_board
-        ) -> list[CaptureFeatures]:
-            return [extract_features(moved[k], assumed) for moved, assumed in same_board]
-
-        by_capture = _changes(features_of, assumed, start)
-        changes.append(by_capture.reshape(len(start.fitted), len(same_board), -1).sum(axis=0))
-    moves = -np.concatenate(changes) @ symmetric_inverse(start.cost.information)[:, :6]
+    for variant in variants:
+        features = (extract_features(o, variant.board) for o in variant.apply(start.fitted))
+        changes.append(_changes(enumerate(features), variant.board, start).sum(axis=0))
+    moves = -np.array(changes) @ symmetric_inverse(start.cost.information)[:, :6]
     return sensitivities_of(variants, moves, known)
 
 
-def _changes(features_of: Callable[[int], list[CaptureFeatures]], board: Board, start: Algorithm1) -> Array:
+def _changes(features: Iterable[tuple[int, CaptureFeatures]], board: Board, start: Algorithm1) -> Array:
     """Compute by how much half gradients (n, 7) differ from those of the captures as observed.
 
     Args:
-        features_of: a capture's features, as they would be with each of some errors.
+        features: n numbers of captures, and their features as they would be with some error.
         board: that is assumed.
         start: as of `ring_sensitivities`.
-
-    Returns:
-        Of the n features, capture by capture.
     """
     problem, x, edge_ids = start.problem, start.solution.x[0], start.solution.edge_ids[0]
     gradients = problem.quadratics(x, edge_ids).gradients
-    starts = np.searchsorted(problem.edge_capture, np.arange(problem.n_captures + 1))
-    own_ids = [edge_ids[first:last] for first, last in pairwise(starts)]
-    differences = []
-    for first_k in range(0, problem.n_captures, _CHUNK):
-        by_capture = {k: features_of(k) for k in range(first_k, min(first_k + _CHUNK, problem.n_captures))}
-        features = [f for variants in by_capture.values() for f in variants]
-        repeated = [k for k, variants in by_capture.items() for _ in variants]
-        keep = None if problem.keep is None else [problem.keep[k] for k in repeated]
-        ids = np.concatenate([own_ids[k] for k in repeated])
-        moved = Problem(features, board, problem.weights, keep).quadratics(x, ids).gradients
-        differences.append(moved - gradients[repeated])
+    own_ids = np.split(edge_ids, np.searchsorted(problem.edge_capture, np.arange(1, problem.n_captures)))
+    source, differences = iter(features), []
+    while chunk := list(islice(source, _CHUNK)):
+        captures = [k for k, _ in chunk]
+        keep = None if problem.keep is None else [problem.keep[k] for k in captures]
+        moved = Problem([f for _, f in chunk], board, problem.weights, keep)
+        ids = np.concatenate([own_ids[k] for k in captures])
+        differences.append(moved.quadratics(x, ids).gradients - gradients[captures])
     return np.concatenate(differences)
 
 

@@ -56,7 +56,7 @@ def measure_lidar(
     board, settings = rig.board.to_board(), rig.lidars[name]
     if not settings.has_rings:
         raise UsageError(f"{name} ({settings.model}) has no lasers of its own", "Calibrate it as it is.")
-    options = EstimateSettings.of(CalibrateOptions("paper", n_draws=0), settings)
+    options = EstimateSettings.of(CalibrateOptions("paper"), settings)
     used, starts = [], []
     for k, session in enumerate(sessions):
         detections = detect(session, progress=progress) if found is None else found[k]

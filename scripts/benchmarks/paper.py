@@ -46,6 +46,6 @@ def _errors(simulated: PaperSet, level: int, method: Method) -> tuple[float, flo
         if isinstance(placement.image, ImageBoard) and isinstance(placement.scans[level], list)
     ]
     rig = paper_rig()
-    settings = EstimateSettings.of(CalibrateOptions(method, n_draws=0), rig.lidars[LIDAR])
+    settings = EstimateSettings.of(CalibrateOptions(method), rig.lidars[LIDAR])
     estimate = fit_extrinsic(candidates, rig.board.to_board(), settings)
     return compare(estimate.T_cam_lidar, simulated.T_cam_lidar)

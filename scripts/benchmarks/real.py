@@ -98,7 +98,7 @@ def _split_halves(
                 calibrate_detections(
                     rig,
                     _only(detections, {n for n, key in prints.items() if key in half}),
-                    EstimateSettings(method, n_draws=0),
+                    EstimateSettings(method),
                     channels=channels,
                 )[0][0].T_cam_lidar
                 for half in halves

@@ -177,7 +177,7 @@ def _runs_in_error(
     for seed in range(n_seeds):
         session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
         profile, found, lens = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
-        options = CalibrateOptions(method=method, n_draws=0)
+        options = CalibrateOptions(method=method)
         (calibration,), _ = calibrate_detections(profile, found, options)
         error = _error_in_use(calibration, session.T_cam_lidar, lens)
         point_px = _point_error_px(calibration, session.T_cam_lidar, lens)
@@ -207,7 +207,7 @@ def _runs(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[B
     rig = load_rig(case.rig)
     board = rig.board.to_board()
     lidar = next(iter(rig.lidars.values()))
-    options = EstimateSettings.of(CalibrateOptions("ml", n_draws=0), lidar)
+    options = EstimateSettings.of(CalibrateOptions("ml"), lidar)
     sessions = [
         still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
         for seed in range(n_seeds)

@@ -16,7 +16,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, exp_so3, pose
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
-FAST = EstimateSettings("paper", n_draws=3)
+FAST = EstimateSettings("paper")
 
 
 def errors_over_seeds(scenario, n_captures, n_seeds, options=FAST):
@@ -85,16 +85,6 @@ def test_the_result_is_as_good_with_the_lidar_turned(turn_deg):
     assert estimate.certificate.is_optimal
 
 
-@pytest.mark.parametrize("draws", [{"n_draws": 1}, {"n_draws": 1, "seed": 5}, {"n_draws": 10}])
-def test_draws_judge_the_result_and_do_not_change_it(draws):
-    # Lost returns and wide steps near the corners: ring ends may be taken for either edge's.
-    captures = simulate(8, 21, Scenario(step_deg=0.4, footprint_m=0.01, lost_share=0.3))
-    T, T_drawn = (
-        fit_extrinsic(captures, BOARD, replace(FAST, **own)).T_cam_lidar for own in ({"n_draws": 0}, draws)
-    )
-    assert np.array_equal(T, T_drawn)
-
-
 def spoil(captures, numbers):
     """Move the board by 6 cm between the sensors in the captures of these numbers."""
     spoilt = list(captures)
@@ -109,7 +99,7 @@ def spoil(captures, numbers):
 
 def test_of_many_captures_those_whose_board_moved_are_refused_too():
     numbers = (2, 3, 50, 62, 90)
-    estimate = fit_extrinsic(spoil(simulate(100, 9), numbers), BOARD, replace(FAST, n_draws=2))
+    estimate = fit_extrinsic(spoil(simulate(100, 9), numbers), BOARD, FAST)
     assert set(estimate.refused) == {f"{k:06d}" for k in numbers}
     assert error_to_reference(estimate.T_cam_lidar, T_FORWARD)[0] < 0.1
 
@@ -166,7 +156,7 @@ def test_residuals_are_those_of_the_extrinsic_and_grow_away_from_it():
 def test_the_same_placements_captured_again_claim_no_smaller_sigma(method):
     once = simulate(14, seed=4)
     again = [replace(item, capture=f"1{item.capture[1:]}") for item in once]
-    options = EstimateSettings(method, n_draws=1)
+    options = EstimateSettings(method)
     single, double = (
         fit_extrinsic(once, BOARD, options),
         fit_extrinsic([*once, *again], BOARD, options),

@@ -12,7 +12,7 @@ from lce_rig.core.geometry import Array, difference, invert
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board
 from tests.calibrate.moving_boards import Moving, simulate_moving, skew
 
-OPTIONS = EstimateSettings("paper", n_draws=0)
+OPTIONS = EstimateSettings("paper")
 TRACKED = Moving(tracked=("events",))
 
 

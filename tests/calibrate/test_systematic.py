@@ -13,7 +13,7 @@ from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings, system
 from lce_rig.core.geometry import difference, fit_plane
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
-NO_DRAWS = EstimateSettings("paper", n_draws=0)
+NO_DRAWS = EstimateSettings("paper")
 LASER_SIGMA_M, OFFSET_SIGMA_M = 0.008, 0.005
 RINGS = np.arange(16, dtype=np.int16)
 

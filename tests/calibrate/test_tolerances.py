@@ -24,7 +24,7 @@ KNOWN = Tolerances(
 PRIOR = KNOWN.lens
 REAL = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.008, end_sigma_m=0.001)
 METHODS = ("paper", "ml")
-SETTINGS = EstimateSettings(n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005, tolerances=KNOWN)
+SETTINGS = EstimateSettings(laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005, tolerances=KNOWN)
 
 
 def as_profiled(captures, lens=CAMERA, board=BOARD):

@@ -12,7 +12,7 @@ from lce_rig.rig.thresholds import CalibrationSettings, VerdictSettings
 from tests.calibrate.boards import BOARD
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
 
-OPTIONS = EstimateSettings(n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+OPTIONS = EstimateSettings(laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
 TARGET, LIMITS = CalibrationSettings(), VerdictSettings()
 N_SOUND = 21
 TURNED = np.array([0, 0, 0, 0, np.radians(0.5), 0])

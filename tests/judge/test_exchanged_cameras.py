@@ -26,7 +26,7 @@ def calibrated(rig: Rig, session: Session, names: tuple[str, str]) -> list[Calib
         for name, camera in zip((LEFT, RIGHT), names, strict=True)
     }
     scans = {board.capture: [board.lidar] for board in session[LEFT]}
-    options = CalibrateOptions("paper", n_draws=0)
+    options = CalibrateOptions("paper")
     return calibrate_detections(rig, Detections(images, {"lidar": scans}), options)[0]
 
 

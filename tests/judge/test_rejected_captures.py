@@ -28,7 +28,7 @@ _LENS = IntrinsicsSettings(
 )
 _CAMERA = _SHIPPED.cameras["cam"].model_copy(update={"intrinsics": _LENS})
 RIG = _SHIPPED.model_copy(update={"cameras": {"cam": _CAMERA}})
-PAPER = CalibrateOptions("paper", n_draws=0)
+PAPER = CalibrateOptions("paper")
 
 
 def taken_by_moved_lidar(lidar: LidarBoard, T: Array) -> LidarBoard:

@@ -32,7 +32,7 @@ RIG = load_rig("rlfs")
 
 @pytest.fixture(scope="module")
 def estimate():
-    return fit_extrinsic(simulate(20, seed=1), BOARD, EstimateSettings(n_draws=3))
+    return fit_extrinsic(simulate(20, seed=1), BOARD, EstimateSettings())
 
 
 @functools.cache
@@ -238,7 +238,7 @@ def test_squares_of_the_wrong_size_are_told_from_the_distances():
         T[:3, 3] /= 1.05
         image = replace(item.image, T_cam_board=T, T_cam_board_alternative=None)
         captures.append(replace(item, image=image))
-    wrong = fit_extrinsic(captures, BOARD, EstimateSettings(n_draws=3))
+    wrong = fit_extrinsic(captures, BOARD, EstimateSettings())
     verdict, reasons = examined_verdict_of(wrong)
     assert verdict == "fail"
     (scale,) = (reason for reason in reasons if reason.code == "verdict.scale")

@@ -17,7 +17,7 @@ RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 def systematic_sigma_m(*lines: str) -> float:
     """Calibrate simulated boards for an RLFS whose LiDAR has these lines in its profile."""
     rig = parse_rig(RLFS.replace("    rate_hz: 10\n", "".join(f"    {line}\n" for line in lines), 1))
-    (calibration,), _ = calibrate_detections(rig, found(), CalibrateOptions("paper", n_draws=0))
+    (calibration,), _ = calibrate_detections(rig, found(), CalibrateOptions("paper"))
     return calibration.diagnostics.sigma_systematic_translation_m
 
 
@@ -43,7 +43,7 @@ def test_a_profile_that_says_that_all_is_exact_is_believed(method: Method) -> No
         text = set_value(text, f"board.{key}", "0.0")
     for key in ("focal_sigma_px", "principal_point_sigma_px", "distortion_sigma_px"):
         text = set_value(text, f"cameras.cam.intrinsics.{key}", "0.0")
-    options = CalibrateOptions(method, n_draws=0)
+    options = CalibrateOptions(method)
     (calibration,), _ = calibrate_detections(parse_rig(text), found(), options)
     # What checks contradict may widen the claim; lens and board add nothing to it.
     assert not calibration.cov_shared.any()

@@ -18,7 +18,7 @@ from tests.calibrate.boards import in_use
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, simulate_two
 
 RIG = load_rig(str(Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"))
-ML, PAPER = CalibrateOptions(method="ml", n_draws=0), CalibrateOptions("paper", n_draws=0)
+ML, PAPER = CalibrateOptions(method="ml"), CalibrateOptions("paper")
 TURNED = np.array([0, 0, 0, 0, np.radians(0.6), 0])
 
 

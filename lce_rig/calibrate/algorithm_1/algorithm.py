@@ -1,9 +1,9 @@
-"""Algorithm 1: planes -> ring ends by background -> outliers and weights -> solution -> draws.
+"""Algorithm 1: planes -> ring ends by background -> outliers and weights -> solution.
 
 References:
     Jiao et al., "LCE-Calib: Automatic LiDAR-Frame/Event Camera Extrinsic Calibration With a Globally Optimal
-    Solution", IEEE/ASME Transactions on Mechatronics, 2023. Unlike there, candidates are judged on captures
-    they were not fitted to, draws are seeded, and each solution carries a certificate.
+    Solution", IEEE/ASME Transactions on Mechatronics, 2023. Unlike there, all captures that agree are used at
+    once, random subsets are not drawn, and the solution carries a certificate.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,6 @@ from lce_rig.core.calibration import Certificate
 from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose
-from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import Observation
 
 NOMINAL_SIGMA_M = 0.01
@@ -47,11 +46,6 @@ _MAX_SHARE = 0.25
 # More captures are predicted in folds of several, and as many are refused at once: the cost stays linear.
 _MAX_FOLDS = 60
 _SIGMA_FLOOR_M = 0.001
-_MIN_SUBSET = 3
-# Of more captures, sizes are drawn at equal distances.
-_MAX_SIZES = 40
-# Subsets at once, and ring ends in all of them, which bounds the memory.
-_CHUNK, _CHUNK_ENDS = 1000, 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,21 +65,12 @@ class Algorithm1(Start):
     cost: Quadratics
 
 
-def solve(
-    observations: Sequence[Observation],
-    board: Board,
-    n_draws: int = 0,
-    seed: int = 0,
-    progress: Progress = silent,
-) -> Algorithm1:
+def solve(observations: Sequence[Observation], board: Board) -> Algorithm1:
     """Solve for T_cam_lidar from matched boards.
 
     Args:
         observations: one per capture.
         board: its specification.
-        n_draws: subsets of each size that judge the solution, `draw_subsets`.
-        seed: of the draws.
-        progress: called with (subsets done, subsets in all).
 
     Raises:
         NotEnoughDataError: the captures leave a direction undetermined, which is named.
@@ -116,17 +101,13 @@ def solve(
         edge_shift_blended_m=float(shifts_m[1]),
         edge_shift_blended_echo_m=float(shifts_m[2]),
     )
-    # Draws judge the solution and do not choose it; without any, the folds of the outliers' search do.
-    held_out_m = plane_m + edge_m
-    if n_draws and problem.n_captures > _MIN_SUBSET:
-        held_out_m = draw_subsets(problem, T_planes, n_draws, seed, progress)
     certificates = solution.certificates
     return Algorithm1(
         T_cam_lidar=solution.T[0],
         certificate=Certificate(bool(certificates.is_optimal[0]), float(certificates.relative_gap[0])),
         observations=observations,
         refused=refused,
-        held_out_m=held_out_m,
+        held_out_m=plane_m + edge_m,
         diagnostics=figures,
         fitted=fitted,
         problem=problem,
@@ -240,53 +221,3 @@ def _excess(errors: Array) -> Array:
     median = float(np.median(errors))
     deviation = 1.4826 * float(np.median(np.abs(errors - median)))
     return errors / max(median + _DEVIATIONS * deviation, _TIMES_MEDIAN * median, _FLOOR_M)
-
-
-def draw_subsets(
-    problem: Problem,
-    T_start: Array,
-    n_draws: int,
-    seed: int,
-    progress: Progress = silent,
-) -> Array:
-    """Judge a solution by `n_draws` random subsets of each size 3..F-1, of many captures of 40 sizes.
-
-    Each candidate is judged on the captures it was not fitted to, as fitted noise would bias the judgement.
-    Every capture counts equally, however often it was held out.
-
-    Args:
-        problem: F captures.
-        T_start: (4, 4) planar initialisation; candidates and solution begin at the same place.
-        n_draws: I.
-        seed: of the draws.
-        progress: called with (subsets done, subsets in all).
-
-    Returns:
-        Mean error (F,) of each capture in candidates of the best size that did not use it.
-    """
-    n = problem.n_captures
-    sizes = np.arange(_MIN_SUBSET, n)
-    if len(sizes) > _MAX_SIZES:
-        sizes = np.linspace(_MIN_SUBSET, n - 1, _MAX_SIZES).astype(np.int_)
-    order = np.argsort(np.random.default_rng(seed).random((len(sizes) * n_draws, n)), axis=1)
-    # A capture takes part if its rank in the shuffled order is below the subset's size.
-    selection = (order < np.repeat(sizes, n_draws)[:, None]).astype(np.float64)
-    chunk = max(min(_CHUNK, _CHUNK_ENDS // max(len(problem.edge_capture), 1)), 1)
-    parts: list[Array] = []
-    begin(progress, "Algorithm 1 on random subsets")
-    for start in range(0, len(selection), chunk):
-        solutions = problem.solve(selection[start : start + chunk], T_start)
-        plane, edge = problem.errors(solutions.x)
-        parts.append(plane + edge)
-        progress(min(start + chunk, len(selection)), len(selection))
-    errors = np.concatenate(parts)
-
-    by_size = len(sizes), n_draws
-    is_held_out = selection.reshape(*by_size, n) == 0
-    count = is_held_out.sum(axis=1)
-    total = np.sum(errors.reshape(*by_size, n) * is_held_out, axis=1)
-    # With few draws a capture may never be held out at a size; its mean over the sizes replaces the figure.
-    overall = total.sum(axis=0) / np.maximum(count.sum(axis=0), 1)
-    per_capture = np.where(count > 0, total / np.maximum(count, 1), overall)
-    best = int(np.argmin(per_capture.mean(axis=1)))
-    return np.asarray(per_capture[best])

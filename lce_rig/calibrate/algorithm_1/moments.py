@@ -36,7 +36,6 @@ N_ROUNDS = 3
 """Rounds of association and solution."""
 # Unknowns [vec R; t; d; 1].
 _SIZE = 14
-_EDGE_CHUNK = 4096
 
 
 class Weights(NamedTuple):
@@ -159,17 +158,13 @@ class Problem:
             (B, 14, 14).
         """
         w = weights or self.weights
-        # Most sets agree on most edges: sum those of the first set for all, then exchange what differs.
-        common = edge_ids[0]
-        chosen = self.edge[np.arange(len(common)), common]
-        total = selection @ (w.plane * self.plane + w.edge * self._by_capture(chosen))
-        sets, ends = np.nonzero((edge_ids != common) & (selection[:, self.edge_capture] != 0))
-        for start in range(0, len(sets), _EDGE_CHUNK):
-            b, j = sets[start : start + _EDGE_CHUNK], ends[start : start + _EDGE_CHUNK]
-            change = self.edge[j, edge_ids[b, j]] - self.edge[j, common[j]]
-            change *= w.edge * selection[b, self.edge_capture[j], None]
-            first = np.flatnonzero(np.r_[True, np.diff(b) > 0])
-            total[b[first]] += np.add.reduceat(change, first, axis=0)
+        ends = np.arange(edge_ids.shape[1])
+        total = np.array(
+            [
+                captures @ (w.plane * self.plane + w.edge * self._by_capture(self.edge[ends, ids]))
+                for captures, ids in zip(selection, edge_ids, strict=True)
+            ]
+        )
         M = self._unpack(total)
         M[:, 12, 12] += EDGE_SHIFT_SIGMA_M**-2
         return M

@@ -167,20 +167,13 @@ def _expand(Q: Array, R: Array) -> tuple[Array, Array, Array]:
 
 def _newton_step(hessian: Array, gradient: Array, damping: Array) -> tuple[Array, NDArray[Any]]:
     """Solve for the damped step (B, 3), at most 1 rad long, and tell where the Hessian is positive."""
-    H = hessian + damping[:, None, None] * np.eye(3)
-    row_0, row_1, row_2 = H[:, 0], H[:, 1], H[:, 2]
-    adjugate = np.stack([np.cross(row_1, row_2), np.cross(row_2, row_0), np.cross(row_0, row_1)], axis=-1)
-    determinant = np.sum(row_0 * adjugate[..., 0], axis=-1)
-    is_convex = (H[:, 0, 0] > 0) & (adjugate[:, 2, 2] > 0) & (determinant > 0)
-    safe = np.where(is_convex, determinant, 1.0)
-    step = -(adjugate @ gradient[..., None])[..., 0] / safe[:, None]
-    if not is_convex.all():
-        saddle = ~is_convex
-        values, vectors = np.linalg.eigh(hessian[saddle])
-        size = np.abs(values)
-        # |eigenvalues| turn the step away from a saddle; the floor keeps it finite along flat directions.
-        size = np.maximum(size, 1e-3 * size.max(axis=-1, keepdims=True)) + damping[saddle, None] + 1e-300
-        along = np.swapaxes(vectors, -1, -2) @ gradient[saddle][..., None]
-        step[saddle] = -(vectors @ (along / size[..., None]))[..., 0]
+    values, vectors = np.linalg.eigh(hessian)
+    is_convex = values[:, 0] + damping > 0
+    size = np.abs(values)
+    # |eigenvalues| turn the step away from a saddle; the floor keeps it finite along flat directions.
+    floored = np.maximum(size, 1e-3 * size.max(axis=1, keepdims=True)) + 1e-300
+    size = np.where(is_convex[:, None], values, floored) + damping[:, None]
+    along = np.swapaxes(vectors, 1, 2) @ gradient[..., None]
+    step = -(vectors @ (along / size[..., None]))[..., 0]
     length = np.linalg.norm(step, axis=-1, keepdims=True)
     return step / np.maximum(length, 1.0), is_convex

@@ -18,7 +18,7 @@ import numpy as np
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
-from lce_rig.calibrate.features import CaptureFeatures, extract_features, place_features
+from lce_rig.calibrate.features import CaptureFeatures, extract_features, features_of_camera
 from lce_rig.calibrate.motion.board_motion import (
     BoardMotions,
     PoseSamples,
@@ -168,7 +168,7 @@ class _Cost:
         """Solve for the extrinsics at offsets (C,), from T_cam_lidar (4, 4) nearby."""
         motions = fit_motions(self.samples, offset_s)
         poses = zip(self.features, motions.at(self.times_s), motions.cov_at(self.times_s), strict=True)
-        placed = [place_features(f, T_cam_board, cov, self.board) for f, T_cam_board, cov in poses]
+        placed = [replace(f, **features_of_camera(T, cov, self.board)) for f, T, cov in poses]
         problem = Problem(placed, self.board, self.weights)
         solution = problem.solve(np.ones((1, problem.n_captures)), T_start, 2)
         plane, edge = problem.errors(solution.x)

@@ -112,7 +112,7 @@ class _Teacher:
     def learn(self, k: int, candidates: Sequence[Observation]) -> Planner | None:
         """Calibrate one guide's sensors; None where more captures are needed."""
         try:
-            estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings("paper", n_draws=0))
+            estimate = fit_extrinsic(list(candidates), self._board, EstimateSettings("paper"))
         except (NotEnoughDataError, np.linalg.LinAlgError):
             return None
         figures = estimate.diagnostics

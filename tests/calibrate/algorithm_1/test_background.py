@@ -9,7 +9,7 @@ from lce_rig.calibrate import EstimateSettings, capture_residual, fit_extrinsic
 from lce_rig.core.geometry import difference
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
-OPTIONS = EstimateSettings("paper", n_draws=0)
+OPTIONS = EstimateSettings("paper")
 NAMES = ("edge_shift_echo_m", "edge_shift_blended_m", "edge_shift_blended_echo_m")
 
 

@@ -13,7 +13,7 @@ from tests.calibrate.boards import BOARD, simulate
 from tests.calibrate.test_tolerances import KNOWN
 from tests.calibrate.two_cameras import LEFT, RIGHT, T_RIGHT_LEFT, TRUTH, only, simulate_two
 
-ML = EstimateSettings(method="ml", n_draws=0, laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
+ML = EstimateSettings(method="ml", laser_bias_sigma_m=0.008, range_offset_sigma_m=0.005)
 FEW = 6
 
 

@@ -80,7 +80,7 @@ def test_lasers_pull_as_in_the_calibration(poses, linearised):
 def test_predicted_scatter_is_that_of_many_sessions(poses):
     scenario = Scenario(range_sigma_m=0.01, corner_sigma_px=0.1)
     # The prediction has the weights of Algorithm 1; the joint likelihood is better than predicted.
-    options = EstimateSettings("paper", n_draws=0)
+    options = EstimateSettings("paper")
     runs = [estimate_observations(observe(poses, seed, scenario), BOARD, options) for seed in range(100, 125)]
     errors = np.array([difference(run.T_cam_lidar, T_FORWARD) for run in runs])
     figures = [run.diagnostics for run in runs]

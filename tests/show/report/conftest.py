@@ -48,7 +48,7 @@ def one() -> Calibration:
     images = {item.capture: item.image for item in captures}
     scans = {item.capture: list(item.places) for item in captures}
     seen = Detections({("cam", "frames"): images}, {"lidar": scans})
-    (calibration,), _ = calibrate_detections(RLFS, seen, CalibrateOptions(n_draws=0))
+    (calibration,), _ = calibrate_detections(RLFS, seen, CalibrateOptions())
     return calibration
 
 
@@ -58,7 +58,7 @@ def two() -> list[Calibration]:
     session = simulate_two(12, 0)
     images = {(name, "frames"): {c.capture: c.image for c in own} for name, own in session.items()}
     seen = Detections(images, {"lidar": {c.capture: list(c.places) for c in next(iter(session.values()))}})
-    calibrations, _ = calibrate_detections(TWO, seen, CalibrateOptions("ml", n_draws=0))
+    calibrations, _ = calibrate_detections(TWO, seen, CalibrateOptions("ml"))
     return calibrations
 
 
