@@ -144,30 +144,35 @@ class Intrinsics:
         points = np.asarray(points_camera, dtype=np.float64)
         z = points[..., 2]
         rho = np.hypot(points[..., 0], points[..., 1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            if self.model == "equidistant":
-                angle = np.arctan2(rho, z)
-                is_valid = (angle < self.max_radius) & np.isfinite(rho)
-                scale = np.where(rho > 1e-12, self._distorted_radius(angle) / rho, 1.0 / z)
-                xy = points[..., :2] * scale[..., None]
-            else:
-                is_valid = (z > 1e-6) & (rho < self.max_radius * z)
-                xy = self._distort(points[..., :2] / np.where(is_valid, z, 1.0)[..., None])
-        pixels = xy * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
+        if self.model == "equidistant":
+            is_valid = (np.arctan2(rho, z) < self.max_radius) & np.isfinite(rho)
+        else:
+            is_valid = (z > 1e-6) & (rho < self.max_radius * z)
+        pixels = self.distort(points) * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
         pixels[~is_valid] = np.nan
         return pixels, is_valid
+
+    def distort(self, points_camera: Array) -> Array:
+        """Project points (..., 3) in units of the focal lengths: (..., 2), also where `project` gives NaN."""
+        lateral, z = points_camera[..., :2], points_camera[..., 2]
+        with np.errstate(all="ignore"):
+            if self.model == "radtan":
+                return self._distort(lateral / z[..., None])
+            rho = np.hypot(lateral[..., 0], lateral[..., 1])
+            scale = np.where(rho > 1e-12, self._distorted_radius(np.arctan2(rho, z)) / rho, 1.0 / z)
+            return np.asarray(lateral * scale[..., None])
 
     def differentiate(self, points_camera: Array) -> Array:
         """Differentiate `project` by the point.
 
         Args:
-            points_camera: (N, 3) m, frame camera optical, where `project` is valid.
+            points_camera: (..., 3) m, frame camera optical, where `project` is valid.
 
         Returns:
-            (N, 2, 3) px per m; without meaning where `project` is not valid.
+            (..., 2, 3) px per m; without meaning where `project` is not valid.
         """
         x, y, z = np.moveaxis(np.asarray(points_camera, dtype=np.float64), -1, 0)
-        slope = np.empty((len(x), 2, 3))
+        slope = np.empty((*x.shape, 2, 3))
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.model == "equidistant":
                 rho = np.maximum(np.hypot(x, y), 1e-12)
@@ -175,15 +180,15 @@ class Intrinsics:
                 across, growth = self._distorted_radius(angle) / rho, self._radius_slope(angle) / square
                 ex, ey = x / rho, y / rho
                 along = growth * z - across
-                slope[:, 0, 0], slope[:, 1, 1] = across + along * ex * ex, across + along * ey * ey
-                slope[:, 0, 1] = slope[:, 1, 0] = along * ex * ey
-                slope[:, 0, 2], slope[:, 1, 2] = -growth * x, -growth * y
+                slope[..., 0, 0], slope[..., 1, 1] = across + along * ex * ex, across + along * ey * ey
+                slope[..., 0, 1] = slope[..., 1, 0] = along * ex * ey
+                slope[..., 0, 2], slope[..., 1, 2] = -growth * x, -growth * y
             else:
                 a, b = x / z, y / z
                 by_x, by_xy, by_y = self._distortion_slope(a, b)
-                slope[:, 0, 0], slope[:, 1, 1] = by_x / z, by_y / z
-                slope[:, 0, 1] = slope[:, 1, 0] = by_xy / z
-                slope[:, 0, 2], slope[:, 1, 2] = -(by_x * a + by_xy * b) / z, -(by_xy * a + by_y * b) / z
+                slope[..., 0, 0], slope[..., 1, 1] = by_x / z, by_y / z
+                slope[..., 0, 1] = slope[..., 1, 0] = by_xy / z
+                slope[..., 0, 2], slope[..., 1, 2] = -(by_x * a + by_xy * b) / z, -(by_xy * a + by_y * b) / z
         return np.asarray(slope * np.array([self.fx_px, self.fy_px])[:, None])
 
     def differentiate_by_errors(self, points_camera: Array) -> Array:

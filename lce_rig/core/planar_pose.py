@@ -1,7 +1,7 @@
 """Pose of a planar board from its corners in one image: both local minima, with covariance."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from lce_rig.core.geometry import (
 
 _MAX_STEPS = 30
 _SAME_POSE_RAD = 1e-3
+Project: TypeAlias = Callable[[Array], tuple[Array, Array]]
+"""From points (..., 3) in the camera to pixels (..., 2) and their derivative (..., 2, 3)."""
 
 
 class PlanarPose(NamedTuple):
@@ -106,39 +108,58 @@ def pose_covariance(
         intrinsics: the camera.
         sigma_px: noise of a corner per coordinate.
     """
-    _, J = _residuals_and_jacobian(T_cam_board, np.zeros((len(corners_board), 2)), corners_board, intrinsics)
+    none = np.zeros((1, len(corners_board), 2))
+    _, (J,) = linearise_poses(T_cam_board[None], none, corners_board, _checked(intrinsics))
     return np.asarray(sigma_px**2 * np.linalg.inv(J.T @ J))
 
 
 def refine_pose(
     T_cam_board: Array, corners_px: Array, corners_board: Array, intrinsics: Intrinsics
 ) -> tuple[Array, float]:
-    """Minimise the reprojection error from a start by Levenberg-Marquardt.
+    """Minimise the reprojection error of one board, as `refine_poses`.
 
     Returns:
         T_cam_board (4, 4) at the minimum and its cost in px^2, infinite where the start projects nowhere.
     """
-    corners_px, corners_board = _seen(corners_px, corners_board)
-    T, damping = T_cam_board, 1e-4
-    residuals, J = _residuals_and_jacobian(T, corners_px, corners_board, intrinsics)
-    cost = float(residuals @ residuals)
-    if not np.isfinite(cost):
-        return T, float("inf")
+    T, cost = refine_poses(T_cam_board[None], corners_px[None], corners_board, _checked(intrinsics))
+    return T[0], float(cost[0])
+
+
+def refine_poses(
+    T_cam_board: Array, corners_px: Array, corners_board: Array, project: Project
+) -> tuple[Array, Array]:
+    """Minimise the reprojection errors of K boards, each alone, by Levenberg-Marquardt.
+
+    Args:
+        T_cam_board: (K, 4, 4) to start from.
+        corners_px: (K, N, 2) measured; NaN where hidden.
+        corners_board: (N, 3) frame board, m.
+        project: pixels of points, and their derivative.
+
+    Returns:
+        T_cam_board (K, 4, 4) at the minima and costs (K,) in px^2, infinite where a start projects nowhere.
+    """
+    T, damping = T_cam_board, np.full(len(T_cam_board), 1e-4)
+    residuals, J = linearise_poses(T, corners_px, corners_board, project)
+    cost = _finite(np.sum(residuals**2, axis=1))
     for _ in range(_MAX_STEPS):
-        H, gradient = J.T @ J, J.T @ residuals
-        step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
-        T_new = perturb(T, step)
-        new_residuals, new_J = _residuals_and_jacobian(T_new, corners_px, corners_board, intrinsics)
-        new_cost = float(new_residuals @ new_residuals)
-        if not new_cost < cost:
-            # Rejected at machine precision: this is the minimum, not a step that was too long.
-            if -gradient @ step < 1e-12 * cost or damping > 1e8:
-                break
-            damping *= 10
-            continue
-        gain = cost - new_cost
-        T, residuals, J, cost, damping = T_new, new_residuals, new_J, new_cost, damping / 10
-        if gain < 1e-9 * cost + 1e-20:
+        Jt = np.swapaxes(J, 1, 2)
+        H, gradient = Jt @ J, (Jt @ residuals[..., None])[..., 0]
+        H_damped = H + np.eye(6) * (damping[:, None] * np.einsum("kii->ki", H))[:, None]
+        step = -np.linalg.solve(H_damped, gradient[..., None])[..., 0]
+        moved = perturb(T, step)
+        new_residuals, new_J = linearise_poses(moved, corners_px, corners_board, project)
+        new_cost = _finite(np.sum(new_residuals**2, axis=1))
+        is_better = new_cost < cost
+        # Rejected at machine precision: this is the minimum, not a step that was too long.
+        is_precise = (-np.sum(gradient * step, axis=1) < 1e-12 * cost) | (damping > 1e8)
+        is_done = np.where(is_better, cost - new_cost < 1e-9 * new_cost + 1e-20, is_precise)
+        T = np.where(is_better[:, None, None], moved, T)
+        residuals = np.where(is_better[:, None], new_residuals, residuals)
+        J = np.where(is_better[:, None, None], new_J, J)
+        cost = np.where(is_better, new_cost, cost)
+        damping = damping * np.where(is_better, 0.1, 10.0)
+        if np.all(is_done | ~np.isfinite(cost)):
             break
     return T, cost
 
@@ -204,16 +225,28 @@ def _pose_from_homography(corners_board: Array, rays: Array) -> Array | None:
     return invert(pose(R_view, np.zeros(3))) @ pose(R, t - R @ centre)
 
 
-def _residuals_and_jacobian(
-    T_cam_board: Array, corners_px: Array, corners_board: Array, intrinsics: Intrinsics
+def linearise_poses(
+    T_cam_board: Array, corners_px: Array, corners_board: Array, project: Project
 ) -> tuple[Array, Array]:
-    """Compute the residuals (2 N,) and their derivative (2 N, 6) by the tangent of T_cam_board.
+    """Compute residuals (K, 2 N), predicted minus measured, and derivatives (K, 2 N, 6) by each tangent.
 
-    The derivative of a point by the tangent is [I, -(R p)^].
+    The derivative of a point by the tangent is [I, -(R p)^]. Both are zero for hidden corners.
+
+    Args:
+        T_cam_board, corners_px, corners_board, project: as of `refine_poses`.
     """
-    turned = corners_board @ T_cam_board[:3, :3].T
-    points = turned + T_cam_board[:3, 3]
-    pixels, _ = intrinsics.project(points)
-    by_point = intrinsics.differentiate(points)
-    by_tangent = np.concatenate([by_point, -by_point @ skew(turned)], axis=-1)
-    return (pixels - corners_px).ravel(), by_tangent.reshape(-1, 6)
+    turned = corners_board @ np.swapaxes(T_cam_board[:, :3, :3], 1, 2)
+    pixels, by_point = project(turned + T_cam_board[:, None, :3, 3])
+    is_seen = ~np.isnan(corners_px)
+    residuals = np.where(is_seen, pixels - corners_px, 0.0)
+    J = np.where(is_seen[..., None], np.concatenate([by_point, -by_point @ skew(turned)], axis=-1), 0.0)
+    return residuals.reshape(len(J), -1), J.reshape(len(J), -1, 6)
+
+
+def _checked(intrinsics: Intrinsics) -> Project:
+    """Project with NaN where the camera's model does not hold."""
+    return lambda points: (intrinsics.project(points)[0], intrinsics.differentiate(points))
+
+
+def _finite(cost: Array) -> Array:
+    return np.where(np.isfinite(cost), cost, np.inf)

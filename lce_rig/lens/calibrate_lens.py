@@ -20,7 +20,7 @@ from lce_rig.lens.fit import (
     corners_of,
     fit,
     reduced,
-    refine_poses,
+    refit_poses,
     residuals_px,
     solve_scaled,
 )
@@ -93,7 +93,7 @@ def estimate_intrinsics(
         for k in np.flatnonzero(~kept):
             solved = solve_planar_pose(setup.corners_px[k], setup.corners_board, lens)
             starts[k] = starts[k] if solved is None else solved.T_cam_board
-        state = refine_poses(setup, fitted.with_poses(starts))
+        state = refit_poses(setup, fitted.with_poses(starts))
         # Boards that fit about as well as is typical of their channel.
         variances = _variances(setup, state)
         fits = variances <= _BAD**2 * (_usual(variances, channels) + _SHARED_PX**2)
@@ -121,7 +121,7 @@ def distances_under(intrinsics: Intrinsics, views: Sequence[BoardView], board: B
     corners = np.array([view.board.corners_px for view in views])
     setup = replace(Setup.of(corners, board, model), is_lens_free=False)
     poses = np.array([view.board.T_cam_board for view in views])
-    start = refine_poses(setup, LensState(model.vector(intrinsics), np.zeros(len(setup.shapes)), poses))
+    start = refit_poses(setup, LensState(model.vector(intrinsics), np.zeros(len(setup.shapes)), poses))
     return _distances(setup, fit(setup, start, np.ones(len(views))))
 
 
@@ -136,13 +136,13 @@ def _require_captures(views: Sequence[BoardView], n_needed: int) -> None:
 
 def _fit_weighted(setup: Setup, state: LensState, channels: NDArray[np.str_]) -> tuple[LensState, Array]:
     """Alternate fitting and weighting; weights (K,) are 1 / px^2."""
-    state = refine_poses(setup, state)
+    state = refit_poses(setup, state)
     weights = _weights(setup, state, channels)
     for done in range(_ROUNDS):
         state = fit(setup, state, weights)
         if done < 2:
             # Better intrinsics may show that a board's tilt was mirrored.
-            state = refine_poses(setup, state)
+            state = refit_poses(setup, state)
         before, weights = weights, _weights(setup, state, channels)
         if np.all(np.abs(weights - before) < _STEADY * before):
             break
@@ -287,6 +287,6 @@ def _held_out(
     for fold in range(n):
         out = captures % n == fold
         fitted = fit(setup.select(~out), state.select(~out), weights[~out])
-        seen = refine_poses(setup.select(out), fitted.with_poses(state.T_cam_board[out]), tries_mirror=False)
+        seen = refit_poses(setup.select(out), fitted.with_poses(state.T_cam_board[out]), tries_mirror=False)
         distances[out] = _distances(setup.select(out), seen)
     return distances

@@ -10,13 +10,14 @@ plate bent by 6 mm, a fit of two bows alone puts the principal point 20 px off.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, perturb, skew
-from lce_rig.core.planar_pose import mirror_tilt
+from lce_rig.core.planar_pose import linearise_poses, mirror_tilt, refine_poses
 from lce_rig.lens.lens_estimate import IntrinsicsEstimate
 from lce_rig.lens.models import LensModel, LensPrior
 
@@ -32,7 +33,6 @@ _EXACT_M = 1e-7
 # corners' own offsets.
 N_MODES = 15
 _MAX_STEPS = 40
-_POSE_STEPS = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,26 +196,11 @@ def residuals_px(setup: Setup, state: LensState) -> Array:
 
 def _project(setup: Setup, state: LensState) -> tuple[Array, Array, Array, Array]:
     """Compute residuals (K, N, 2), derivatives by point and lens, and the corners rotated into the camera."""
-    turned, points = _in_camera(setup, state)
-    pixels, by_point, by_lens = setup.model.project(state.lens, points)
-    by_point, by_lens = setup.without_hidden(by_point), setup.without_hidden(by_lens)
-    return setup.minus_measured(pixels), by_point, by_lens, turned
-
-
-def _in_camera(setup: Setup, state: LensState) -> tuple[Array, Array]:
-    """Rotate the corners (K, N, 3) into the camera, and place them before it."""
     T = state.T_cam_board
     turned = corners_of(setup, state.shape) @ np.swapaxes(T[:, :3, :3], 1, 2)
-    return turned, turned + T[:, None, :3, 3]
-
-
-def _by_pose(setup: Setup, state: LensState) -> tuple[Array, Array]:
-    """Compute residuals (K, 2 N) and their derivative (K, 2 N, 6) by the tangent of each pose."""
-    turned, points = _in_camera(setup, state)
-    pixels, by_point = setup.model.project_points(state.lens, points)
-    by_point = setup.without_hidden(by_point)
-    J = np.concatenate([by_point, -by_point @ skew(turned)], axis=-1)
-    return setup.minus_measured(pixels).reshape(len(J), -1), J.reshape(len(J), -1, 6)
+    pixels, by_point, by_lens = setup.model.project(state.lens, turned + T[:, None, :3, 3])
+    by_point, by_lens = setup.without_hidden(by_point), setup.without_hidden(by_lens)
+    return setup.minus_measured(pixels), by_point, by_lens, turned
 
 
 def linearise(setup: Setup, state: LensState) -> tuple[Array, Array, Array]:
@@ -234,10 +219,8 @@ def linearise(setup: Setup, state: LensState) -> tuple[Array, Array, Array]:
     return residuals.reshape(K, -1), G.reshape(K, -1, G.shape[-1]), J.reshape(K, -1, 6)
 
 
-def refine_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) -> LensState:
+def refit_poses(setup: Setup, state: LensState, *, tries_mirror: bool = True) -> LensState:
     """Fit every board's pose to a given lens and shape.
-
-    This is `core.planar_pose.solve_planar_pose` for all boards at once, with a known start.
 
     Args:
         setup: K boards.
@@ -262,7 +245,8 @@ def fit_poses(estimate: IntrinsicsEstimate, corners_px: Array, starts: Array) ->
     """
     setup, state = _of_estimate(estimate, corners_px, starts)
     T, cost = _descend(setup, state)
-    _, J = _by_pose(setup, state.with_poses(T))
+    project = partial(setup.model.project_points, state.lens)
+    _, J = linearise_poses(T, corners_px, corners_of(setup, state.shape), project)
     return T, cost, np.asarray(np.swapaxes(J, 1, 2) @ J)
 
 
@@ -295,27 +279,9 @@ def _of_estimate(
 
 
 def _descend(setup: Setup, state: LensState) -> tuple[Array, Array]:
-    """Levenberg-Marquardt on each pose separately; poses (K, 4, 4) and costs (K,) px^2."""
-    damping = np.full(len(state.T_cam_board), 1e-4)
-    T = state.T_cam_board
-    residuals, J = _by_pose(setup, state)
-    cost = _finite(np.sum(residuals**2, axis=1))
-    for _ in range(_POSE_STEPS):
-        Jt = np.swapaxes(J, 1, 2)
-        step = -np.linalg.solve(_damped(Jt @ J, damping), Jt @ residuals[..., None])[..., 0]
-        candidate = perturb(T, np.asarray(step))
-        new_residuals, new_J = _by_pose(setup, state.with_poses(candidate))
-        new_cost = _finite(np.sum(new_residuals**2, axis=1))
-        is_better = new_cost < cost
-        gain = np.where(is_better, cost - new_cost, 0.0)
-        T = np.where(is_better[:, None, None], candidate, T)
-        residuals = np.where(is_better[:, None], new_residuals, residuals)
-        J = np.where(is_better[:, None, None], new_J, J)
-        cost = np.where(is_better, new_cost, cost)
-        damping = np.where(is_better, damping / 10, damping * 10)
-        if np.all(gain <= 1e-9 * cost):
-            break
-    return T, cost
+    """Fit each pose alone to lens and shape; poses (K, 4, 4) and costs (K,) px^2."""
+    corners_board, project = corners_of(setup, state.shape), partial(setup.model.project_points, state.lens)
+    return refine_poses(state.T_cam_board, setup.corners_px, corners_board, project)
 
 
 def fit(setup: Setup, start: LensState, weights: Array) -> LensState:
@@ -373,7 +339,8 @@ def _step(
     """
     residuals, G, J = linear
     Jt, root = np.swapaxes(J, 1, 2), np.sqrt(weights)[:, None, None]
-    H_pose = _damped(Jt @ J, np.full(len(J), damping))
+    H_pose = Jt @ J
+    H_pose += np.eye(6) * ((damping + 1e-12) * np.einsum("kii->ki", H_pose))[:, None]
     coupling, g_pose = Jt @ G, Jt @ residuals[..., None]
     eliminated = np.linalg.solve(H_pose, np.concatenate([coupling, g_pose], axis=-1))
     tall = (root * G).reshape(-1, G.shape[-1])
@@ -399,13 +366,5 @@ def solve_scaled(H: Array, right: Array) -> Array:
 def _cost(setup: Setup, state: LensState, residuals: Array, weights: Array) -> float:
     squares = np.sum(residuals.reshape(len(weights), -1) ** 2, axis=1)
     off = state.shared - setup.mean
-    return float(_finite(weights @ squares + off @ setup.information @ off))
-
-
-def _finite(cost: Array) -> Array:
-    return np.where(np.isfinite(cost), cost, np.inf)
-
-
-def _damped(H: Array, damping: Array) -> Array:
-    diagonal = np.einsum("kii->ki", H)
-    return np.asarray(H + np.eye(H.shape[1]) * ((damping[:, None] + 1e-12) * diagonal)[:, None, :])
+    cost = float(weights @ squares + off @ setup.information @ off)
+    return cost if np.isfinite(cost) else np.inf

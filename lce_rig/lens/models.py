@@ -1,7 +1,7 @@
 """Lens models as vectors of parameters, with the derivatives for fitting."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -68,22 +68,19 @@ class LensModel:
         Returns:
             Pixels (..., 2), their derivative by the point (..., 2, 3) and by the parameters (..., 2, P).
         """
-        distort = _distort_equidistant if self.family == "equidistant" else _distort_radtan
-        xy, by_point, by_coefficient = distort(vector[4:], points_camera)
-        focal = vector[:2]
+        lens, focal = self.intrinsics(vector, 0, 0), vector[:2]
+        xy = lens.distort(points_camera)
         by_parameter = np.zeros((*xy.shape, self.size))
         by_parameter[..., 0, 0], by_parameter[..., 1, 1] = xy[..., 0], xy[..., 1]
         by_parameter[..., 0, 2] = by_parameter[..., 1, 3] = 1.0
-        by_parameter[..., 4:] = focal[:, None] * by_coefficient
-        return xy * focal + vector[2:4], focal[:, None] * by_point, by_parameter
+        by_coefficient = _by_equidistant if self.family == "equidistant" else _by_radtan
+        by_parameter[..., 4:] = focal[:, None] * by_coefficient(vector[4:], points_camera)
+        return xy * focal + vector[2:4], lens.differentiate(points_camera), by_parameter
 
     def project_points(self, vector: Array, points_camera: Array) -> tuple[Array, Array]:
         """Project points and differentiate the pixels by the points alone, as `project`."""
-        if self.family == "equidistant":
-            pixels, by_point, _ = self.project(vector, points_camera)
-            return pixels, by_point
-        _, xy, by_point = _radtan(vector[4:], points_camera)
-        return xy * vector[:2] + vector[2:4], vector[:2, None] * by_point
+        lens = self.intrinsics(vector, 0, 0)
+        return lens.distort(points_camera) * vector[:2] + vector[2:4], lens.differentiate(points_camera)
 
 
 _NO_PRIOR = float("inf")
@@ -233,41 +230,13 @@ def _rays(lens: Intrinsics) -> tuple[Array, Array]:
     return pixels[is_seen], rays[is_seen]
 
 
-class _Radii(NamedTuple):
-    """x/z, y/z, their squared radius s, the radial scale and its denominator."""
-
-    x: Array
-    y: Array
-    s: Array
-    scale: Array
-    lower: Array
-
-
-def _radtan(coefficients: Array, points: Array) -> tuple[_Radii, Array, Array]:
-    """Distort x/z, y/z: (..., 2), and its derivative by the point (..., 2, 3)."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
-    z = points[..., 2]
-    x, y = points[..., 0] / z, points[..., 1] / z
+def _by_radtan(coefficients: Array, points: Array) -> Array:
+    """Differentiate distorted x/z, y/z by the coefficients: (..., 2, n)."""
+    k1, k2, _, _, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
+    x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
     s = x * x + y * y
-    upper, lower = 1 + s * (k1 + s * (k2 + s * k3)), 1 + s * (k4 + s * (k5 + s * k6))
-    scale = upper / lower
-    # Derivative of the radial scale by s = r^2.
-    slope = (k1 + s * (2 * k2 + 3 * s * k3) - scale * (k4 + s * (2 * k5 + 3 * s * k6))) / lower
-    xy, by_point = np.empty((*s.shape, 2)), np.empty((*s.shape, 2, 3))
-    xy[..., 0] = x * scale + 2 * p1 * x * y + p2 * (s + 2 * x * x)
-    xy[..., 1] = y * scale + p1 * (s + 2 * y * y) + 2 * p2 * x * y
-    across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    by_point[..., 0, 0] = xx = scale + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    by_point[..., 1, 1] = yy = scale + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    by_point[..., 0, 1] = by_point[..., 1, 0] = across
-    by_point[..., 0, 2], by_point[..., 1, 2] = -(xx * x + across * y), -(across * x + yy * y)
-    by_point /= z[..., None, None]
-    return _Radii(x, y, s, scale, lower), xy, by_point
-
-
-def _distort_radtan(coefficients: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Distort x/z, y/z; derivatives by the point (..., 2, 3) and by the coefficients (..., 2, n)."""
-    (x, y, s, scale, lower), xy, by_point = _radtan(coefficients, points)
+    lower = 1 + s * (k4 + s * (k5 + s * k6))
+    scale = (1 + s * (k1 + s * (k2 + s * k3))) / lower
     by_coefficient = np.empty((*s.shape, 2, 8))
     power = 1 / lower
     for column in (0, 1, 4):
@@ -276,23 +245,12 @@ def _distort_radtan(coefficients: Array, points: Array) -> tuple[Array, Array, A
     by_coefficient[..., 0, 2] = by_coefficient[..., 1, 3] = 2 * x * y
     by_coefficient[..., 0, 3], by_coefficient[..., 1, 2] = s + 2 * x * x, s + 2 * y * y
     by_coefficient[..., 5:] = -scale[..., None, None] * by_coefficient[..., [0, 1, 4]]
-    return xy, by_point, by_coefficient[..., : len(coefficients)]
+    return by_coefficient[..., : len(coefficients)]
 
 
-def _distort_equidistant(coefficients: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Distort by the angle from the axis; derivatives as `_distort_radtan`."""
-    lateral, z = points[..., :2], points[..., 2]
-    rho = np.maximum(np.linalg.norm(lateral, axis=-1), 1e-12)
-    angle = np.arctan2(rho, z)
-    squares = angle[..., None] ** (2 * np.arange(1, 5))
-    radius = angle * (1 + squares @ coefficients)
-    slope = 1 + squares @ (coefficients * [3, 5, 7, 9])
-    direction = lateral / rho[..., None]
-    by_rho, by_z = slope * z / (rho**2 + z**2), -slope * rho / (rho**2 + z**2)
-    # The radius grows along the direction by `by_rho`; across it the image rotates about the centre.
-    outer = direction[..., :, None] * direction[..., None, :]
-    turn = (radius / rho)[..., None, None]
-    by_lateral = by_rho[..., None, None] * outer + turn * (np.eye(2) - outer)
-    by_point = np.concatenate([by_lateral, (by_z[..., None] * direction)[..., None]], axis=-1)
-    by_coefficient = direction[..., None] * (angle[..., None] * squares)[..., None, :]
-    return direction * radius[..., None], by_point, by_coefficient
+def _by_equidistant(_coefficients: Array, points: Array) -> Array:
+    """Differentiate the distorted coordinates by the coefficients: (..., 2, 4)."""
+    lateral = points[..., :2]
+    rho = np.maximum(np.linalg.norm(lateral, axis=-1, keepdims=True), 1e-12)
+    angle = np.arctan2(rho, points[..., 2:])
+    return np.asarray((lateral / rho)[..., None] * (angle ** (2 * np.arange(1, 5) + 1))[..., None, :])
