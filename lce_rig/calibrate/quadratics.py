@@ -10,6 +10,7 @@ from the scatter between captures follow from it. Errors are independent between
 between captures that repeat one.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -102,9 +103,9 @@ class Quadratics:
         correction = (n_groups - 1) / max(n_groups - p - 2, 2)
         return np.asarray(correction * jackknife_scatter(self.moves()))
 
-    def hold(self, unknown: int) -> "Quadratics":
-        """Hold an unknown fixed: quadratics in the others."""
-        return self.of(np.delete(np.arange(len(self.prior)), unknown))
+    def hold(self, unknowns: Sequence[int]) -> "Quadratics":
+        """Hold some unknowns fixed: quadratics in the others."""
+        return self.of(np.delete(np.arange(len(self.prior)), unknowns))
 
     def of(self, unknowns: NDArray[np.intp]) -> "Quadratics":
         """Hold all unknowns but these, by index, fixed."""

@@ -19,7 +19,7 @@ from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb, tangent_sizes
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.judge.local_quadratic import SCALE, expand
+from lce_rig.judge.local_quadratic import OF_PROFILE, expand
 from lce_rig.judge.session_check import find_meetings, seen_by_own_lens
 from lce_rig.rig import LidarSettings, Rig
 from lce_rig.scene.alignment import AXES, IS_ROTATION
@@ -213,7 +213,7 @@ def _expand(seen: list[Observation], board: Board, T_cam_lidar: Array, lidar: Li
         laser_bias_sigma_m=lidar.laser_bias_sigma_m,
         range_offset_sigma_m=lidar.range_offset_sigma_m,
     )
-    return cost.hold(SCALE)
+    return cost.hold(OF_PROFILE)
 
 
 def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:

@@ -57,6 +57,7 @@ def profile_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
 def find_contradictions(
     estimate: CalibrationEstimate,
     scale: tuple[float, float] | None,
+    pattern: tuple[Array, Array] | None,
     contrasts: Sequence[Contrast],
     rig: Rig,
 ) -> Iterator[Contradiction]:
@@ -65,6 +66,7 @@ def find_contradictions(
     Args:
         estimate: with the sensitivities to errors of the profile.
         scale: of the camera's distances, with its standard deviation.
+        pattern: (2,) offset from its place on the plate that contradicts the profile, with its covariance.
         contrasts: subsets of the captures that should agree.
         rig: targets and limits.
     """
@@ -75,6 +77,8 @@ def find_contradictions(
         variance = scale[1] ** 2 + squares.sigma**2 + estimate.lens.focal_sigma**2
         if scale[0] ** 2 > _SURE**2 * variance:
             yield Contradiction("scale", scale[0] * squares.moves)
+    if of_source and pattern is not None:
+        yield Contradiction("pattern", pattern[0][None] @ of_source["pattern_offset"].moves)
     for contrast in objections(contrasts, target, rig.verdict):
         # The result lies between both subsets; where the extrinsics change on the way, it lies a whole change
         # from one of the two that may hold now.

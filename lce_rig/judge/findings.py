@@ -31,6 +31,7 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
     "verdict.camera_changed": _OF_POSES.split(),
     "verdict.plate_size": (["verdict.edge_residual", "verdict.shares_differ", "verdict.laser_angles"]),
     "verdict.plate_edge": [
+        "verdict.pattern_offset",
         "verdict.edge_residual",
         "verdict.shares_differ",
         *_OF_SIGMAS,
@@ -40,6 +41,7 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
         f"{_OF_DISTANCES}verdict.scale verdict.far_from_nominal verdict.cameras_differ".split()
     ),
     "verdict.scale": f"{_OF_DISTANCES}verdict.sensors_disagree verdict.planes_apart".split(),
+    "verdict.pattern_offset": f"{_OF_DISTANCES}verdict.planes_apart".split(),
     "verdict.two_groups": _OF_SIGMAS,
     "verdict.shares_differ": _OF_SIGMAS,
     "verdict.cameras_differ": _OF_SIGMAS,
@@ -86,6 +88,7 @@ _CAUSES = {
 _CONTRADICTIONS = {
     "intrinsics": "the profile's intrinsics and those of the session's boards",
     "scale": "the camera's distances and the LiDAR's",
+    "pattern": "the pattern's place on the plate and the profile's",
     "channels": "the camera's channels",
     "cameras": "the cameras",
     "group_rest": "two groups of captures",
@@ -232,6 +235,16 @@ def _plate(finding: Finding) -> str:
         finding.figures,
     )
     return f"{sizes}: {abs(percent):.1f} % {'larger' if percent > 0 else 'smaller'}"
+
+
+def _pattern_offset(finding: Finding) -> str:
+    """The pattern sits {right_m}, {up_m} +- {sigma_m} from its place in {n_captures} captures."""
+    sides = [
+        fill(f"{{{name}:mm}} {words[finding.figure(name) < 0]}", {name: abs(finding.figure(name))})
+        for name, words in (("right_m", ("right", "left")), ("up_m", ("up", "down")))
+    ]
+    place = "from the profile's place on the plate in {n_captures} captures (+- {sigma_m:mm})"
+    return fill(f"the pattern sits {', '.join(sides)} {place}", finding.figures)
 
 
 def _sensors_disagree(finding: Finding) -> str:
@@ -413,6 +426,12 @@ SHARES_DIFFER = Kind(
 )
 SCALE_OFF = Kind(
     "verdict.scale", _scale, "measure the squares, then `lce-rig calibrate {session} --rig FILE`"
+)
+PATTERN_OFFSET = Kind(
+    "verdict.pattern_offset",
+    _pattern_offset,
+    "measure the pattern's margins and enter board.pattern_offset_m",
+    severity="warning",
 )
 LASER_ANGLES = Kind(
     "verdict.laser_angles",

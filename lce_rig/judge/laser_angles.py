@@ -85,7 +85,9 @@ def estimate_angles(
         is_end = np.abs(r_end - np.median(r_end)) < _OUTLIER * sigmas.end_m
         H, g = H + J[is_end].T @ J[is_end] / sigmas.end_m**2, g + r_end[is_end] @ J[is_end] / sigmas.end_m**2
     priors = Priors()
-    H[:lens, :lens] += priors_of_constants(L, lidar.laser_bias_sigma_m, lidar.range_offset_sigma_m)[:-1, :-1]
+    H[:lens, :lens] += priors_of_constants(L, lidar.laser_bias_sigma_m, lidar.range_offset_sigma_m)[
+        :lens, :lens
+    ]
     known = [priors.lateral_m, priors.vertical_m, _PLATE_M, *np.full(2 * L, _LOOSE_RAD)]
     H[lens:, lens:] += np.diag(1 / np.square(known))
     cov = np.linalg.inv(H)

@@ -27,8 +27,11 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard, Observation
 
 SHIFT, FIRST_RING, SCALE = 6, 7, -1
+PATTERN = (-3, -2)
 """Indices in the x of `expand`, after the tangent (translation m, rotation rad): edge shift m, range offset m
-of each ring, and last the camera's scale."""
+of each ring, the pattern's x and y on the plate m, and last the camera's scale."""
+OF_PROFILE = (*PATTERN, SCALE)
+"""What the profile states, and checks of the captures hold fixed."""
 
 # Errors of a board's plane and of its ring ends are at least as large as this.
 _PLANE_FLOOR_M, _END_FLOOR_M = 0.001, 0.002
@@ -64,13 +67,15 @@ def expand(
     sigmas = sigmas or feature_sigmas(features, board, T_cam_lidar)
     if rings is None:
         rings = np.unique(np.concatenate([seen.lidar.ring for seen in observations]))
-    p = FIRST_RING + len(rings) + 1
+    p = FIRST_RING + len(rings) + len(OF_PROFILE)
     gradients, hessians = np.zeros((len(features), p)), np.zeros((len(features), p, p))
     for k, (f, seen) in enumerate(zip(features, observations, strict=True)):
         r_plane, J_plane = plane_rows(f, T_cam_lidar, seen.lidar, rings)
         r_end, by_end = end_rows(f, T_cam_lidar, board)
         J_end = np.zeros((len(r_end), p))
         J_end[:, [*range(FIRST_RING), SCALE]] = by_end
+        # A pattern that sits farther right has the plate's edges farther left.
+        J_end[:, PATTERN] = -board.edges()[1][end_residuals(f, T_cam_lidar, board)[1], :2]
         by_plane = PLANE_FREEDOMS / (sigmas.plane_m**2 * max(len(r_plane), 1))
         for r, J, weight in ((r_plane, J_plane, by_plane), (r_end, J_end, 1 / sigmas.end_m**2)):
             gradients[k] += weight * r @ J
@@ -83,15 +88,31 @@ def scale_of(expansion: Quadratics) -> tuple[float, float]:
     """Estimate the camera's distances over the LiDAR's, less 1, by single errors and by leave-one-out.
 
     Args:
-        expansion: by `expand`, with the scale free.
+        expansion: by `expand`, with all unknowns free.
 
     Returns:
         The scale without a prior, and its standard deviation.
     """
-    without = expansion.without_each()[:, [SCALE]]
-    scatter = jackknife_scatter(without - without.mean(axis=0))[0, 0]
-    sigma = float(np.sqrt(expansion.covariance()[SCALE, SCALE] + scatter))
-    return float(expansion.optimum()[SCALE]), sigma
+    (scale,), ((variance,),) = _estimate(expansion.hold(PATTERN), (SCALE,))
+    return float(scale), float(np.sqrt(variance))
+
+
+def pattern_of(expansion: Quadratics) -> tuple[Array, Array]:
+    """Estimate how far the pattern sits from its place on the plate: (2,) right and up, m; covariance (2, 2).
+
+    Planes of tilted boards place the LiDAR without it, ring ends only with it.
+
+    Args:
+        expansion: by `expand`, with all unknowns free.
+    """
+    return _estimate(expansion, PATTERN)
+
+
+def _estimate(expansion: Quadratics, unknowns: tuple[int, ...]) -> tuple[Array, Array]:
+    """Estimate some unknowns (n,) with the covariance (n, n) of single errors and of leave-one-out."""
+    without = expansion.without_each()[:, unknowns]
+    scatter = jackknife_scatter(without - without.mean(axis=0))
+    return expansion.optimum()[[*unknowns]], expansion.covariance()[np.ix_(unknowns, unknowns)] + scatter
 
 
 def plane_rows(
@@ -102,7 +123,7 @@ def plane_rows(
     A ring's rays are its offset too long; the scale s shrinks the camera's distances to (1 - s) g.
     """
     points = np.asarray(lidar.points, dtype=np.float64)
-    J = np.zeros((len(points), FIRST_RING + len(rings) + 1))
+    J = np.zeros((len(points), FIRST_RING + len(rings) + len(OF_PROFILE)))
     J[:, :SHIFT] = differentiate(f.normal, points @ T[:3, :3].T)
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
     J[np.arange(len(points)), FIRST_RING + np.searchsorted(rings, lidar.ring)] = rays @ T[:3, :3].T @ f.normal
@@ -112,10 +133,13 @@ def plane_rows(
 
 def priors_of_constants(n_rings: int, laser_m: float, offset_m: float) -> Array:
     """Write priors as information (p, p): of the edge shift, of offsets about their mean, of the mean."""
-    prior = np.zeros((FIRST_RING + n_rings + 1, FIRST_RING + n_rings + 1))
+    p = FIRST_RING + n_rings + len(OF_PROFILE)
+    prior = np.zeros((p, p))
     prior[SHIFT, SHIFT] = 1 / EDGE_SHIFT_SIGMA_M**2
     cov = max(laser_m, _RANGE_FLOOR_M) ** 2 * (np.eye(n_rings) - 1 / n_rings)
-    prior[FIRST_RING:SCALE, FIRST_RING:SCALE] = np.linalg.inv(cov + max(offset_m, _RANGE_FLOOR_M) ** 2)
+    prior[FIRST_RING : PATTERN[0], FIRST_RING : PATTERN[0]] = np.linalg.inv(
+        cov + max(offset_m, _RANGE_FLOOR_M) ** 2
+    )
     return prior
 
 

@@ -27,7 +27,14 @@ from lce_rig.judge.contributions import (
 )
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given
 from lce_rig.judge.laser_angles import estimate_angles
-from lce_rig.judge.local_quadratic import SCALE, capture_costs, expand, feature_sigmas, scale_of
+from lce_rig.judge.local_quadratic import (
+    OF_PROFILE,
+    capture_costs,
+    expand,
+    feature_sigmas,
+    pattern_of,
+    scale_of,
+)
 from lce_rig.judge.split_consistency import (
     MEDIAN_CHI2,
     Contrast,
@@ -65,6 +72,7 @@ class Validation:
         captures: their names, in the order of the contrasts.
         contrasts: subsets of the captures that should agree.
         scale: as `scale_of`; None for too few placements.
+        pattern: as `pattern_of`, where it contradicts the profile; else None.
         laser_angles: errors of the lasers' angles in deg, as `estimate_angles`.
         intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
     """
@@ -76,6 +84,7 @@ class Validation:
     captures: tuple[str, ...]
     contrasts: tuple[Contrast, ...]
     scale: tuple[float, float] | None
+    pattern: tuple[Array, Array] | None
     laser_angles: Mapping[str, float]
     intrinsics: IntrinsicsCheck | None
 
@@ -97,12 +106,13 @@ def validate(
         lens: of the camera, as the profile says; None where a LiDAR is in its place.
         rejected: captures in which both sensors see the board, that the estimate does not use.
         recount: (F,) factor of each capture in the estimate's own cost, where that is to judge subsets: of
-            boards in two scans, whose poses are less accurate than those in images. There is no scale, too.
+            boards in two scans, whose poses are less accurate than those in images. There is no scale and no
+            pattern, too.
     """
     board, known = rig.board.to_board(), estimate.sensitivities
     fitted = None if estimate.lens is None else estimate.lens.estimate
     intrinsics = None if fitted is None or lens is None else compare_with_given(fitted, lens, board)[0]
-    scale = None
+    scale = pattern = None
     contrasts: tuple[Contrast, ...] = ()
     laser_angles: Mapping[str, float] = {}
     observations = [estimate.fitted[name] for name in estimate.used]
@@ -115,14 +125,15 @@ def validate(
     )
     own_cost = None if recount is None else estimate.cost
     if len(expansion.groups) >= _MIN_PLACEMENTS:
-        settled = expansion.hold(SCALE).settled()
+        settled = expansion.hold(OF_PROFILE).settled()
         if own_cost is not None and recount is not None:
             # Outliers may be captures of another mounting.
             settled = own_cost.weighted(recount).settled(own_cost.optimum())
         centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
         of_rejected = find_moved(observations, rejected, board, estimate.T_cam_lidar, lidar)
         contrasts = (*of_rejected, *contrast_halves(settled, centres), *find_groups(settled))
-        scale = scale_of(expansion) if own_cost is None else None
+        if own_cost is None:
+            scale, pattern = scale_of(expansion), _contradicting(pattern_of(expansion), rig)
         # Captures of another mounting would look like other angles.
         apart = {
             name
@@ -132,7 +143,7 @@ def validate(
         agreeing = [observation for observation in observations if observation.capture not in apart]
         if lidar.has_rings and len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
             laser_angles = estimate_angles(agreeing, board, estimate.T_cam_lidar, lidar)
-    contradictions = list(find_contradictions(estimate, scale, contrasts, rig))
+    contradictions = list(find_contradictions(estimate, scale, pattern, contrasts, rig))
     cov_agreed = estimate.cov + profile_covariance(known)
     return Validation(
         cov=cov_agreed + sum(each.cov for each in contradictions),
@@ -143,9 +154,17 @@ def validate(
         captures=estimate.used,
         contrasts=contrasts,
         scale=scale,
+        pattern=pattern,
         laser_angles=laser_angles,
         intrinsics=intrinsics,
     )
+
+
+def _contradicting(pattern: tuple[Array, Array], rig: Rig) -> tuple[Array, Array] | None:
+    """Return the pattern's offset where neither chance nor the profile's deviation explains it, else None."""
+    offset_m, cov = pattern
+    chi2 = offset_m @ np.linalg.solve(cov + rig.board.pattern_offset_sigma_m**2 * np.eye(2), offset_m)
+    return pattern if np.exp(-chi2 / 2) < rig.verdict.least_chance else None
 
 
 def find_moved(
@@ -270,7 +289,7 @@ class _Test:
             range_offset_sigma_m=self._lidar.range_offset_sigma_m,
             sigmas=self._sigmas,
             rings=self._rings,
-        ).hold(SCALE)
+        ).hold(OF_PROFILE)
 
 
 def _own_gains(g: Array, H: Array) -> Array:

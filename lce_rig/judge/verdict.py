@@ -25,6 +25,7 @@ from lce_rig.judge.findings import (
     MOVED,
     NO_CERTIFICATE,
     NOT_CERTIFIED,
+    PATTERN_OFFSET,
     PLANE_RESIDUAL,
     PLANES_APART,
     PLATE_EDGE,
@@ -95,6 +96,7 @@ def judge(
         *angle_findings(examination.laser_angles),
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
         *_scale(examination.scale, board, rig.verdict.max_scale_error),
+        *_pattern(examination.pattern, len(estimate.used)),
         *split_findings(examination.contrasts, examination.captures, rig.calibration, rig.verdict),
         *others,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
@@ -276,6 +278,15 @@ def _scale(scale: tuple[float, float] | None, board: Board, limit: float) -> lis
             profile_square_m=board.square_m,
         )
     ]
+
+
+def _pattern(pattern: tuple[Array, Array] | None, n_captures: int) -> list[Finding]:
+    """Find a pattern that sits elsewhere on the plate than the profile states."""
+    if pattern is None:
+        return []
+    (right_m, up_m), cov = pattern[0].tolist(), pattern[1]
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
+    return [PATTERN_OFFSET(right_m=right_m, up_m=up_m, sigma_m=sigma_m, n_captures=n_captures)]
 
 
 def _motion(estimate: CalibrationEstimate, limit_m: float) -> list[Finding]:

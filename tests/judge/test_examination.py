@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
+from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.geometry import difference, perturb
-from lce_rig.judge.local_quadratic import SCALE, expand, scale_of
+from lce_rig.judge.local_quadratic import OF_PROFILE, expand, pattern_of, scale_of
 from lce_rig.judge.split_consistency import contrast_halves, find_groups, split_findings
 from lce_rig.judge.validate import validate
+from lce_rig.judge.verdict import judge
+from lce_rig.lens.models import LensPrior
 from lce_rig.rig import CalibrationSettings, VerdictSettings, load_rig
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, simulate
 
@@ -28,9 +31,9 @@ def observed(n=15, seed=1, scenario=None):
     return simulate(n, seed, scenario)
 
 
-def expanded(observations, T=T_NEAR, laser=0.008, offset=0.005, is_scale_free=False):
+def expanded(observations, T=T_NEAR, is_profile_free=False, laser=0.008, offset=0.005):
     every = expand(observations, BOARD, T, laser_bias_sigma_m=laser, range_offset_sigma_m=offset)
-    return every if is_scale_free else every.hold(SCALE)
+    return every if is_profile_free else every.hold(OF_PROFILE)
 
 
 def middles(observations):
@@ -52,14 +55,36 @@ def test_the_second_opinion_is_as_near_to_the_truth_as_its_covariance_says():
 
 
 def test_squares_of_another_size_are_found_as_a_scale():
-    scale, sigma = scale_of(expanded(observed(), is_scale_free=True))
+    scale, sigma = scale_of(expanded(observed(), is_profile_free=True))
     assert abs(scale) < 3 * sigma < 0.02
     smaller = [
         moved(seen, np.vstack([seen.image.T_cam_board[:3] * [1, 1, 1, 0.97], [0, 0, 0, 1]]))
         for seen in observed()
     ]
-    scale, sigma = scale_of(expanded(smaller, is_scale_free=True))
+    scale, sigma = scale_of(expanded(smaller, is_profile_free=True))
     assert scale == pytest.approx(-0.03, abs=3 * sigma)
+
+
+@pytest.mark.parametrize("offset_m", [(0.0, 0.0), (0.02, 0.0), (0.0, -0.02)])
+def test_a_pattern_beside_its_place_on_the_plate_is_measured_and_widens_the_claim(offset_m):
+    profile = RIG.board.model_copy(update={"pattern_offset_m": offset_m})
+    rig, sees = RIG.model_copy(update={"board": profile}), profile.to_board()
+    aside = np.eye(4)
+    aside[:2, 3] = -np.array(offset_m)
+    captures = [moved(seen, seen.image.T_cam_board @ aside) for seen in observed(16, 3)]
+    tolerances = Tolerances(LensPrior(CAMERA, 0.0, 0.0, 0.0, is_board_exact=True), 0.002, 0.003, 0.001, 0.001)
+    estimate = fit_extrinsic(captures, sees, replace(FAST, tolerances=tolerances))
+    validation = validate(estimate, rig, rig.lidars["lidar"], CAMERA)
+    (measured_m, cov), error = pattern_of(expanded(captures, estimate.T_cam_lidar, True)), -np.array(offset_m)
+    assert (measured_m - error) @ np.linalg.solve(cov, measured_m - error) < 13.8
+    assert (validation.pattern is not None) == any(offset_m)
+    off = difference(estimate.T_cam_lidar, T_FORWARD)
+    assert off @ np.linalg.solve(validation.cov, off) < 16.8
+    verdict, findings = judge(estimate, validation, rig, "cam", "lidar", 16)
+    codes = [finding.code for finding in findings if finding.severity != "note"]
+    assert (verdict, codes[:1]) == (
+        ("marginal", ["verdict.pattern_offset"]) if any(offset_m) else ("pass", [])
+    )
 
 
 @pytest.mark.parametrize(("angle_deg", "severity"), [(0.0, None), (0.6, "warning"), (2.0, "error")])
