@@ -29,6 +29,7 @@ from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given
 from lce_rig.judge.laser_angles import estimate_angles
 from lce_rig.judge.local_quadratic import (
     OF_PROFILE,
+    SCALE,
     capture_costs,
     expand,
     feature_sigmas,
@@ -125,15 +126,16 @@ def validate(
     )
     own_cost = None if recount is None else estimate.cost
     if len(expansion.groups) >= _MIN_PLACEMENTS:
-        settled = expansion.hold(OF_PROFILE).settled()
+        if own_cost is None:
+            scale, pattern = scale_of(expansion), _contradicting(pattern_of(expansion), rig)
+        # A wrong place of the pattern would look like captures that differ.
+        settled = expansion.hold((SCALE,) if pattern is not None else OF_PROFILE).settled()
         if own_cost is not None and recount is not None:
             # Outliers may be captures of another mounting.
             settled = own_cost.weighted(recount).settled(own_cost.optimum())
         centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
         of_rejected = find_moved(observations, rejected, board, estimate.T_cam_lidar, lidar)
         contrasts = (*of_rejected, *contrast_halves(settled, centres), *find_groups(settled))
-        if own_cost is None:
-            scale, pattern = scale_of(expansion), _contradicting(pattern_of(expansion), rig)
         # Captures of another mounting would look like other angles.
         apart = {
             name
