@@ -68,7 +68,7 @@ _MEASURE = {
     "resolve": "resolve what contradicts first: more captures do not reduce this",
     "measure_intrinsics": _CORNERS_TOO,
     "measure_square_size": "measure across all squares, divide, and enter square_m and square_sigma_m",
-    "measure_pattern_offset": "measure the pattern's margins, and enter pattern_offset(_sigma)_m",
+    "measure_pattern_offset": "measure the pattern's margins: pattern_offset_m, pattern_offset_sigma_m",
     "measure_plate_size": "measure the plate, and enter width_m, height_m and plate_sigma_m",
     "measure_board_bow": "lay a straight edge across the board, and enter bow_sigma_m",
 }

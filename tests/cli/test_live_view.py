@@ -64,7 +64,7 @@ def test_everything_fits_into_80_by_24() -> None:
         "below 0.12 deg",
     ):
         assert wanted in text
-    assert "captured 000006" in text and "boards must" in text and "q stop" in text
+    assert "01:04 not captured" in text and "boards must" in text and "q stop" in text
 
 
 def test_of_several_cameras_the_picture_says_whose_it_is() -> None:
@@ -179,3 +179,11 @@ def test_plain_lines_say_what_changes_once(capsys: pytest.CaptureFixture[str]) -
 def test_outlines_that_leave_the_picture_or_the_lens_break_nothing() -> None:
     beyond = np.array([[-500.0, 100.0], [np.nan, np.nan], [3000, 400], [100, 5000], [-500, 100]])
     assert len(draw_outlines((346, 260), beyond, beyond, (40, 9))) == 9
+
+
+def test_the_drawing_keeps_its_size_when_the_first_prediction_arrives() -> None:
+    before = replace(STATE, goes_on="", notes=("boards must stand still: no sync board",), log=())
+    after = replace(before, goes_on="captures to go: 10 (minimum 6, below 0.18 deg, 9 mm)")
+    borders = [[line.find("┌") for line in drawn(state)] for state in (before, after)]
+    widths = [max(len(line) for line in drawn(state) if "┐" in line) for state in (before, after)]
+    assert borders[0] == borders[1] and widths[0] == widths[1]

@@ -25,7 +25,7 @@ from lce_rig.core.phrasing import as_line, significant
 from lce_rig.detect.detection import Pair
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
-from lce_rig.judge.findings import cause_words, weakest_words
+from lce_rig.judge.findings import cause_words, consequences, lacks_captures, weakest_words
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.show.report import calibration_drawings as drawings
@@ -35,7 +35,7 @@ from lce_rig.show.report.page import as_markup, render, style
 Row = Sequence[object]
 _STEP = 1e-6
 _AXES = {"x": "x right", "y": "y down", "z": "z forward"}
-_LENS_CODES = ("verdict.intrinsics", "verdict.scale")
+_LENS_CODES, _PLAN = ("verdict.intrinsics", "verdict.scale"), "guide.add"
 # The statement names the expected error at this distance.
 _USUAL_M = 10.0
 # Captures with more than this many times the median residual are marked. A page holds so many pictures.
@@ -120,6 +120,7 @@ def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
         "calibration": c,
         "anchor": anchor,
         "statement": _statement(c),
+        "reasons": _reasons(c),
         "body_frames": (
             rig.lidars[c.lidar].frame,
             (rig.lidars if lens is None else rig.cameras)[c.camera].frame,
@@ -145,7 +146,7 @@ def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
         ],
         "captures": captures,
         "clocks": _clock_rows(c),
-        "lens": [finding.sentence for finding in c.findings if finding.code in _LENS_CODES],
+        "lens": [finding.text for finding in c.findings if finding.code in _LENS_CODES],
         "scene": _scene_rows(c),
         "cameras": _camera_rows(c),
         "refused": [(name, why.stage, as_markup(why.sentence)) for name, why in c.captures_refused.items()],
@@ -208,9 +209,8 @@ def _statement(c: Calibration) -> str:
         f"{len(c.captures_used)} of {c.n_captures} captures of the board"
     )
     if c.verdict == "fail":
-        return "Do not use this result: " + _reason(c) + _others(c, "error")
-    passed = "every check passed" if c.verdict == "pass" else "use it with care: " + _reason(c) + _others(c)
-    text = f"{known}; {passed.rstrip('.')}."
+        return "Do not use this result."
+    text = f"{known}; {'every check passed' if c.verdict == 'pass' else 'use it with care'}."
     if not c.uncertainty:
         return text
     at = min(c.uncertainty, key=lambda point: abs(point.distance_m - _USUAL_M))
@@ -221,20 +221,29 @@ def _statement(c: Calibration) -> str:
     )
 
 
-def _reason(c: Calibration) -> str:
-    reasons = [finding for finding in c.findings if finding.severity != "note"]
-    return f"{reasons[0].text}." if reasons else "its checks failed."
-
-
-def _others(c: Calibration, severity: str = "warning") -> str:
-    n = sum(finding.severity == severity for finding in c.findings) - 1
-    return f" {n} other reason{'s' if n > 1 else ''} below." if n > 0 else ""
+def _reasons(c: Calibration) -> list[tuple[str, str]]:
+    """List severity and text of the findings: causes, what follows from them, notes."""
+    following, rows = consequences(c.findings), []
+    for finding in c.findings:
+        if finding.code in following:
+            rows.append(("note", f"Follows: {finding.text}"))
+        elif finding.code != _PLAN:
+            rows.append((finding.severity, f"{'Note: ' * (finding.severity == 'note')}{finding.text}"))
+    return rows
 
 
 def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
-    """List the next steps, the most urgent first: the findings' actions, then the checks before use."""
-    asked = [finding.advice_at(folder) for finding in sorted(c.findings, key=lambda f: f.severity != "error")]
-    steps = [as_line(text) for text in dict.fromkeys(asked) if text]
+    """List the next steps, the most urgent first: the causes' actions, then the checks before use."""
+    following = consequences(c.findings)
+    plan = next((finding.advice for finding in c.findings if finding.code == _PLAN), "")
+    asked, optional = [], []
+    for finding in sorted(c.findings, key=lambda f: f.severity != "error"):
+        advice = plan if plan and lacks_captures([finding]) else finding.advice_at(folder)
+        if finding.severity != "note" and finding.code not in following:
+            asked.append(advice)
+        elif advice and advice != plan and finding.action.startswith("measure"):
+            optional.append(f"For less uncertainty, {advice}.")
+    steps = [as_line(text) for text in dict.fromkeys([*asked, plan]) if text]
     if c.verdict == "fail":
         earlier = " The last usable result is in `previous/`." if has_previous else ""
         return [*steps, f"Then run `lce-rig calibrate {shlex.quote(folder)}` again.{earlier}"]
@@ -247,6 +256,7 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
         "ring ends must lie on the board's outline on all sides.",
         "Collect a second session on another day and compare both: "
         f"`lce-rig repeat {shlex.quote(folder)} OTHER_SESSION`.",
+        *optional,
     ]
 
 

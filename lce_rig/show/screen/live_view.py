@@ -298,6 +298,8 @@ def render(
     n_fixed = 1 + len(banner) + len(detail) + n_streams + len(page) + len(keys)
     side = _progress(state)
     n_room = height - n_fixed - len(newest) - sum(map(len, notes[:1]))
+    # The lines of a prediction are kept free until there is one: the drawing beside them keeps its size.
+    side += [Text()] * (min(n_room, len(_BARS) + 4) - len(side))
     edge = 1 if n_room - len(side) >= 2 else 0
     if n_room < len(side):
         side = side[len(_BARS) :]
