@@ -14,7 +14,7 @@ from lce_rig.core.geometry import Array
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board, track_lidar_board
+from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board
 from lce_rig.detect.lidar.unstructured import find_unstructured_boards, look_for_unstructured_board
 from lce_rig.detect.limits_met import gate_image_board, gate_lidar_boards
 from lce_rig.rig import Rig
@@ -128,22 +128,20 @@ class BoardFinder:
             scan: the next one of the same LiDAR.
             last: what the search before located, at least one.
         """
-        limits = self._limits(scan.sensor)
-        if self.rig.lidars[scan.sensor].has_rings:
-            tracked = [track_lidar_board(scan, self.board, previous, limits) for previous in last]
-        else:
-            poses = (previous.T_lidar_board for previous in last)
-            tracked = [look_for_unstructured_board(scan, self.board, pose, limits) for pose in poses]
-        boards = [result for result in tracked if isinstance(result, LidarBoard)]
-        lost = [result for result in tracked if isinstance(result, Refusal)]
+        looked = [self._located(scan, previous.T_lidar_board) for previous in last]
+        boards = [result for result in looked if isinstance(result, LidarBoard)]
+        lost = [result for result in looked if isinstance(result, Refusal)]
         return self._compared(boards or lost[0], scan)
 
     def look_for(self, scan: Scan, T_lidar_board: Array) -> LidarBoard | Refusal:
         """Find the board in a scan about a predicted pose (4, 4)."""
-        look = look_for_board if self.rig.lidars[scan.sensor].has_rings else look_for_unstructured_board
-        found = look(scan, self.board, T_lidar_board, self._limits(scan.sensor))
-        usable = self._compared(found if isinstance(found, Refusal) else [found], scan).usable
+        located = self._located(scan, T_lidar_board)
+        usable = self._compared(located if isinstance(located, Refusal) else [located], scan).usable
         return usable if isinstance(usable, Refusal) else usable[0]
+
+    def _located(self, scan: Scan, T_lidar_board: Array) -> LidarBoard | Refusal:
+        look = look_for_board if self.rig.lidars[scan.sensor].has_rings else look_for_unstructured_board
+        return look(scan, self.board, T_lidar_board, self._limits(scan.sensor))
 
     def _limits(self, sensor: str) -> Limits:
         lidar, quality = self.rig.lidars[sensor], self.rig.quality

@@ -31,11 +31,6 @@ def _other_grid(finding: Finding) -> str:
     return f"{at['n_cols']}x{at['n_rows']} inner corners expected, {seen} detected"
 
 
-def _lost(finding: Finding) -> str:
-    """Lost near its last place, for the code in {cause}, with its figures."""
-    return f"lost near its last place: {_cause(finding).text}"
-
-
 def _not_there(finding: Finding) -> str:
     """Not where images and other captures have it, for the code in {cause}, with its figures."""
     return f"not where the image and the other captures have it: {_cause(finding).text}"
@@ -290,17 +285,11 @@ LIDAR_RAGGED_EDGES = Kind(
     "ring ends {rms_m:mm} rms from a rectangle (limit {max_rms_m:mm})",
     "keep hands and other things away from the board's border",
 )
-LIDAR_LOST = Kind("lidar.lost", _lost, _find_again)
 LIDAR_NOT_WHERE_EXPECTED = Kind("lidar.not_where_expected", _not_there, _find_again)
 LIDAR_NOTHING_WHERE_EXPECTED = Kind(
     "lidar.nothing_where_expected",
     "no plate of the board's size at the {distance_m:.1f} m where image and other captures have it",
     "move the board clear of other things",
-)
-LIDAR_TURNED_AWAY = Kind(
-    "lidar.turned_away",
-    "the only plate near the board's last place is rotated by over {max_turn_deg:.0f} deg",
-    "move more slowly",
 )
 
 

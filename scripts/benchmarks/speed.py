@@ -31,7 +31,6 @@ def bench_speed() -> None:
 
 
 def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
-    from lce_rig.detect.lidar.search import track_lidar_board
     from lce_rig.session import Session
 
     session = Session.open(path)
@@ -43,7 +42,8 @@ def _detector_speed(path: Path) -> Iterator[tuple[str, str]]:
         "board in a full VLP-16 scan, no prior, median",
         milliseconds(lambda k: BoardFinder(rig).scan(scans[k])),
     )
-    yield "tracked, median", milliseconds(lambda k: track_lidar_board(scans[k], board, found[k][0]))  # type: ignore[index]
+    boards = [result if isinstance(result, list) else [] for result in found]
+    yield "tracked, median", milliseconds(lambda k: BoardFinder(rig).follow_scan(scans[k], boards[k]))
     yield (
         "board in a 1280x720 picture, median",
         milliseconds(lambda k: BoardFinder(rig).image(pictures[k])),

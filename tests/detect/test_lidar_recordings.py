@@ -16,7 +16,7 @@ from lce_rig.core.data import Scan
 from lce_rig.core.files import decode_pcd
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import invert, pose
-from lce_rig.detect.lidar.search import find_lidar_boards, track_lidar_board
+from lce_rig.detect.lidar.search import find_lidar_boards, look_for_board
 from lce_rig.io.cloud import rings_from_elevation
 
 pytestmark = pytest.mark.dataset
@@ -99,7 +99,7 @@ def test_the_board_is_tracked_through_a_hand_held_recording(recordings):
     board, scans = board_of(folder), scans_of(folder)
     for key, scan in scans.items():
         found = find_lidar_boards(scan, board)[0]
-        tracked = track_lidar_board(scan, board, found)
+        tracked = look_for_board(scan, board, found.T_lidar_board)
         assert not isinstance(tracked, Refusal), (key, tracked)
         # The crop's own noise estimate moves the borderline returns, by no more than this.
         assert np.linalg.norm(tracked.T_lidar_board[:3, 3] - found.T_lidar_board[:3, 3]) < 0.03, key

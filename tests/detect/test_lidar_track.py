@@ -1,4 +1,4 @@
-"""Following the board from scan to scan."""
+"""The board about a pose: that of the scan before, or one that an image predicts."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scans import BOARD, board_plate, cast, person, place, room
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.lidar.measurement import Beam
-from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board, track_lidar_board
+from lce_rig.detect.lidar.search import Limits, find_lidar_boards, look_for_board
 
 LIMITS = Limits(beam=Beam(0.0, 0.0))
 
@@ -20,25 +20,9 @@ def test_board_in_motion_is_followed_through_every_scan():
     board = find_lidar_boards(view(place(2.5, 170)), BOARD, LIMITS)[0]
     for k in range(1, 12):
         T = place(2.5 - 0.04 * k, 170 + 1.5 * k, 45 + 2 * k, 3 * k)
-        board = track_lidar_board(view(T, seed=k), BOARD, board, LIMITS)
+        board = look_for_board(view(T, seed=k), BOARD, board.T_lidar_board, LIMITS)
         assert isinstance(board, LidarBoard)
         assert np.linalg.norm(board.T_lidar_board[:3, 3] - T[:3, 3]) < 0.03
-
-
-def test_tracking_finds_what_the_full_search_finds():
-    scan = view(place(2.2, 40, 30, 20))
-    full = find_lidar_boards(scan, BOARD, LIMITS)[0]
-    tracked = track_lidar_board(scan, BOARD, full, LIMITS)
-    np.testing.assert_allclose(tracked.T_lidar_board, full.T_lidar_board, atol=5e-3)
-    np.testing.assert_allclose(tracked.plane, full.plane, atol=5e-3)
-    assert len(tracked.points) > 0.97 * len(full.points)
-
-
-def test_board_that_left_is_reported_lost():
-    board = find_lidar_boards(view(place(2.5, 40)), BOARD, LIMITS)[0]
-    refusal = track_lidar_board(view(place(2.5, 200)), BOARD, board, LIMITS)
-    assert isinstance(refusal, Refusal)
-    assert (refusal.code, refusal.figures["cause"]) == ("lidar.lost", "lidar.no_returns")
 
 
 def test_board_held_still_is_measured_as_well_as_by_the_full_search():
@@ -47,7 +31,7 @@ def test_board_held_still_is_measured_as_well_as_by_the_full_search():
         T = place(2.0 + 0.1 * seed, 40 - 10 * seed, 35, 25, 15)
         previous = find_lidar_boards(view(T, seed=100 + seed), BOARD, LIMITS)[0]
         full = find_lidar_boards(view(T, seed=seed), BOARD, LIMITS)[0]
-        tracked = track_lidar_board(view(T, seed=seed), BOARD, previous, LIMITS)
+        tracked = look_for_board(view(T, seed=seed), BOARD, previous.T_lidar_board, LIMITS)
         for errors, board in ((found_deg, full), (tracked_deg, tracked)):
             errors.append(np.degrees(np.linalg.norm(np.cross(board.plane[:3], T[:3, 2]))))
     assert np.sqrt(np.mean(np.square(tracked_deg))) < 1.1 * np.sqrt(np.mean(np.square(found_deg)))

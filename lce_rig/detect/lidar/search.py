@@ -10,7 +10,6 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.findings import (
-    LIDAR_LOST,
     LIDAR_NO_PLATE,
     LIDAR_NO_RETURNS,
     LIDAR_NOT_WHERE_EXPECTED,
@@ -20,7 +19,6 @@ from lce_rig.detect.findings import (
     LIDAR_TOO_FEW_RINGS,
     LIDAR_TOO_THICK,
     LIDAR_TOUCHING,
-    LIDAR_TURNED_AWAY,
 )
 from lce_rig.detect.lidar.measurement import Beam, build_board, refine
 from lce_rig.detect.lidar.plates import propose_plates, screen_plates
@@ -303,49 +301,7 @@ def _penalty(found: LidarBoard, board: Board) -> float:
     return penalty
 
 
-WORSE_M = 0.003  # by how much the outline of a board held still may fit worse than before
-# Farther from its last pose a board did not stand still: the search is the safer start.
-STILL_M, STILL_TURN = 0.02, np.cos(np.radians(1.5))
-MAX_TURN = np.cos(np.radians(45.0))
 MARGIN_M = 0.25  # by how much the box that is searched reaches beyond the board on every side
-
-
-def track_lidar_board(
-    scan: Scan,
-    board: Board,
-    previous: LidarBoard,
-    limits: Limits = STANDARD,
-) -> LidarBoard | Refusal:
-    """Find the board near its previous pose: only returns in a box about it are looked at.
-
-    A board held still is measured again where it was; one that moved is searched for in the box.
-
-    Args:
-        scan: one revolution.
-        board: the outer size is what is looked for.
-        previous: the board in an earlier scan.
-        limits: without noise; the search has no maximum range.
-
-    Returns:
-        The best candidate in the box, or why there is none.
-
-    References:
-        LCE-Calib, "Checkerboard Tracking".
-    """
-    nearby = scan.select(_near(scan, board, previous.T_lidar_board))
-    as_well = replace(limits, template_m=min(limits.template_m, previous.quality.template_m + WORSE_M))
-    still = _measure_at(nearby, board, previous.T_lidar_board, as_well)
-    if isinstance(still, LidarBoard) and _is_at(still, previous.T_lidar_board, STILL_M, STILL_TURN):
-        return still
-    found = find_lidar_boards(nearby, board, replace(limits, max_range_m=np.inf))
-    if isinstance(found, Refusal):
-        return LIDAR_LOST.refusal(**found.figures, cause=found.code)
-    for candidate in found:
-        if candidate.plane[:3] @ previous.plane[:3] > MAX_TURN:
-            return candidate
-    return LIDAR_TURNED_AWAY.refusal(max_turn_deg=float(np.degrees(np.arccos(MAX_TURN))))
-
-
 LOOK_TURN = np.cos(np.radians(15.0))
 
 
@@ -355,9 +311,9 @@ def look_for_board(
     T_lidar_board: Array,
     limits: Limits = STANDARD,
 ) -> LidarBoard | Refusal:
-    """Find the board about a predicted pose, such as an image and extrinsics give.
+    """Find the board about a predicted pose, as an image and extrinsics give it or an earlier scan.
 
-    The outline is registered from that pose, where the search starts from segments; a plate is judged alike.
+    The outline is registered from that pose; where this fails, the box about it is searched.
 
     Args:
         scan: one revolution.
@@ -367,16 +323,19 @@ def look_for_board(
 
     Returns:
         The board, or why none is there.
+
+    References:
+        LCE-Calib, "Checkerboard Tracking".
     """
     at_once = _measure_at(scan, board, T_lidar_board, limits)
-    if isinstance(at_once, LidarBoard) and _is_at(at_once, T_lidar_board, MARGIN_M, LOOK_TURN):
+    if isinstance(at_once, LidarBoard) and _is_at(at_once, T_lidar_board):
         return at_once
     nearby = scan.select(_near(scan, board, T_lidar_board))
     found = find_lidar_boards(nearby, board, replace(limits, max_range_m=np.inf))
     if not isinstance(found, Refusal):
         distance_m = float(np.linalg.norm(T_lidar_board[:3, 3]))
         return next(
-            (candidate for candidate in found if _is_at(candidate, T_lidar_board, MARGIN_M, LOOK_TURN)),
+            (candidate for candidate in found if _is_at(candidate, T_lidar_board)),
             LIDAR_NOTHING_WHERE_EXPECTED.refusal(distance_m=distance_m),
         )
     cause = at_once if isinstance(at_once, Refusal) else found
@@ -398,10 +357,10 @@ def _measure_at(
     return measure_plate(ordered, scan, board, (plane, centre, outline), limits.widened(ordered.sigma_m))
 
 
-def _is_at(found: LidarBoard, T_lidar_board: Array, reach_m: float, cos_turn: float) -> bool:
+def _is_at(found: LidarBoard, T_lidar_board: Array) -> bool:
     """Return whether a board lies where a pose has it."""
     away_m = float(np.linalg.norm(found.T_lidar_board[:3, 3] - T_lidar_board[:3, 3]))
-    return away_m < reach_m and abs(float(found.plane[:3] @ T_lidar_board[:3, 2])) > cos_turn
+    return away_m < MARGIN_M and abs(float(found.plane[:3] @ T_lidar_board[:3, 2])) > LOOK_TURN
 
 
 def _near(scan: Scan, board: Board, T_lidar_board: Array) -> Indices:
