@@ -36,7 +36,6 @@ class BoardDetection:
         unseen: why it was not found, by (camera, channel), where it was looked for.
         unscanned: why there is no such candidate, by LiDAR, where it was looked for.
         unfit: why the profile's limits refuse a board of `images`, by (camera, channel).
-        is_moving: whether images were not searched because nothing that may be the board is at rest there.
     """
 
     frame: Frame
@@ -45,7 +44,6 @@ class BoardDetection:
     unseen: dict[ImageKey, Refusal] = field(default_factory=dict)
     unscanned: dict[str, Refusal] = field(default_factory=dict)
     unfit: dict[ImageKey, Refusal] = field(default_factory=dict)
-    is_moving: bool = False
 
     @property
     def poses(self) -> dict[ImageKey, Array]:
@@ -141,8 +139,7 @@ class BoardTracker:
                 lidars[scan.sensor] = candidates
         if not detection.images:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
-            if not detection.is_moving:
-                self.refusals.add(IMAGE_NONE.refusal())
+            self.refusals.add(IMAGE_NONE.refusal())
         elif not lidars:
             self.refusals.add(LIDAR_NONE.refusal())
         return replace(detection, lidars=lidars, unscanned=unscanned)

@@ -30,9 +30,6 @@ _SEARCH_S = 0.3
 _THOROUGH_S = 1.0
 # A process of its own for images takes a second to start.
 _LONG_SAMPLES = 200
-# Comparing small images misses motions below this: looser limits on stillness need full searches.
-_GLANCED_M = 0.01
-
 
 Progress = Callable[[int, int, str], None]
 """Told (samples done, samples in all, what happened)."""
@@ -224,8 +221,7 @@ class _Collector:
         frames = pair_by_time(samples, rig, Losses() if cameras else losses)
         detections: Iterable[BoardDetection] = map(tracker.sight, frames)
         if recording.n_samples >= _LONG_SAMPLES:
-            are_still = not has_events and max_motion_m <= _GLANCED_M
-            detections = sight_ahead(tracker, frames, is_still_wanted=are_still)
+            detections = sight_ahead(tracker, frames)
         gate: StillnessGate | MotionGate = StillnessGate(
             rig.board.to_board(), max_motion_m, takes_singles=True, window_s=stillness_window_s(rig)
         )

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.collect.board_search import RestingTracker, glance_at, sight_ahead
+from lce_rig.collect.board_search import sight_ahead
 from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
 from lce_rig.collect.gates import StillnessGate, find_moments
 from lce_rig.core.findings import Refusal
@@ -129,33 +129,9 @@ def test_images_searched_ahead_give_the_same_detections() -> None:
     order = (0, 0, 0, 1, 1, 2, 3, 3, 0, 0, 1, 2)
     frames = [frame_of(k, 0.1 * i) for i, k in enumerate(order)]
     one, two = BoardTracker(rig(), 0.3), BoardTracker(rig(), 0.3)
-    for alone, ahead in zip(
-        map(one.sight, frames), sight_ahead(two, frames, is_still_wanted=False), strict=True
-    ):
+    for alone, ahead in zip(map(one.sight, frames), sight_ahead(two, frames), strict=True):
         assert ahead.frame is alone.frame
         assert ahead.images.keys() == alone.images.keys() and ahead.lidars.keys() == alone.lidars.keys()
         for key, board in alone.images.items():
             assert np.array_equal(board.corners_px, ahead.images[key].corners_px)
     assert one.refusals.by_code() == two.refusals.by_code()
-
-
-def test_images_are_searched_where_a_board_rests_and_left_out_where_it_moves() -> None:
-    order = (0, 0, 0, 1, 2, 3, 1, 1, 1)
-    frames = [frame_of(k, 0.1 * i) for i, k in enumerate(order)]
-    tracker = RestingTracker(rig(), 0.0, 1.0)
-    found = [tracker.look(frame, glances) for frame, glances in glance_at(frames)]
-    assert [bool(each.images) for each in found] == [True] * 3 + [False] * 3 + [True] * 3
-    assert [each.is_moving for each in found] == [False] * 3 + [True] * 3 + [False] * 3
-
-
-def test_a_scene_without_a_board_is_seldom_searched_while_nothing_changes() -> None:
-    frame = frame_of(0, 0.0)
-    (image,) = frame.images
-    noise = np.random.default_rng(0).integers(88, 93, (25, *image.pixels.shape)).astype(np.uint8)
-    flat = [replace(image, pixels=pixels) for pixels in noise]
-    frames = [replace(frame, images=(one,), time_ns=T0_NS + 100_000_000 * k) for k, one in enumerate(flat)]
-    tracker = RestingTracker(rig(), 0.0, 0.0)
-    found = [tracker.look(each, glances) for each, glances in glance_at(frames)]
-    assert not any(each.images or each.is_moving for each in found)
-    # A thorough search says why there is none.
-    assert [k for k, each in enumerate(found) if each.unseen] == [0]
