@@ -6,12 +6,11 @@ is too slow for that, all runs in slow motion: sensors, timestamps and person ke
 """
 
 import math
-import multiprocessing
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from types import TracebackType
 
 import numpy as np
@@ -20,7 +19,7 @@ from lce_rig.collect.findings import CLOCK_SIMULATED
 from lce_rig.collect.guidance.instructions import HeldPose, build_pose, describe_pose, instruct
 from lce_rig.collect.guidance.sensor_model import SensorPlace
 from lce_rig.collect.live.state import LiveState
-from lce_rig.collect.worker import start_without_interrupts
+from lce_rig.collect.worker import Worker
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import LceRigError, ProfileError, SourceError
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
@@ -30,8 +29,6 @@ from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.placements import between
 
-# For each camera: what it sees of the room is rendered first.
-START_S = 120.0
 # How people behave: they react, walk, and try again where nothing happens.
 REACTION_S = 0.7
 WALK_MPS = 0.6
@@ -103,52 +100,35 @@ class SimulatedRig:
         Raises:
             ProfileError: the rig has no camera with frames, or its LiDAR is not known.
         """
-        self._rig = rig
-        self._seed = seed
         framed = [name for name, camera in rig.cameras.items() if camera.first_channel("frames")]
         if not framed:
             raise ProfileError(
                 f"rig {rig.name!r} has no camera with frames; events are not simulated in real time",
                 "Simulate a recording instead: lce-rig simulate --recording FOLDER.",
             )
-        self._period_s = 1 / min(lidar.rate_hz for lidar in rig.lidars.values())
-        self._simulated_s = 0.0
         self._by_sensor = {name: SimulatedSource(name) for name in [*framed, *rig.lidars]}
-        self._counted = next(iter(rig.lidars))
+        self.sources: list[LiveSource] = list(self._by_sensor.values())
         # People see the rig as its drawing has it: they do not know the true extrinsics.
-        self._views = {name: SensorPlace.nominal(rig, name, self._counted) for name in framed}
-        self._sent_s = -1e9
+        lidar = next(iter(rig.lidars))
+        views = {name: SensorPlace.nominal(rig, name, lidar) for name in framed}
+        self._worker = Worker("simulated rig", _Simulation, rig, seed, views)
+        self._reader = threading.Thread(target=self._read, name="read simulated rig", daemon=True)
+        self._now_s, self._period_s = 0.0, 1 / min(lidar.rate_hz for lidar in rig.lidars.values())
+        self._asked: tuple[str, Array] | None = None
+        self._asked_s = -1e9
         self._last: tuple[int, bytes] | None = None
         self._changed_s = 0.0
-
-    @property
-    def sources(self) -> list[LiveSource]:
-        """The sensors."""
-        return list(self._by_sensor.values())
 
     def __enter__(self) -> "SimulatedRig":
         """Start the simulation and wait until it runs.
 
         Raises:
-            SourceError: it does not.
+            LceRigError: it does not.
         """
-        # A forked process would share locks of this one's threads.
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        arguments = theirs, self._rig, self._seed, dict(self._views)
-        self._process = context.Process(target=_simulate, args=arguments, name="simulated rig", daemon=True)
-        start_without_interrupts(self._process)
-        theirs.close()
-        try:
-            if not self._connection.poll(START_S * len(self._views)):
-                raise SourceError("the simulated rig does not start", "Is the computer very busy?")
-            answer = self._connection.recv()
-        except (EOFError, OSError):
-            answer = SourceError("the simulated rig ended at once")
-        if isinstance(answer, LceRigError):
-            self._process.join()
-            raise answer
-        self._reader = threading.Thread(target=self._read, name="read simulated rig", daemon=True)
+        with ExitStack() as stack:
+            stack.enter_context(self._worker)
+            self._worker.call("take", None)
+            stack.pop_all()
         self._reader.start()
         return self
 
@@ -156,73 +136,57 @@ class SimulatedRig:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Stop the simulation."""
-        self._process.terminate()
-        self._process.join()
+        self._worker.__exit__(kind, error, trace)
         self._reader.join()
-        self._connection.close()
 
     def watch(self, state: LiveState) -> None:
         """Let the person see a state of the collection: where the board is wanted, and what was captured."""
         drawing = state.drawing
         if drawing is None or drawing.wanted is None or state.phase in ("holding", "saving"):
             return
-        wanted, now_s = (state.n_captures, drawing.wanted.tobytes()), self._simulated_s
+        wanted, now_s = (state.n_captures, drawing.wanted.tobytes()), self._now_s
         if wanted != self._last:
             self._last, self._changed_s = wanted, now_s
-            self._sent_s = -1e9
+            self._asked_s = -1e9
         is_noticed = now_s - self._changed_s > REACTION_S
-        if is_noticed and now_s - self._sent_s > AGAIN_S:
-            self._sent_s = now_s
-            try:
-                self._connection.send((drawing.camera.partition(".")[0], drawing.wanted))
-            except OSError:
-                return  # The reader tells.
+        if is_noticed and now_s - self._asked_s > AGAIN_S:
+            self._asked_s = now_s
+            self._asked = drawing.camera.partition(".")[0], drawing.wanted
 
     def _read(self) -> None:
-        while True:
-            try:
-                sample: Image | Scan = self._connection.recv()
-            except (EOFError, OSError):
-                for source in self._by_sensor.values():
-                    source.fail(SourceError("the simulated rig has ended", "Start again."))
-                return
-            self._by_sensor[sample.sensor].put(sample)
-            if sample.sensor == self._counted:
-                self._simulated_s += self._period_s
+        try:
+            while True:
+                asked, self._asked = self._asked, None
+                for sample in self._worker.call("take", asked):
+                    self._by_sensor[sample.sensor].put(sample)
+                self._now_s += self._period_s
+        except LceRigError:
+            for source in self._by_sensor.values():
+                source.fail(SourceError("the simulated rig has ended", "Start again."))
 
 
-def _simulate(connection: Connection, rig: Rig, seed: int, views: Mapping[str, SensorPlace]) -> None:
-    """Run the simulation until the other end is gone."""
-    try:
-        scene = LiveScene(rig, seed, SimulationOptions.for_rig(rig.name))
+class _Simulation:
+    """The object in the worker's process: takes samples turn by turn, no faster than they come in reality."""
+
+    def __init__(self, rig: Rig, seed: int, views: Mapping[str, SensorPlace]) -> None:
+        self._scene = LiveScene(rig, seed, SimulationOptions.for_rig(rig.name))
         camera = next(iter(views))
-        scene.hold(scene.stage.T_world_sensor[camera] @ build_pose(views[camera], _START))
-        answer: LceRigError | str = "running"
-    except LceRigError as error:
-        answer = error
-    try:
-        connection.send(answer)
-    except OSError:
-        return  # The parent has ended.
-    if isinstance(answer, LceRigError):
-        return
-    walker = Walker(scene, Person(), views)
-    period_ns = max(model.period_ns for model in scene.stage.models.values())
-    stamp_ns, due_s = time.time_ns(), time.monotonic()
-    try:
-        while True:
-            while connection.poll():
-                camera, wanted = connection.recv()
-                walker.hear(camera, wanted, stamp_ns * 1e-9)
-            walker.walk(stamp_ns * 1e-9)
-            for sample in scene.take(stamp_ns):
-                connection.send(sample)
-            stamp_ns += period_ns
-            # Late is late: a turn that took long is not made up for by short ones.
-            due_s = max(due_s + period_ns * 1e-9, time.monotonic())
-            time.sleep(max(0.0, due_s - time.monotonic()))
-    except (EOFError, OSError, KeyboardInterrupt):
-        return
+        self._scene.hold(self._scene.stage.T_world_sensor[camera] @ build_pose(views[camera], _START))
+        self._walker = Walker(self._scene, Person(), views)
+        self._stamp_ns, self._due_s = time.time_ns(), time.monotonic()
+
+    def take(self, asked: tuple[str, Array] | None) -> list[Image | Scan]:
+        """Tell the person a camera and T_cam_board (4, 4), and take a sample of each sensor."""
+        time.sleep(max(0.0, self._due_s - time.monotonic()))
+        period_ns = max(model.period_ns for model in self._scene.stage.models.values())
+        if asked is not None:
+            self._walker.hear(*asked, self._stamp_ns * 1e-9)
+        self._walker.walk(self._stamp_ns * 1e-9)
+        samples = list(self._scene.take(self._stamp_ns))
+        self._stamp_ns += period_ns
+        # Late is late: a turn that took long is not made up for by short ones.
+        self._due_s = max(self._due_s + period_ns * 1e-9, time.monotonic())
+        return samples
 
 
 _FIGURE = {

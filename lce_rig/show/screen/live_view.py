@@ -3,9 +3,8 @@
 import io
 import math
 import sys
-import textwrap
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import pairwise
 from typing import Any, Protocol
@@ -79,8 +78,6 @@ _BELLS = {"captured": 1, "taken_back": 1, "refused": 2, "enough": 3, "lost": 3, 
 _HEIGHT, _WIDTH = 24, 80
 # Bars and figures; the drawing stands beside them.
 _SIDE_WIDTH = 40
-# A message may take so many lines; none of lce-rig's is longer at 80 columns.
-_MESSAGE_LINES = 4
 # Written small in the headline, too: 8 M would be something else.
 _UNITS = ("m", "cm", "mm", "deg", "s", "cm/s")
 _PLAIN_EVERY_S = 3.0
@@ -267,10 +264,16 @@ def render(
     Sentences wrap. What is left over goes to messages and to a larger drawing; where lines are short, the
     banner's edges and then the coverage bars make way.
     """
-    from rich.console import Group
+    from rich.console import Console, Group
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
+
+    console = Console(width=width, file=io.StringIO())
+
+    def n_lines(parts: Iterable[Any], among: int = width) -> int:
+        options = console.options.update_width(among)
+        return sum(len(console.render_lines(part, options, pad=False)) for part in parts)
 
     wanted = f" of {state.n_wanted}" if state.n_wanted is not None else ""
     shown = state.n_captures if state.n_wanted is None else state.n_wanted
@@ -286,98 +289,69 @@ def render(
     headline = " ".join(word if word.strip(",") in _UNITS else word.upper() for word in words)
     if state.hold_s is not None:
         headline += f"   {state.hold_s:.1f} s"
-    banner = _wrap(headline, width - 4)
-    detail = _wrap(state.detail or " ", width)
-    streams, n_streams = _stream_table(state.streams, width)
+    banner = Text(headline, style="bold", justify="center")
+    above = [Text(state.detail or " ", style="italic"), _stream_table(state.streams)]
     # A link that is cut is none: it wraps where it is too long.
-    page = [line for link in links[:1] for line in _folded(f"page: {link}", width)]
-    keys = [HELP + (PAGE_HELP if links and qr_lines(links[0]) else "")] if has_keys else []
-    newest = _wrap(state.log[-1], width) if state.log else []
-    notes = [_wrap(f"! {note}", width) for note in state.notes]
+    below = [Text(f"page: {link}", overflow="fold") for link in links[:1]]
+    if has_keys:
+        keys = HELP + (PAGE_HELP if links and qr_lines(links[0]) else "")
+        below.append(Text(keys, style="bold dim"))
+    newest, *older = [Text(message, style="dim") for message in reversed(state.log)] or [Text("")]
+    notes = [Text(f"! {note}", style="yellow") for note in state.notes]
 
-    n_fixed = 1 + len(banner) + len(detail) + n_streams + len(page) + len(keys)
     side = _progress(state)
-    n_room = height - n_fixed - len(newest) - sum(map(len, notes[:1]))
+    n_free = height - n_lines([title, Padding(banner, (0, 2)), *above, *below])
+    n_room = n_free - n_lines([newest, *notes[:1]])
     # The lines of a prediction are kept free until there is one: the drawing beside them keeps its size.
-    side += [Text()] * (min(n_room, len(_BARS) + 4) - len(side))
-    edge = 1 if n_room - len(side) >= 2 else 0
-    if n_room < len(side):
+    side += [Text(" ")] * (min(n_room, len(_BARS) + 4) - n_lines(side, _SIDE_WIDTH))
+    edge = 1 if n_room - n_lines(side, _SIDE_WIDTH) >= 2 else 0
+    if n_room < n_lines(side, _SIDE_WIDTH):
         side = side[len(_BARS) :]
-    n_room = height - n_fixed - 2 * edge
-    # Of one size whatever messages come.
-    n_beside = max(min(height - 14, n_room - 3), len(side)) if height > _HEIGHT else len(side)
-    messages = _fill(notes, state.log, n_room - n_beside, width)
+    n_beside = n_lines(side, _SIDE_WIDTH)
+    n_room = n_free - 2 * edge
+    if height > _HEIGHT:  # of one size whatever messages come
+        n_beside = max(min(height - 14, n_room - 3), n_beside)
+    # The newest message, notes, then older messages, as many as there is room for.
+    n_left = n_room - n_beside - n_lines([newest])
+    kept = []
+    for part in [*notes, *older]:
+        n_left -= n_lines([part])
+        if n_left < 0:
+            break
+        kept.append(part)
+    messages = [*kept[: len(notes)], *reversed(kept[len(notes) :]), newest]
     drawing = _drawing(state, (width - _SIDE_WIDTH - 2, n_beside))
-    texts = Text("\n".join(banner), style="bold", justify="center")
-    parts: list[Any] = [title, Padding(texts, (edge, 2), style=_STYLES[state.phase])]
-    parts += [Text("\n".join(detail), style="italic"), streams]
     beside = Table.grid(padding=(0, 1, 0, 0))
     beside.add_column(width=min(_SIDE_WIDTH, width))
-    beside.add_row(Text("\n").join(side), *([] if drawing is None or width < _WIDTH else [drawing]))
-    parts += [beside, *messages, *map(Text, page)]
-    return Group(*parts, *(Text(line, style="bold dim") for line in keys))
-
-
-def _wrap(text: str, width: int) -> list[str]:
-    """Break a sentence between words into at most `_MESSAGE_LINES` lines."""
-    return textwrap.wrap(text, max(width, 10), max_lines=_MESSAGE_LINES, placeholder=" …") or [" "]
+    beside.add_row(Group(*side), *([] if drawing is None or width < _WIDTH else [drawing]))
+    banner_box = Padding(banner, (edge, 2), style=_STYLES[state.phase])
+    return Group(title, banner_box, *above, beside, *messages, *below)
 
 
 def _folded(text: str, width: int) -> list[str]:
     return [text[k : k + width] for k in range(0, len(text), width)]
 
 
-def _fill(notes: list[list[str]], log: tuple[str, ...], n_lines: int, width: int) -> list[Any]:
-    """Choose whole notes and messages for some lines: the newest message, notes, then older messages."""
-    from rich.text import Text
-
-    newest = _wrap(log[-1], width) if log else []
-    # A drawing that is larger than the bars beside it is worth as much as what happened long ago.
-    n_left = n_lines - len(newest)
-    warnings: list[str] = []
-    for note in notes:
-        if len(note) > n_left:
-            break
-        warnings, n_left = warnings + note, n_left - len(note)
-    older: list[str] = []
-    n_old = n_left if n_lines <= _HEIGHT // 2 else n_left // 3
-    for message in reversed(log[:-1]):
-        lines = _wrap(message, width)
-        if len(older) + len(lines) > n_old:
-            break
-        older = lines + older
-    texts = [Text(line, style="yellow") for line in warnings]
-    return texts + [Text(line, style="dim") for line in (*older, *newest)]
-
-
-def _stream_table(streams: tuple[StreamState, ...], width: int) -> tuple[Any, int]:
-    """Lay the streams out, reasons wrapped; also count the lines."""
+def _stream_table(streams: tuple[StreamState, ...]) -> Any:
+    """Lay the streams out: name, rate, losses, and figures of the board or what is wrong."""
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, show_header=False, padding=(0, 1, 0, 0), pad_edge=False)
-    widths = [14, 7, 9] if any(stream.n_lost for stream in streams) else [14, 7]
-    table.add_column(width=14, no_wrap=True)
-    table.add_column(width=7, justify="right", no_wrap=True)
-    if len(widths) > 2:
-        table.add_column(width=9, no_wrap=True)
-    left = max(width - sum(widths) - len(widths), 20)
-    table.add_column(width=left)
-    n_lines = 0
+    table = Table.grid(padding=(0, 1, 0, 0), pad_edge=False, expand=True)
+    table.add_column(min_width=14, no_wrap=True)
+    table.add_column(min_width=7, justify="right", no_wrap=True)
+    table.add_column(style="red", no_wrap=True)
+    table.add_column(ratio=1)
     for stream in streams:
         is_bad = stream.sees_board is False or bool(stream.reason)
         mark, style = (
             ("x", "bold red") if is_bad else ("o", "bold green") if stream.sees_board else ("-", "dim")
         )
         rate = f"{stream.rate_hz:.1f}/s" if stream.rate_hz < 1000 else f"{stream.rate_hz / 1e6:.2f}M/s"
-        lost = (
-            [Text(f"{stream.n_lost} lost" if stream.n_lost else "", style="red")] if len(widths) > 2 else []
-        )
-        texts = _wrap(stream.reason or stream.figures or " ", left)
-        n_lines += len(texts)
-        reason = Text("\n".join(texts), style="red" if is_bad else "")
-        table.add_row(Text(f"{mark} {stream.name}", style=style), rate, *lost, reason)
-    return table, n_lines
+        lost = f"{stream.n_lost} lost" if stream.n_lost else ""
+        reason = Text(stream.reason or stream.figures, style="red" if is_bad else "")
+        table.add_row(Text(f"{mark} {stream.name}", style=style), rate, lost, reason)
+    return table
 
 
 def _progress(state: LiveState) -> list[Any]:
@@ -401,9 +375,7 @@ def _progress(state: LiveState) -> list[Any]:
         figure = f"below {shown} {unit}" if is_known else "-"
         style = "green" if is_known and sigma <= target else "yellow"
         lines.append(Text.assemble(f"{name:<11}", (figure, style), f" (target {target:g})"))
-    if state.goes_on:
-        lines += [Text(line) for line in _wrap(state.goes_on, _SIDE_WIDTH)]
-    return lines
+    return [*lines, Text(state.goes_on)] if state.goes_on else lines
 
 
 def _drawing(state: LiveState, most: tuple[int, int]) -> Any:
