@@ -159,7 +159,6 @@ class SimulationOptions:
         distance_m: range of the board's distance from the camera; where the LiDAR would see less than four
             fifths of the plate, no board is placed (a diamond of 1 m nearer than about 1.4 m).
         roll_deg: mean and half-width of the board's turn in its plane, 0 = upright, 45 = a diamond.
-        has_decoy_plate: whether a blank plate of the board's size stands in the room.
         furnish: draws the room's size and furniture, see `build_room`; None for one room for all seeds.
         truth_rotation_deg, truth_translation_m: how far the true extrinsics lie from the profile's nominal
             ones at most; never more than 0.8 of the tolerances that the profile gives.
@@ -182,7 +181,6 @@ class SimulationOptions:
     camera: CameraNoise = field(default_factory=CameraNoise)
     distance_m: tuple[float, float] = (1.2, 4.0)
     roll_deg: tuple[float, float] = (45.0, 15.0)
-    has_decoy_plate: bool = False
     furnish: Furnish | None = None
     truth_rotation_deg: float = 2.0
     truth_translation_m: float = 0.02

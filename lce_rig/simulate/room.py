@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array, invert, pose, transform
 from lce_rig.simulate.options import Carrier, Furnish, Obstacles, Part
-from lce_rig.simulate.scene import PLATE, Raycaster, Surface
+from lce_rig.simulate.scene import Raycaster, Surface
 from lce_rig.simulate.surfaces import Material, Mesh, box, cone, ellipsoid, inside_box, limb, merge, rectangle
 
 _WALL = Material((0.66, 0.70, 0.72), 0.75)
@@ -47,7 +47,6 @@ class Room:
         lamps: (P, 3) m, world.
         low, high: (3,) corners, m, frame room.
         obstacles: (low, high) of what stands in it, m, frame room.
-        T_world_decoy: (4, 4) pose of the blank decoy plate; None without.
     """
 
     T_world_room: Array
@@ -56,7 +55,6 @@ class Room:
     low: Array
     high: Array
     obstacles: Obstacles
-    T_world_decoy: Array | None = None
 
     def is_free(self, points_world: Array, margin_m: float = 0.1) -> NDArray[np.bool_]:
         """Find which points (N, 3) lie in the room, at least `margin_m` from everything in it."""
@@ -64,49 +62,29 @@ class Room:
         free = np.all((points > self.low + margin_m) & (points < self.high - margin_m), axis=1)
         for low, high in self.obstacles:
             free &= ~np.all((points > low - margin_m) & (points < high + margin_m), axis=1)
-        if self.T_world_decoy is not None:
-            away = np.linalg.norm((points_world - self.T_world_decoy[:3, 3])[:, :2], axis=1)
-            free &= away > 0.6 + margin_m
         return np.asarray(free)
 
 
-def build_room(
-    heading_rad: float,
-    rng: np.random.Generator,
-    decoy: Board | None = None,
-    furnish: Furnish | None = None,
-) -> Room:
+def build_room(heading_rad: float, rng: np.random.Generator, furnish: Furnish | None = None) -> Room:
     """Build the room around the rig.
 
     Args:
         heading_rad: azimuth that the first camera looks along, world.
         rng: source of the room's turn against the rig, and of what is drawn in it.
-        decoy: a blank plate of this board's size stands at the side; None for none.
         furnish: draws corners (3,), parts and obstacles of a room from those of the usual one; None keeps it.
     """
     turn_rad = heading_rad + np.radians(rng.uniform(-6.0, 6.0))
     T_world_room = pose(_turn_z(turn_rad), np.zeros(3))
     low, high, obstacles, parts = _LOW, _HIGH, _OBSTACLES, _furniture()
-    T_room_decoy = None if decoy is None else _decoy_pose(rng)
     if furnish is not None:
         low, high, parts, obstacles = furnish(low, high, rng)
     parts = [*_shell(low, high), *parts]
-    if decoy is not None and T_room_decoy is not None:
-        plate = rectangle(decoy.width_m, decoy.height_m).moved(T_room_decoy)
-        foot = T_room_decoy[:3, 3] - 0.06 * T_room_decoy[:3, 2]
-        pole = cone((foot[0], foot[1], 0.02), foot, 0.015)
-        base = box((0.4, 0.4, 0.03), (foot[0], foot[1], 0.015))
-        parts += [
-            ("decoy plate", plate, PLATE, T_room_decoy),
-            _part("decoy stand", merge([pole, base]), _LEGS),
-        ]
     surfaces = [
         Surface(name, mesh.moved(T_world_room), material, T_world_room @ T_room_surface)
         for name, mesh, material, T_room_surface in parts
     ]
     lamps = transform(T_world_room, np.array([[x, y, high[2] - 0.05] for x, y in _LAMP_SPOTS]))
-    T_world_decoy = None if T_room_decoy is None else T_world_room @ T_room_decoy
-    return Room(T_world_room, Raycaster(surfaces), lamps, low, high, obstacles, T_world_decoy)
+    return Room(T_world_room, Raycaster(surfaces), lamps, low, high, obstacles)
 
 
 def _turn_z(angle_rad: float) -> Array:
@@ -173,16 +151,6 @@ def _furniture() -> list[Part]:
         _on_wall("poster", (0.9, 1.2), np.array([-4.59, -0.8, 1.6]), back, _POSTER),
         _on_wall("poster", (0.9, 1.2), np.array([-1.8, 3.39, 1.6]), left, _POSTER),
     ]
-
-
-def _decoy_pose(rng: np.random.Generator) -> Array:
-    """Choose where the decoy hangs at the LiDAR's height, about facing the rig, in the room frame."""
-    azimuth_rad = rng.choice([-1.0, 1.0]) * np.radians(rng.uniform(50.0, 75.0))
-    distance_m = rng.uniform(1.9, 2.3)
-    at = np.array([distance_m * np.cos(azimuth_rad), distance_m * np.sin(azimuth_rad), LIDAR_HEIGHT_M])
-    facing = _turn_z(azimuth_rad + np.radians(rng.uniform(-15.0, 15.0))) @ np.array([-1.0, 0.0, 0.0])
-    upright = np.stack([np.cross([0.0, 0.0, 1.0], facing), [0.0, 0.0, 1.0], facing], axis=1)
-    return pose(upright @ _turn_z(np.radians(rng.uniform(35.0, 55.0))), at)
 
 
 _STEEL = Material((0.50, 0.50, 0.50), 0.5)

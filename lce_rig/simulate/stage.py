@@ -152,7 +152,6 @@ def set_stage(rig: Rig, seed: int, options: SimulationOptions | None = None) -> 
     room = build_room(
         float(np.arctan2(sight[1], sight[0])),
         np.random.default_rng([seed, OF_SESSION, ROOM]),
-        rig.board.to_board() if options.has_decoy_plate else None,
         options.furnish,
     )
     sheets: dict[str, DataSheet] = {}

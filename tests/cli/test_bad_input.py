@@ -10,10 +10,13 @@ import pytest
 import yaml
 
 from lce_rig.cli.main import run
-from lce_rig.core.geometry import rotation_angle
+from lce_rig.core.geometry import exp_so3, pose, rotation_angle
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.simulate import SimulationOptions, rig_truth, simulate_captures
+from lce_rig.simulate.room import LIDAR_HEIGHT_M
+from lce_rig.simulate.scene import PLATE
+from lce_rig.simulate.surfaces import rectangle
 
 
 def edit_profile(session: Path, **changes) -> None:
@@ -105,11 +108,21 @@ def test_a_session_whose_captures_are_all_damaged_names_the_damage(lce_rig, sess
     assert "000000" in outcome.err
 
 
+def furnish_with_a_plate(low, high, _rng):
+    """Put a blank plate of the board's size into the room alone, at the rig's side and facing it."""
+    board, centre = load_rig("rles").board.to_board(), np.array([1.1, 1.8, LIDAR_HEIGHT_M])
+    facing, up = np.append(-centre[:2], 0.0) / np.linalg.norm(centre[:2]), np.array([0.0, 0.0, 1.0])
+    diamond = exp_so3(np.array([0.0, 0.0, np.pi / 4]))
+    T = pose(np.stack([np.cross(up, facing), up, facing], axis=1) @ diamond, centre)
+    plate = rectangle(board.width_m, board.height_m).moved(T)
+    return low, high, [("plate", plate, PLATE, T)], [(centre - 0.7, centre + 0.7)]
+
+
 @pytest.mark.long
 def test_a_plate_of_the_boards_size_that_stands_in_the_room_is_not_taken_for_the_board(tmp_path):
     """The decoy is in every scan; only the board moves with what the camera sees."""
     session, rig = tmp_path / "session", load_rig("rles")
-    options = replace(SimulationOptions.for_rig("rles"), has_decoy_plate=True)
+    options = replace(SimulationOptions.for_rig("rles"), furnish=furnish_with_a_plate)
     with Session.create(session, rig) as writer:
         for capture in simulate_captures(rig, n_captures=10, seed=5, options=options):
             writer.add_capture(capture.images, capture.scans, {})

@@ -1,7 +1,5 @@
 """Anti-aliased marks, colour scales and text on BGR images; sizes follow the image's width."""
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -162,24 +160,17 @@ def draw_scale(
     picture: Picture, box: tuple[int, int, int, int], low: float, high: float, unit: str, text_px: float
 ) -> None:
     """Draw a horizontal turbo scale into box (u, v, width, height) with ticks at round values below it."""
+    from matplotlib.ticker import MaxNLocator
+
     u, v, width, height = box
     ramp = turbo(np.linspace(low, high, width), low, high)
     picture[v : v + height, u : u + width] = ramp[None]
     cv2.rectangle(picture, (u - 1, v - 1), (u + width, v + height), FAINT, 1)
-    for tick in round_ticks(low, high, max(2, int(width / (6 * text_px)))):
+    ticks = MaxNLocator(max(2, int(width / (6 * text_px))), steps=[1, 2, 5, 10]).tick_values(low, high)
+    for tick in ticks[(ticks >= low - 1e-9) & (ticks <= high + 1e-9)].tolist():
         at = u + (tick - low) / (high - low) * (width - 1)
         draw_line(picture, np.array([[at, v + height], [at, v + height + 5]]), INK, 1, None)
         draw_text(picture, f"{tick:g} {unit}", at, v + height + 9 + 1.2 * text_px, text_px, INK, align=0.5)
-
-
-def round_ticks(low: float, high: float, n: int) -> Sequence[float]:
-    """Choose about n round values from low to high."""
-    raw = (high - low) / max(n, 1)
-    power = 10.0 ** np.floor(np.log10(max(raw, 1e-9)))
-    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw)
-    first = int(np.ceil(low / step - 1e-9))
-    last = int(np.floor(high / step + 1e-9))
-    return [float(index * step) for index in range(first, last + 1)]
 
 
 def _fixed(pixels: Array) -> list[list[int]]:

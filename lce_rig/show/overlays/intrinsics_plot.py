@@ -6,16 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.core.geometry import Array
 from lce_rig.lens.difference import LensCertainty
 from lce_rig.lens.lens_estimate import IntrinsicsEstimate
 from lce_rig.show.overlays.canvas import Picture
+from lce_rig.show.report.calibration_drawings import MIN_IN_CELL, add_mean_arrows
 
 _INK, _GREY, _FAINT, _SHADE = "#22262b", "#5b636b", "#9aa3ad", "#e9ecef"
-_BLUE, _ORANGE = "#1f6fb4", "#d9730d"
+_ORANGE = "#d9730d"
 # The standard deviation map covers 0.01 to 10 px; beyond, the intrinsics are unusable.
 _CERTAIN_PX, _UNKNOWN_PX = 0.01, 10.0
-_CELLS, _MIN_IN_CELL = 16, 4
 _DPI = 110
 
 
@@ -67,64 +66,30 @@ def draw_intrinsics(
 def _frame(axis: Any, estimate: IntrinsicsEstimate, title: str, note: str) -> None:
     """Lay out an axis as the image: pixels, v down."""
     lens = estimate.intrinsics
-    axis.set_xlim(-0.5, lens.width_px - 0.5)
-    axis.set_ylim(lens.height_px - 0.5, -0.5)
-    axis.set_aspect("equal")
+    axis.set(xlim=(-0.5, lens.width_px - 0.5), ylim=(lens.height_px - 0.5, -0.5), aspect="equal")
     axis.set_xlabel("u, px", color=_INK)
     axis.set_ylabel("v, px", color=_INK)
-    _style(axis, title, note)
-
-
-def _style(axis: Any, title: str, note: str) -> None:
-    axis.annotate(
-        title, (0, 1), (0, 21), xycoords="axes fraction", textcoords="offset points", fontsize=12, color=_INK
-    )
-    axis.annotate(
-        note, (0, 1), (0, 7), xycoords="axes fraction", textcoords="offset points", fontsize=9.5, color=_GREY
-    )
+    for text, up_pt, size_pt, colour in ((title, 21, 12, _INK), (note, 7, 9.5, _GREY)):
+        axis.annotate(
+            text,
+            (0, 1),
+            (0, up_pt),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            fontsize=size_pt,
+            color=colour,
+        )
     axis.tick_params(colors=_INK, labelsize=9)
     for spine in axis.spines.values():
         spine.set_color(_FAINT)
 
 
 def _draw_residuals(axis: Any, estimate: IntrinsicsEstimate) -> None:
-    note = f"mean of each cell with at least {_MIN_IN_CELL} corners; nothing was seen in the blank area"
+    note = f"mean of each cell with at least {MIN_IN_CELL} corners; nothing was seen in the blank area"
     _frame(axis, estimate, "Residuals over the image", note)
     corners, residuals = estimate.corners_px, estimate.residuals_px
     axis.plot(*corners.T, ".", color=_FAINT, markersize=1.6, alpha=0.7, zorder=1)
-    cell_px = estimate.intrinsics.width_px / _CELLS
-    cells, index, counts = np.unique(
-        np.floor(corners / cell_px), axis=0, return_inverse=True, return_counts=True
-    )
-    sums = np.zeros((len(cells), 4))
-    np.add.at(sums, index.ravel(), np.concatenate([corners, residuals], axis=1))
-    means = (sums / counts[:, None])[counts >= _MIN_IN_CELL]
-    if len(means):
-        _arrows(axis, means[:, :2], means[:, 2:], cell_px)
-
-
-def _arrows(axis: Any, at: Array, vectors_px: Array, reach_px: float) -> None:
-    """Draw arrows scaled so that a typical one fills its cell, with a key of a round length."""
-    lengths = np.linalg.norm(vectors_px, axis=1)
-    usual = max(float(np.percentile(lengths, 90)), 1e-6)
-    magnification = reach_px / usual
-    shown = vectors_px * np.minimum(1.0, 2.0 * usual / np.maximum(lengths, 1e-12))[:, None] * magnification
-    arrows = axis.quiver(
-        *at.T, *shown.T, color=_BLUE, angles="xy", scale_units="xy", scale=1.0, width=0.0026, zorder=3
-    )
-    # The key is 1, 2 or 5 times a power of ten, not above the usual length.
-    power = 10.0 ** np.floor(np.log10(usual))
-    key_px = float(max(step for step in (1.0, 2.0, 5.0) if step * power <= usual * (1 + 1e-9)) * power)
-    axis.quiverkey(
-        arrows,
-        1.0 - 1.2 / _CELLS,
-        1.105,
-        key_px * magnification,
-        f"{key_px:g} px  ",
-        labelpos="W",
-        labelcolor=_INK,
-        fontproperties={"size": 9},
-    )
+    add_mean_arrows(axis, corners, residuals, estimate.intrinsics)
 
 
 def _draw_certainty(figure: Any, axis: Any, estimate: IntrinsicsEstimate, certainty: LensCertainty) -> None:

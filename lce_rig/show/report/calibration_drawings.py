@@ -77,8 +77,8 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
 
 
 _LINE = 0.8
-# Cells along the width of the image, points or corners that one needs, names along an axis.
-_CELLS, _MIN_IN_CELL, _MOST_LABELS = 14, 5, 10
+# Cells along the width of the image, corners that one needs, names along an axis.
+_CELLS, MIN_IN_CELL, _MOST_LABELS = 14, 5, 10
 _DISTANCES_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0)
 # Causes of less than this, in percent, are in the table only.
 _LEAST_SHARE = 0.5
@@ -114,27 +114,11 @@ def draw_from_above(
     calibration: Calibration, evidence: Evidence, board: Board, lens: Intrinsics, links: Mapping[str, str]
 ) -> Markup:
     """Draw the plates about the LiDAR as seen from above, with the camera's field of view."""
-    from matplotlib.patches import Circle
-
     # Left is +y of the LiDAR, up is +x.
     plates = [transform(o.lidar.T_lidar_board, board.outline())[:, 1::-1] for o in evidence.observations]
     shown = np.concatenate([*plates, np.zeros((1, 2))])
     far_m = float(np.linalg.norm(shown, axis=1).max())
-    low, high = shown.min(axis=0) - 0.1 * far_m, shown.max(axis=0) + 0.1 * far_m
-    wide_m, high_m = high - low
-    missing_m = max(0.5 * wide_m - high_m, 0.0) / 2, max(high_m - wide_m, 0.0) / 2
-    low, high = low - missing_m[::-1], high + missing_m[::-1]
-    wide_m, high_m = high - low
-    figure, (axes,) = new_axes(WIDTH_IN * high_m / wide_m, left_in=0, right_in=0, bottom_in=0, top_in=0)
-    # The direction with most room shows the circles' radii.
-    signs = np.concatenate([-np.eye(2), np.eye(2)])
-    radial = signs[int(np.argmax([-low[0], -low[1], high[0], high[1]]))]
-    step_m = next(step for step in (0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 1e6) if far_m / step <= 6)
-    for radius_m in np.arange(step_m, 1.5 * far_m, step_m):
-        axes.add_patch(Circle((0, 0), radius_m, fill=False, edgecolor=FAINT, linewidth=0.6))
-        axes.text(
-            *(radius_m * radial), f"{radius_m:g} m", color=QUIET, ha="center", va="center", clip_on=True
-        )
+    figure, (axes,) = new_axes(WIDTH_IN)
     # The rays through the middles of the image's left and right borders.
     T_lidar_cam, middle = invert(calibration.T_cam_lidar), (lens.height_px - 1) / 2
     rays = lens.unproject(np.array([[0.0, middle], [lens.width_px - 1.0, middle]]))
@@ -145,9 +129,12 @@ def draw_from_above(
     axes.plot(start[1], start[0], "s", color=ORANGE, markersize=3)
     _add_shapes(axes, plates, [links[o.capture] for o in evidence.observations], 0.5)
     axes.plot(0, 0, "o", color=INK, markersize=4)
-    axes.set_xlim(high[0], low[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_axis_off()
+    low, high = shown.min(axis=0) - 0.1 * far_m, shown.max(axis=0) + 0.1 * far_m
+    axes.set(xlim=(high[0], low[0]), ylim=(low[1], high[1]))
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("left of the LiDAR, m")
+    axes.set_title("ahead, m")
+    axes.grid()
     return drawing(figure, "Boards around the LiDAR, from above")
 
 
@@ -224,33 +211,31 @@ def _zero(axes: Any) -> None:
 
 def draw_corners(evidence: Evidence, lens: Intrinsics) -> Markup:
     """Draw the mean residual of the corners in each cell of the image as an arrow."""
-    cells, means = _cell_means(
-        evidence.corners_px, np.hstack([evidence.corners_px, evidence.corner_residuals_px]), lens
-    )
     figure, axes = _image_axes(lens)
-    axes.plot(
-        *evidence.corners_px[:: max(1, len(evidence.corners_px) // 1500)].T, ".", color=FAINT, markersize=1
-    )
-    if len(cells):
-        usual_px = max(float(np.percentile(np.linalg.norm(means[:, 2:], axis=1), 90)), 1e-3)
-        scale = usual_px / (lens.width_px / _CELLS)
-        arrows = axes.quiver(
-            *means.T, color=BLUE, angles="xy", scale_units="xy", scale=scale, width=0.004, zorder=3
-        )
-        axes.quiverkey(
-            arrows, 0.92, 1.05, usual_px, f"{significant(usual_px)} px ", labelpos="W", labelcolor=INK
-        )
+    every = max(1, len(evidence.corners_px) // 1500)
+    axes.plot(*evidence.corners_px[::every].T, ".", color=FAINT, markersize=1)
+    add_mean_arrows(axes, evidence.corners_px, evidence.corner_residuals_px, lens)
     return drawing(figure, "Residuals of the corners in the image")
 
 
-def _cell_means(pixels: Array, values: Array, lens: Intrinsics) -> tuple[Array, Array]:
-    """Average values (N, K) over square cells of the image: cells (M, 2) by column and row, means (M, K)."""
-    at = np.floor((pixels + 0.5) * _CELLS / lens.width_px)
-    cells, index, counts = np.unique(at, axis=0, return_inverse=True, return_counts=True)
-    sums = np.zeros((len(cells), values.shape[1]))
-    np.add.at(sums, index.ravel(), values)
-    is_full = counts >= _MIN_IN_CELL
-    return cells[is_full], (sums / counts[:, None])[is_full]
+def add_mean_arrows(axes: Any, corners_px: Array, residuals_px: Array, lens: Intrinsics) -> None:
+    """Draw the mean residual of (N, 2) in each cell of the image; a typical arrow fills its cell."""
+    cell_px = lens.width_px / _CELLS
+    cells, index, counts = np.unique(
+        np.floor((corners_px + 0.5) / cell_px), axis=0, return_inverse=True, return_counts=True
+    )
+    sums = np.zeros((len(cells), 4))
+    np.add.at(sums, index.ravel(), np.hstack([corners_px, residuals_px]))
+    means = (sums / counts[:, None])[counts >= MIN_IN_CELL]
+    if not len(means):
+        return
+    usual_px = max(float(np.percentile(np.linalg.norm(means[:, 2:], axis=1), 90)), 1e-3)
+    scale = usual_px / cell_px
+    arrows = axes.quiver(
+        *means.T, color=BLUE, angles="xy", scale_units="xy", scale=scale, width=0.004, zorder=3
+    )
+    label = f"{significant(usual_px)} px "
+    axes.quiverkey(arrows, 0.92, 1.05, usual_px, label, labelpos="W", labelcolor=INK)
 
 
 def principal_axes(cov: Array) -> tuple[Array, Array]:

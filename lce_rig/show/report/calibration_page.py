@@ -101,8 +101,6 @@ def _pair(rig: Rig, c: Calibration, anchor: str) -> dict[str, Any]:
         figures = [
             ("planes", 1000 * residual.plane_mean_m, "mm"),
             ("edges", 1000 * residual.edge_mean_m, "mm"),
-        ]
-        figures += [
             ("held out", 1000 * residual.held_out_m, "mm"),
             ("corners", residual.reprojection_px, "px"),
         ]
@@ -342,10 +340,7 @@ def _camera_rows(c: Calibration) -> list[Row]:
     return rows
 
 
-MOST_BYTES = 12_000
-"""Of one picture's data URI."""
-_WIDTH_PX, _OUTLINE_BGR = 320, (0, 140, 255)
-_QUALITIES = (75, 60, 45, 30, 15)
+_MOST_PX, _QUALITY, _OUTLINE_BGR = 320, 60, (0, 140, 255)
 # Events of this long make a picture in which the board's edges can be seen.
 _EVENTS_NS = 20_000_000
 
@@ -360,7 +355,7 @@ def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics)
         lens: of the camera.
 
     Returns:
-        A data URI of at most `MOST_BYTES`; "" where the capture holds no picture, or a damaged one.
+        A data URI; "" where the capture holds no picture, or a damaged one.
     """
     observation = c.observations.get(capture.name)
     outline, stamp_ns = np.empty((0, 2)), None
@@ -377,33 +372,28 @@ def picture_of(capture: Capture, c: Calibration, board: Board, lens: Intrinsics)
 
 
 def data_uri(pixels: NDArray[np.uint8], outline: Array) -> str:
-    """Shrink an image and draw an outline into it.
+    """Shrink an image to at most 320 px and draw an outline into it.
 
     Args:
         pixels: (H, W) grey or (H, W, 3) BGR.
         outline: (N, 2) px; points that are not finite are left out.
 
     Returns:
-        A JPEG of at most `MOST_BYTES` as a data URI.
+        A JPEG as a data URI.
     """
     height, width = pixels.shape[:2]
-    scale = min(1.0, _WIDTH_PX / width, _WIDTH_PX / height)
-    for shrink in (1.0, 0.7, 0.5, 0.3):
-        size = max(1, round(shrink * scale * width)), max(1, round(shrink * scale * height))
-        small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-        drawn = small if small.ndim == 3 else cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
-        line = outline[np.isfinite(outline).all(axis=1)]
-        if len(line):
-            # Pixel centres are at whole numbers, before and after; 4 bits of fraction.
-            at = (line + 0.5) * size[0] / width - 0.5
-            points = np.round(16 * np.clip(at, -1e4, 1e4)).astype(np.int32)
-            cv2.polylines(drawn, [points], True, _OUTLINE_BGR, 2, cv2.LINE_AA, 4)
-        for quality in _QUALITIES:
-            content = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-            uri = "data:image/jpeg;base64," + base64.b64encode(content).decode()
-            if len(uri) <= MOST_BYTES:
-                return uri
-    return ""
+    scale = min(1.0, _MOST_PX / width, _MOST_PX / height)
+    size = max(1, round(scale * width)), max(1, round(scale * height))
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    drawn = small if small.ndim == 3 else cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+    line = outline[np.isfinite(outline).all(axis=1)]
+    if len(line):
+        # Pixel centres are at whole numbers, before and after; 4 bits of fraction.
+        at = (line + 0.5) * size[0] / width - 0.5
+        points = np.round(16 * np.clip(at, -1e4, 1e4)).astype(np.int32)
+        cv2.polylines(drawn, [points], True, _OUTLINE_BGR, 2, cv2.LINE_AA, 4)
+    content = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    return "data:image/jpeg;base64," + base64.b64encode(content).decode()
 
 
 def _accumulated(events: Events, stamp_ns: int | None) -> NDArray[np.uint8]:
