@@ -62,6 +62,13 @@ class StagedBoard:
     trajectory: Trajectory
     carrier_rng: np.random.Generator
 
+    def T_sensor_board(self, sensor: str, t_ns: int | NDArray[np.int64]) -> Array:
+        """Compute the board's true pose (..., 4, 4) before a camera or LiDAR at times of the rig's clock.
+
+        Timestamps of images and events read `frame_offset_s` or `event_offset_s` more than that clock.
+        """
+        return np.asarray(invert(self.stage.T_world_sensor[sensor]) @ self.trajectory.at(t_ns))
+
     def scene_at(self, t_ns: int) -> Scene:
         """Build the scene at a time."""
         T_world_board, stage = self.trajectory.at(t_ns), self.stage
@@ -231,10 +238,7 @@ def _capture(board: StagedBoard, index: int, exposed_ns: int) -> SimulatedCaptur
         for camera in stage.pixels
     ]
     times_ns = dict.fromkeys(stage.T_world_sensor, stamp_ns) | dict.fromkeys(stage.framed, exposed_ns)
-    T_sensor_board = {
-        name: invert(T_world_sensor) @ board.trajectory.at(times_ns[name])
-        for name, T_world_sensor in stage.T_world_sensor.items()
-    }
+    T_sensor_board = {name: board.T_sensor_board(name, t_ns) for name, t_ns in times_ns.items()}
     view = stage.views[index % len(stage.views)]
     return SimulatedCapture(
         index,
@@ -293,49 +297,37 @@ def board_time_ns(rig: Rig, capture: SimulatedCapture, scan: Scan) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatedRecording:
+class SimulatedRecording(StagedBoard):
     """A recording with its truth; iterating yields its samples in order of their timestamps.
 
     Attributes:
-        stage: the rig's true geometry and the room.
-        trajectory: where the board is in the world at any time of the rig's clock, the LiDAR's.
         start_ns, end_ns: on the rig's clock.
     """
 
-    stage: Stage
-    trajectory: Trajectory
     start_ns: int
     end_ns: int
 
     def __iter__(self) -> Iterator[Image | Scan | Events]:
         stage = self.stage
-        board = StagedBoard(stage, self.trajectory, stage.rng(OF_SESSION, CARRIER))
         every_ns = round(1e9 * stage.options.frame_every_s)
 
         def images(camera: str) -> Iterator[Image]:
             for k, t_ns in enumerate(range(self.start_ns + every_ns // 2, self.end_ns, every_ns)):
-                yield board.take_image(camera, t_ns, (OF_SESSION, k))
+                yield self.take_image(camera, t_ns, (OF_SESSION, k))
 
         def scans(lidar: str, period_ns: int) -> Iterator[Scan]:
             for k, t_ns in enumerate(range(self.start_ns, self.end_ns - period_ns + 1, period_ns)):
-                yield board.take_scan(lidar, t_ns, (OF_SESSION, k))
+                yield self.take_scan(lidar, t_ns, (OF_SESSION, k))
 
         streams: list[Iterator[Image | Scan | Events]] = [
             *map(images, stage.framed),
             *(scans(lidar, model.period_ns) for lidar, model in stage.models.items()),
             *(
-                filter(len, board.take_events(camera, self.start_ns, self.end_ns, _PACKET_NS, (OF_SESSION,)))
+                filter(len, self.take_events(camera, self.start_ns, self.end_ns, _PACKET_NS, (OF_SESSION,)))
                 for camera in stage.pixels
             ),
         ]
         return merge(*streams, key=stamp_of)
-
-    def T_sensor_board(self, sensor: str, t_ns: int | NDArray[np.int64]) -> Array:
-        """Compute the board's true pose (..., 4, 4) before a camera or LiDAR at times of the rig's clock.
-
-        Timestamps of images and events read `frame_offset_s` or `event_offset_s` more than that clock.
-        """
-        return np.asarray(invert(self.stage.T_world_sensor[sensor]) @ self.trajectory.at(t_ns))
 
 
 def stamp_of(sample: Image | Scan | Events) -> int:
@@ -368,7 +360,8 @@ def simulate_recording(
         placements.append(stage.place(len(placements), stage.rng(len(placements), PLACEMENT)))
         trajectory = carry_board(placements, _START_NS, options.hand, stage.rng(OF_SESSION, HAND))
         if trajectory.departure_ns[-1] >= end_ns:
-            return SimulatedRecording(stage, trajectory, _START_NS, end_ns)
+            carrier_rng = stage.rng(OF_SESSION, CARRIER)
+            return SimulatedRecording(stage, trajectory, carrier_rng, _START_NS, end_ns)
 
 
 def recording_truth(recording: SimulatedRecording) -> dict[str, Any]:

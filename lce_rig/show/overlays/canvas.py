@@ -166,7 +166,8 @@ def draw_scale(
     ramp = turbo(np.linspace(low, high, width), low, high)
     picture[v : v + height, u : u + width] = ramp[None]
     cv2.rectangle(picture, (u - 1, v - 1), (u + width, v + height), FAINT, 1)
-    ticks = MaxNLocator(max(2, int(width / (6 * text_px))), steps=[1, 2, 5, 10]).tick_values(low, high)
+    locator = MaxNLocator(max(2, int(width / (6 * text_px))), steps=[1, 2, 5, 10])
+    ticks = np.asarray(locator.tick_values(low, high))
     for tick in ticks[(ticks >= low - 1e-9) & (ticks <= high + 1e-9)].tolist():
         at = u + (tick - low) / (high - low) * (width - 1)
         draw_line(picture, np.array([[at, v + height], [at, v + height + 5]]), INK, 1, None)

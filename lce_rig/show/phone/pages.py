@@ -10,8 +10,9 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from importlib import resources
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +20,8 @@ from aiohttp import WSMsgType, web
 from aiohttp.typedefs import Handler
 from numpy.typing import NDArray
 
-from lce_rig.collect.live.state import LiveState, TakeBack
+from lce_rig.collect.guidance.planner import Coverage
+from lce_rig.collect.live.state import Cue, LiveState, StreamState, TakeBack
 from lce_rig.core.geometry import Array
 
 Pixels = NDArray[np.uint8]
@@ -39,10 +41,11 @@ def to_json(state: LiveState, update: int, *, has_picture: bool) -> str:
         update: a number that the page answers with once it has shown the state.
         has_picture: whether a JPEG of the drawing follows.
     """
-    drawing = None
+    document = {field.name: getattr(state, field.name) for field in fields(state)}
+    document |= {"update": update, "log": state.log[-_MAX_LOG:]}
     if state.drawing is not None:
         height, width = state.drawing.pixels.shape[:2]
-        drawing = {
+        document["drawing"] = {
             "camera": state.drawing.camera,
             "width_px": width,
             "height_px": height,
@@ -51,31 +54,20 @@ def to_json(state: LiveState, update: int, *, has_picture: bool) -> str:
             "is_there": bool(state.drawing.is_there),
             "has_picture": has_picture,
         }
-    document = {
-        "update": update,
-        "rig": state.rig,
-        "session": state.session,
-        "elapsed_s": _number(state.elapsed_s),
-        "phase": state.phase,
-        "headline": state.headline,
-        "detail": state.detail,
-        "hold_s": None if state.hold_s is None else _number(state.hold_s),
-        "n_captures": int(state.n_captures),
-        "n_wanted": state.n_wanted,
-        "last_capture": state.last_capture,
-        "goes_on": state.goes_on,
-        "streams": [stream._asdict() | {"rate_hz": _number(stream.rate_hz)} for stream in state.streams],
-        "drawing": drawing,
-        "coverage": None if state.coverage is None else asdict(state.coverage),
-        "sigma_deg": _number(state.sigma_deg),
-        "sigma_mm": _number(state.sigma_mm),
-        "target_deg": _number(state.target_deg),
-        "target_mm": _number(state.target_mm),
-        "cues": [cue._asdict() for cue in state.cues],
-        "log": list(state.log[-_MAX_LOG:]),
-        "notes": list(state.notes),
-    }
-    return json.dumps(document, allow_nan=False)
+    return json.dumps(_plain(document), allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    """Turn records into what JSON knows."""
+    if isinstance(value, Coverage):
+        value = asdict(value)
+    elif isinstance(value, (StreamState, Cue)):
+        value = value._asdict()
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def beat(age_s: float | None) -> str:
@@ -131,10 +123,6 @@ def _outline(points_px: Array | None) -> list[list[float] | None] | None:
     is_seen = np.asarray(np.isfinite(points_px).all(axis=1))
     rounded = np.round(np.where(is_seen[:, None], points_px, 0.0), 1).tolist()
     return [point if is_point else None for point, is_point in zip(rounded, is_seen, strict=True)]
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 # A person who taps faster than the collection listens wants one thing.
