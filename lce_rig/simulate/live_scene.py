@@ -11,8 +11,8 @@ from lce_rig.rig import Rig
 from lce_rig.simulate.image_rendering import develop, focus, glance, render_radiance, shot_noise_e
 from lce_rig.simulate.lidar import Sweep, sweep_again, sweep_scene
 from lce_rig.simulate.options import SimulationOptions
-from lce_rig.simulate.placements import between
-from lce_rig.simulate.room import build_carrier
+from lce_rig.simulate.placements import between, hold_board
+from lce_rig.simulate.sampling import StagedBoard
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.stage import CARRIER, OF_SESSION, set_stage
 
@@ -132,9 +132,6 @@ class LiveScene:
 
     def _render(self) -> Scene:
         if self._scene is None:
-            stage, options = self.stage, self.stage.options
-            rng = stage.rng(OF_SESSION, CARRIER)
-            carrier = build_carrier(options.carrier, stage.board, self.T_world_board, rng)
-            raycaster, reflectivity = stage.room.raycaster, options.print_reflectivity
-            self._scene = Scene(raycaster, carrier, stage.board, self.T_world_board, reflectivity)
+            rng = self.stage.rng(OF_SESSION, CARRIER)
+            self._scene = StagedBoard(self.stage, hold_board(self.T_world_board), rng).scene_at(0)
         return self._scene

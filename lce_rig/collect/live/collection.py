@@ -13,11 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lce_rig.collect.board_search import BoardSearch
-from lce_rig.collect.board_tracker import (
-    BoardDetection,
-    CaptureMoment,
-    ImageKey,
-)
+from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment, ImageKey
 from lce_rig.collect.live.capture_writer import CaptureWriter, Learning, record_streams
 from lce_rig.collect.live.frame_feed import FrameFeed
 from lce_rig.collect.live.guide import (
@@ -132,6 +128,7 @@ class _Loop:
         self._guides, self._search, self._learning = guides, search, keeper.learning
         self._began_s = time.monotonic()
         self._gate: StillBoards | SlowBoards | None = None
+        self._taken = Placements(_NOVEL_M, _NOVEL_DEG)
         self._n_before = len(self._session.captures)
         self._number = int(self._session.next_name)
         self._asked: list[_Asked] = []
@@ -160,7 +157,7 @@ class _Loop:
                 self.report.ending = ending
                 lost = {name: error for name, (error, _) in self._sensors.lost().items()}
                 self.report.notes += [f"{name} is lost: {e.what}. {e.hint}" for name, e in lost.items()]
-                self.report.is_enough = all(guide.is_usable for guide in self._guides)
+                self.report.is_enough = all(guide.has_enough for guide in self._guides)
                 for name, status in self._sensors.statuses().items():
                     self.report.n_lost[name] = status.n_lost + status.n_dropped
                 return
@@ -207,10 +204,10 @@ class _Loop:
         self._monitor.see(detection)
         gate = self._find_gate()
         moments = gate.take(detection)
-        guide = self._active_guide(detection)
+        guide, poses = self._active_guide(detection), detection.poses
         for planned in self._guides:
-            planned.plan(planned.locate(detection), _time_s(detection), is_asked=planned is guide)
-        present = guide.locate(detection)
+            planned.plan(poses.get(planned.key), _time_s(detection), is_asked=planned is guide)
+        present = poses.get(guide.key)
         if present is not None and guide.sees(detection):
             narration = gate.narrate(guide, present)
         else:
@@ -254,11 +251,15 @@ class _Loop:
         statuses = self._sensors.statuses()
         serials = {name: status.serial for name, status in statuses.items() if status.serial}
         meta |= {SERIALS: serials} if serials else {}
-        self._keeper.keep(moment, gate.events_of(moment), meta)
+        # A board that stands still makes too few events.
+        self._keeper.keep(moment, frame.events if isinstance(gate, SlowBoards) else (), meta)
         name = f"{self._number:06d}"
         self._number += 1
         self._asked.append(_Asked(name, frame.time_ns, detection.poses))
-        gate.note_capture(detection)
+        if isinstance(gate, SlowBoards):
+            self._taken.add(str(frame.time_ns), detection.poses)
+        else:
+            gate.is_decided = True
         self._captured_s = time.monotonic()
         for guide in self._guides:
             if guide.sees(detection):
@@ -282,7 +283,7 @@ class _Loop:
             self.report.captured = [name for name in self.report.captured if name != last]
             for planned in self._guides:
                 planned.remove(last)
-            self._find_gate().forget_capture(taken.time_ns)
+            self._taken.remove(str(taken.time_ns))
             return
         guide = None if self._last is None else self._active_guide(self._last)
         if key == "next" and guide is not None:
@@ -373,7 +374,7 @@ class _Loop:
         may_move = has_events and not self._clock.verdict().requires_still_boards
         if self._gate is None or may_move != isinstance(self._gate, SlowBoards):
             self._gate = (
-                SlowBoards(self._rig, Placements(_NOVEL_M, _NOVEL_DEG))
+                SlowBoards(self._rig, self._taken)
                 if may_move
                 else StillBoards(self._rig, self._options.hold_s)
             )

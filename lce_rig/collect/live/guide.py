@@ -24,7 +24,6 @@ from lce_rig.core.geometry import Array
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
-from lce_rig.timing.scan_pairing import EventCut
 
 #: Another placement is proposed after a board was wanted at one for so long.
 GIVE_UP_S = 30.0
@@ -83,9 +82,14 @@ class Guide:
         return self.guidance is not None and self.guidance.is_enough
 
     @property
-    def is_usable(self) -> bool:
+    def has_enough(self) -> bool:
         """Whether the captures are enough as far as is known: by their number where nothing is predicted."""
         return self.n_held >= self._min_captures if self._planner is None else self.is_enough
+
+    @property
+    def why_none(self) -> str:
+        """Say why there is no guidance; "" while there is."""
+        return self.problem.sentence if self.problem else ""
 
     @property
     def is_exhausted(self) -> bool:
@@ -100,11 +104,6 @@ class Guide:
     def sees(self, detection: BoardDetection) -> bool:
         """Check whether both of its sensors see the board in a detection as the profile's limits want it."""
         return self.key in detection.images.keys() - detection.unfit.keys() and self.lidar in detection.lidars
-
-    def locate(self, detection: BoardDetection) -> Array | None:
-        """Give T_cam_board (4, 4) as its camera sees it; None where it does not."""
-        board = detection.images.get(self.key)
-        return None if board is None else board.T_cam_board
 
     def add(self, name: str, T_cam_board: Array) -> None:
         """Take a capture into account; the next placement is chosen by `plan`."""
@@ -319,11 +318,6 @@ def narrate_refused(guide: Guide, present: Array, refusal: Refusal) -> Narration
     return Narration("refused", _next(guide, present, refusal.advice), f"not here: {refusal.text}")
 
 
-def _problem(guide: Guide) -> str:
-    """Say why there is no guidance; "" while there is."""
-    return guide.problem.sentence if guide.problem else ""
-
-
 def _next(guide: Guide, present: Array, otherwise: str) -> str:
     """Say how to go on to the wanted placement; something else where the board is there, or none is known."""
     if guide.wanted is None:
@@ -337,7 +331,11 @@ LIVE_PATIENCE_S = 0.7
 
 
 class StillBoards:
-    """Captures boards that stand still for `hold_s`."""
+    """Captures boards that stand still for `hold_s`.
+
+    Attributes:
+        is_decided: whether the board was captured, or is not to be, before it has moved.
+    """
 
     def __init__(self, rig: Rig, hold_s: float) -> None:
         self._hold_s = hold_s
@@ -345,18 +343,18 @@ class StillBoards:
         # The first window of stillness has passed when the hold begins.
         window_s = stillness_window_s(rig)
         self._gate = StillnessGate(rig.board.to_board(), self._max_motion_m, hold_s, window_s=window_s)
-        self._is_judged = self._is_decided = False
+        self._is_judged = self.is_decided = False
         self._refusal: Refusal | None = None
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
         """Take the next detection; a board that is moved on before its time is not captured."""
         moments = self._gate.take(detection)
         if self._gate.motion_m > self._max_motion_m:
-            self._is_judged = self._is_decided = False
+            self._is_judged = self.is_decided = False
             return []
-        if not moments or self._is_decided:
+        if not moments or self.is_decided:
             return []
-        self._is_decided = True
+        self.is_decided = True
         return moments
 
     def narrate(self, guide: Guide, present: Array) -> Narration:
@@ -367,30 +365,18 @@ class StillBoards:
             self._is_judged, self._refusal = True, guide.adds_nothing(present)
             if self._refusal is not None:
                 guide.note_refusal(present)
-        if held_s is None or self._is_decided:
-            return Narration("moving", _next(guide, present, _HOLD), _problem(guide))
+        if held_s is None or self.is_decided:
+            return Narration("moving", _next(guide, present, _HOLD), guide.why_none)
         if self._refusal is not None:
             return narrate_refused(guide, present, self._refusal)
         return Narration("holding", _HOLD, "", max(self._hold_s - held_s, 0.0))
 
-    def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
-        """Give none: a board that stands still makes too few events."""
-        return ()
-
-    def note_capture(self, detection: BoardDetection) -> None:
-        """Capture a board that was captured no more before it has moved."""
-        self._is_decided = True
-
-    def forget_capture(self, time_ns: int) -> None:
-        """Do nothing: a key captures it again, and by itself it is captured after it has moved only."""
-
 
 class SlowBoards:
-    """Captures boards that move slowly before a camera of events."""
+    """Captures boards that move slowly before a camera of events, where none is `taken` yet."""
 
-    def __init__(self, rig: Rig, novelty: Placements) -> None:
-        self._novelty = novelty
-        self._gate = MotionGate(rig, novelty, Losses(), LIVE_PATIENCE_S)
+    def __init__(self, rig: Rig, taken: Placements) -> None:
+        self._gate = MotionGate(rig, taken, Losses(), LIVE_PATIENCE_S)
 
     def take(self, detection: BoardDetection) -> list[CaptureMoment]:
         """Take the next detection."""
@@ -403,16 +389,4 @@ class SlowBoards:
             return Narration("moving", headline, judged.sentence)
         if isinstance(judged, CaptureMoment) and guide.is_there(present):
             return Narration("holding", "good: go on slowly", f"{judged.figures['speed_mps']:.2f} m/s")
-        return Narration("moving", headline, _problem(guide))
-
-    def events_of(self, moment: CaptureMoment) -> tuple[EventCut, ...]:
-        """Give all of them."""
-        return moment.detection.frame.events
-
-    def note_capture(self, detection: BoardDetection) -> None:
-        """Count the place of a capture as taken; what the gate itself has chosen is taken already."""
-        self._novelty.add(str(detection.frame.time_ns), detection.poses)
-
-    def forget_capture(self, time_ns: int) -> None:
-        """Let the place of a capture be new again."""
-        self._novelty.remove(str(time_ns))
+        return Narration("moving", headline, guide.why_none)

@@ -233,5 +233,5 @@ class Monitor:
                 named.setdefault(problem.sentence, []).append(name)
         notes += [f"{', '.join(names)}: {sentence}" for sentence, names in named.items()]
         if self._guide is not None and self._guide.problem:
-            notes.append(self._guide.problem.sentence)
+            notes.append(self._guide.why_none)
         return tuple(notes)

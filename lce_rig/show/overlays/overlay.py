@@ -86,7 +86,7 @@ def draw_event_key(
         left_px += canvas.text_width_px(text, text_px) + text_px
 
 
-MARKS = (
+_MARKS = (
     ("board, LiDAR points", "point"),
     ("board, ring ends", "end"),
     ("board outline", "line"),
@@ -152,7 +152,7 @@ def draw_overlay(
     strip = canvas.panel(width_px, _title_px(width_px))
     text_px = 13 * unit
     canvas.draw_text(strip, title, text_px, 1.8 * text_px, text_px, INK)
-    parts = [strip, picture, _legend(width_px, limits_m, residuals, has_lidar, has_image)]
+    parts = [strip, picture, draw_legend(width_px, limits_m, residuals, has_lidar, has_image)]
     if warning:
         text_px, left = 11 * unit, 16 * unit
         lines = canvas.wrapped(warning, width_px - 2 * left, text_px)
@@ -257,14 +257,14 @@ def _draw_scan(
     canvas.draw_discs(picture, pixels[order], canvas.turbo(ranges_m[order], *limits_m), radius_px)
 
 
-def _legend(
+def draw_legend(
     width_px: int,
     limits_m: tuple[float, float],
     residuals: Mapping[str, float | str],
-    has_lidar: bool,
-    has_image: bool,
+    has_lidar: bool = True,
+    has_image: bool = True,
 ) -> Picture:
-    """Explain marks and colours and list the residuals, in columns below the image."""
+    """Explain marks and colours and list figures, in columns."""
     unit = width_px / 1000
     text_px = 11 * unit
     line_px = 2.1 * text_px
@@ -277,9 +277,18 @@ def _legend(
     legend = canvas.panel(width_px, round((n_lines + 0.9) * line_px))
     rows = [(0.95 + row) * line_px for row in range(n_lines)]
 
-    marks = (MARKS[:2] if has_lidar else ()) + (MARKS[2:] if has_image else ())
+    marks = (_MARKS[:2] if has_lidar else ()) + (_MARKS[2:] if has_image else ())
     for (name, kind), baseline in zip(marks, rows, strict=False):
-        draw_mark(legend, kind, 24 * unit, baseline - 0.45 * text_px, unit)
+        at = np.array([[24 * unit, baseline - 0.45 * text_px]])
+        if kind == "point":
+            canvas.draw_discs(legend, at, MAGENTA, 4 * unit, WHITE)
+        elif kind == "end":
+            canvas.draw_diamonds(legend, at, ORANGE, 6 * unit)
+        elif kind == "corner":
+            canvas.draw_discs(legend, at, WHITE, 3 * unit, BLACK)
+        else:
+            line = at + [[-12 * unit, 0], [12 * unit, 0]]
+            canvas.draw_line(legend, line, WHITE, max(1, round(2 * unit)))
         canvas.draw_text(legend, name, 48 * unit, baseline, text_px)
     canvas.draw_text(legend, "range from the LiDAR", 300 * unit, rows[0], text_px)
     scale = (round(300 * unit), round(rows[0] + 0.7 * text_px), round(270 * unit), round(1.3 * text_px))
@@ -292,16 +301,3 @@ def _legend(
         legend, np.array([[605, 8], [605, 1e3 * legend.shape[0] / width_px - 8]]) * unit, FAINT, 1, None
     )
     return legend
-
-
-def draw_mark(legend: Picture, kind: str, u: float, v: float, unit: float) -> None:
-    """Draw one of `MARKS` at (u, v) px of a legend, `unit` times as large as in one of 1000 px."""
-    at = np.array([[u, v]])
-    if kind == "point":
-        canvas.draw_discs(legend, at, MAGENTA, 4 * unit, WHITE)
-    elif kind == "end":
-        canvas.draw_diamonds(legend, at, ORANGE, 6 * unit)
-    elif kind == "corner":
-        canvas.draw_discs(legend, at, WHITE, 3 * unit, BLACK)
-    else:
-        canvas.draw_line(legend, at + [[-12 * unit, 0], [12 * unit, 0]], WHITE, max(1, round(2 * unit)))

@@ -26,10 +26,9 @@ from lce_rig.session.durable import write_atomically
 from lce_rig.show.overlays import canvas
 from lce_rig.show.overlays.canvas import FAINT, GREEN, INK, ORANGE, RED, Picture
 from lce_rig.show.overlays.overlay import (
-    MARKS,
     ImageWithEvents,
     camera_part,
-    draw_mark,
+    draw_legend,
     draw_overlay,
     range_limits,
 )
@@ -125,7 +124,7 @@ def _head(head: SheetHead, width_px: int, page: tuple[int, int]) -> Picture:
     number, n_pages = page
     stated = head.lines if number == 1 else head.lines[:1]
     lines = [part for line in stated for part in canvas.wrapped(line, right - left, _TEXT_PX)]
-    strip = canvas.panel(width_px, 44 + (len(lines) + 3) * _LINE_PX + 2 * _GAP_PX)
+    strip = canvas.panel(width_px, 44 + len(lines) * _LINE_PX + 2 * _GAP_PX)
     canvas.draw_text(strip, head.title, left, 32, 16, INK)
     pages = f"sheet {number} of {n_pages}" if n_pages > 1 else ""
     canvas.draw_text(strip, pages, right, 32, _TEXT_PX, FAINT, align=1)
@@ -135,18 +134,8 @@ def _head(head: SheetHead, width_px: int, page: tuple[int, int]) -> Picture:
     for line in lines:
         canvas.draw_text(strip, line, left, baseline, _TEXT_PX, INK)
         baseline += _LINE_PX
-    baseline += 0.5 * _GAP_PX
-    for k, (name, kind) in enumerate(MARKS):
-        u = left + 12 + 230 * k
-        draw_mark(strip, kind, u, baseline - 0.45 * _TEXT_PX, 1.0)
-        canvas.draw_text(strip, name, u + 22, baseline, _TEXT_PX, INK)
-    baseline += 1.3 * _LINE_PX
-    canvas.draw_text(strip, "range from the LiDAR", left, baseline, _TEXT_PX, INK)
-    u = round(left + canvas.text_width_px("range from the LiDAR", _TEXT_PX)) + 20
-    canvas.draw_scale(strip, (u, round(baseline) - 13, 360, 14), *head.limits_m, "m", _TEXT_PX)
-    cv2.rectangle(strip, (u + 420, round(baseline) - 12), (u + 440, round(baseline) + 1), ORANGE, 3)
-    canvas.draw_text(strip, "capture refused or not used", u + 452, baseline, _TEXT_PX, INK)
-    return strip
+    marks = draw_legend(width_px, head.limits_m, {"orange frame": "not used"})
+    return np.vstack([strip, marks])
 
 
 def write_overlays(
