@@ -23,10 +23,9 @@ def sight_ahead(tracker: BoardTracker, frames: Iterable[Frame]) -> Iterator[Boar
         tracker: has not been used before.
         frames: in order of time.
     """
-    intervals_s = tracker.search_interval_s, tracker.thorough_interval_s
     waiting: deque[tuple[Frame, Future[BoardDetection]]] = deque()
     with (
-        Worker("search images", _Search, tracker.rig, *intervals_s) as images,
+        Worker("search images", _Search, tracker.rig, tracker.thorough_interval_s) as images,
         ThreadPoolExecutor(1) as caller,
     ):
 
@@ -46,8 +45,6 @@ def sight_ahead(tracker: BoardTracker, frames: Iterable[Frame]) -> Iterator[Boar
             caller.shutdown(wait=False, cancel_futures=True)
 
 
-# Interval of searches of a whole image while no board is in sight, which hold guidance up.
-_SEARCH_S = 0.3
 # Interval of thorough searches of an image without a board, which hold guidance up even longer.
 _THOROUGH_S = 3.0
 # Interval of searches of a scan for other things of the board's size while all known ones are followed.
@@ -61,7 +58,7 @@ class BoardSearch(Worker):
 
     def __init__(self, rig: Rig) -> None:
         """Prepare; see `BoardTracker`."""
-        super().__init__("search for the board", _Search, rig, _SEARCH_S, _THOROUGH_S, _RESCAN_S)
+        super().__init__("search for the board", _Search, rig, _THOROUGH_S, _RESCAN_S)
 
     def sight(self, frame: Frame) -> BoardDetection:
         """Find the board in every image and scan of a frame.
@@ -85,15 +82,8 @@ class BoardSearch(Worker):
 class _Search:
     """The object in that process: it does not send the searched samples back."""
 
-    def __init__(
-        self, rig: Rig, search_interval_s: float, thorough_interval_s: float, rescan_interval_s: float = 0.0
-    ) -> None:
-        self._tracker = BoardTracker(
-            rig,
-            search_interval_s,
-            thorough_interval_s=thorough_interval_s,
-            rescan_interval_s=rescan_interval_s,
-        )
+    def __init__(self, rig: Rig, thorough_interval_s: float, rescan_interval_s: float = 0.0) -> None:
+        self._tracker = BoardTracker(rig, thorough_interval_s, rescan_interval_s)
         self._longest_s = 0.0
 
     def look(self, frame: Frame) -> BoardDetection:

@@ -19,6 +19,8 @@ from lce_rig.timing.scan_pairing import Frame
 
 ImageKey = tuple[str, str]
 
+# Interval of searches of a whole image while no board is in sight, and of a scan while one is lost.
+_SEARCH_S = 0.3
 # A candidate is the camera's board where it lies as far from it as nominal extrinsics may be off, and a half.
 _NOMINAL_MARGIN = 1.5
 # Nominal extrinsics that fit a board so well at one distance fit boards at all distances.
@@ -77,18 +79,17 @@ class BoardTracker:
 
     Attributes:
         rig: the profile.
-        search_interval_s: how often a whole image is searched while no board is in sight.
-        refusals: frames in which it was not found, and boards that were found and cannot be used.
-        thorough_interval_s: how often such a search is thorough, which takes most of a second; 0 for always.
+        thorough_interval_s: how often an image without a board is searched thoroughly, which takes most of a
+            second; 0 for always.
         rescan_interval_s: how often a whole scan is searched while all candidates are followed; 0 for as
             often as while one is lost.
+        refusals: frames in which it was not found, and boards that were found and cannot be used.
     """
 
     rig: Rig
-    search_interval_s: float
-    refusals: Losses = field(default_factory=Losses)
     thorough_interval_s: float = 0.0
     rescan_interval_s: float = 0.0
+    refusals: Losses = field(default_factory=Losses)
     _seen: dict[ImageKey, ImageBoard] = field(default_factory=dict)
     _candidates: dict[str, list[LidarBoard]] = field(default_factory=dict)
     _n_candidates: dict[str, int] = field(default_factory=dict)
@@ -111,7 +112,7 @@ class BoardTracker:
         for image in frame.images:
             key = (image.sensor, image.channel)
             last = self._seen.pop(key, None)
-            if last is None and not _is_due(self._searched_ns, key, frame.time_ns, self.search_interval_s):
+            if last is None and not _is_due(self._searched_ns, key, frame.time_ns, _SEARCH_S):
                 continue
             is_thorough = self._is_thorough_due(key, frame.time_ns, was_seen=last is not None)
             search = self.finder.search_image(image, last, is_thorough=is_thorough)
@@ -193,7 +194,7 @@ class BoardTracker:
         followed = self.finder.follow_scan(scan, known) if known else None
         n_found = len(followed.located) if followed is not None and isinstance(followed.located, list) else 0
         are_all_there = n_found == self._n_candidates.get(scan.sensor)
-        interval_s = max(self.search_interval_s, self.rescan_interval_s if are_all_there else 0.0)
+        interval_s = max(_SEARCH_S, self.rescan_interval_s if are_all_there else 0.0)
         is_due = _is_due(self._searched_ns, scan.sensor, time_ns, interval_s)
         search = followed
         if search is None or not n_found or is_due:

@@ -24,8 +24,6 @@ from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time
 
-# How often a whole image is searched while no board is in sight.
-_SEARCH_S = 0.3
 # How often an image without a board is searched thoroughly, which takes most of a second.
 _THOROUGH_S = 1.0
 # A process of its own for images takes a second to start.
@@ -128,6 +126,7 @@ class _Collector:
                 if isinstance(source, dict) and isinstance(source.get("key"), str):
                     self._names_by_key[source["key"]] = capture.name
         self._n_captures = len(session.captures)
+        self._torn: SourceError | None = None
 
     def take_pairs(self, recording: FolderRecording) -> None:
         """Capture every pair of a folder.
@@ -187,9 +186,8 @@ class _Collector:
         events = [stream for stream in recording.streams if stream.kind == "events"]
         reconstructed = {(s.sensor, s.channel) for s in events if s.sensor not in with_images}
         self.report.has_events |= bool(events)
-        torn: list[SourceError] = []
         cameras = {camera for camera, _ in reconstructed}
-        for moment in self._moments(recording, torn, cameras, has_events=bool(events)):
+        for moment in self._moments(recording, cameras, has_events=bool(events)):
             if self._is_enough():
                 self.report.note(["stopped early: the session has as many captures as wanted"])
                 break
@@ -197,26 +195,25 @@ class _Collector:
             images = moment.detection.frame.images
             stored = [image for image in images if (image.sensor, image.channel) not in reconstructed]
             self._take_moment(recording, moment, stored, known)
-        if torn:
-            raise torn[0]
+        if self._torn is not None:
+            raise self._torn
 
     def _moments(
-        self, recording: ContinuousRecording, torn: list[SourceError], cameras: set[str], *, has_events: bool
+        self, recording: ContinuousRecording, cameras: set[str], *, has_events: bool
     ) -> Iterator[CaptureMoment]:
         """Yield confirmed moments: by motion where there are events, else by stillness.
 
         Args:
             recording: is read once.
-            torn: receives the error where the recording is torn.
             cameras: cameras with events and without images.
             has_events: whether events are kept with captures, so that the board has to move.
         """
         rig, options, losses = self._session.rig, self._options, self.report.counts
         max_motion_m = rig.quality.max_motion_m if options.max_motion_m is None else options.max_motion_m
-        samples = self._read(recording, torn)
+        samples = self._read(recording)
         if cameras:
             samples = with_event_pictures(samples, rig, cameras, losses)
-        tracker = BoardTracker(rig, _SEARCH_S, losses, _THOROUGH_S)
+        tracker = BoardTracker(rig, _THOROUGH_S, refusals=losses)
         # Scans without an image made of events are counted by `with_event_pictures`.
         frames = pair_by_time(samples, rig, Losses() if cameras else losses)
         detections: Iterable[BoardDetection] = map(tracker.sight, frames)
@@ -304,9 +301,9 @@ class _Collector:
     def _is_enough(self) -> bool:
         return self._options.target is not None and self._n_captures >= self._options.target
 
-    def _read(self, recording: ContinuousRecording, torn: list[SourceError]) -> Iterator[Sample]:
-        """Yield samples up to a tear, whose error goes to `torn`: moments before it are still captured."""
-        done = 0
+    def _read(self, recording: ContinuousRecording) -> Iterator[Sample]:
+        """Yield samples up to a tear, whose error is kept: moments before it are still captured."""
+        done, self._torn = 0, None
         try:
             for sample in check_overlap(recording.samples(), self._session.rig, recording.notes):
                 yield sample
@@ -314,4 +311,4 @@ class _Collector:
                     done += 1
                     self._progress(done, recording.n_samples, f"{len(self.report.captured)} captured")
         except SourceError as error:
-            torn.append(error)
+            self._torn = error

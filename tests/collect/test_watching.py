@@ -41,13 +41,13 @@ def nearest_m(detection: BoardDetection, k: int) -> float:
 
 
 def test_a_board_that_jumps_is_found_in_the_scan_long_before_the_next_search_is_due() -> None:
-    watcher = BoardTracker(rig(), 0.3, thorough_interval_s=0.0, rescan_interval_s=1000.0)
+    watcher = BoardTracker(rig(), rescan_interval_s=1000.0)
     for k, time_s in ((0, 0.0), (0, 0.1), (0, 0.5), (1, 0.9), (1, 1.0), (2, 1.4)):
         assert nearest_m(see(watcher, k, time_s), k) < 0.3, (k, time_s)
 
 
 def test_a_board_that_was_out_of_sight_is_searched_for_at_once() -> None:
-    watcher = BoardTracker(rig(), 0.3, thorough_interval_s=0.0, rescan_interval_s=1000.0)
+    watcher = BoardTracker(rig(), rescan_interval_s=1000.0)
     assert nearest_m(see(watcher, 0, 0.0), 0) < 0.3
     capture = placements()[0]
     blank = replace(capture.images[0], pixels=np.full_like(capture.images[0].pixels, 90))
@@ -62,7 +62,7 @@ def strict(**limits: float) -> Rig:
 
 
 def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> None:
-    watcher = BoardTracker(strict(min_square_px=1000.0), 0.3)
+    watcher = BoardTracker(strict(min_square_px=1000.0))
     seen = [see(watcher, 0, 0.1 * k) for k in range(30)]
     assert all(("davis", "frames") in each.images for each in seen)
     assert not any(each.is_usable for each in seen)
@@ -73,7 +73,7 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> 
 
 
 def test_single_shots_of_a_recording_are_moments_and_passing_samples_are_not() -> None:
-    watcher = BoardTracker(rig(), 0.3, thorough_interval_s=0.0, rescan_interval_s=0.0)
+    watcher = BoardTracker(rig())
     times_s = (0.0, 4.0, 8.0, 8.1, 12.0)
     seen = [see(watcher, k % len(placements()), time_s) for k, time_s in enumerate(times_s)]
     assert all(each.is_usable for each in seen)
@@ -86,7 +86,7 @@ def test_single_shots_of_a_recording_are_moments_and_passing_samples_are_not() -
 def test_live_and_offline_take_the_same_boards() -> None:
     for limits in ({"max_distance_m": 3.0}, {"max_tilt_deg": 20.0, "min_rings": 8}):
         profile = strict(**limits)
-        finder, watcher = BoardFinder(profile), BoardTracker(profile, 0.0)
+        finder, watcher = BoardFinder(profile), BoardTracker(profile)
         for k, capture in enumerate(placements()):
             detection = see(watcher, k, float(k))
             image, scan = finder.image(capture.images[0]), finder.scan(capture.scans[0])
@@ -97,7 +97,7 @@ def test_live_and_offline_take_the_same_boards() -> None:
 
 
 def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
-    watcher = BoardTracker(rig(), 0.3)
+    watcher = BoardTracker(rig())
     for time_s in (0.0, 0.1, 0.2):
         detection = see(watcher, 0, time_s)
     confirmed = watcher.confirm(CaptureMoment(detection, {"motion_m": 0.001}))
@@ -112,7 +112,7 @@ def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
 
 
 def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have_fitted() -> None:
-    watcher = BoardTracker(rig(), 0.0)
+    watcher = BoardTracker(rig())
     whole = see(watcher, 0, 0.0)
     (scan,) = whole.frame.scans
     # As if the LiDAR had missed the board, and seen another plate of its size.
@@ -128,7 +128,7 @@ def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have
 def test_images_searched_ahead_give_the_same_detections() -> None:
     order = (0, 0, 0, 1, 1, 2, 3, 3, 0, 0, 1, 2)
     frames = [frame_of(k, 0.1 * i) for i, k in enumerate(order)]
-    one, two = BoardTracker(rig(), 0.3), BoardTracker(rig(), 0.3)
+    one, two = BoardTracker(rig()), BoardTracker(rig())
     for alone, ahead in zip(map(one.sight, frames), sight_ahead(two, frames), strict=True):
         assert ahead.frame is alone.frame
         assert ahead.images.keys() == alone.images.keys() and ahead.lidars.keys() == alone.lidars.keys()

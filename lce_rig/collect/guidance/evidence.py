@@ -10,7 +10,7 @@ with the systematic part of lce_rig.calibrate.systematic. All are first built in
 plane's residual depends on three freedoms b(u, v) = (1, u, v) only, and then moved to the camera's.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,13 +130,7 @@ class Evidence:
 
     def of(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> "Evidence":
         """Take some of the placements."""
-        return Evidence(
-            self.hessian[chosen],
-            self.noise[chosen],
-            self.drift[chosen],
-            self.n_rings[chosen],
-            self.n_points[chosen],
-        )
+        return Evidence(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def weigh_placements(model: SensorModel, T_cam_board: Array, T_cam_lidar: Array) -> Evidence:

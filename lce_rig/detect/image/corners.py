@@ -17,8 +17,6 @@ Grey = NDArray[np.uint8]
 # squares of 10 to 60 px.
 _WIDE_PX = 700
 _SEARCH_PX = 640
-# Of squares of a known size, images are searched in which they are so large: time goes with area.
-_SQUARE_PX = 12.0
 _MOST_SCALE = 1.5
 # Saddle points that are looked at, and about how far edges reach around them, in the image that is searched.
 _MOST_SADDLES = 220
@@ -32,37 +30,30 @@ _WAYS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 _SB_THOROUGH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 
 
-def find_grid(
-    grey: Grey, board: Board, *, is_thorough: bool = True, square_px: float | None = None
-) -> Crossings | None:
+def find_grid(grey: Grey, board: Board, *, is_thorough: bool = True) -> Crossings | None:
     """Find the inner corners, cheapest attempt first, and fit them to sub-pixel accuracy.
 
     Args:
         grey: (H, W).
         board: tells the number of inner corners.
         is_thorough: whether to go on after the quick attempts, which take a tenth of the time of all.
-        square_px: approximate size of its squares, if known; only such are searched for.
 
     Returns:
         The crossings, `grid_px` in the order of `Board.corners()`; None if no attempt finds that many.
     """
     width = grey.shape[1]
-    lattice_scale = _SEARCH_PX / width if width > _WIDE_PX else 1.0
-    if square_px is not None:
-        lattice_scale = min(_SQUARE_PX / square_px, 1.0)
-    lattice = crossing_lattice(grey, (board.cols, board.rows), lattice_scale)
+    scale = _SEARCH_PX / width if width > _WIDE_PX else 1.0
+    lattice = crossing_lattice(grey, (board.cols, board.rows), scale)
     if lattice is not None:
         ordered = order_corners(grey, lattice, board)
         crossings = fit_crossings(grey, ordered.reshape(board.rows, board.cols, 2))
         if crossings.is_fitted.all():
             return crossings
-    seen = seen_grid(grey, None if square_px is None else min(_SQUARE_PX / square_px, _MOST_SCALE))
+    seen = seen_grid(grey)
     if seen is not None and seen.shape[:2] == (board.cols, board.rows):
         seen = seen.swapaxes(0, 1)
     if seen is not None and seen.shape[:2] == (board.rows, board.cols):
         attempts: Iterator[Array | None] = iter([seen.reshape(-1, 2)])
-    elif square_px is not None:
-        return None
     else:
         attempts = _attempts(grey, (board.cols, board.rows), is_thorough)
     for found in attempts:
@@ -71,19 +62,14 @@ def find_grid(
     return None
 
 
-def seen_grid(grey: Grey, scale: float | None = None) -> Array | None:
-    """Find a checkerboard of any size of at least 5x4 inner corners, in about 30 ms.
-
-    Args:
-        grey: (H, W).
-        scale: of the image that is searched; None for what suits images of this width.
+def seen_grid(grey: Grey) -> Array | None:
+    """Find a checkerboard of any size of at least 5x4 inner corners in (H, W), in about 30 ms.
 
     Returns:
         (rows, cols, 2) px; rows and cols may be exchanged. None if nothing is found.
     """
     width = grey.shape[1]
-    if scale is None:
-        scale = _SEARCH_PX / width if width > _WIDE_PX else _MOST_SCALE
+    scale = _SEARCH_PX / width if width > _WIDE_PX else _MOST_SCALE
     level = level_contrast(_resize(grey, scale))
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     is_found, corners, meta = cv2.findChessboardCornersSBWithMeta(level, (5, 4), flags)

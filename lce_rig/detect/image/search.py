@@ -208,7 +208,7 @@ def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> C
 def _find_near(
     grey: NDArray[np.uint8], board: Board, last: ImageBoard | None, *, is_thorough: bool
 ) -> Crossings | None:
-    """Search about where the board was; a quick search looks for squares of the size they had there only."""
+    """Search about where the board was."""
     if last is None:
         return None
     # The corners' box, larger by half its size.
@@ -219,11 +219,7 @@ def _find_near(
     part = grey[v0:v1, u0:u1]
     if min(part.shape) < 16:
         return None
-    square_px = None
-    if not is_thorough:
-        grid_px = last.corners_px.reshape(board.rows, board.cols, 2)
-        square_px = float(np.median(np.linalg.norm(np.diff(grid_px, axis=1), axis=-1)))
-    crossings = find_grid(np.ascontiguousarray(part), board, is_thorough=is_thorough, square_px=square_px)
+    crossings = find_grid(np.ascontiguousarray(part), board, is_thorough=is_thorough)
     return None if crossings is None else replace(crossings, grid_px=crossings.grid_px + [u0, v0])
 
 
