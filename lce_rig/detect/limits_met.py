@@ -45,8 +45,7 @@ def gate_image_board(sighting: ImageBoard, limits: QualitySettings) -> ImageBoar
         figures = {"square_px": q.square_px, "min_square_px": limits.min_square_px, "closer_m": closer_m}
         return IMAGE_SMALL_SQUARES.refusal(**figures)
     if q is not None and q.border_px < limits.min_border_px:
-        figures = {"border_px": q.border_px, "min_border_px": limits.min_border_px}
-        return IMAGE_NEAR_BORDER.refusal(**figures)
+        return IMAGE_NEAR_BORDER.refusal(border_px=q.border_px, min_border_px=limits.min_border_px)
     if sighting.tilt_deg > limits.max_tilt_deg:
         turn_deg = sighting.tilt_deg - limits.max_tilt_deg + 5
         figures = {"tilt_deg": sighting.tilt_deg, "max_tilt_deg": limits.max_tilt_deg, "turn_deg": turn_deg}
@@ -86,8 +85,7 @@ def _lidar_problem(candidate: LidarBoard, board: Board, limits: QualitySettings)
                 side=side, measured_m=measured_m, sigma_m=sigma_m, profile_m=wanted_m
             )
     if q.edge_rms_m > limits.max_edge_rms_m:
-        figures = {"rms_m": q.edge_rms_m, "max_rms_m": limits.max_edge_rms_m}
-        return LIDAR_RAGGED_EDGES.refusal(**figures)
+        return LIDAR_RAGGED_EDGES.refusal(rms_m=q.edge_rms_m, max_rms_m=limits.max_edge_rms_m)
     return _gate_distance("lidar", q.distance_m, limits)
 
 
@@ -126,14 +124,12 @@ def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard |
     if q is None:
         return found
     if q.events_px < limits.min_events_px:
-        figures = {"events_px": q.events_px, "min_events_px": limits.min_events_px}
-        return IMAGE_HARDLY_MOVED.refusal(**figures)
+        return IMAGE_HARDLY_MOVED.refusal(events_px=q.events_px, min_events_px=limits.min_events_px)
     # Comparisons with a figure that is not known are false.
     if q.speed_mps - 2 * q.speed_sigma_mps > limits.max_board_speed_mps:
         return too_fast(q.speed_mps, limits)
     if q.turn_deg_s - 2 * q.turn_sigma_deg_s > limits.max_turn_deg_s:
-        figures = {"turn_deg_s": q.turn_deg_s, "max_turn_deg_s": limits.max_turn_deg_s}
-        return IMAGE_TURNING.refusal(**figures)
+        return IMAGE_TURNING.refusal(turn_deg_s=q.turn_deg_s, max_turn_deg_s=limits.max_turn_deg_s)
     if q.smear_m > limits.max_smear_m:
         return IMAGE_SMEARED.refusal(smear_m=q.smear_m, max_smear_m=limits.max_smear_m)
     return found
@@ -141,8 +137,7 @@ def gate_event_board(found: ImageBoard, limits: QualitySettings) -> ImageBoard |
 
 def too_fast(speed_mps: float, limits: QualitySettings) -> Refusal:
     """Refuse a board that moves faster than the profile allows."""
-    figures = {"speed_mps": speed_mps, "max_speed_mps": limits.max_board_speed_mps}
-    return IMAGE_TOO_FAST.refusal(**figures)
+    return IMAGE_TOO_FAST.refusal(speed_mps=speed_mps, max_speed_mps=limits.max_board_speed_mps)
 
 
 def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: QualitySettings) -> Refusal:
@@ -175,8 +170,7 @@ def explain_missing_board(events: Events, stamp_ns: int, seen: Refusal, limits: 
         return IMAGE_HOT_PIXELS.refusal(n_hot=n_hot, share=hot_share)
     events_px, needed_px = busiest_events(events, stamp_ns), max(_SLOW_EVENTS_PX, limits.min_events_px)
     if events_px < needed_px:
-        figures = {"events_px": events_px, "min_events_px": needed_px}
-        return IMAGE_STILL_SCENE.refusal(**figures)
+        return IMAGE_STILL_SCENE.refusal(events_px=events_px, min_events_px=needed_px)
     return seen
 
 

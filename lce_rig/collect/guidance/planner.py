@@ -233,8 +233,7 @@ class Planner:
         alike = np.flatnonzero(self._is_like(held, present[None], guidance.spacing)[:, 0])
         if len(alike):
             name = str(alike[0] + 1) if names is None else names[alike[0]]
-            figures = {"capture": name, "instruction": instruction}
-            return CALIBRATE_KNOWN_PLACEMENT.refusal(action=action, **figures)
+            return CALIBRATE_KNOWN_PLACEMENT.refusal(action=action, capture=name, instruction=instruction)
         is_asked = asked is not None and is_there(self.view, present, asked)
         if wanted is None or guidance.is_enough or is_asked:
             return None

@@ -1,6 +1,5 @@
 """What becomes of a live capture: it is written, raw streams beside it on request, then learned from."""
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -38,8 +37,7 @@ class Learning:
         self._min_captures = rig.quality.min_captures
         self._worker = Worker("calibrate captures", _Teacher, rig, nice=_NICE)
         self._caller = ThreadPoolExecutor(1, "learn from captures")
-        self._lock = threading.Lock()
-        self._candidates: dict[int, list[Observation]] = {k: [] for k in range(len(guides))}
+        self._shown: dict[str, BoardDetection] = {}
         self._due: deque[int] = deque()
         self._running: tuple[int, Future[Planner | None]] | None = None
         self._problem = ""
@@ -57,45 +55,41 @@ class Learning:
         self._caller.shutdown(cancel_futures=True)
 
     def show(self, name: str, detection: BoardDetection) -> None:
-        """Take a capture's detection; returns at once."""
-        with self._lock:
-            for k, guide in enumerate(self._guides):
-                if guide.sees(detection):
-                    image, scans = detection.images[guide.key], detection.lidars[guide.lidar]
-                    self._candidates[k].append(Observation.of(name, image, scans))
-                    if len(self._candidates[k]) >= self._min_captures and k not in self._due:
-                        self._due.append(k)
+        """Take a capture's detection."""
+        self._shown[name] = detection
+        self._calibrate_again(detection)
 
     def forget(self, name: str) -> None:
-        """Forget a capture; returns at once, and the remaining ones are calibrated again."""
-        with self._lock:
-            for k, candidates in self._candidates.items():
-                left = [candidate for candidate in candidates if candidate.capture != name]
-                if len(left) < len(candidates):
-                    self._candidates[k] = left
-                    if k not in self._due:
-                        self._due.append(k)
+        """Forget a capture; the remaining ones are calibrated again."""
+        self._calibrate_again(self._shown.pop(name))
+
+    def _calibrate_again(self, detection: BoardDetection) -> None:
+        self._due += [k for k, g in enumerate(self._guides) if g.sees(detection) and k not in self._due]
 
     def teach(self) -> None:
         """Pass what was learned since the last call to its guide, and begin to learn what came since."""
-        with self._lock:
-            if self._running is not None and self._running[1].done():
-                k, learned = self._running
-                self._running, planner = None, None
-                try:
-                    planner = learned.result()
-                except Exception as error:  # Captures are safe even if a calibration fails.
-                    self._problem = f"guidance does not learn from captures: {error}" if self._is_open else ""
-                # Where captures came, or were taken back, meanwhile, it is due again.
-                if k not in self._due:
-                    self._guides[k].adopt(planner)
-            if self._running is None and self._due and self._is_open:
-                k = self._due.popleft()
-                candidates = list(self._candidates[k])
-                if len(candidates) >= self._min_captures:
-                    self._running = k, self._caller.submit(self._worker.call, "learn", k, candidates)
-                else:
-                    self._guides[k].adopt(None)
+        if self._running is not None and self._running[1].done():
+            k, learned = self._running
+            self._running, planner = None, None
+            try:
+                planner = learned.result()
+            except Exception as error:  # Captures are safe even if a calibration fails.
+                self._problem = f"guidance does not learn from captures: {error}" if self._is_open else ""
+            # Where captures came, or were taken back, meanwhile, it is due again.
+            if k not in self._due:
+                self._guides[k].adopt(planner)
+        if self._running is None and self._due and self._is_open:
+            k = self._due.popleft()
+            guide = self._guides[k]
+            candidates = [
+                Observation.of(name, detection.images[guide.key], detection.lidars[guide.lidar])
+                for name, detection in self._shown.items()
+                if guide.sees(detection)
+            ]
+            if len(candidates) >= self._min_captures:
+                self._running = k, self._caller.submit(self._worker.call, "learn", k, candidates)
+            else:
+                guide.adopt(None)
 
     def notes(self) -> list[str]:
         """Say what went wrong."""
@@ -126,14 +120,12 @@ class CaptureWriter:
 
     Attributes:
         session: open for writing.
-        learning: receives each capture that is safe.
     """
 
-    def __init__(self, session: Session, learning: Learning, disk: DiskWriter) -> None:
+    def __init__(self, session: Session, disk: DiskWriter) -> None:
         """Prepare; see `CaptureWriter`."""
         self.session = session
-        self.learning = learning
-        self._done: deque[tuple[str, float | None]] = deque()
+        self._done: deque[tuple[str, BoardDetection | None, float]] = deque()
         # Captures are stored and rejected in the order of the requests.
         self._sink: Sink[Callable[[], None]] = disk.add(session.path, lambda step: step(), is_vital=True)
 
@@ -153,13 +145,11 @@ class CaptureWriter:
         asked_s = time.monotonic()
 
         def store() -> None:
-            detection, frame = moment.detection, moment.detection.frame
-            whole = {**meta, **moment.figures, **pose_figures(detection.poses)}
+            frame = moment.detection.frame
+            whole = {**meta, **moment.figures, **pose_figures(moment.detection.poses)}
             cuts = [cut.events for cut in events]
             name = self.session.add_capture(frame.images, frame.scans, whole, cuts)
-            self._done.append((name, time.monotonic() - asked_s))
-            # The capture is safe: the rest delays nothing.
-            self.learning.show(name, detection)
+            self._done.append((name, moment.detection, time.monotonic() - asked_s))
 
         self._sink.put(store)
 
@@ -168,15 +158,14 @@ class CaptureWriter:
 
         def reject() -> None:
             self.session.reject(name, "taken back while collecting")
-            self.learning.forget(name)
-            self._done.append((name, None))
+            self._done.append((name, None, 0.0))
 
         self._sink.put(reject)
 
-    def take(self) -> list[tuple[str, float | None]]:
+    def take(self) -> list[tuple[str, BoardDetection | None, float]]:
         """Return the captures saved or taken back since the last call, by name.
 
-        Each comes with the time in s from the decision until it was safe; None where it was taken back.
+        Each comes with its detection, None where it was taken back, and the time in s until it was safe.
 
         Raises:
             SessionError: one cannot be written: the disk is full, or gone.

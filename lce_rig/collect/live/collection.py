@@ -86,10 +86,10 @@ def collect_live(
             record, recorded = record_streams(record_to, rig, sources, disk)
         search = BoardSearch(rig)
         with search, Learning(rig, guides) as learning:
-            keeper = CaptureWriter(session, learning, disk)
+            keeper = CaptureWriter(session, disk)
             clock = RigClock(rig, has_board=board is not None, edge_cameras=edge_cameras(rig))
             with AttachedSensors(sources) as sensors, FrameFeed(rig, sensors, clock, board, record) as feed:
-                loop = _Loop(options, guides, feed, search, keeper)
+                loop = _Loop(options, guides, feed, search, keeper, learning)
                 loop.run(show, keys)
             disk.close()
             loop.take_kept()
@@ -121,11 +121,12 @@ class _Loop:
         feed: FrameFeed,
         search: BoardSearch,
         keeper: CaptureWriter,
+        learning: Learning,
     ) -> None:
         self.report = LiveReport()
         self._session, self._rig, self._options = keeper.session, keeper.session.rig, options
         self._sensors, self._clock, self._feed, self._keeper = feed.sensors, feed.clock, feed, keeper
-        self._guides, self._search, self._learning = guides, search, keeper.learning
+        self._guides, self._search, self._learning = guides, search, learning
         self._began_s = time.monotonic()
         self._gate: StillBoards | SlowBoards | None = None
         self._taken = Placements(_NOVEL_M, _NOVEL_DEG)
@@ -165,12 +166,14 @@ class _Loop:
     def take_kept(self) -> None:
         """Count the captures that were saved or taken back, and adopt new planners."""
         self._learning.teach()
-        for name, latency_s in self._keeper.take():
-            if latency_s is None:
+        for name, detection, latency_s in self._keeper.take():
+            if detection is None:
+                self._learning.forget(name)
                 self.report.taken_back.append(name)
                 restore = f"lce-rig captures {self._session.path} --restore {name}"
                 self._monitor.cue("taken_back", f"{name} taken back ({restore})")
                 continue
+            self._learning.show(name, detection)
             self.report.latencies_s.append(latency_s)
             self._kept.add(name)
             if any(name == asked.name for asked in self._asked):

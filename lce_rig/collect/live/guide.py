@@ -134,8 +134,10 @@ class Guide:
 
     def adopt(self, planner: Planner | None) -> None:
         """Take a planner from `prepare`; None to go back to the one before any capture."""
+        before = self._planner
         self._planner, self.problem = self._at_first if planner is None else (planner, None)
-        self.guidance = self._coverage = None
+        if self._planner is not before:
+            self.guidance = self._coverage = None
 
     def plan(self, present: Array | None, now_s: float, *, is_asked: bool = True) -> None:
         """Choose the next placement where none is chosen, or the last was not reached for long.

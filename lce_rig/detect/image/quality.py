@@ -203,8 +203,7 @@ def quality_problem(
     min_contrast = limits.min_event_contrast if is_from_events else _MIN_CONTRAST
     min_sharpness = limits.min_event_sharpness if is_from_events else _MIN_SHARPNESS
     if quality.contrast < min_contrast:
-        figures = {"contrast": quality.contrast, "min_contrast": min_contrast}
-        return IMAGE_LOW_CONTRAST.refusal(action=action, **figures)
+        return IMAGE_LOW_CONTRAST.refusal(action=action, contrast=quality.contrast, min_contrast=min_contrast)
     if quality.sharpness < min_sharpness:
         figures = {
             "edge_px": quality.edge_width_px,

@@ -76,8 +76,7 @@ def too_thick(heights_m: Array, limit_m: float) -> Refusal:
         heights_m: (N,) of the returns over the plane.
         limit_m: largest rms of them.
     """
-    figures = {"plane_rms_m": float(np.sqrt(np.mean(heights_m**2))), "max_plane_rms_m": limit_m}
-    return LIDAR_TOO_THICK.refusal(**figures)
+    return LIDAR_TOO_THICK.refusal(plane_rms_m=float(np.sqrt(np.mean(heights_m**2))), max_plane_rms_m=limit_m)
 
 
 def outline_misfit(view: PlaneView, placement: Placement, limit_m: float, rms_limit_m: float) -> Refusal:
