@@ -245,8 +245,8 @@ class Planner:
         gain, best = np.asarray(1 - shortfall(model, after.improvable) / now)
         if best < LEAST_GAIN or gain >= LEAST_SHARE * best:
             return None
-        figures = {"gain": max(float(gain), 0.0), "best_gain": float(best), "instruction": instruction}
-        return CALIBRATE_LITTLE_GAIN.refusal(**figures)
+        gains = {"gain": max(float(gain), 0.0), "best_gain": float(best)}
+        return CALIBRATE_LITTLE_GAIN.refusal(instruction=instruction, **gains)
 
     def _weigh(self, poses: Array) -> Evidence:
         return weigh_placements(self.view.model, poses, self.view.T_cam_lidar)
