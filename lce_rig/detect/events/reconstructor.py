@@ -240,11 +240,6 @@ class Reconstructor:
         self._current: _Window | None = None
         self._noise = NoiseFilter()
 
-    @property
-    def is_warm(self) -> bool:
-        """Whether enough of the stream has been seen for images to count."""
-        return self.n_steps >= N_WARM_UP
-
     def reconstruct(self, batches: Iterable[Events], stamps_ns: Sequence[int]) -> Iterator[Image | Refusal]:
         """Return one image, or the reason for none, for every timestamp, in the order of the timestamps.
 
@@ -260,22 +255,17 @@ class Reconstructor:
             raise UsageError("stamps_ns must not decrease")
         self.reset()
         wanted = deque(stamps_ns)
-        last_ns: int | None = None
-        for batch in batches:
-            if not len(batch):
-                continue
-            self._take(batch, last_ns)
-            last_ns = int(batch.t_ns[-1])
+        for batch in filter(len, batches):
+            last_ns = self._take(batch)
             while wanted and wanted[0] <= last_ns:
-                yield self._picture_at(wanted.popleft())
+                yield self.picture_at(wanted.popleft())
             self._advance(last_ns)
         for stamp_ns in wanted:
-            if last_ns is None:
-                yield READ_NO_EVENTS.refusal()
-            elif stamp_ns - last_ns <= _MAX_AFTER_END_NS:
-                yield self._picture_at(stamp_ns)
+            late_ns = 0 if self._fed_ns is None else stamp_ns - self._fed_ns
+            if late_ns <= _MAX_AFTER_END_NS:
+                yield self.picture_at(stamp_ns)
             else:
-                yield READ_AFTER_EVENTS.refusal(gap_s=1e-9 * (stamp_ns - last_ns))
+                yield READ_AFTER_EVENTS.refusal(gap_s=1e-9 * late_ns)
 
     def feed(self, events: Events) -> None:
         """Take the next events of a stream that runs on; `picture_at` gives its images.
@@ -287,9 +277,7 @@ class Reconstructor:
             SourceError: they are of another sensor or go back in time.
         """
         if len(events):
-            self._take(events, self._fed_ns)
-            self._fed_ns = int(events.t_ns[-1])
-            self._advance(self._fed_ns)
+            self._advance(self._take(events))
 
     def picture_at(self, stamp_ns: int, *, is_step: bool = False) -> Image | Refusal:
         """Return the image at a timestamp up to which the stream was fed, or the reason for none.
@@ -301,15 +289,33 @@ class Reconstructor:
         """
         if self._first_ns is None:
             return READ_NO_EVENTS.refusal()
-        return self._picture_at(stamp_ns, is_step=is_step)
+        if stamp_ns <= self._first_ns:
+            return READ_BEFORE_EVENTS.refusal(gap_s=1e-9 * (self._first_ns - stamp_ns))
+        self._advance(stamp_ns)
+        if self.n_steps < N_WARM_UP:
+            seen_s = 1e-9 * (stamp_ns - self._first_ns)
+            return READ_NETWORK_SETTLING.refusal(n_steps=self.n_steps, n_warm_up=N_WARM_UP, seen_s=seen_s)
+        window = self._current
+        assert window is not None
+        events = self._noise.clean(window.events.between(window.start_ns, stamp_ns))
+        is_thin = self._rule().fill(len(events), stamp_ns - window.start_ns) < _MIN_FILL
+        if is_thin and self._previous is not None:
+            events = join_events([self._previous.events, events])
+            window = self._previous
+        if is_step and not is_thin:
+            picture = self._commit(stamp_ns)
+        else:
+            picture, _ = self._picture(events, window.start_ns, stamp_ns, window.states)
+        return Image(events.sensor, self.channel, stamp_ns, self._scale.to_grey(picture))
 
-    def _take(self, batch: Events, last_ns: int | None) -> None:
-        """Append a batch to the current window."""
+    def _take(self, batch: Events) -> int:
+        """Append a batch to the current window, and return when it ends."""
+        last_ns, self._fed_ns = self._fed_ns, int(batch.t_ns[-1])
         if self._current is None:
             self._first_ns = int(batch.t_ns[0])
             states = self._model.initial_states(batch.height_px, batch.width_px)
             self._current = _Window(self._first_ns, batch, states)
-            return
+            return self._fed_ns
         pending = self._current.events
         size, expected = (batch.width_px, batch.height_px), (pending.width_px, pending.height_px)
         if size != expected:
@@ -323,6 +329,7 @@ class Reconstructor:
                 f"{batch.sensor}: events go back in time by {back_s:.6f} s", "Sort the recording."
             )
         self._current = replace(self._current, events=join_events([pending, batch]))
+        return self._fed_ns
 
     def _rule(self) -> WindowRule:
         assert self._current is not None
@@ -363,24 +370,3 @@ class Reconstructor:
         """Make the image (H, W) at end_ns from the window [start_ns, end_ns) and the states before it."""
         voxels = normalise_voxels(voxel_grid(events, self._model.n_bins, start_ns, end_ns))
         return self._model.step(voxels, states)
-
-    def _picture_at(self, stamp_ns: int, *, is_step: bool = False) -> Image | Refusal:
-        assert self._first_ns is not None
-        if stamp_ns <= self._first_ns:
-            return READ_BEFORE_EVENTS.refusal(gap_s=1e-9 * (self._first_ns - stamp_ns))
-        self._advance(stamp_ns)
-        if not self.is_warm:
-            seen_s = 1e-9 * (stamp_ns - self._first_ns)
-            return READ_NETWORK_SETTLING.refusal(n_steps=self.n_steps, n_warm_up=N_WARM_UP, seen_s=seen_s)
-        window = self._current
-        assert window is not None
-        events = self._noise.clean(window.events.between(window.start_ns, stamp_ns))
-        is_thin = self._rule().fill(len(events), stamp_ns - window.start_ns) < _MIN_FILL
-        if is_thin and self._previous is not None:
-            events = join_events([self._previous.events, events])
-            window = self._previous
-        if is_step and not is_thin:
-            picture = self._commit(stamp_ns)
-        else:
-            picture, _ = self._picture(events, window.start_ns, stamp_ns, window.states)
-        return Image(events.sensor, self.channel, stamp_ns, self._scale.to_grey(picture))

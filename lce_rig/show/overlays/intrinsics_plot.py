@@ -6,13 +6,17 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.core.camera import Intrinsics
+from lce_rig.core.geometry import Array
+from lce_rig.core.phrasing import significant
 from lce_rig.lens.difference import LensCertainty
 from lce_rig.lens.lens_estimate import IntrinsicsEstimate
 from lce_rig.show.overlays.canvas import Picture
-from lce_rig.show.report.calibration_drawings import MIN_IN_CELL, add_mean_arrows
 
 _INK, _GREY, _FAINT, _SHADE = "#22262b", "#5b636b", "#9aa3ad", "#e9ecef"
-_ORANGE = "#d9730d"
+_BLUE, _ORANGE = "#1f6fb4", "#d9730d"
+# Cells along the width of the image, and corners that one needs.
+_CELLS, _MIN_IN_CELL = 14, 5
 # The standard deviation map covers 0.01 to 10 px; beyond, the intrinsics are unusable.
 _CERTAIN_PX, _UNKNOWN_PX = 0.01, 10.0
 _DPI = 110
@@ -85,11 +89,31 @@ def _frame(axis: Any, estimate: IntrinsicsEstimate, title: str, note: str) -> No
 
 
 def _draw_residuals(axis: Any, estimate: IntrinsicsEstimate) -> None:
-    note = f"mean of each cell with at least {MIN_IN_CELL} corners; nothing was seen in the blank area"
+    note = f"mean of each cell with at least {_MIN_IN_CELL} corners; nothing was seen in the blank area"
     _frame(axis, estimate, "Residuals over the image", note)
     corners, residuals = estimate.corners_px, estimate.residuals_px
     axis.plot(*corners.T, ".", color=_FAINT, markersize=1.6, alpha=0.7, zorder=1)
     add_mean_arrows(axis, corners, residuals, estimate.intrinsics)
+
+
+def add_mean_arrows(axes: Any, corners_px: Array, residuals_px: Array, lens: Intrinsics) -> None:
+    """Draw the mean residual of (N, 2) in each cell of the image; a typical arrow fills its cell."""
+    cell_px = lens.width_px / _CELLS
+    cells, index, counts = np.unique(
+        np.floor((corners_px + 0.5) / cell_px), axis=0, return_inverse=True, return_counts=True
+    )
+    sums = np.zeros((len(cells), 4))
+    np.add.at(sums, index.ravel(), np.hstack([corners_px, residuals_px]))
+    means = (sums / counts[:, None])[counts >= _MIN_IN_CELL]
+    if not len(means):
+        return
+    usual_px = max(float(np.percentile(np.linalg.norm(means[:, 2:], axis=1), 90)), 1e-3)
+    scale = usual_px / cell_px
+    arrows = axes.quiver(
+        *means.T, color=_BLUE, angles="xy", scale_units="xy", scale=scale, width=0.004, zorder=3
+    )
+    label = f"{significant(usual_px)} px "
+    axes.quiverkey(arrows, 0.92, 1.05, usual_px, label, labelpos="W", labelcolor=_INK)
 
 
 def _draw_certainty(figure: Any, axis: Any, estimate: IntrinsicsEstimate, certainty: LensCertainty) -> None:

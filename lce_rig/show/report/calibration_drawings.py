@@ -16,12 +16,12 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.core.phrasing import significant
 from lce_rig.core.planar_pose import refine_pose
 from lce_rig.core.results import Observation
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.judge.findings import cause_words
 from lce_rig.judge.reach import point_uncertainties, with_lens
+from lce_rig.show.overlays.intrinsics_plot import add_mean_arrows
 from lce_rig.show.report.page import BLUE, FAINT, INK, ORANGE, QUIET, WIDTH_IN, drawing, new_axes
 
 
@@ -77,8 +77,8 @@ def gather(calibration: Calibration, board: Board, lens: Intrinsics) -> Evidence
 
 
 _LINE = 0.8
-# Cells along the width of the image, corners that one needs, names along an axis.
-_CELLS, MIN_IN_CELL, _MOST_LABELS = 14, 5, 10
+# Names along an axis.
+_MOST_LABELS = 10
 _DISTANCES_M = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0)
 # Causes of less than this, in percent, are in the table only.
 _LEAST_SHARE = 0.5
@@ -216,26 +216,6 @@ def draw_corners(evidence: Evidence, lens: Intrinsics) -> Markup:
     axes.plot(*evidence.corners_px[::every].T, ".", color=FAINT, markersize=1)
     add_mean_arrows(axes, evidence.corners_px, evidence.corner_residuals_px, lens)
     return drawing(figure, "Residuals of the corners in the image")
-
-
-def add_mean_arrows(axes: Any, corners_px: Array, residuals_px: Array, lens: Intrinsics) -> None:
-    """Draw the mean residual of (N, 2) in each cell of the image; a typical arrow fills its cell."""
-    cell_px = lens.width_px / _CELLS
-    cells, index, counts = np.unique(
-        np.floor((corners_px + 0.5) / cell_px), axis=0, return_inverse=True, return_counts=True
-    )
-    sums = np.zeros((len(cells), 4))
-    np.add.at(sums, index.ravel(), np.hstack([corners_px, residuals_px]))
-    means = (sums / counts[:, None])[counts >= MIN_IN_CELL]
-    if not len(means):
-        return
-    usual_px = max(float(np.percentile(np.linalg.norm(means[:, 2:], axis=1), 90)), 1e-3)
-    scale = usual_px / cell_px
-    arrows = axes.quiver(
-        *means.T, color=BLUE, angles="xy", scale_units="xy", scale=scale, width=0.004, zorder=3
-    )
-    label = f"{significant(usual_px)} px "
-    axes.quiverkey(arrows, 0.92, 1.05, usual_px, label, labelpos="W", labelcolor=INK)
 
 
 def principal_axes(cov: Array) -> tuple[Array, Array]:
