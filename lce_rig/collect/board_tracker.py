@@ -114,7 +114,10 @@ class BoardTracker:
             last = self._seen.pop(key, None)
             if last is None and not _is_due(self._searched_ns, key, frame.time_ns, _SEARCH_S):
                 continue
-            is_thorough = self._is_thorough_due(key, frame.time_ns, was_seen=last is not None)
+            if last is not None:
+                # A board just lost is soon seen again by a quick search.
+                self._thorough_ns[key] = frame.time_ns
+            is_thorough = _is_due(self._thorough_ns, key, frame.time_ns, self.thorough_interval_s)
             search = self.finder.search_image(image, last, is_thorough=is_thorough)
             if isinstance(search.located, Refusal):
                 if search.located is not NOT_SEEN_AT_ONCE:
@@ -205,13 +208,6 @@ class BoardTracker:
         if isinstance(search.located, list) and isinstance(search.usable, Refusal):
             self.refusals.add(search.usable)
         return search.usable
-
-    def _is_thorough_due(self, key: ImageKey, time_ns: int, *, was_seen: bool) -> bool:
-        """Check whether it is time for a thorough search; a board just lost is soon seen again without."""
-        if was_seen and self.thorough_interval_s > 0:
-            self._thorough_ns[key] = time_ns
-            return False
-        return _is_due(self._thorough_ns, key, time_ns, self.thorough_interval_s)
 
 
 def _is_due(last_ns: dict[ImageKey | str, int], key: ImageKey | str, time_ns: int, interval_s: float) -> bool:

@@ -74,7 +74,8 @@ def build_room(heading_rad: float, rng: np.random.Generator, furnish: Furnish | 
         furnish: draws corners (3,), parts and obstacles of a room from those of the usual one; None keeps it.
     """
     turn_rad = heading_rad + np.radians(rng.uniform(-6.0, 6.0))
-    T_world_room = pose(_turn_z(turn_rad), np.zeros(3))
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    T_world_room = pose(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
     low, high, obstacles, parts = _LOW, _HIGH, _OBSTACLES, _furniture()
     if furnish is not None:
         low, high, parts, obstacles = furnish(low, high, rng)
@@ -85,11 +86,6 @@ def build_room(heading_rad: float, rng: np.random.Generator, furnish: Furnish | 
     ]
     lamps = transform(T_world_room, np.array([[x, y, high[2] - 0.05] for x, y in _LAMP_SPOTS]))
     return Room(T_world_room, Raycaster(surfaces), lamps, low, high, obstacles)
-
-
-def _turn_z(angle_rad: float) -> Array:
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _part(name: str, mesh: Mesh, material: Material) -> Part:

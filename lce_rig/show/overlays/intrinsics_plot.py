@@ -58,7 +58,11 @@ def draw_intrinsics(
     figure.text(0.035, 1 - 0.65 / height, summary, fontsize=11, color=_INK, va="center")
     lowest, highest = (0.7 + below) / height, 1 - 1.45 / height
     grid = figure.add_gridspec(1, 2, left=0.05, right=0.92, top=highest, bottom=lowest, wspace=0.16)
-    _draw_residuals(figure.add_subplot(grid[0]), estimate)
+    note = f"mean of each cell with at least {_MIN_IN_CELL} corners; nothing was seen in the blank area"
+    residuals = figure.add_subplot(grid[0])
+    _frame(residuals, estimate, "Residuals over the image", note)
+    residuals.plot(*estimate.corners_px.T, ".", color=_FAINT, markersize=1.6, alpha=0.7, zorder=1)
+    add_mean_arrows(residuals, estimate.corners_px, estimate.residuals_px, estimate.intrinsics)
     _draw_certainty(figure, figure.add_subplot(grid[1]), estimate, certainty)
     for row, line in enumerate(reversed(notes)):
         figure.text(0.035, (0.15 + 0.2 * row) / height, line, fontsize=10, color=_INK)
@@ -86,14 +90,6 @@ def _frame(axis: Any, estimate: IntrinsicsEstimate, title: str, note: str) -> No
     axis.tick_params(colors=_INK, labelsize=9)
     for spine in axis.spines.values():
         spine.set_color(_FAINT)
-
-
-def _draw_residuals(axis: Any, estimate: IntrinsicsEstimate) -> None:
-    note = f"mean of each cell with at least {_MIN_IN_CELL} corners; nothing was seen in the blank area"
-    _frame(axis, estimate, "Residuals over the image", note)
-    corners, residuals = estimate.corners_px, estimate.residuals_px
-    axis.plot(*corners.T, ".", color=_FAINT, markersize=1.6, alpha=0.7, zorder=1)
-    add_mean_arrows(axis, corners, residuals, estimate.intrinsics)
 
 
 def add_mean_arrows(axes: Any, corners_px: Array, residuals_px: Array, lens: Intrinsics) -> None:

@@ -230,7 +230,7 @@ def render_code(link: str, state: LiveState, *, height: int = _HEIGHT, width: in
 
     code = qr_lines(link)
     texts = [f"page: {link}", state.headline]
-    lines = [line for text in texts for line in _folded(text, width)]
+    lines = [text[k : k + width] for text in texts for k in range(0, len(text), width)]
     if not code or len(code) + len(lines) > height or len(code[0]) > width:
         return None
     return Group(*(Text(line, style=CODE_STYLE) for line in code), *map(Text, lines))
@@ -326,10 +326,6 @@ def render(
     beside.add_row(Group(*side), *([] if drawing is None or width < _WIDTH else [drawing]))
     banner_box = Padding(banner, (edge, 2), style=_STYLES[state.phase])
     return Group(title, banner_box, *above, beside, *messages, *below)
-
-
-def _folded(text: str, width: int) -> list[str]:
-    return [text[k : k + width] for k in range(0, len(text), width)]
 
 
 def _stream_table(streams: tuple[StreamState, ...]) -> Any:
