@@ -9,17 +9,19 @@ from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureM
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.collect.findings import CALIBRATE_SAME_PLACEMENT
 from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments, stillness_window_s
-from lce_rig.collect.placement_dedupe import Placements, capture_poses, pose_figures
+from lce_rig.collect.placement_dedupe import (
+    MIN_MOVE_M,
+    MIN_TURN_DEG,
+    Placements,
+    capture_poses,
+    pose_figures,
+)
 from lce_rig.core.data import Events, Image, Sample, Scan
 from lce_rig.core.errors import LceRigError, SessionError, SourceError, refusal_of
 from lce_rig.core.findings import Losses, Refusal
 from lce_rig.io.folder import FolderRecording
 from lce_rig.io.joining import check_overlap, join_recordings, require_sensors
-from lce_rig.io.protocol import (
-    ContinuousRecording,
-    Recording,
-    serials_of,
-)
+from lce_rig.io.protocol import ContinuousRecording, Recording, serials_of
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.timing.scan_pairing import pair_by_time
@@ -45,8 +47,8 @@ class CollectOptions:
     """
 
     target: int | None = None
-    min_move_m: float = 0.15
-    min_turn_deg: float = 10.0
+    min_move_m: float = MIN_MOVE_M
+    min_turn_deg: float = MIN_TURN_DEG
     max_motion_m: float | None = None
 
 

@@ -5,6 +5,7 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.geometry import Array, parse_pose, rotation_angle
 from lce_rig.core.results import ImageBoard
@@ -13,6 +14,17 @@ from lce_rig.session import Capture, Session, check_capture
 
 ImageKey = tuple[str, str]
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+#: Placements moved and turned by less than this count as the same.
+MIN_MOVE_M, MIN_TURN_DEG = 0.15, 10.0
+
+
+def find_alike(held: Array, others: Array, min_move_m: float, min_turn_rad: float) -> NDArray[np.bool_]:
+    """Find which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
+    way_m = np.linalg.norm(held[:, None, :3, 3] - others[None, :, :3, 3], axis=-1)
+    # The pattern may be read from either end.
+    R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
+    turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ _HALF_TURN, R_others))
+    return np.asarray((way_m < min_move_m) & (turn < min_turn_rad))
 
 
 class Placements:
@@ -22,7 +34,7 @@ class Placements:
         min_move_m, min_turn_deg: a board that moved or turned as far stands somewhere new.
     """
 
-    def __init__(self, min_move_m: float, min_turn_deg: float) -> None:
+    def __init__(self, min_move_m: float = MIN_MOVE_M, min_turn_deg: float = MIN_TURN_DEG) -> None:
         self._min_move_m = min_move_m
         self._min_turn_rad = float(np.radians(min_turn_deg))
         self._poses: list[tuple[str, ImageKey, Array]] = []
@@ -50,11 +62,7 @@ class Placements:
         return bool(shared) and all(likes)
 
     def _is_like(self, T_1: Array, T_2: Array) -> bool:
-        if float(np.linalg.norm(T_1[:3, 3] - T_2[:3, 3])) >= self._min_move_m:
-            return False
-        # The pattern may be read from either end.
-        turns = [rotation_angle(T_1[:3, :3] @ flip, T_2[:3, :3]) for flip in (np.eye(3), _HALF_TURN)]
-        return float(min(turns)) < self._min_turn_rad
+        return bool(find_alike(T_1[None], T_2[None], self._min_move_m, self._min_turn_rad))
 
 
 def pose_figures(poses: Mapping[ImageKey, Array]) -> dict[str, Any]:

@@ -19,11 +19,12 @@ from lce_rig.collect.guidance.evidence import (
 )
 from lce_rig.collect.guidance.instructions import describe_pose, instruct, is_there, say
 from lce_rig.collect.guidance.sensor_model import DIAMOND_DEG, SensorModel, SensorPlace, spread_candidates
+from lce_rig.collect.placement_dedupe import MIN_MOVE_M, MIN_TURN_DEG, find_alike
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.geometry import Array, rotation_angle
+from lce_rig.core.geometry import Array
 from lce_rig.rig import Rig
 
 #: A bar is full where captures span this share of what reachable placements span.
@@ -95,8 +96,6 @@ ENOUGH_SHARE = 0.9
 LEAST_SHARE = 0.1
 #: Where even the best placement brings less than this share, any new one is welcome.
 LEAST_GAIN = 0.02
-#: Placements moved and turned by less than this count as the same.
-MIN_MOVE_M, MIN_TURN_DEG = 0.15, 10.0
 # Spacings of placements in these units: nearer ones are asked for when no others are left.
 _SPACINGS = (1.0, 0.5)
 #: Around a place that cannot be reached.
@@ -105,7 +104,6 @@ AVOIDED_M = 0.4
 _EFFORT = 0.01
 # Upper bound of the "captures left" shown to the user.
 _MOST_MORE = 60
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
 class Guidance(NamedTuple):
@@ -181,7 +179,8 @@ class Planner:
             turn = np.arccos(np.clip(self.candidates[:, :3, 2] @ present[:3, 2], -1.0, 1.0))
             cost = cost * (1 + _EFFORT * np.asarray(way_m + turn))
         if avoid is not None:
-            cost[_way_m(avoid, self.candidates).min(axis=0, initial=np.inf) < AVOIDED_M] = np.inf
+            way_m = np.linalg.norm(avoid[:, None, :3, 3] - self.candidates[:, :3, 3], axis=-1)
+            cost[way_m.min(axis=0, initial=np.inf) < AVOIDED_M] = np.inf
         best, spacing = self._choose(cost, held, present)
         wanted = None if best is None else self.candidates[best]
         rotation, translation = sigmas(now.cov)
@@ -291,16 +290,7 @@ class Planner:
 
     def _is_like(self, held: Array, others: Array, spacing: float) -> NDArray[np.bool_]:
         """Find which of others (M, 4, 4) stand where one of those held (N, 4, 4) does, (N, M)."""
-        # The pattern may be read from either end.
-        R, R_others = held[:, None, :3, :3], others[None, :, :3, :3]
-        turn = np.minimum(rotation_angle(R, R_others), rotation_angle(R @ _HALF_TURN, R_others))
-        is_turned = turn >= spacing * self._min_turn_rad
-        return np.asarray((_way_m(held, others) < spacing * self._min_move_m) & ~is_turned)
-
-
-def _way_m(held: Array, others: Array) -> Array:
-    """Measure the distances (N, M) between boards (N, 4, 4) and others (M, 4, 4)."""
-    return np.asarray(np.linalg.norm(held[:, None, :3, 3] - others[None, :, :3, 3], axis=-1))
+        return find_alike(held, others, spacing * self._min_move_m, spacing * self._min_turn_rad)
 
 
 _FEWEST, _MOST = 2, 6

@@ -43,7 +43,6 @@ _WAIT_S = 0.1
 # Threads that read sensors ask for the interpreter often and briefly, the loop holds it for long: at Python's
 # 5 ms guidance would be slower by a third.
 _TURN_S = 0.0005
-_NOVEL_M, _NOVEL_DEG = 0.15, 10.0
 # A board that has not moved, as far as its pose is known.
 _SAME_M, _SAME_DEG = 0.02, 2.0
 
@@ -129,7 +128,7 @@ class _Loop:
         self._guides, self._search, self._learning = guides, search, learning
         self._began_s = time.monotonic()
         self._gate: StillBoards | SlowBoards | None = None
-        self._taken = Placements(_NOVEL_M, _NOVEL_DEG)
+        self._taken = Placements()
         self._n_before = len(self._session.captures)
         self._number = int(self._session.next_name)
         self._asked: list[_Asked] = []
@@ -302,7 +301,7 @@ class _Loop:
             return
         # Of a board that was captured by itself just now the hand comes late.
         is_recent = time.monotonic() - self._captured_s < self._options.hold_s
-        places = Placements(_NOVEL_M, _NOVEL_DEG) if is_recent else Placements(_SAME_M, _SAME_DEG)
+        places = Placements() if is_recent else Placements(_SAME_M, _SAME_DEG)
         if self._asked and places.are_alike(self._asked[-1].poses, detection.poses):
             name = self._asked[-1].name
             self._monitor.cue("refused", f"not captured: {name} shows the board here; move it first")

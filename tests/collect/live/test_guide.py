@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.guidance.instructions import HeldPose, build_pose
-from lce_rig.collect.guidance.planner import MIN_MOVE_M, MIN_TURN_DEG
 from lce_rig.collect.guidance.sensor_model import SensorPlace
 from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
 from lce_rig.collect.live.simulated import Person
@@ -210,7 +209,7 @@ def test_a_person_who_goes_on_is_sent_to_new_places_until_there_are_as_many_capt
     walk = follow_guide(rig(), 20)
     assert len(walk.captured) == 20
     assert len(walk.proposed) >= 20
-    places, key = Placements(MIN_MOVE_M, MIN_TURN_DEG), ("davis", "frames")
+    places, key = Placements(), ("davis", "frames")
     for T_cam_board, n_held in walk.proposed:
         assert not any(places.are_alike({key: T_cam_board}, {key: T}) for T in walk.captured[:n_held])
 
