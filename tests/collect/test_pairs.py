@@ -49,7 +49,7 @@ def test_every_pair_becomes_a_capture_and_a_second_run_adds_none(tmp_path, folde
         report = run(session, folder, rig)
     assert report.captured == [f"{k:06d}" for k in range(N_PAIRS)]
     assert any(note.startswith("recording: 5 pairs") and "names" in note for note in report.notes)
-    assert any("no time" in note for note in report.notes)
+    assert any("without times" in note for note in report.notes)
     with Session.resume(tmp_path / "s", rig) as session:
         again = run(session, folder, rig)
     assert (again.captured, again.n_known) == ([], N_PAIRS)
