@@ -60,6 +60,7 @@ def estimate_extrinsics(
     Raises:
         NotEnoughDataError: no channel has enough captures, or they leave a direction undetermined.
     """
+    begin(progress, "intrinsics and board")
     candidates, settings = _with_session_lens(candidates, board, settings)
     agreed, noise_px = _agree(candidates, board)
     matched = {name: consensus.observations for name, consensus in agreed.items()}

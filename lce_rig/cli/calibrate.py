@@ -399,7 +399,7 @@ def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
             f"  {show.escape(finding.text)}"
             for finding in c.findings
             if finding.code in _CORRECTED and finding.severity == "note"
-        ]
+        ][:1]
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
         lines.append(
             f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"

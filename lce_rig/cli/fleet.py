@@ -4,7 +4,9 @@ import csv
 import json
 import math
 import os
+import shlex
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -35,6 +37,7 @@ _SHOWN = (
     "sigma_rotation_deg",
     "sigma_translation_m",
 )
+_HEADINGS = ("robot", "captured", "camera", "lidar", "result", ">used", ">deg", ">mm", "cause")
 _MOST_SHOWN, _MOST_FINDINGS, _MOST_CAUSES = 100, 5, 5
 
 
@@ -142,6 +145,7 @@ def run(
             f"  {len(done.causes) - _MOST_CAUSES} more causes: lce-rig fleet table --registry {registry}"
         )
     show.say(f"{place.url}: {show.counted(len(done.table), 'row')} in the table")
+    show.note(f"  next         lce-rig fleet report --registry {shlex.quote(registry)}")
 
 
 @fleet.command()
@@ -197,13 +201,24 @@ def table(
         sys.stdout.write("\n]}\n")
     else:
         rows = chosen.slice(0, _MOST_SHOWN).to_pylist()
-        shown = show.plain_table("", *chosen.column_names)
+        shown = show.plain_table("", *(chosen.column_names if columns else _HEADINGS))
         for row in rows:
-            shown.add_row(*(_cell(value) for value in row.values()))
+            shown.add_row(*(map(_cell, row.values()) if columns else _summary(row)))
         show.print_table(shown)
         is_whole = len(chosen) == len(rows)
         count = show.counted(len(chosen), "row")
         show.note(count if is_whole else f"{len(rows)} of {count}; --csv and --json print all")
+
+
+def _summary(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Sum a row up for people, under `_HEADINGS`."""
+    sigmas = (
+        "-" if row[name] is None else f"{scale * row[name]:.{digits}f}"
+        for name, scale, digits in (("sigma_rotation_deg", 1.0, 3), ("sigma_translation_m", 1000.0, 1))
+    )
+    captured, result = (row["date"] or "-")[:10], row["verdict"] or _words(row["status"])
+    names = (row["robot"], captured, row["camera"], row["lidar"], result, row["n_used"])
+    return *map(_cell, names), *sigmas, _cell(row["cause"])
 
 
 def _cell(value: Any) -> str:
@@ -249,7 +264,7 @@ def report(registry: str, output: Path, json_file: Path | None) -> None:
     states = [*made.history.robots.values()]
     unknown = states.count("cannot_tell")
     moved = f"{states.count('moved')} of {show.counted(len(states), 'robot')} moved"
-    show.note(f"{moved}{f', cannot tell of {unknown} yet' if unknown else ''}; written: {output}")
+    show.note(f"{moved}{f', {unknown} cannot be judged yet' if unknown else ''}; written: {output}")
 
 
 @fleet.command()

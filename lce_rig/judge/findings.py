@@ -172,14 +172,14 @@ def _correction(q: Mapping[str, Figure]) -> str:
         )
         if q[name]
     ]
-    return f" by {' and '.join(parts)}" if parts else ""
+    return f" by {', '.join(parts)}" if parts else ""
 
 
 def _intrinsics(finding: Finding) -> str:
     """Intrinsics do not fit: {rms_px}, {possible_px}, {displacement_px}, {turn_deg}, {focal_ratio}."""
     q = finding.figures
     if finding.severity == "note":
-        return f"boards correct the profile's intrinsics{_correction(q)}"
+        return f"boards correct intrinsics{_correction(q) or ' slightly'}"
     fit = "do not fit" if finding.severity == "error" else "fit only roughly"
     displacement_px, correction = q["displacement_px"], _correction(q)
     if not isinstance(displacement_px, float) or not math.isfinite(displacement_px):
@@ -208,9 +208,8 @@ def _scale(finding: Finding) -> str:
     scale, sigma = 100 * finding.figure("scale"), 100 * finding.figure("scale_sigma")
     squares = fill("squares of {square_m:1mm}, not {profile_square_m:1mm}", finding.figures)
     if finding.severity == "note":
-        return (
-            f"boards correct the distances by {abs(scale):.1f} +- {sigma:.1f} %: {squares}, or another lens"
-        )
+        squares = fill("squares {square_m:1mm}", finding.figures)
+        return f"boards correct the scale by {abs(scale):.1f} +- {sigma:.1f} %: {squares}, or the lens"
     side = "far" if scale > 0 else "near"
     return f"{squares}, or another lens: boards {abs(scale):.1f} +- {sigma:.1f} % too {side}"
 

@@ -98,7 +98,7 @@ def _draw_curves(drift: Drift, states: Mapping[str, State], board: Sequence[Axis
         axes.set_title(f"{motion_words(AXES[index])}: {STATES[state]}{by_board}", fontsize=8)
         axes.set_xlabel(unit, fontsize=8)
         axes.tick_params(labelsize=8)
-    of_board = "; diamond: what the board says, 1 standard deviation" if board else ""
+    of_board = "; diamond: by the board, 1 standard deviation" if board else ""
     figure.suptitle(
         f"score of the scene along each axis; shaded: changes too small to be seen{of_board}", fontsize=10
     )
