@@ -6,13 +6,13 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.core import velodyne
-from lce_rig.core.findings import Figure, Finding, Kind, Losses
+from lce_rig.core.findings import Figure, Finding, Kind
 from lce_rig.io import findings
 from lce_rig.timing.clock import resolve_hour
 
@@ -27,9 +27,6 @@ _FLAGS = [velodyne.BLOCK_FLAG] * velodyne.N_BLOCKS
 _RMC = re.compile(
     rb"\$G[PN]RMC,(\d\d)(\d\d)(\d\d)(?:\.\d*)?,([AV]),[^*\r\n]*\*([0-9A-Fa-f]{1,2})(?![0-9A-Fa-f])"
 )
-# So many packets ahead are believed whatever the host's clock says; beyond, both clocks must agree.
-_MAX_BLIND = 4
-_MAX_DISAGREEMENT_NS = 20_000_000
 
 
 class BadPacketError(ValueError):
@@ -179,51 +176,6 @@ def _read_rmc(raw: bytes) -> tuple[int | None, bool]:
     if checksum != int(match[5], 16) or minute > 59 or second > 59:
         return None, False
     return 60 * minute + second, match[4] == b"A"
-
-
-class PacketOrder:
-    """Follows the sensor's counter from packet to packet.
-
-    Args:
-        losses: receives packets that never arrived or came late, and steps of the clock.
-
-    Attributes:
-        elapsed_ns: of the counter since the first packet; hours are counted on, and steps excluded.
-    """
-
-    def __init__(self, losses: Losses) -> None:
-        self._losses = losses
-        self.elapsed_ns = 0
-        self._last: DataPacket | None = None
-
-    def place(self, packet: DataPacket) -> Literal["next", "late", "after a step"]:
-        """Compare the sensor's counter with the host's clock since the packet before.
-
-        Returns:
-            "late" for a packet to skip: it was sent before another that has arrived, or twice;
-            "after a step" where the sensor's clock was set, as it is when it locks to a pulse, or its return
-            mode.
-        """
-        last, self._last = self._last, packet
-        if last is None:
-            return "next"
-        # The shorter way around the hour.
-        half_us = velodyne.HOUR_US // 2
-        step_ns = 1000 * ((packet.us - last.us + half_us) % velodyne.HOUR_US - half_us)
-        n_ahead = round(step_ns / packet.packet_ns)
-        is_host_known = bool(last.host_ns and packet.host_ns)
-        off_ns = packet.host_ns - last.host_ns - step_ns if is_host_known else 0
-        do_agree = abs(off_ns) <= _MAX_DISAGREEMENT_NS
-        if packet.mode == last.mode and n_ahead > 0 and (n_ahead <= _MAX_BLIND or do_agree):
-            self._losses.add(findings.LOST(), n_ahead - 1)
-            self.elapsed_ns += step_ns
-            return "next"
-        if n_ahead <= 0 and step_ns > -_MAX_DISAGREEMENT_NS and do_agree:
-            self._last = last
-            self._losses.add(findings.LATE())
-            return "late"
-        self._losses.add(findings.CLOCK_SET())
-        return "after a step"
 
 
 #: Clocks further apart than this do not both show UTC.

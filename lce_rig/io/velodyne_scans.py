@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ from lce_rig.io.protocol import SourceOptions, choose_lidar, fingerprint
 from lce_rig.io.velodyne_packets import (
     BadPacketError,
     DataPacket,
-    PacketOrder,
     VelodyneClock,
     read_data_packet,
     read_position_packet,
@@ -38,6 +37,9 @@ OFFSETS_NOTE = "points include the lasers' vertical offsets (VLP-16: up to 11 mm
 DUAL_NOTE = "dual returns: of each firing the brighter one is kept"
 _CONTROLS = ("position_port", "cut_deg")
 _MODELS = {"VLP-16": "VLP16", "Puck Hi-Res": "PuckHiRes", "HDL-32E": "HDL32E", "VLP-32C": "VLP32C"}
+# So many packets ahead are believed whatever the host's clock says; beyond, both clocks must agree.
+_MAX_BLIND = 4
+_MAX_DISAGREEMENT_NS = 20_000_000
 # A scan with more of its packets lost is not worth looking at.
 _MIN_COVERAGE = 0.5
 
@@ -117,8 +119,19 @@ class Vlp16Stream:
             )
         self.product = product
         self._sensor = sensor
-        self._order = PacketOrder(self.losses)
-        self._decoder = Vlp16Decoder(settings.min_range_m, settings.max_range_m, self.product)
+        # Of the sensor's counter since the first packet; hours are counted on, and steps excluded.
+        self._elapsed_ns = 0
+        self._last: DataPacket | None = None
+        import velodyne_decoder  # type: ignore[import-untyped]
+
+        self._library: Any = velodyne_decoder
+        config = velodyne_decoder.Config(
+            model=getattr(velodyne_decoder.Model, _MODELS[product.name]),
+            min_range=settings.min_range_m,
+            max_range=settings.max_range_m,
+            timestamp_first_packet=True,
+        )
+        self._decoder = velodyne_decoder.ScanDecoder(config)
         # The sensor counts clockwise.
         _, cut_rad = read_controls(sensor, settings)
         self._cut = round(-cut_rad / velodyne.AZIMUTH_STEP_RAD) % velodyne.AZIMUTH_STEPS
@@ -158,7 +171,7 @@ class Vlp16Stream:
             self.losses.add(kind(where=f"data packet: {error}"))
             self.other_models.update([error.model] if error.model else [])
             return None
-        place = self._order.place(packet)
+        place = self._place(packet)
         if place == "late":
             return None
         self.n_data += 1
@@ -167,8 +180,8 @@ class Vlp16Stream:
             self._pieces, self._is_from_cut = [], False
             self.clock.restart()
         self.mode, self.rotor_hz = packet.mode, packet.steps_per_ns * 1e9 / velodyne.AZIMUTH_STEPS
-        self.clock.see_data(packet, self._order.elapsed_ns)
-        return self._add(packet, self._order.elapsed_ns)
+        self.clock.see_data(packet, self._elapsed_ns)
+        return self._add(packet, self._elapsed_ns)
 
     def finish(self) -> Scan | None:
         """End the stream; returns the last scan where it is whole but for the packet that would close it."""
@@ -181,6 +194,35 @@ class Vlp16Stream:
         self._pieces, self._is_from_cut = [], False
         self.losses.add(findings.SCAN_PARTIAL())
         return None
+
+    def _place(self, packet: DataPacket) -> Literal["next", "late", "after a step"]:
+        """Compare the sensor's counter with the host's clock since the packet before.
+
+        Returns:
+            "late" for a packet to skip: it was sent before another that has arrived, or twice;
+            "after a step" where the sensor's clock was set, as it is when it locks to a pulse, or its return
+            mode.
+        """
+        last, self._last = self._last, packet
+        if last is None:
+            return "next"
+        # The shorter way around the hour.
+        half_us = velodyne.HOUR_US // 2
+        step_ns = 1000 * ((packet.us - last.us + half_us) % velodyne.HOUR_US - half_us)
+        n_ahead = round(step_ns / packet.packet_ns)
+        is_host_known = bool(last.host_ns and packet.host_ns)
+        off_ns = packet.host_ns - last.host_ns - step_ns if is_host_known else 0
+        do_agree = abs(off_ns) <= _MAX_DISAGREEMENT_NS
+        if packet.mode == last.mode and n_ahead > 0 and (n_ahead <= _MAX_BLIND or do_agree):
+            self.losses.add(findings.LOST(), n_ahead - 1)
+            self._elapsed_ns += step_ns
+            return "next"
+        if n_ahead <= 0 and step_ns > -_MAX_DISAGREEMENT_NS and do_agree:
+            self._last = last
+            self.losses.add(findings.LATE())
+            return "late"
+        self.losses.add(findings.CLOCK_SET())
+        return "after a step"
 
     def _add(self, packet: DataPacket, elapsed_ns: int) -> Scan | None:
         """Add a packet to its revolution, or to two where the rotor passes the cut within it."""
@@ -225,7 +267,7 @@ class Vlp16Stream:
         first = pieces[0]
         if first.packet.is_dual:
             keep_brighter(packets)
-        points, intensity, ring, offset_ns = self._decoder.decode(packets, [p.elapsed_ns for p in pieces])
+        points, intensity, ring, offset_ns = self._decode(packets, [p.elapsed_ns for p in pieces])
         if len(points) == 0:
             self.losses.add(findings.SCAN_THIN())
             return None
@@ -240,25 +282,7 @@ class Vlp16Stream:
         host_ns = packet.host_ns or None
         return Scan(self._sensor, stamp_ns, points, intensity, ring, offset_ns - lead_ns, host_ns)
 
-
-class Vlp16Decoder:
-    """Decodes packets of one model, a VLP-16 by default, that were checked before."""
-
-    def __init__(
-        self, min_range_m: float, max_range_m: float, product: velodyne.Product = velodyne.READ[0]
-    ) -> None:
-        import velodyne_decoder  # type: ignore[import-untyped]
-
-        self._library: Any = velodyne_decoder
-        config = velodyne_decoder.Config(
-            model=getattr(velodyne_decoder.Model, _MODELS[product.name]),
-            min_range=min_range_m,
-            max_range=max_range_m,
-            timestamp_first_packet=True,
-        )
-        self._decoder = velodyne_decoder.ScanDecoder(config)
-
-    def decode(
+    def _decode(
         self, packets: NDArray[np.void], start_ns: Sequence[int]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int16], NDArray[np.int64]]:
         """Decode packets of one return mode.
