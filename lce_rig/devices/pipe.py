@@ -11,8 +11,7 @@ import selectors
 import signal
 import subprocess
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from fcntl import F_SETPIPE_SZ, fcntl
 from typing import IO
@@ -70,7 +69,7 @@ class ImagePipeSource(LiveSource):
             hint = f"Add to cameras.{self.sensor}: {line}\nAn example of a command: {_EXAMPLE}"
             raise SourceError(f"{self.sensor}: the profile does not say how it is reached", hint)
         self._complaints, self._n_images = b"", 0
-        self._stream: ImageStream = Y4mImages()
+        self._stream = ImageStream()
         wanted = self._settings.driver.pixel_format
         if wanted is not None:
             code = find_format(wanted)
@@ -78,7 +77,7 @@ class ImagePipeSource(LiveSource):
                 what = f"{self._who}: raw images of driver.pixel_format {wanted!r} are not read"
                 raw = ", ".join(code.strip() for code, form in FORMATS.items() if not form.is_compressed)
                 raise SourceError(what, f"It can be {raw}, or missing for Y4M.")
-            self._stream = RawImages(code, *self._settings.resolution_px)
+            self._stream = ImageStream(PixelDecoder(code, *self._settings.resolution_px))
         try:
             self._process = subprocess.Popen(
                 command,
@@ -183,13 +182,18 @@ def _end_process(process: "subprocess.Popen[bytes]") -> None:
             pipe.close()
 
 
-class ImageStream(ABC):
-    """Bytes in as they come, images out."""
+class ImageStream:
+    """Bytes in as they come, images out.
 
-    _decode: Callable[[bytes], Pixels]
+    Args:
+        decoder: of raw images with nothing between them and no padding of rows; None for YUV4MPEG2 of 8 bits,
+            grey or 4:2:0, whose header says what follows.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, decoder: PixelDecoder | None = None) -> None:
         self._rest = bytearray()
+        self._decoder = decoder
+        self._is_raw = self._is_in_frame = decoder is not None
 
     def feed(self, data: bytes) -> Iterator[Pixels]:
         """Take bytes and yield the images that they complete, (H, W) grey or (H, W, 3) BGR.
@@ -198,79 +202,52 @@ class ImageStream(ABC):
             ValueError: the stream is not what it began as.
         """
         self._rest += data
-        while (payload := self._cut()) is not None:
-            yield self._decode(payload)
+        while self._is_in_frame or self._begin_frame():
+            assert self._decoder is not None  # as a frame has begun
+            if len(self._rest) < self._decoder.n_bytes:
+                break
+            payload = bytes(self._rest[: self._decoder.n_bytes])
+            del self._rest[: len(payload)]
+            self._is_in_frame = self._is_raw
+            yield self._decoder.decode(payload)
 
-    @abstractmethod
-    def _cut(self) -> bytes | None:
-        """Take the next image's bytes off the rest; None where they have not all come."""
-
-    def _take(self, n_bytes: int) -> bytes | None:
-        if len(self._rest) < n_bytes:
-            return None
-        taken = bytes(self._rest[:n_bytes])
-        del self._rest[:n_bytes]
-        return taken
-
-
-class RawImages(ImageStream):
-    """Images of one pixel format and size, with nothing between them and no padding of rows."""
-
-    def __init__(self, code: str, width: int, height: int) -> None:
-        super().__init__()
-        decoder = PixelDecoder(code, width, height)
-        self._n_bytes, self._decode = decoder.n_bytes, decoder.decode
-
-    def _cut(self) -> bytes | None:
-        return self._take(self._n_bytes)
-
-
-class Y4mImages(ImageStream):
-    """YUV4MPEG2 of 8 bits, grey or 4:2:0."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._n_bytes = 0
-        self._is_in_frame = False
-
-    def _cut(self) -> bytes | None:
-        if not self._n_bytes:
+    def _begin_frame(self) -> bool:
+        """Read the header of the stream, and of an image; returns whether they have come."""
+        if self._decoder is None:
             begin = bytes(self._rest[: len(_Y4M)])
             if not _Y4M.startswith(begin):
                 raise ValueError(f"no Y4M: they begin {begin!r}")
             header = self._line()
             if header is None:
-                return None
-            self._read_header(header)
-        if not self._is_in_frame:
-            line = self._line()
-            if line is None:
-                return None
-            if not line.startswith("FRAME"):
-                raise ValueError(f"a Y4M frame was expected, {line[:20]!r} came (GStreamer pads rows)")
-            self._is_in_frame = True
-        payload = self._take(self._n_bytes)
-        self._is_in_frame = payload is None
-        return payload
+                return False
+            self._decoder = _decoder_of_y4m(header)
+        line = self._line()
+        if line is not None and not line.startswith("FRAME"):
+            raise ValueError(f"a Y4M frame was expected, {line[:20]!r} came (GStreamer pads rows)")
+        self._is_in_frame = line is not None
+        return self._is_in_frame
 
     def _line(self) -> str | None:
         end = self._rest.find(b"\n", 0, _MAX_HEADER)
-        if end < 0 and len(self._rest) >= _MAX_HEADER:
-            raise ValueError("a line of text was expected, other bytes came")
-        line = self._take(end + 1) if end >= 0 else None
-        return None if line is None else line.decode("ascii", "backslashreplace").rstrip()
+        if end < 0:
+            if len(self._rest) >= _MAX_HEADER:
+                raise ValueError("a line of text was expected, other bytes came")
+            return None
+        line = self._rest[:end].decode("ascii", "backslashreplace").rstrip()
+        del self._rest[: end + 1]
+        return line
 
-    def _read_header(self, line: str) -> None:
-        fields = {word[0]: word[1:] for word in line.split(" ")[1:] if word}
-        sides, colour = (fields.get("W", ""), fields.get("H", "")), fields.get("C", "420")
-        if not all(side.isdigit() and 0 < int(side) < 65536 for side in sides):
-            raise ValueError(f"the Y4M header holds no size: {line[:80]!r}")
-        if colour not in _Y4M_COLOURS:
-            raise ValueError(f"Y4M colour {colour} is not read here: let the command write 4:2:0, 8 bit")
-        width, height = (int(side) for side in sides)
-        if width * height > MAX_PIXELS:
-            raise ValueError(f"Y4M images of {width}x{height} px are too large: at most {MAX_PIXELS} px")
-        if colour != "mono" and (width % 2 or height % 2):
-            raise ValueError(f"Y4M images of {width}x{height} px in colour: both must be even")
-        decoder = PixelDecoder("GREY" if colour == "mono" else "YU12", width, height)
-        self._n_bytes, self._decode = decoder.n_bytes, decoder.decode
+
+def _decoder_of_y4m(header: str) -> PixelDecoder:
+    fields = {word[0]: word[1:] for word in header.split(" ")[1:] if word}
+    sides, colour = (fields.get("W", ""), fields.get("H", "")), fields.get("C", "420")
+    if not all(side.isdigit() and 0 < int(side) < 65536 for side in sides):
+        raise ValueError(f"the Y4M header holds no size: {header[:80]!r}")
+    if colour not in _Y4M_COLOURS:
+        raise ValueError(f"Y4M colour {colour} is not read here: let the command write 4:2:0, 8 bit")
+    width, height = (int(side) for side in sides)
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"Y4M images of {width}x{height} px are too large: at most {MAX_PIXELS} px")
+    if colour != "mono" and (width % 2 or height % 2):
+        raise ValueError(f"Y4M images of {width}x{height} px in colour: both must be even")
+    return PixelDecoder("GREY" if colour == "mono" else "YU12", width, height)

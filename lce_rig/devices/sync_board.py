@@ -5,7 +5,8 @@ import math
 import threading
 import time
 from collections import deque
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import serial
@@ -35,84 +36,6 @@ _UTC_MIN_ANSWERS = 8
 _N_HEARD_BYTES = 40
 
 
-class BoardPort:
-    """An open serial port, for this program alone.
-
-    DTR and RTS are low before it opens: on many boards they are wired to the reset. Some kernels raise them
-    for a moment all the same.
-
-    Raises:
-        SourceError: it is absent, busy, not permitted or no serial port.
-    """
-
-    def __init__(self, who: str, device: str, baud: int) -> None:
-        self._who, self._device = who, device
-        self._port = serial.Serial()
-        self._port.port, self._port.baudrate = device, baud
-        self._port.timeout, self._port.write_timeout = _READ_S, _WRITE_S
-        self._port.exclusive = True
-        self._port.dtr = self._port.rts = False
-        try:
-            self._port.open()
-        except (serial.SerialException, OSError, ValueError) as error:
-            raise self._explain(error) from None
-
-    def read(self) -> bytes:
-        """Wait for bytes, 20 ms at most, and return them.
-
-        Raises:
-            SourceError: the board was unplugged.
-        """
-        try:
-            return bytes(self._port.read(max(1, self._port.in_waiting)))
-        except (serial.SerialException, OSError) as error:
-            raise self._gone(error) from None
-
-    def write(self, data: bytes) -> int:
-        """Send a command; gives the time of day in ns when it went out.
-
-        Raises:
-            SourceError: the board was unplugged.
-        """
-        sent_ns = time.time_ns()
-        try:
-            self._port.write(data)
-        except serial.SerialTimeoutException:
-            pass  # A board that takes no commands gives no answers either, which is reported.
-        except (serial.SerialException, OSError) as error:
-            raise self._gone(error) from None
-        return sent_ns
-
-    def close(self) -> None:
-        """Close the port; never raises."""
-        with suppress(serial.SerialException, OSError):
-            self._port.close()
-
-    def _gone(self, error: Exception) -> SourceError:
-        number = getattr(error, "errno", None)
-        cause = errno.errorcode.get(number, number) if number else str(error).partition("(")[0].strip()
-        return SourceError(
-            f"{self._who} on {self._device} is gone: {cause}",
-            "Check its plug and cable and its power; what was captured before is safe. Begin again when "
-            "`ls -l /dev/serial/by-id` shows it.",
-        )
-
-    def _explain(self, error: Exception) -> SourceError:
-        """Explain why the port cannot be opened, with an action."""
-        number, what = getattr(error, "errno", None), f"{self._who}: {self._device}"
-        if number == errno.ENOENT:
-            ports = sorted(map(str, _BY_ID.iterdir())) if _BY_ID.is_dir() else []
-            listing = f"choose one of: {', '.join(ports)}" if ports else "no port is there"
-            return SourceError(f"{what} is not there", f"Check plug and cable, and sync.device; {listing}.")
-        if number in (errno.EACCES, errno.EPERM):
-            hint = "Run: sudo usermod -aG dialout $USER, then log in again."
-            return SourceError(f"{what} may not be opened by this user", hint)
-        if number in (errno.EBUSY, errno.EAGAIN):
-            hint = f"Close it: a serial monitor, ModemManager or another lce-rig. `fuser {self._device}`."
-            return SourceError(f"{what} is in use by another program", hint)
-        return SourceError(f"{what} cannot be opened: {error}", "Check sync.device in the profile.")
-
-
 class SyncBoard(LiveSource):
     """An attached sync board; a `LiveSource` of pulses.
 
@@ -139,7 +62,7 @@ class SyncBoard(LiveSource):
         self._n_restarts = self._cookie = 0
         self._asked_ns = self._told_utc_ns = self._greeted_ns = 0
         self._is_set_up = False
-        self._port: BoardPort | None = None
+        self._port: serial.Serial | None = None
 
     def open(self) -> None:
         """Open the port, wait for the board's first words, set its lines and start them.
@@ -147,7 +70,7 @@ class SyncBoard(LiveSource):
         Raises:
             SourceError: the port cannot be opened, or the board is silent or talks otherwise.
         """
-        self._port = BoardPort(self._who, self._settings.device, self._settings.port_baud)
+        self._port = self._open_port()
         self._early, self._heard, self._is_set_up = [], b"", False
         with self._lock:
             self._state.opened(time.monotonic_ns())
@@ -175,7 +98,8 @@ class SyncBoard(LiveSource):
     def close(self) -> None:
         """Close the port; the board's pulses go on, so that the LiDAR stays locked."""
         if self._port is not None:
-            self._port.close()
+            with suppress(serial.SerialException, OSError):
+                self._port.close()
 
     def read(self) -> list[Pulse]:
         """Return the pulses that came, and send the commands that are due.
@@ -187,7 +111,8 @@ class SyncBoard(LiveSource):
         """
         assert self._port is not None  # it is open
         early, self._early = self._early, []
-        data = self._port.read()
+        with self._reaching_board():
+            data = bytes(self._port.read(max(1, self._port.in_waiting)))
         arrival = Arrival(time.time_ns(), time.monotonic_ns())
         self._heard = (self._heard + data)[:_N_HEARD_BYTES]
         with self._lock:
@@ -203,7 +128,7 @@ class SyncBoard(LiveSource):
             if has_restarted or (not self._is_set_up and self._state.hello is not None):
                 self._set_lines()
                 self._is_set_up = True
-        self._talk(self._port, arrival.steady_ns)
+        self._talk(arrival.steady_ns)
         return early + pulses
 
     def describe(self) -> SourceStatus:
@@ -241,6 +166,59 @@ class SyncBoard(LiveSource):
             self._rate_hz = rate_hz
             self._set_lines()
 
+    def _open_port(self) -> serial.Serial:
+        """Open the serial port for this program alone.
+
+        DTR and RTS are low before it opens: on many boards they are wired to the reset. Some kernels raise
+        them for a moment all the same.
+        """
+        port = serial.Serial(baudrate=self._settings.port_baud, timeout=_READ_S, write_timeout=_WRITE_S)
+        port.port, port.exclusive = self._settings.device, True
+        port.dtr = port.rts = False
+        try:
+            port.open()
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise self._explain(error) from None
+        return port
+
+    def _write(self, data: bytes) -> int:
+        """Send a command; gives the time of day in ns when it went out."""
+        assert self._port is not None  # it is open
+        sent_ns = time.time_ns()
+        # A board that takes no commands gives no answers either, which is reported.
+        with self._reaching_board(), suppress(serial.SerialTimeoutException):
+            self._port.write(data)
+        return sent_ns
+
+    @contextmanager
+    def _reaching_board(self) -> Iterator[None]:
+        try:
+            yield
+        except (serial.SerialException, OSError) as error:
+            number = getattr(error, "errno", None)
+            cause = errno.errorcode.get(number, number) if number else str(error).partition("(")[0].strip()
+            raise SourceError(
+                f"{self._who} on {self._settings.device} is gone: {cause}",
+                "Check its plug and cable and its power; what was captured before is safe. Begin again when "
+                "`ls -l /dev/serial/by-id` shows it.",
+            ) from None
+
+    def _explain(self, error: Exception) -> SourceError:
+        """Explain why the port cannot be opened, with an action."""
+        number, device = getattr(error, "errno", None), self._settings.device
+        what = f"{self._who}: {device}"
+        if number == errno.ENOENT:
+            ports = sorted(map(str, _BY_ID.iterdir())) if _BY_ID.is_dir() else []
+            listing = f"choose one of: {', '.join(ports)}" if ports else "no port is there"
+            return SourceError(f"{what} is not there", f"Check plug and cable, and sync.device; {listing}.")
+        if number in (errno.EACCES, errno.EPERM):
+            hint = "Run: sudo usermod -aG dialout $USER, then log in again."
+            return SourceError(f"{what} may not be opened by this user", hint)
+        if number in (errno.EBUSY, errno.EAGAIN):
+            hint = f"Close it: a serial monitor, ModemManager or another lce-rig. `fuser {device}`."
+            return SourceError(f"{what} is in use by another program", hint)
+        return SourceError(f"{what} cannot be opened: {error}", "Check sync.device in the profile.")
+
     def _set_lines(self) -> None:
         """Queue the commands that set the lines, for a board that knows nothing yet."""
         for trigger in self._settings.triggers.values():
@@ -250,25 +228,25 @@ class SyncBoard(LiveSource):
         if self._settings.triggers:
             self._outbox.append(lce1.START)
 
-    def _talk(self, port: BoardPort, now_ns: int) -> None:
+    def _talk(self, now_ns: int) -> None:
         """Send the greetings, commands, UTC and time requests that are due."""
         if not self._is_set_up:
             if now_ns - self._greeted_ns > _GREET_AGAIN_NS:
                 self._greeted_ns = now_ns
-                port.write(lce1.ASK_HELLO)
+                self._write(lce1.ASK_HELLO)
             return
         while self._outbox:
-            port.write(self._outbox.popleft())
+            self._write(self._outbox.popleft())
         if now_ns - self._told_utc_ns > _SET_UTC_EVERY_NS:
-            self._tell_utc(port, now_ns)
+            self._tell_utc(now_ns)
         is_free = self._state.has_answered or now_ns - self._asked_ns > _ANSWER_WITHIN_NS
         if is_free and now_ns - self._asked_ns > _ASK_EVERY_NS:
             self._asked_ns = now_ns
             self._cookie += 1
             # The answer is read by this same thread: it cannot overtake the note.
-            self._state.asked(self._cookie, port.write(lce1.ask_time(self._cookie)))
+            self._state.asked(self._cookie, self._write(lce1.ask_time(self._cookie)))
 
-    def _tell_utc(self, port: BoardPort, now_ns: int) -> None:
+    def _tell_utc(self, now_ns: int) -> None:
         """Tell a board that has no receiver when a second begins, by the computer's time of day."""
         with self._lock:
             pps, model = self._state.pps, self._state.host_tracker.model
@@ -278,4 +256,4 @@ class SyncBoard(LiveSource):
         board_clock = model.inverse()
         if board_clock.sigma_ns(utc_s * NS_PER_S) < _UTC_SIGMA_NS:
             self._told_utc_ns = now_ns
-            port.write(lce1.set_utc(round(board_clock.convert(utc_s * NS_PER_S) / 1000), utc_s))
+            self._write(lce1.set_utc(round(board_clock.convert(utc_s * NS_PER_S) / 1000), utc_s))

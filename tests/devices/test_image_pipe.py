@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from lce_rig.core.data import Image, LiveSample
 from lce_rig.core.errors import SourceError
-from lce_rig.devices.pipe import ImagePipeSource, ImageStream, RawImages, Y4mImages
+from lce_rig.devices.pipe import ImagePipeSource, ImageStream
+from lce_rig.devices.pixel_formats import PixelDecoder
 from lce_rig.rig import CameraSettings, load_rig
 from tests.devices.attached import attached
 from tests.shared import has_ended, wait_until
@@ -43,9 +44,9 @@ def raw(pictures: list[np.ndarray]) -> bytes:
 
 
 STREAMS: dict[str, tuple[Callable[[list[np.ndarray]], bytes], Callable[[], ImageStream]]] = {
-    "y4m": (y4m, Y4mImages),
-    "grey y4m": (lambda pictures: y4m(pictures, "mono"), Y4mImages),
-    "raw": (raw, lambda: RawImages("GREY", WIDTH, HEIGHT)),
+    "y4m": (y4m, ImageStream),
+    "grey y4m": (lambda pictures: y4m(pictures, "mono"), ImageStream),
+    "raw": (raw, lambda: ImageStream(PixelDecoder("GREY", WIDTH, HEIGHT))),
 }
 
 
@@ -74,7 +75,7 @@ def test_grey_values_are_kept(kind: str) -> None:
 
 @pytest.mark.parametrize("colour", ["420", "420mpeg2"])
 def test_y4m_luma_is_of_video_range(colour: str) -> None:
-    came = levels(list(Y4mImages().feed(y4m(grey_pictures(3), colour))))
+    came = levels(list(ImageStream().feed(y4m(grey_pictures(3), colour))))
     assert came == pytest.approx([(level - 16) * 255 / 219 for level in (30, 40, 50)], abs=1)
 
 
@@ -94,7 +95,7 @@ def test_y4m_luma_is_of_video_range(colour: str) -> None:
 )
 def test_streams_that_cannot_be_read_are_refused(begin: bytes) -> None:
     with pytest.raises(ValueError):
-        list(Y4mImages().feed(begin))
+        list(ImageStream().feed(begin))
 
 
 # What follows runs real programs at the other end of a real pipe.
