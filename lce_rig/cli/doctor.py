@@ -10,7 +10,7 @@ from lce_rig.cli.options import FiniteRange, explain_option, json_option, path_o
 from lce_rig.core.findings import worst
 from lce_rig.core.phrasing import as_line
 from lce_rig.devices import sensors
-from lce_rig.doctor.checks import Check, DoctorOptions, examine
+from lce_rig.doctor.checks import Check, examine
 from lce_rig.rig import load_rig
 
 _MARKS = {"note": "[green]ok[/]  ", "warning": "[yellow]warn[/]", "error": "[bold red]FAIL[/]"}
@@ -48,7 +48,7 @@ def doctor(rig_name: str, explain: bool, as_json: bool, duration: float, folder:
     """
     rig = load_rig(rig_name)
     show.note(f"watching {', '.join(sensors(rig))} ...")
-    checks = examine(rig, DoctorOptions(duration, folder))
+    checks = examine(rig, duration, folder)
     severity = worst(found for check in checks for found in check.findings)
     if as_json:
         # Figures that were not measured are null.

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -400,15 +400,7 @@ class Check:
         return {name: figure for each in self.findings for name, figure in each.figures.items()}
 
 
-class DoctorOptions(NamedTuple):
-    """How to examine: for how long, where sessions are to be written, port of a VLP-16's web server."""
-
-    duration_s: float = 5.0
-    folder: Path = Path()
-    web_port: int = 80
-
-
-def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
+def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path(), web_port: int = 80) -> list[Check]:
     """Look at the computer and every sensor of a rig.
 
     What is absent or fails is an error; everything else is looked at all the same. Takes the duration, and
@@ -416,22 +408,21 @@ def examine(rig: Rig, options: DoctorOptions | None = None) -> list[Check]:
 
     Args:
         rig: the profile.
-        options: how to examine.
+        duration_s: for how long the sensors are watched.
+        folder: where sessions are to be written.
+        web_port: of a VLP-16's web server.
 
     Returns:
         A line for each thing looked at: the computer's, each sensor's, the rig's.
     """
-    options = options or DoctorOptions()
     seen, sources = dict[str, ObservedSensor](), list[LiveSource]()
     for sensor in sensors(rig):
         try:
             sources.append(source_of(rig, sensor))
         except SourceError as error:
             seen[sensor] = ObservedSensor(sensor, failure=error)
-    exam = Examination(rig, options.folder, seen | observe(sources, options.duration_s))
-    web = {
-        name: _read_web(rig, name, options.web_port) for name in rig.lidars if exam.driver(name) == "vlp16"
-    }
+    exam = Examination(rig, folder, seen | observe(sources, duration_s))
+    web = {name: _read_web(rig, name, web_port) for name in rig.lidars if exam.driver(name) == "vlp16"}
     exam = replace(exam, web=web)
     subjects = [("computer", "computer"), *((name, "lidar") for name in rig.lidars)]
     subjects += [*((name, "camera") for name in rig.cameras), *([(BOARD, "sync")] if rig.sync else [])]

@@ -1,10 +1,19 @@
 """Findings about recordings and packets: parts that were skipped, repaired, lost or assumed."""
 
-from lce_rig.core.findings import Finding, Kind
+from functools import partial
+
+from lce_rig.core.findings import Finding, Kind, Losses
+
+_note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
+
+
+def worded(losses: Losses) -> list[str]:
+    """List the losses, a line each."""
+    return [finding.sentence for finding in losses.findings()]
 
 
 def _loss(name: str, text: str) -> Kind:
-    return Kind(f"recording.{name}", text, severity="warning")
+    return _warning(f"recording.{name}", text)
 
 
 BROKEN_PACKETS = _loss("broken_packets", "{n} broken packets skipped (first: {where})")
@@ -22,24 +31,16 @@ CLOCK_SET_BACK = _loss("clock_set_back", "{n} jumps of the clock back by more th
 NOT_DECODED = _loss("not_decoded", "{n} could not be decoded (first: {where})")
 
 
-DAMAGED = Kind("packet.damaged", "{n} damaged packets skipped (first: {where})", severity="warning")
-OTHER_MODEL = Kind(
-    "packet.other_model", "{n} packets of another LiDAR model skipped (first: {where})", severity="warning"
+DAMAGED = _warning("packet.damaged", "{n} damaged packets skipped (first: {where})")
+OTHER_MODEL = _warning("packet.other_model", "{n} packets of another LiDAR model skipped (first: {where})")
+LOST = _warning("packet.lost", "{n} data packets lost")
+LATE = _warning("packet.late", "{n} data packets late or sent twice, skipped")
+CLOCK_SET = _note("packet.clock_set", "the LiDAR's clock was set {n} times")
+SCAN_PARTIAL = _note("scan.partial", "{n} revolutions skipped: cut off at an end, or where the clock was set")
+SCAN_THIN = _warning(
+    "scan.thin", "{n} revolutions skipped: more than half of their packets or all returns are missing"
 )
-LOST = Kind("packet.lost", "{n} data packets lost", severity="warning")
-LATE = Kind("packet.late", "{n} data packets late or sent twice, skipped", severity="warning")
-CLOCK_SET = Kind("packet.clock_set", "the LiDAR's clock was set {n} times", severity="note")
-SCAN_PARTIAL = Kind(
-    "scan.partial", "{n} revolutions skipped: cut off at an end, or where the clock was set", severity="note"
-)
-SCAN_THIN = Kind(
-    "scan.thin",
-    "{n} revolutions skipped: more than half of their packets or all returns are missing",
-    severity="warning",
-)
-CUT_SHORT = Kind(
-    "datagram.cut_short", "{n} datagrams skipped: fragments, or cut short by the recorder", severity="warning"
-)
+CUT_SHORT = _warning("datagram.cut_short", "{n} datagrams skipped: fragments, or cut short by the recorder")
 
 _BY_ARRIVAL = "scans are timestamped by arrival: "
 
@@ -57,52 +58,34 @@ def _nmea_of_other_second(finding: Finding) -> str:
     return f"{_BY_ARRIVAL}NMEA time {minute:02d}:{second:02d} past the hour is not the LiDAR's"
 
 
-LIDAR_UTC = Kind("clock.lidar_utc", _lidar_utc, severity="note")
-HOST_WANTED = Kind("clock.host_wanted", f"{_BY_ARRIVAL}timestamps.clock is host", severity="note")
-ARRIVALS_UNKNOWN = Kind(
-    "clock.arrivals_unknown",
-    "scans are not timestamped: their arrivals and so the hour are unknown",
-    severity="note",
+LIDAR_UTC = _note("clock.lidar_utc", _lidar_utc)
+HOST_WANTED = _note("clock.host_wanted", f"{_BY_ARRIVAL}timestamps.clock is host")
+ARRIVALS_UNKNOWN = _note(
+    "clock.arrivals_unknown", "scans are not timestamped: their arrivals and so the hour are unknown"
 )
-NO_POSITION_PACKETS = Kind(
+NO_POSITION_PACKETS = _warning(
     "clock.no_position_packets",
     f"{_BY_ARRIVAL}no position packets, which report PPS",
     "open port 8308 in the firewall, and record it beside the data",
-    severity="warning",
 )
-POSITION_PACKETS_STOPPED = Kind(
+POSITION_PACKETS_STOPPED = _warning(
     "clock.position_packets_stopped",
     f"{_BY_ARRIVAL}position packets have stopped, or their time differs",
     "check the network and the sensor",
-    severity="warning",
 )
-PPS_NOT_LOCKED = Kind(
+PPS_NOT_LOCKED = _warning(
     "clock.pps_not_locked",
     f"{_BY_ARRIVAL}PPS is {{pps}}",
     "check the pulse at the interface box: 1 Hz, 3 to 15 V, rising edge",
-    severity="warning",
 )
-NO_NMEA = Kind(
-    "clock.no_nmea",
-    f"{_BY_ARRIVAL}no NMEA",
-    "send $GPRMC at 9600 baud with RS-232 polarity",
-    severity="warning",
+NO_NMEA = _warning(
+    "clock.no_nmea", f"{_BY_ARRIVAL}no NMEA, or damaged NMEA", "send $GPRMC at 9600 baud with RS-232 polarity"
 )
-NMEA_DAMAGED = Kind(
-    "clock.nmea_damaged",
-    f"{_BY_ARRIVAL}NMEA is damaged",
-    "send $GPRMC at 9600 baud with RS-232 polarity",
-    severity="warning",
+NMEA_OF_OTHER_SECOND = _warning(
+    "clock.nmea_of_other_second", _nmea_of_other_second, "send each sentence after its pulse, within a second"
 )
-NMEA_OF_OTHER_SECOND = Kind(
-    "clock.nmea_of_other_second",
-    _nmea_of_other_second,
-    "send each sentence after its pulse, within a second",
-    severity="warning",
-)
-LIDAR_UTC_DIFFERS = Kind(
+LIDAR_UTC_DIFFERS = _warning(
     "clock.lidar_utc_differs",
     f"{_BY_ARRIVAL}the LiDAR's UTC differs by {{ahead_s:+.2f}} s from this computer's",
     "set this computer's clock by the same source (chrony with gpsd, or NTP)",
-    severity="warning",
 )

@@ -17,7 +17,7 @@ from lce_rig.core.errors import SourceError, reading
 from lce_rig.core.findings import Losses
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image, require_las
-from lce_rig.io.findings import NOT_DECODED
+from lce_rig.io.findings import NOT_DECODED, worded
 from lce_rig.io.protocol import (
     PairMethod,
     SourceOptions,
@@ -347,7 +347,7 @@ class ImagesRecording:
                 n_read += 1
                 yield image
         finally:
-            self.notes += [f"{self.path.name}: {finding.text}" for finding in losses.findings()]
+            self.notes += [f"{self.path.name}: {line}" for line in worded(losses)]
         if n_read == 0:
             raise SourceError(f"{self.path}: not one image could be read")
 

@@ -136,8 +136,7 @@ class PcapFile:
 
     def account(self) -> list[str]:
         """List the losses in words."""
-        lines = [loss.text for loss in self.losses.findings()]
-        return [*lines, self.damage] if self.damage else lines
+        return findings.worded(self.losses) + ([self.damage] if self.damage else [])
 
     def _read(self, raw: bytes, host_ns: int) -> Datagram | None:
         """Take the UDP datagram out of a frame; None where there is no whole one."""

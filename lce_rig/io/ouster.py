@@ -227,7 +227,7 @@ class OusterRecording:
             else:
                 n_scans += 1
                 yield scan
-        lines = [loss.text for loss in losses.findings()] + self._file.account()
+        lines = findings.worded(losses) + self._file.account()
         self.notes += [f"{self.path.name}: {line}" for line in lines]
         if n_scans == 0:
             raise SourceError(f"{self.path}: no whole revolution in it", "Record at least 1 s.")

@@ -81,14 +81,12 @@ class PositionPacket(NamedTuple):
     Attributes:
         us: time past the hour on the sensor's counter.
         pps: index into velodyne.PPS_STATES.
-        nmea: the sentence it last received, without its line end; "" for none.
-        nmea_s: second past the hour of that sentence; None where it is no sound $GPRMC.
+        nmea_s: second past the hour of the sentence it last received; None where it is no sound $GPRMC.
         is_fix: whether that sentence claims to be valid (status A).
     """
 
     us: int
     pps: int
-    nmea: str
     nmea_s: int | None
     is_fix: bool
 
@@ -159,10 +157,7 @@ def read_position_packet(payload: bytes | memoryview) -> PositionPacket:
         raise BadPacketError(f"time {us} us beyond the hour")
     if pps >= len(velodyne.PPS_STATES):
         raise BadPacketError("unknown PPS state")
-    raw = bytes(fields["nmea"]).split(b"\0")[0]
-    nmea_s, is_fix = _read_rmc(raw)
-    nmea = raw.strip().decode("ascii", "replace")
-    return PositionPacket(us, pps, nmea, nmea_s, is_fix)
+    return PositionPacket(us, pps, *_read_rmc(bytes(fields["nmea"]).split(b"\0")[0]))
 
 
 def _read_rmc(raw: bytes) -> tuple[int | None, bool]:
@@ -274,7 +269,7 @@ class VelodyneClock:
         if position.pps != velodyne.PPS_LOCKED:
             return findings.PPS_NOT_LOCKED
         if position.nmea_s is None:
-            return findings.NMEA_DAMAGED if position.nmea else findings.NO_NMEA
+            return findings.NO_NMEA
         if (position.us // 1_000_000 - position.nmea_s) % 3600 not in _SENTENCE_LAG_S:
             return findings.NMEA_OF_OTHER_SECOND
         if ahead_ns is None:

@@ -144,10 +144,6 @@ class Vlp16Stream:
         kinds = {findings.DAMAGED.code, findings.OTHER_MODEL.code}
         return [loss for loss in self.losses.findings() if loss.code in kinds]
 
-    def account(self) -> list[str]:
-        """List the losses in words."""
-        return [loss.text for loss in self.losses.findings()]
-
     def push_position(self, payload: bytes | memoryview) -> None:
         """Take a position packet; a bad one is counted."""
         try:
@@ -376,11 +372,14 @@ class PcapRecording:
                 yield last
         finally:
             lines = [OFFSETS_NOTE, *([DUAL_NOTE] if stream.mode == velodyne.DUAL else [])]
-            lines += [stream.clock.state().text, *stream.account(), *self._file.account()]
+            lines += [stream.clock.state().text, *findings.worded(stream.losses), *self._file.account()]
             notes = [f"{self.path.name}: {line}" for line in lines]
             self.notes += [note for note in notes if note not in self.notes]
         if stream.n_scans == 0:
-            causes = "; ".join(stream.account()) or f"{stream.n_data} packets are less than a revolution"
+            causes = (
+                "; ".join(findings.worded(stream.losses))
+                or f"{stream.n_data} packets are less than a revolution"
+            )
             raise SourceError(f"{self.path}: no whole revolution in it: {causes}", "Record at least 1 s.")
 
     def _explain(self, datagram: Datagram) -> str:

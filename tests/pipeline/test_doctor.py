@@ -7,7 +7,7 @@ import pytest
 from wire.vlp16_packets import Vlp16Clock
 
 from lce_rig.core.findings import worst
-from lce_rig.doctor.checks import Check, DoctorOptions, examine
+from lce_rig.doctor.checks import Check, examine
 from lce_rig.rig import Rig
 from tests.doctor.attached import Attached, attach, picture_of, scan_of
 from tests.doctor.observed import codes, make_rig
@@ -16,7 +16,7 @@ Lines = dict[tuple[str, str], Check]
 
 
 def doctor(rig: Rig, folder: Path, web_port: int, duration_s: float = 2.0) -> Lines:
-    checks = examine(rig, DoctorOptions(duration_s, folder, web_port))
+    checks = examine(rig, duration_s, folder, web_port)
     assert len({(check.subject, check.name) for check in checks}) == len(checks)
     return {(check.subject, check.name): check for check in checks}
 

@@ -15,6 +15,7 @@ from lce_rig.core.data import MAX_TIME_NS, EventColumns, Events, join_events
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
+from lce_rig.io.findings import worded
 
 NS_PER_US = 1000
 MAX_EVENT_PIXELS = 1 << 22
@@ -40,11 +41,6 @@ class NoEventsError(SourceError):
 NO_EVENTS = EventColumns(
     np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.bool_)
 )
-
-
-def worded(losses: Losses) -> list[str]:
-    """List the losses, a line each."""
-    return [finding.sentence for finding in losses.findings()]
 
 
 class EventStream:

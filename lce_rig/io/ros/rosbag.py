@@ -11,7 +11,8 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
 from lce_rig.io.cloud import to_scan
-from lce_rig.io.events.event_recording import EventRecording, NoEventsError, worded
+from lce_rig.io.events.event_recording import EventRecording, NoEventsError
+from lce_rig.io.findings import worded
 from lce_rig.io.joining import follows, merge_by_time
 from lce_rig.io.protocol import SourceOptions, fingerprint
 from lce_rig.io.ros.bag_file import BagFile, RawMessage, list_topics
@@ -83,7 +84,7 @@ class TopicDecoder:
     def account(self) -> list[str]:
         """List assumptions and losses, in words."""
         lines = sorted(self.notes) + worded(self.losses)
-        return lines if self._packets is None else lines + self._packets.account()
+        return lines if self._packets is None else lines + worded(self._packets.losses)
 
     def _assemble(self, content: Any) -> list[Image | Scan]:
         """Assemble the packets of a message; a scan ends where the rotor passes the cut, not the message."""
