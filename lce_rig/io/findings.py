@@ -25,7 +25,6 @@ EVENTS_BEFORE_CLOCK_SET = _loss(
 )
 EVENTS_STRAY = _loss("events_stray", "{n} events with stray timestamps skipped (first: {where})")
 EVENTS_OFF_SENSOR = _loss("events_off_sensor", "{n} events off the sensor skipped (first: {where})")
-BROKEN_LINES = _loss("broken_lines", "{n} broken lines skipped (first: {where})")
 OUT_OF_ORDER = _loss("out_of_order", "{n} sent twice or out of order, skipped")
 CLOCK_SET_BACK = _loss("clock_set_back", "{n} jumps of the clock back by more than 1 s")
 NOT_DECODED = _loss("not_decoded", "{n} could not be decoded (first: {where})")

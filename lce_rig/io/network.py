@@ -60,7 +60,6 @@ class PcapFile:
         path: the file.
         losses: datagrams that are not whole; grows while the file is read.
         damage: the reason for which the file could not be read to its end; "" where it could.
-        n_bytes_read: position of the last reading in the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,7 +71,6 @@ class PcapFile:
         self.path = path
         self.losses = Losses()
         self.damage = ""
-        self.n_bytes_read = 0
         if not path.is_file():
             raise SourceError(f"{path}: not a file")
         hint = "Record the card that the LiDAR is on (tcpdump -i eth0 -w FILE); unpack a packed file first."
@@ -88,7 +86,6 @@ class PcapFile:
         with self.path.open("rb") as file:
             try:
                 for stamp_s, raw in dpkt.pcap.UniversalReader(file):
-                    self.n_bytes_read = file.tell()
                     # dpkt gives stamps of ns as exact decimals and others as floats, which hold a us.
                     is_exact = isinstance(stamp_s, Decimal)
                     host_ns = int(stamp_s * _NS_PER_S) if is_exact else round(stamp_s * 1e6) * 1000
@@ -96,7 +93,7 @@ class PcapFile:
                     if datagram is not None:
                         yield datagram
             except Exception as error:  # dpkt's own, struct's, and others that damage leads to.
-                self.damage = f"{reason_of(error)}; read up to byte {self.n_bytes_read}"
+                self.damage = f"{reason_of(error)}; read up to byte {file.tell()}"
 
     def choose_sender(
         self, explain: Callable[[Datagram], str], what: str, lidar: str, driver: DriverSettings

@@ -56,12 +56,8 @@ class Hdf5Events(EventStream):
                 end = min(begin + _BLOCK_EVENTS, self._n_events)
                 try:
                     t_us, x, y, polarity = (np.asarray(column[begin:end]) for column in columns)
-                    if t_us.dtype.kind == "f" and np.any(t_us % 1):
-                        raise ValueError("events/t holds fractions, not whole microseconds")
-                    # Pixels beyond 16 bits stay off any sensor.
-                    x, y = (np.where((c >= 0) & (c < 1 << 16), c, (1 << 16) - 1) for c in (x, y))
-                    pixels = x.astype(np.uint16), y.astype(np.uint16)
-                    yield EventColumns(to_ns(t_us, self._offset_us), *pixels, polarity > 0)
+                    t_ns = to_ns(t_us, self._offset_us)
+                    yield EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)
                 except (OSError, RuntimeError, ValueError) as error:
                     if not begin:
                         raise
@@ -147,9 +143,6 @@ class TextEvents(EventStream):
                 if table.shape[1] != 4:
                     raise ValueError(f"lines up to {n_lines} have {table.shape[1]} numbers, not 4")
                 t_s, x, y, polarity = table.T
-                is_pixel = (x >= 0) & (x < 1 << 15) & (x % 1 == 0) & (y >= 0) & (y < 1 << 15) & (y % 1 == 0)
-                is_event = np.isfinite(t_s) & is_pixel & (np.abs(polarity) <= 1) & (polarity % 1 == 0)
-                losses.add(findings.BROKEN_LINES(where=f"up to line {n_lines}"), int((~is_event).sum()))
                 # Doubles hold today's seconds to 0.24 us: rounding gives the microsecond that was written.
-                t_ns, pixels = to_ns(np.rint(t_s[is_event] * 1e6)), table[is_event, 1:3].astype(np.uint16)
-                yield EventColumns(t_ns, pixels[:, 0], pixels[:, 1], polarity[is_event] > 0)
+                t_ns = to_ns(np.rint(t_s * 1e6))
+                yield EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)
