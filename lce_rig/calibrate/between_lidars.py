@@ -73,11 +73,6 @@ class PlacedBoards:
     cov: Array
     shared: Array
 
-    def of(self, captures: Sequence[int]) -> "PlacedBoards":
-        """Choose captures by index."""
-        chosen = np.array(captures, dtype=np.intp)
-        return PlacedBoards(self.T[chosen], self.cov[chosen], self.shared[chosen])
-
 
 class PairEstimate(NamedTuple):
     """Two LiDARs' pose to each other, in an optical frame of the first.
@@ -191,7 +186,8 @@ def estimate_between_lidars(
     apart = difference(T_consensus @ other.T, one.T)
     spins_rad = np.abs(np.einsum("fi,fi->f", apart[:, 3:], one.T[:, :3, 2]))
     T_view = optical_frame(one.T[:, :3, 3])
-    one = _rotated(one, T_view)
+    R = np.kron(np.eye(2), T_view[:3, :3])
+    one = PlacedBoards(T_view @ one.T, R @ one.cov @ R.T, R @ one.shared)
     refused, observations = dict(consensus.refused), []
     for k, o in enumerate(agreed):
         if spins_rad[k] > _MOST_TURN_RAD:
@@ -214,9 +210,9 @@ def estimate_between_lidars(
         np.full(len(observations), np.nan),
         solved.diagnostics,
     )
-    place = {o.capture: k for k, o in enumerate(agreed)}
-    used = [place[o.capture] for o in observations]
-    estimate, trust = _fit_poses(start, one.of(used), other.of(used), board)
+    used = spins_rad <= _MOST_TURN_RAD
+    one, other = (PlacedBoards(each.T[used], each.cov[used], each.shared[used]) for each in (one, other))
+    estimate, trust = _fit_poses(start, one, other, board)
     return PairEstimate(estimate, trust, T_view)
 
 
@@ -277,12 +273,6 @@ def optical_frame(middles: Array) -> Array:
 
 def _apart_m(T: Array, lidar: LidarBoard) -> float:
     return float(np.linalg.norm(T[:3, 3] - lidar.T_lidar_board[:3, 3]))
-
-
-def _rotated(placed: PlacedBoards, T: Array) -> PlacedBoards:
-    """Express poses in a frame of the same origin."""
-    R = np.kron(np.eye(2), T[:3, :3])
-    return PlacedBoards(T @ placed.T, R @ placed.cov @ R.T, R @ placed.shared)
 
 
 def _turned_alike(T: Array, other: Array, board: Board) -> Array:

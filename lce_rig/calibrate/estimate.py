@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.calibrate.algorithm_1.algorithm import solve
+from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1, solve
 from lce_rig.calibrate.consensus import Consensus, find_consensus
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
@@ -66,19 +66,19 @@ def estimate_extrinsics(
     matched = {name: consensus.observations for name, consensus in agreed.items()}
     scans, conflicts = join_scans(matched, candidates)
     samples = sample_poses(scans, clocks, noise_px)
+
+    def result_of(
+        name: str, alone: CalibrationEstimate, cov: Array, still: Algorithm1 | None = None
+    ) -> ChannelResult:
+        scatter_m = depth_scatter_m(alone.T_cam_lidar, list(alone.observations.values()))
+        still_m = depth_scatter_m(still.T_cam_lidar, still.observations) if still else scatter_m
+        of_all = name, len(matched[name]), noise_px[name]
+        return ChannelResult(*of_all, alone.T_cam_lidar, cov, scatter_m, still_m)
+
     if len(agreed) == 1 and np.count_nonzero(samples.tells_motion) < MIN_MOVING:
         ((name, of_channel),) = matched.items()
         estimate = estimate_observations(of_channel, board, settings, progress)
-        scatter_m = depth_scatter_m(estimate.T_cam_lidar, list(estimate.observations.values()))
-        channel = ChannelResult(
-            name,
-            len(of_channel),
-            noise_px[name],
-            estimate.T_cam_lidar,
-            estimate.cov,
-            scatter_m,
-            scatter_m,
-        )
+        channel = result_of(name, estimate, estimate.cov)
         return _with_consensus(replace(estimate, channels=(channel,)), list(agreed.values()))
 
     begin(progress, "motion of the board")
@@ -93,22 +93,12 @@ def estimate_extrinsics(
     for name, observations in by_channel.items():
         begin(progress, f"{name} alone")
         alone = estimate_observations(observations, board, fast)
-        result = ChannelResult(
-            name,
-            len(matched[name]),
-            noise_px[name],
-            alone.T_cam_lidar,
-            motion.widened(alone.cov),
-            depth_scatter_m(alone.T_cam_lidar, list(alone.observations.values())),
-            depth_scatter_m(still[name].T_cam_lidar, still[name].observations),
-        )
+        result = result_of(name, alone, motion.widened(alone.cov), still[name])
         if motion.offsets is not None:
             index = motion.offsets.channels.index(name)
-            time_offset_sigma_s = float(np.sqrt(motion.offsets.cov[index, index]))
+            offset_s, variance = motion.offsets.offset_s[index], motion.offsets.cov[index, index]
             result = replace(
-                result,
-                time_offset_s=float(motion.offsets.offset_s[index]),
-                time_offset_sigma_s=time_offset_sigma_s,
+                result, time_offset_s=float(offset_s), time_offset_sigma_s=float(np.sqrt(variance))
             )
         channels.append(result)
     begin(progress, "difference of the channels")

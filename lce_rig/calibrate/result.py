@@ -13,8 +13,7 @@ from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.session_lens import SessionLens
 from lce_rig.calibrate.tolerances import Sensitivity
 from lce_rig.core.board import Board
-from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Metrics
-from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Diagnostics, Metrics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, rotation_angle, sigma_sizes
 from lce_rig.core.results import Observation

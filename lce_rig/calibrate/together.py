@@ -7,7 +7,7 @@ import numpy as np
 
 from lce_rig.calibrate.findings import TWO_PLACES
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
-from lce_rig.calibrate.likelihood.levels import PoseLevels, what_is_known
+from lce_rig.calibrate.likelihood.levels import OF_IMAGES, what_is_known
 from lce_rig.calibrate.observations import group_shared_placements, scan_key
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.result import CalibrationEstimate, Start
@@ -70,7 +70,7 @@ def calibrate_together(
     # Pose errors of the cameras' images, as each alone estimates them, compared with their geometric mean.
     figures = [start.diagnostics for start in starts]
     logs = np.log([[d.noise_tilt_deg, d.noise_spin_deg, d.noise_depth_m, d.noise_across_m] for d in figures])
-    ratios = [PoseLevels(*of_camera) for of_camera in np.exp(logs - logs.mean(axis=0)).tolist()]
+    ratios = [dict(zip(OF_IMAGES, own, strict=True)) for own in np.exp(logs - logs.mean(axis=0)).tolist()]
     joint = maximise_likelihood(labelled, board, T_start, priors, usual, pose_ratios=ratios)
     order = {name: k for k, name in enumerate(sorted({o.capture for own in labelled for o in own}))}
     placement = group_shared_placements(labelled, order)

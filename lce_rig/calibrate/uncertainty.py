@@ -18,7 +18,7 @@ from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_pa
 from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities, systematic_covariances
 from lce_rig.calibrate.tolerances import Variant, sensitivities_of, vary
 from lce_rig.core.board import Board
-from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.calibration import Diagnostics
 from lce_rig.core.geometry import Array
 from lce_rig.core.results import Observation
 
@@ -157,7 +157,7 @@ def _moves_under(
     moves = np.array([variants[k].pose_moves for k in of_images])
     # The gradients by [y, z] move by J^T C^-1 times how far the images' poses do.
     images, rows, place = terms.images[0], terms.image_rows[0], joint.state.layout.image_row(0)[:-1]
-    weighted = -np.linalg.solve(images.total_cov(joint.levels.pose), np.moveaxis(moves, 0, -1))
+    weighted = -np.linalg.solve(images.total_cov(joint.levels), np.moveaxis(moves, 0, -1))
     gradients = np.zeros((len(terms.trust), OWN.size + G, len(moves)))
     gradients[images.capture[:, None], place] = np.swapaxes(rows[:, :, :-1], 1, 2) @ weighted
     gradients *= terms.trust[:, None, None]

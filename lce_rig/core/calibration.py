@@ -8,7 +8,7 @@ a default, so that files of earlier versions stay readable.
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args
@@ -27,7 +27,6 @@ from pydantic import (
 
 import lce_rig
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.diagnostics import Diagnostics
 from lce_rig.core.errors import ResultRefusedError, SessionError, reading
 from lce_rig.core.findings import Figure, Finding, Refusal
 from lce_rig.core.geometry import Array, parse_pose, sigma_sizes
@@ -129,6 +128,50 @@ class Metrics:
     def mge_m(self) -> float:
         """Mean geometric error, the paper's summary figure."""
         return self.mpe_m + self.mee_m
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What a method and the checks on its result say; NaN where they say nothing.
+
+    result.json keeps each under its name here.
+    """
+
+    n_placements: float = math.nan  # different placements of the board among the captures used
+    held_out_m: float = math.nan  # mean over captures of their rms residual where they were not fitted
+    # Of Algorithm 1's residuals, rms over captures.
+    fit_plane_rms_m: float = math.nan
+    fit_edge_rms_m: float = math.nan
+    # Parts of the standard deviations: from the scatter between captures, from errors common to all of them.
+    sigma_scatter_rotation_deg: float = math.nan
+    sigma_scatter_translation_m: float = math.nan
+    sigma_systematic_rotation_deg: float = math.nan
+    sigma_systematic_translation_m: float = math.nan
+    edge_shift_m: float = math.nan  # by how much ring ends lie beyond the board's edges
+    edge_shift_sigma_m: float = math.nan
+    # Additions to that by the background behind the board.
+    edge_shift_echo_m: float = math.nan
+    edge_shift_blended_m: float = math.nan
+    edge_shift_blended_echo_m: float = math.nan
+    covariance_inflation: float = math.nan  # of the joint estimate's covariance, from leave-one-out results
+    range_offset_m: float = math.nan  # mean over lasers of their range errors
+    laser_spread_m: float = math.nan  # standard deviation of these
+    lens_vertical_m_per_rad: float = math.nan  # displacement of the LiDAR's lens
+    camera_scale: float = math.nan  # of the camera's distances
+    noise_range_m: float = math.nan  # of ranges
+    # Of the board's pose by the camera, beyond its corners' noise.
+    noise_tilt_deg: float = math.nan
+    noise_spin_deg: float = math.nan
+    noise_depth_m: float = math.nan
+    noise_across_m: float = math.nan
+    alone_sigma_rotation_deg: float = math.nan  # standard deviations without the other cameras
+    alone_sigma_translation_m: float = math.nan
+    channels_rotation_deg: float = math.nan  # between the extrinsics of two channels of the camera
+    channels_translation_m: float = math.nan
+
+    def figures(self) -> dict[str, float]:
+        """List the figures that are not NaN by name, sorted."""
+        return {name: value for name, value in sorted(asdict(self).items()) if not math.isnan(value)}
 
 
 @dataclass(frozen=True, eq=False)

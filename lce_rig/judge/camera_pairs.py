@@ -173,7 +173,7 @@ def _poses(observations: Sequence[Observation]) -> tuple[Array, Array]:
     images = [observation.image for observation in observations]
     every = np.arange(len(images), dtype=np.intp)
     stacked = stack_images(every, images)
-    return stacked.T_cam_board, stacked.total_cov(Levels().pose)
+    return stacked.T_cam_board, stacked.total_cov(Levels())
 
 
 def _board_rms_m(shared: Sequence[tuple[Observation, Observation]], T_second_first: Array) -> float:

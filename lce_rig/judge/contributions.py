@@ -16,8 +16,7 @@ import numpy as np
 
 from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.tolerances import Sensitivity, Source
-from lce_rig.core.calibration import Contribution
-from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.calibration import Contribution, Diagnostics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, sigma_sizes, tangent_sizes
 from lce_rig.judge.findings import LARGEST_CAUSE, SURPRISING_CHI2

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.findings import CALIBRATE_KNOWN_PLACEMENT
-from lce_rig.core.calibration import Calibration, Certificate, Metrics
-from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.calibration import Calibration, Certificate, Diagnostics, Metrics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.detect.findings import LIDAR_TOO_FEW_RINGS

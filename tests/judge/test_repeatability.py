@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import Calibration
-from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.calibration import Calibration, Diagnostics
 from lce_rig.core.geometry import exp_so3, perturb, pose
 from lce_rig.judge.repeatability import compare_calibrations
 from lce_rig.lens.difference import turn_of_lens

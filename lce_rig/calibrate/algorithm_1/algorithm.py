@@ -28,8 +28,7 @@ from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.result import Start
 from lce_rig.core.board import Board
-from lce_rig.core.calibration import Certificate
-from lce_rig.core.diagnostics import Diagnostics
+from lce_rig.core.calibration import Certificate, Diagnostics
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import Array, pose
 from lce_rig.core.results import Observation

@@ -11,8 +11,8 @@ gives f(R) = g + z^T Z z >= g + 4 min(eig Z, 0) on SO(3), since |z|^2 = 4. With 
 
 where lambda is the least eigenvalue of Z on the complement of E. After turning the problem so that R* = I,
 E, the pseudo-inverse that solves Z E = 0 for the multipliers, and the family N_j of multipliers that leave
-Z E alone are constants. Three choices of multipliers are tried, dearer each time: of least norm; with the
-component of Z along the family removed; maximising lambda within the family by a barrier method.
+Z E alone are constants. Multipliers of least norm are tried first, then those that maximise lambda within the
+family, by a barrier method.
 
 (2) holds whether or not any of this has converged. It says nothing about how well the minimum is determined.
 
@@ -74,12 +74,10 @@ def certify(Q: Array, R: Array) -> Certificates:
         return np.asarray(np.maximum(cost[rows] - bound[rows], 0) + 4 * slack)  # equation (2)
 
     gap = gap_at(_least_eigenvalue(Z), np.arange(len(Z)))
-    for improve in (_flatten, _raise_least_eigenvalue):
-        # No multipliers help where R is not stationary.
-        left = np.flatnonzero((gap > tolerance) & (4 * stationarity <= tolerance))
-        if len(left) == 0:
-            break
-        gap[left] = np.minimum(gap[left], gap_at(_least_eigenvalue(improve(Z[left])), left))
+    # No multipliers help where R is not stationary.
+    left = np.flatnonzero((gap > tolerance) & (4 * stationarity <= tolerance))
+    if len(left):
+        gap[left] = np.minimum(gap[left], gap_at(_raise_least_eigenvalue(Z[left]), left))
     return Certificates(gap, cost, gap <= tolerance)
 
 
@@ -194,20 +192,17 @@ def _least_eigenvalue(Z: Array) -> Array:
     return np.asarray(np.linalg.eigvalsh(Z)[..., 0])
 
 
-def _flatten(Z: Array) -> Array:
-    """Remove the component of Z along the family (least squares in the Frobenius norm)."""
-    family = _dual().family
-    along = Z.reshape(-1, 81) @ family.reshape(-1, 81).T
-    return np.asarray(Z - np.tensordot(along, family, axes=1))
-
-
 def _raise_least_eigenvalue(Z: Array) -> Array:
-    """Maximise s subject to Z + sum c_j N_j >= s I by Newton's method on s + mu log det(. - s I), mu -> 0."""
+    """Maximise s subject to Z + sum c_j N_j >= s I by Newton's method on s + mu log det(. - s I), mu -> 0.
+
+    Returns:
+        (B,) the largest least eigenvalue of Z + sum c_j N_j that was met.
+    """
     family = _dual().family
     m = len(family)
     scale = np.maximum(np.abs(np.trace(Z, axis1=-2, axis2=-1)) / 9, 1e-300)
     Z = Z / scale[:, None, None]
-    c, best_c = np.zeros((len(Z), m)), np.zeros((len(Z), m))
+    c = np.zeros((len(Z), m))
     best = _least_eigenvalue(Z)
     s = best - 1e-2 * (1 + np.abs(best))
     mu = np.full(len(Z), 0.1)
@@ -229,11 +224,9 @@ def _raise_least_eigenvalue(Z: Array) -> Array:
         c[active] += step[:, :m]
         eigenvalue = _least_eigenvalue(Z[active] + np.tensordot(c[active], family, axes=1))
         s[active] = np.minimum(s[active] + step[:, m], eigenvalue - 1e-3 * mu[active])
-        is_better = eigenvalue > best[active]
-        best[active[is_better]] = eigenvalue[is_better]
-        best_c[active[is_better]] = c[active[is_better]]
+        best[active] = np.maximum(best[active], eigenvalue)
         mu[active] = np.where(decrement < 0.5, 0.2 * mu[active], mu[active])
         active = active[(9 * mu[active] >= 1e-10) & (best[active] <= 0)]
         if len(active) == 0:
             break
-    return np.asarray((Z + np.tensordot(best_c, family, axes=1)) * scale[:, None, None])
+    return np.asarray(best * scale)

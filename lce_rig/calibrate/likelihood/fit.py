@@ -5,7 +5,7 @@ Fisher scoring: Gauss-Newton on ranges and images, mean information and score fo
 (restricted maximum likelihood), so that residuals reduced by the fit are not mistaken for small noise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.likelihood.images import StackedImages, stack_images
 from lce_rig.calibrate.likelihood.layout import State
-from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, PoseLevels, Priors
+from lce_rig.calibrate.likelihood.levels import LOG_SIGMA, MOST_LOST, NO_LASER_M, Levels, Priors
 from lce_rig.calibrate.likelihood.model import Reduced, Terms, assemble, evidence, linearise
 from lce_rig.calibrate.likelihood.rays import interior, lens_fields, stack_scans
 from lce_rig.calibrate.observations import group_shared_placements
@@ -110,7 +110,7 @@ def maximise_likelihood(
     T_cam_lidar: Sequence[Array],
     priors: Priors | None = None,
     usual: Levels | None = None,
-    pose_ratios: Sequence[PoseLevels] | None = None,
+    pose_ratios: Sequence[Mapping[str, float]] | None = None,
 ) -> JointEstimate:
     """Estimate extrinsics of C cameras; captures of the same name share their scan and the board's pose.
 
@@ -120,7 +120,7 @@ def maximise_likelihood(
         T_cam_lidar: (4, 4) of each, accurate to some degrees and centimetres.
         priors: of the constant errors; a scale that contradicts its own is freed.
         usual: typical noise levels.
-        pose_ratios: for each camera, ratio of its images' errors beyond corner noise; 1 if None.
+        pose_ratios: for each camera, ratios of its images' errors beyond corner noise, by level; 1 if None.
     """
     by_name = {o.capture: (o, T) for camera, T in zip(cameras, T_cam_lidar, strict=True) for o in camera}
     order = {name: k for k, name in enumerate(sorted(by_name))}

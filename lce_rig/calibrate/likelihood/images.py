@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lce_rig.calibrate.likelihood.layout import IMAGE, Indices
-from lce_rig.calibrate.likelihood.levels import PoseLevels
+from lce_rig.calibrate.likelihood.levels import OF_IMAGES, Levels
 from lce_rig.core.geometry import Array, difference, skew
 from lce_rig.core.results import ImageBoard
 
@@ -27,7 +27,7 @@ class StackedImages:
         capture: (P,) which of the stacked captures.
         T_cam_board: (P, 4, 4).
         cov: (P, 6, 6) of the corners' noise, tangent of T_cam_board.
-        shapes: (P, 6, 6) each, derivative of Q by the square of each of `PoseLevels`, by name.
+        shapes: (P, 6, 6) each, derivative of Q by the square of each of the levels `OF_IMAGES`.
     """
 
     capture: Indices
@@ -35,16 +35,16 @@ class StackedImages:
     cov: Array
     shapes: Mapping[str, Array]
 
-    def total_cov(self, levels: PoseLevels) -> Array:
+    def total_cov(self, levels: Levels) -> Array:
         """Add Q to the corners' covariance: (P, 6, 6)."""
         Q = np.zeros_like(self.cov)
         for name, shape in self.shapes.items():
             Q += getattr(levels, name) ** 2 * shape
         return self.cov + Q
 
-    def with_larger_errors(self, ratios: PoseLevels) -> "StackedImages":
+    def with_larger_errors(self, ratios: Mapping[str, float]) -> "StackedImages":
         """Scale the images' errors beyond corner noise relative to the levels."""
-        shapes = {name: getattr(ratios, name) ** 2 * shape for name, shape in self.shapes.items()}
+        shapes = {name: ratios[name] ** 2 * shape for name, shape in self.shapes.items()}
         return replace(self, shapes=shapes)
 
 
@@ -57,7 +57,7 @@ def stack_images(capture: Indices, images: Sequence[ImageBoard]) -> StackedImage
     """
     T = np.array([image.T_cam_board for image in images])
     cov = np.array([image.cov for image in images])
-    shapes = {name: np.zeros((len(T), 6, 6)) for name in PoseLevels._fields}
+    shapes = {name: np.zeros((len(T), 6, 6)) for name in OF_IMAGES}
     normal, sight = T[:, :3, 2], T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
     about, along = (v[:, :, None] * v[:, None, :] for v in (normal, sight))
     shapes["tilt_rad"][:, 3:, 3:], shapes["spin_rad"][:, 3:, 3:] = np.eye(3) - about, about

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -10,15 +9,6 @@ from lce_rig.calibrate.algorithm_1.background import BACKGROUND_SIGMAS_M
 from lce_rig.calibrate.options import EstimateSettings, KnownLidar
 from lce_rig.calibrate.plane_and_ends import EDGE_SHIFT_SIGMA_M
 from lce_rig.core.geometry import Array
-
-
-class PoseLevels(NamedTuple):
-    """Errors of a board's pose in an image beyond corner noise, as in `Levels`; or ratios of them."""
-
-    tilt_rad: float
-    spin_rad: float
-    depth_m: float
-    across_m: float
 
 
 @dataclass(frozen=True)
@@ -51,11 +41,6 @@ class Levels:
     across_m: float = 0.0013
     laser_m: float = 0.008
 
-    @property
-    def pose(self) -> PoseLevels:
-        """The levels of an image's pose."""
-        return PoseLevels(self.tilt_rad, self.spin_rad, self.depth_m, self.across_m)
-
     def blurred(self, blur_rad: float) -> "Levels":
         """Set a minimum blur of ring ends."""
         edge_rad, backed_rad = max(self.edge_rad, blur_rad), max(self.backed_rad, blur_rad)
@@ -80,6 +65,8 @@ LOG_SIGMA: Mapping[str, float] = {
 _SCALE_SIGMAS, _FREE_SCALE = 3.0, 0.02
 # Most ring ends must be at the board's edge, or the board could not be located.
 MOST_LOST = 0.6
+OF_IMAGES = ("tilt_rad", "spin_rad", "depth_m", "across_m")
+"""The levels of a board's pose in an image."""
 
 
 @dataclass(frozen=True)

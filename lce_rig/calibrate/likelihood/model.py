@@ -14,7 +14,7 @@ import numpy as np
 from lce_rig.calibrate.likelihood.end_density import edge_products
 from lce_rig.calibrate.likelihood.images import StackedImages, image_rows
 from lce_rig.calibrate.likelihood.layout import END, LASER, OWN, RING, Columns, Indices, Layout, State
-from lce_rig.calibrate.likelihood.levels import Levels, Priors
+from lce_rig.calibrate.likelihood.levels import OF_IMAGES, Levels, Priors
 from lce_rig.calibrate.likelihood.rays import (
     EdgeRows,
     RangeSums,
@@ -121,7 +121,7 @@ def _of_ends(terms: Terms, levels: Levels) -> Iterator[Products]:
 def _of_images(terms: Terms, levels: Levels) -> Iterator[Products]:
     """Weight the images, camera by camera."""
     for c, (images, rows) in enumerate(zip(terms.images, terms.image_rows, strict=True)):
-        cov = images.total_cov(levels.pose)
+        cov = images.total_cov(levels)
         products = np.swapaxes(rows, 1, 2) @ np.linalg.solve(cov, rows)
         place = np.tile(terms.state.layout.image_row(c), (len(rows), 1))
         yield Products(images.capture, place, products, np.linalg.slogdet(cov)[1])
@@ -139,7 +139,7 @@ def _of_own_shifts(terms: Terms, levels: Levels) -> Iterator[Products]:
 _PARTS: dict[Part, tuple[str, ...]] = {
     _of_returns: ("range_m", "ring_m"),
     _of_ends: ("edge_rad", "backed_rad", "lost_share"),
-    _of_images: ("tilt_rad", "spin_rad", "depth_m", "across_m"),
+    _of_images: OF_IMAGES,
     _of_own_shifts: ("own_shift_m",),
 }
 """The levels on which the products of each kind of measurement depend."""

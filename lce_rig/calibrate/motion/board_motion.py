@@ -165,15 +165,13 @@ def fit_motions(samples: PoseSamples, offset_s: Array, only: str | None = None) 
     is_followed = samples.is_followed
     is_heard = is_followed | ~np.any(is_followed, axis=1, keepdims=True)
     heard = samples.information * is_heard[..., None, None]
-    lines = _Lines.through(y, heard, time_s)
-    habits = USUAL_HABITS
-    H_rates, g_rates = lines.rates()
-    for _ in range(_N_LEARNING):
-        cov = np.linalg.inv(H_rates + _habit_precision(habits))
-        second = (cov @ g_rates[..., None])[..., 0] ** 2 + np.diagonal(cov, axis1=1, axis2=2)
-        total = second.reshape(-1, 2, 3).mean(axis=2).sum(axis=0)
-        habits = np.sqrt((_USUAL_WEIGHT * USUAL_HABITS**2 + total) / (_USUAL_WEIGHT + len(y)))
-    mean, cov, prior = lines.fit(habits)
+    # Normal equations of y_j = p + t_j r, without the prior of r: (F, 12, 12) and (F, 12).
+    powers = np.stack([np.ones_like(time_s), time_s], axis=-1)
+    H = np.einsum("fja,fjb,fjkl->fakbl", powers, powers, heard).reshape(-1, 12, 12)
+    g = np.einsum("fja,fjk->fak", powers, (heard @ y[..., None])[..., 0]).reshape(-1, 12)
+    prior = _learn_habits(H, g)
+    cov = np.asarray(np.linalg.inv(H + prior), dtype=np.float64)
+    mean = (cov @ g[..., None])[..., 0]
     moved = y - mean[:, None, :6] - time_s[..., None] * mean[:, None, 6:]
     misfit = np.einsum("fji,fjik,fjk->f", moved, heard, moved)
     misfit += np.einsum("fi,ik,fk->f", mean, prior, mean)
@@ -211,37 +209,22 @@ def _disagreement(
     return misfit
 
 
-@dataclass(frozen=True, eq=False)
-class _Lines:
-    """Normal equations of y_j = p + t_j r, without the prior of r: (F, 12, 12) and (F, 12)."""
+def _learn_habits(H: Array, g: Array) -> Array:
+    """Find the precision (12, 12) of position and rates that a hand's typical rates give a priori.
 
-    H: Array
-    g: Array
-
-    @classmethod
-    def through(cls, y: Array, information: Array, time_s: Array) -> "_Lines":
-        powers = np.stack([np.ones_like(time_s), time_s], axis=-1)
-        pulled = (information @ y[..., None])[..., 0]
-        H = np.einsum("fja,fjb,fjkl->fakbl", powers, powers, information).reshape(-1, 12, 12)
-        return cls(H, np.einsum("fja,fjk->fak", powers, pulled).reshape(-1, 12))
-
-    def rates(self) -> tuple[Array, Array]:
-        """Eliminate p: the normal equations (F, 6, 6) and (F, 6) of r alone."""
-        lever = self.H[:, 6:, :6] @ np.linalg.inv(self.H[:, :6, :6])
-        g = self.g[:, 6:] - (lever @ self.g[:, :6, None])[..., 0]
-        return self.H[:, 6:, 6:] - lever @ self.H[:, :6, 6:], g
-
-    def fit(self, habits: Array) -> tuple[Array, Array, Array]:
-        """Solve for (p, r) (F, 12), its covariance (F, 12, 12), and return the prior's precision (12, 12)."""
-        prior = np.zeros((12, 12))
-        prior[6:, 6:] = _habit_precision(habits)
-        cov = np.asarray(np.linalg.inv(self.H + prior), dtype=np.float64)
-        return (cov @ self.g[..., None])[..., 0], cov, prior
-
-
-def _habit_precision(habits: Array) -> Array:
-    """Return the inverse covariance (6, 6) of rates from a hand's typical ones."""
-    return np.diag(np.repeat(habits, 3) ** -2.0)
+    Args:
+        H, g: (F, 12, 12), (F, 12) normal equations of both, from which the position is eliminated.
+    """
+    lever = H[:, 6:, :6] @ np.linalg.inv(H[:, :6, :6])
+    H_rates, g_rates = H[:, 6:, 6:] - lever @ H[:, :6, 6:], g[:, 6:] - (lever @ g[:, :6, None])[..., 0]
+    habits, prior = USUAL_HABITS, np.zeros((12, 12))
+    for _ in range(_N_LEARNING):
+        cov = np.linalg.inv(H_rates + np.diag(np.repeat(habits, 3) ** -2.0))
+        second = (cov @ g_rates[..., None])[..., 0] ** 2 + np.diagonal(cov, axis1=1, axis2=2)
+        total = second.reshape(-1, 2, 3).mean(axis=2).sum(axis=0)
+        habits = np.sqrt((_USUAL_WEIGHT * USUAL_HABITS**2 + total) / (_USUAL_WEIGHT + len(g)))
+    prior[6:, 6:] = np.diag(np.repeat(habits, 3) ** -2.0)
+    return prior
 
 
 def _place(

@@ -201,7 +201,7 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
             own[:, z[common]] = by_camera[k][:, IMAGE[name]]
         own[:, own_pose(k)], own[:, -1] = by_camera[k][:, IMAGE["pose"]], by_camera[k, :, -1]
         rows.append(own)
-        noise.append(terms.images[0].total_cov(levels.pose)[k])
+        noise.append(terms.images[0].total_cov(levels)[k])
     by_plane = freedoms(scans, T_lidar_board)
     for i, k in enumerate(scans.capture):
         own = np.zeros((1, z.size + 6 * F + 1))
