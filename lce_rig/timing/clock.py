@@ -1,6 +1,6 @@
 """The relation of two clocks: offset and drift with their standard deviations, and time conversion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,6 @@ class ClockModel:
             leaves no trace in their scatter.
         rms_ns: scatter of the readings about the line.
         first_ns, last_ns: from when to when on the source's clock there were readings.
-        n_used, n_left_out: readings the line was fitted to, and outliers.
         origin: what the readings were, in words: "98 time requests".
     """
 
@@ -44,8 +43,6 @@ class ClockModel:
     rms_ns: float
     first_ns: int
     last_ns: int
-    n_used: int
-    n_left_out: int
     origin: str
 
     @staticmethod
@@ -56,7 +53,7 @@ class ClockModel:
             sigma_ns: how well it does.
             origin: why, in words: "PPS locked".
         """
-        return ClockModel(0, 0, 0.0, np.zeros((2, 2)), sigma_ns, 0.0, -FOREVER_NS, FOREVER_NS, 0, 0, origin)
+        return ClockModel(0, 0, 0.0, np.zeros((2, 2)), sigma_ns, 0.0, -FOREVER_NS, FOREVER_NS, origin)
 
     def convert(self, source_ns: int) -> int:
         """Read the reference's clock at a moment of the source's (1)."""
@@ -83,18 +80,13 @@ class ClockModel:
 
     def inverse(self) -> "ClockModel":
         """Build the model that reads the source's clock on the reference's."""
-        return ClockModel(
-            self.reference_ns,
-            self.anchor_ns,
-            -self.drift / (1 + self.drift),
-            self.cov,  # to first order in the drift
-            self.bias_sigma_ns,
-            self.rms_ns,
-            self.convert(self.first_ns),
-            self.convert(self.last_ns),
-            self.n_used,
-            self.n_left_out,
-            self.origin,
+        return replace(  # the covariance is the same to first order in the drift
+            self,
+            anchor_ns=self.reference_ns,
+            reference_ns=self.anchor_ns,
+            drift=-self.drift / (1 + self.drift),
+            first_ns=self.convert(self.first_ns),
+            last_ns=self.convert(self.last_ns),
         )
 
     def then(self, other: "ClockModel") -> "ClockModel":
@@ -115,8 +107,6 @@ class ClockModel:
             float(np.hypot(self.rms_ns, other.rms_ns)),
             max(self.first_ns, back.convert(other.first_ns)),
             min(self.last_ns, back.convert(other.last_ns)),
-            min(self.n_used, other.n_used),
-            self.n_left_out + other.n_left_out,
             f"{self.origin}, then {other.origin}",
         )
 

@@ -106,8 +106,6 @@ def sync_board(
         1e4,
         BOARD_NS,
         BOARD_NS + 5 * S,
-        50,
-        0,
         "requests",
     )
     return seen

@@ -94,7 +94,6 @@ def test_a_fifth_of_false_edges_does_not_move_the_line():
         wrong = rng.choice(100, 20, replace=False)
         pairs.reference_ns[wrong] += np.int64(rng.uniform(5e6, 500e6, 20))
         model = fit_clock(pairs, "edges")
-        assert model.n_left_out >= 20
         assert abs(device.error_sigmas(model, model.anchor_ns)) < 4
 
 
@@ -125,7 +124,7 @@ def test_edges_find_their_partners_in_spite_of_losses_and_bounces():
     rng = np.random.default_rng(3)
     device = Device(40e-6)
     times = np.arange(200) * 0.05 * S
-    coarse = ClockModel(0, START_NS - 5 * S + 4_000_000, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, 0, "start")
+    coarse = ClockModel(0, START_NS - 5 * S + 4_000_000, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, "start")
     seen = rng.uniform(size=200) < 0.8
     bounced = np.sort(np.concatenate([times[seen], times[seen][::7] + 3000]))
     made = rng.uniform(size=200) < 0.9
@@ -163,14 +162,13 @@ def test_a_host_clock_that_is_set_is_noticed_once_and_followed(jump_ns):
 def test_a_device_that_begins_anew_is_noticed_at_its_first_reading():
     tracker, _, steps = followed(np.random.default_rng(0), 15 * S, at_s=15, what="device")
     assert [round(step.size_ns / S) for step in steps] == [15]
-    assert tracker.model.n_used < 200
+    assert tracker.model.first_ns >= steps[0].source_ns
 
 
 def test_a_tracker_forgets_what_is_older_than_its_window():
     tracker = ClockTracker("edges")
     for k in range(2_000):
         tracker.add(k * S // 10, START_NS + k * S // 10)
-    assert tracker.model.n_used <= 601
     assert tracker.model.first_ns >= 139 * S
 
 

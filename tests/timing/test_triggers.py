@@ -17,6 +17,12 @@ PIXELS = np.zeros((2, 2), np.uint8)
 HOST_NS = 1_753_000_000 * S
 
 
+def matcher_of(max_delay_ms=30.0):
+    matcher = TriggerMatcher("cam", round(max_delay_ms * MS))
+    matcher.set_clock(ClockModel(HOST_NS, 77 * S, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, "start"))
+    return matcher
+
+
 @dataclass
 class Rig:
     """A board and a camera it triggers, and what becomes of both streams on their way.
@@ -95,8 +101,7 @@ class Rig:
         return [sample for _, sample in sorted(ordered, key=lambda pair: pair[0])]
 
     def run(self, max_delay_ms=30.0):
-        matcher = TriggerMatcher("cam", round(max_delay_ms * MS))
-        matcher.set_clock(ClockModel(HOST_NS, 77 * S, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, 0, "start"))
+        matcher = matcher_of(max_delay_ms)
         matched = []
         for sample in self.streams():
             take = matcher.take_pulse if isinstance(sample, Pulse) else matcher.take_image
@@ -202,8 +207,7 @@ def test_a_start_that_leaves_a_choice_is_refused_with_what_to_do():
 
 def test_a_camera_that_runs_free_is_refused():
     rng = np.random.default_rng(0)
-    matcher = TriggerMatcher("cam", 30 * MS)
-    matcher.set_clock(ClockModel(HOST_NS, 77 * S, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, 0, "start"))
+    matcher = matcher_of()
     matched = []
     for k in range(600):
         matcher.take_pulse(Pulse("cam", 77 * S + round(k * 33.3 * MS), k, 0))
@@ -214,8 +218,7 @@ def test_a_camera_that_runs_free_is_refused():
 
 def test_a_camera_that_is_opened_again_is_matched_again():
     first, second = Rig(n=60), Rig(n=60, first_number=0, first_count=61)
-    matcher = TriggerMatcher("cam", 30 * MS)
-    matcher.set_clock(ClockModel(HOST_NS, 77 * S, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, 0, "start"))
+    matcher = matcher_of()
     found = []
     for rig, later_ns in ((first, 0), (second, 60 * S)):
         for sample in rig.streams():
@@ -231,8 +234,7 @@ def test_a_camera_that_is_opened_again_is_matched_again():
 
 
 def test_a_board_that_begins_anew_is_matched_again():
-    matcher = TriggerMatcher("cam", 30 * MS)
-    matcher.set_clock(ClockModel(HOST_NS, 77 * S, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, 0, "start"))
+    matcher = matcher_of()
     found = []
     for k in range(100):
         count = k if k < 50 else k - 50
@@ -252,8 +254,7 @@ def test_pictures_without_numbers_or_before_the_clock_is_tied_are_not_matched():
 
 
 def test_pictures_without_pulses_wait_and_are_given_up_in_the_end():
-    matcher = TriggerMatcher("cam", 30 * MS)
-    matcher.set_clock(ClockModel(HOST_NS, 77 * S, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, 0, "start"))
+    matcher = matcher_of()
     for k in range(200):
         assert matcher.take_image(Image("cam", "frames", HOST_NS + k * 33 * MS, PIXELS, None, k)) == []
     assert matcher.counts["n_unmatched"] == 200 - 64
