@@ -32,6 +32,7 @@ class ClockModel:
             leaves no trace in their scatter.
         rms_ns: scatter of the readings about the line.
         first_ns, last_ns: from when to when on the source's clock there were readings.
+        n_used: readings the line was fitted to, without outliers.
         origin: what the readings were, in words: "98 time requests".
     """
 
@@ -43,6 +44,7 @@ class ClockModel:
     rms_ns: float
     first_ns: int
     last_ns: int
+    n_used: int
     origin: str
 
     @staticmethod
@@ -53,7 +55,7 @@ class ClockModel:
             sigma_ns: how well it does.
             origin: why, in words: "PPS locked".
         """
-        return ClockModel(0, 0, 0.0, np.zeros((2, 2)), sigma_ns, 0.0, -FOREVER_NS, FOREVER_NS, origin)
+        return ClockModel(0, 0, 0.0, np.zeros((2, 2)), sigma_ns, 0.0, -FOREVER_NS, FOREVER_NS, 0, origin)
 
     def convert(self, source_ns: int) -> int:
         """Read the reference's clock at a moment of the source's (1)."""
@@ -107,6 +109,7 @@ class ClockModel:
             float(np.hypot(self.rms_ns, other.rms_ns)),
             max(self.first_ns, back.convert(other.first_ns)),
             min(self.last_ns, back.convert(other.last_ns)),
+            min(self.n_used, other.n_used),
             f"{self.origin}, then {other.origin}",
         )
 

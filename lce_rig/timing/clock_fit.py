@@ -106,6 +106,7 @@ def fit_clock(pairs: TimePairs, what: str) -> ClockModel | None:
         rms_ns=float(np.sqrt(residual @ residual / np.sum(fit.sigma_ns**-2.0))),
         first_ns=int(source_ns[keep].min()),
         last_ns=int(source_ns[keep].max()),
+        n_used=int(keep.sum()),
         origin=f"{len(pairs)} {what}",
     )
 

@@ -106,6 +106,7 @@ def sync_board(
         1e4,
         BOARD_NS,
         BOARD_NS + 5 * S,
+        50,
         "requests",
     )
     return seen

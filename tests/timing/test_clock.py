@@ -124,7 +124,7 @@ def test_edges_find_their_partners_in_spite_of_losses_and_bounces():
     rng = np.random.default_rng(3)
     device = Device(40e-6)
     times = np.arange(200) * 0.05 * S
-    coarse = ClockModel(0, START_NS - 5 * S + 4_000_000, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, "start")
+    coarse = ClockModel(0, START_NS - 5 * S + 4_000_000, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, "start")
     seen = rng.uniform(size=200) < 0.8
     bounced = np.sort(np.concatenate([times[seen], times[seen][::7] + 3000]))
     made = rng.uniform(size=200) < 0.9

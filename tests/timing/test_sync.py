@@ -111,7 +111,7 @@ HOST_NS = 1_753_000_000 * S
 
 def coarse(error_ms):
     """From the camera's Unix time to the board's, as the computer knows it when the camera is opened."""
-    return ClockModel(HOST_NS, 77 * S + round(error_ms * MS), 0.0, np.zeros((2, 2)), 0, 0, 0, 0, "host")
+    return ClockModel(HOST_NS, 77 * S + round(error_ms * MS), 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, "host")
 
 
 def run(
@@ -169,7 +169,7 @@ def test_a_board_that_begins_anew_is_fitted_anew():
     for k in range(100):
         clock.take_sent(Pulse("davis", k * 50 * MS, k, 0))
     assert clock.fit() is None
-    clock.set_clock(ClockModel(HOST_NS, 0, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, "host"))
+    clock.set_clock(ClockModel(HOST_NS, 0, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, "host"))
     for k in range(100):
         clock.take_seen(Pulse("davis", HOST_NS + k * 50 * MS, k, 0))
     assert abs(clock.fit().drift) < 1e-7

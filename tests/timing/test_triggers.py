@@ -19,7 +19,7 @@ HOST_NS = 1_753_000_000 * S
 
 def matcher_of(max_delay_ms=30.0):
     matcher = TriggerMatcher("cam", round(max_delay_ms * MS))
-    matcher.set_clock(ClockModel(HOST_NS, 77 * S, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, "start"))
+    matcher.set_clock(ClockModel(HOST_NS, 77 * S, 0.0, np.zeros((2, 2)), 0, 0, 0, 0, 0, "start"))
     return matcher
 
 
