@@ -37,6 +37,7 @@ _FOLLOWS: Mapping[str, Sequence[str]] = {
         *_OF_SIGMAS,
     ],
     "verdict.laser_angles": _OF_POSES.split(),
+    "verdict.lens_model": f"{_OF_POSES}verdict.intrinsics verdict.pattern_offset".split(),
     "verdict.intrinsics": (
         f"{_OF_DISTANCES}verdict.scale verdict.far_from_nominal verdict.cameras_differ".split()
     ),
@@ -192,6 +193,14 @@ def _intrinsics(finding: Finding) -> str:
         percent, sigma = 100 * (finding.figure("focal_ratio") - 1), 100 * finding.figure("focal_sigma")
         reason = f"focal length {abs(percent):.1f} +- {sigma:.1f} % {'larger' if percent > 0 else 'smaller'}"
     return f"the profile's intrinsics {fit}: {reason}"
+
+
+def _lens_model(finding: Finding) -> str:
+    """Corners fit to {rms_px} px with lens model {model}, to {other_px} with {other}; {noise_px} is noise."""
+    text = fill("corners fit the lens model {model} to {rms_px:.2f} px only, ", finding.figures)
+    fisheye = "the fisheye model " if finding.figures["other"] == "equidistant" else ""
+    fits, possible = f"{fisheye}{{other}} to {{other_px:.2f}} px", "{noise_px:.2f} px are possible"
+    return text + fill(fits if finding.figures["other"] else possible, finding.figures)
 
 
 def _reach(finding: Finding) -> str:
@@ -387,6 +396,12 @@ INTRINSICS = Kind(
         "collect": "cover the corners, then " + _SAVE,
         "weighed": "use the result's, or " + _SAVE,
     },
+)
+LENS_MODEL = Kind(
+    "verdict.lens_model",
+    _lens_model,
+    "enter it: `lce-rig intrinsics {session} --model {other} --save-profile FILE`",
+    actions={"none": "check that the images are as the camera takes them and of one lens"},
 )
 INTRINSICS_BETTER = Kind(
     "intrinsics.better",

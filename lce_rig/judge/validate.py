@@ -27,6 +27,7 @@ from lce_rig.judge.contributions import (
 )
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given
 from lce_rig.judge.laser_angles import estimate_angles
+from lce_rig.judge.lens_model import OtherModel, find_other_model
 from lce_rig.judge.local_quadratic import (
     OF_PROFILE,
     SCALE,
@@ -76,6 +77,7 @@ class Validation:
         pattern: as `pattern_of`, where it contradicts the profile; else None.
         laser_angles: errors of the lasers' angles in deg, as `estimate_angles`.
         intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
+        lens_model: one that fits the corners where the profile's does not; None where it does.
     """
 
     cov: Array
@@ -88,6 +90,7 @@ class Validation:
     pattern: tuple[Array, Array] | None
     laser_angles: Mapping[str, float]
     intrinsics: IntrinsicsCheck | None
+    lens_model: OtherModel | None
 
 
 def validate(
@@ -159,6 +162,7 @@ def validate(
         pattern=pattern,
         laser_angles=laser_angles,
         intrinsics=intrinsics,
+        lens_model=None if fitted is None or lens is None else find_other_model(fitted, board),
     )
 
 

@@ -47,6 +47,7 @@ from lce_rig.judge.findings import (
 )
 from lce_rig.judge.intrinsics_check import lens_findings
 from lce_rig.judge.laser_angles import angle_findings
+from lce_rig.judge.lens_model import model_findings
 from lce_rig.judge.split_consistency import split_findings
 from lce_rig.judge.validate import Validation
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
@@ -92,6 +93,7 @@ def judge(
     board, nominal = rig.board.to_board(), rig.nominal(camera, lidar)
     findings = [
         *_certificate(estimate),
+        *model_findings(examination.lens_model),
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
         *angle_findings(examination.laser_angles),
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),

@@ -16,6 +16,7 @@ from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
+from lce_rig.judge.lens_model import find_other_model, model_findings
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of, lens_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
@@ -43,7 +44,8 @@ class MeasuredIntrinsics:
         check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
         difference: per pixel; None likewise.
         certainty: of the estimate, per pixel.
-        judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`.
+        judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`, or
+            another lens model that fits them.
         misfit: how the profile's do not fit; None if they do, or are for another resolution.
         weaknesses: what the captures do not determine, and what to do.
         refused: name of an image -> why the estimate does not use it.
@@ -162,6 +164,8 @@ def measure_intrinsics(
     check, difference = None, None
     if (given.width_px, given.height_px) == (lens.width_px, lens.height_px):
         check, difference = compare_with_given(estimate, given, rig.board.to_board())
+    judgement = judge_lens(certainty.covered, certainty.image_sigma_px, check, target_deg)
+    judgement = next(iter(model_findings(find_other_model(estimate, rig.board.to_board()))), judgement)
     refused = {f"{name}.{channel}": why for (name, channel), why in found.items() if isinstance(why, Refusal)}
     return MeasuredIntrinsics(
         camera=camera,
@@ -171,7 +175,7 @@ def measure_intrinsics(
         check=check,
         difference=difference,
         certainty=certainty,
-        judgement=judge_lens(certainty.covered, certainty.image_sigma_px, check, target_deg),
+        judgement=judgement,
         misfit=next(iter(lens_findings(check, target_deg)), None),
         weaknesses=find_weaknesses(estimate, certainty),
         refused=dict(sorted({**refused, **estimate.refused}.items())),
