@@ -22,12 +22,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _shared(tmp_path_factory: pytest.TempPathFactory) -> None:
+def _shared(tmp_path_factory):
     Shared.folder = find_folder(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
-def recordings() -> Path:
+def recordings():
     """The folder of recordings by others, named by LCE_RIG_DATA."""
     folder = os.environ.get("LCE_RIG_DATA")
     if not folder or not Path(folder).is_dir():

@@ -3,10 +3,10 @@
 from hypothesis import strategies as st
 
 
-def damaged(whole: bytes) -> st.SearchStrategy[bytes]:
+def damaged(whole):
     """Cut a file short at any byte, or change one of its bytes."""
 
-    def changed(at: int, mask: int) -> bytes:
+    def changed(at, mask):
         return whole[:at] + bytes([whole[at] ^ mask]) + whole[at + 1 :]
 
     places = st.integers(0, len(whole) - 1)

@@ -1,15 +1,10 @@
 """Calibrations that a test made up, and their result.json."""
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
-
 from lce_rig.core.calibration import Calibration, Certificate, Metrics, Provenance, ResultFile
-from lce_rig.core.geometry import Array
 from lce_rig.session.durable import write_atomically
 
 
-def made_calibration(T_cam_lidar: Array, cov: Array, **fields: Any) -> Calibration:
+def made_calibration(T_cam_lidar, cov, **fields):
     """Make up a calibration that passes, of camera "cam" and LiDAR "lidar"; `fields` replace these."""
     usual = {
         "camera": "cam",
@@ -26,23 +21,13 @@ def made_calibration(T_cam_lidar: Array, cov: Array, **fields: Any) -> Calibrati
     return Calibration(T_cam_lidar=T_cam_lidar, cov=cov, **{**usual, **fields})
 
 
-def result_file(
-    rig: str,
-    calibrations: Sequence[Calibration],
-    inputs: Mapping[str, str] | None = None,
-    provenance: Provenance | None = None,
-) -> ResultFile:
+def result_file(rig, calibrations, inputs=None, provenance=None):
     """Build result.json of a rig."""
     return ResultFile(
-        rig=rig,
-        pairs=tuple(calibrations),
-        inputs_sha256=inputs or {},
-        provenance=provenance or Provenance(),
+        rig=rig, pairs=tuple(calibrations), inputs_sha256=inputs or {}, provenance=provenance or Provenance()
     )
 
 
-def write_result(
-    path: Path, rig: str, calibrations: Sequence[Calibration], inputs: Mapping[str, str] | None = None
-) -> None:
+def write_result(path, rig, calibrations, inputs=None):
     """Write result.json of a rig."""
     write_atomically(path, result_file(rig, calibrations, inputs).text())

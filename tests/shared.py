@@ -5,12 +5,9 @@ import os
 import pickle
 import resource
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
-
-import pytest
+from typing import TypeVar
 
 T = TypeVar("T")
 
@@ -21,13 +18,13 @@ class Shared:
     folder: Path | None = None
 
 
-def find_folder(temporary: pytest.TempPathFactory) -> Path:
+def find_folder(temporary):
     """Name the run's folder: above that of a worker of xdist."""
     base = temporary.getbasetemp()
     return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
 
-def make_once(name: str, make: Callable[[Path], object]) -> Path:
+def make_once(name, make):
     """Make a file or a folder where no other worker has, and wait for one that is about it."""
     assert Shared.folder is not None
     path, done = Shared.folder / name, Shared.folder / f"{name}.done"
@@ -39,14 +36,13 @@ def make_once(name: str, make: Callable[[Path], object]) -> Path:
     return path
 
 
-def compute_once(name: str, compute: Callable[[], T]) -> T:
+def compute_once(name, compute):
     """Compute a value where no other worker has."""
     path = make_once(name, lambda path: path.write_bytes(pickle.dumps(compute())))
-    value: T = pickle.loads(path.read_bytes())
-    return value
+    return pickle.loads(path.read_bytes())
 
 
-def changed(settings: Any, **values: object) -> Any:
+def changed(settings, **values):
     """Copy a profile or a part of it with other values, as of cameras__cam__driver__device."""
     for path, value in values.items():
         key, _, rest = path.partition("__")
@@ -57,7 +53,7 @@ def changed(settings: Any, **values: object) -> Any:
     return settings
 
 
-def half_size(rig: Any) -> Any:
+def half_size(rig):
     """Let cameras take images of half the size, which are rendered and searched in a quarter of the time."""
     for name, camera in rig.cameras.items():
         lens = camera.intrinsics.model_dump()
@@ -68,7 +64,7 @@ def half_size(rig: Any) -> Any:
     return rig
 
 
-def wait_until(is_so: Callable[[], object], patience_s: float = 20.0) -> None:
+def wait_until(is_so, patience_s=20.0):
     """Wait until something is so; a busy computer takes long."""
     deadline_s = time.monotonic() + patience_s
     while not is_so():
@@ -76,7 +72,7 @@ def wait_until(is_so: Callable[[], object], patience_s: float = 20.0) -> None:
         time.sleep(0.005)
 
 
-def has_ended(pid: str | int) -> bool:
+def has_ended(pid):
     """Tell whether a process is gone, or only waits to be reaped."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0] in "ZX"
@@ -85,7 +81,7 @@ def has_ended(pid: str | int) -> bool:
 
 
 @contextmanager
-def files_up_to(n_bytes: int) -> Iterator[None]:
+def files_up_to(n_bytes):
     """Let no file grow beyond a size, as on a disk that is full."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
@@ -95,6 +91,6 @@ def files_up_to(n_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def contents(folder: Path) -> dict[Path, bytes]:
+def contents(folder):
     """Read every file below a folder."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def to_yuv(bgr: np.ndarray) -> np.ndarray:
+def to_yuv(bgr):
     """Convert (H, W, 3) BGR to (H, W, 3) Y, U, V."""
     blue, green, red = np.moveaxis(bgr.astype(float), 2, 0)
     y = 16 + (65.481 * red + 128.553 * green + 24.966 * blue) / 255
@@ -12,7 +12,7 @@ def to_yuv(bgr: np.ndarray) -> np.ndarray:
     return np.rint(np.stack((y, u, v), 2)).astype(np.uint8)
 
 
-def to_422(bgr: np.ndarray, order: str) -> np.ndarray:
+def to_422(bgr, order):
     """Convert (H, W, 3) BGR to (H, W, 2), "uyvy" or "yuyv", each two pixels with one chroma."""
     y, u, v = np.moveaxis(to_yuv(bgr), 2, 0)
     chroma = u.copy()

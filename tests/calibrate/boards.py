@@ -1,6 +1,5 @@
 """A small simulator of detected boards: a spinning LiDAR and a camera in front of one board per capture."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
@@ -9,18 +8,9 @@ import numpy as np
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import (
-    Array,
-    exp_so3,
-    fit_plane,
-    invert,
-    perturb,
-    pose,
-    project_to_so3,
-    transform,
-)
+from lce_rig.core.geometry import exp_so3, fit_plane, invert, perturb, pose, project_to_so3, transform
 from lce_rig.core.planar_pose import solve_planar_pose
-from lce_rig.core.results import ImageBoard, LidarBoard, LidarQuality, Observation
+from lce_rig.core.results import LidarBoard, LidarQuality, Observation
 from lce_rig.detect.image.search import board_from_pose
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.models import model_of
@@ -53,13 +43,7 @@ class Scenario:
     template_sigma_m: float = 0.01
 
 
-def simulate(
-    n: int,
-    seed: int,
-    scenario: Scenario | None = None,
-    T_cam_lidar: np.ndarray = T_FORWARD,
-    board: Board = BOARD,
-) -> list[Observation]:
+def simulate(n, seed, scenario=None, T_cam_lidar=T_FORWARD, board=BOARD):
     """Simulate n captures in which both sensors see the board."""
     made, source = _session(seed, scenario or Scenario(), T_cam_lidar.tobytes(), board)
     made += islice(source, max(0, n - len(made)))
@@ -67,14 +51,12 @@ def simulate(
 
 
 @lru_cache(maxsize=100)
-def _session(
-    seed: int, scenario: Scenario, T_cam_lidar: bytes, board: Board
-) -> tuple[list[Observation], Iterator[Observation]]:
+def _session(seed, scenario, T_cam_lidar, board):
     """Keep what was simulated of a session, and what goes on with it: many tests ask for the same one."""
     return [], _captures(seed, scenario, np.frombuffer(T_cam_lidar).reshape(4, 4), board)
 
 
-def _captures(seed: int, scenario: Scenario, T_cam_lidar: np.ndarray, board: Board) -> Iterator[Observation]:
+def _captures(seed, scenario, T_cam_lidar, board):
     rng = np.random.default_rng(seed)
     # A generator of their own: the captures of a seed are otherwise the same with and without biases.
     laser_rng = np.random.default_rng([seed, 1])
@@ -90,7 +72,7 @@ def _captures(seed: int, scenario: Scenario, T_cam_lidar: np.ndarray, board: Boa
             n_seen += 1
 
 
-def random_pose(rng: np.random.Generator, scenario: Scenario, board: Board) -> np.ndarray:
+def random_pose(rng, scenario, board):
     """Draw T_cam_board somewhere in the picture, facing the camera but for a tilt and a roll."""
     pixel = rng.uniform(0.15, 0.85, 2) * [CAMERA.width_px, CAMERA.height_px]
     centre = CAMERA.unproject(pixel) * rng.uniform(*scenario.distance_m)
@@ -104,9 +86,7 @@ def random_pose(rng: np.random.Generator, scenario: Scenario, board: Board) -> n
     return pose(R, centre)
 
 
-def photograph(
-    T_cam_board: np.ndarray, rng: np.random.Generator, scenario: Scenario, board: Board
-) -> ImageBoard | None:
+def photograph(T_cam_board, rng, scenario, board):
     """Measure the corners with noise and solve for both poses; None where the board leaves the picture."""
     pixels, is_valid = CAMERA.project(transform(T_cam_board, board.corners()))
     if not (is_valid.all() and CAMERA.is_inside(pixels, 3.0).all()):
@@ -116,13 +96,7 @@ def photograph(
     return None if solved is None else board_from_pose(pixels, solved)
 
 
-def scan_board(
-    T_lidar_board: np.ndarray,
-    rng: np.random.Generator,
-    scenario: Scenario,
-    board: Board,
-    bias_m: np.ndarray | float = 0.0,
-) -> LidarBoard | None:
+def scan_board(T_lidar_board, rng, scenario, board, bias_m=0.0):
     """Fire 16 rings at a board; ring ends lie up to `footprint_m` outside it, some are lost.
 
     Each ring's ranges are off by its `bias_m`.
@@ -188,9 +162,7 @@ def scan_board(
     )
 
 
-def measured_plate(
-    width_m: float, height_m: float, points: Array, *, sigma_m: float = np.inf, n_rings: int = 8
-) -> LidarQuality:
+def measured_plate(width_m, height_m, points, *, sigma_m=np.inf, n_rings=8):
     """What a detector says of a plate; by default it does not know its size."""
     return LidarQuality(
         width_m=width_m,
@@ -212,13 +184,13 @@ def measured_plate(
     )
 
 
-def with_decoy(item: Observation, decoy: LidarBoard, *, is_first: bool) -> Observation:
+def with_decoy(item, decoy, *, is_first):
     """Add a rival to the LiDAR's candidates."""
     places = (decoy, *item.places) if is_first else (*item.places, decoy)
     return replace(item, lidar=places[0], others=places[1:])
 
 
-def in_use(T_cam_lidar: Array, lens: Intrinsics) -> Array:
+def in_use(T_cam_lidar, lens):
     """Turn extrinsics (4, 4) back as the error of the estimated lens, with which they are used, does."""
     model = model_of(lens)
     turn = turn_of_lens(lens) @ (model.vector(lens) - model.vector(CAMERA))

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.core.geometry import Array, fit_plane, invert, perturb
-from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+from lce_rig.core.geometry import fit_plane, invert, perturb
+from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, random_pose, scan_board
 
 STAMP_NS = 1_700_000_000_000_000_000
@@ -34,18 +34,15 @@ class Moving:
     apart: tuple[float, ...] = (0.0,) * 6
 
 
-def simulate_moving(
-    n: int, seed: int, moving: Moving | None = None, scenario: Scenario | None = None
-) -> dict[str, list[Observation]]:
+def simulate_moving(n, seed, moving=None, scenario=None):
     """Simulate n captures of a moving board, by channel."""
     moving, scenario = moving or Moving(), scenario or Scenario()
     rng = np.random.default_rng(seed)
-    found: dict[str, list[Observation]] = {channel: [] for channel, _ in moving.offset_s}
+    found = {channel: [] for channel, _ in moving.offset_s}
     while len(found["frames"]) < n:
         T_cam_board = random_pose(rng, scenario, BOARD)
         rates = np.r_[
-            moving.speed_mps * rng.standard_normal(3),
-            np.radians(moving.turn_deg_s) * rng.standard_normal(3),
+            moving.speed_mps * rng.standard_normal(3), np.radians(moving.turn_deg_s) * rng.standard_normal(3)
         ]
         middle_s = rng.uniform(0.02, 0.08)
         still = scan_board(invert(T_FORWARD) @ perturb(T_cam_board, rates * middle_s), rng, scenario, BOARD)
@@ -65,7 +62,7 @@ def simulate_moving(
     return found
 
 
-def skew(lidar: LidarBoard, rates: Array, middle_s: float) -> LidarBoard:
+def skew(lidar, rates, middle_s):
     """Move points along their rays to where a board on its way meets them."""
     azimuth = np.arctan2(lidar.points[:, 1], lidar.points[:, 0])
     since_s = -(azimuth - azimuth.mean()) / (2 * np.pi) * 0.1
@@ -73,7 +70,7 @@ def skew(lidar: LidarBoard, rates: Array, middle_s: float) -> LidarBoard:
     centre, normal = lidar.points.mean(axis=0), lidar.plane[:3]
     v, w = R_lidar_cam @ rates[:3], R_lidar_cam @ rates[3:]
 
-    def along_rays(points: Array, times_s: Array) -> Array:
+    def along_rays(points, times_s):
         way = (times_s[:, None] * (v + np.cross(w, points - centre))) @ normal
         return points * (1 + way / (points @ normal))[:, None]
 
@@ -91,22 +88,14 @@ def skew(lidar: LidarBoard, rates: Array, middle_s: float) -> LidarBoard:
     )
 
 
-def _picture(
-    channel: str,
-    T_cam_board: Array,
-    rates: Array,
-    offset_s: float,
-    moving: Moving,
-    scenario: Scenario,
-    rng: np.random.Generator,
-) -> ImageBoard | None:
+def _picture(channel, T_cam_board, rates, offset_s, moving, scenario, rng):
     """Photograph the board; the camera's clock reads `offset_s` less than the LiDAR's."""
     is_events = channel == "events"
     noise = replace(scenario, corner_sigma_px=moving.events_px if is_events else scenario.corner_sigma_px)
     elsewhere = perturb(np.eye(4), np.array(moving.apart) * is_events)
     taken_s = offset_s + (rng.uniform(-0.03, 0.07) if moving.has_stamps else 0.0)
 
-    def at(t_s: float) -> ImageBoard | None:
+    def at(t_s):
         return photograph(elsewhere @ perturb(T_cam_board, rates * t_s), rng, noise, BOARD)
 
     image = at(taken_s)

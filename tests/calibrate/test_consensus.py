@@ -10,15 +10,7 @@ from lce_rig.calibrate.result import error_to_reference
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import exp_so3, invert, pose
 from lce_rig.core.results import Observation
-from tests.calibrate.boards import (
-    BOARD,
-    T_FORWARD,
-    Scenario,
-    random_pose,
-    scan_board,
-    simulate,
-    with_decoy,
-)
+from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board, simulate, with_decoy
 
 
 def somewhere_else(seed, T_cam_lidar=T_FORWARD):

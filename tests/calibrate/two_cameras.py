@@ -1,11 +1,10 @@
 """Two cameras side by side before the same boards and one LiDAR: sessions for tests/rigs/two_cameras.yaml."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.core.geometry import Array, exp_so3, invert, perturb, pose
+from lce_rig.core.geometry import exp_so3, invert, perturb, pose
 from lce_rig.core.results import Observation
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, random_pose, scan_board
 
@@ -18,15 +17,7 @@ REAL = Scenario(laser_bias_sigma_m=0.008, footprint_m=0.008, end_sigma_m=0.001)
 Session = dict[str, list[Observation]]
 
 
-def simulate_two(
-    n: int,
-    seed: int,
-    scenario: Scenario = REAL,
-    *,
-    right_corner_sigma_px: float | None = None,
-    nudge: Array | None = None,
-    nudged_from: int = 0,
-) -> Session:
+def simulate_two(n, seed, scenario=REAL, *, right_corner_sigma_px=None, nudge=None, nudged_from=0):
     """Simulate n captures in which both cameras and the LiDAR see the board.
 
     Args:
@@ -42,13 +33,7 @@ def simulate_two(
     return {LEFT: [left for left, _ in pairs], RIGHT: [right for _, right in pairs]}
 
 
-def _captures(
-    seed: int,
-    scenario: Scenario,
-    right_corner_sigma_px: float | None,
-    nudge: Array | None,
-    nudged_from: int,
-) -> Iterator[tuple[Observation, Observation]]:
+def _captures(seed, scenario, right_corner_sigma_px, nudge, nudged_from):
     rng = np.random.default_rng([seed, 2])
     bias_m = scenario.laser_bias_sigma_m * np.random.default_rng([seed, 1]).standard_normal(16)
     bias_m += scenario.range_offset_m - bias_m.mean()
@@ -67,6 +52,6 @@ def _captures(
             n_seen += 1
 
 
-def only(captures: list[Observation], kept: range) -> list[Observation]:
+def only(captures, kept):
     """Keep captures by their place."""
     return [captures[k] for k in kept]

@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 
@@ -24,7 +23,7 @@ class Outcome:
 def lce_rig(capsys):
     """Run a command line in this process."""
 
-    def call(*words) -> Outcome:
+    def call(*words):
         capsys.readouterr()
         code = run([str(word) for word in words])
         captured = capsys.readouterr()
@@ -34,16 +33,16 @@ def lce_rig(capsys):
 
 
 @pytest.fixture
-def mute(monkeypatch: pytest.MonkeyPatch) -> None:
+def mute(monkeypatch):
     """Every rendered text is its code alone."""
     monkeypatch.setattr(Finding, "_render", lambda finding, template: finding.code)
 
 
 @pytest.fixture(scope="session")
-def simulated() -> Path:
+def simulated():
     """A session of the rig rles with sixteen captures, detected once."""
 
-    def make(session: Path) -> None:
+    def make(session):
         assert run(["simulate", "--rig", "rles", str(session), "--captures", "16", "--seed", "3"]) == 0
         assert run(["check", str(session)]) == 0
 
@@ -51,10 +50,10 @@ def simulated() -> Path:
 
 
 @pytest.fixture(scope="session")
-def calibrated_once(simulated) -> Path:
+def calibrated_once(simulated):
     """The simulated session with its result; as `lce-rig calibrate` leaves it."""
 
-    def make(session: Path) -> None:
+    def make(session):
         shutil.copytree(simulated, session)
         assert run(["calibrate", str(session)]) == 0
 
@@ -62,7 +61,7 @@ def calibrated_once(simulated) -> Path:
 
 
 @pytest.fixture
-def calibrated(calibrated_once, tmp_path) -> Path:
+def calibrated(calibrated_once, tmp_path):
     """A copy of the calibrated session to write into."""
     copy = tmp_path / "session"
     shutil.copytree(calibrated_once, copy)
@@ -70,7 +69,7 @@ def calibrated(calibrated_once, tmp_path) -> Path:
 
 
 @pytest.fixture
-def calibrated_few(calibrated) -> Path:
+def calibrated_few(calibrated):
     """The same with its first four captures only, for what is quicker to see on few."""
     for path in sorted((calibrated / "captures").iterdir())[4:]:
         shutil.rmtree(path)
@@ -78,7 +77,7 @@ def calibrated_few(calibrated) -> Path:
 
 
 @pytest.fixture
-def session(simulated, tmp_path) -> Path:
+def session(simulated, tmp_path):
     """A copy of the simulated session to write into."""
     copy = tmp_path / "session"
     shutil.copytree(simulated, copy)

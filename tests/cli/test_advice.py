@@ -4,7 +4,6 @@ import ast
 import re
 import shlex
 import shutil
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
@@ -24,10 +23,10 @@ _PLAIN = re.compile(
 )
 
 
-def _texts(source: str) -> Iterator[str]:
+def _texts(source):
     """Yield every text of a module but docstrings, with X for each value that is put in."""
     tree = ast.parse(source)
-    parts: set[int] = set()
+    parts = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             parts.add(id(node.value))
@@ -39,7 +38,7 @@ def _texts(source: str) -> Iterator[str]:
             yield node.value
 
 
-def _advised() -> Iterator[tuple[str, str]]:
+def _advised():
     for path in sorted(PACKAGE.rglob("*")):
         if path.suffix == ".py":
             texts = list(_texts(path.read_text(encoding="utf-8")))
@@ -56,10 +55,10 @@ def _advised() -> Iterator[tuple[str, str]]:
 ADVISED = sorted(set(_advised()))
 
 
-def _lacking(command: str) -> str:
+def _lacking(command):
     """Say what a command lacks to be run as it is typed; "" if nothing."""
     words = [word for word in shlex.split(command) if word != "\\"]
-    at: click.Command = cli
+    at = cli
     context = click.Context(cli, info_name="lce-rig")
     while isinstance(at, click.Group):
         if not words:
@@ -84,7 +83,7 @@ def _lacking(command: str) -> str:
     return ", ".join(missing)
 
 
-def test_an_action_takes_one_line_of_a_terminal() -> None:
+def test_an_action_takes_one_line_of_a_terminal():
     for path in sorted(PACKAGE.glob("*/findings.py")):
         import_module(f"lce_rig.{path.parent.name}.findings")
     for kind in KINDS.values():
@@ -95,13 +94,13 @@ def test_an_action_takes_one_line_of_a_terminal() -> None:
                 assert len(filled) <= 80 - 7, (kind.code, action)
 
 
-def test_commands_are_found() -> None:
+def test_commands_are_found():
     verbs = {command.split()[0] for _, command in ADVISED}
     assert {"calibrate", "check", "collect", "intrinsics", "drift", "doctor", "rigs"} <= verbs
 
 
 @pytest.mark.parametrize(("place", "command"), ADVISED)
-def test_an_advised_command_can_be_typed(place: str, command: str) -> None:
+def test_an_advised_command_can_be_typed(place, command):
     assert _lacking(command) == ""
 
 
@@ -135,11 +134,11 @@ _PLACEHOLDERS = {
 }
 
 
-def _typed(command: str) -> tuple[str, ...]:
+def _typed(command):
     """Put names of the workbench where an advised command has placeholders."""
     words = shlex.split(command)
     first = " ".join(words[:2])
-    typed: list[str] = []
+    typed = []
     for word in words:
         before = typed[-1] if typed else ""
         if word not in _PLACEHOLDERS:
@@ -168,14 +167,14 @@ TYPED = sorted(
 
 
 @pytest.fixture(scope="module")
-def workbench() -> Path:
+def workbench():
     """Sessions, results, a recording, a registry and a robot: all that advised commands name."""
 
-    def make(folder: Path) -> None:
+    def make(folder):
         folder.mkdir()
         session, rig, recording = folder / "session", folder / "rig.yaml", folder / "recording"
 
-        def calls(*words: object) -> None:
+        def calls(*words):
             assert run([str(word) for word in words]) in (0, 7), words
 
         calls("rigs", "new", "rlfs", "--from", "rlfs", "-o", rig)
@@ -205,7 +204,7 @@ def workbench() -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", TYPED, ids=" ".join)
-def test_an_advised_command_works(command, workbench, tmp_path, monkeypatch, lce_rig) -> None:
+def test_an_advised_command_works(command, workbench, tmp_path, monkeypatch, lce_rig):
     shutil.copytree(workbench, tmp_path, dirs_exist_ok=True, symlinks=True)
     monkeypatch.chdir(tmp_path)
     if command[0] in ("collect", "simulate") or "--save-profile" in command:

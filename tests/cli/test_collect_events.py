@@ -1,18 +1,17 @@
 """`lce-rig collect` from recordings with raw events: what it captures, and what it says where it cannot."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from lce_rig.core.data import Events, Image, Sample
+from lce_rig.core.data import Events, Image
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.session import Session
 from tests.collect import simulated_moves as moves
 from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 
 
-def bag(path: Path, samples: list[Sample]) -> Path:
+def bag(path, samples):
     with BagRecorder(path, moves.rig()) as recorder:
         for sample in samples:
             recorder.write(sample)
@@ -20,7 +19,7 @@ def bag(path: Path, samples: list[Sample]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory):
     """A LiDAR's bag, and files of the DAVIS beside it: sound, of another time, of another camera, empty."""
     path = tmp_path_factory.mktemp("recordings")
     bag(path / "lidar.bag", moves.without(Image, Events))
@@ -35,7 +34,7 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
-def collect(lce_rig, folder: Path, session: Path, *names: str):
+def collect(lce_rig, folder, session, *names):
     sources = [word for name in names for word in ("--from", folder / name)]
     return lce_rig("collect", "--rig", "rles", session, *sources)
 
@@ -53,13 +52,13 @@ def collect(lce_rig, folder: Path, session: Path, *names: str):
         (["lidar.bag"], ["no topic /davis/image_raw for davis.frames"]),
     ],
 )
-def test_what_cannot_be_used_is_said_with_what_to_do(lce_rig, folder, tmp_path, names, said) -> None:
+def test_what_cannot_be_used_is_said_with_what_to_do(lce_rig, folder, tmp_path, names, said):
     outcome = collect(lce_rig, folder, tmp_path / "s", *names)
     assert outcome.code == 5
     assert all(text in outcome.err for text in said)
 
 
-def test_a_board_that_makes_no_events_gives_no_captures_and_the_reason(lce_rig, tmp_path) -> None:
+def test_a_board_that_makes_no_events_gives_no_captures_and_the_reason(lce_rig, tmp_path):
     few = [s.select(slice(None, None, 400)) if isinstance(s, Events) else s for s in moves.samples()]
     bag(tmp_path / "few.bag", few)
     outcome = collect(lce_rig, tmp_path, tmp_path / "s", "few.bag")

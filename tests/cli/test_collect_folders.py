@@ -13,7 +13,7 @@ TWO = Path(__file__).parents[1] / "rigs" / "two_cameras.yaml"
 
 
 @pytest.fixture
-def folders(tmp_path) -> list[Path]:
+def folders(tmp_path):
     """Two folders of one picture and one cloud each, of the same cloud."""
     cloud = np.zeros(16, [(name, "f4") for name in ("x", "y", "z", "intensity")] + [("ring", "u2")])
     cloud["x"], cloud["ring"] = 3, np.arange(16)

@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,22 +29,20 @@ from lce_rig.simulate import truth_extrinsics
         (["--seed", "3"], "--seed"),
     ],
 )
-def test_options_of_the_other_kind_are_refused_by_name(
-    lce_rig, tmp_path: Path, arguments: list[str], named: str
-) -> None:
+def test_options_of_the_other_kind_are_refused_by_name(lce_rig, tmp_path, arguments, named):
     result = lce_rig("collect", "--rig", "rles", tmp_path / "session", *arguments)
     assert result.code == 2 and named in result.err
     assert not (tmp_path / "session").exists()
 
 
-def test_a_rig_without_its_devices_says_what_to_check(lce_rig, tmp_path: Path) -> None:
+def test_a_rig_without_its_devices_says_what_to_check(lce_rig, tmp_path):
     result = lce_rig("collect", "--rig", "rlfs", tmp_path / "session", "--plain", "--timeout", "5")
     assert result.code == 5
     assert "lidar" in result.err and "doctor" in result.err
     assert "captures" not in result.err and not (tmp_path / "session").exists(), "nothing had begun"
 
 
-def test_simulated_and_real_captures_are_not_mixed(lce_rig, tmp_path: Path) -> None:
+def test_simulated_and_real_captures_are_not_mixed(lce_rig, tmp_path):
     path = tmp_path / "session"
     path.mkdir()
     (path / "truth.json").write_text(json.dumps({"seed": 3}))
@@ -61,7 +58,7 @@ def test_simulated_and_real_captures_are_not_mixed(lce_rig, tmp_path: Path) -> N
     assert result.code == 4 and "real" in result.err
 
 
-def test_a_page_that_cannot_be_served_is_said_before_anything_is_made(lce_rig, tmp_path: Path) -> None:
+def test_a_page_that_cannot_be_served_is_said_before_anything_is_made(lce_rig, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         used = f"127.0.0.1:{taken.getsockname()[1]}"
         for address in (used, "99999"):
@@ -73,26 +70,14 @@ def test_a_page_that_cannot_be_served_is_said_before_anything_is_made(lce_rig, t
             assert "starting" not in result.err and not path.exists() and not record.exists()
 
 
-def start(path: Path, *arguments: str, rig: str = "rles", **options: object) -> "subprocess.Popen[str]":
-    command = [
-        sys.executable,
-        "-m",
-        "lce_rig",
-        "collect",
-        "--rig",
-        rig,
-        str(path),
-        "--simulated",
-        *arguments,
-    ]
+def start(path, *arguments, rig="rles", **options):
+    command = [sys.executable, "-m", "lce_rig", "collect", "--rig", rig, str(path), "--simulated", *arguments]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload, no-any-return]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("rig", "camera"), [("rles", "davis"), ("mid360", "cam")])
-def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(
-    tmp_path: Path, rig: str, camera: str
-) -> None:
+def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path, rig, camera):
     path = tmp_path / "session"
     process = start(path, "--plain", "--captures", "2", "--timeout", "240", "--hold", "0.3", rig=rig)
     _, said = process.communicate(timeout=300)
@@ -109,7 +94,7 @@ def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(
 
 
 @pytest.mark.long
-def test_ctrl_c_and_a_kill_while_the_simulated_rig_starts_end_it_without_a_trace(tmp_path: Path) -> None:
+def test_ctrl_c_and_a_kill_while_the_simulated_rig_starts_end_it_without_a_trace(tmp_path):
     for number in (signal.SIGINT, signal.SIGTERM):
         process = start(tmp_path / number.name, "--plain", start_new_session=True)
         assert process.stderr is not None
@@ -122,7 +107,7 @@ def test_ctrl_c_and_a_kill_while_the_simulated_rig_starts_end_it_without_a_trace
 
 @pytest.mark.long
 @pytest.mark.parametrize("term", ["xterm", pytest.param("dumb", marks=pytest.mark.slow)])
-def test_a_terminal_that_is_closed_ends_the_collection_in_good_order(tmp_path: Path, term: str) -> None:
+def test_a_terminal_that_is_closed_ends_the_collection_in_good_order(tmp_path, term):
     ours, theirs = pty.openpty()
     path = tmp_path / "session"
     environment = {**os.environ, "TERM": term}
@@ -149,8 +134,8 @@ def test_a_terminal_that_is_closed_ends_the_collection_in_good_order(tmp_path: P
 
 @pytest.mark.long
 def test_a_run_that_nobody_looks_after_ends_and_says_that_too_little_was_shown(
-    lce_rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    lce_rig, tmp_path, monkeypatch
+):
     monkeypatch.setattr("lce_rig.cli.collect_live.SIMULATED_IDLE_S", 15.0)
     session = tmp_path / "session"
     # Nobody holds a board still for half a minute.

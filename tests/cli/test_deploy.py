@@ -22,7 +22,7 @@ def words(session, targets, *more, target="here"):
     return ("deploy", session, "--target", target, "--targets", targets, *more)
 
 
-def test_deploy_dry_run_status_and_rollback(lce_rig, calibrated_once, targets, tmp_path) -> None:
+def test_deploy_dry_run_status_and_rollback(lce_rig, calibrated_once, targets, tmp_path):
     dry = json.loads(lce_rig(*words(calibrated_once, targets, "--dry-run", "--json")).out)
     assert dry["current"] is None and not (tmp_path / "robot").exists()
     done = json.loads(lce_rig(*words(calibrated_once, targets, "--json")).out)
@@ -40,7 +40,7 @@ def test_deploy_dry_run_status_and_rollback(lce_rig, calibrated_once, targets, t
     assert lce_rig(*words(calibrated_once, targets, "--rollback")).code == 8
 
 
-def test_exit_codes(lce_rig, calibrated_once, targets, tmp_path) -> None:
+def test_exit_codes(lce_rig, calibrated_once, targets, tmp_path):
     failed = lce_rig(*words(calibrated_once, targets, target="failing"))
     assert failed.code == 9
     assert (tmp_path / "robot" / "current" / "result.json").exists()

@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from wire.vlp16_packets import Vlp16Clock
@@ -16,7 +15,7 @@ from tests.shared import has_ended, wait_until
 
 
 @pytest.fixture
-def absent(tmp_path: Path) -> Path:
+def absent(tmp_path):
     """The profile of a rig of which nothing is attached."""
     path = tmp_path / "absent.yaml"
     with attach(Attached(make_rig(), has_board=False), tmp_path) as (rig, _):

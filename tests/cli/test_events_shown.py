@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from tests.saved_results import made_calibration, write_result
 
 
 @pytest.fixture(scope="module")
-def moving(tmp_path_factory) -> Path:
+def moving(tmp_path_factory):
     """A session of the rig rles with a capture of a moving board, and the truth; beside it one of frames."""
     rig = load_rig("rles")
     options = replace(SimulationOptions.for_rig("rles", "moving"), events_span_s=(0.9, 0.15))
@@ -43,7 +42,7 @@ def moving(tmp_path_factory) -> Path:
     return path
 
 
-def coloured(picture, colour) -> int:
+def coloured(picture, colour):
     return int(np.all(np.abs(picture.astype(int) - colour) < 20, axis=-1).sum())
 
 
@@ -85,10 +84,7 @@ def test_verify_draws_the_lidar_and_the_events_for_each_channel(lce_rig, moving,
     for channel in ("events", "frames"):
         assert f"davis.{channel} and lidar" in outcome.out
         folder = tmp_path / f"davis.{channel}.lidar"
-        assert sorted(file.name for file in folder.iterdir()) == [
-            "000000.png",
-            "contact_sheet.png",
-        ]
+        assert sorted(file.name for file in folder.iterdir()) == ["000000.png", "contact_sheet.png"]
         drawn = cv2.imread(str(folder / "000000.png"))
         heights[channel] = drawn.shape[0]
         assert coloured(drawn, (235, 60, 255)) > 300  # magenta: the board in the LiDAR

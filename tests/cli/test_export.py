@@ -66,7 +66,7 @@ def test_files_fit_into_the_robots_tree_and_what_is_left_out_is_told(lce_rig, ca
     outcome = lce_rig("export", calibrated, "-o", out, "--formats", "isaac,ros2_launch,mcap", "--tree", robot)
     assert outcome.code == 0 and "export." not in outcome.err
     assert {path.name for path in out.iterdir()} == {
-        *("isaac_calibration.urdf", "rles.launch.py", "rles_session"),
+        *("isaac_calibration.urdf", "rles.launch.py", "rles_session")
     }
     read = URDF.load(str(out / "isaac_calibration.urdf"), load_meshes=False)
     T = read.get_transform("velodyne", "davis_optical_frame")

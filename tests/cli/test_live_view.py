@@ -41,7 +41,7 @@ STATE = LiveState(
 )
 
 
-def drawn(state: LiveState, links: tuple[str, ...] = (), width: int = 80, height: int = 24) -> list[str]:
+def drawn(state, links=(), width=80, height=24):
     console = Console(width=width, height=height, file=io.StringIO(), force_terminal=False)
     console.print(render(state, links=links, height=height, width=width))
     out = console.file
@@ -49,7 +49,7 @@ def drawn(state: LiveState, links: tuple[str, ...] = (), width: int = 80, height
     return out.getvalue().rstrip("\n").split("\n")
 
 
-def test_everything_fits_into_80_by_24() -> None:
+def test_everything_fits_into_80_by_24():
     lines = drawn(STATE)
     assert len(lines) <= 24
     assert max(len(line) for line in lines) <= 80
@@ -67,7 +67,7 @@ def test_everything_fits_into_80_by_24() -> None:
     assert "01:04 not captured" in text and "boards must" in text and "q stop" in text
 
 
-def test_of_several_cameras_the_picture_says_whose_it_is() -> None:
+def test_of_several_cameras_the_picture_says_whose_it_is():
     (first, *others) = STREAMS
     two = (first._replace(name="left.frames"), first._replace(name="right.frames"), *others[:1])
     drawing = replace(STATE.drawing, camera="right.frames")
@@ -92,7 +92,7 @@ SAID = replace(
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (100, 30), (120, 40)])
-def test_no_sentence_is_cut_and_a_wide_terminal_has_a_larger_drawing(width: int, height: int) -> None:
+def test_no_sentence_is_cut_and_a_wide_terminal_has_a_larger_drawing(width, height):
     lines = drawn(SAID, width=width, height=height)
     assert len(lines) <= height and max(len(line) for line in lines) <= width
     # Beside each other stand the streams' columns, and the bars and the drawing.
@@ -104,7 +104,7 @@ def test_no_sentence_is_cut_and_a_wide_terminal_has_a_larger_drawing(width: int,
     assert drawing.index("┐") - drawing.index("┌") >= (20 if height == 24 else 0.45 * width)
 
 
-def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same() -> None:
+def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same():
     bare = replace(
         STATE, drawing=None, coverage=None, sigma_deg=np.nan, sigma_mm=np.nan, hold_s=None, streams=()
     )
@@ -112,11 +112,11 @@ def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same() ->
     assert "rotation   -" in text and "HOLD STILL" in text
 
 
-def test_the_bell_rings_once_for_a_capture_and_twice_for_a_refused_one_apart_in_time() -> None:
+def test_the_bell_rings_once_for_a_capture_and_twice_for_a_refused_one_apart_in_time():
     clock = [0.0]
-    rung: list[float] = []
+    rung = []
 
-    def heard(state: LiveState, n_states: int = 20, is_silent: bool = False) -> list[float]:
+    def heard(state, n_states=20, is_silent=False):
         bell = Bell(is_silent, lambda: rung.append(clock[0]), lambda: clock[0])
         rung.clear()
         for _ in range(n_states):
@@ -133,7 +133,7 @@ def test_the_bell_rings_once_for_a_capture_and_twice_for_a_refused_one_apart_in_
     assert heard(STATE, is_silent=True) == []
 
 
-def test_the_pages_code_fits_and_holds_its_link() -> None:
+def test_the_pages_code_fits_and_holds_its_link():
     import cv2
 
     link = "http://192.168.100.200:8765/?token=q3Zk9Xw0aB4_"
@@ -147,7 +147,7 @@ def test_the_pages_code_fits_and_holds_its_link() -> None:
     assert qr_lines("http://127.0.0.1:8765/") == [] == qr_lines("http://localhost:8765/")
 
 
-def test_plain_lines_say_what_changes_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plain_lines_say_what_changes_once(capsys):
     view = PlainView(Bell(is_silent=True))
     moving = replace(
         STATE, phase="moving", headline="one step left", hold_s=None, cues=(), log=(), notes=("a note",)
@@ -176,7 +176,7 @@ def test_plain_lines_say_what_changes_once(capsys: pytest.CaptureFixture[str]) -
     assert tuple(lines[3:]) == told
 
 
-def test_outlines_that_leave_the_picture_or_the_lens_break_nothing() -> None:
+def test_outlines_that_leave_the_picture_or_the_lens_break_nothing():
     beyond = np.array([[-500.0, 100.0], [np.nan, np.nan], [3000, 400], [100, 5000], [-500, 100]])
     assert len(draw_outlines((346, 260), beyond, beyond, (40, 9))) == 9
 

@@ -10,7 +10,7 @@ from lce_rig.rig import find_profile, load_rig
 from tests.shared import files_up_to
 
 
-def test_called_bare_it_lists_the_profiles(capsys: pytest.CaptureFixture[str]) -> None:
+def test_called_bare_it_lists_the_profiles(capsys):
     assert run(["rigs"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in ("rlfs", "rles", "sss", "DAVIS346"))
@@ -18,9 +18,7 @@ def test_called_bare_it_lists_the_profiles(capsys: pytest.CaptureFixture[str]) -
     assert capsys.readouterr().out == out
 
 
-def test_show_prints_what_is_not_default_and_with_all_everything(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_show_prints_what_is_not_default_and_with_all_everything(capsys, tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(f"{find_profile('rles').read_text(encoding='utf-8')}\nquality: {{min_rings: 7}}\n")
     assert run(["rigs", "show", str(path)]) == 0
@@ -31,9 +29,7 @@ def test_show_prints_what_is_not_default_and_with_all_everything(
 
 
 @pytest.mark.parametrize("more", [[], ["--all"]])
-def test_show_prints_a_profile_that_loads_again(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, more: list[str]
-) -> None:
+def test_show_prints_a_profile_that_loads_again(capsys, tmp_path, more):
     path = tmp_path / "copy.yaml"
     assert run(["rigs", "show", "rlfs", *more]) == 0
     path.write_text(capsys.readouterr().out, encoding="utf-8")
@@ -42,7 +38,7 @@ def test_show_prints_a_profile_that_loads_again(
     assert json.loads(capsys.readouterr().out)["board"]["square_m"] == 0.07
 
 
-def test_check_exits_by_what_it_finds(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_check_exits_by_what_it_finds(capsys, tmp_path):
     path = tmp_path / "mine.yaml"
     assert run(["rigs", "new", "mine", "--from", "sss", "-o", str(path)]) == 0
     assert run(["rigs", "check", str(path)]) == 0
@@ -53,7 +49,7 @@ def test_check_exits_by_what_it_finds(capsys: pytest.CaptureFixture[str], tmp_pa
     assert "cameras.cam.intrinsics.fx_pix:" in said and "fx_px" in said
 
 
-def test_check_warns_of_what_is_rarely_meant(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_check_warns_of_what_is_rarely_meant(capsys, tmp_path):
     path = tmp_path / "mine.yaml"
     turned = ["--from", "sss", "--set", "board.inner_corners=[6, 8]"]
     assert run(["rigs", "new", "mine", *turned, "-o", str(path)]) == 0
@@ -63,9 +59,7 @@ def test_check_warns_of_what_is_rarely_meant(capsys: pytest.CaptureFixture[str],
     assert "warning: " in capsys.readouterr().err
 
 
-def test_new_writes_a_profile_and_never_over_another(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_writes_a_profile_and_never_over_another(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run(["rigs", "new", "mine", "--from", "rlfs", "--set", "board.square_m=0.065"]) == 0
     assert load_rig("mine.yaml").board.square_m == 0.065
@@ -75,7 +69,7 @@ def test_new_writes_a_profile_and_never_over_another(
     assert Path("mine.yaml").read_bytes() == before
 
 
-def test_a_full_disk_leaves_no_part_of_a_profile(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_full_disk_leaves_no_part_of_a_profile(capsys, tmp_path):
     path = tmp_path / "mine.yaml"
     with files_up_to(100):
         assert run(["rigs", "new", "mine", "-o", str(path)]) == 3
@@ -84,9 +78,7 @@ def test_a_full_disk_leaves_no_part_of_a_profile(capsys: pytest.CaptureFixture[s
     assert run(["rigs", "new", "mine", "-o", str(path)]) == 0
 
 
-def test_a_profile_of_ones_own_sensors_takes_one_command(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_profile_of_ones_own_sensors_takes_one_command(capsys, tmp_path):
     path = tmp_path / "os1.yaml"
     lens = "equidistant,1920x1208,959.554,960.194,940.789,670.737,-0.097824,0.141429,-0.148385,0.055918"
     words = ["rigs", "new", "os1", "--lidar", "OS1-64", "--intrinsics", lens, "-o", str(path)]
@@ -119,15 +111,13 @@ def test_a_profile_of_ones_own_sensors_takes_one_command(
         (["x", "--intrinsics", "pinhole,64x48,50,50,32,24", "--board", "8x6,0.07,0.767x0.626"], 2),
     ],
 )
-def test_a_profile_that_cannot_be_written_leaves_no_file(
-    words: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_profile_that_cannot_be_written_leaves_no_file(words, code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run(["rigs", "new", *words]) == code
     assert not list(tmp_path.iterdir())
 
 
-def test_a_derived_profile_keeps_no_block_that_was_removed(tmp_path: Path) -> None:
+def test_a_derived_profile_keeps_no_block_that_was_removed(tmp_path):
     path = tmp_path / "mine.yaml"
     removed = ["--unset", "nominal_extrinsics", "--unset", "cameras.cam.driver"]
     assert run(["rigs", "new", "mine", *removed, "-o", str(path)]) == 0

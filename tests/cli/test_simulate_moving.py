@@ -1,8 +1,6 @@
 """`lce-rig simulate` of a moving board: sessions with raw events, recordings, and truth that fits both."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +10,9 @@ from lce_rig.core.data import Events, Image, Scan
 from lce_rig.io import open_recording
 from lce_rig.io.events import open_events
 from lce_rig.io.protocol import ContinuousRecording
-from lce_rig.rig import Rig, dump_rig, load_rig
+from lce_rig.rig import dump_rig, load_rig
 from lce_rig.session import Session
-from lce_rig.simulate import SimulatedCapture, SimulationOptions, simulate_captures
+from lce_rig.simulate import SimulationOptions, simulate_captures
 from tests.shared import changed, contents, half_size
 
 # The placement is 1.3 m away: squares are 9 px wide, even to a camera of half the resolution.
@@ -22,26 +20,26 @@ SEED = 9
 OPTIONS = SimulationOptions.for_rig("rles", motion="moving")
 
 
-def small_rig(*channels: str) -> Rig:
+def small_rig(*channels):
     """The rig rles with a camera of half the resolution, which simulates in a quarter of the time."""
     rig = half_size(load_rig("rles"))
     kept = {name: rig.cameras["davis"].channels[name] for name in channels}
     return changed(rig, cameras__davis__channels=kept)
 
 
-def write_profile(folder: Path, *channels: str) -> Path:
+def write_profile(folder, *channels):
     path = folder / "small.yaml"
     path.write_text(dump_rig(small_rig(*channels)))
     return path
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return small_rig("frames", "events")
 
 
 @pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def moving(tmp_path_factory):
     """A session of one capture of a moving board."""
     folder = tmp_path_factory.mktemp("moving")
     profile = write_profile(folder, "frames", "events")
@@ -51,25 +49,24 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def simulated(rig: Rig) -> SimulatedCapture:
+def simulated(rig):
     """What the first capture was made from."""
     return next(simulate_captures(rig, n_captures=1, seed=SEED, options=OPTIONS))
 
 
 @pytest.fixture(scope="module")
-def truth(moving: Path) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads((moving / "truth.json").read_text())
-    return document
+def truth(moving):
+    return json.loads((moving / "truth.json").read_text())
 
 
-def test_a_capture_holds_a_picture_a_scan_and_raw_events(moving: Path) -> None:
+def test_a_capture_holds_a_picture_a_scan_and_raw_events(moving):
     (capture,) = Session.open(moving).captures
     capture.check()
     assert capture.image_keys == [("davis", "frames")], "pictures of events are made at detection"
     assert (capture.lidars, capture.event_cameras) == (["lidar"], ["davis"])
 
 
-def test_the_session_holds_exactly_what_was_simulated(moving: Path, simulated: SimulatedCapture) -> None:
+def test_the_session_holds_exactly_what_was_simulated(moving, simulated):
     capture = Session.open(moving).captures[0]
     image, scan, events = capture.image("davis", "frames"), capture.scan("lidar"), capture.events("davis")
     assert np.array_equal(image.pixels, simulated.images[0].pixels)
@@ -79,7 +76,7 @@ def test_the_session_holds_exactly_what_was_simulated(moving: Path, simulated: S
         assert np.array_equal(getattr(events, column), getattr(simulated.events[0], column))
 
 
-def test_truth_names_the_speed_and_the_board(truth: dict[str, Any], simulated: SimulatedCapture) -> None:
+def test_truth_names_the_speed_and_the_board(truth, simulated):
     assert truth["motion"] == "moving"
     for sensor, board in truth["captures"]["000000"]["boards"].items():
         expected = simulated.T_sensor_board(sensor, board["t_ns"])
@@ -89,7 +86,7 @@ def test_truth_names_the_speed_and_the_board(truth: dict[str, Any], simulated: S
     assert np.array(truth["T_cam_lidar"]).shape == (4, 4)
 
 
-def test_a_rig_of_events_alone_is_simulated_moving(lce_rig: Any, tmp_path: Path) -> None:
+def test_a_rig_of_events_alone_is_simulated_moving(lce_rig, tmp_path):
     profile = write_profile(tmp_path, "events")
     words = ("simulate", "--rig", profile, "--captures", 1)
     outcome = lce_rig(*words, tmp_path / "s")
@@ -101,7 +98,7 @@ def test_a_rig_of_events_alone_is_simulated_moving(lce_rig: Any, tmp_path: Path)
     assert "only frames" in outcome.err and not any((tmp_path / "t").glob("captures/*"))
 
 
-def test_a_still_board_makes_no_events_and_help_says_so(lce_rig: Any, tmp_path: Path) -> None:
+def test_a_still_board_makes_no_events_and_help_says_so(lce_rig, tmp_path):
     profile = write_profile(tmp_path, "frames", "events")
     outcome = lce_rig("simulate", "--rig", profile, tmp_path / "s", "--captures", 1)
     assert outcome.code == 0
@@ -121,9 +118,7 @@ def test_a_still_board_makes_no_events_and_help_says_so(lce_rig: Any, tmp_path: 
         *(("--duration", value, "--recording", "r") for value in ("nan", "inf", "-0.1")),
     ],
 )
-def test_choices_that_cannot_be_meant_exit_with_2_and_write_nothing(
-    lce_rig: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
-) -> None:
+def test_choices_that_cannot_be_meant_exit_with_2_and_write_nothing(lce_rig, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     outcome = lce_rig("simulate", "--rig", "rles", *words)
     assert outcome.code == 2
@@ -131,7 +126,7 @@ def test_choices_that_cannot_be_meant_exit_with_2_and_write_nothing(
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory):
     """A quarter of a second as files."""
     folder = tmp_path_factory.mktemp("recorded")
     profile = write_profile(folder, "frames", "events")
@@ -140,7 +135,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "r"
 
 
-def test_a_recording_is_read_by_the_readers_of_recordings(recorded: Path, rig: Rig) -> None:
+def test_a_recording_is_read_by_the_readers_of_recordings(recorded, rig):
     assert sorted(path.name for path in recorded.iterdir()) == ["recording", "truth.json"]
     recording = open_recording(recorded / "recording", rig)
     assert isinstance(recording, ContinuousRecording)
@@ -153,7 +148,7 @@ def test_a_recording_is_read_by_the_readers_of_recordings(recorded: Path, rig: R
     assert sum(len(sample) for sample in samples if isinstance(sample, Events)) == sum(map(len, events))
 
 
-def test_a_recording_overwrites_nothing(lce_rig: Any, recorded: Path, tmp_path: Path) -> None:
+def test_a_recording_overwrites_nothing(lce_rig, recorded, tmp_path):
     before = contents(recorded)
     profile = write_profile(tmp_path, "frames", "events")
     outcome = lce_rig("simulate", "--rig", profile, "--recording", recorded)

@@ -3,10 +3,7 @@
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,14 +13,14 @@ from lce_rig.session import Session
 WORDS = {"text", "action", "cause", "reasons"}
 
 
-def facts(document: Any) -> Any:
+def facts(document):
     """Leave out of a document what is said in words."""
     if isinstance(document, dict):
         return {key: facts(value) for key, value in document.items() if key not in WORDS}
     return [facts(value) for value in document] if isinstance(document, list) else document
 
 
-def findings(document: Any) -> Iterator[dict[str, Any]]:
+def findings(document):
     """Find every finding and refusal in a document."""
     values = (
         document.values() if isinstance(document, dict) else document if isinstance(document, list) else ()
@@ -35,7 +32,7 @@ def findings(document: Any) -> Iterator[dict[str, Any]]:
 
 
 @pytest.fixture
-def spoilt(session: Path) -> Path:
+def spoilt(session):
     """A session not searched yet: of sixteen captures ten are sound, the rest refused for various causes."""
     captures = Session.open(session).captures[10:]
     spoilt = [(capture.image("davis", "frames"), capture.scan("lidar")) for capture in captures]
@@ -57,7 +54,7 @@ def spoilt(session: Path) -> Path:
 def run_twice(lce_rig, tmp_path, request):
     """Run a verb with and without words on copies of sessions; gives its exit code and what it prints."""
 
-    def call(verb: str, *sessions: Path) -> tuple[int, Any]:
+    def call(verb, *sessions):
         done = []
         for is_mute in (False, True):
             if is_mute:
@@ -78,7 +75,7 @@ def run_twice(lce_rig, tmp_path, request):
     return call
 
 
-def moved(session: Path) -> Path:
+def moved(session):
     """Put the LiDAR of a session's result 5 cm elsewhere."""
     path = session / "calibration" / "result.json"
     document = json.loads(path.read_text())
@@ -87,7 +84,7 @@ def moved(session: Path) -> Path:
     return session
 
 
-def codes(document: Any) -> set[str]:
+def codes(document):
     return {each["code"] for each in findings(document)}
 
 
@@ -113,7 +110,7 @@ def test_verify_is_contradicted_by_the_same_captures(run_twice, calibrated_few):
 
 
 @pytest.fixture
-def halves(simulated, tmp_path) -> list[Path]:
+def halves(simulated, tmp_path):
     """Two sessions without a result."""
     halves = [tmp_path / f"half{half}" for half in range(2)]
     for half, folder in enumerate(halves):

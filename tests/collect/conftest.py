@@ -1,21 +1,17 @@
 """Simulated placements of a board, shown one after the other as in a recording."""
 
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from lce_rig.core.data import Image, Scan
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.rig import Rig
 from tests.collect.live import replay
 
 T0_NS = 1_700_000_000 * 10**9
 STEP_NS = 100_000_000
 
 
-def frames(order: Sequence[int], lag_ns: int = 0) -> Iterator[Image | Scan]:
+def frames(order, lag_ns=0):
     """One scan and, at its middle plus `lag_ns`, one picture of each placement in turn, at 10 Hz."""
     for k, index in enumerate(order):
         capture, stamp_ns = replay.placements()[index], T0_NS + k * STEP_NS
@@ -25,15 +21,15 @@ def frames(order: Sequence[int], lag_ns: int = 0) -> Iterator[Image | Scan]:
 
 
 @pytest.fixture(scope="session")
-def rig() -> Rig:
+def rig():
     return replay.rig()
 
 
 @pytest.fixture(scope="session")
-def write_bag(rig: Rig) -> Callable[..., Path]:
+def write_bag(rig):
     """Write a bag of placements on the profile's topics."""
 
-    def write(path: Path, order: Sequence[int], lag_ns: int = 0) -> Path:
+    def write(path, order, lag_ns=0):
         with BagRecorder(path, rig) as recorder:
             for sample in sorted(frames(order, lag_ns), key=lambda sample: sample.stamp_ns or 0):
                 recorder.write(sample)

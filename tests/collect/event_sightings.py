@@ -1,13 +1,10 @@
 """Sightings of a board on a given way before an event camera, and its stream; no picture is drawn."""
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.results import ImageBoard, LidarBoard
-from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, EventBuffer, Frame
 from tests.calibrate.boards import measured_plate
 
@@ -18,9 +15,7 @@ _SCAN_S = 0.1
 _LEFT, _RIGHT, _TOP, _BOTTOM = 30, 316, 60, 200
 
 
-def event_stream(
-    rates_px_s: Sequence[tuple[float, float, float]], seed: int = 0, lamp_hz: float = 0.0
-) -> list[Events]:
+def event_stream(rates_px_s, seed=0, lamp_hz=0.0):
     """Events of (from s, to s, events a second and pixel), cut into packets.
 
     With `lamp_hz` all pixels turn brighter, then darker, so often a second.
@@ -41,16 +36,7 @@ def event_stream(
     return packets
 
 
-def watch(
-    rig: Rig,
-    way: Callable[[float], tuple[float, float]],
-    duration_s: float,
-    stream: Sequence[Events],
-    *,
-    channel: str = "frames",
-    is_seen: Callable[[float], bool] = lambda _time_s: True,
-    has_lidar: bool = True,
-) -> list[BoardDetection]:
+def watch(rig, way, duration_s, stream, *, channel="frames", is_seen=lambda _time_s: True, has_lidar=True):
     """Sight a board at (x, y) m, three metres away, once a scan; the middle of the first sweep is 0.05 s."""
     buffer = EventBuffer(rig)
     for packet in stream:
@@ -71,14 +57,14 @@ def watch(
     return found
 
 
-def board_at(x_m: float, y_m: float) -> ImageBoard:
+def board_at(x_m, y_m):
     """A board that faces the camera."""
     T_cam_board = np.diag([1.0, -1.0, -1.0, 1.0])
     T_cam_board[:3, 3] = x_m, y_m, 3.0
     return ImageBoard(np.zeros((54, 2)), T_cam_board, np.eye(6) * 1e-6, None, np.inf, False, 0.1, 0.1)
 
 
-def plate() -> LidarBoard:
+def plate():
     """What a scan shows of it; only that there is something counts."""
     none, nothing = np.zeros((0, 3)), np.zeros(0)
     ring, side = np.zeros(0, np.int16), np.zeros(0, np.int8)

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from functools import cache
 
-from lce_rig.core.data import Events, Image, Sample, Scan
-from lce_rig.rig import Rig, load_rig
-from lce_rig.simulate import HandMotion, LidarNoise, SimulatedRecording, SimulationOptions, simulate_recording
+from lce_rig.core.data import Events
+from lce_rig.rig import load_rig
+from lce_rig.simulate import HandMotion, LidarNoise, SimulationOptions, simulate_recording
 from lce_rig.simulate.sampling import stamp_of
 from tests.shared import compute_once
 
@@ -24,29 +24,29 @@ OPTIONS = SimulationOptions(
 
 
 @cache
-def rig() -> Rig:
+def rig():
     return load_rig("rles")
 
 
 @cache
-def recording() -> SimulatedRecording:
+def recording():
     return simulate_recording(rig(), duration_s=DURATION_S, seed=2, options=OPTIONS)
 
 
 @cache
-def samples() -> tuple[Sample, ...]:
+def samples():
     """Events of nearly two seconds, and the scans and frames at their end."""
     return compute_once("moves", _sample)
 
 
-def _sample() -> tuple[Sample, ...]:
+def _sample():
     start_ns = recording().start_ns
     return tuple(s for s in recording() if isinstance(s, Events) or stamp_of(s) >= start_ns + _FIRST_SCAN_NS)
 
 
-def events() -> list[Events]:
+def events():
     return [s for s in samples() if isinstance(s, Events)]
 
 
-def without(*kinds: type[Image] | type[Scan] | type[Events]) -> list[Sample]:
+def without(*kinds):
     return [s for s in samples() if not isinstance(s, kinds)]

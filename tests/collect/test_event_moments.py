@@ -1,13 +1,12 @@
 """From recordings with raw events to captures, end to end, against the truth of the simulator."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lce_rig.collect.offline import CollectReport, collect
-from lce_rig.core.data import Events, Image, Sample
+from lce_rig.collect.offline import collect
+from lce_rig.core.data import Events, Image
 from lce_rig.core.errors import SourceError
 from lce_rig.core.geometry import rotation_angle
 from lce_rig.core.results import ImageBoard
@@ -22,14 +21,14 @@ from . import simulated_moves as moves
 EXPOSURE_US = 8000
 
 
-def bag(path: Path, samples: list[Sample]) -> Path:
+def bag(path, samples):
     with BagRecorder(path, moves.rig()) as recorder:
         for sample in samples:
             recorder.write(sample)
     return path
 
 
-def run(folder: Path, *paths: Path) -> tuple[Session, CollectReport]:
+def run(folder, *paths):
     options = SourceOptions(is_part=len(paths) > 1)
     with Session.resume(folder, moves.rig()) as session:
         recordings = [open_recording(path, session.rig, options) for path in paths]
@@ -37,27 +36,27 @@ def run(folder: Path, *paths: Path) -> tuple[Session, CollectReport]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Path:
+def whole(tmp_path_factory):
     return bag(tmp_path_factory.mktemp("whole") / "whole.bag", list(moves.samples()))
 
 
 @pytest.fixture(scope="module")
-def lidar(tmp_path_factory) -> Path:
+def lidar(tmp_path_factory):
     return bag(tmp_path_factory.mktemp("lidar") / "lidar.bag", moves.without(Image, Events))
 
 
 @pytest.fixture(scope="module")
-def collected(tmp_path_factory, whole) -> tuple[Session, CollectReport]:
+def collected(tmp_path_factory, whole):
     return run(tmp_path_factory.mktemp("collected") / "s", whole)
 
 
-def whole_stream() -> Events:
+def whole_stream():
     parts = moves.events()
     columns = {n: np.concatenate([getattr(e, n) for e in parts]) for n in ("t_ns", "x", "y", "polarity")}
     return replace(parts[0], **columns, host_ns=None)
 
 
-def off_truth(T_cam_board: np.ndarray, stamp_ns: int) -> tuple[float, float]:
+def off_truth(T_cam_board, stamp_ns):
     """Distance in m, and angle in rad, of a pose from the true one; the print may be read upside down."""
     truth = moves.recording().T_sensor_board("davis", stamp_ns)
     turns = [
@@ -67,7 +66,7 @@ def off_truth(T_cam_board: np.ndarray, stamp_ns: int) -> tuple[float, float]:
     return float(np.linalg.norm(T_cam_board[:3, 3] - truth[:3, 3])), float(min(turns))
 
 
-def test_a_slowly_moved_board_becomes_a_capture_with_the_events_around_its_scan(collected) -> None:
+def test_a_slowly_moved_board_becomes_a_capture_with_the_events_around_its_scan(collected):
     session, report = collected
     assert report.captured == ["000000"] and not report.errors and report.has_events
     (capture,) = session.captures
@@ -86,9 +85,7 @@ def test_a_slowly_moved_board_becomes_a_capture_with_the_events_around_its_scan(
     assert 1 < capture.meta["events_px"] < 50
 
 
-def test_a_davis_file_beside_a_lidars_bag_gives_the_same_captures_as_one_bag(
-    tmp_path, collected, lidar
-) -> None:
+def test_a_davis_file_beside_a_lidars_bag_gives_the_same_captures_as_one_bag(tmp_path, collected, lidar):
     frames = [s for s in moves.samples() if isinstance(s, Image)]
     raw = [RawFrame(f.stamp_ns // 1000 - EXPOSURE_US // 2, EXPOSURE_US, f.pixels) for f in frames]
     file = write_davis(tmp_path / "davis.aedat4", moves.events(), raw)
@@ -103,7 +100,7 @@ def test_a_davis_file_beside_a_lidars_bag_gives_the_same_captures_as_one_bag(
     assert (again.captured, again.n_known) == ([], 1)
 
 
-def test_events_alone_are_watched_in_their_own_pictures_which_are_not_kept(tmp_path, lidar) -> None:
+def test_events_alone_are_watched_in_their_own_pictures_which_are_not_kept(tmp_path, lidar):
     write_aedat4(tmp_path / "events.aedat4", _with_hot_pixels(moves.events()))
     session, report = run(tmp_path / "s", lidar, tmp_path / "events.aedat4")
     assert report.captured == ["000000"]
@@ -125,7 +122,7 @@ def test_events_alone_are_watched_in_their_own_pictures_which_are_not_kept(tmp_p
     assert isinstance(seen.board, ImageBoard) and off_truth(seen.board.T_cam_board, middle_ns)[0] < 0.03
 
 
-def _with_hot_pixels(packets: list[Events]) -> list[Events]:
+def _with_hot_pixels(packets):
     """Twenty pixels that fire 300 times a second, whatever they see."""
     rng = np.random.default_rng(0)
     x, y = rng.integers(0, 346, 20).astype(np.uint16), rng.integers(0, 260, 20).astype(np.uint16)
@@ -140,7 +137,7 @@ def _with_hot_pixels(packets: list[Events]) -> list[Events]:
     return mixed
 
 
-def test_a_file_that_ends_in_a_packet_gives_the_captures_before_its_end_and_says_so(tmp_path, lidar) -> None:
+def test_a_file_that_ends_in_a_packet_gives_the_captures_before_its_end_and_says_so(tmp_path, lidar):
     frames = [s for s in moves.samples() if isinstance(s, Image)]
     raw = [RawFrame(f.stamp_ns // 1000 - EXPOSURE_US // 2, EXPOSURE_US, f.pixels) for f in frames]
     file = write_davis(tmp_path / "davis.aedat4", moves.events(), raw)
@@ -150,7 +147,7 @@ def test_a_file_that_ends_in_a_packet_gives_the_captures_before_its_end_and_says
     assert any("torn ends" in note for note in report.notes)
 
 
-def test_clocks_that_do_not_overlap_are_an_error(tmp_path, lidar) -> None:
+def test_clocks_that_do_not_overlap_are_an_error(tmp_path, lidar):
     late = [replace(e, t_ns=e.t_ns + 1_234_500_000_000) for e in moves.events()]
     write_aedat4(tmp_path / "late.aedat4", late)
     with pytest.raises(SourceError, match=r"davis\.events"):
@@ -161,7 +158,7 @@ def test_clocks_that_do_not_overlap_are_an_error(tmp_path, lidar) -> None:
     assert report.captured == ["000000"] and len(report.errors) == 1
 
 
-def test_captures_whose_events_begin_late_are_kept(tmp_path) -> None:
+def test_captures_whose_events_begin_late_are_kept(tmp_path):
     start_ns = moves.recording().start_ns + 900_000_000
     late = [s for s in moves.samples() if not isinstance(s, Events) or s.t_ns[0] >= start_ns]
     session, report = run(tmp_path / "s", bag(tmp_path / "late.bag", late))
@@ -169,6 +166,6 @@ def test_captures_whose_events_begin_late_are_kept(tmp_path) -> None:
     assert session.captures[0].events("davis").t_ns[0] >= start_ns
 
 
-def test_without_events_the_same_rig_still_wants_the_board_to_stand(tmp_path) -> None:
+def test_without_events_the_same_rig_still_wants_the_board_to_stand(tmp_path):
     _, report = run(tmp_path / "s", bag(tmp_path / "a.bag", moves.without(Events)))
     assert report.captured == [] and not report.has_events

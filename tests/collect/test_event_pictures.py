@@ -1,17 +1,16 @@
 """Pictures for cameras without frames: one for the middle of every sweep, from all events up to it."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lce_rig.collect.event_pictures import with_event_pictures
-from lce_rig.core.data import Image, Sample, Scan
+from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Losses
 from lce_rig.detect.events.search import reconstructor_for
 from lce_rig.io.joining import merge_by_time
-from lce_rig.rig import ReconstructionSettings, Rig, load_rig
+from lce_rig.rig import ReconstructionSettings, load_rig
 from tests.detect.onnx_file import write_network
 from tests.shared import changed
 
@@ -21,7 +20,7 @@ MS = 1_000_000
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory: pytest.TempPathFactory) -> ReconstructionSettings:
+def quick(tmp_path_factory):
     """A network that takes the mean of its bins, which is quick; it settles in 0.36 s."""
     voxels, image = ("v", [1, 5, "height", "width"]), [1, 1, "height", "width"]
     path = write_network(tmp_path_factory.mktemp("network") / "mean.onnx", [voxels], [image])
@@ -29,11 +28,11 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> ReconstructionSettings:
 
 
 @pytest.fixture(scope="module")
-def rig(quick: ReconstructionSettings) -> Rig:
+def rig(quick):
     return changed(load_rig("rles"), cameras__davis__channels__events__reconstruction=quick)
 
 
-def scan(time_ms: float) -> Scan:
+def scan(time_ms):
     """A sweep of 100 ms whose middle is at `time_ms`."""
     offset_ns, zeros = np.array([0, 100 * MS]), np.zeros(2, np.float32)
     stamp_ns = T0_NS + round((time_ms - 50) * MS)
@@ -44,14 +43,12 @@ EVENTS = event_stream([(0.0, 2.0, 0.5)])
 MIDDLES_MS = range(450, 1950, 100)
 
 
-def pictures(samples: Iterable[Sample], rig: Rig, tally: Losses | None = None) -> list[Image]:
+def pictures(samples, rig, tally=None):
     found = list(with_event_pictures(samples, rig, ["davis"], tally or Losses()))
     return [sample for sample in found if isinstance(sample, Image)]
 
 
-def test_images_are_those_of_the_whole_stream_at_the_middle_of_each_scan(
-    rig: Rig, quick: ReconstructionSettings
-) -> None:
+def test_images_are_those_of_the_whole_stream_at_the_middle_of_each_scan(rig, quick):
     given = list(merge_by_time([EVENTS, map(scan, MIDDLES_MS)], rig))
     passed = list(with_event_pictures(given, rig, ["davis"], Losses()))
     assert [s for s in passed if not isinstance(s, Image)] == given
@@ -64,7 +61,7 @@ def test_images_are_those_of_the_whole_stream_at_the_middle_of_each_scan(
 
 
 @pytest.mark.parametrize("late_ms", [120, 700])
-def test_scans_that_come_late_and_packets_of_any_length_change_nothing(rig: Rig, late_ms: int) -> None:
+def test_scans_that_come_late_and_packets_of_any_length_change_nothing(rig, late_ms):
     whole = replace(
         EVENTS[0],
         **{n: np.concatenate([getattr(e, n) for e in EVENTS]) for n in ("t_ns", "x", "y", "polarity")},
@@ -78,7 +75,7 @@ def test_scans_that_come_late_and_packets_of_any_length_change_nothing(rig: Rig,
     assert all(np.array_equal(a.pixels, b.pixels) for a, b in zip(late, prompt, strict=True))
 
 
-def test_scans_before_the_first_event_get_no_picture_and_are_counted(rig: Rig) -> None:
+def test_scans_before_the_first_event_get_no_picture_and_are_counted(rig):
     tally = Losses()
     scans = [scan(t) for t in range(-2950, 500, 100)]
     found = pictures(merge_by_time([EVENTS, scans], rig), rig, tally)
@@ -87,7 +84,7 @@ def test_scans_before_the_first_event_get_no_picture_and_are_counted(rig: Rig) -
     assert counts == {"read.events_not_begun": 30, "read.network_settling": 4}
 
 
-def test_scans_of_a_clock_that_was_set_back_get_no_picture_of_other_times(rig: Rig) -> None:
+def test_scans_of_a_clock_that_was_set_back_get_no_picture_of_other_times(rig):
     tally = Losses()
     given = [*EVENTS[:30], scan(1050), scan(1150), *EVENTS[30:], scan(550), scan(1950)]
     found = pictures(given, rig, tally)

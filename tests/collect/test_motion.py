@@ -1,17 +1,16 @@
 """Which moments of a moving board become captures for an event camera, and why others do not."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lce_rig.collect.board_tracker import BoardDetection, CaptureMoment
+from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Losses, Refusal
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 
 from .event_sightings import event_stream, watch
 
@@ -20,21 +19,21 @@ SOME = event_stream([(-1.3, 6.0, 2.0)])
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return load_rig("rles")
 
 
-def choose(detections: Iterable[BoardDetection], rig: Rig) -> tuple[list[CaptureMoment], dict[str, int]]:
+def choose(detections, rig):
     tally = Losses()
     moments = find_moments(detections, MotionGate(rig, Placements(0.15, 10.0), tally))
     return list(moments), tally.by_code()
 
 
-def places_m(moments: list[CaptureMoment]) -> list[float]:
+def places_m(moments):
     return [float(m.detection.images["davis", "frames"].T_cam_board[0, 3]) for m in moments]
 
 
-def test_a_board_that_passes_slowly_is_taken_once_a_place(rig: Rig) -> None:
+def test_a_board_that_passes_slowly_is_taken_once_a_place(rig):
     moments, refused = choose(watch(rig, lambda t: (0.1 * t - 0.25, 0.0), 5.0, SOME), rig)
     assert len(moments) in (3, 4) and not refused
     assert np.diff(places_m(moments)).min() >= 0.15
@@ -54,21 +53,21 @@ def test_a_board_that_passes_slowly_is_taken_once_a_place(rig: Rig) -> None:
     ],
 )
 def test_boards_without_use_for_an_event_camera_are_refused_by_their_cause(
-    rig: Rig, speed_mps: float, rate: float, lamp_hz: float, code: str
-) -> None:
+    rig, speed_mps, rate, lamp_hz, code
+):
     stream = event_stream([(-1.3, 3.0, rate)], lamp_hz=lamp_hz)
     detections = watch(rig, lambda t: (speed_mps * (t - 0.5), 0.0), 1.0, stream)
     assert choose(detections, rig) == ([], {code: 10})
 
 
-def test_a_board_that_has_just_stopped_or_a_rig_that_moves_will_do_where_events_are_plenty(rig: Rig) -> None:
+def test_a_board_that_has_just_stopped_or_a_rig_that_moves_will_do_where_events_are_plenty(rig):
     moments, refused = choose(watch(rig, lambda _t: (0.0, 0.0), 2.0, PLENTY), rig)
     assert len(moments) == 1 and not refused
     assert moments[0].figures["speed_mps"] < 0.01 and moments[0].figures["events_px"] > 4
 
 
-def test_the_slowest_part_of_a_way_is_preferred_to_a_fast_one_through_the_same_place(rig: Rig) -> None:
-    def way(t: float) -> tuple[float, float]:
+def test_the_slowest_part_of_a_way_is_preferred_to_a_fast_one_through_the_same_place(rig):
+    def way(t):
         """In at 0.4 m/s, then on at 0.1 m/s."""
         return (0.4 * (t - 1.0) if t < 1.0 else 0.1 * (t - 1.0), 0.0)
 
@@ -78,30 +77,27 @@ def test_the_slowest_part_of_a_way_is_preferred_to_a_fast_one_through_the_same_p
     assert all(np.diff(sorted(places_m(moments))) >= 0.15)
 
 
-def test_moments_before_the_stream_or_after_it_are_counted(rig: Rig) -> None:
+def test_moments_before_the_stream_or_after_it_are_counted(rig):
     stream = event_stream([(1.0, 2.0, 4.0)])
     _, refused = choose(watch(rig, lambda t: (0.05 * t, 0.0), 6.0, stream), rig)
     # Scans 8 to 31 begin less than 1.2 s after its end and end less than 0.15 s before its beginning.
     assert refused["read.no_events_at_scan"] == 8 + 28
 
 
-def test_a_board_that_the_lidar_does_not_see_is_no_moment(rig: Rig) -> None:
+def test_a_board_that_the_lidar_does_not_see_is_no_moment(rig):
     assert choose(watch(rig, lambda t: (0.1 * t, 0.0), 1.0, SOME, has_lidar=False), rig) == ([], {})
 
 
-def test_a_board_that_comes_back_is_not_taken_twice(rig: Rig) -> None:
+def test_a_board_that_comes_back_is_not_taken_twice(rig):
     moments, _ = choose(watch(rig, lambda t: (0.1 * abs(t - 3.0), 0.0), 6.0, SOME), rig)
     places = sorted(places_m(moments))
     assert 2 <= len(places) <= 3 and np.diff(places).min() >= 0.15
 
 
-def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig: Rig) -> None:
+def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig):
     lit = event_stream([(-1.3, 3.0, 8.0)], lamp_hz=60.0)
     unseen = Refusal("image.no_board")
-    for stream, code in [
-        (lit, "image.flicker"),
-        (event_stream([(-1.3, 3.0, 0.3)]), "image.still_scene"),
-    ]:
+    for stream, code in [(lit, "image.flicker"), (event_stream([(-1.3, 3.0, 0.3)]), "image.still_scene")]:
         detections = watch(
             rig, lambda _t: (0.0, 0.0), 1.0, stream, channel="events", is_seen=lambda _t: False
         )
@@ -115,8 +111,8 @@ def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig:
     [("charuco", False, True), ("charuco", True, False), ("checkerboard", True, True)],
 )
 def test_markers_tell_a_turned_board_from_a_still_one_and_need_no_neighbours(
-    rig: Rig, markers: str, is_turned: bool, is_still: bool
-) -> None:
+    rig, markers, is_turned, is_still
+):
     board = Board(8, 6, 0.07, 0.767, 0.626)
     corners_px = 100 + 400 * board.corners()[:, :2]
     if markers == "charuco":

@@ -92,10 +92,7 @@ def test_damaged_files_are_refused_with_their_cause_and_the_rest_is_captured(tmp
 def test_a_folder_of_which_nothing_can_be_read_is_an_error_that_names_the_first_file(tmp_path, folder, rig):
     for path in (folder / "pcd").iterdir():
         os.truncate(path, 0)
-    with (
-        Session.create(tmp_path / "s", rig) as session,
-        pytest.raises(SourceError, match=r"pcd/00000\.pcd"),
-    ):
+    with Session.create(tmp_path / "s", rig) as session, pytest.raises(SourceError, match=r"pcd/00000\.pcd"):
         run(session, folder, rig)
 
 

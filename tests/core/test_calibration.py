@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from hypothesis import strategies as st
 
 from lce_rig.core.calibration import (
     AxisOpinion,
-    Calibration,
     Certificate,
     ChannelResult,
     Contribution,
@@ -48,7 +46,7 @@ REQUIRED = [
 Edit = Callable[[dict[str, Any]], Any]
 
 
-def full() -> Calibration:
+def full():
     """Fill every field that the file keeps."""
     T, cov = calibration().T_cam_lidar, calibration().cov
     return calibration(
@@ -74,11 +72,11 @@ def full() -> Calibration:
     )
 
 
-def as_text(*calibrations: Calibration) -> str:
+def as_text(*calibrations):
     return result_file("rles", calibrations).text()
 
 
-def edited(path: Path, edit: Edit) -> Path:
+def edited(path, edit):
     """Write a result after a change to its document."""
     document = result_file("rles", [full()]).document()
     edit(document)
@@ -86,7 +84,7 @@ def edited(path: Path, edit: Edit) -> Path:
     return path
 
 
-def test_the_published_keys_are_there_in_order() -> None:
+def test_the_published_keys_are_there_in_order():
     document = result_file("rles", [full()]).document()
     assert list(document) == ["format_version", "rig", "made_by", "inputs_sha256", "pairs"]
     assert (document["format_version"], document["rig"]) == (1, "rles")
@@ -108,9 +106,7 @@ def test_the_published_keys_are_there_in_order() -> None:
     scale=st.floats(1e-9, 1e-1),
     cause=st.text(max_size=20),
 )
-def test_every_field_is_read_back_to_the_last_digit(
-    tmp_path: Path, phi: Any, t: Any, scale: float, cause: str
-) -> None:
+def test_every_field_is_read_back_to_the_last_digit(tmp_path, phi, t, scale, cause):
     T, cov = pose(exp_so3(np.array(phi)), np.array(t)) + 0.0, calibration().cov * scale
     written = replace(full(), T_cam_lidar=T, cov=cov, findings=(reason(cause),))
     path = tmp_path / "result.json"
@@ -124,7 +120,7 @@ def test_every_field_is_read_back_to_the_last_digit(
     assert read.pairs[0].captures_refused == written.captures_refused
 
 
-def test_figures_that_are_not_known_are_null(tmp_path: Path) -> None:
+def test_figures_that_are_not_known_are_null(tmp_path):
     unknown = calibration(metrics=Metrics(np.nan, 0.1, 0.2), certificate=Certificate(False, np.inf))
     path = tmp_path / "result.json"
     path.write_text(as_text(unknown))
@@ -136,7 +132,7 @@ def test_figures_that_are_not_known_are_null(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["T_cam_lidar", "cov", "cov_shared"])
-def test_an_array_that_is_not_finite_is_refused(name: str, bad: float) -> None:
+def test_an_array_that_is_not_finite_is_refused(name, bad):
     array = np.array(getattr(calibration(), name))
     array[0, 3] = bad
     with pytest.raises(ResultRefusedError):
@@ -144,9 +140,7 @@ def test_an_array_that_is_not_finite_is_refused(name: str, bad: float) -> None:
 
 
 @pytest.mark.parametrize("times", [("2026-11-20T10:22:03Z", None), (None, "2026-11-20T10:22:03Z")])
-def test_provenance_and_hashes_of_inputs_are_read_back(
-    tmp_path: Path, times: tuple[str | None, str | None]
-) -> None:
+def test_provenance_and_hashes_of_inputs_are_read_back(tmp_path, times):
     path = tmp_path / "result.json"
     origin = Provenance("kestrel", {"lidar": "AG1", "cam": "7"}, times[0], "0f" * 32, times[1])
     inputs = {"rig.yaml": "0f" * 32, "captures/000000/meta.json": "a1" * 32}
@@ -156,7 +150,7 @@ def test_provenance_and_hashes_of_inputs_are_read_back(
     assert list(json.loads(path.read_text())["inputs_sha256"]) == sorted(inputs)
 
 
-def pair_edit(**changes: Any) -> Edit:
+def pair_edit(**changes):
     return lambda document: document["pairs"][0].update(changes)
 
 
@@ -183,24 +177,24 @@ def pair_edit(**changes: Any) -> Edit:
         ),
     ],
 )
-def test_a_tampered_result_is_refused_with_its_key(tmp_path: Path, edit: Edit, key: str) -> None:
+def test_a_tampered_result_is_refused_with_its_key(tmp_path, edit, key):
     path = edited(tmp_path / "result.json", edit)
     with pytest.raises(SessionError) as caught:
         read_result(path)
     assert caught.value.what.startswith(f"{path}: {key}")
 
 
-def test_keys_of_later_versions_are_ignored(tmp_path: Path) -> None:
-    def of_tomorrow(document: dict[str, Any]) -> None:
+def test_keys_of_later_versions_are_ignored(tmp_path):
+    def of_tomorrow(document):
         document["later"] = document["pairs"][0]["later"] = {"x": 1}
 
     assert len(read_result(edited(tmp_path / "result.json", of_tomorrow)).pairs) == 1
 
 
-def test_files_of_earlier_versions_are_read(tmp_path: Path) -> None:
+def test_files_of_earlier_versions_are_read(tmp_path):
     """They hold no provenance, hashes or findings, and refusals in words only."""
 
-    def as_before(document: dict[str, Any]) -> None:
+    def as_before(document):
         del document["inputs_sha256"]
         pair = document["pairs"][0]
         for key in FIELDS[FIELDS.index("reasons") + 1 :]:
@@ -223,8 +217,8 @@ def test_files_of_earlier_versions_are_read(tmp_path: Path) -> None:
     assert file.document()["pairs"][0]["reasons"] == ["the board was bent: use another"]
 
 
-def test_findings_of_another_version_keep_their_words(tmp_path: Path) -> None:
-    def of_tomorrow(document: dict[str, Any]) -> None:
+def test_findings_of_another_version_keep_their_words(tmp_path):
+    def of_tomorrow(document):
         finding = document["pairs"][0]["findings"][1]
         finding |= {"code": "verdict.of_tomorrow", "text": "too uncertain", "action": "collect more"}
         document["pairs"][0]["captures_refused"]["000003"]["code"] = "calibrate.of_tomorrow"
@@ -240,7 +234,7 @@ def test_findings_of_another_version_keep_their_words(tmp_path: Path) -> None:
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_any_prefix_or_flipped_bit_gives_an_error_or_a_result(tmp_path: Path, data: st.DataObject) -> None:
+def test_any_prefix_or_flipped_bit_gives_an_error_or_a_result(tmp_path, data):
     path = tmp_path / "result.json"
     path.write_bytes(data.draw(damaged(as_text(full()).encode())))
     try:
@@ -250,7 +244,7 @@ def test_any_prefix_or_flipped_bit_gives_an_error_or_a_result(tmp_path: Path, da
 
 
 @pytest.mark.parametrize("content", [b"", b"[1]", b"null", b"\xff\xfe", b"[" * 100_000])
-def test_a_file_that_is_no_result_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_no_result_is_refused(tmp_path, content):
     path = tmp_path / "result.json"
     path.write_bytes(content)
     with pytest.raises(SessionError):

@@ -11,7 +11,7 @@ from lce_rig.core.data_sheets import DATA_SHEETS, VLP_16, DataSheet, find_data_s
 
 
 @pytest.mark.parametrize("sheet", DATA_SHEETS, ids=lambda sheet: sheet.name)
-def test_every_model_is_whole_and_names_its_source(sheet: DataSheet) -> None:
+def test_every_model_is_whole_and_names_its_source(sheet):
     assert sheet.source
     assert set(sheet.estimated) <= set(DataSheet.__dataclass_fields__)
     if not sheet.has_rings:
@@ -27,14 +27,14 @@ def test_every_model_is_whole_and_names_its_source(sheet: DataSheet) -> None:
         assert (sheet.n_rings - 1) // sheet.n_at_once * sheet.firing_ns < sheet.sequence_ns
 
 
-def test_every_model_is_in_the_documentation() -> None:
+def test_every_model_is_in_the_documentation():
     text = (Path(__file__).parents[2] / "docs" / "rig-profiles.md").read_text(encoding="utf-8")
     listed = [line.split(" | ")[0].removeprefix("| ") for line in text.splitlines() if line.count(" | ") == 6]
     assert set(listed) >= {sheet.name for sheet in DATA_SHEETS}
 
 
 @pytest.mark.parametrize("name", ["VLP-16", "Puck Hi-Res", "HDL-32E", "VLP-32C", "Alpha Prime"])
-def test_velodynes_beams_are_those_of_its_calibration_files(name: str) -> None:
+def test_velodynes_beams_are_those_of_its_calibration_files(name):
     folder = Path(velodyne_decoder.__file__).parent / "calibrations"
     document = yaml.safe_load((folder / f"{name}.yml").read_text(encoding="utf-8"))
     lasers = sorted(document["lasers"], key=lambda laser: int(laser["laser_id"]))
@@ -66,12 +66,12 @@ def test_velodynes_beams_are_those_of_its_calibration_files(name: str) -> None:
         ("", None),
     ],
 )
-def test_models_are_found_by_any_spelling_and_not_by_half_a_name(spelling: str, name: str | None) -> None:
+def test_models_are_found_by_any_spelling_and_not_by_half_a_name(spelling, name):
     found = find_data_sheet(spelling)
     assert (found and found.name) == name
 
 
-def test_a_units_own_beams_replace_the_models() -> None:
+def test_a_units_own_beams_replace_the_models():
     own = VLP_16.with_rings((-10.0, 0.0, 10.0), 2048)
     assert np.degrees(own.rings_rad) == pytest.approx([-10, 0, 10])
     assert own.step_rad(10.0) == own.step_rad(20.0) == pytest.approx(2 * np.pi / 2048)

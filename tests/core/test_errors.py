@@ -26,7 +26,7 @@ PATH = Path("folder/file.bin")
     ],
     ids=lambda error: type(error).__name__,
 )
-def test_any_error_of_a_library_becomes_one_line_that_names_the_file(error: Exception) -> None:
+def test_any_error_of_a_library_becomes_one_line_that_names_the_file(error):
     with pytest.raises(ProfileError) as raised, reading(PATH, ProfileError):
         raise error
     assert raised.value.what.startswith(f"{PATH}: ")
@@ -34,7 +34,7 @@ def test_any_error_of_a_library_becomes_one_line_that_names_the_file(error: Exce
     raised.value.what.encode()
 
 
-def test_an_error_of_lce_rig_passes_unchanged() -> None:
+def test_an_error_of_lce_rig_passes_unchanged():
     error = SessionError("capture 000003 is incomplete", "collect it again")
     with pytest.raises(SessionError) as raised, reading(PATH, SourceError):
         raise error

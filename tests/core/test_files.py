@@ -39,7 +39,7 @@ BODIES = {
 
 
 @pytest.mark.parametrize("encoding", BODIES)
-def test_clouds_of_every_encoding_are_read_exactly(encoding: str) -> None:
+def test_clouds_of_every_encoding_are_read_exactly(encoding):
     read = decode_pcd(f"{HEAD}{encoding}\n".encode() + BODIES[encoding])
     assert read.dtype.names == CLOUD.dtype.names
     assert read.tolist() == CLOUD.tolist() == decode_pcd(encode_pcd(read, ["made here"])).tolist()
@@ -47,13 +47,13 @@ def test_clouds_of_every_encoding_are_read_exactly(encoding: str) -> None:
 
 @pytest.mark.parametrize("encoding", BODIES)
 @given(data=st.data())
-def test_damaged_clouds_are_read_or_refused(encoding: str, data: st.DataObject) -> None:
+def test_damaged_clouds_are_read_or_refused(encoding, data):
     with suppress(SourceError), reading("a.pcd"):
         assert decode_pcd(data.draw(damaged(f"{HEAD}{encoding}\n".encode() + BODIES[encoding]))).dtype.names
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])
-def test_headers_as_matlab_writes_them_are_read(end: bytes) -> None:
+def test_headers_as_matlab_writes_them_are_read(end):
     read = decode_pcd(MATLAB.replace(b"\n", end) + np.arange(8, dtype="<f4").tobytes())
     assert read["intensity"].tolist() == [3.0, 7.0]
 
@@ -68,12 +68,12 @@ def test_headers_as_matlab_writes_them_are_read(end: bytes) -> None:
         MATLAB.replace(b"binary", b"binary_compressed") + struct.pack("<II", 9, 31),
     ],
 )
-def test_missing_points_are_an_error(data: bytes) -> None:
+def test_missing_points_are_an_error(data):
     with pytest.raises(SourceError), reading("a.pcd"):
         decode_pcd(data)
 
 
-def events_at(t_ns: list[int], host_ns: int | None = None) -> Events:
+def events_at(t_ns, host_ns=None):
     n = len(t_ns)
     x, y = (np.arange(n) * 7 % 346).astype(np.uint16), (np.arange(n) % 260).astype(np.uint16)
     return Events("cam", np.array(t_ns, np.int64), x, y, np.arange(n) % 3 == 0, 346, 260, host_ns)
@@ -83,7 +83,7 @@ def events_at(t_ns: list[int], host_ns: int | None = None) -> Events:
     t_ns=st.lists(st.integers(-(2**60), 2**60), max_size=30).map(sorted),
     host_ns=st.none() | st.integers(0, 2**62),
 )
-def test_events_come_back_to_the_nanosecond(t_ns: list[int], host_ns: int | None) -> None:
+def test_events_come_back_to_the_nanosecond(t_ns, host_ns):
     events = events_at(t_ns, host_ns)
     data = encode_events(events)
     assert data == encode_events(events)
@@ -108,7 +108,7 @@ def test_events_come_back_to_the_nanosecond(t_ns: list[int], host_ns: int | None
         {"t_us": np.array([None], object), "x": [1], "y": [1]},
     ],
 )
-def test_other_archives_are_refused(columns: dict[str, object]) -> None:
+def test_other_archives_are_refused(columns):
     buffer = io.BytesIO()
     np.savez(buffer, **columns, polarity=[True], resolution_px=[346, 260])
     with pytest.raises(ValueError):
@@ -116,17 +116,17 @@ def test_other_archives_are_refused(columns: dict[str, object]) -> None:
 
 
 @given(data=damaged(encode_events(events_at(list(range(0, 10**6, 10_000))))))
-def test_damaged_archives_give_events_or_an_error_that_names_the_file(data: bytes) -> None:
+def test_damaged_archives_give_events_or_an_error_that_names_the_file(data):
     with suppress(SourceError), reading("capture/events.npz"):
         events = decode_events(data, "cam")
         assert len(events.t_ns) == len(events.x) == len(events.y) == len(events.polarity)
 
 
 @pytest.mark.parametrize("data", [b"[" * 100_000, b"[NaN]", b"[-Infinity]", b"\xff[1]", b'["\\ud800"]', b""])
-def test_what_is_no_json_is_refused(data: bytes) -> None:
+def test_what_is_no_json_is_refused(data):
     with pytest.raises(ValueError):
         parse_json(data)
 
 
-def test_json_is_read_with_or_without_a_mark_of_its_encoding() -> None:
+def test_json_is_read_with_or_without_a_mark_of_its_encoding():
     assert parse_json(b'\xef\xbb\xbf{"a": [1, 2.5, "\\ud83d\\ude00", null]}') == {"a": [1, 2.5, "😀", None]}

@@ -14,13 +14,13 @@ LIMIT = Kind(
 )
 
 
-def test_figures_are_scaled_to_the_unit_that_is_printed() -> None:
+def test_figures_are_scaled_to_the_unit_that_is_printed():
     found = RINGS("velodyne", n=2, distance_m=4.04, closer_m=0.8)
     assert found.sentence == "2 rings at 4.0 m: come 80.0 cm closer"
     assert found.as_json()["figures"] == {"n": 2, "distance_m": 4.04, "closer_m": 0.8}
 
 
-def test_a_figure_that_is_not_finite_reads_as_unknown() -> None:
+def test_a_figure_that_is_not_finite_reads_as_unknown():
     assert "unknown cm" in RINGS(n=2, distance_m=1.0, closer_m=float("nan")).advice
 
 
@@ -32,24 +32,22 @@ def test_a_figure_that_is_not_finite_reads_as_unknown() -> None:
         (0.012, 0.012, 60.0, "error 12 mm (limit 12 mm), tilt 60 deg (60 deg)"),
     ],
 )
-def test_a_figure_is_printed_so_that_it_differs_from_its_limit(
-    error_m: float, limit_m: float, tilt_deg: float, words: str
-) -> None:
+def test_a_figure_is_printed_so_that_it_differs_from_its_limit(error_m, limit_m, tilt_deg, words):
     assert LIMIT(error_m=error_m, limit_m=limit_m, tilt_deg=tilt_deg, max_tilt_deg=60.0).text == words
 
 
-def test_a_finding_read_from_a_file_keeps_the_words_of_the_file() -> None:
+def test_a_finding_read_from_a_file_keeps_the_words_of_the_file():
     found = Finding("t.of_an_old_version", stored=("the text", "the action"))
     assert found.sentence == "the text: the action"
 
 
-def test_the_worst_finding_decides_and_order_is_kept_otherwise() -> None:
+def test_the_worst_finding_decides_and_order_is_kept_otherwise():
     notes = [Finding("a", "note"), Finding("b", "error"), Finding("c", "warning"), Finding("d", "error")]
     assert worst(notes) == "error" and worst([]) == "note"
     assert [finding.code for finding in ranked(notes)] == ["b", "d", "c", "a"]
 
 
-def test_every_declared_kind_is_made_somewhere() -> None:
+def test_every_declared_kind_is_made_somewhere():
     sources = {path: path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
     declared = [
         name for text in sources.values() for name in re.findall(r"^(\w+) = Kind\(", text, re.MULTILINE)

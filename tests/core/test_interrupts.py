@@ -4,7 +4,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -41,7 +40,7 @@ BUSY = {
 
 
 @contextmanager
-def running(busy: str) -> Iterator["subprocess.Popen[str]"]:
+def running(busy):
     words = [sys.executable, "-c", PROGRAM.format(busy=busy)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -54,7 +53,7 @@ def running(busy: str) -> Iterator["subprocess.Popen[str]"]:
 
 
 @pytest.mark.parametrize("busy", BUSY.values(), ids=BUSY)
-def test_whatever_is_going_on_ends_after_a_grace_in_one_line(busy: str) -> None:
+def test_whatever_is_going_on_ends_after_a_grace_in_one_line(busy):
     with running(busy) as process:
         pressed_s = time.monotonic()
         process.send_signal(signal.SIGINT)
@@ -64,7 +63,7 @@ def test_whatever_is_going_on_ends_after_a_grace_in_one_line(busy: str) -> None:
     assert said == INTERRUPTED + "\n"
 
 
-def test_who_presses_twice_does_not_wait() -> None:
+def test_who_presses_twice_does_not_wait():
     with running(BUSY["a pool whose job goes on"].replace("30", "20")) as process:
         process.send_signal(signal.SIGINT)
         time.sleep(0.3)
@@ -76,7 +75,7 @@ def test_who_presses_twice_does_not_wait() -> None:
     assert said == INTERRUPTED + "\n"
 
 
-def test_what_must_be_written_first_has_longer_but_not_at_the_second_press() -> None:
+def test_what_must_be_written_first_has_longer_but_not_at_the_second_press():
     busy = """
     import signal
     asked = []

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array, difference, exp_so3, pose, rotation_angle, transform
-from lce_rig.core.planar_pose import PlanarPose, refine_pose, solve_planar_pose
+from lce_rig.core.geometry import difference, exp_so3, pose, rotation_angle, transform
+from lce_rig.core.planar_pose import refine_pose, solve_planar_pose
 
 BOARD = Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
 RADTAN = Intrinsics(
@@ -21,20 +21,20 @@ CAMERAS = pytest.mark.parametrize("camera", [RADTAN, FISHEYE], ids=["radtan", "f
 FACING = np.diag([1.0, -1.0, -1.0])
 
 
-def looking(tilt_deg: float, about_deg: float, roll_deg: float, centre: tuple[float, float, float]) -> Array:
+def looking(tilt_deg, about_deg, roll_deg, centre):
     """Place the board at `centre` in the camera, its print tilted against the camera's axis."""
     about, roll = np.radians([about_deg, roll_deg])
     tilt = exp_so3(np.radians(tilt_deg) * np.array([np.cos(about), np.sin(about), 0.0]))
     return pose(tilt @ FACING @ exp_so3(np.array([0.0, 0.0, roll])), np.array(centre))
 
 
-def seen(T: Array, camera: Intrinsics, sigma_px: float = 0.0, seed: int = 0) -> Array:
+def seen(T, camera, sigma_px=0.0, seed=0):
     pixels, is_valid = camera.project(transform(T, BOARD.corners()))
     assert is_valid.all()
     return pixels + sigma_px * np.random.default_rng(seed).standard_normal(pixels.shape)
 
 
-def solve(corners: Array, camera: Intrinsics) -> PlanarPose:
+def solve(corners, camera):
     solved = solve_planar_pose(corners, BOARD.corners(), camera)
     assert solved is not None
     return solved
@@ -49,9 +49,7 @@ def solve(corners: Array, camera: Intrinsics) -> PlanarPose:
     y=st.floats(-0.25, 0.25),
     z=st.floats(1.2, 5.0),
 )
-def test_exact_corners_give_the_exact_pose(
-    camera: Intrinsics, tilt_deg: float, about_deg: float, roll_deg: float, x: float, y: float, z: float
-) -> None:
+def test_exact_corners_give_the_exact_pose(camera, tilt_deg, about_deg, roll_deg, x, y, z):
     T = looking(tilt_deg, about_deg, roll_deg, (x, y, z))
     solved = solve(seen(T, camera), camera)
     assert solved.reprojection_px < 1e-4
@@ -64,7 +62,7 @@ def test_exact_corners_give_the_exact_pose(
     [(RADTAN, 40.0, 1.5), (RADTAN, 25.0, 2.5), (FISHEYE, 25.0, 2.5)],
     ids=["near", "far", "fisheye"],
 )
-def test_the_covariance_is_what_monte_carlo_scatters(camera: Intrinsics, tilt_deg: float, z_m: float) -> None:
+def test_the_covariance_is_what_monte_carlo_scatters(camera, tilt_deg, z_m):
     T, sigma_px, n = looking(tilt_deg, 30, 40, (0.2, -0.1, z_m)), 0.15, 300
     runs = [solve(seen(T, camera, sigma_px, seed), camera) for seed in range(n)]
     errors = np.array([difference(run.T_cam_board, T) for run in runs])
@@ -78,7 +76,7 @@ def test_the_covariance_is_what_monte_carlo_scatters(camera: Intrinsics, tilt_de
 
 
 @CAMERAS
-def test_both_minima_of_a_far_board_are_found_and_the_better_one_is_returned(camera: Intrinsics) -> None:
+def test_both_minima_of_a_far_board_are_found_and_the_better_one_is_returned(camera):
     T = looking(20, 75, 10, (0.1, 0.05, 4.0 if camera is RADTAN else 9.0))
     solved = solve(seen(T, camera, 0.2, 1), camera)
     other = solved.T_cam_board_alternative
@@ -94,7 +92,7 @@ def test_both_minima_of_a_far_board_are_found_and_the_better_one_is_returned(cam
 
 @pytest.mark.parametrize("n_starts", [1, 2])
 @pytest.mark.parametrize("swapped", [False, True])
-def test_starts_of_a_picture_before_lead_to_the_same_minima(n_starts: int, swapped: bool) -> None:
+def test_starts_of_a_picture_before_lead_to_the_same_minima(n_starts, swapped):
     before = solve(seen(looking(15, 40, 30, (0.1, 0.0, 4.5)), RADTAN, 0.1, 1), RADTAN)
     corners = seen(looking(17, 44, 31, (0.12, 0.01, 4.55)), RADTAN, 0.1, 2)
     alone = solve(corners, RADTAN)
@@ -108,6 +106,6 @@ def test_starts_of_a_picture_before_lead_to_the_same_minima(n_starts: int, swapp
     assert led.chi2_gap == pytest.approx(alone.chi2_gap, rel=1e-4)
 
 
-def test_corners_outside_the_lens_model_give_no_pose() -> None:
+def test_corners_outside_the_lens_model_give_no_pose():
     corners = seen(looking(20, 0, 0, (0, 0, 2)), RADTAN) + [4000.0, 0.0]
     assert solve_planar_pose(corners, BOARD.corners(), RADTAN) is None

@@ -2,12 +2,11 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
-from lce_rig.core.geometry import Array, exp_so3, pose, transform
+from lce_rig.core.geometry import exp_so3, pose, transform
 from lce_rig.core.pattern import is_dark
 
 ASYMMETRIC = Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
@@ -18,7 +17,7 @@ WIDE = Intrinsics(897.5, 896.8, 635.4, 375.3, 1280, 720, "radtan", (-0.4398, 0.2
 FISHEYE = Intrinsics(590.0, 590.0, 480.0, 305.0, 960, 604, "equidistant", (-0.054, -0.0784, 0.096, -0.0515))
 
 
-def looking(tilt_deg: float, about_deg: float, roll_deg: float, centre: tuple[float, float, float]) -> Array:
+def looking(tilt_deg, about_deg, roll_deg, centre):
     """Place the board at `centre`; roll 0 shows the print upright."""
     about, roll = np.radians([about_deg, roll_deg])
     tilt = exp_so3(np.radians(tilt_deg) * np.array([np.cos(about), np.sin(about), 0.0]))
@@ -26,17 +25,7 @@ def looking(tilt_deg: float, about_deg: float, roll_deg: float, centre: tuple[fl
     return pose(tilt @ upright, np.array(centre))
 
 
-def draw(
-    board: Board,
-    camera: Intrinsics,
-    T_cam_board: Array,
-    *,
-    black: float = 40,
-    white: float = 200,
-    blur_px: float = 0.7,
-    noise: float = 2.0,
-    seed: int = 0,
-) -> NDArray[np.uint8]:
+def draw(board, camera, T_cam_board, *, black=40, white=200, blur_px=0.7, noise=2.0, seed=0):
     """Render the board on plain grey, 4 x 4 rays a pixel, with Gaussian blur and noise."""
     n, width, height = 4, camera.width_px, camera.height_px
     outline, _ = camera.project(transform(T_cam_board, board.outline()))
@@ -48,7 +37,7 @@ def draw(
     R, t = T_cam_board[:3, :3], T_cam_board[:3, 3]
     tables = [coarse @ axis for axis in R.T]
 
-    def look(u: Array, v: Array) -> Array:
+    def look(u, v):
         along_x, along_y, along_z = (_interpolate(k, (u - gu[0]) / 4, (v - gv[0]) / 4) for k in tables)
         distance = (R[:, 2] @ t) / along_z
         x, y = along_x * distance - R[:, 0] @ t, along_y * distance - R[:, 1] @ t
@@ -69,7 +58,7 @@ def draw(
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-def _interpolate(table: Array, u: Array, v: Array) -> Array:
+def _interpolate(table, u, v):
     """Interpolate linearly at columns u and rows v, which are broadcast against each other."""
     # cv2.remap rounds its weights to 1/32; rays need more.
     i, j = np.floor(u).astype(int), np.floor(v).astype(int)
@@ -79,5 +68,5 @@ def _interpolate(table: Array, u: Array, v: Array) -> Array:
     return np.asarray((1 - b) * above + b * below)
 
 
-def picture(pixels: NDArray[np.uint8], channel: str = "frames") -> Image:
+def picture(pixels, channel="frames"):
     return Image("cam", channel, None, pixels)

@@ -1,13 +1,12 @@
 """ONNX files written by hand, without the onnx package: networks that copy their inputs."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 FLOAT = 1
 Dims = Sequence[int | str]
 
 
-def _varint(value: int) -> bytes:
+def _varint(value):
     found = bytearray()
     while value > 127:
         found.append(value & 127 | 128)
@@ -15,36 +14,34 @@ def _varint(value: int) -> bytes:
     return bytes([*found, value])
 
 
-def number(field: int, value: int) -> bytes:
+def number(field, value):
     return _varint(field << 3) + _varint(value)
 
 
-def text(field: int, value: str | bytes) -> bytes:
+def text(field, value):
     content = value.encode() if isinstance(value, str) else value
     return _varint(field << 3 | 2) + _varint(len(content)) + content
 
 
-def integers(name: str, values: Sequence[int]) -> bytes:
+def integers(name, values):
     return text(5, text(1, name) + b"".join(number(8, value) for value in values) + number(20, 7))
 
 
-def integer(name: str, value: int) -> bytes:
+def integer(name, value):
     return text(5, text(1, name) + number(3, value) + number(20, 2))
 
 
-def node(kind: str, inputs: Sequence[str], outputs: Sequence[str], attributes: bytes = b"") -> bytes:
+def node(kind, inputs, outputs, attributes=b""):
     ports = b"".join(text(1, name) for name in inputs) + b"".join(text(2, name) for name in outputs)
     return ports + text(4, kind) + attributes
 
 
-def value(name: str, dims: Dims) -> bytes:
+def value(name, dims):
     sizes = b"".join(text(1, text(2, n) if isinstance(n, str) else number(1, n)) for n in dims)
     return text(1, name) + text(2, text(1, number(1, FLOAT) + text(2, sizes)))
 
 
-def write_network(
-    path: Path, inputs: Sequence[tuple[str, Dims]], outputs: Sequence[Dims], *, drops_rows: bool = False
-) -> Path:
+def write_network(path, inputs, outputs, *, drops_rows=False):
     """Write a graph of opset 17: the first output is the mean over bins, the others copy inputs.
 
     Args:
@@ -54,7 +51,7 @@ def write_network(
         drops_rows: whether the second output is the mean over the rows of its input.
     """
 
-    def mean(name: str, output: str, axis: int) -> bytes:
+    def mean(name, output, axis):
         return node("ReduceMean", [name], [output], integers("axes", [axis]) + integer("keepdims", 1))
 
     nodes = []

@@ -1,10 +1,8 @@
 """Synthetic scans with exact truth: beams of a spinning LiDAR cast at a few simple shapes."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
@@ -25,7 +23,7 @@ class Plate:
     width_m: float
     height_m: float
 
-    def ranges(self, rays: Array) -> Array:
+    def ranges(self, rays):
         """Return the range of each ray (N, 3), infinite where it misses."""
         T = invert(self.T_lidar_plate)
         direction, start = rays @ T[:3, :3].T, T[:3, 3]
@@ -43,7 +41,7 @@ class Box:
     T_lidar_box: Array
     size_m: tuple[float, float, float]
 
-    def ranges(self, rays: Array) -> Array:
+    def ranges(self, rays):
         """Return the range of each ray (N, 3), infinite where it misses."""
         T = invert(self.T_lidar_box)
         direction, start = rays @ T[:3, :3].T, T[:3, 3]
@@ -66,7 +64,7 @@ class Pillar:
     low_m: float = -1.2
     high_m: float = 2.0
 
-    def ranges(self, rays: Array) -> Array:
+    def ranges(self, rays):
         """Return the range of each ray (N, 3), infinite where it misses."""
         a = rays[:, 0] ** 2 + rays[:, 1] ** 2
         b = rays[:, 0] * self.x_m + rays[:, 1] * self.y_m
@@ -79,14 +77,7 @@ class Pillar:
 Shape = Plate | Box | Pillar
 
 
-def place(
-    distance_m: float,
-    azimuth_deg: float = 0.0,
-    roll_deg: float = 45.0,
-    yaw_deg: float = 0.0,
-    pitch_deg: float = 0.0,
-    z_m: float = 0.0,
-) -> Array:
+def place(distance_m, azimuth_deg=0.0, roll_deg=45.0, yaw_deg=0.0, pitch_deg=0.0, z_m=0.0):
     """Build T_lidar_board of a board that faces the LiDAR, then turned in its plane and tilted."""
     facing = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]) @ np.diag([-1.0, 1.0, 1.0])
     facing[:, 0] = np.cross(facing[:, 1], facing[:, 2])
@@ -98,12 +89,12 @@ def place(
     return pose(about @ local, about @ np.array([distance_m, 0.0, z_m]))
 
 
-def board_plate(T_lidar_board: Array, board: Board = BOARD, scale: float = 1.0) -> Plate:
+def board_plate(T_lidar_board, board=BOARD, scale=1.0):
     """Make the plate of a board."""
     return Plate(T_lidar_board, board.width_m * scale, board.height_m * scale)
 
 
-def room(size_m: float = 9.0) -> list[Shape]:
+def room(size_m=9.0):
     """Build walls, floor and ceiling, a poster, a pillar, a table and a door leaf."""
     return [
         Box(pose(np.eye(3), np.array([0.4, -0.3, 0.6])), (size_m, size_m + 1, 3.2)),
@@ -114,28 +105,28 @@ def room(size_m: float = 9.0) -> list[Shape]:
     ]
 
 
-def person(T_lidar_board: Array, behind_m: float) -> list[Shape]:
+def person(T_lidar_board, behind_m):
     """Build torso, head and two arms of somebody who holds the board from behind, standing upright."""
     towards = T_lidar_board[:2, 3] / np.linalg.norm(T_lidar_board[:2, 3])
     azimuth = np.arctan2(towards[1], towards[0])
     upright = exp_so3(np.array([0.0, 0.0, azimuth]))
     middle = T_lidar_board[:3, 3] + upright @ [behind_m + 0.12, 0.0, -0.1]
     arms = [T_lidar_board[:3, 3] + upright @ [behind_m / 2 + 0.05, side * 0.42, 0.0] for side in (-1, 1)]
-    torso: list[Shape] = [Box(pose(upright, middle), (0.24, 0.46, 0.9))]
+    torso = [Box(pose(upright, middle), (0.24, 0.46, 0.9))]
     return torso + [Box(pose(upright, arm), (behind_m + 0.06, 0.09, 0.09)) for arm in arms]
 
 
 def cast(
-    shapes: Sequence[Shape],
+    shapes,
     *,
-    sigma_m: float = 0.0,
-    seed: int = 0,
-    elevations_deg: Array = VLP16_DEG,
-    step_deg: float = STEP_DEG,
-    start_deg: float = 0.0,
-    mixed_share: float = 0.0,
-    max_range_m: float = 100.0,
-) -> Scan:
+    sigma_m=0.0,
+    seed=0,
+    elevations_deg=VLP16_DEG,
+    step_deg=STEP_DEG,
+    start_deg=0.0,
+    mixed_share=0.0,
+    max_range_m=100.0,
+):
     """Cast one revolution, in order of firing, clockwise as a VLP-16 turns.
 
     Args:
@@ -156,7 +147,7 @@ def cast(
     )
     elevation = np.radians(elevations_deg)[ring]
 
-    def trace(shift_rad: float) -> tuple[Array, Array]:
+    def trace(shift_rad):
         at = azimuth + shift_rad
         rays = np.stack(
             [np.cos(elevation) * np.cos(at), np.cos(elevation) * np.sin(at), np.sin(elevation)], axis=1
@@ -182,7 +173,7 @@ def cast(
     return Scan("lidar", 0, points, intensity, ring[keep].astype(np.int16), offset_ns.astype(np.int64))
 
 
-def outline_distance(points: Array, T_lidar_board: Array, board: Board = BOARD) -> NDArray[np.float64]:
+def outline_distance(points, T_lidar_board, board=BOARD):
     """Measure how far points lie from the board's border, along their rays in its plane; negative inside."""
     T = invert(T_lidar_board)
     normal, centre = T_lidar_board[:3, 2], T_lidar_board[:3, 3]

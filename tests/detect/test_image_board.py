@@ -3,18 +3,16 @@
 import json
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, difference, pose, rotation_angle, transform
+from lce_rig.core.geometry import difference, pose, rotation_angle, transform
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.image.search import find_image_board
 from tests.detect.drawn_boards import (
@@ -30,13 +28,13 @@ from tests.detect.drawn_boards import (
 )
 
 
-def found(pixels: NDArray[np.uint8], board: Board, camera: Intrinsics) -> ImageBoard:
+def found(pixels, board, camera):
     result = find_image_board(picture(pixels), board, camera)
     assert isinstance(result, ImageBoard), result
     return result
 
 
-def refused(pixels: NDArray[np.uint8], board: Board, camera: Intrinsics) -> Refusal:
+def refused(pixels, board, camera):
     result = find_image_board(picture(pixels), board, camera)
     assert isinstance(result, Refusal)
     assert result.stage == "image"
@@ -53,9 +51,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("board", "camera", "T"), CASES)
-def test_corners_are_found_in_order_to_a_twentieth_of_a_pixel(
-    board: Board, camera: Intrinsics, T: Array
-) -> None:
+def test_corners_are_found_in_order_to_a_twentieth_of_a_pixel(board, camera, T):
     result = found(draw(board, camera, T), board, camera)
     truth, _ = camera.project(transform(T, board.corners()))
     error = result.corners_px - truth
@@ -69,14 +65,14 @@ def test_corners_are_found_in_order_to_a_twentieth_of_a_pixel(
 
 
 @pytest.mark.parametrize("roll_deg", range(0, 360, 60))
-def test_the_black_corner_square_tells_how_an_asymmetric_board_is_turned(roll_deg: int) -> None:
+def test_the_black_corner_square_tells_how_an_asymmetric_board_is_turned(roll_deg):
     T = looking(20, 70, roll_deg, (0.0, 0.0, 1.7))
     result = found(draw(ASYMMETRIC, DAVIS, T), ASYMMETRIC, DAVIS)
     assert np.degrees(rotation_angle(result.T_cam_board[:3, :3], T[:3, :3])) < 1.0
 
 
 @pytest.mark.parametrize("roll_deg", [0, 40, 140, 220])
-def test_a_symmetric_board_is_read_with_its_top_row_up(roll_deg: int) -> None:
+def test_a_symmetric_board_is_read_with_its_top_row_up(roll_deg):
     T = looking(20, 70, roll_deg, (0.0, 0.0, 2.0))
     result = found(draw(SYMMETRIC, WIDE, T), SYMMETRIC, WIDE)
     assert result.T_cam_board[1, 1] < 0  # board y points up, camera y down
@@ -86,14 +82,14 @@ def test_a_symmetric_board_is_read_with_its_top_row_up(roll_deg: int) -> None:
     assert min(apart) < 1.0
 
 
-def test_a_board_of_ten_grey_values_contrast_in_event_pictures_is_found() -> None:
+def test_a_board_of_ten_grey_values_contrast_in_event_pictures_is_found():
     T = looking(25, 30, 45, (0.0, 0.0, 1.8))
     pixels = draw(ASYMMETRIC, DAVIS, T, black=105, white=135, noise=2.5)
     assert found(pixels, ASYMMETRIC, DAVIS).quality.contrast == pytest.approx(30, abs=6)
 
 
 @cache
-def _first_of_following(board: Board) -> ImageBoard:
+def _first_of_following(board):
     return found(draw(board, WIDE, FOLLOWED_FROM), board, WIDE)
 
 
@@ -102,9 +98,7 @@ SHIFTS = [(n, to) for n in (0.2, 0.6, 1.0, 1.4, 2.0) for to in ((1.0, 0.0), (0.0
 
 @pytest.mark.parametrize("board", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
 @pytest.mark.parametrize(("n_squares", "direction"), [(0.0, (1.0, 0.0)), *SHIFTS])
-def test_a_board_that_is_followed_is_found_as_if_it_were_not(
-    board: Board, n_squares: float, direction: tuple[float, float]
-) -> None:
+def test_a_board_that_is_followed_is_found_as_if_it_were_not(board, n_squares, direction):
     first = _first_of_following(board)
     shift = n_squares * board.square_m * np.array(direction)
     T_moved = FOLLOWED_FROM.copy()
@@ -118,7 +112,7 @@ def test_a_board_that_is_followed_is_found_as_if_it_were_not(
 
 
 @cache
-def _first_of_a_quick_search(camera: Intrinsics, z_m: float) -> ImageBoard:
+def _first_of_a_quick_search(camera, z_m):
     return found(draw(ASYMMETRIC, camera, looking(10, 80, 5, (0.0, 0, z_m))), ASYMMETRIC, camera)
 
 
@@ -126,9 +120,7 @@ def _first_of_a_quick_search(camera: Intrinsics, z_m: float) -> ImageBoard:
     ("camera", "z_m"), [(WIDE, 1.2), (WIDE, 3.0), (DAVIS, 1.6)], ids=["near", "far", "small picture"]
 )
 @pytest.mark.parametrize(("turn_deg", "closer"), [(0, 1.0), (12, 0.9), (-12, 1.1)])
-def test_a_quick_search_finds_a_board_that_moved_on_and_turned_a_little(
-    camera: Intrinsics, z_m: float, turn_deg: float, closer: float
-) -> None:
+def test_a_quick_search_finds_a_board_that_moved_on_and_turned_a_little(camera, z_m, turn_deg, closer):
     first = _first_of_a_quick_search(camera, z_m)
     shift_m = 1.5 * ASYMMETRIC.square_m
     T_moved = looking(10, 80, 5 + turn_deg, (shift_m, shift_m, closer * z_m))
@@ -139,7 +131,7 @@ def test_a_quick_search_finds_a_board_that_moved_on_and_turned_a_little(
     assert np.abs(quick.corners_px - whole.corners_px).max() < 0.15
 
 
-def test_a_board_that_went_far_is_found_in_the_whole_picture() -> None:
+def test_a_board_that_went_far_is_found_in_the_whole_picture():
     pixels = draw(SYMMETRIC, WIDE, looking(25, 80, 40, (0.5, 0, 2.2)))
     before = found(draw(SYMMETRIC, WIDE, looking(25, 80, 40, (-0.7, 0, 2.2))), SYMMETRIC, WIDE)
     result = find_image_board(picture(pixels), SYMMETRIC, WIDE, last=before)
@@ -148,9 +140,7 @@ def test_a_board_that_went_far_is_found_in_the_whole_picture() -> None:
 
 @pytest.mark.parametrize("step", [(-1, 0), (0, 1), (1, 1)])
 @pytest.mark.parametrize(("board", "camera", "T"), CASES[::2])
-def test_wrong_inner_corners_are_named_with_those_seen(
-    board: Board, camera: Intrinsics, T: Array, step: tuple[int, int]
-) -> None:
+def test_wrong_inner_corners_are_named_with_those_seen(board, camera, T, step):
     wrong = replace(board, cols=board.cols + step[0], rows=board.rows + step[1])
     refusal = refused(draw(board, camera, T), wrong, camera)
     assert refusal.code == (
@@ -164,7 +154,7 @@ def test_wrong_inner_corners_are_named_with_those_seen(
     }
 
 
-def test_a_board_of_which_a_part_is_found_because_it_is_far_is_refused_for_its_squares() -> None:
+def test_a_board_of_which_a_part_is_found_because_it_is_far_is_refused_for_its_squares():
     pixels = draw(SYMMETRIC, DAVIS, looking(40, 80, 45, (0, 0, 5.2)), seed=2, blur_px=1.2)
     refusal = refused(pixels, SYMMETRIC, DAVIS)
     assert refusal.code == "image.part_of_small" and "n_cols_seen" not in refusal.figures
@@ -173,7 +163,7 @@ def test_a_board_of_which_a_part_is_found_because_it_is_far_is_refused_for_its_s
     assert refusal.figure("min_square_px") == 5.0
 
 
-def test_a_board_cut_off_by_the_border_is_said_to_be() -> None:
+def test_a_board_cut_off_by_the_border_is_said_to_be():
     shifted = replace(WIDE, cx_px=1180.0)
     pixels = draw(SYMMETRIC, shifted, looking(5, 0, 5, (0.0, 0.0, 1.8)))
     refusal = refused(pixels, SYMMETRIC, shifted)
@@ -183,7 +173,7 @@ def test_a_board_cut_off_by_the_border_is_said_to_be() -> None:
 
 
 @pytest.mark.long
-def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures() -> None:
+def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures():
     T = looking(20, 30, 40, (0, 0, 1.8))
     noise = np.random.default_rng(0).normal(0, 2, (260, 346))
     stripes = np.where(np.arange(346) // 20 % 2, 200, 40).astype(np.uint8)
@@ -198,21 +188,21 @@ def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures()
         assert (refusal.code, refusal.action) == (code, "")
 
 
-def test_an_empty_event_picture_asks_for_motion() -> None:
+def test_an_empty_event_picture_asks_for_motion():
     grey = np.clip(140 + np.random.default_rng(0).normal(0, 3, (260, 346)), 0, 255).astype(np.uint8)
     result = find_image_board(picture(grey, "events"), ASYMMETRIC, DAVIS, is_from_events=True)
     assert isinstance(result, Refusal)
     assert (result.code, result.action) == ("image.flat", "events")
 
 
-def test_intrinsics_of_another_resolution_are_refused_naming_both_sizes() -> None:
+def test_intrinsics_of_another_resolution_are_refused_naming_both_sizes():
     pixels = cv2.resize(draw(ASYMMETRIC, DAVIS, looking(20, 30, 40, (0, 0, 1.8))), (692, 520))
     with pytest.raises(ProfileError, match=r"692x520 px.*346x260 px") as raised:
         find_image_board(picture(pixels), ASYMMETRIC, DAVIS)
     assert "by 2" in raised.value.hint
 
 
-def test_a_blank_margin_beyond_the_sensor_and_a_readout_cut_short_change_nothing() -> None:
+def test_a_blank_margin_beyond_the_sensor_and_a_readout_cut_short_change_nothing():
     pixels = draw(ASYMMETRIC, DAVIS, looking(20, 30, 40, (0, 0, 1.8)))
     padded = np.full((480, 640), 128, np.uint8)
     padded[:260, :346] = pixels
@@ -221,7 +211,7 @@ def test_a_blank_margin_beyond_the_sensor_and_a_readout_cut_short_change_nothing
         assert np.allclose(corners, found(pixels, ASYMMETRIC, DAVIS).corners_px, atol=0.01)
 
 
-def test_intrinsics_of_another_lens_are_refused_by_the_misfit_of_the_corners() -> None:
+def test_intrinsics_of_another_lens_are_refused_by_the_misfit_of_the_corners():
     pixels = draw(SYMMETRIC, WIDE, looking(30, 40, 40, (-0.5, 0.15, 1.2)))
     wrong = replace(WIDE, distortion=(0.3, 0.0, 0.0, 0.0))
     refusal = refused(pixels, SYMMETRIC, wrong)
@@ -229,7 +219,7 @@ def test_intrinsics_of_another_lens_are_refused_by_the_misfit_of_the_corners() -
     assert (refusal.figures["width_px"], refusal.figures["height_px"]) == (1280, 720)
 
 
-def _recording(folder: Path) -> tuple[Board, Intrinsics, list[Path]]:
+def _recording(folder):
     params = json.loads((folder / "params.json").read_text())
     spec, K = params["board"], params["K"]
     offset = tuple(spec.get("pattern_offset_m", (0.0, 0.0)))
@@ -241,7 +231,7 @@ def _recording(folder: Path) -> tuple[Board, Intrinsics, list[Path]]:
     return board, camera, sorted((folder / "img").iterdir())
 
 
-def _find(path: Path, board: Board, camera: Intrinsics) -> ImageBoard | Refusal:
+def _find(path, board, camera):
     return find_image_board(picture(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)), board, camera)
 
 
@@ -258,7 +248,7 @@ def _find(path: Path, board: Board, camera: Intrinsics) -> ImageBoard | Refusal:
         ("rles02_le", 55, 0.25),
     ],
 )
-def test_boards_of_recordings_are_found(recordings: Path, name: str, at_least: int, median_px: float) -> None:
+def test_boards_of_recordings_are_found(recordings, name, at_least, median_px):
     board, camera, paths = _recording(recordings / name)
     results = [_find(path, board, camera) for path in paths]
     boards = [result for result in results if isinstance(result, ImageBoard)]
@@ -267,7 +257,7 @@ def test_boards_of_recordings_are_found(recordings: Path, name: str, at_least: i
 
 
 @pytest.mark.dataset
-def test_frames_and_event_pictures_agree_on_how_the_board_is_turned(recordings: Path) -> None:
+def test_frames_and_event_pictures_agree_on_how_the_board_is_turned(recordings):
     board, camera, paths = _recording(recordings / "rles02_lf")
     angles = []
     for path in paths:

@@ -1,7 +1,6 @@
 """Voxel grids, event maps, noise filters, and lamps that flicker."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,11 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from moving_board import Motion, board_events, events_of, join, lamps, noise
 
-from lce_rig.detect.events.noise import (
-    hot_pixels,
-    measure_flicker,
-    without_background_activity,
-)
+from lce_rig.detect.events.noise import hot_pixels, measure_flicker, without_background_activity
 from lce_rig.detect.events.windows import normalise_voxels, voxel_grid
 from lce_rig.io.events import open_events
 
@@ -68,7 +63,7 @@ def test_most_noise_goes_and_nearly_all_events_of_the_board_stay():
     assert len(without_background_activity(noise_only)) < 0.25 * len(noise_only)
 
 
-def test_lamps_that_flicker_are_told_from_motion() -> None:
+def test_lamps_that_flicker_are_told_from_motion():
     flicker = measure_flicker(lamps(100))
     assert flicker.is_storm
     assert flicker.frequency_hz == pytest.approx(100.0, abs=2.0)
@@ -78,7 +73,7 @@ def test_lamps_that_flicker_are_told_from_motion() -> None:
         assert not measure_flicker(scene).is_storm
 
 
-def test_events_of_one_polarity_alone_are_a_storm() -> None:
+def test_events_of_one_polarity_alone_are_a_storm():
     scene = noise(5.0)
     assert measure_flicker(replace(scene, polarity=np.ones(len(scene), bool))).is_storm
     sparse = noise(0.02)
@@ -89,9 +84,7 @@ def test_events_of_one_polarity_alone_are_a_storm() -> None:
 @pytest.mark.parametrize(
     ("name", "is_storm"), [("event_packet_ros1.bag", True), ("davis346_apriltag_libcaer_cmp.mcap", False)]
 )
-def test_a_real_room_with_mains_light_is_told_from_one_without(
-    recordings: Path, name: str, is_storm: bool
-) -> None:
+def test_a_real_room_with_mains_light_is_told_from_one_without(recordings, name, is_storm):
     if not (recordings / "events").is_dir():
         pytest.skip("no recordings of events")
     recording = open_events(recordings / "events" / name)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 
 
 @pytest.fixture
-def rig() -> Rig:
+def rig():
     return load_rig("rlfs")

@@ -12,11 +12,11 @@ from lce_rig.io.network import Datagram, PcapWriter
 HERE = Path("somewhere")
 
 
-def test_vital_items_overtake_others_and_each_sink_keeps_its_order() -> None:
-    written: list[str] = []
+def test_vital_items_overtake_others_and_each_sink_keeps_its_order():
+    written = []
     may_go = threading.Event()
 
-    def write(item: str) -> None:
+    def write(item):
         may_go.wait(10)
         written.append(item)
 
@@ -34,7 +34,7 @@ def test_vital_items_overtake_others_and_each_sink_keeps_its_order() -> None:
     assert captures.n_waiting == 0 and (captures.n_written, samples.n_written) == (2, 3)
 
 
-def test_what_a_slow_disk_cannot_take_is_dropped_counted_and_said(tmp_path: Path) -> None:
+def test_what_a_slow_disk_cannot_take_is_dropped_counted_and_said(tmp_path):
     datagram = Datagram(1_700_000_000 * 10**9, "127.0.0.1", 2368, 2368, bytes(1206))
     writer = PcapWriter(tmp_path / "raw.pcap")
     with DiskWriter(most_waiting_bytes=100_000) as disk:
@@ -47,8 +47,8 @@ def test_what_a_slow_disk_cannot_take_is_dropped_counted_and_said(tmp_path: Path
     assert (finding.code, finding.figures["n"]) == ("device.recording_incomplete", sink.n_dropped)
 
 
-def test_a_sink_that_fails_takes_nothing_more_and_the_others_go_on() -> None:
-    def fail(_item: int) -> None:
+def test_a_sink_that_fails_takes_nothing_more_and_the_others_go_on():
+    def fail(_item):
         raise OSError(28, "No space left on device")
 
     with DiskWriter() as disk:
@@ -60,8 +60,8 @@ def test_a_sink_that_fails_takes_nothing_more_and_the_others_go_on() -> None:
     assert [finding.code for finding in full.findings()] == ["device.recording_stopped"]
 
 
-def test_a_vital_sink_that_fails_is_an_error_but_not_over_another() -> None:
-    def fail(_item: int) -> None:
+def test_a_vital_sink_that_fails_is_an_error_but_not_over_another():
+    def fail(_item):
         raise SessionError("the disk is gone")
 
     with pytest.raises(SessionError, match="gone"), DiskWriter() as disk:
@@ -71,8 +71,8 @@ def test_a_vital_sink_that_fails_is_an_error_but_not_over_another() -> None:
         raise KeyError
 
 
-def test_sinks_are_finished_after_their_last_item() -> None:
-    done: list[str] = []
+def test_sinks_are_finished_after_their_last_item():
+    done = []
     with DiskWriter() as disk:
         disk.add(HERE, done.append, lambda: done.append("finished")).put("item")
         disk.close()

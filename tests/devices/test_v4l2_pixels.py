@@ -12,18 +12,18 @@ from tests.yuv import to_422, to_yuv
 WIDTH, HEIGHT = 22, 12
 
 
-def smooth_picture(seed: int = 0) -> np.ndarray:
+def smooth_picture(seed=0):
     """A picture (H, W, 3) BGR whose neighbours differ little, so that halved chroma loses little."""
     coarse = np.random.default_rng(seed).uniform(20, 235, (3, 4, 3)).astype(np.float32)
     return cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR).astype(np.uint8)
 
 
-def pad(rows: np.ndarray, stride: int) -> bytes:
+def pad(rows, stride):
     """Lay rows (H, n bytes) out at a stride, the gaps filled with what must not be seen."""
     return np.pad(rows, ((0, 0), (0, stride - rows.shape[1])), constant_values=255).tobytes()
 
 
-def encode(code: str, bgr: np.ndarray, padding: int) -> tuple[bytes, int]:
+def encode(code, bgr, padding):
     """Write a picture in a pixel format; gives the bytes and the stride."""
     height, width = bgr.shape[:2]
     if code in ("UYVY", "YUYV"):
@@ -47,7 +47,7 @@ def encode(code: str, bgr: np.ndarray, padding: int) -> tuple[bytes, int]:
 
 @pytest.mark.parametrize("code", ["UYVY", "YUYV", "NV12", "YU12", "BGR3", "RGB3", "BGR4"])
 @pytest.mark.parametrize("padding", [0, 5])
-def test_a_colour_picture_comes_back(code: str, padding: int) -> None:
+def test_a_colour_picture_comes_back(code, padding):
     picture = smooth_picture()
     data, stride = encode(code, picture, padding)
     pixels = PixelDecoder(code, WIDTH, HEIGHT, stride).decode(data)
@@ -61,7 +61,7 @@ def test_a_colour_picture_comes_back(code: str, padding: int) -> None:
 @pytest.mark.parametrize(
     ("code", "red_at"), [("RGGB", (0, 0)), ("GRBG", (0, 1)), ("GBRG", (1, 0)), ("BA81", (1, 1))]
 )
-def test_a_mosaic_of_one_colour_gives_that_colour(code: str, red_at: tuple[int, int]) -> None:
+def test_a_mosaic_of_one_colour_gives_that_colour(code, red_at):
     mosaic = np.full((HEIGHT, WIDTH), 120, np.uint8)
     mosaic[red_at[0] :: 2, red_at[1] :: 2] = 200
     mosaic[1 - red_at[0] :: 2, 1 - red_at[1] :: 2] = 40
@@ -70,20 +70,20 @@ def test_a_mosaic_of_one_colour_gives_that_colour(code: str, red_at: tuple[int, 
 
 
 @pytest.mark.parametrize(("code", "bits"), [("Y10 ", 10), ("Y12 ", 12), ("Y16 ", 16)])
-def test_deep_grey_keeps_its_upper_bits(code: str, bits: int) -> None:
+def test_deep_grey_keeps_its_upper_bits(code, bits):
     grey = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH)).astype(np.uint16)
     data = pad((grey << (bits - 8)).astype("<u2").view(np.uint8), 2 * WIDTH + 6)
     assert (PixelDecoder(code, WIDTH, HEIGHT, 2 * WIDTH + 6).decode(data) == grey).all()
 
 
-def test_left_aligned_bits_are_found_out_and_remembered() -> None:
+def test_left_aligned_bits_are_found_out_and_remembered():
     decoder = PixelDecoder("Y12 ", WIDTH, HEIGHT)
     bright, dark = np.full((HEIGHT, WIDTH), 200 << 8, "<u2"), np.full((HEIGHT, WIDTH), 3 << 8, "<u2")
     assert (decoder.decode(bright.tobytes()) == 200).all()
     assert (decoder.decode(dark.tobytes()) == 3).all()
 
 
-def test_a_jpeg_is_decoded_and_must_have_the_size() -> None:
+def test_a_jpeg_is_decoded_and_must_have_the_size():
     data = cv2.imencode(".jpg", smooth_picture())[1].tobytes()
     assert PixelDecoder("MJPG", WIDTH, HEIGHT).decode(data).shape == (HEIGHT, WIDTH, 3)
     with pytest.raises(ValueError):
@@ -93,7 +93,7 @@ def test_a_jpeg_is_decoded_and_must_have_the_size() -> None:
 
 
 @given(code=st.sampled_from(sorted(FORMATS)), width=st.integers(1, 20), padding=st.integers(0, 9))
-def test_exactly_the_declared_bytes_make_a_picture(code: str, width: int, padding: int) -> None:
+def test_exactly_the_declared_bytes_make_a_picture(code, width, padding):
     width, form = 2 * width, FORMATS[code]
     row = width * form.n_channels * (2 if form.bits > 8 else 1)
     decoder = PixelDecoder(code, width, 8, row + 2 * padding)

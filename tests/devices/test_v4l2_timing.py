@@ -15,9 +15,7 @@ TIMES = st.integers(0, 40_000)
 
 
 @given(n_rows=ROWS, exposure_ns=TIMES, line_time_ns=TIMES, delay_ns=TIMES)
-def test_every_mark_leads_to_the_middle_of_the_middle_row(
-    n_rows: int, exposure_ns: int, line_time_ns: int, delay_ns: int
-) -> None:
+def test_every_mark_leads_to_the_middle_of_the_middle_row(n_rows, exposure_ns, line_time_ns, delay_ns):
     starts = delay_ns + line_time_ns * np.arange(n_rows)  # after the trigger at 0
     reads = starts + exposure_ns
     middle = np.mean(starts + exposure_ns / 2)
@@ -27,10 +25,7 @@ def test_every_mark_leads_to_the_middle_of_the_middle_row(
         "start_of_frame": reads[0],
         "end_of_frame": reads[-1] + line_time_ns,
     }
-    frame = FrameTimingSettings(
-        line_time_us=line_time_ns / 1000,
-        trigger_delay_us=delay_ns / 1000,
-    )
+    frame = FrameTimingSettings(line_time_us=line_time_ns / 1000, trigger_delay_us=delay_ns / 1000)
     for mark, stamp in marks.items():
         assert abs(stamp + to_mid_ns(mark, frame, n_rows, exposure_ns / 1000) - middle) <= 1  # type: ignore[arg-type]
 
@@ -44,9 +39,7 @@ def test_every_mark_leads_to_the_middle_of_the_middle_row(
         ("trigger", 0x12000, "tegra-video", "trigger"),
     ],
 )
-def test_the_mark_comes_from_profile_flags_and_driver(
-    mark: str, flags: int, driver: str, moment: str
-) -> None:
+def test_the_mark_comes_from_profile_flags_and_driver(mark, flags, driver, moment):
     settings = DriverSettings(frame_timing=FrameTimingSettings(mark=mark))  # type: ignore[arg-type]
     assert stamped_moment(settings, flags, driver) == moment
 
@@ -65,7 +58,7 @@ NOW = {
 
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("age_ms", [0, 12, 199])
-def test_the_clock_of_the_stamps_is_found(clock: str, age_ms: int) -> None:
+def test_the_clock_of_the_stamps_is_found(clock, age_ms):
     assert choose_clock(NOW[clock] - age_ms * MS, NOW) == (clock, 0)
 
 
@@ -74,15 +67,13 @@ def test_the_clock_of_the_stamps_is_found(clock: str, age_ms: int) -> None:
     [(age_ms, 0, (None, 0)) for age_ms in (-1, 201, 5000, -29_000)]
     + [(20, 1, ("monotonic", MS)), (20, 40, ("monotonic", 40 * MS))],
 )
-def test_clocks_that_fit_and_differ_are_told_from_none(
-    age_ms: int, apart_ms: int, chosen: tuple[str | None, int]
-) -> None:
+def test_clocks_that_fit_and_differ_are_told_from_none(age_ms, apart_ms, chosen):
     now = NOW | ({"monotonic_raw": NOW["monotonic"] + apart_ms * MS} if apart_ms else {})
     assert choose_clock(NOW["monotonic"] - age_ms * MS, now) == chosen
 
 
 @pytest.mark.parametrize("clock", ["monotonic", "realtime"])
-def test_a_stamp_of_this_computers_clock_becomes_utc(clock: str) -> None:
+def test_a_stamp_of_this_computers_clock_becomes_utc(clock):
     before_ns, stamp_ns, after_ns = time.time_ns(), read_clocks()[clock], time.time_ns()
     stamps = StampClock()
     utc_ns = stamps.to_utc_ns(stamp_ns)
@@ -92,7 +83,7 @@ def test_a_stamp_of_this_computers_clock_becomes_utc(clock: str) -> None:
     assert stamps.problems() == []
 
 
-def test_stamps_that_fit_no_clock_give_none_and_a_problem() -> None:
+def test_stamps_that_fit_no_clock_give_none_and_a_problem():
     stamps = StampClock()
     assert stamps.to_utc_ns(read_clocks()["monotonic"] + 3600 * 1000 * MS) is None
     (problem,) = stamps.problems()
@@ -100,7 +91,7 @@ def test_stamps_that_fit_no_clock_give_none_and_a_problem() -> None:
     assert "monotonic -3600000 ms" in str(problem.figures["ages"])
 
 
-def test_stamps_that_leave_their_clock_are_followed() -> None:
+def test_stamps_that_leave_their_clock_are_followed():
     stamps = StampClock()
     stamps.to_utc_ns(read_clocks()["monotonic"])
     stamps.to_utc_ns(read_clocks()["realtime"])
@@ -108,7 +99,7 @@ def test_stamps_that_leave_their_clock_are_followed() -> None:
 
 
 @pytest.mark.parametrize("clock", ["realtime", "tsc"])
-def test_a_clock_set_by_hand_that_does_not_fit_or_is_missing_is_not_used(clock: str) -> None:
+def test_a_clock_set_by_hand_that_does_not_fit_or_is_missing_is_not_used(clock):
     stamps = StampClock(clock)
     assert stamps.to_utc_ns(read_clocks()["monotonic"] - 40_000 * MS) is None
     assert stamps.used is None

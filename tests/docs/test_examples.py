@@ -98,7 +98,7 @@ def test_the_notebook_runs_from_top_to_bottom(workplace):
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     assert not any(cell["outputs"] for cell in cells)
     (workplace / "monday").rename("session")
-    names: dict = {"__name__": "__main__"}
+    names = {"__name__": "__main__"}
     for cell in cells:
         exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
     assert (workplace / "session" / "calibration" / "result.json").exists()

@@ -1,25 +1,23 @@
 """Frames equal pulses, or the line says so."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
 from lce_rig.doctor.checks import check_frames_of_pulses, check_pulses_sent
-from lce_rig.rig import Rig
 
 from .observed import camera, codes, examination, look, make_rig, sync_board
 
 
-def with_sync(**sync: Any) -> Rig:
+def with_sync(**sync):
     return make_rig(sync={"device": "/dev/null", **sync})
 
 
-def with_trigger(**trigger: float) -> Rig:
+def with_trigger(**trigger):
     return with_sync(triggers={"cam": {"channel": 0, "rate_hz": 20.0, **trigger}})
 
 
-def test_as_many_frames_as_pulses_are_green_with_their_delay() -> None:
+def test_as_many_frames_as_pulses_are_green_with_their_delay():
     line = look(check_frames_of_pulses, examination(camera(), sync_board()), "cam")
     assert line is not None and line.severity == "note"
     counts, delay = line.findings
@@ -29,7 +27,7 @@ def test_as_many_frames_as_pulses_are_green_with_their_delay() -> None:
     assert delay.figure("delay_scatter_ms") < 0.01
 
 
-def test_frames_that_come_too_late_for_their_pulses_are_not_matched() -> None:
+def test_frames_that_come_too_late_for_their_pulses_are_not_matched():
     line = look(
         check_frames_of_pulses,
         examination(camera(delay_s=0.045), sync_board(), rig=with_trigger(max_delay_s=0.03)),
@@ -38,7 +36,7 @@ def test_frames_that_come_too_late_for_their_pulses_are_not_matched() -> None:
     assert line is not None and line.severity == "error" and "pulses.images_without" in codes(line)
 
 
-def test_where_two_pulses_could_have_made_a_frame_they_are_counted() -> None:
+def test_where_two_pulses_could_have_made_a_frame_they_are_counted():
     exam = examination(camera(), sync_board(), rig=with_trigger(max_delay_s=0.1))
     line = look(check_frames_of_pulses, exam, "cam")
     assert line is not None and (line.severity, codes(line)) == ("note", ["pulses.frames"])
@@ -47,14 +45,14 @@ def test_where_two_pulses_could_have_made_a_frame_they_are_counted() -> None:
     assert line is not None and line.severity == "error" and "pulses.unequal" in codes(line)
 
 
-def test_lost_frames_count_by_their_numbers() -> None:
+def test_lost_frames_count_by_their_numbers():
     seen = camera()
     seen.frames = [frame for frame in seen.frames if frame.count is not None and frame.count % 10]
     line = look(check_frames_of_pulses, examination(seen, sync_board()), "cam")
     assert line is not None and line.severity == "note"
 
 
-def test_the_boards_lines_are_held_against_the_profile() -> None:
+def test_the_boards_lines_are_held_against_the_profile():
     line = look(check_pulses_sent, examination(sync_board()))
     assert line is not None and line.severity == "note"
     assert codes(line) == ["pulses.line_none", "pulses.line", "pulses.lost"]
@@ -65,5 +63,5 @@ def test_the_boards_lines_are_held_against_the_profile() -> None:
     assert dead is not None and dead.severity == "error"
 
 
-def test_without_a_board_there_is_no_line() -> None:
+def test_without_a_board_there_is_no_line():
     assert look(check_frames_of_pulses, examination(camera(), rig=make_rig(sync=None)), "cam") is None

@@ -1,7 +1,6 @@
 """Results to export."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from lce_rig.collect.findings import CALIBRATE_KNOWN_PLACEMENT
 from lce_rig.core.calibration import Calibration, Certificate, Diagnostics, Metrics
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, exp_so3, pose
+from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.detect.findings import LIDAR_TOO_FEW_RINGS
 from lce_rig.judge.findings import LAST_REJECTED, ROTATION_UNCERTAIN
 from lce_rig.rig import Rig, load_rig
@@ -18,12 +17,12 @@ Make = Callable[..., Calibration]
 
 
 @pytest.fixture(scope="session")
-def rles() -> Rig:
+def rles():
     return load_rig("rles")
 
 
 @pytest.fixture(scope="session")
-def three_sensor_rig() -> Rig:
+def three_sensor_rig():
     """Two LiDARs, and three cameras with each kind of lens."""
     data = load_rig("rles").model_dump()
     data["name"] = "trio"
@@ -47,11 +46,11 @@ _UNCERTAIN = {
 }
 
 
-def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration:
+def calibration(T_cam_lidar=None, **changes):
     """Build a plausible result."""
     sides = np.diag([1e-3, 1e-3, 2e-3, 1e-4, 2e-4, 1e-4])
     mixing = np.eye(6) + 0.1 * np.ones((6, 6))
-    fields: dict[str, Any] = {
+    fields = {
         "camera": "davis",
         "channels": ("frames",),
         "lidar": "lidar",
@@ -76,18 +75,16 @@ def calibration(T_cam_lidar: Array | None = None, **changes: Any) -> Calibration
     return Calibration(**(fields | changes))
 
 
-def reason(text: str) -> Finding:
+def reason(text):
     """A reason of a verdict that only its words tell from others."""
     return Finding("verdict.text", figures={"text": text}, stored=(text, ""))
 
 
-def some_pose(
-    phi: tuple[float, ...] = (1.2, -1.3, 1.1), t: tuple[float, ...] = (0.12, -0.07, -0.08)
-) -> Array:
+def some_pose(phi=(1.2, -1.3, 1.1), t=(0.12, -0.07, -0.08)):
     return pose(exp_so3(np.array(phi)), np.array(t))
 
 
 @pytest.fixture(scope="session")
-def make() -> Make:
+def make():
     """The builder of results; without arguments a plausible one of rig rles."""
     return calibration

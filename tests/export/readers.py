@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import cv2
 import numpy as np
@@ -49,18 +48,18 @@ class Case:
     lens: Lens
 
     @property
-    def camera(self) -> str:
+    def camera(self):
         """The camera's name."""
         return self.calibration.camera
 
     @property
-    def frames(self) -> tuple[str, str]:
+    def frames(self):
         """The camera's optical frame and the LiDAR's frame."""
         camera, lidar = self.rig.cameras[self.camera], self.rig.lidars[self.calibration.lidar]
         return camera.optical_frame, lidar.frame
 
 
-def project(points_lidar: Array, T_cam_lidar: Array, lens: Lens) -> Array:
+def project(points_lidar, T_cam_lidar, lens):
     """Draw points by OpenCV."""
     model, K, distortion = lens
     function = cv2.fisheye.projectPoints if model == "fisheye" else cv2.projectPoints
@@ -68,12 +67,12 @@ def project(points_lidar: Array, T_cam_lidar: Array, lens: Lens) -> Array:
     return np.asarray(function(points, np.zeros(3), np.zeros(3), K, distortion)[0].reshape(-1, 2))
 
 
-def _matrix(xyz: Any, R: Any) -> Array:
+def _matrix(xyz, R):
     return pose(np.asarray(R, dtype=np.float64).reshape(3, 3), np.asarray(xyz, dtype=np.float64))
 
 
-def _chained(joints: dict[str, tuple[str, Array]], optical: str, lidar: str) -> Array:
-    def from_root(frame: str) -> Array:
+def _chained(joints, optical, lidar):
+    def from_root(frame):
         T = np.eye(4)
         while frame in joints:
             frame, T_parent_child = joints[frame]
@@ -83,18 +82,18 @@ def _chained(joints: dict[str, tuple[str, Array]], optical: str, lidar: str) -> 
     return np.asarray(np.linalg.inv(from_root(optical)) @ from_root(lidar))
 
 
-def _yaml(path: Path) -> Any:
+def _yaml(path):
     return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
-def _extrinsics(case: Case) -> Array:
+def _extrinsics(case):
     (pair,) = _yaml(case.folder / "extrinsics.yaml")["pairs"]
     block = pair["T_cam_lidar"]
     R = Rotation.from_quat(block["quaternion_xyzw"]).as_matrix()
     return project(case.points_lidar, _matrix(block["translation_m"], R), case.lens)
 
 
-def _urdf(case: Case, name: str | None = None) -> Array:
+def _urdf(case, name=None):
     from yourdfpy import URDF
 
     robot = URDF.load(str(case.folder / (name or f"{case.rig.name}.urdf")), load_meshes=False)
@@ -102,7 +101,7 @@ def _urdf(case: Case, name: str | None = None) -> Array:
     return project(case.points_lidar, np.asarray(robot.get_transform(lidar, optical)), case.lens)
 
 
-def _isaac(case: Case) -> Array:
+def _isaac(case):
     from yourdfpy import URDF
 
     path = case.folder / "isaac_calibration.urdf"
@@ -111,25 +110,25 @@ def _isaac(case: Case) -> Array:
     return _urdf(case, path.name)
 
 
-def _info_lens(data: Any) -> Lens:
+def _info_lens(data):
     model = "fisheye" if data["distortion_model"] == "equidistant" else "radtan"
     K = np.reshape(data["camera_matrix"]["data"], (3, 3))
     return model, K, np.array(data["distortion_coefficients"]["data"])
 
 
-def _camera_info(case: Case) -> Array:
+def _camera_info(case):
     lens = _info_lens(_yaml(case.folder / f"camera_info_{case.camera}.yaml"))
     return project(case.points_lidar, case.calibration.T_cam_lidar, lens)
 
 
-def _static_tf(case: Case) -> Array:
+def _static_tf(case):
     """Parse the lines of ROS 2 as a shell and the publisher's options do."""
     lines = (case.folder / "static_transforms.txt").read_text(encoding="utf-8").splitlines()
     calls = [shlex.split(line)[4:] for line in lines if line.startswith("ros2 run tf2_ros static")]
     return _published(case, calls)
 
 
-def _published(case: Case, calls: list[list[str]]) -> Array:
+def _published(case, calls):
     joints = {}
     for words in calls:
         given = dict(zip(words[::2], words[1::2], strict=True))
@@ -140,7 +139,7 @@ def _published(case: Case, calls: list[list[str]]) -> Array:
     return project(case.points_lidar, _chained(joints, *case.frames), case.lens)
 
 
-def _ros2_launch(case: Case) -> Array:
+def _ros2_launch(case):
     """Run the launch file as `ros2 launch` does, with classes that keep what they are given."""
     names = {"launch": "LaunchDescription", "launch_ros": "", "launch_ros.actions": "Node"}
     modules = {name: ModuleType(name) for name in names}
@@ -149,7 +148,7 @@ def _ros2_launch(case: Case) -> Array:
     before = {name: sys.modules.get(name) for name in names}
     sys.modules.update(modules)
     try:
-        space: dict[str, Any] = {}
+        space = {}
         exec((case.folder / f"{case.rig.name}.launch.py").read_text(encoding="utf-8"), space)
         nodes = space["generate_launch_description"]()
     finally:
@@ -164,12 +163,12 @@ def _ros2_launch(case: Case) -> Array:
     return _published(case, [node["arguments"] for node in nodes])
 
 
-def _messages(path: Path) -> dict[str, list[Any]]:
+def _messages(path):
     """Read all messages of an mcap file by topic."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    found: dict[str, list[Any]] = {}
+    found = {}
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         for _, channel, _, message in reader.iter_decoded_messages():
@@ -177,7 +176,7 @@ def _messages(path: Path) -> dict[str, list[Any]]:
     return found
 
 
-def _joints(messages: list[Any]) -> dict[str, tuple[str, Array]]:
+def _joints(messages):
     joints = {}
     for each in messages[0].transforms:
         t, q = each.transform.translation, each.transform.rotation
@@ -186,7 +185,7 @@ def _joints(messages: list[Any]) -> dict[str, tuple[str, Array]]:
     return joints
 
 
-def _tf_static_rosbags(case: Case) -> Array:
+def _tf_static_rosbags(case):
     from rosbags.highlevel import AnyReader
 
     with AnyReader([case.folder / "tf_static"]) as reader:
@@ -198,7 +197,7 @@ def _tf_static_rosbags(case: Case) -> Array:
     return project(case.points_lidar, _chained(_joints(messages), *case.frames), case.lens)
 
 
-def _kalibr(case: Case) -> Array:
+def _kalibr(case):
     block = _yaml(case.folder / f"camchain_{case.calibration.lidar}.yaml")["cam0"]
     fx, fy, cx, cy = block["intrinsics"]
     model = "fisheye" if block["distortion_model"] == "equidistant" else "radtan"
@@ -206,10 +205,10 @@ def _kalibr(case: Case) -> Array:
     return project(case.points_lidar, np.array(block["T_cam_lidar"]), lens)
 
 
-def _autoware(case: Case) -> Array:
+def _autoware(case):
     """Compose as Autoware's xacro does: kit, housing and its centre; kit, body and its optical frame."""
 
-    def matrix(block: dict[str, float]) -> Array:
+    def matrix(block):
         R = Rotation.from_euler("xyz", [block[angle] for angle in ("roll", "pitch", "yaw")]).as_matrix()
         return _matrix([block[axis] for axis in "xyz"], R)
 
@@ -224,7 +223,7 @@ def _autoware(case: Case) -> Array:
     return project(case.points_lidar, _chained(joints, optical, lidar), case.lens)
 
 
-def _fast_livo2(case: Case) -> Array:
+def _fast_livo2(case):
     given = _yaml(case.folder / f"fast_livo2_{case.camera}.yaml")["extrin_calib"]
     camera = _yaml(case.folder / f"fast_livo2_camera_{case.camera}.yaml")
     fx, fy, cx, cy = (camera[f"cam_{key}"] * camera["scale"] for key in ("fx", "fy", "cx", "cy"))
@@ -235,7 +234,7 @@ def _fast_livo2(case: Case) -> Array:
     return project(case.points_lidar, _matrix(given["Pcl"], given["Rcl"]), lens)
 
 
-def _koide3(case: Case) -> Array:
+def _koide3(case):
     data = json.loads((case.folder / f"calib_{case.camera}.json").read_text(encoding="utf-8"))
     *xyz, qx, qy, qz, qw = data["results"]["T_lidar_camera"]
     T_lidar_cam = _matrix(xyz, Rotation.from_quat([qx, qy, qz, qw]).as_matrix())
@@ -246,7 +245,7 @@ def _koide3(case: Case) -> Array:
     return project(case.points_lidar, np.linalg.inv(T_lidar_cam), lens)
 
 
-def _opencv(case: Case) -> Array:
+def _opencv(case):
     file = cv2.FileStorage(str(case.folder / f"opencv_{case.camera}.yaml"), cv2.FILE_STORAGE_READ)
     names = ("rvec", "tvec", "camera_matrix", "distortion_coefficients")
     rvec, tvec, K, distortion = (file.getNode(name).mat() for name in names)
@@ -255,7 +254,7 @@ def _opencv(case: Case) -> Array:
     return np.asarray(function(case.points_lidar[:, None], rvec, tvec, K, distortion)[0].reshape(-1, 2))
 
 
-def _mcap(case: Case) -> Array:
+def _mcap(case):
     """Read transforms and camera model; images and points must be those of the session."""
     name = f"{case.rig.name}_session"
     found = _messages(case.folder / name / f"{name}.mcap")
@@ -284,7 +283,7 @@ def _mcap(case: Case) -> Array:
     return project(case.points_lidar, T_cam_lidar, (*lens, np.array(info.d)))
 
 
-def _ply(case: Case) -> Array:
+def _ply(case):
     """Read positions and colours; a colour says from which pixel it was taken.
 
     The image's blue and green are the column's and row's number. Where a colour is as the projection says,
@@ -303,7 +302,7 @@ def _ply(case: Case) -> Array:
     return wanted + (named - nearest % 256)
 
 
-def probe_points(calibration: Calibration, rig: Rig) -> Array:
+def probe_points(calibration, rig):
     """List points (N, 3) m, frame LiDAR, that cover the camera's image at 1 to 10 m."""
     intrinsics = rig.cameras[calibration.camera].to_intrinsics()
     u = np.linspace(0.05, 0.95, 5) * (intrinsics.width_px - 1)
@@ -338,7 +337,7 @@ MODELS = {"radtan": "k1 k2 p1 p2 k3", "fisheye": "equidistant", "rational": "k1 
 """Kinds of lens, and their coefficients."""
 
 
-def session_image(rig: Rig, camera: str) -> Array:
+def session_image(rig, camera):
     """Draw an image in which each pixel's blue, green and red are its column, its row (mod 256) and 7."""
     width, height = rig.cameras[camera].resolution_px
     image = np.full((height, width, 3), 7, np.uint8)
@@ -347,7 +346,7 @@ def session_image(rig: Rig, camera: str) -> Array:
     return image
 
 
-def outputs_case(rig_name: str, folder: Path, *, model: str = "radtan", seed: int = 0) -> Case:
+def outputs_case(rig_name, folder, *, model="radtan", seed=0):
     """Export all formats of a random result.
 
     Args:
@@ -398,7 +397,7 @@ def outputs_case(rig_name: str, folder: Path, *, model: str = "radtan", seed: in
     return Case(folder / "out", rig, calibration, points.astype(np.float64), lens)
 
 
-def off_px(case: Case, name: str, reader: Callable[[Case], Array]) -> float:
+def off_px(case, name, reader):
     """Measure by how much the points that a reader draws miss those of the result, px, at most.
 
     A format with fewer coefficients holds the model that was fitted, and said to be so.

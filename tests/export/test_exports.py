@@ -1,9 +1,7 @@
 """Every export, read by programs that know nothing of how it was written."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,21 +12,20 @@ from scipy.spatial.transform import Rotation
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
-from lce_rig.core.geometry import Array, exp_so3, invert, pose
+from lce_rig.core.geometry import exp_so3, invert, pose
 from lce_rig.export import EXPORTS, export, export_formats
 from lce_rig.export.other_tools import fit_coefficients
 from lce_rig.export.robot_tree import Joint, RobotTree, build_trees
 from lce_rig.export.ros_files import load_camera_info
 from lce_rig.export.urdf import read_robot_urdf
 from lce_rig.export.writing import T_BODY_OPTICAL
-from lce_rig.rig import Rig
 from tests.export.conftest import reason
 
 Make = Callable[..., Calibration]
 in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=10)
 
 
-def body_poses() -> Iterator[Any]:
+def body_poses():
     """Poses of a camera's body on the LiDAR, with pitch at and near +-90 deg as well as anywhere."""
     near = st.sampled_from([0.0, 1e-12, 1e-9, 1e-7, 1e-5]).flatmap(
         lambda off: st.sampled_from([np.pi / 2 - off, off - np.pi / 2])
@@ -44,7 +41,7 @@ def body_poses() -> Iterator[Any]:
 
 @in_one_folder
 @given(T_lidar_body=body_poses())
-def test_every_format_survives_any_pose(rles: Rig, make: Make, tmp_path: Path, T_lidar_body: Array) -> None:
+def test_every_format_survives_any_pose(rles, make, tmp_path, T_lidar_body):
     T_cam_lidar = invert(T_lidar_body @ T_BODY_OPTICAL)
     usual = {"extrinsics.yaml", "rles.urdf", "camera_info_davis.yaml", "static_transforms.txt"}
     assert {path.name for path in export([make(T_cam_lidar)], rles, tmp_path)} == usual
@@ -56,9 +53,7 @@ def test_every_format_survives_any_pose(rles: Rig, make: Make, tmp_path: Path, T
     np.testing.assert_allclose(read, T_cam_lidar, atol=1e-12)
 
 
-def test_extrinsics_agree_in_every_notation_and_the_worked_points_hold(
-    rles: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_extrinsics_agree_in_every_notation_and_the_worked_points_hold(rles, make, tmp_path):
     calibration = make()
     (path,) = export([calibration], rles, tmp_path, formats=["extrinsics"])
     (pair,) = yaml.safe_load(path.read_text(encoding="utf-8"))["pairs"]
@@ -83,7 +78,7 @@ def test_extrinsics_agree_in_every_notation_and_the_worked_points_hold(
     np.testing.assert_array_equal(pair["covariance"]["matrix"], calibration.cov)
 
 
-def test_static_transforms_for_both_ros_versions_say_the_same(rles: Rig, make: Make, tmp_path: Path) -> None:
+def test_static_transforms_for_both_ros_versions_say_the_same(rles, make, tmp_path):
     (path,) = export([make()], rles, tmp_path, formats=["static_tf"])
     lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
     # What ROS 2 is told is read back elsewhere; ROS 1 takes the same values in the same order, without names.
@@ -96,15 +91,13 @@ def test_static_transforms_for_both_ros_versions_say_the_same(rles: Rig, make: M
     ]
 
 
-def random_pose(seed: int) -> Array:
+def random_pose(seed):
     rng = np.random.default_rng(seed)
     return pose(exp_so3(rng.normal(size=3)), rng.normal(size=3))
 
 
 @pytest.mark.parametrize("base", [None, "velodyne_back", "left_link"])
-def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(
-    three_sensor_rig: Rig, make: Make, tmp_path: Path, base: str | None
-) -> None:
+def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(three_sensor_rig, make, tmp_path, base):
     rig = three_sensor_rig.model_copy(update={"base_frame": base})
     pairs = [("davis", "front"), ("left", "front"), ("left", "back"), ("fish", "back")]
     calibrations = [make(random_pose(i), camera=c, lidar=lidar) for i, (c, lidar) in enumerate(pairs)]
@@ -119,15 +112,13 @@ def test_several_cameras_and_lidars_hang_in_one_tree_under_the_base(
         np.testing.assert_allclose(T_cam_lidar, calibration.T_cam_lidar, atol=1e-12)
 
 
-def test_sensors_that_no_calibration_connects_get_a_urdf_each(
-    three_sensor_rig: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_sensors_that_no_calibration_connects_get_a_urdf_each(three_sensor_rig, make, tmp_path):
     calibrations = [make(camera="davis", lidar="front"), make(camera="left", lidar="back")]
     paths = export(calibrations, three_sensor_rig, tmp_path, formats=["urdf"])
     assert [path.name for path in paths] == ["trio.urdf", "trio-velodyne_back.urdf"]
 
 
-def test_of_two_channels_the_better_verdict_and_then_the_surer_gives_the_place(rles: Rig, make: Make) -> None:
+def test_of_two_channels_the_better_verdict_and_then_the_surer_gives_the_place(rles, make):
     events = make(random_pose(1), channels=("events",))
     surer = replace(make(), cov=events.cov / 4)
     for frames, wanted in ((surer, "frames"), (replace(surer, verdict="marginal"), "events")):
@@ -149,14 +140,12 @@ def test_of_two_channels_the_better_verdict_and_then_the_surer_gives_the_place(r
         ([], []),
     ],
 )
-def test_frames_that_make_no_tree_are_refused(links: list[str], joints: list[str]) -> None:
+def test_frames_that_make_no_tree_are_refused(links, joints):
     with pytest.raises(SessionError):
         RobotTree.of_joints("a.urdf", [Joint(parent, child, np.eye(4)) for parent, child in joints], links)
 
 
-def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_left(
-    rles: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_left(rles, make, tmp_path):
     export([make()], rles, tmp_path)
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     failed = make(verdict="fail", findings=(reason("translation known to 80 mm only"),))
@@ -166,9 +155,7 @@ def test_a_result_that_failed_is_not_exported_and_removes_what_an_earlier_run_le
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
-    rles: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_a_forced_export_of_a_failed_result_says_so_in_every_file(rles, make, tmp_path):
     failed = make(verdict="fail", findings=(reason("sigma -- 80 mm\nand more"),))
     paths = export([failed], rles, tmp_path, formats=EXPORTS, is_forced=True)
     for path in paths:
@@ -181,7 +168,7 @@ def test_a_forced_export_of_a_failed_result_says_so_in_every_file(
 
 
 @pytest.mark.parametrize("extra, model", [("", "radtan"), ("fisheye_model: 1\n", "equidistant")])
-def test_a_lens_of_opencv_is_read(extra: str, model: str, tmp_path: Path) -> None:
+def test_a_lens_of_opencv_is_read(extra, model, tmp_path):
     matrix = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [ {} ]\n"
     text = "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n" + extra
     text += "camera_matrix: " + matrix.format(3, 3, "500., 0., 320., 0., 501., 240., 0., 0., 1.")
@@ -193,24 +180,20 @@ def test_a_lens_of_opencv_is_read(extra: str, model: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", sorted(EXPORTS))
-def test_a_pose_that_is_not_finite_is_refused_before_a_file_is_written(
-    name: str, rles: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_a_pose_that_is_not_finite_is_refused_before_a_file_is_written(name, rles, make, tmp_path):
     with pytest.raises(ResultRefusedError):
         export([make(np.full((4, 4), np.nan))], rles, tmp_path, formats=[name])
     assert not list(tmp_path.iterdir())
 
 
-def test_a_result_of_another_rig_is_refused(rles: Rig, make: Make, tmp_path: Path) -> None:
+def test_a_result_of_another_rig_is_refused(rles, make, tmp_path):
     for change in ({"camera": "cam"}, {"lidar": "other"}, {"channels": ("depth",)}):
         with pytest.raises(LceRigError):
             export([make(**change)], rles, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_kalibrs_chain_leads_from_each_camera_to_the_next(
-    three_sensor_rig: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_kalibrs_chain_leads_from_each_camera_to_the_next(three_sensor_rig, make, tmp_path):
     names = ("davis", "left", "fish")
     calibrations = [make(random_pose(i), camera=name, lidar="front") for i, name in enumerate(names)]
     files, findings = export_formats(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"])
@@ -226,9 +209,7 @@ def test_kalibrs_chain_leads_from_each_camera_to_the_next(
 
 
 @pytest.mark.parametrize("n_coefficients", [4, 5])
-def test_a_lens_with_fewer_coefficients_is_as_near_as_is_said(
-    three_sensor_rig: Rig, n_coefficients: int
-) -> None:
+def test_a_lens_with_fewer_coefficients_is_as_near_as_is_said(three_sensor_rig, n_coefficients):
     true = three_sensor_rig.cameras["left"].to_intrinsics()
     lens = fit_coefficients(true, n_coefficients)
     assert len(lens.intrinsics.distortion) == n_coefficients

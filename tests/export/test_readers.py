@@ -1,14 +1,12 @@
 """Every output read by a program that is not ours, by the format's own conventions."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.geometry import Array, perturb
+from lce_rig.core.geometry import perturb
 from lce_rig.export import EXPORTS, ExportJob, is_export, remove_exports, usual_formats
 from lce_rig.export.coloured_cloud import coloured
 from lce_rig.rig import load_rig
@@ -17,18 +15,16 @@ from tests.export.readers import MODELS, READERS, Case, off_px, outputs_case, se
 
 
 @pytest.fixture(scope="module", params=MODELS)
-def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Case:
+def case(request, tmp_path_factory):
     return outputs_case("rlfs", tmp_path_factory.mktemp("outputs"), model=request.param)
 
 
 @pytest.mark.parametrize(("read_by", "reader"), READERS.items(), ids=[" by ".join(key) for key in READERS])
-def test_another_program_draws_the_same_points(
-    case: Case, read_by: tuple[str, str], reader: Callable[[Case], Array]
-) -> None:
+def test_another_program_draws_the_same_points(case, read_by, reader):
     assert off_px(case, read_by[0], reader) < 1e-6
 
 
-def test_every_format_has_a_reader_and_a_wrong_pose_is_seen(case: Case) -> None:
+def test_every_format_has_a_reader_and_a_wrong_pose_is_seen(case):
     read = {name for name, _ in READERS}
     assert set(EXPORTS) - read == {"ply_captures"}  # written as ply is
     wrong = perturb(case.calibration.T_cam_lidar, np.array([1e-6, 0, 0, 0, 0, 1e-6]))
@@ -43,7 +39,7 @@ def test_every_format_has_a_reader_and_a_wrong_pose_is_seen(case: Case) -> None:
     assert off_px(moved, key[0], READERS[key]) > 1e-6
 
 
-def test_all_files_are_known_as_exports_and_nothing_else_is_removed(case: Case, tmp_path: Path) -> None:
+def test_all_files_are_known_as_exports_and_nothing_else_is_removed(case, tmp_path):
     import shutil
 
     folder = tmp_path / "out"
@@ -56,14 +52,14 @@ def test_all_files_are_known_as_exports_and_nothing_else_is_removed(case: Case, 
     assert sorted(path.name for path in folder.iterdir()) == ["mine", "scan.ply"]
 
 
-def test_the_profile_names_the_formats_that_are_written() -> None:
+def test_the_profile_names_the_formats_that_are_written():
     assert set(OutputFormat.__args__) == set(EXPORTS)  # type: ignore[attr-defined]
     rig = load_rig("rlfs")
     assert usual_formats(rig)[0] == "extrinsics" and "mcap" not in usual_formats(rig)
     assert usual_formats(rig.model_copy(update={"exports": ("ply", "urdf")})) == ("ply", "urdf")
 
 
-def test_points_that_only_the_lidar_sees_get_no_colour(case: Case) -> None:
+def test_points_that_only_the_lidar_sees_get_no_colour(case):
     """A board at 1 m hides a part of the wall at 4 m from a camera beside the LiDAR, and not the rest."""
     T_cam_lidar = case.calibration.T_cam_lidar.copy()
     T_cam_lidar[:3, 3] = [0.3, 0.0, 0.0]

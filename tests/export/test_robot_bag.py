@@ -1,7 +1,6 @@
 """Static transforms of recordings, written by rosbags, and what is fitted into them."""
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from lce_rig.export import export, export_formats
 from lce_rig.export.robot_tree import build_trees, fit_tree
 from lce_rig.export.urdf import read_robot, read_robot_bag
 from lce_rig.export.writing import R_BODY_OPTICAL
-from lce_rig.rig import Rig
 from lce_rig.rig.profile import Mount
 
 Make = Callable[..., Calibration]
@@ -26,7 +24,7 @@ Transform = tuple[str, str, Array]
 OPTICAL = pose(R_BODY_OPTICAL, np.zeros(3))
 
 
-def write_bag(path: Path, batches: Sequence[Sequence[Transform]], topic: str = "/tf_static") -> Path:
+def write_bag(path, batches, topic="/tf_static"):
     """Write messages of transforms: ROS 1 for .bag, ROS 2 sqlite3 for a name with db3, else mcap."""
     is_ros1 = path.suffix == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
@@ -44,7 +42,7 @@ def write_bag(path: Path, batches: Sequence[Sequence[Transform]], topic: str = "
     return path
 
 
-def stamped(store, transform: Transform, is_ros1: bool):
+def stamped(store, transform, is_ros1):
     parent, child, T = transform
     types = store.types
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
@@ -63,7 +61,7 @@ def stamped(store, transform: Transform, is_ros1: bool):
     )
 
 
-def placed(x: float, yaw_deg: float = 0.0) -> Array:
+def placed(x, yaw_deg=0.0):
     return pose(Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix(), np.array([x, 0.1, 0.2]))
 
 
@@ -77,9 +75,7 @@ ROBOT = [
 
 
 @pytest.mark.parametrize("name", ["robot.bag", "robot_db3", "robot_mcap"])
-def test_outputs_fit_the_static_transforms_of_every_kind_of_bag(
-    rles: Rig, make: Make, tmp_path: Path, name: str
-) -> None:
+def test_outputs_fit_the_static_transforms_of_every_kind_of_bag(rles, make, tmp_path, name):
     # The camera comes in a second message, as from a second publisher, and an old one is published anew.
     path = write_bag(tmp_path / name, [[("base_link", "mast", placed(7.0)), *ROBOT[1:2]], ROBOT])
     robot = read_robot(path)
@@ -105,18 +101,14 @@ def test_outputs_fit_the_static_transforms_of_every_kind_of_bag(
     assert published == [["--frame-id", "mast", "--child-frame-id", "velodyne"]]
 
 
-def test_a_camera_without_optical_frame_gets_one_as_rep_103_has_it(
-    rles: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_a_camera_without_optical_frame_gets_one_as_rep_103_has_it(rles, make, tmp_path):
     robot = read_robot_bag(write_bag(tmp_path / "robot_mcap", [ROBOT[:3]]))
     tree, changes, _ = fit_tree(robot, [make()], rles)
     assert [change.joint.child for change in changes] == ["velodyne", "davis_optical_frame"]
     np.testing.assert_allclose(tree.find_pose("davis_link", "davis_optical_frame"), OPTICAL, atol=1e-12)
 
 
-def test_a_moving_joint_above_the_sensors_is_where_the_tree_begins(
-    rles: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_a_moving_joint_above_the_sensors_is_where_the_tree_begins(rles, make, tmp_path):
     """The head's pose on the base is on /tf; static are only the transforms in the head."""
     head = [("head", child, T) for _, child, T in (ROBOT[0], ROBOT[2])]
     robot = read_robot_bag(write_bag(tmp_path / "robot_mcap", [[*head, *ROBOT[1:2], *ROBOT[3:]]]))
@@ -134,21 +126,19 @@ def test_a_moving_joint_above_the_sensors_is_where_the_tree_begins(
         pytest.param([[*ROBOT[:3], ("base_link", "davis_optical_frame", OPTICAL)]], id="optical elsewhere"),
     ],
 )
-def test_a_tree_that_does_not_fit_is_refused(
-    rles: Rig, make: Make, tmp_path: Path, batches: Sequence[Sequence[Transform]]
-) -> None:
+def test_a_tree_that_does_not_fit_is_refused(rles, make, tmp_path, batches):
     path = write_bag(tmp_path / "robot_mcap", batches)
     with pytest.raises(SessionError) as error:
         build_trees([make()], rles, read_robot_bag(path))
     assert str(path) in error.value.what
 
 
-def test_a_recording_without_static_transforms_is_refused(tmp_path: Path) -> None:
+def test_a_recording_without_static_transforms_is_refused(tmp_path):
     with pytest.raises(SourceError):
         read_robot(write_bag(tmp_path / "robot_mcap", [ROBOT], topic="/tf"))
 
 
-def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles: Rig, make: Make, tmp_path: Path) -> None:
+def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles, make, tmp_path):
     robot = read_robot_bag(write_bag(tmp_path / "robot_mcap", [ROBOT[:1]]))
     mount = Mount(parent="mast", of="velodyne", xyz_m=(0.0, 0.0, 0.4))
     (tree,) = build_trees([make()], rles.model_copy(update={"mount": mount}), robot)
@@ -170,7 +160,7 @@ def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles: Rig, make: Make
     )
 
 
-def test_autowares_kit_and_housing_stay_as_the_robot_has_them(rles: Rig, make: Make, tmp_path: Path) -> None:
+def test_autowares_kit_and_housing_stay_as_the_robot_has_them(rles, make, tmp_path):
     import yaml
 
     housing = placed(0.0) * [[1, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1]]  # 0.2 m above its base
@@ -184,7 +174,7 @@ def test_autowares_kit_and_housing_stay_as_the_robot_has_them(rles: Rig, make: M
     paths = export([make()], rles, tmp_path / "out", formats=["autoware"], robot=read)
     kit, base = (yaml.safe_load(path.read_text(encoding="utf-8")) for path in paths)
 
-    def read_pose(block: dict[str, float]) -> Array:
+    def read_pose(block):
         R = Rotation.from_euler("xyz", [block["roll"], block["pitch"], block["yaw"]]).as_matrix()
         return pose(R, np.array([block["x"], block["y"], block["z"]]))
 

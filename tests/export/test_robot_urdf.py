@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from datetime import datetime
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +11,10 @@ from yourdfpy import URDF
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import SessionError
-from lce_rig.core.geometry import Array, exp_so3, pose
+from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.export import export
 from lce_rig.export.robot_tree import fit_tree
 from lce_rig.export.urdf import read_robot_urdf, write_into_urdf
-from lce_rig.rig import Rig
 from lce_rig.rig.profile import Mount
 
 Make = Callable[..., Calibration]
@@ -40,7 +38,7 @@ OPTICAL = """  <link name="davis_optical_frame"/>
 """
 
 
-def found(path: Path, rig: Rig) -> Array:
+def found(path, rig):
     """Read T_cam_lidar as another program does."""
     robot = URDF.load(str(path), load_meshes=False)
     return np.asarray(robot.get_transform("velodyne", "davis_optical_frame"))
@@ -49,8 +47,8 @@ def found(path: Path, rig: Rig) -> Array:
 @pytest.mark.parametrize("has_camera", [False, True])
 @pytest.mark.parametrize("has_optical", [False, True])
 def test_a_camera_is_moved_below_its_own_parent_or_added_below_the_lidar(
-    rles: Rig, make: Make, tmp_path: Path, has_camera: bool, has_optical: bool
-) -> None:
+    rles, make, tmp_path, has_camera, has_optical
+):
     path, calibration = tmp_path / "cart.urdf", make()
     text = HEAD + BASE + MAST + (CAMERA.format(kind="fixed") if has_camera else "")
     text += (OPTICAL if has_camera and has_optical else "") + "</robot>\n<!-- end -->\n"
@@ -71,9 +69,7 @@ def test_a_camera_is_moved_below_its_own_parent_or_added_below_the_lidar(
     assert write_into_urdf(path, [calibration], rles, NOW) == (None, [])
 
 
-def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(
-    rles: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(rles, make, tmp_path):
     path, calibration = tmp_path / "cart.urdf", make()
     mast = MAST.replace('"base_link"', '"davis_link"')
     path.write_text(HEAD + BASE + CAMERA.format(kind="fixed") + mast + OPTICAL + "</robot>\n")
@@ -113,9 +109,7 @@ def test_a_lidar_is_moved_where_the_camera_is_nearer_to_the_root(
         "empty",
     ],
 )
-def test_a_urdf_that_does_not_fit_is_refused_and_stays_as_it_was(
-    rles: Rig, make: Make, tmp_path: Path, text: str | bytes
-) -> None:
+def test_a_urdf_that_does_not_fit_is_refused_and_stays_as_it_was(rles, make, tmp_path, text):
     path = tmp_path / "cart.urdf"
     before = text.encode() if isinstance(text, str) else text
     path.write_bytes(before)
@@ -126,7 +120,7 @@ def test_a_urdf_that_does_not_fit_is_refused_and_stays_as_it_was(
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_link_stays_a_link_and_its_target_gets_the_joints(rles: Rig, make: Make, tmp_path: Path) -> None:
+def test_a_link_stays_a_link_and_its_target_gets_the_joints(rles, make, tmp_path):
     target, link = tmp_path / "package" / "cart.urdf", tmp_path / "cart.urdf"
     target.parent.mkdir()
     target.write_text(HEAD + BASE + MAST + "</robot>\n")
@@ -137,9 +131,7 @@ def test_a_link_stays_a_link_and_its_target_gets_the_joints(rles: Rig, make: Mak
     assert backup is not None and backup.parent == target.parent
 
 
-def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(
-    three_sensor_rig: Rig, make: Make, tmp_path: Path
-) -> None:
+def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(three_sensor_rig, make, tmp_path):
     rng = np.random.default_rng(0)
     poses = [pose(exp_so3(rng.normal(size=3)), rng.normal(size=3)) for _ in range(3)]
     pairs = [("davis", "front"), ("davis", "back"), ("left", "back")]
@@ -154,7 +146,7 @@ def test_several_sensors_fit_with_the_one_nearest_to_the_root_standing(
         np.testing.assert_allclose(tree.find_pose(optical, lidar), T, atol=1e-12)
 
 
-def test_with_a_mount_all_outputs_hang_from_the_robots_frame(rles: Rig, make: Make, tmp_path: Path) -> None:
+def test_with_a_mount_all_outputs_hang_from_the_robots_frame(rles, make, tmp_path):
     mount = Mount(parent="base_link", of="davis_link", xyz_m=(0.1, 0.2, 0.3), rpy_deg=(10.0, 20.0, 30.0))
     rig = rles.model_copy(update={"mount": mount})
     export([make()], rig, tmp_path)

@@ -2,9 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +10,7 @@ from wire.sshd import NoServerError, Sshd
 import lce_rig.collect.findings
 import lce_rig.judge.findings  # noqa: F401  kinds of the findings in stored results
 from lce_rig.core.calibration import Provenance
-from lce_rig.fleet.registry import Row
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
 from lce_rig.simulate import simulate_captures
@@ -26,9 +22,9 @@ ORIGIN = Provenance("kestrel", {"lidar": "AG1", "davis": "499"}, "2026-11-20T10:
 
 
 @pytest.fixture
-def row() -> Callable[..., Row]:
-    def make(robot: str = "r1", date: str | None = "2026-01-05T10:00:00Z", **changes: object) -> Row:
-        known: dict[str, object] = {
+def row():
+    def make(robot="r1", date="2026-01-05T10:00:00Z", **changes):
+        known = {
             "robot": robot,
             "date": date,
             "status": "ok",
@@ -50,13 +46,13 @@ def row() -> Callable[..., Row]:
 
 
 @pytest.fixture(scope="session")
-def small_rig() -> Rig:
+def small_rig():
     """Give the rig rlfs with images of half the size, which are found in half the time."""
     return half_size(load_rig("rlfs"))
 
 
 @pytest.fixture(scope="session")
-def simulated(small_rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def simulated(small_rig, tmp_path_factory):
     """Simulate a session of eight captures."""
     path = tmp_path_factory.mktemp("simulated") / "session"
     with Session.create(path, small_rig) as session:
@@ -66,7 +62,7 @@ def simulated(small_rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def fleet_root(simulated: Path, tmp_path: Path) -> Path:
+def fleet_root(simulated, tmp_path):
     """Lay out three sessions of two robots, of them one without result and one that cannot be read."""
     root = tmp_path / "root"
     for name in ("r1/monday", "r2/monday", "r2/torn"):
@@ -78,15 +74,15 @@ def fleet_root(simulated: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def rig() -> Rig:
+def rig():
     return load_rig("rles")
 
 
 @pytest.fixture
-def result(tmp_path: Path) -> Callable[..., Path]:
+def result(tmp_path):
     """Write the result of a calibration into a folder of its own."""
 
-    def write(name: str = "a", x_m: float = 0.12, origin: Provenance = ORIGIN, **changes: Any) -> Path:
+    def write(name="a", x_m=0.12, origin=ORIGIN, **changes):
         folder = tmp_path / f"result-{name}"
         folder.mkdir()
         pair = calibration(some_pose(t=(x_m, -0.07, -0.08)), **changes)
@@ -97,18 +93,18 @@ def result(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def robot(tmp_path: Path) -> Path:
+def robot(tmp_path):
     """The folder that a robot's software reads from."""
     return tmp_path / "robot"
 
 
 @pytest.fixture
-def local(robot: Path) -> TargetSettings:
+def local(robot):
     return TargetSettings(to=str(robot))
 
 
 @pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sshd]:
+def server(tmp_path_factory):
     try:
         with Sshd(tmp_path_factory.mktemp("ssh")) as running:
             yield running
@@ -117,17 +113,16 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sshd]:
 
 
 @pytest.fixture
-def far(robot: Path, server: Sshd) -> TargetSettings:
+def far(robot, server):
     return TargetSettings(to=f"{server.to}:{robot}", ssh=server.options)
 
 
 @pytest.fixture(params=["folder", pytest.param("ssh", marks=pytest.mark.long)])
-def target(request: pytest.FixtureRequest) -> TargetSettings:
+def target(request):
     """A target in this computer's files, and the same by ssh."""
     name = {"folder": "local", "ssh": "far"}[request.param]
-    found: TargetSettings = request.getfixturevalue(name)
-    return found
+    return request.getfixturevalue(name)
 
 
-def log_of(robot: Path) -> list[dict[str, Any]]:
+def log_of(robot):
     return [json.loads(line) for line in (robot / "deployments.log").read_text().splitlines()]

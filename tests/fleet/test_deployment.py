@@ -10,11 +10,9 @@ from pathlib import Path
 import pytest
 
 from lce_rig.core.errors import CommandError, ResultRefusedError, SessionError, TargetError
-from lce_rig.fleet import deployment
 from lce_rig.fleet.deployment import deploy, plan, rollback, standing
 from lce_rig.fleet.place import RECORD, Place
 from lce_rig.fleet.releases import content_of, set_sha256
-from lce_rig.rig import Rig
 from lce_rig.rig.target_settings import TargetSettings
 from tests.fleet.conftest import ORIGIN, log_of
 
@@ -22,17 +20,15 @@ Result = Callable[..., Path]
 FILES = {"camera_info_davis.yaml", "extrinsics.yaml", "result.json", "rles.urdf", "static_transforms.txt"}
 
 
-def codes(planned: deployment.Plan) -> list[str]:
+def codes(planned):
     return [finding.code for finding in planned.objections]
 
 
-def with_settings(target: TargetSettings, **changes: object) -> TargetSettings:
+def with_settings(target, **changes):
     return TargetSettings.model_validate(target.model_dump() | changes)
 
 
-def test_a_result_is_deployed_asked_for_replaced_and_restored_byte_for_byte(
-    result: Result, rig: Rig, target: TargetSettings, robot: Path
-) -> None:
+def test_a_result_is_deployed_asked_for_replaced_and_restored_byte_for_byte(result, rig, target, robot):
     folder = result("a")
     first = deploy(folder, rig, target)
     assert first.is_new and first.replaces == "" and first.output is None
@@ -57,9 +53,7 @@ def test_a_result_is_deployed_asked_for_replaced_and_restored_byte_for_byte(
     assert rollback(target, second.release.name).release == second.release
 
 
-def test_the_same_files_are_deployed_once(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
-) -> None:
+def test_the_same_files_are_deployed_once(result, rig, local, robot):
     folder = result("a")
     first = deploy(folder, rig, local)
     again = deploy(folder, rig, local)
@@ -76,9 +70,7 @@ def test_the_same_files_are_deployed_once(
         rollback(local)
 
 
-def test_a_dry_run_gives_degrees_millimetres_and_changes_nothing(
-    result: Result, rig: Rig, target: TargetSettings, robot: Path
-) -> None:
+def test_a_dry_run_gives_degrees_millimetres_and_changes_nothing(result, rig, target, robot):
     planned = plan(result("a"), rig, target)
     assert planned.state.current is None and not robot.exists()
     (change,) = planned.sensors
@@ -103,8 +95,8 @@ def test_a_dry_run_gives_degrees_millimetres_and_changes_nothing(
     ],
 )
 def test_what_does_not_belong_there_is_refused_unless_a_reason_is_written_down(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path, changes: dict[str, object], code: str
-) -> None:
+    result, rig, local, robot, changes, code
+):
     deploy(result("a"), rig, local)
     before = content_of(robot / "current")
     folder = result("b", **changes)
@@ -118,9 +110,7 @@ def test_what_does_not_belong_there_is_refused_unless_a_reason_is_written_down(
     assert (log_of(robot)[-1]["forced"], log_of(robot)[-1]["reason"]) == ([code], forced.reason)
 
 
-def test_the_target_may_name_its_robot_and_what_nothing_tells_is_no_objection(
-    result: Result, rig: Rig, local: TargetSettings
-) -> None:
+def test_the_target_may_name_its_robot_and_what_nothing_tells_is_no_objection(result, rig, local):
     named = with_settings(local, robot="heron")
     assert codes(plan(result("a"), rig, named)) == ["deploy.other_robot"]
     unknown = result("b", origin=replace(ORIGIN, robot="", serials={}, date=None, session_sha256=""))
@@ -133,9 +123,7 @@ def test_the_target_may_name_its_robot_and_what_nothing_tells_is_no_objection(
     assert plan(result("d", 0.1), rig, local).remarks == ()
 
 
-def test_formats_and_further_files_are_chosen(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
-) -> None:
+def test_formats_and_further_files_are_chosen(result, rig, local, robot):
     folder = result("a")
     (folder / "report.html").write_text("<html>")
     (folder / "plots").mkdir()
@@ -149,9 +137,7 @@ def test_formats_and_further_files_are_chosen(
         deploy(folder, rig, with_settings(local, files=["way-out"]))
 
 
-def test_a_command_that_fails_is_told_with_output_and_code_and_runs_again(
-    result: Result, rig: Rig, target: TargetSettings, robot: Path
-) -> None:
+def test_a_command_that_fails_is_told_with_output_and_code_and_runs_again(result, rig, target, robot):
     folder = result("a")
     failing = with_settings(target, run="ls rles.urdf; echo not today >&2; test -e ../../ready || exit 3")
     with pytest.raises(CommandError, match="3") as caught:
@@ -170,18 +156,16 @@ def test_a_command_that_fails_is_told_with_output_and_code_and_runs_again(
 class Meanwhile(Place):
     """A place at which something happens once new files have been copied."""
 
-    def __init__(self, target: TargetSettings, happens: Callable[[Path], object]) -> None:
+    def __init__(self, target, happens):
         super().__init__(target)
         self._happens = happens
 
-    def put(self, folder: Path, name: str) -> None:
+    def put(self, folder, name):
         super().put(folder, name)
         self._happens(Path(self.path) / name)
 
 
-def test_of_two_deployments_at_once_one_is_refused(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
-) -> None:
+def test_of_two_deployments_at_once_one_is_refused(result, rig, local, robot):
     deploy(result("a"), rig, local)
     folder, other = result("b", 0.15), result("c", 0.2)
 
@@ -191,12 +175,10 @@ def test_of_two_deployments_at_once_one_is_refused(
     assert sorted(entry.name for entry in robot.glob(".*")) == [".lock"]
 
 
-def test_files_that_the_disk_does_not_give_back_are_not_made_current(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
-) -> None:
+def test_files_that_the_disk_does_not_give_back_are_not_made_current(result, rig, local, robot):
     first = deploy(result("a"), rig, local).release
 
-    def damage(draft: Path) -> None:
+    def damage(draft):
         (draft / "rles.urdf").write_text("")
 
     with pytest.raises(TargetError, match=r"rles\.urdf"):
@@ -209,7 +191,7 @@ def test_files_that_the_disk_does_not_give_back_are_not_made_current(
 LOST = "releases/20260101T000000Z-00000000"
 
 
-def tree(folder: Path) -> dict[str, object]:
+def tree(folder):
     """List everything below a folder, with contents and targets of links."""
     return {
         str(path): str(path.readlink())
@@ -235,9 +217,7 @@ def tree(folder: Path) -> dict[str, object]:
         "mkdir -p robot && mkfifo robot/deployments.log",
     ],
 )
-def test_a_folder_that_lce_rig_has_not_made_is_refused_untouched(
-    result: Result, rig: Rig, local: TargetSettings, tmp_path: Path, way: str
-) -> None:
+def test_a_folder_that_lce_rig_has_not_made_is_refused_untouched(result, rig, local, tmp_path, way):
     folder = result("a")
     subprocess.run(["sh", "-c", way], cwd=tmp_path, check=True)
     before = tree(tmp_path)
@@ -247,9 +227,7 @@ def test_a_folder_that_lce_rig_has_not_made_is_refused_untouched(
     assert tree(tmp_path) == before
 
 
-def test_only_own_releases_are_removed_and_only_after_the_switch(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
-) -> None:
+def test_only_own_releases_are_removed_and_only_after_the_switch(result, rig, local, robot):
     few = with_settings(local, keep=2)
     first = deploy(result("a"), rig, few).release
     others = ["golden", "20260101T000000Z-00000000", "20260101T000000Z-0000000", "notes.txt"]
@@ -268,9 +246,7 @@ def test_only_own_releases_are_removed_and_only_after_the_switch(
     assert sorted(path.name for path in (robot / "releases").iterdir()) == sorted([*others, *names[1:]])
 
 
-def test_the_release_before_stays_where_few_are_kept_and_one_was_rolled_back(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
-) -> None:
+def test_the_release_before_stays_where_few_are_kept_and_one_was_rolled_back(result, rig, local, robot):
     few = with_settings(local, keep=2)
     first, _ = (deploy(result(name, x_m), rig, few).release for name, x_m in (("a", 0.1), ("b", 0.2)))
     rollback(few)
@@ -279,9 +255,7 @@ def test_the_release_before_stays_where_few_are_kept_and_one_was_rolled_back(
     assert rollback(few).release == first
 
 
-def test_releases_are_named_in_order_where_the_clock_was_set_back(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path
-) -> None:
+def test_releases_are_named_in_order_where_the_clock_was_set_back(result, rig, local, robot):
     early = deploy(result("a"), rig, local).release
     late = early.model_copy(update={"name": f"20990101T000000Z-{early.name[-8:]}"})
     (robot / "releases" / early.name).rename(robot / "releases" / late.name)
@@ -301,13 +275,11 @@ class Toolless(Place):
 
     tools: Path
 
-    def command(self, script: str, *arguments: str) -> list[str]:
+    def command(self, script, *arguments):
         return ["env", f"PATH={self.tools}", *super().command(script, *arguments)]
 
 
-def test_a_robot_without_flock_is_deployed_to(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path, tmp_path: Path
-) -> None:
+def test_a_robot_without_flock_is_deployed_to(result, rig, local, robot, tmp_path):
     place = Toolless(with_settings(local, run="true"))
     place.tools = tmp_path / "tools"
     place.tools.mkdir()
@@ -319,9 +291,7 @@ def test_a_robot_without_flock_is_deployed_to(
     assert not (robot / ".lock").exists() and not standing(local).changed
 
 
-def test_a_release_with_a_link_to_an_endless_device_is_named_and_replaced(
-    result: Result, rig: Rig, target: TargetSettings, robot: Path
-) -> None:
+def test_a_release_with_a_link_to_an_endless_device_is_named_and_replaced(result, rig, target, robot):
     deploy(result("a"), rig, target)
     (robot / "current" / "extrinsics.yaml").unlink()
     (robot / "current" / "extrinsics.yaml").symlink_to("/dev/zero")
@@ -332,9 +302,7 @@ def test_a_release_with_a_link_to_an_endless_device_is_named_and_replaced(
 
 
 @pytest.mark.long
-def test_the_output_and_the_time_of_a_command_are_bounded(
-    result: Result, rig: Rig, target: TargetSettings
-) -> None:
+def test_the_output_and_the_time_of_a_command_are_bounded(result, rig, target):
     endless = with_settings(target, run="yes", run_timeout_s=2)
     with pytest.raises(CommandError) as caught:
         deploy(result("a"), rig, endless)
@@ -342,7 +310,7 @@ def test_the_output_and_the_time_of_a_command_are_bounded(
     assert standing(endless).is_pending
 
 
-def test_the_command_gets_the_robot_as_an_argument(result: Result, rig: Rig, local: TargetSettings) -> None:
+def test_the_command_gets_the_robot_as_an_argument(result, rig, local):
     named = with_settings(local, robot="kestrel", run='echo "for $1"')
     assert deploy(result("a"), rig, named).output == "for kestrel\n"
 
@@ -350,7 +318,7 @@ def test_the_command_gets_the_robot_as_an_argument(result: Result, rig: Rig, loc
 class Failing(Place):
     """A place where the shell is killed before it starts its n-th program; flushing is left out."""
 
-    def __init__(self, target: TargetSettings, tools: Path, n: int) -> None:
+    def __init__(self, target, tools, n):
         super().__init__(target)
         self._tools = tools
         shutil.rmtree(tools, ignore_errors=True)
@@ -364,14 +332,12 @@ class Failing(Place):
             )
             wrapper.chmod(0o755)
 
-    def command(self, script: str, *arguments: str) -> list[str]:
+    def command(self, script, *arguments):
         return ["env", f"PATH={self._tools}:/usr/bin:/bin", *super().command(script, *arguments)]
 
 
 @pytest.mark.long
-def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(
-    result: Result, rig: Rig, local: TargetSettings, robot: Path, tmp_path: Path
-) -> None:
+def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(result, rig, local, robot, tmp_path):
     settings = with_settings(local, keep=2, formats=["urdf"])
     folders = [result("a"), result("b", 0.15)]
     sound = Failing(settings, tmp_path / "sound", 0)

@@ -42,7 +42,7 @@ def test_a_lost_worker_and_a_client_that_ends_lose_nothing(simulated, tmp_path, 
     assert not [path for path in (tmp_path / "registry").iterdir() if path.name.startswith(".new-")]
 
 
-def workers_of(pid: int) -> list[int]:
+def workers_of(pid):
     """List the worker processes of Dask that a client started."""
     with contextlib.suppress(psutil.Error):
         children = psutil.Process(pid).children()

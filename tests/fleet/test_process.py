@@ -5,11 +5,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 
 import pytest
 
-from lce_rig.fleet.work import Ended, run_apart
+from lce_rig.fleet.work import run_apart
 from tests.shared import has_ended, wait_until
 
 # What a session does, by name; the server imports this module by its path.
@@ -37,7 +36,7 @@ def stumble(arguments, tell):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _acts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def _acts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sessions")
     (folder / "acts_of_sessions.py").write_text(_MODULE)
     before = os.environ.get("PYTHONPATH", "")
@@ -46,7 +45,7 @@ def _acts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     os.environ["PYTHONPATH"] = before
 
 
-def act(name: str, limit_s: float = 60.0, limit_mb: float = 1000.0) -> Ended:
+def act(name, limit_s=60.0, limit_mb=1000.0):
     return run_apart(f"acts_of_sessions:{name}", {"robot": "r1"}, limit_s, limit_mb)
 
 

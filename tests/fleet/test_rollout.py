@@ -2,8 +2,6 @@
 
 import json
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,7 +11,7 @@ from lce_rig.cli.main import run
 from lce_rig.core.calibration import Provenance
 from lce_rig.core.errors import ProfileError, UsageError
 from lce_rig.fleet.registry import Registry, as_table, write_rows
-from lce_rig.fleet.rollout import FleetDeployment, Rollout, newest_results
+from lce_rig.fleet.rollout import FleetDeployment, newest_results
 from lce_rig.fleet.storage import Storage
 from lce_rig.rig import dump_rig, load_rig
 from tests.export.conftest import calibration, some_pose
@@ -25,23 +23,16 @@ Add = Callable[..., None]
 
 
 @pytest.fixture
-def registry(tmp_path: Path) -> Registry:
+def registry(tmp_path):
     return Registry(Storage.at(tmp_path / "registry"))
 
 
 @pytest.fixture
-def add(registry: Registry) -> Add:
+def add(registry):
     """Put a result of a robot into the registry."""
 
-    def put(
-        robot: str,
-        date: str = "2026-01-05T10:00:00Z",
-        x_m: float = 0.1,
-        verdict: Any = "pass",
-        is_last: bool = True,
-        **changes: object,
-    ) -> None:
-        known: dict[str, object] = {"status": "ok", "source": f"/sessions/{robot}/{date[:10]}"}
+    def put(robot, date="2026-01-05T10:00:00Z", x_m=0.1, verdict="pass", is_last=True, **changes):
+        known = {"status": "ok", "source": f"/sessions/{robot}/{date[:10]}"}
         row = {"robot": robot, "date": date, "folder": f"{robot}/{date[:10]}-0f", **known, **changes}
         with registry.result(str(row["folder"])) as draft:
             origin = Provenance(robot, {}, date, "0f" * 32)
@@ -57,7 +48,7 @@ def add(registry: Registry) -> Add:
 
 
 @pytest.fixture
-def targets(tmp_path: Path) -> Path:
+def targets(tmp_path):
     """Each robot's files lie in a folder of its name; its command fails where there is a file `broken`."""
     file = tmp_path / "deploy.yaml"
     run = f"! test -e {tmp_path}/robots/$1/broken"
@@ -70,27 +61,27 @@ def targets(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def whole(add: Add) -> None:
+def whole(add):
     """A result of each robot."""
     for robot in ROBOTS:
         add(robot, is_last=robot == ROBOTS[-1])
 
 
-def deploy(registry: Registry, targets: Path) -> Rollout:
+def deploy(registry, targets):
     return FleetDeployment(registry, "nav", targets).run(newest_results(registry))
 
 
-def held(targets: Path, robot: str) -> bytes | None:
+def held(targets, robot):
     file = targets.parent / "robots" / robot / "calib" / "current" / "result.json"
     return file.read_bytes() if file.exists() else None
 
 
-def states(rollout: Rollout) -> dict[str, str]:
+def states(rollout):
     return {robot: state.state for robot, state in rollout.robots.items()}
 
 
 @pytest.mark.usefixtures("whole")
-def test_every_robot_gets_its_own_newest_result(registry: Registry, targets: Path, add: Add) -> None:
+def test_every_robot_gets_its_own_newest_result(registry, targets, add):
     add("r2", "2026-02-01T10:00:00Z", 0.2)
     rollout = deploy(registry, targets)
     assert states(rollout) == dict.fromkeys(ROBOTS, "in_place") and not rollout.stopped_by
@@ -104,7 +95,7 @@ def test_every_robot_gets_its_own_newest_result(registry: Registry, targets: Pat
 
 
 @pytest.mark.usefixtures("whole")
-def test_a_robot_whose_newest_session_failed_is_left_out(registry: Registry, targets: Path, add: Add) -> None:
+def test_a_robot_whose_newest_session_failed_is_left_out(registry, targets, add):
     add("r2", "2026-02-01T10:00:00Z", verdict="fail")
     add("r3", "2026-02-01T10:00:00Z", status="failed", cause="fleet.session")
     rollout = deploy(registry, targets)
@@ -113,7 +104,7 @@ def test_a_robot_whose_newest_session_failed_is_left_out(registry: Registry, tar
 
 
 @pytest.mark.usefixtures("whole")
-def test_the_first_failure_stops_and_the_same_call_goes_on(registry: Registry, targets: Path) -> None:
+def test_the_first_failure_stops_and_the_same_call_goes_on(registry, targets):
     robots = targets.parent / "robots"
     (robots / "r2" / "broken").touch()
     rollout = deploy(registry, targets)
@@ -126,7 +117,7 @@ def test_the_first_failure_stops_and_the_same_call_goes_on(registry: Registry, t
 
 
 @pytest.mark.usefixtures("whole")
-def test_a_robot_that_refuses_its_result_stops_it(registry: Registry, targets: Path, add: Add) -> None:
+def test_a_robot_that_refuses_its_result_stops_it(registry, targets, add):
     # The files at r3 come from later captures than its newest result in this registry.
     add("r3", "2026-03-01T10:00:00Z")
     deploy(registry, targets)
@@ -137,9 +128,7 @@ def test_a_robot_that_refuses_its_result_stops_it(registry: Registry, targets: P
 
 @pytest.mark.usefixtures("whole")
 @pytest.mark.parametrize("name", ["a}]}, x: {to: /tmp", "$(touch x)", "../r1", "r 9", "-oProxyCommand=x"])
-def test_a_name_in_the_registry_becomes_no_yaml_no_path_and_no_command(
-    registry: Registry, targets: Path, name: str
-) -> None:
+def test_a_name_in_the_registry_becomes_no_yaml_no_path_and_no_command(registry, targets, name):
     row = {
         "robot": name,
         "date": "2026-01-05T10:00:00Z",
@@ -155,7 +144,7 @@ def test_a_name_in_the_registry_becomes_no_yaml_no_path_and_no_command(
 
 
 @pytest.mark.usefixtures("whole")
-def test_all_robots_are_rolled_back_byte_for_byte(registry: Registry, targets: Path, add: Add) -> None:
+def test_all_robots_are_rolled_back_byte_for_byte(registry, targets, add):
     deploy(registry, targets)
     first = {robot: held(targets, robot) for robot in ROBOTS}
     for robot in ROBOTS[:-1]:
@@ -171,9 +160,7 @@ def test_all_robots_are_rolled_back_byte_for_byte(registry: Registry, targets: P
 
 
 @pytest.mark.usefixtures("whole")
-def test_robots_that_hold_another_result_are_not_rolled_back(
-    registry: Registry, targets: Path, add: Add
-) -> None:
+def test_robots_that_hold_another_result_are_not_rolled_back(registry, targets, add):
     deploy(registry, targets)
     add("r1", "2026-04-01T10:00:00Z", 0.4)
     deploy(registry, targets)
@@ -184,10 +171,8 @@ def test_robots_that_hold_another_result_are_not_rolled_back(
 
 
 @pytest.mark.usefixtures("whole")
-def test_the_verb_plans_deploys_shows_and_rolls_back(
-    targets: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def call(*options: str) -> tuple[int, str]:
+def test_the_verb_plans_deploys_shows_and_rolls_back(targets, capsys):
+    def call(*options):
         place = ["--registry", str(targets.parent / "registry"), "--targets", str(targets)]
         capsys.readouterr()
         code = run(["fleet", "deploy", *place, "--target", "nav", *options])

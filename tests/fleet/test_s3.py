@@ -4,7 +4,6 @@ import contextlib
 import json
 import logging
 import os
-from collections.abc import Iterator
 from urllib.request import Request, urlopen
 
 import pytest
@@ -19,7 +18,7 @@ from lce_rig.fleet.work import Settings, work
 
 
 @contextlib.contextmanager
-def s3_server() -> Iterator[str]:
+def s3_server():
     """Serve S3 on loopback, with a bucket `fleet`; the environment names it while the block lasts."""
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
@@ -47,7 +46,7 @@ def s3_server() -> Iterator[str]:
         server.stop()
 
 
-def files_of(place: Storage) -> dict[str, bytes]:
+def files_of(place):
     """Read every file of a registry but the table, without the figures that differ between runs."""
     files = {}
     for name in place.files():

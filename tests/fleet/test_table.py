@@ -8,14 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lce_rig.core.errors import SessionError
-from lce_rig.fleet.registry import (
-    SCHEMA,
-    as_table,
-    covariances,
-    poses,
-    read_table,
-    table_bytes,
-)
+from lce_rig.fleet.registry import SCHEMA, as_table, covariances, poses, read_table, table_bytes
 
 
 def test_rows_are_read_back_as_they_were_written(tmp_path, row):

@@ -1,7 +1,6 @@
 """Targets: found by name, and refused where a path or an option could be taken for something else."""
 
 import shlex
-from pathlib import Path
 
 import pytest
 
@@ -13,12 +12,12 @@ from lce_rig.rig import load_rig
 from lce_rig.rig.target_settings import TargetSettings
 
 
-def write(path: Path, text: str) -> Path:
+def write(path, text):
     path.write_text(text)
     return path
 
 
-def test_a_target_is_found_in_the_file_beside_the_session_or_in_the_profile(tmp_path: Path) -> None:
+def test_a_target_is_found_in_the_file_beside_the_session_or_in_the_profile(tmp_path):
     session = tmp_path / "session"
     session.mkdir()
     rig = load_rig("rles").model_copy(update={"targets": {"heron": TargetSettings(to="/profile")}})
@@ -44,7 +43,7 @@ def test_a_target_is_found_in_the_file_beside_the_session_or_in_the_profile(tmp_
         ("./a:b", None, "./a:b"),
     ],
 )
-def test_places_are_read_as_scp_reads_them(to: str, host: str | None, path: str) -> None:
+def test_places_are_read_as_scp_reads_them(to, host, path):
     target = TargetSettings(to=to)
     assert (target.host, target.path) == (host, path)
 
@@ -74,13 +73,13 @@ def test_places_are_read_as_scp_reads_them(to: str, host: str | None, path: str)
         "to: /opt\n    keep: 1",
     ],
 )
-def test_what_a_shell_or_ssh_could_take_for_something_else_is_refused(tmp_path: Path, text: str) -> None:
+def test_what_a_shell_or_ssh_could_take_for_something_else_is_refused(tmp_path, text):
     path = write(tmp_path / "deploy.yaml", f"targets:\n  kestrel:\n    {text}\n")
     with pytest.raises(ProfileError, match=r"deploy\.yaml:[34]:"):
         read_targets(path)
 
 
-def test_arguments_reach_the_script_as_they_are(tmp_path: Path) -> None:
+def test_arguments_reach_the_script_as_they_are(tmp_path):
     words = Place(TargetSettings(to="kestrel:c", ssh={"Port": 2222})).command("echo $2", "it's; $(reboot)")
     assert words[0] == "ssh" and "Port=2222" in words and "BatchMode=yes" in words
     assert words[-2] == "kestrel"
@@ -88,18 +87,18 @@ def test_arguments_reach_the_script_as_they_are(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_computer_that_is_not_there_is_an_error_in_words() -> None:
+def test_a_computer_that_is_not_there_is_an_error_in_words():
     with pytest.raises(TargetError) as caught:
         standing(TargetSettings(to="robot@127.0.0.1:c", ssh={"Port": 1}))
     assert "no connection" in caught.value.what and caught.value.exit_code == 8
 
 
-def test_a_jump_over_hosts_is_allowed() -> None:
+def test_a_jump_over_hosts_is_allowed():
     jump = "ann@gate:2222,[fe80::1]"
     assert TargetSettings(to="kestrel:c", ssh={"ProxyJump": jump}).ssh == {"ProxyJump": jump}
 
 
-def test_the_name_of_a_robot_is_put_into_the_place_only(tmp_path: Path) -> None:
+def test_the_name_of_a_robot_is_put_into_the_place_only(tmp_path):
     text = "targets: {nav: {to: 'robot@{robot}.local:calib', run: 'echo {robot}'}}"
     (target,) = read_targets(write(tmp_path / "deploy.yaml", text)).values()
     own = target.for_robot("r17")

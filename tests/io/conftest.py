@@ -1,25 +1,18 @@
 """Real bags of any kind, and small rooms for LiDARs to look at."""
 
-from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
-from lce_rig.rig import Rig, load_rig
-
-Message = tuple[str, str, int, dict[str, Any]]
-"""Topic, type ("Image"), time of receipt in ns, fields."""
+from lce_rig.rig import load_rig
 
 
 @pytest.fixture(scope="session")
-def rig() -> Rig:
+def rig():
     return load_rig("rlfs")
 
 
 @pytest.fixture(scope="session")
-def room() -> np.ndarray:
+def room():
     """A sweep of 16 rings in a round room, firing order, structured with the usual fields."""
     azimuth = np.linspace(np.pi, -np.pi, 360, endpoint=False)
     elevation = np.radians(np.arange(-15, 16, 2))
@@ -33,13 +26,13 @@ def room() -> np.ndarray:
     return cloud.ravel()
 
 
-def _typestore(kind: str) -> Any:
+def _typestore(kind):
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
 
 
-def _build(store: Any, msgtype: str, fields: dict[str, Any]) -> Any:
+def _build(store, msgtype, fields):
     """Build a message, its header from `stamp_ns`, its fields from plain values."""
     types = store.types
     fields = dict(fields)
@@ -61,17 +54,17 @@ def _build(store: Any, msgtype: str, fields: dict[str, Any]) -> Any:
 
 
 @pytest.fixture(scope="session")
-def write_bag() -> Callable[[Path, str, Iterable[Message]], Path]:
+def write_bag():
     """Write a bag: kind "ros1", "sqlite3" or "mcap"; returns the file, or the folder for ROS 2."""
 
-    def write(path: Path, kind: str, messages: Iterable[Message], compression: str = "") -> Path:
+    def write(path, kind, messages, compression=""):
         from rosbags.rosbag1 import Writer as Writer1
         from rosbags.rosbag2 import StoragePlugin
         from rosbags.rosbag2 import Writer as Writer2
 
         store = _typestore(kind)
         if kind == "ros1":
-            writer: Any = Writer1(path.with_suffix(".bag"))
+            writer = Writer1(path.with_suffix(".bag"))
         else:
             writer = Writer2(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
         if compression and kind == "ros1":
@@ -81,7 +74,7 @@ def write_bag() -> Callable[[Path, str, Iterable[Message]], Path]:
 
             writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
         with writer:
-            connections: dict[str, Any] = {}
+            connections = {}
             for topic, msgtype, log_ns, fields in messages:
                 full = f"sensor_msgs/msg/{msgtype}"
                 if topic not in connections:
@@ -95,11 +88,11 @@ def write_bag() -> Callable[[Path, str, Iterable[Message]], Path]:
 
 
 @pytest.fixture(scope="session")
-def cloud_message() -> Callable[..., dict[str, Any]]:
+def cloud_message():
     """Lay a structured cloud out as a PointCloud2."""
     codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
-    def build(cloud: np.ndarray, stamp_ns: int) -> dict[str, Any]:
+    def build(cloud, stamp_ns):
         fields = [(name, place, codes[kind.str[1:]], 1) for name, (kind, place) in cloud.dtype.fields.items()]
         return {
             "stamp_ns": stamp_ns, "height": 1, "width": len(cloud), "is_bigendian": False, "fields": fields,
@@ -111,10 +104,10 @@ def cloud_message() -> Callable[..., dict[str, Any]]:
 
 
 @pytest.fixture(scope="session")
-def image_message() -> Callable[..., dict[str, Any]]:
+def image_message():
     """Build an Image message from pixels."""
 
-    def build(pixels: np.ndarray, stamp_ns: int, encoding: str = "bgr8") -> dict[str, Any]:
+    def build(pixels, stamp_ns, encoding="bgr8"):
         height, width = pixels.shape[:2]
         data = np.frombuffer(pixels.tobytes(), np.uint8)
         return {"stamp_ns": stamp_ns, "height": height, "width": width, "encoding": encoding,

@@ -1,22 +1,19 @@
 """What a rig delivers, as samples of noise that are quick to make, and a bag of them read back."""
 
-from pathlib import Path
-
 import numpy as np
 
-from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.io import open_recording
 from lce_rig.io.events import open_events
-from lce_rig.io.protocol import ContinuousRecording, SourceOptions
+from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.rig import Rig
 
 T0_NS = 1_700_000_000_123_456_789
 KINDS = ["recording.bag", "recording"]
 """A bag of ROS 1, and one of ROS 2."""
 
 
-def sweep(k: int) -> Scan:
+def sweep(k):
     """A scan of a round room in the order of firing, at 10 Hz, that arrives when it is complete."""
     azimuth = np.linspace(np.pi, -np.pi, 400, endpoint=False).repeat(16)
     ring = np.tile(np.arange(16), 400)
@@ -31,13 +28,13 @@ def sweep(k: int) -> Scan:
     )
 
 
-def picture(k: int, shape: tuple[int, ...] = (260, 346)) -> Image:
+def picture(k, shape=(260, 346)):
     pixels = np.random.default_rng(k).integers(0, 256, shape, dtype=np.uint8)
     stamp_ns = T0_NS + k * 50_000_001
     return Image("davis", "frames", stamp_ns, pixels, stamp_ns + 7_000_000)
 
 
-def packet(k: int, n: int = 4000) -> Events:
+def packet(k, n=4000):
     """20 ms of events, whole microseconds."""
     rng = np.random.default_rng(k)
     t_ns = (T0_NS // 1000 + k * 20_000 + np.sort(rng.integers(0, 20_000, n))) * 1000
@@ -45,27 +42,27 @@ def packet(k: int, n: int = 4000) -> Events:
     return Events("davis", t_ns, x, y, rng.random(n) < 0.5, 346, 260, int(t_ns[0]) + 3_000_000)
 
 
-def one_second(n_events: int = 4000) -> list[Sample]:
+def one_second(n_events=4000):
     """Everything a rig delivers in a second, in the order of arrival; so many events in each packet."""
     packets = [packet(k, n_events) for k in range(50)]
-    samples: list[Sample] = [*map(sweep, range(10)), *map(picture, range(20)), *packets]
+    samples = [*map(sweep, range(10)), *map(picture, range(20)), *packets]
     return sorted(samples, key=lambda sample: sample.host_ns or 0)
 
 
-def record(path: Path, rig: Rig, samples: list[Sample]) -> Path:
+def record(path, rig, samples):
     with BagRecorder(path, rig) as recorder:
         for sample in samples:
             recorder.write(sample)
     return path
 
 
-def read(path: Path, rig: Rig, options: SourceOptions | None = None) -> tuple[list[Image], list[Scan]]:
+def read(path, rig, options=None):
     recording = open_recording(path, rig, options)
     assert isinstance(recording, ContinuousRecording)
     samples = list(recording.samples())
     return [s for s in samples if isinstance(s, Image)], [s for s in samples if isinstance(s, Scan)]
 
 
-def read_events(path: Path) -> dict[str, np.ndarray]:
+def read_events(path):
     parts = list(open_events(path, sensor="davis", resolution=(346, 260)))
     return {n: np.concatenate([getattr(p, n) for p in parts]) for n in ("t_ns", "x", "y", "polarity")}

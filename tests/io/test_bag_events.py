@@ -1,19 +1,17 @@
 """Raw events in bags beside pictures and scans: topics, order, clocks, and what may be wrong with them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image, Sample, Scan, Stream
+from lce_rig.core.data import Events, Image, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import open_bag_writer
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from lce_rig.timing.rig_time import rig_time_ns
-from tests.io.events import encoders
 from tests.io.events.encoders import listed
 from tests.notes import has_note
 from tests.shared import changed
@@ -24,28 +22,26 @@ SIZE = (346, 260)
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return load_rig("rles")
 
 
-def opened(path: Path, rig: Rig, **options: object) -> ContinuousRecording:
+def opened(path, rig, **options):
     recording = open_recording(path, rig, SourceOptions(**options))
     assert isinstance(recording, ContinuousRecording)
     return recording
 
 
-def events_of(samples: list[Sample]) -> list[encoders.Event]:
+def events_of(samples):
     return [event for sample in samples if isinstance(sample, Events) for event in listed(sample)]
 
 
-def with_topic(rig: Rig, topic: str | None) -> Rig:
+def with_topic(rig, topic):
     return changed(rig, cameras__davis__channels__events__topic=topic)
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(
-    tmp_path: Path, rig: Rig, name: str
-) -> None:
+def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(tmp_path, rig, name):
     given = one_second()
     recording = opened(record(tmp_path / name, rig, given), rig)
     samples = list(recording.samples())
@@ -61,14 +57,14 @@ def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(
     assert (np.maximum.accumulate(times_ns) - times_ns).max() <= 110_000_000
 
 
-def test_a_topic_of_pictures_that_others_reconstructed_is_read_as_such(tmp_path: Path, rig: Rig) -> None:
+def test_a_topic_of_pictures_that_others_reconstructed_is_read_as_such(tmp_path, rig):
     images = [replace(picture(k), channel="events") for k in range(3)]
     recording = opened(record(tmp_path / "r.bag", rig, [*images, sweep(0), sweep(1)]), rig)
     assert [s.channel for s in recording.samples() if isinstance(s, Image)] == ["events"] * 3
     assert recording.streams == {Stream("davis", "events", "images"), Stream("lidar", "", "scans")}
 
 
-def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path: Path, rig: Rig) -> None:
+def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path, rig):
     path = record(tmp_path / "r.bag", rig, one_second(50))
     open_rig = with_topic(rig, None)
     recording = opened(path, open_rig)
@@ -81,7 +77,7 @@ def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path
             opened(path, rig, topics={"davis.events": wrong})
 
 
-def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_path: Path, rig: Rig) -> None:
+def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_path, rig):
     samples = one_second(50)
     for name, kind in (("events", Events), ("scans", Scan), ("images", Image)):
         path = record(tmp_path / f"{name}.bag", rig, [s for s in samples if isinstance(s, kind)])
@@ -96,11 +92,11 @@ def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_pat
     assert has_note([caught.value.hint], "/velodyne_points", "PointCloud2, 1")
 
 
-def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path: Path, rig: Rig) -> None:
+def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path, rig):
     from lce_rig.io.ros.bag_recorder import encode_image, encode_scan
     from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, typestore
 
-    def write(path: Path, has_pictures: bool) -> Path:
+    def write(path, has_pictures):
         with open_bag_writer(path) as writer:
             store = typestore(True)
             writer.add_connection("/davis/events", EVENT_ARRAY_TYPE, typestore=store)

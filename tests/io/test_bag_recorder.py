@@ -2,7 +2,6 @@
 
 import tracemalloc
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,19 +10,19 @@ from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from tests.shared import changed, files_up_to
 
 from .rig_samples import KINDS, T0_NS, one_second, packet, picture, read, read_events, record, sweep
 
 
 @pytest.fixture(scope="module")
-def rles() -> Rig:
+def rles():
     return load_rig("rles")
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_samples_come_back_as_they_were(tmp_path: Path, rles: Rig, name: str) -> None:
+def test_samples_come_back_as_they_were(tmp_path, rles, name):
     samples = one_second()
     path = record(tmp_path / name, rles, samples)
     images, scans = read(path, rles)
@@ -44,7 +43,7 @@ def test_samples_come_back_as_they_were(tmp_path: Path, rles: Rig, name: str) ->
         assert np.array_equal(found_column, np.concatenate([getattr(p, column) for p in events])), column
 
 
-def test_colour_pictures_and_scans_without_times_come_back_too(tmp_path: Path, rles: Rig) -> None:
+def test_colour_pictures_and_scans_without_times_come_back_too(tmp_path, rles):
     colour = picture(0, (20, 30, 3))
     given = replace(sweep(0), offset_ns=None, host_ns=None)
     images, scans = read(record(tmp_path / "r.bag", rles, [colour, given]), rles)
@@ -54,7 +53,7 @@ def test_colour_pictures_and_scans_without_times_come_back_too(tmp_path: Path, r
 
 
 @pytest.mark.parametrize("has_times", [True, False])
-def test_stamps_mark_the_firing_that_the_profile_says(tmp_path: Path, rles: Rig, has_times: bool) -> None:
+def test_stamps_mark_the_firing_that_the_profile_says(tmp_path, rles, has_times):
     rig = changed(rles, lidars__lidar__timestamps__reference="last_firing")
     given = sweep(3) if has_times else replace(sweep(3), offset_ns=None)
     _, (found,) = read(record(tmp_path / "r.bag", rig, [picture(0), given]), rig)
@@ -62,15 +61,13 @@ def test_stamps_mark_the_firing_that_the_profile_says(tmp_path: Path, rles: Rig,
 
 
 @pytest.mark.parametrize("path", ["no/folder/r.bag", "file/r"])
-def test_places_where_no_bag_can_be_are_refused(tmp_path: Path, rles: Rig, path: str) -> None:
+def test_places_where_no_bag_can_be_are_refused(tmp_path, rles, path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(SourceError, match=path):
         BagRecorder(tmp_path / path, rles)
 
 
-def test_samples_that_the_profile_does_not_know_are_refused_and_the_others_kept(
-    tmp_path: Path, rles: Rig
-) -> None:
+def test_samples_that_the_profile_does_not_know_are_refused_and_the_others_kept(tmp_path, rles):
     with BagRecorder(tmp_path / "r.bag", rles) as recorder:
         recorder.write(picture(0))
         for stranger, name in (
@@ -92,7 +89,7 @@ def test_samples_that_the_profile_does_not_know_are_refused_and_the_others_kept(
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_memory_stays_flat_however_long_it_records(tmp_path: Path, rles: Rig, name: str) -> None:
+def test_memory_stays_flat_however_long_it_records(tmp_path, rles, name):
     image, scan, events = picture(0), sweep(0), packet(0)
     with BagRecorder(tmp_path / name, rles) as recorder:
         recorder.write(image)
@@ -112,7 +109,7 @@ def test_memory_stays_flat_however_long_it_records(tmp_path: Path, rles: Rig, na
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_full_disk_stops_the_recording(tmp_path: Path, rles: Rig, name: str) -> None:
+def test_a_full_disk_stops_the_recording(tmp_path, rles, name):
     samples = [*map(sweep, range(5)), *map(picture, range(50))]
     n_taken = 0
     with files_up_to(3_000_000), BagRecorder(tmp_path / name, rles) as recorder:

@@ -1,7 +1,6 @@
 """Files of an event camera's own recorder as recordings: events, frames, and what may be wrong with them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from lce_rig.core.data import Events, Image, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.io.protocol import ContinuousRecording, serials_of
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from tests.io.events import encoders
 from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 from tests.io.events.encoders import listed, random_events
@@ -27,25 +26,25 @@ EVENT_STREAM, FRAME_STREAM = Stream("davis", "events", "events"), Stream("davis"
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return load_rig("rles")
 
 
-def opened(path: Path, rig: Rig, **options: object) -> ContinuousRecording:
+def opened(path, rig, **options):
     recording = open_recording(path, rig, SourceOptions(**options))
     assert isinstance(recording, ContinuousRecording)
     return recording
 
 
-def events_of(recording: ContinuousRecording) -> list[encoders.Event]:
+def events_of(recording):
     return [event for s in recording.samples() if isinstance(s, Events) for event in listed(s)]
 
 
-def images_of(recording: ContinuousRecording) -> list[Image]:
+def images_of(recording):
     return [s for s in recording.samples() if isinstance(s, Image)]
 
 
-def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path: Path, rig: Rig) -> None:
+def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path, rig):
     recording = opened(write_davis(tmp_path / "a.aedat4", PIECES, FRAMES), rig)
     assert (recording.n_samples, set(recording.streams)) == (5, {EVENT_STREAM, FRAME_STREAM})
     assert events_of(recording) == listed(EVENTS)
@@ -56,15 +55,13 @@ def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path: 
     assert has_note(recording.notes, "a.aedat4", "davis.frames", "mid exposure", "8.0 ms")
 
 
-def test_frames_alone_are_a_recording_too(tmp_path: Path, rig: Rig) -> None:
+def test_frames_alone_are_a_recording_too(tmp_path, rig):
     recording = opened(write_davis(tmp_path / "a.aedat4", [], FRAMES), rig)
     assert set(recording.streams) == {FRAME_STREAM} and len(images_of(recording)) == 5
     assert has_note(recording.notes, "no stream")
 
 
-def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(
-    tmp_path: Path, rig: Rig
-) -> None:
+def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(tmp_path, rig):
     channels = {"events": rig.cameras["davis"].channels["events"]}
     path = write_davis(tmp_path / "a.aedat4", PIECES, FRAMES)
     recording = opened(path, changed(rig, cameras__davis__channels=channels))
@@ -72,7 +69,7 @@ def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(
     assert has_note(recording.notes, "frames skipped", "davis", "no channel")
 
 
-def test_frames_out_of_order_are_left_out_and_counted(tmp_path: Path, rig: Rig) -> None:
+def test_frames_out_of_order_are_left_out_and_counted(tmp_path, rig):
     path = write_davis(
         tmp_path / "a.aedat4", PIECES, [FRAMES[0], replace(FRAMES[1], exposure_us=-90_000), FRAMES[2]]
     )
@@ -82,12 +79,12 @@ def test_frames_out_of_order_are_left_out_and_counted(tmp_path: Path, rig: Rig) 
 
 
 @pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.raw", "a.txt"])
-def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path: Path, rig: Rig, name: str) -> None:
+def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path, rig, name):
     WRITERS[name](tmp_path / name, EVENTS)
     assert len(events_of(opened(tmp_path / name, rig))) == len(EVENTS)
 
 
-def test_serial_numbers_in_heads_of_files_are_told(tmp_path: Path, rig: Rig) -> None:
+def test_serial_numbers_in_heads_of_files_are_told(tmp_path, rig):
     write_aedat4(tmp_path / "a.aedat4", [EVENTS], "DAVIS346_00000499")
     local = [(t - T0_US, x, y, p) for t, x, y, p in listed(EVENTS)]
     head = b"% evt 3.0\n% geometry 346x260\n% serial_number 00050423\n% end\n"
@@ -97,7 +94,7 @@ def test_serial_numbers_in_heads_of_files_are_told(tmp_path: Path, rig: Rig) -> 
     assert found == [{"davis": "00000499"}, {"davis": "00050423"}, {}]
 
 
-def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path: Path, rig: Rig) -> None:
+def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path, rig):
     write_aedat4(tmp_path / "none.aedat4", [])
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     with pytest.raises(SourceError, match=r"none\.aedat4"):
@@ -111,7 +108,7 @@ def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path: 
         opened(tmp_path / "a.aedat4", rig, camera="left")
 
 
-def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path: Path, rig: Rig) -> None:
+def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path, rig):
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     both = changed(rig, cameras__right=rig.cameras["davis"])
     assert has_note(opened(tmp_path / "a.aedat4", both).notes, "events assigned", "camera davis")
@@ -119,7 +116,7 @@ def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path: Pa
     assert {s.sensor for s in right.samples()} == {"right"} and next(iter(right.streams)).sensor == "right"
 
 
-def test_a_file_that_ends_in_a_packet_gives_what_comes_before(tmp_path: Path, rig: Rig) -> None:
+def test_a_file_that_ends_in_a_packet_gives_what_comes_before(tmp_path, rig):
     whole = write_davis(tmp_path / "whole.aedat4", PIECES, FRAMES).read_bytes()
     (tmp_path / "torn.aedat4").write_bytes(whole[: len(whole) * 3 // 5])
     recording = opened(tmp_path / "torn.aedat4", rig)

@@ -106,7 +106,7 @@ def test_ply_without_all_its_vertices_is_refused(tmp_path, data):
         read_cloud(tmp_path / "a.ply")
 
 
-def las() -> bytes:
+def las():
     header = laspy.LasHeader(point_format=3, version="1.2")
     header.scales = np.full(3, 0.0005)
     header.add_extra_dim(laspy.ExtraBytesParams("Ring", np.uint8))

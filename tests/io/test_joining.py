@@ -1,18 +1,17 @@
 """Recordings of one moment by several recorders: which belong together, and in what order they are read."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image, Sample, Scan, Stream
+from lce_rig.core.data import Events, Image, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.io.joining import JoinedRecording, check_overlap, join_recordings, merge_by_time, require_sensors
 from lce_rig.io.protocol import ContinuousRecording
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from tests.notes import has_note
 from tests.shared import changed
 
@@ -22,7 +21,7 @@ LIDAR = Stream("lidar", "", "scans")
 FRAMES, EVENTS = Stream("davis", "frames", "images"), Stream("davis", "events", "events")
 
 
-def sample(stream: Stream, time_s: float) -> Sample:
+def sample(stream, time_s):
     stamp_ns = T0_NS + round(time_s * S)
     if stream.kind == "images":
         return Image(stream.sensor, stream.channel, stamp_ns, np.zeros((2, 2), np.uint8))
@@ -43,12 +42,12 @@ class Listed:
     torn: str = ""
     notes: list[str] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         self.path, self.key = Path(self.name), self.name
         self.n_samples = sum(stream.kind != "events" for stream, _ in self.contents)
         self.streams = {stream for stream, _ in self.contents}
 
-    def samples(self) -> Iterator[Sample]:
+    def samples(self):
         yield from (sample(stream, time_s) for stream, time_s in self.contents)
         self.notes.append(f"{self.name} was read")
         if self.torn:
@@ -56,30 +55,30 @@ class Listed:
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return load_rig("rles")
 
 
-def lidar(name: str = "lidar.bag", step_s: float = 0.1, **kwargs: object) -> Listed:
+def lidar(name="lidar.bag", step_s=0.1, **kwargs):
     return Listed(name, [(LIDAR, k * step_s) for k in range(3)], **kwargs)
 
 
-def camera(name: str = "events.aedat4", after_s: float = 0.0) -> Listed:
+def camera(name="events.aedat4", after_s=0.0):
     contents = [(EVENTS, 0.01), (FRAMES, 0.05), (EVENTS, 0.12), (FRAMES, 0.15)]
     return Listed(name, [(stream, time_s + after_s) for stream, time_s in contents])
 
 
-def whole(name: str, *more: Stream) -> Listed:
+def whole(name, *more):
     return Listed(name, [(stream, 0.1 * k) for k, stream in enumerate((LIDAR, FRAMES, *more))])
 
 
-def names(recordings: list[object]) -> list[list[str]]:
+def names(recordings):
     return [
         [part.name for part in r._parts] if isinstance(r, JoinedRecording) else [r.name] for r in recordings
     ]
 
 
-def test_each_recording_joins_those_before_it_that_lack_its_sensors(rig: Rig) -> None:
+def test_each_recording_joins_those_before_it_that_lack_its_sensors(rig):
     events_only = Listed("e", [(EVENTS, 0.0)])
     for given, wanted in [
         ([lidar(), camera()], [["lidar.bag", "events.aedat4"]]),
@@ -94,14 +93,14 @@ def test_each_recording_joins_those_before_it_that_lack_its_sensors(rig: Rig) ->
         assert names(join_recordings(given, rig)) == wanted
 
 
-def test_a_copy_of_what_is_there_already_is_left_out_and_it_is_said(rig: Rig) -> None:
+def test_a_copy_of_what_is_there_already_is_left_out_and_it_is_said(rig):
     (joined,) = join_recordings([whole("a.bag", EVENTS), camera("c.aedat4")], rig)
     assert isinstance(joined, JoinedRecording)
     assert has_note(joined.notes, "davis.events", "a.bag, not", "c.aedat4")
     assert len(list(joined.samples())) == 3
 
 
-def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rig: Rig) -> None:
+def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rig):
     (joined,) = join_recordings([lidar(), camera()], rig)
     assert isinstance(joined, ContinuousRecording)
     kinds = [type(s).__name__ for s in joined.samples()]
@@ -114,7 +113,7 @@ def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rig: Rig
     assert kinds == ["Image", "Scan", "Image", "Scan", "Scan"]
 
 
-def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rig: Rig) -> None:
+def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rig):
     one, other = JoinedRecording([lidar(), camera()], rig), JoinedRecording([camera(), lidar()], rig)
     assert one.key == other.key != JoinedRecording([lidar(), camera("x")], rig).key
 
@@ -126,7 +125,7 @@ def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rig: Rig)
         (-1_699_999_999.0, ["one computer's"]),
     ],
 )
-def test_clocks_that_do_not_overlap_are_said_by_how_much(rig: Rig, after_s: float, words: list[str]) -> None:
+def test_clocks_that_do_not_overlap_are_said_by_how_much(rig, after_s, words):
     joined = JoinedRecording([lidar(), camera(after_s=after_s)], rig)
     passed = []
     with pytest.raises(SourceError) as caught:
@@ -135,13 +134,13 @@ def test_clocks_that_do_not_overlap_are_said_by_how_much(rig: Rig, after_s: floa
     assert len(passed) == 7 and all(word in caught.value.hint for word in words)
 
 
-def test_a_partial_overlap_is_noted(rig: Rig) -> None:
+def test_a_partial_overlap_is_noted(rig):
     joined = JoinedRecording([lidar(step_s=15.0), camera(after_s=20.0)], rig)
     assert len(list(check_overlap(joined.samples(), rig, joined.notes))) == 7
     assert has_note(joined.notes, "davis.events", "0.1 of", "30.0 s", "lidar's")
 
 
-def test_a_part_that_is_torn_does_not_end_the_others(rig: Rig) -> None:
+def test_a_part_that_is_torn_does_not_end_the_others(rig):
     torn = lidar(torn="lidar.bag is damaged")
     found = []
     with pytest.raises(SourceError, match=r"lidar\.bag"):
@@ -150,7 +149,7 @@ def test_a_part_that_is_torn_does_not_end_the_others(rig: Rig) -> None:
     assert len(found) == 7
 
 
-def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rig: Rig) -> None:
+def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rig):
     require_sensors(JoinedRecording([lidar(), camera()], rig))
     with pytest.raises(SourceError, match=r"events\.aedat4"):
         require_sensors(camera())
@@ -159,7 +158,7 @@ def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rig
     assert re.findall(r"--from (\S+\w)", caught.value.hint) == ["lidar.bag", "events.aedat4"]
 
 
-def test_samples_without_stamps_stay_where_they_are_in_their_own_stream(rig: Rig) -> None:
+def test_samples_without_stamps_stay_where_they_are_in_their_own_stream(rig):
     image = sample(FRAMES, 0.05)
     assert isinstance(image, Image)
     timeless = replace(image, stamp_ns=None)

@@ -1,6 +1,5 @@
 """Bags of Livox drivers: their own messages, point clouds with tags, and scans that are accumulated."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from lce_rig.core.data import NO_RING, Scan
 from lce_rig.io import open_recording
 from lce_rig.io.cloud import to_scan
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from tests.shared import changed
 
 T0_NS = 1_700_000_000 * 10**9
@@ -28,7 +27,7 @@ uint8[3] rsvd
 CustomPoint[] points"""
 
 
-def write_custom(path: Path, package: str, n: int, is_ros1: bool) -> Path:
+def write_custom(path, package, n, is_ros1):
     """Write n messages of a Livox driver at 10 Hz; every fifth point is tagged as noise."""
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(POINT, f"{package}/msg/CustomPoint"))
@@ -59,20 +58,18 @@ def write_custom(path: Path, package: str, n: int, is_ros1: bool) -> Path:
     return path.with_suffix(".bag") if is_ros1 else path
 
 
-def scans_of(path: Path, rig: Rig) -> list[Scan]:
+def scans_of(path, rig):
     recording = open_recording(path, rig, SourceOptions(is_part=True))
     assert isinstance(recording, ContinuousRecording)
     return [sample for sample in recording.samples() if isinstance(sample, Scan)]
 
 
-def of_model(model: str, **changes: Any) -> Rig:
+def of_model(model, **changes):
     return changed(load_rig("mid360"), lidars__lidar__model=model, **changes)
 
 
 @pytest.mark.parametrize(("package", "is_ros1"), [("livox_ros_driver", True), ("livox_ros_driver2", False)])
-def test_messages_of_both_drivers_are_read_without_noise_and_accumulated(
-    tmp_path: Path, package: str, is_ros1: bool
-) -> None:
+def test_messages_of_both_drivers_are_read_without_noise_and_accumulated(tmp_path, package, is_ros1):
     path = write_custom(tmp_path / "bag", package, 25, is_ros1)
     scans = scans_of(path, of_model("Avia"))
     # At one scan per second: two whole ones, and what is left.
@@ -87,7 +84,7 @@ def test_messages_of_both_drivers_are_read_without_noise_and_accumulated(
 
 
 @pytest.mark.parametrize(("model", "n_kept"), [("Avia", 160), ("Mid-360", 80), ("unstructured", 160)])
-def test_tags_are_read_as_the_model_means_them_and_may_be_missing(model: str, n_kept: int) -> None:
+def test_tags_are_read_as_the_model_means_them_and_may_be_missing(model, n_kept):
     index = np.arange(N_POINTS)
     cloud = np.zeros(N_POINTS, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("tag", "u1"), ("timestamp", "f8")])
     cloud["x"], cloud["y"], cloud["tag"] = 3.0, 0.01 * index, 16 * (index % 2) + (index % 5 == 2)

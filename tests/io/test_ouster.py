@@ -6,7 +6,6 @@ the metadata in it, and the points (16, 16, 3) that its XYZLut gives.
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +16,9 @@ from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.network import Datagram, PcapWriter
-from lce_rig.io.ouster import PROFILES, OusterMetadata, OusterRecording, read_metadata
+from lce_rig.io.ouster import PROFILES, OusterRecording, read_metadata
 from lce_rig.io.protocol import SourceOptions
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from tests.damage import damaged
 
 KEPT = np.load(Path(__file__).parent / "ouster_packets.npz")
@@ -28,18 +27,18 @@ T0_NS = 1_700_000_000 * 10**9
 
 
 @pytest.fixture
-def rig() -> Rig:
+def rig():
     return load_rig("os1_64")
 
 
-def write_metadata(path: Path, profile: str, **changes: Any) -> OusterMetadata:
+def write_metadata(path, profile, **changes):
     layout = {**DOCUMENT["data_format"], "udp_profile_lidar": profile}
     path.write_text(json.dumps({**DOCUMENT, "data_format": layout, **changes}))
     return read_metadata(path)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_points_are_those_of_ousters_own_library(tmp_path: Path, profile: str) -> None:
+def test_points_are_those_of_ousters_own_library(tmp_path, profile):
     metadata = write_metadata(tmp_path / "metadata.json", profile)
     payload = KEPT[f"{profile}_packet"].tobytes()
     assert metadata.packet.itemsize == len(payload)
@@ -53,7 +52,7 @@ def test_points_are_those_of_ousters_own_library(tmp_path: Path, profile: str) -
     np.testing.assert_allclose(points[range_m > 0], wanted[range_m > 0], atol=1e-5)
 
 
-def test_metadata_in_groups_as_newer_sensors_write_them_are_the_same(tmp_path: Path) -> None:
+def test_metadata_in_groups_as_newer_sensors_write_them_are_the_same(tmp_path):
     flat = write_metadata(tmp_path / "flat.json", "LEGACY")
     beams = ("beam_altitude_angles", "beam_azimuth_angles", "beam_to_lidar_transform")
     document = {
@@ -68,7 +67,7 @@ def test_metadata_in_groups_as_newer_sensors_write_them_are_the_same(tmp_path: P
     assert (groups.origin_m, groups.packet) == (flat.origin_m, flat.packet)
 
 
-def write_pcap(path: Path, metadata: OusterMetadata, n_frames: float, range_m: float = 4.0) -> None:
+def write_pcap(path, metadata, n_frames, range_m=4.0):
     """Record whole frames of a sensor in the middle of a sphere."""
     profile = PROFILES[metadata.name]
     per, step_ns = metadata.columns_per_packet, 10**8 // metadata.n_columns
@@ -91,7 +90,7 @@ def write_pcap(path: Path, metadata: OusterMetadata, n_frames: float, range_m: f
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_a_pcap_gives_one_scan_a_frame(tmp_path: Path, rig: Rig, profile: str) -> None:
+def test_a_pcap_gives_one_scan_a_frame(tmp_path, rig, profile):
     metadata = write_metadata(tmp_path / "drive.json", profile)
     write_pcap(tmp_path / "drive.pcap", metadata, 2.25)
     recording = open_recording(tmp_path / "drive.pcap", rig, SourceOptions(is_part=True))
@@ -109,7 +108,7 @@ def test_a_pcap_gives_one_scan_a_frame(tmp_path: Path, rig: Rig, profile: str) -
     assert scan.offset_ns.max() == pytest.approx(10**8, rel=0.01)
 
 
-def test_what_is_missing_or_not_read_is_named(tmp_path: Path, rig: Rig) -> None:
+def test_what_is_missing_or_not_read_is_named(tmp_path, rig):
     path = tmp_path / "drive.pcap"
     write_pcap(path, write_metadata(tmp_path / "drive.json", "LEGACY"), 0.1)
     with pytest.raises(SourceError):
@@ -135,9 +134,7 @@ def test_what_is_missing_or_not_read_is_named(tmp_path: Path, rig: Rig) -> None:
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(data=st.data())
-def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(
-    tmp_path: Path, rig: Rig, data: st.DataObject
-) -> None:
+def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(tmp_path, rig, data):
     path = tmp_path / "drive.pcap"
     path.unlink(missing_ok=True)
     write_pcap(path, write_metadata(tmp_path / "drive.json", "LEGACY"), 1.0)

@@ -2,13 +2,11 @@
 
 import struct
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from wire.vlp16_packets import SensorPacket
 
 from lce_rig.core.data import Scan, Stream
 from lce_rig.core.errors import SourceError
@@ -16,7 +14,6 @@ from lce_rig.io import open_recording
 from lce_rig.io.network import Datagram, PcapFile, PcapWriter, build_frame
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
 from lce_rig.io.velodyne_scans import PcapRecording
-from lce_rig.rig import Rig
 from tests.damage import damaged
 from tests.notes import has_note
 from tests.shared import changed
@@ -27,27 +24,27 @@ SENSOR = "192.168.1.201"
 IP_AT = 14
 
 
-def to_datagram(packet: SensorPacket, source: str = SENSOR) -> Datagram:
+def to_datagram(packet, source=SENSOR):
     return Datagram(packet.sent_ns + NETWORK_NS, source, packet.port, packet.port, packet.payload)
 
 
 @pytest.fixture(scope="module")
-def datagrams() -> list[Datagram]:
+def datagrams():
     return [to_datagram(packet) for packet in packets_of(room_scans(3))]
 
 
 @pytest.fixture(scope="module")
-def frames(datagrams: list[Datagram]) -> list[tuple[int, bytes]]:
+def frames(datagrams):
     """Arrival and Ethernet frame of each packet."""
     return [(datagram.host_ns, build_frame(datagram)) for datagram in datagrams]
 
 
-def read(path: Path, rig: Rig) -> tuple[list[Scan], list[str]]:
+def read(path, rig):
     recording = PcapRecording(path, rig, SourceOptions())
     return list(recording.samples()), recording.notes
 
 
-def check_scans(scans: list[Scan]) -> None:
+def check_scans(scans):
     truth = room_scans(3)
     assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in truth]
     for scan, true in zip(scans, truth, strict=True):
@@ -55,13 +52,7 @@ def check_scans(scans: list[Scan]) -> None:
         assert np.linalg.norm(scan.points - true.points, axis=1).max() < 2e-3
 
 
-def write_pcap(
-    path: Path,
-    frames: list[tuple[int, bytes]],
-    *,
-    link: int = 1,
-    snaplen: int = 65535,
-) -> Path:
+def write_pcap(path, frames, *, link=1, snaplen=65535):
     parts = [struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, snaplen, link)]
     for host_ns, frame in frames:
         seconds, ns = divmod(host_ns, 10**9)
@@ -71,13 +62,13 @@ def write_pcap(
     return path
 
 
-def block(kind: int, body: bytes) -> bytes:
+def block(kind, body):
     body += bytes(-len(body) % 4)
     length = 12 + len(body)
     return struct.pack("<II", kind, length) + body + struct.pack("<I", length)
 
 
-def write_pcapng(path: Path, frames: list[tuple[int, bytes]]) -> Path:
+def write_pcapng(path, frames):
     """A card whose stamps are in units of 2**-20 s."""
     resolution = struct.pack("<HHB3x", 9, 1, 0x80 | 20) + struct.pack("<HH", 0, 0)
     parts = [
@@ -107,21 +98,17 @@ LINKS: dict[str, tuple[int, Callable[[bytes], bytes]]] = {
 
 
 @pytest.mark.parametrize("name", sorted(LINKS))
-def test_every_link_type_gives_the_same_scans(
-    name: str, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
-) -> None:
+def test_every_link_type_gives_the_same_scans(name, frames, rig, tmp_path):
     link, wrap = LINKS[name]
     path = write_pcap(tmp_path / "a.pcap", [(ns, wrap(frame)) for ns, frame in frames], link=link)
     check_scans(read(path, rig)[0])
 
 
-def test_wiresharks_own_format_is_read(frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path) -> None:
+def test_wiresharks_own_format_is_read(frames, rig, tmp_path):
     check_scans(read(write_pcapng(tmp_path / "a.pcapng", frames), rig)[0])
 
 
-def test_what_the_writer_wrote_comes_back_byte_for_byte(
-    datagrams: list[Datagram], rig: Rig, tmp_path: Path
-) -> None:
+def test_what_the_writer_wrote_comes_back_byte_for_byte(datagrams, rig, tmp_path):
     path = tmp_path / "a.pcap"
     with PcapWriter(path) as writer:
         for datagram in datagrams:
@@ -133,9 +120,7 @@ def test_what_the_writer_wrote_comes_back_byte_for_byte(
         PcapWriter(path)
 
 
-def test_a_recording_is_found_by_its_suffix(
-    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
-) -> None:
+def test_a_recording_is_found_by_its_suffix(frames, rig, tmp_path):
     recording = open_recording(write_pcap(tmp_path / "a.PCAP", frames), rig)
     assert isinstance(recording, ContinuousRecording)
     assert recording.n_samples == 3
@@ -144,9 +129,7 @@ def test_a_recording_is_found_by_its_suffix(
     assert isinstance(part, ContinuousRecording) and part.key == recording.key
 
 
-def test_notes_say_what_was_taken_and_what_the_stamps_are(
-    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
-) -> None:
+def test_notes_say_what_was_taken_and_what_the_stamps_are(frames, rig, tmp_path):
     lossy = frames[:100] + frames[110:]
     n_lost = sum(len(frame) > 1206 for _, frame in frames[100:110])  # the others are of the LiDAR's state
     _, notes = read(write_pcap(tmp_path / "a.pcap", lossy), rig)
@@ -154,9 +137,7 @@ def test_notes_say_what_was_taken_and_what_the_stamps_are(
     assert 0 < n_lost <= 10 and has_note(notes, f"{n_lost} data packets", "lost")
 
 
-def test_a_torn_file_is_read_up_to_where_it_is_torn(
-    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
-) -> None:
+def test_a_torn_file_is_read_up_to_where_it_is_torn(frames, rig, tmp_path):
     whole = write_pcap(tmp_path / "a.pcap", frames).read_bytes()
     torn = tmp_path / "torn.pcap"
     for end, note in ((len(whole) - 1, "cut short"), (len(whole) - 1255, "read up to byte")):
@@ -174,9 +155,7 @@ def test_a_torn_file_is_read_up_to_where_it_is_torn(
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(data=st.data())
-def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(
-    suffix: str, frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path, data: st.DataObject
-) -> None:
+def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(suffix, frames, rig, tmp_path, data):
     path = tmp_path / f"a.{suffix}"
     whole = (write_pcap if suffix == "pcap" else write_pcapng)(path, frames[:90]).read_bytes()
     path.write_bytes(data.draw(damaged(whole)))
@@ -200,16 +179,14 @@ def test_any_beginning_and_any_flipped_byte_give_scans_or_a_source_error(
     ],
     ids=["empty", "text", "packed", "torn header", "no frames", "wireless", "pcapng of a wireless card"],
 )
-def test_recordings_of_no_wired_network_are_refused(content: bytes, rig: Rig, tmp_path: Path) -> None:
+def test_recordings_of_no_wired_network_are_refused(content, rig, tmp_path):
     path = tmp_path / "a.pcap"
     path.write_bytes(content)
     with pytest.raises(SourceError, match=path.name):
         read(path, rig)
 
 
-def test_of_several_sensors_the_profiles_is_taken(
-    datagrams: list[Datagram], rig: Rig, tmp_path: Path
-) -> None:
+def test_of_several_sensors_the_profiles_is_taken(datagrams, rig, tmp_path):
     both = [
         (d.host_ns, build_frame(Datagram(d.host_ns, source, d.port, d.port, d.payload)))
         for d in datagrams
@@ -222,9 +199,7 @@ def test_of_several_sensors_the_profiles_is_taken(
     assert all(address in caught.value.what for address in (SENSOR, "192.168.1.77"))
 
 
-def test_no_packets_whole_ones_or_whole_revolutions_are_errors(
-    frames: list[tuple[int, bytes]], rig: Rig, tmp_path: Path
-) -> None:
+def test_no_packets_whole_ones_or_whole_revolutions_are_errors(frames, rig, tmp_path):
     with pytest.raises(SourceError, match="243"):
         read(write_pcap(tmp_path / "a.pcap", frames, snaplen=96), rig)
     mdns = build_frame(Datagram(T0_NS, "10.0.0.1", 5353, 5353, b"mdns"))

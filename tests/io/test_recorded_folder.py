@@ -1,7 +1,5 @@
 """A folder that several recorders filled is read as one recording; other folders stay what they were."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -13,23 +11,23 @@ from lce_rig.io.joining import JoinedRecording, check_overlap, join_recordings
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 
 from .rig_samples import KINDS, T0_NS, one_second
 from .vlp16_room import NETWORK_NS, packets_of, room_scans
 
 
 @pytest.fixture(scope="module")
-def rles() -> Rig:
+def rles():
     return load_rig("rles")
 
 
 @pytest.fixture(scope="module")
-def rlfs() -> Rig:
+def rlfs():
     return load_rig("rlfs")
 
 
-def fill(folder: Path, rig: Rig, ros: int = 1) -> int:
+def fill(folder, rig, ros=1):
     """Record a second as `collect --record` does: packets apart, all else in a bag."""
     n_pictures = 0
     with BagRecorder.in_folder(folder, rig, ros) as recorder:
@@ -44,16 +42,14 @@ def fill(folder: Path, rig: Rig, ros: int = 1) -> int:
     return n_pictures
 
 
-def read(folder: Path, rig: Rig) -> ContinuousRecording:
+def read(folder, rig):
     (joined,) = join_recordings(open_recordings([folder], rig), rig)
     assert isinstance(joined, ContinuousRecording)
     return joined
 
 
 @pytest.mark.parametrize(("ros", "bag"), list(enumerate(KINDS, start=1)))
-def test_packets_pictures_and_events_of_a_folder_come_back_as_one_recording(
-    tmp_path: Path, rles: Rig, ros: int, bag: str
-) -> None:
+def test_packets_pictures_and_events_of_a_folder_come_back_as_one_recording(tmp_path, rles, ros, bag):
     folder = tmp_path / "kept"
     n_pictures = fill(folder, rles, ros)
     assert {each.name for each in folder.iterdir()} == {bag, "lidar.pcap"}
@@ -71,7 +67,7 @@ def test_packets_pictures_and_events_of_a_folder_come_back_as_one_recording(
         BagRecorder.in_folder(folder, rles, ros)
 
 
-def test_a_file_that_a_killed_recorder_left_empty_is_passed_over_and_named(tmp_path: Path, rles: Rig) -> None:
+def test_a_file_that_a_killed_recorder_left_empty_is_passed_over_and_named(tmp_path, rles):
     folder = tmp_path / "kept"
     fill(folder, rles)
     (folder / "events.aedat4").write_bytes(b"")
@@ -85,7 +81,7 @@ def test_a_file_that_a_killed_recorder_left_empty_is_passed_over_and_named(tmp_p
         open_recordings([folder], rles)
 
 
-def test_files_named_after_a_sensor_belong_to_it(tmp_path: Path, rles: Rig) -> None:
+def test_files_named_after_a_sensor_belong_to_it(tmp_path, rles):
     two = rles.model_copy(update={"lidars": {"left": rles.lidars["lidar"], "right": rles.lidars["lidar"]}})
     for name in ("recording.bag", "left.pcap", "right.pcap", "davis.aedat4", "notes.txt"):
         (tmp_path / name).touch()
@@ -110,7 +106,7 @@ def test_files_named_after_a_sensor_belong_to_it(tmp_path: Path, rles: Rig) -> N
     ],
     ids=["pictures and clouds", "a bag in pieces", "a bag of ROS 2", "all in one", "empty"],
 )
-def test_other_folders_are_read_as_a_whole(tmp_path: Path, rles: Rig, files: tuple[str, ...]) -> None:
+def test_other_folders_are_read_as_a_whole(tmp_path, rles, files):
     for name in files:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
@@ -120,7 +116,7 @@ def test_other_folders_are_read_as_a_whole(tmp_path: Path, rles: Rig, files: tup
     assert list_parts(lone, rles, options) == [(lone, options)]
 
 
-def fill_with_pictures(folder: Path, place: str = "webcam", n: int = 5, torn: int | None = None) -> None:
+def fill_with_pictures(folder, place="webcam", n=5, torn=None):
     """Record a second of packets, and pictures named after their times, ten a second."""
     pictures = folder / place
     pictures.mkdir(parents=True)
@@ -136,9 +132,7 @@ def fill_with_pictures(folder: Path, place: str = "webcam", n: int = 5, torn: in
 
 
 @pytest.mark.parametrize("paths", [["."], ["lidar.pcap", "webcam"], ["webcam", "lidar.pcap"]])
-def test_pictures_named_after_their_times_are_joined_with_packets(
-    tmp_path: Path, rlfs: Rig, paths: list[str]
-) -> None:
+def test_pictures_named_after_their_times_are_joined_with_packets(tmp_path, rlfs, paths):
     fill_with_pictures(tmp_path / "day", torn=3)
     (joined,) = join_recordings(open_recordings([tmp_path / "day" / p for p in paths], rlfs), rlfs)
     assert isinstance(joined, JoinedRecording)
@@ -151,7 +145,7 @@ def test_pictures_named_after_their_times_are_joined_with_packets(
     assert any(".350000.jpg" in note for note in joined.notes)
 
 
-def test_two_days_of_pictures_and_packets_stay_apart(tmp_path: Path, rlfs: Rig) -> None:
+def test_two_days_of_pictures_and_packets_stay_apart(tmp_path, rlfs):
     for day in ("monday", "tuesday"):
         fill_with_pictures(tmp_path / day)
     for file in (tmp_path / "tuesday/webcam").iterdir():
@@ -163,7 +157,7 @@ def test_two_days_of_pictures_and_packets_stay_apart(tmp_path: Path, rlfs: Rig) 
         list(check_overlap(joined[1].samples(), rlfs, []))  # type: ignore[attr-defined]
 
 
-def test_pictures_without_times_or_without_scans_are_refused(tmp_path: Path, rlfs: Rig) -> None:
+def test_pictures_without_times_or_without_scans_are_refused(tmp_path, rlfs):
     fill_with_pictures(tmp_path)
     with pytest.raises(SourceError):
         open_recordings([tmp_path / "webcam"], rlfs)

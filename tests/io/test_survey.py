@@ -1,7 +1,5 @@
 """A bag tells what a profile has to say of its sensors."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ K = [897.5, 0.0, 635.4, 0.0, 896.8, 375.3, 0.0, 0.0, 1.0]
 D = [-0.44, 0.233, -0.001, 0.0002, -0.073]
 
 
-def camera_info(stamp_ns: int, model: str = "plumb_bob", coefficients: Any = D) -> dict[str, Any]:
+def camera_info(stamp_ns, model="plumb_bob", coefficients=D):
     return {
         "stamp_ns": stamp_ns, "width": 64, "height": 48, "distortion_model": model,
         "D": np.array(coefficients), "K": np.array(K), "R": np.eye(3).ravel(), "P": np.zeros(12),
@@ -23,7 +21,7 @@ def camera_info(stamp_ns: int, model: str = "plumb_bob", coefficients: Any = D) 
     }  # fmt: skip
 
 
-def messages(room, cloud_message, image_message, info: dict[str, Any] | None = None):
+def messages(room, cloud_message, image_message, info=None):
     pixels = np.zeros((48, 64, 3), np.uint8)
     for k in range(5):
         t = 10**18 + k * 50_000_000
@@ -74,13 +72,7 @@ def test_a_bag_without_sensors_is_refused_with_what_it_holds(tmp_path, write_bag
     assert "/front/camera_info" in caught.value.hint
 
 
-def test_a_camera_of_a_bag_without_a_lens_is_named(
-    tmp_path,
-    write_bag,
-    room,
-    cloud_message,
-    image_message,
-):
+def test_a_camera_of_a_bag_without_a_lens_is_named(tmp_path, write_bag, room, cloud_message, image_message):
     path = write_bag(tmp_path / "bag", "ros1", messages(room, cloud_message, image_message))
     with pytest.raises(UsageError, match="rear"):
         new_profile("truck", parse_board("5x7,0.095,0.61x0.85"), recording=path)

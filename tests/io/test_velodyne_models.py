@@ -1,7 +1,5 @@
 """Packets of every Velodyne that is read, and those that others recorded, become scans of their own beams."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,17 +14,14 @@ from lce_rig.io.ros.bag_recorder import open_bag_writer
 from lce_rig.io.ros.messages import deserialize, typestore
 from lce_rig.io.ros.rosbag import BagRecording
 from lce_rig.io.velodyne_scans import PcapRecording, Vlp16Stream
-from lce_rig.rig import LidarSettings, Rig, load_rig
+from lce_rig.rig import LidarSettings, load_rig
 
-from .vlp16_room import (
-    stamps,
-    stream_of,
-)
+from .vlp16_room import stamps, stream_of
 
 RANGE_M, RATE_HZ, T0_US = 4.0, 10.0, 5_000_000
 
 
-def write_packets(path: Path, payloads: list[bytes], arrivals_ns: list[int]) -> Path:
+def write_packets(path, payloads, arrivals_ns):
     """Write VelodyneScans of 40 packets each, as the ROS drivers do; ROS 1 where the path ends in .bag."""
     is_ros1 = path.suffix == ".bag"
     store, name = typestore(is_ros1), "velodyne_msgs/msg/VelodyneScan"
@@ -48,7 +43,7 @@ def write_packets(path: Path, payloads: list[bytes], arrivals_ns: list[int]) -> 
     return path
 
 
-def packets_of(product: velodyne.Product, n_revolutions: float, step_m: float) -> list[bytes]:
+def packets_of(product, n_revolutions, step_m):
     """Packets of a sensor in the middle of a sphere."""
     n = int(n_revolutions / RATE_HZ * 1e9 / product.packet_ns(is_dual=False))
     fields = np.zeros(n, velodyne.DATA_PACKET)
@@ -64,7 +59,7 @@ def packets_of(product: velodyne.Product, n_revolutions: float, step_m: float) -
 
 
 @pytest.mark.parametrize("product", velodyne.READ, ids=lambda product: product.name)
-def test_scans_have_the_models_rings_and_times(product: velodyne.Product) -> None:
+def test_scans_have_the_models_rings_and_times(product):
     sheet = find_data_sheet(product.name)
     assert sheet is not None
     stream = Vlp16Stream("lidar", LidarSettings(model=product.name))
@@ -87,16 +82,14 @@ def test_scans_have_the_models_rings_and_times(product: velodyne.Product) -> Non
     assert 0 <= scan.offset_ns.min() < 60_000 and scan.offset_ns.max() == pytest.approx(0.1e9, abs=200_000)
 
 
-def test_a_model_without_packets_is_named() -> None:
+def test_a_model_without_packets_is_named():
     with pytest.raises(SourceError) as caught:
         Vlp16Stream("lidar", LidarSettings(model="OS1-64"))
     assert "HDL-32E" in caught.value.hint
 
 
 @pytest.mark.parametrize("name", ["packets.bag", "packets"])
-def test_packets_in_bags_become_the_scans_that_they_are_in_a_pcap(
-    tmp_path: Path, rig: Rig, name: str
-) -> None:
+def test_packets_in_bags_become_the_scans_that_they_are_in_a_pcap(tmp_path, rig, name):
     product = velodyne.READ[0]
     payloads = packets_of(product, 2.3, 0.002)
     arrivals_ns = [10**18 + product.packet_ns(is_dual=False) * (k + 1) for k in range(len(payloads))]
@@ -114,7 +107,7 @@ def test_packets_in_bags_become_the_scans_that_they_are_in_a_pcap(
     assert any("vertical offsets" in note for note in recording.notes)
 
 
-def test_a_bag_of_another_models_packets_is_refused_with_its_name(tmp_path: Path, rig: Rig) -> None:
+def test_a_bag_of_another_models_packets_is_refused_with_its_name(tmp_path, rig):
     payloads = packets_of(velodyne.product_of("HDL-32E") or velodyne.READ[0], 0.2, 0.002)
     bag = write_packets(tmp_path / "packets", payloads, [10**18 + k for k in range(len(payloads))])
     recording = open_recording(bag, rig, SourceOptions(topics={"lidar": "/velodyne_packets"}, is_part=True))
@@ -125,7 +118,7 @@ def test_a_bag_of_another_models_packets_is_refused_with_its_name(tmp_path: Path
 
 
 @pytest.mark.dataset
-def test_a_recorded_hdl32e_is_read(recordings: Path) -> None:
+def test_a_recorded_hdl32e_is_read(recordings):
     path = recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_hdl32.pcap"
     recording = open_recording(path, load_rig("hdl32e"), SourceOptions(is_part=True))
     assert isinstance(recording, PcapRecording)
@@ -135,19 +128,19 @@ def test_a_recorded_hdl32e_is_read(recordings: Path) -> None:
     assert len(scan.points) > 50_000 and top == pytest.approx(10.67, abs=0.3)
 
 
-def einride(recordings: Path) -> np.ndarray:
+def einride(recordings):
     return np.fromfile(recordings / "vlp16_packets" / "einride" / "recording.bin", velodyne.DATA_PACKET)
 
 
 @pytest.mark.dataset
-def test_the_einride_payloads_make_whole_scans_without_a_loss(recordings: Path) -> None:
+def test_the_einride_payloads_make_whole_scans_without_a_loss(recordings):
     stream = stream_of()
     fields = einride(recordings)
     scans = [scan for packet in fields if (scan := stream.push_data(packet.tobytes(), 0)) is not None]
     assert (len(scans), stream.losses.n("packet.lost"), stream.flaws()) == (13, 0, [])
 
 
-def nebula_packets(recordings: Path) -> list[tuple[int, bytes]]:
+def nebula_packets(recordings):
     bag = BagFile(recordings / "vlp16_packets" / "nebula" / "vlp16" / "1673400471837873222")
     messages = [deserialize(message) for message in bag.messages({"/velodyne_packets"})]
     return [
@@ -158,7 +151,7 @@ def nebula_packets(recordings: Path) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.dataset
-def test_nebulas_recording_was_not_synchronised_and_is_stamped_by_arrival(recordings: Path) -> None:
+def test_nebulas_recording_was_not_synchronised_and_is_stamped_by_arrival(recordings):
     stream = stream_of()
     sent = nebula_packets(recordings)
     scans = [scan for host_ns, body in sent if (scan := stream.push_data(body, host_ns)) is not None]
@@ -170,7 +163,7 @@ def test_nebulas_recording_was_not_synchronised_and_is_stamped_by_arrival(record
 
 
 @pytest.mark.dataset
-def test_mrpts_recording_gives_its_scans_with_the_clock_in_doubt(recordings: Path, rig: Rig) -> None:
+def test_mrpts_recording_gives_its_scans_with_the_clock_in_doubt(recordings, rig):
     path = recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_vlp16_gps.pcap"
     recording = PcapRecording(path, rig, SourceOptions())
     scans = list(recording.samples())
@@ -182,6 +175,6 @@ def test_mrpts_recording_gives_its_scans_with_the_clock_in_doubt(recordings: Pat
 
 
 @pytest.mark.dataset
-def test_mrpts_hdl32_is_refused_by_name(recordings: Path, rig: Rig) -> None:
+def test_mrpts_hdl32_is_refused_by_name(recordings, rig):
     with pytest.raises(SourceError, match="HDL-32E"):
         open_recording(recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_hdl32.pcap", rig)

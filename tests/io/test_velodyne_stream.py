@@ -1,17 +1,15 @@
 """Packets of a VLP-16: only whole ones are believed; they become scans with the manual's points and time."""
 
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from wire.vlp16_packets import SensorPacket, Vlp16Clock, Vlp16Packets
+from wire.vlp16_packets import Vlp16Clock, Vlp16Packets
 
 from lce_rig.core import velodyne
-from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io.velodyne_packets import BadPacketError, read_data_packet, read_position_packet
 from lce_rig.io.velodyne_scans import Vlp16Stream, read_controls
@@ -35,11 +33,11 @@ from .vlp16_room import (
 
 
 @pytest.fixture(scope="module")
-def packets() -> list[SensorPacket]:
+def packets():
     return packets_of(room_scans(5))
 
 
-def test_scans_go_from_seam_to_seam_behind_the_sensor(packets: list[SensorPacket]) -> None:
+def test_scans_go_from_seam_to_seam_behind_the_sensor(packets):
     for truth, scan in zip(room_scans(5), push(stream_of(), packets), strict=True):
         assert scan.offset_ns is not None and scan.offset_ns[0] == 0
         assert len(scan.points) == len(truth.points)
@@ -49,9 +47,7 @@ def test_scans_go_from_seam_to_seam_behind_the_sensor(packets: list[SensorPacket
         assert abs(azimuth[0]) > 179.5
 
 
-def test_a_stream_that_begins_and_ends_anywhere_loses_only_the_broken_revolutions(
-    packets: list[SensorPacket],
-) -> None:
+def test_a_stream_that_begins_and_ends_anywhere_loses_only_the_broken_revolutions(packets):
     stream = stream_of()
     scans = push(stream, packets[30:-30])
     assert stream.finish() is None
@@ -60,9 +56,7 @@ def test_a_stream_that_begins_and_ends_anywhere_loses_only_the_broken_revolution
     assert stream.losses.n("packet.lost") == 0
 
 
-def test_losses_are_counted_by_the_sensors_counter_whatever_the_hosts_clock_does(
-    packets: list[SensorPacket],
-) -> None:
+def test_losses_are_counted_by_the_sensors_counter_whatever_the_hosts_clock_does(packets):
     rng = np.random.default_rng(0)
     is_kept = rng.random(len(packets)) > 0.3
     is_kept[[0, -1]] = True
@@ -76,7 +70,7 @@ def test_losses_are_counted_by_the_sensors_counter_whatever_the_hosts_clock_does
     assert share == pytest.approx(len(only_data(kept)) / len(only_data(packets)), abs=0.01)
 
 
-def test_a_scan_of_which_more_than_half_is_lost_is_left_out(packets: list[SensorPacket]) -> None:
+def test_a_scan_of_which_more_than_half_is_lost_is_left_out(packets):
     gap = slice(90, 135)
     stream = stream_of()
     scans = push(stream, packets[: gap.start] + packets[gap.stop :])
@@ -84,7 +78,7 @@ def test_a_scan_of_which_more_than_half_is_lost_is_left_out(packets: list[Sensor
     assert stream.losses.n("packet.lost") == len(only_data(packets[gap]))
 
 
-def test_packets_sent_twice_or_late_change_nothing(packets: list[SensorPacket]) -> None:
+def test_packets_sent_twice_or_late_change_nothing(packets):
     arrived = list(packets)
     arrived.insert(50, packets[40])
     arrived.insert(200, packets[198])
@@ -96,7 +90,7 @@ def test_packets_sent_twice_or_late_change_nothing(packets: list[SensorPacket]) 
 
 
 @pytest.mark.parametrize("shift_us", [500_000, -700_000_000])
-def test_a_sensor_whose_clock_is_set_loses_one_revolution(shift_us: int) -> None:
+def test_a_sensor_whose_clock_is_set_loses_one_revolution(shift_us):
     before = packets_of(room_scans(3), clock=Vlp16Clock(error_us=shift_us, pps="absent"))
     after = packets_of(room_scans(6))
     at = 140
@@ -109,7 +103,7 @@ def test_a_sensor_whose_clock_is_set_loses_one_revolution(shift_us: int) -> None
         assert min(abs(int(stamp_ns or 0) - int(s.stamp_ns or 0)) for s in room_scans(6)) < 1_000_000
 
 
-def test_a_change_to_dual_returns_is_followed(packets: list[SensorPacket]) -> None:
+def test_a_change_to_dual_returns_is_followed(packets):
     dual = packets_of(room_scans(3, T0_NS + 5 * PERIOD_NS), velodyne.DUAL)
     stream = stream_of()
     scans = push(stream, [*packets[:-2], *dual])
@@ -121,14 +115,14 @@ def test_a_change_to_dual_returns_is_followed(packets: list[SensorPacket]) -> No
     "controls",
     [{"rpm": 600}, {"position_port": "8308"}, {"position_port": 0}, {"cut_deg": True}, {"cut_deg": 500.0}],
 )
-def test_what_cannot_be_meant_is_refused_with_its_key(controls: dict[str, object]) -> None:
+def test_what_cannot_be_meant_is_refused_with_its_key(controls):
     driver = DriverSettings.model_validate({"controls": controls})
     with pytest.raises(SourceError, match=next(iter(controls))):
         read_controls("lidar", settings(driver=driver))
 
 
 @pytest.mark.parametrize("cut_deg", [-90, 0, 37.5])
-def test_the_seam_lies_where_the_profile_wants_it(cut_deg: float) -> None:
+def test_the_seam_lies_where_the_profile_wants_it(cut_deg):
     driver = DriverSettings(controls={"cut_deg": cut_deg})
     stream = Vlp16Stream("lidar", settings(driver=driver))
     scans = push(stream, packets_of(room_scans(4)))
@@ -140,7 +134,7 @@ def test_the_seam_lies_where_the_profile_wants_it(cut_deg: float) -> None:
         assert np.ptp(azimuth_deg) == pytest.approx(359.8, abs=0.4)
 
 
-def test_time_goes_on_over_the_full_hour() -> None:
+def test_time_goes_on_over_the_full_hour():
     truth = room_scans(6, T0_NS - T0_NS % HOUR_NS + HOUR_NS - 250_000_000)
     stream = stream_of()
     scans = push(stream, packets_of(truth))
@@ -160,7 +154,7 @@ UNSYNCHRONISED = {
 
 
 @pytest.mark.parametrize("name", sorted(UNSYNCHRONISED))
-def test_time_that_cannot_be_trusted_is_said_and_replaced_by_arrival(name: str) -> None:
+def test_time_that_cannot_be_trusted_is_said_and_replaced_by_arrival(name):
     clock, code = UNSYNCHRONISED[name]
     truth = room_scans(3, T0_NS + 500_000_000)
     stream = stream_of()
@@ -172,7 +166,7 @@ def test_time_that_cannot_be_trusted_is_said_and_replaced_by_arrival(name: str) 
     np.testing.assert_allclose(late_ns, NETWORK_NS, atol=1000)
 
 
-def test_arrivals_that_waited_do_not_shift_stamps() -> None:
+def test_arrivals_that_waited_do_not_shift_stamps():
     truth = room_scans(10)
     clock = Vlp16Clock("absent", has_nmea=False, error_us=5)
     rng = np.random.default_rng(1)
@@ -185,7 +179,7 @@ def test_arrivals_that_waited_do_not_shift_stamps() -> None:
     assert late_ns.min() > -1000 and late_ns[1:].max() < 300_000
 
 
-def test_position_packets_that_lack_or_stop_end_the_trust(packets: list[SensorPacket]) -> None:
+def test_position_packets_that_lack_or_stop_end_the_trust(packets):
     stream = stream_of()
     assert len(push(stream, only_data(packets))) == 5
     assert stream.clock.state().code == "clock.no_position_packets"
@@ -196,7 +190,7 @@ def test_position_packets_that_lack_or_stop_end_the_trust(packets: list[SensorPa
     assert stream.clock.state().code == "clock.position_packets_stopped"
 
 
-def test_the_profile_may_want_the_hosts_time(packets: list[SensorPacket]) -> None:
+def test_the_profile_may_want_the_hosts_time(packets):
     stream = stream_of(timestamps=TimestampSettings(reference="first_firing", clock="host"))
     scans = push(stream, packets)
     assert stream.clock.state().code == "clock.host_wanted"
@@ -205,20 +199,20 @@ def test_the_profile_may_want_the_hosts_time(packets: list[SensorPacket]) -> Non
     )
 
 
-def test_packets_without_any_arrival_give_scans_without_stamps(packets: list[SensorPacket]) -> None:
+def test_packets_without_any_arrival_give_scans_without_stamps(packets):
     scans = push(stream_of(), packets, delay_ns=None)
     assert stamps(scans) == [None] * 5
     assert scans[0].host_ns is None
 
 
-def test_ranges_beyond_the_profiles_limits_give_no_points(packets: list[SensorPacket]) -> None:
+def test_ranges_beyond_the_profiles_limits_give_no_points(packets):
     near = push(stream_of(min_range_m=4.0, max_range_m=4.5), packets)[1]
     reach = np.linalg.norm(near.points, axis=1)
     assert 3.98 < reach.min() < 4.02 and 4.48 < reach.max() < 4.52
     assert np.all(np.diff(near.offset_ns) > 0)
 
 
-def test_of_two_returns_the_brighter_one_is_kept() -> None:
+def test_of_two_returns_the_brighter_one_is_kept():
     front = room_scan(T0_NS, dropout=0.0)
     behind = room_scan(T0_NS, scale=1.5, dropout=0.0)
     # The last return is brighter in every other firing, and alone in the last hundred.
@@ -234,7 +228,7 @@ def test_of_two_returns_the_brighter_one_is_kept() -> None:
     np.testing.assert_allclose(reach, reach_behind * expected / 1.5, atol=0.02)
 
 
-def packets_of_dual(front: Scan, behind: Scan) -> list[SensorPacket]:
+def packets_of_dual(front, behind):
     sender = Vlp16Packets(velodyne.DUAL)
     return sender.feed(front, behind) + sender.finish()
 
@@ -243,11 +237,11 @@ US_AT, MODE_AT, PRODUCT_AT = 1200, 1204, 1205
 
 
 @pytest.fixture(scope="module")
-def payload() -> bytes:
+def payload():
     return packets_of(room_scans(1))[20].payload
 
 
-def damage(payload: bytes, at: int, value: bytes) -> bytes:
+def damage(payload, at, value):
     return payload[:at] + value + payload[at + len(value) :]
 
 
@@ -266,14 +260,14 @@ def damage(payload: bytes, at: int, value: bytes) -> bytes:
         lambda p: damage(p, PRODUCT_AT, b"\x23"),
     ],
 )
-def test_a_damaged_data_packet_is_refused(spoil: Callable[[bytes], bytes], payload: bytes) -> None:
+def test_a_damaged_data_packet_is_refused(spoil, payload):
     read_data_packet(payload, 0)
     with pytest.raises(BadPacketError):
         read_data_packet(spoil(payload), 0)
 
 
 @given(st.binary(max_size=600))
-def test_whatever_comes_as_a_position_packet_is_read_or_refused(payload: bytes) -> None:
+def test_whatever_comes_as_a_position_packet_is_read_or_refused(payload):
     for body in (payload, payload.ljust(velodyne.POSITION_BYTES, b"\0")[: velodyne.POSITION_BYTES]):
         try:
             read = read_position_packet(body)
@@ -294,7 +288,7 @@ def test_whatever_comes_as_a_position_packet_is_read_or_refused(payload: bytes) 
         (b"\xff" * 306, None),
     ],
 )
-def test_only_sound_sentences_tell_the_time(sentence: bytes, second: int | None) -> None:
+def test_only_sound_sentences_tell_the_time(sentence, second):
     body = bytearray(velodyne.POSITION_BYTES)
     body[0xCE : 0xCE + len(sentence)] = sentence
     assert read_position_packet(bytes(body)).nmea_s == second

@@ -1,14 +1,12 @@
 """A round room as a VLP-16 sees it, made without ray casting."""
 
-from collections.abc import Iterable
-
 import numpy as np
-from wire.vlp16_packets import STREAMED_VLP16, SensorPacket, Vlp16Clock, Vlp16Packets
+from wire.vlp16_packets import STREAMED_VLP16, Vlp16Packets
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.io.velodyne_scans import Vlp16Stream
-from lce_rig.rig import LidarSettings, load_rig
+from lce_rig.rig import load_rig
 
 PERIOD_NS = STREAMED_VLP16.period_ns
 #: 14 November 2023, 22:13:20 UTC.
@@ -17,11 +15,11 @@ NETWORK_NS = 120_000
 HOUR_NS = 3600 * 10**9
 
 
-def settings(**changes: object) -> LidarSettings:
+def settings(**changes):
     return load_rig("rles").lidars["lidar"].model_copy(update=changes)
 
 
-def room_scan(stamp_ns: int, *, scale: float = 1.0, phase: float = 0.25, dropout: float = 0.1) -> Scan:
+def room_scan(stamp_ns, *, scale=1.0, phase=0.25, dropout=0.1):
     """One revolution in a wavy round room, on the grid of firings, with a tenth of the returns missing."""
     n_sequences = PERIOD_NS // velodyne.SEQUENCE_NS
     sequence, laser = np.divmod(np.arange(n_sequences * velodyne.N_LASERS), velodyne.N_LASERS)
@@ -47,20 +45,16 @@ def room_scan(stamp_ns: int, *, scale: float = 1.0, phase: float = 0.25, dropout
     )
 
 
-def room_scans(n: int, start_ns: int = T0_NS) -> list[Scan]:
+def room_scans(n, start_ns=T0_NS):
     return [room_scan(start_ns + k * PERIOD_NS) for k in range(n)]
 
 
-def packets_of(
-    scans: Iterable[Scan], mode: int = velodyne.STRONGEST, clock: Vlp16Clock | None = None
-) -> list[SensorPacket]:
+def packets_of(scans, mode=velodyne.STRONGEST, clock=None):
     sender = Vlp16Packets(mode, clock)
     return [packet for scan in scans for packet in sender.feed(scan)] + sender.finish()
 
 
-def push(
-    stream: Vlp16Stream, packets: Iterable[SensorPacket], delay_ns: int | None = NETWORK_NS
-) -> list[Scan]:
+def push(stream, packets, delay_ns=NETWORK_NS):
     """Feed packets as they would arrive, then end the stream; without a delay arrivals are unknown."""
     scans = []
     for packet in packets:
@@ -73,19 +67,19 @@ def push(
     return scans if last is None else [*scans, last]
 
 
-def stream_of(**changes: object) -> Vlp16Stream:
+def stream_of(**changes):
     return Vlp16Stream("lidar", settings(**changes))
 
 
-def only_data(packets: Iterable[SensorPacket]) -> list[SensorPacket]:
+def only_data(packets):
     return [packet for packet in packets if packet.port == velodyne.DATA_PORT]
 
 
-def stamps(scans: Iterable[Scan]) -> list[int | None]:
+def stamps(scans):
     return [scan.stamp_ns for scan in scans]
 
 
-def largest_errors(truth: Scan, decoded: Scan) -> tuple[float, float]:
+def largest_errors(truth, decoded):
     """Largest error along the ray in m, and across it in rad; the scans have the same points."""
     np.testing.assert_array_equal(truth.ring, decoded.ring)
     centre = np.zeros((len(truth.points), 3))

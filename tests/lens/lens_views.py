@@ -30,14 +30,14 @@ class Scene:
     flutter_m: float = 0.0
 
 
-def photograph(n: int, seed: int, scene: Scene | None = None, board: Board = BOARD) -> list[BoardView]:
+def photograph(n, seed, scene=None, board=BOARD):
     """Hold a board n times before a lens; starting poses are some centimetres and degrees off."""
     scene = scene or Scene()
     rng = np.random.default_rng(seed)
     printed = bent(board, scene, rng)
     x, y = board.corners()[:, :2].T
     size = np.array([scene.lens.width_px, scene.lens.height_px])
-    views: list[BoardView] = []
+    views = []
     while len(views) < n:
         ray = scene.lens.unproject(rng.uniform(*scene.spread, 2) * size)
         tilt, angle = np.radians(rng.uniform(*scene.tilt_deg)), rng.uniform(0, 2 * np.pi)
@@ -58,7 +58,7 @@ def photograph(n: int, seed: int, scene: Scene | None = None, board: Board = BOA
     return views
 
 
-def bent(board: Board, scene: Scene, rng: np.random.Generator) -> np.ndarray:
+def bent(board, scene, rng):
     """Place the corners of a board that is bowed, stretched and printed badly."""
     corners = board.corners()
     x, y = corners[:, :2].T
@@ -69,6 +69,6 @@ def bent(board: Board, scene: Scene, rng: np.random.Generator) -> np.ndarray:
     return corners
 
 
-def with_corners(view: BoardView, corners_px: np.ndarray) -> BoardView:
+def with_corners(view, corners_px):
     """Exchange a view's corners."""
     return replace(view, board=replace(view.board, corners_px=corners_px))

@@ -11,12 +11,7 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.image.search import find_image_board
-from lce_rig.judge.intrinsics_check import (
-    check_intrinsics,
-    compare_with_given,
-    explain,
-    judge_lens,
-)
+from lce_rig.judge.intrinsics_check import check_intrinsics, compare_with_given, explain, judge_lens
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import certainty_of, compare_lenses
 from lce_rig.lens.lens_estimate import BoardView, find_weaknesses, reach

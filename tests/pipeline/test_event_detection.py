@@ -2,18 +2,17 @@
 
 from dataclasses import replace
 from importlib import resources
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import lce_rig as lce
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import ProfileError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard
 from lce_rig.pipeline.detect_session import event_picture, picture_stamp_ns
-from lce_rig.rig import Rig, load_rig, parse_rig
+from lce_rig.rig import load_rig, parse_rig
 from lce_rig.session import Session
 from tests.calibrate.boards import simulate
 from tests.detect.moving_board import CENTRE_PX, HEIGHT_PX, WIDTH_PX, Motion, board_events
@@ -37,31 +36,31 @@ cameras:
 
 
 @pytest.fixture(scope="module")
-def stream() -> Events:
+def stream():
     events = board_events(Motion(), 1.4, threshold=0.6)
     return replace(events, sensor="dvs", t_ns=events.t_ns + T0_NS)
 
 
-def bare_scan(stamp_ns: int | None = SCAN_NS) -> Scan:
+def bare_scan(stamp_ns=SCAN_NS):
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32) + [5, 0, 0]
     return Scan(
         "lidar", stamp_ns, points.astype(np.float32), np.zeros(50, np.float32), np.zeros(50, np.int16)
     )
 
 
-def session_of(folder: Path, events: Events, profile: str = PROFILE, **more) -> Session:
+def session_of(folder, events, profile=PROFILE, **more):
     with Session.create(folder / "session", parse_rig(profile)) as session:
         scan = bare_scan(more.pop("stamp_ns", SCAN_NS))
         session.add_capture(more.pop("images", []), [scan], {}, [events])
     return session
 
 
-def found_in(session: Session, **more) -> ImageBoard | Refusal:
+def found_in(session, **more):
     return lce.detect(session, **more).images["dvs", "events"]["000000"]
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory, stream) -> Session:
+def seen(tmp_path_factory, stream):
     session = session_of(tmp_path_factory.mktemp("seen"), stream)
     assert isinstance(found_in(session), ImageBoard)
     return session
@@ -134,18 +133,18 @@ def test_damaged_events_are_a_refusal_that_says_so(tmp_path, stream):
     assert board.code == "read.error" and "damaged" in board.figures["what"]
 
 
-def with_network(path: str) -> str:
+def with_network(path):
     return PROFILE.replace("{kind: events,", f"{{kind: events, reconstruction: {{model: {path}}},")
 
 
-def shipped_network() -> bytes:
+def shipped_network():
     return (resources.files("lce_rig") / "models" / "reconstruction.onnx").read_bytes()
 
 
 def test_another_network_is_found_beside_the_profile_and_makes_its_own_pictures(tmp_path, stream):
     (tmp_path / "mine.onnx").write_bytes(shipped_network())
     (tmp_path / "mine.yaml").write_text(with_network("mine.onnx"), encoding="utf-8")
-    rig: Rig = load_rig(tmp_path / "mine.yaml")
+    rig = load_rig(tmp_path / "mine.yaml")
     with Session.create(tmp_path / "session", rig) as session:
         session.add_capture([], [bare_scan()], {}, [stream])
     # Opened anew: the profile frozen in the session leads to the file.

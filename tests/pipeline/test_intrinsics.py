@@ -37,7 +37,7 @@ def pictures():
     return drawn
 
 
-def session_of(path, pictures, channel="frames", **camera) -> Session:
+def session_of(path, pictures, channel="frames", **camera):
     """Make a session of pictures with keys of the camera set to other values."""
     text = RLES
     for key, value in camera.items():
@@ -49,7 +49,7 @@ def session_of(path, pictures, channel="frames", **camera) -> Session:
 
 
 @pytest.fixture(scope="module")
-def session(pictures, tmp_path_factory) -> Session:
+def session(pictures, tmp_path_factory):
     return session_of(tmp_path_factory.mktemp("right") / "session", pictures)
 
 

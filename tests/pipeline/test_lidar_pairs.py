@@ -1,18 +1,15 @@
 """Two LiDARs that saw the same plate: their pose to each other, and what must never pass."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from lce_rig.calibrate.between_lidars import close_loops
-from lce_rig.core.board import Board
-from lce_rig.core.calibration import Calibration, ResultFile, read_result
+from lce_rig.core.calibration import ResultFile, read_result
 from lce_rig.core.errors import NotEnoughDataError, ProfileError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
-from lce_rig.core.results import LidarBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.export import ExportJob, export
@@ -28,7 +25,7 @@ PLATE = {"type": "plain", "width_m": 0.9, "height_m": 0.7}
 ROUGH = {"rpy_deg": [0, 0, 25], "translation_m": [0.1, -0.5, 0.0], "tolerance_deg": 6}
 
 
-def make_rig(board: dict[str, Any] = PLATE, model: str = "VLP-16", nominal: bool = True) -> Rig:
+def make_rig(board=PLATE, model="VLP-16", nominal=True):
     return Rig.model_validate(
         {
             "format_version": 1,
@@ -43,13 +40,11 @@ def make_rig(board: dict[str, Any] = PLATE, model: str = "VLP-16", nominal: bool
     )
 
 
-def scan_both(
-    n: int, seed: int, board: Board, *, n_moved: int = 0, move: np.ndarray | None = None
-) -> dict[str, dict[str, list[LidarBoard]]]:
+def scan_both(n, seed, board, *, n_moved=0, move=None):
     """Scan boards by both LiDARs; before the last `n_moved`, the right one moves."""
     rng, scenario = np.random.default_rng(seed), Scenario(range_sigma_m=0.01)
-    left: dict[str, list[LidarBoard]] = {}
-    right: dict[str, list[LidarBoard]] = {}
+    left = {}
+    right = {}
     while len(left) < n:
         T_right = T_LEFT_RIGHT
         if len(left) >= n - n_moved and move is not None:
@@ -70,17 +65,17 @@ def scan_both(
     return {"left": left, "right": right}
 
 
-def calibrate(rig: Rig, scans: dict[str, dict[str, Any]]) -> Calibration:
+def calibrate(rig, scans):
     (result,), shortages = calibrate_detections(rig, Detections({}, scans))
     assert not shortages
     return result
 
 
-def codes(result: Calibration) -> set[str]:
+def codes(result):
     return {finding.code for finding in result.findings if finding.severity != "note"}
 
 
-def test_the_pose_is_found_within_its_uncertainty_and_passes() -> None:
+def test_the_pose_is_found_within_its_uncertainty_and_passes():
     rig, chi2 = make_rig(), []
     for seed in range(4):
         result = calibrate(rig, scan_both(20, seed, rig.board.to_board()))
@@ -94,7 +89,7 @@ def test_the_pose_is_found_within_its_uncertainty_and_passes() -> None:
 
 
 @pytest.mark.parametrize("sides", [(0.7, 0.7), (0.9, 0.7)])
-def test_a_plate_that_looks_the_same_when_turned_is_no_doubt(sides: tuple[float, float]) -> None:
+def test_a_plate_that_looks_the_same_when_turned_is_no_doubt(sides):
     rig = make_rig({"type": "plain", "width_m": sides[0], "height_m": sides[1]})
     scans = scan_both(14, 3, rig.board.to_board())
     n_fold = 4 if sides[0] == sides[1] else 2
@@ -108,7 +103,7 @@ def test_a_plate_that_looks_the_same_when_turned_is_no_doubt(sides: tuple[float,
     assert off @ np.linalg.solve(result.cov, off) < 25
 
 
-def test_lidars_under_each_others_name_fail_by_their_nominal_pose() -> None:
+def test_lidars_under_each_others_name_fail_by_their_nominal_pose():
     rig = make_rig()
     scans = scan_both(14, 1, rig.board.to_board())
     result = calibrate(rig, {"left": scans["right"], "right": scans["left"]})
@@ -116,7 +111,7 @@ def test_lidars_under_each_others_name_fail_by_their_nominal_pose() -> None:
     assert "verdict.lidars_exchanged" in codes(result)
 
 
-def test_lidars_under_each_others_name_fail_by_their_rings() -> None:
+def test_lidars_under_each_others_name_fail_by_their_rings():
     rig = make_rig(model="HDL-32E", nominal=False)
     scans = scan_both(14, 1, rig.board.to_board())
     for found in scans["left"].values():
@@ -126,7 +121,7 @@ def test_lidars_under_each_others_name_fail_by_their_rings() -> None:
     assert "verdict.other_model" in codes(result)
 
 
-def test_without_a_nominal_pose_alike_lidars_never_pass() -> None:
+def test_without_a_nominal_pose_alike_lidars_never_pass():
     rig = make_rig(nominal=False)
     result = calibrate(rig, scan_both(14, 1, rig.board.to_board()))
     assert result.verdict == "marginal"
@@ -136,7 +131,7 @@ def test_without_a_nominal_pose_alike_lidars_never_pass() -> None:
 
 
 @pytest.mark.parametrize(("n_moved", "turn_deg"), [(7, 1.0), (4, 2.0), (2, 3.0)])
-def test_a_lidar_that_moved_between_captures_never_passes(n_moved: int, turn_deg: float) -> None:
+def test_a_lidar_that_moved_between_captures_never_passes(n_moved, turn_deg):
     rig = make_rig()
     move = np.r_[0.01, 0, 0.02, np.radians([0.0, 0.6 * turn_deg, 0.8 * turn_deg])]
     for seed in range(2):
@@ -145,9 +140,9 @@ def test_a_lidar_that_moved_between_captures_never_passes(n_moved: int, turn_deg
         assert codes(result) & {"verdict.moved", "verdict.changed", "verdict.two_groups"}
 
 
-def test_boards_that_one_lidar_does_not_see_whole_are_named_with_their_cause() -> None:
+def test_boards_that_one_lidar_does_not_see_whole_are_named_with_their_cause():
     rig = make_rig()
-    scans: dict[str, dict[str, Any]] = dict(scan_both(9, 1, rig.board.to_board()))
+    scans = dict(scan_both(9, 1, rig.board.to_board()))
     cut = LIDAR_OTHER_SIZE.refusal(
         side="height", measured_m=0.5, sigma_m=0.01, profile_m=0.7, distance_m=2.0, hidden_share=0.0
     )
@@ -162,7 +157,7 @@ def test_boards_that_one_lidar_does_not_see_whole_are_named_with_their_cause() -
     assert caught.value.finding.code == "shortage.few_detected"
 
 
-def test_a_result_of_lidars_is_read_back_and_exported(tmp_path: Any) -> None:
+def test_a_result_of_lidars_is_read_back_and_exported(tmp_path):
     rig = make_rig()
     result = calibrate(rig, scan_both(14, 2, rig.board.to_board()))
     path = tmp_path / "result.json"
@@ -178,7 +173,7 @@ def test_a_result_of_lidars_is_read_back_and_exported(tmp_path: Any) -> None:
     assert np.allclose(joint.T_parent_child, result.T_cam_lidar)
 
 
-def test_poses_of_a_camera_to_both_lidars_that_contradict_theirs_are_found() -> None:
+def test_poses_of_a_camera_to_both_lidars_that_contradict_theirs_are_found():
     rig = make_rig()
     between = calibrate(rig, scan_both(14, 2, rig.board.to_board()))
     T_cam_left = pose(exp_so3(np.radians([80.0, 5.0, 10.0])), np.array([0.0, -0.1, 0.2]))
@@ -201,7 +196,7 @@ def test_poses_of_a_camera_to_both_lidars_that_contradict_theirs_are_found() -> 
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.7, 1.0])
-def test_poses_that_close_are_no_worse_than_each_alone(shared: float) -> None:
+def test_poses_that_close_are_no_worse_than_each_alone(shared):
     """Errors of the sensors' boards, `shared` of their variance, cancel in the loop; the others do not."""
     rng, names = np.random.default_rng(0), ("cam", "left", "right", "top")
     T = {name: pose(exp_so3(rng.normal(size=3)), rng.normal(size=3)) for name in names}
@@ -224,7 +219,7 @@ def test_poses_that_close_are_no_worse_than_each_alone(shared: float) -> None:
     assert np.mean(np.square(after)) <= np.mean(np.square(before)) * (0.6 if shared == 0 else 1 + 1e-6)
 
 
-def test_profiles_of_plain_plates_read_back_and_have_no_camera() -> None:
+def test_profiles_of_plain_plates_read_back_and_have_no_camera():
     rig = make_rig()
     assert parse_rig(dump_rig(rig)) == rig
     camera = """

@@ -8,22 +8,19 @@ import lce_rig as lce
 from lce_rig.core.findings import Refusal
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.pipeline.detect_session import detect, expected_poses, match_sensors
-from lce_rig.session import Session
 
 RIGS = Path(__file__).parents[1] / "rigs"
 
 
 @pytest.fixture(scope="module")
-def session(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
+def session(recordings, tmp_path_factory):
     rig = lce.load_rig(RIGS / "os1_64.yaml")
     return lce.collect_from(rig, recordings / "os1_64", tmp_path_factory.mktemp("os1") / "session")
 
 
 @pytest.mark.dataset
 @pytest.mark.long
-def test_boards_that_walls_hide_are_found_where_their_image_has_them(
-    session: Session,
-) -> None:
+def test_boards_that_walls_hide_are_found_where_their_image_has_them(session):
     detections = detect(session)
     pair = Pair("cam", "frames", "lidar")
     assert len(detections.captures(pair)) == 11
@@ -34,7 +31,7 @@ def test_boards_that_walls_hide_are_found_where_their_image_has_them(
 
 @pytest.mark.dataset
 @pytest.mark.long
-def test_nothing_is_predicted_from_few_captures_or_without_an_image(session: Session) -> None:
+def test_nothing_is_predicted_from_few_captures_or_without_an_image(session):
     found = detect(session)
     names = found.captures(Pair("cam", "frames", "lidar"))
     refusal = Refusal("lidar.no_returns", figures={"n_points": 0, "min_range_m": 0.4})

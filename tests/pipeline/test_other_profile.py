@@ -1,7 +1,6 @@
 """Deployed extrinsics are judged with the lenses that they were estimated with."""
 
 from hashlib import sha256
-from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +15,7 @@ RIG = load_rig("rlfs")
 OTHER = changed(RIG, cameras__cam__intrinsics__cx_px=660.0)
 
 
-def test_the_keys_that_differ_are_named_and_the_result_s_lens_counts() -> None:
+def test_the_keys_that_differ_are_named_and_the_result_s_lens_counts():
     rig, (note,) = with_lenses_of(changed(OTHER, board__square_m=0.071), RIG)
     assert note.code == "verify.other_profile"
     assert str(note.figures["keys"]).split(", ") == ["board.square_m", "cameras.cam.intrinsics.cx_px"]
@@ -24,13 +23,13 @@ def test_the_keys_that_differ_are_named_and_the_result_s_lens_counts() -> None:
     assert rig.board.square_m == 0.071
 
 
-def test_the_same_profile_or_none_changes_nothing() -> None:
+def test_the_same_profile_or_none_changes_nothing():
     described = RIG.model_copy(update={"description": "another"})
     assert with_lenses_of(described, RIG) == (described, ())
     assert with_lenses_of(RIG, None) == (RIG, ())
 
 
-def test_a_result_s_profile_is_that_of_its_session_if_it_is_still_the_same(tmp_path: Path) -> None:
+def test_a_result_s_profile_is_that_of_its_session_if_it_is_still_the_same(tmp_path):
     profile, file = tmp_path / "rig.yaml", tmp_path / "calibration/front/result.json"
     file.parent.mkdir(parents=True)
     profile.write_text(dump_rig(RIG))

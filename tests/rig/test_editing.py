@@ -11,7 +11,7 @@ from lce_rig.rig import derive_text, find_profile, load_rig, parse_rig, set_valu
 RLES = find_profile("rles").read_text(encoding="utf-8")
 
 
-def test_another_focus_changes_five_lines_and_keeps_every_comment() -> None:
+def test_another_focus_changes_five_lines_and_keeps_every_comment():
     numbers = {"fx_px": "305.5716", "fy_px": "305.6182", "cx_px": "175.2111", "cy_px": "125.4881"}
     settings = [(f"cameras.davis.intrinsics.{key}", value) for key, value in numbers.items()]
     text = derive_text(RLES, "rles02", settings, "rles02.yaml", "rles")
@@ -27,7 +27,7 @@ def test_another_focus_changes_five_lines_and_keeps_every_comment() -> None:
     assert rig.board == load_rig("rles").board
 
 
-def test_a_missing_key_is_added_at_the_end_of_its_block() -> None:
+def test_a_missing_key_is_added_at_the_end_of_its_block():
     text = set_value(RLES, "calibration.target_sigma_m", "0.02")
     text = set_value(text, "quality.min_rings", "5")
     text = set_value(text, "quality.min_points", "50")
@@ -37,12 +37,12 @@ def test_a_missing_key_is_added_at_the_end_of_its_block() -> None:
     assert rig.calibration.target_sigma_deg == load_rig("rles").calibration.target_sigma_deg
 
 
-def test_entries_of_lists_are_reached_by_their_place() -> None:
+def test_entries_of_lists_are_reached_by_their_place():
     rig = parse_rig(set_value(RLES, "nominal_extrinsics.0.translation_m", "[1, 2, 3]"))
     assert rig.nominal_extrinsics[0].translation_m == (1, 2, 3)
 
 
-def test_a_profile_that_would_be_wrong_is_refused_with_its_key() -> None:
+def test_a_profile_that_would_be_wrong_is_refused_with_its_key():
     with pytest.raises(ProfileError, match=r"new\.yaml"):
         derive_text(RLES, "new", [("board.square_m", "68")], "new.yaml", "rles")
     with pytest.raises(ProfileError, match=r"board\.sqare_m"):
@@ -59,16 +59,16 @@ def test_a_profile_that_would_be_wrong_is_refused_with_its_key() -> None:
         ("quality.x.y", "1 # b"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_usage_errors(path: str, value: str) -> None:
+def test_settings_that_cannot_be_meant_are_usage_errors(path, value):
     with pytest.raises(UsageError):
         set_value(RLES, path, value)
 
 
-def test_a_name_that_yaml_reads_as_a_number_stays_a_name() -> None:
+def test_a_name_that_yaml_reads_as_a_number_stays_a_name():
     assert parse_rig(derive_text(RLES, "346", [], "x", "rles")).name == "346"
 
 
-def paths(data: object, prefix: str = "") -> list[str]:
+def paths(data, prefix=""):
     items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else []
     return [prefix.lstrip("."), *(p for key, value in items for p in paths(value, f"{prefix}.{key}"))]
 
@@ -78,7 +78,7 @@ PATHS = [path for path in paths(yaml.safe_load(RLES)) if path]
 
 @settings(max_examples=15)
 @given(st.sampled_from(PATHS), st.sampled_from(["1.5", "[1, 2]", "{a: 1}", "text", '"a # b"', "null", "{}"]))
-def test_setting_a_key_changes_that_key_and_nothing_else(path: str, value: str) -> None:
+def test_setting_a_key_changes_that_key_and_nothing_else(path, value):
     wanted = yaml.safe_load(RLES)
     *parents, last = [int(key) if key.isdigit() else key for key in path.split(".")]
     block = wanted

@@ -1,7 +1,6 @@
 """Profiles from and to files."""
 
 from itertools import chain
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -13,12 +12,12 @@ from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, shippe
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 
 
-def test_the_shipped_profiles_are_the_papers_and_one_for_each_kind_of_lidar() -> None:
+def test_the_shipped_profiles_are_the_papers_and_one_for_each_kind_of_lidar():
     assert set(shipped_profiles()) == {"rlfs", "rles", "sss", "os1_64", "os0_128", "xt32", "hdl32e", "mid360"}
     assert all(load_rig(name).name == name for name in shipped_profiles())
 
 
-def test_no_shipped_profile_gives_a_warning() -> None:
+def test_no_shipped_profile_gives_a_warning():
     assert not [*chain.from_iterable(load_rig(name).warnings() for name in shipped_profiles())]
 
 
@@ -33,13 +32,7 @@ def test_no_shipped_profile_gives_a_warning() -> None:
         st.booleans() | st.integers(-9, 9) | st.floats(-1, 1) | st.text(max_size=5),
     ),
 )
-def test_any_profile_survives_a_round_trip_to_the_last_digit(
-    square_m: float,
-    focal_px: float,
-    offset_s: float,
-    tiny: float,
-    controls: dict[str, bool | int | float | str],
-) -> None:
+def test_any_profile_survives_a_round_trip_to_the_last_digit(square_m, focal_px, offset_s, tiny, controls):
     data = load_rig("rlfs").model_dump()
     data["board"]["square_m"] = square_m
     data["cameras"]["cam"]["intrinsics"] |= {
@@ -55,14 +48,14 @@ def test_any_profile_survives_a_round_trip_to_the_last_digit(
     assert again.lidars["lidar"].driver.controls == controls
 
 
-def test_a_path_loads_a_file(tmp_path: Path) -> None:
+def test_a_path_loads_a_file(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(RLFS.replace("name: rlfs", "name: mine"), encoding="utf-8")
     assert load_rig(path).name == "mine"
     assert load_rig(str(path)) == load_rig(path)
 
 
-def test_a_misspelt_name_lists_the_known_ones_and_the_nearest() -> None:
+def test_a_misspelt_name_lists_the_known_ones_and_the_nearest():
     with pytest.raises(ProfileError) as caught:
         load_rig("rlsf")
     assert "rlfs" in caught.value.hint
@@ -70,7 +63,7 @@ def test_a_misspelt_name_lists_the_known_ones_and_the_nearest() -> None:
 
 
 @pytest.mark.parametrize("name", ["nothing.yaml", "no/such/rlfs", "/tmp"])
-def test_a_missing_file_or_a_folder_is_no_profile(name: str) -> None:
+def test_a_missing_file_or_a_folder_is_no_profile(name):
     with pytest.raises(ProfileError):
         load_rig(name)
 
@@ -93,7 +86,7 @@ def test_a_missing_file_or_a_folder_is_no_profile(name: str) -> None:
         (b"name: !!bool x\n", ""),
     ],
 )
-def test_what_is_no_profile_is_refused_with_its_place(tmp_path: Path, content: bytes, place: str) -> None:
+def test_what_is_no_profile_is_refused_with_its_place(tmp_path, content, place):
     path = tmp_path / "mine.yaml"
     path.write_bytes(content)
     with pytest.raises(ProfileError) as caught:
@@ -103,7 +96,7 @@ def test_what_is_no_profile_is_refused_with_its_place(tmp_path: Path, content: b
 
 @settings(max_examples=30)
 @given(st.integers(0, len(RLFS)), st.integers(0, 40), st.text(max_size=6))
-def test_any_damage_is_a_profile_error_or_harmless(start: int, length: int, inserted: str) -> None:
+def test_any_damage_is_a_profile_error_or_harmless(start, length, inserted):
     text = RLFS[:start] + inserted + RLFS[start + length :]
     try:
         rig = parse_rig(text)

@@ -18,7 +18,7 @@ RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 RLES = find_profile("rles").read_text(encoding="utf-8")
 
 
-def refusal(*edits: tuple[str, str]) -> str:
+def refusal(*edits):
     """Edit rlfs.yaml and return what is said about it."""
     text = RLFS
     for old, new in edits:
@@ -30,7 +30,7 @@ def refusal(*edits: tuple[str, str]) -> str:
     return str(caught.value)
 
 
-def test_shipped_profiles_carry_the_published_numbers() -> None:
+def test_shipped_profiles_carry_the_published_numbers():
     rlfs, rles, sss = load_rig("rlfs"), load_rig("rles"), load_rig("sss")
     assert rlfs.cameras["cam"].to_intrinsics().fx_px == 897.4566
     assert rlfs.cameras["cam"].to_intrinsics().distortion == (-0.4398, 0.2329, -0.0011, 0.00020984, -0.0730)
@@ -41,7 +41,7 @@ def test_shipped_profiles_carry_the_published_numbers() -> None:
     assert sss.nominal("cam", "lidar") is None
 
 
-def test_nominal_pose_puts_the_lidars_forward_axis_before_the_camera() -> None:
+def test_nominal_pose_puts_the_lidars_forward_axis_before_the_camera():
     entry = load_rig("rles").nominal("davis", "lidar")
     assert entry is not None
     np.testing.assert_allclose(entry.to_matrix()[:3, :3], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
@@ -72,7 +72,7 @@ def test_nominal_pose_puts_the_lidars_forward_axis_before_the_camera() -> None:
         ("format_version: 1", "format_version: 2", "format_version"),
     ],
 )
-def test_each_mistake_is_named_with_its_line_and_key(old: str, new: str, key: str) -> None:
+def test_each_mistake_is_named_with_its_line_and_key(old, new, key):
     position, _, message = refusal((old, new)).partition(": ")
     assert message.startswith(f"{key}: ")
     source, _, line = position.partition(":")
@@ -98,25 +98,23 @@ def test_each_mistake_is_named_with_its_line_and_key(old: str, new: str, key: st
         ),
     ],
 )
-def test_a_mistake_is_answered_with_the_figure_or_key_that_is_meant(
-    edits: list[tuple[str, str]], facts: list[str]
-) -> None:
+def test_a_mistake_is_answered_with_the_figure_or_key_that_is_meant(edits, facts):
     text = refusal(*edits)
     assert all(fact in text for fact in facts)
 
 
-def test_board_that_fits_both_ways_round_gives_a_warning() -> None:
+def test_board_that_fits_both_ways_round_gives_a_warning():
     turned = find_profile("sss").read_text(encoding="utf-8").replace("[8, 6]", "[6, 8]")
     assert [warning.code for warning in parse_rig(turned).warnings()] == ["profile.swapped_sides"]
     assert not list(load_rig("sss").warnings())
 
 
 @pytest.mark.parametrize("size", ["[640, 360]", "[960, 540]", "[1920, 1080]", "[2560, 1440]"])
-def test_intrinsics_of_another_resolution_are_noticed(size: str) -> None:
+def test_intrinsics_of_another_resolution_are_noticed(size):
     assert "(about 1271x751 px)" in refusal(("[1280, 720]", size))
 
 
-def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
+def test_all_problems_are_listed_at_once_in_the_files_order():
     text = refusal(
         ("square_m: 0.070", "square_m: 70"), ("fx_px: 897.4566", "fx: 897"), ("rate_hz: 10", "rate_hz: 0")
     )
@@ -127,13 +125,13 @@ def test_all_problems_are_listed_at_once_in_the_files_order() -> None:
     ] * 3
 
 
-def rows(R: np.ndarray) -> str:
+def rows(R):
     return str([[float(value) for value in row] for row in R])
 
 
 @settings(max_examples=10)
 @given(st.tuples(*[st.floats(-3, 3)] * 3))
-def test_every_way_to_write_a_nominal_rotation_gives_the_same_pose(phi: tuple[float, float, float]) -> None:
+def test_every_way_to_write_a_nominal_rotation_gives_the_same_pose(phi):
     from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_rotvec(phi)
@@ -154,7 +152,7 @@ def test_every_way_to_write_a_nominal_rotation_gives_the_same_pose(phi: tuple[fl
         "tolerance_deg: 5.0",
     ],
 )
-def test_what_is_no_rotation_is_refused(rotation: str) -> None:
+def test_what_is_no_rotation_is_refused(rotation):
     text = RLFS.replace("    tolerance_deg: 5.0\n", "")
     text = text.replace("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]", rotation)
     with pytest.raises(ProfileError):
@@ -164,13 +162,13 @@ def test_what_is_no_rotation_is_refused(rotation: str) -> None:
 DOCUMENT = Path(__file__).parents[2] / "docs" / "rig-profiles.md"
 
 
-def test_every_setting_is_documented() -> None:
+def test_every_setting_is_documented():
     text = DOCUMENT.read_text(encoding="utf-8")
     assert [key for _, key in all_keys() if f"`{key}`" not in text] == []
 
 
-def test_documented_defaults_are_those_of_the_code() -> None:
-    documented: dict[str, float] = {}
+def test_documented_defaults_are_those_of_the_code():
+    documented = {}
     for line in DOCUMENT.read_text(encoding="utf-8").splitlines():
         keys, _, rest = line.removeprefix("| ").partition(" | ")
         values = rest.partition(" | ")[0].split(", ")
@@ -182,7 +180,7 @@ def test_documented_defaults_are_those_of_the_code() -> None:
                 assert float(documented[key]) == field.default, key
 
 
-def test_what_a_copied_camera_shares_with_the_first_is_a_warning() -> None:
+def test_what_a_copied_camera_shares_with_the_first_is_a_warning():
     document = load_rig("rlfs").model_dump(exclude_none=True)
     right = document["cameras"]["cam"] | {"frame": "right_link", "optical_frame": "right_optical"}
     document["cameras"]["right"] = right
@@ -195,7 +193,7 @@ def test_what_a_copied_camera_shares_with_the_first_is_a_warning() -> None:
         assert warning.figures == {"value": value, "other": f"cameras.cam.{key}"}
 
 
-def test_a_driver_or_model_that_nothing_knows_is_named_with_its_key() -> None:
+def test_a_driver_or_model_that_nothing_knows_is_named_with_its_key():
     (unknown,) = parse_rig(RLFS.replace("model: VLP-16", "model: XY-64")).warnings()
     assert (unknown.code, unknown.subject) == ("profile.unknown_model", "lidars.lidar.model")
     assert "cameras.cam.driver.type" in refusal(("type: v4l2", "type: webcam"))
@@ -210,14 +208,12 @@ sync:
 """
 
 
-def with_block(block: str, kind: str = KIND) -> str:
+def with_block(block, kind=KIND):
     return RLES.replace(kind, f"{kind}        reconstruction: {block}\n", 1)
 
 
 @pytest.mark.parametrize("path", ["nets/other.onnx", "/nets/other.onnx"])
-def test_the_path_of_a_network_begins_at_the_profiles_folder_and_stays_absolute_in_a_session(
-    tmp_path: Path, path: str
-) -> None:
+def test_the_path_of_a_network_begins_at_the_profiles_folder_and_stays_absolute_in_a_session(tmp_path, path):
     (tmp_path / "mine.yaml").write_text(with_block(f"{{model: {path}}}"), encoding="utf-8")
     rig = load_rig(tmp_path / "mine.yaml")
     settings = rig.cameras["davis"].channels["events"].reconstruction
@@ -239,7 +235,7 @@ def test_the_path_of_a_network_begins_at_the_profiles_folder_and_stays_absolute_
         ("{model: ''}", "model"),
     ],
 )
-def test_a_reconstruction_that_cannot_be_meant_is_named_with_its_line(block: str, key: str) -> None:
+def test_a_reconstruction_that_cannot_be_meant_is_named_with_its_line(block, key):
     text = with_block(block)
     line = text[: text.index("reconstruction:")].count("\n") + 1
     with pytest.raises(ProfileError) as caught:
@@ -260,7 +256,7 @@ def test_a_reconstruction_that_cannot_be_meant_is_named_with_its_line(block: str
         ("device:", "type: nmea\n  device:", "sync.type"),
     ],
 )
-def test_a_sync_board_that_cannot_be_meant_is_refused_with_its_key(old: str, new: str, key: str) -> None:
+def test_a_sync_board_that_cannot_be_meant_is_refused_with_its_key(old, new, key):
     with pytest.raises(ProfileError) as caught:
         parse_rig(RLFS + SYNC.replace(old, new))
     assert f"{key}: " in str(caught.value)
@@ -285,7 +281,7 @@ def test_a_sync_board_that_cannot_be_meant_is_refused_with_its_key(old: str, new
         ({"type": "circles"}, "board.type"),
     ],
 )
-def test_keys_of_another_type_of_board_are_named(changes: dict[str, object], key: str) -> None:
+def test_keys_of_another_type_of_board_are_named(changes, key):
     document = load_rig("rlfs").model_dump(mode="json", exclude_none=True)
     document["board"] |= changes
     with pytest.raises(ProfileError) as caught:
@@ -303,9 +299,7 @@ def test_keys_of_another_type_of_board_are_named(changes: dict[str, object], key
         ("tags", (2, 1), True),
     ],
 )
-def test_boards_with_too_few_corners_to_be_detected_are_refused(
-    key: str, size: tuple[int, int], is_accepted: bool
-) -> None:
+def test_boards_with_too_few_corners_to_be_detected_are_refused(key, size, is_accepted):
     board = {
         "squares": {"type": "charuco", "marker_m": 0.05, "dictionary": "5X5_50"},
         "tags": {"type": "aprilgrid", "tag_spacing": 0.3},
@@ -320,7 +314,7 @@ def test_boards_with_too_few_corners_to_be_detected_are_refused(
     assert f"board.{key}" in caught.value.what + caught.value.hint
 
 
-def test_a_board_with_markers_survives_its_profile_and_old_profiles_are_checkerboards() -> None:
+def test_a_board_with_markers_survives_its_profile_and_old_profiles_are_checkerboards():
     document = load_rig("rlfs").model_dump(mode="json", exclude_none=True)
     assert load_rig("rlfs").board.type == "checkerboard"
     document["board"] = {
@@ -334,6 +328,6 @@ def test_a_board_with_markers_survives_its_profile_and_old_profiles_are_checkerb
     assert parse_rig(dump_rig(rig)) == rig
 
 
-def test_keys_of_earlier_versions_are_read_and_mean_nothing() -> None:
+def test_keys_of_earlier_versions_are_read_and_mean_nothing():
     retired = "verdict: {control_sigmas: 3, max_spread_ratio: 1.2, max_change: 2}\n"
     assert parse_rig(RLFS + retired) == parse_rig(RLFS + "verdict: {max_change: 2}\n")

@@ -1,11 +1,9 @@
 """A simulated room with exact truth, seen in four captures by a small camera and a VLP-16."""
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.rig import Rig, load_rig
@@ -29,18 +27,18 @@ class Seen(NamedTuple):
     views: list[SceneView]
 
 
-def small_rig(name: str = "rlfs") -> Rig:
+def small_rig(name="rlfs"):
     """A rig with a camera of half its resolution, which renders fast."""
     return half_size(load_rig(name))
 
 
-def deployed(T_cam_lidar: NDArray[np.float64]) -> Calibration:
+def deployed(T_cam_lidar):
     """Make a result with given extrinsics."""
     return made_calibration(T_cam_lidar, COV, n_captures=4, n_detected=4)
 
 
 @pytest.fixture(scope="session")
-def seen() -> Seen:
+def seen():
     """Simulate the captures once."""
     rig = small_rig()
     captures = list(simulate_captures(rig, n_captures=4, seed=SEED))
@@ -50,7 +48,7 @@ def seen() -> Seen:
 
 
 @pytest.fixture(scope="session")
-def room(seen: Seen, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room(seen, tmp_path_factory):
     """A session of the captures with the true extrinsics as its result."""
     path = tmp_path_factory.mktemp("scene") / "room"
     with Session.create(path, seen.rig) as session:

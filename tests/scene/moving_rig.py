@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, exp_so3, invert, pose
-from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.backdrop import build_backdrop
 from lce_rig.simulate.event_camera import EventCamera, draw_pixels
@@ -30,21 +28,21 @@ class MovingRig:
     T_world_start: Array
 
     @classmethod
-    def build(cls, rig: Rig, seed: int, velocity_mps, turn_rad_s: float, at=(0.0, 0.0)) -> "MovingRig":
+    def build(cls, rig, seed, velocity_mps, turn_rad_s, at=(0.0, 0.0)):
         stage = set_stage(rig, seed, SimulationOptions.for_rig(rig.name))
         start = pose(np.eye(3), np.array([*at, 0.0]))
         return cls(stage, np.array(velocity_mps, dtype=np.float64), turn_rad_s, start)
 
-    def base_at(self, t_ns: int | NDArray[np.int64]) -> Array:
+    def base_at(self, t_ns):
         """Where the rig is, relative to where it stands in the stage, (..., 4, 4)."""
         t_s = 1e-9 * (np.asarray(t_ns, dtype=np.float64) - START_NS)[..., None]
         turn = exp_so3(t_s * [0.0, 0.0, self.turn_rad_s])
         return self.T_world_start @ pose(turn, t_s * self.velocity_mps)
 
-    def sensor_at(self, sensor: str, t_ns: int | NDArray[np.int64]) -> Array:
+    def sensor_at(self, sensor, t_ns):
         return self.base_at(t_ns) @ self.stage.T_world_sensor[sensor]
 
-    def scan(self, lidar: str, stamp_ns: int, seed: int) -> Scan:
+    def scan(self, lidar, stamp_ns, seed):
         stage, rng = self.stage, np.random.default_rng([seed, 1])
         empty = Scene(stage.room.raycaster, (), stage.board, NOWHERE)
         sweep = sweep_scene(
@@ -58,16 +56,16 @@ class MovingRig:
         )
         return stage.measure(lidar, sweep, rng, stamp_ns)
 
-    def radiance(self, camera: str, t_ns: int) -> Array:
+    def radiance(self, camera, t_ns):
         lens = self.stage.rig.cameras[camera].to_intrinsics()
         return build_backdrop(self.stage.room, self.sensor_at(camera, t_ns), lens).radiance
 
-    def image(self, camera: str, stamp_ns: int, seed: int) -> Image:
+    def image(self, camera, stamp_ns, seed):
         rng = np.random.default_rng([seed, 2])
         pixels = expose(self.radiance(camera, stamp_ns), self.stage.options.camera, rng)
         return Image(camera, "frames", stamp_ns, pixels, stamp_ns)
 
-    def events(self, camera: str, start_ns: int, end_ns: int, seed: int, n_steps: int = 8) -> Events:
+    def events(self, camera, start_ns, end_ns, seed, n_steps=8):
         lens, noise = self.stage.rig.cameras[camera].to_intrinsics(), self.stage.options.events
         rng = np.random.default_rng([seed, 3])
         times = np.linspace(start_ns, end_ns, n_steps + 1).astype(np.int64)
@@ -77,5 +75,5 @@ class MovingRig:
             sensor.see(light, int(t_ns))
         return sensor.take()
 
-    def truth(self, camera: str, lidar: str) -> Array:
+    def truth(self, camera, lidar):
         return invert(self.stage.T_world_sensor[camera]) @ self.stage.T_world_sensor[lidar]

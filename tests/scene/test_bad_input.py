@@ -7,28 +7,26 @@ import cv2
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import Calibration, ResultFile
+from lce_rig.core.calibration import ResultFile
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.geometry import Array, exp_so3
-from lce_rig.pipeline.pair_drift import PairDrift
+from lce_rig.core.geometry import exp_so3
 from lce_rig.pipeline.watch_drift import SceneCaptures
-from lce_rig.rig import Rig
-from lce_rig.simulate import SimulatedCapture, truth_extrinsics
+from lce_rig.simulate import truth_extrinsics
 from lce_rig.timing.scan_pairing import Frame
 from tests.scene.conftest import SEED
 
 Corruption = Callable[[Image, Scan, np.random.Generator], tuple[Image, Scan]]
 
 
-def _of_image(change: Callable[[Array, np.random.Generator], Array]) -> Corruption:
-    def corrupt(image: Image, scan: Scan, rng: np.random.Generator) -> tuple[Image, Scan]:
+def _of_image(change):
+    def corrupt(image, scan, rng):
         pixels = np.clip(change(image.grey.astype(np.float64), rng), 0, 255).astype(np.uint8)
         return replace(image, pixels=pixels), scan
 
     return corrupt
 
 
-def _featureless(image: Image, scan: Scan, rng: np.random.Generator) -> tuple[Image, Scan]:
+def _featureless(image, scan, rng):
     """Stand in an empty round room: walls of 6 m radius, a floor without a print."""
     rays = scan.points / np.linalg.norm(scan.points, axis=1, keepdims=True)
     range_m = np.minimum(6.0 / np.hypot(rays[:, 0], rays[:, 1]), 1.0 / np.maximum(-rays[:, 2], 1e-3))
@@ -38,7 +36,7 @@ def _featureless(image: Image, scan: Scan, rng: np.random.Generator) -> tuple[Im
     return replace(image, pixels=grey.astype(np.uint8)), even
 
 
-def _rain(image: Image, scan: Scan, rng: np.random.Generator) -> tuple[Image, Scan]:
+def _rain(image, scan, rng):
     """Let drops return a fifth of the beams from anywhere before what they should meet."""
     is_drop = rng.random(len(scan.points)) < 0.2
     share = np.where(is_drop, rng.uniform(0.1, 1.0, len(scan.points)), 1.0)
@@ -46,7 +44,7 @@ def _rain(image: Image, scan: Scan, rng: np.random.Generator) -> tuple[Image, Sc
     return image, replace(scan, points=points)
 
 
-def _tilted(image: Image, scan: Scan, _: np.random.Generator) -> tuple[Image, Scan]:
+def _tilted(image, scan, _):
     """Let the LiDAR's mount have given way by 6 deg."""
     turn = exp_so3(np.radians([0.0, 6.0, 0.0])).T
     return image, replace(scan, points=(scan.points @ turn.T).astype(np.float32))
@@ -63,9 +61,7 @@ CORRUPTIONS: dict[str, Corruption] = {
 """What happens to the images and scans of unchanged extrinsics, or changes them beyond the range searched."""
 
 
-def judge_corrupted(
-    rig: Rig, captures: list[SimulatedCapture], deployed: Calibration, corrupt: Corruption
-) -> PairDrift:
+def judge_corrupted(rig, captures, deployed, corrupt):
     """Judge extrinsics by corrupted captures."""
     rng = np.random.default_rng(0)
     result = ResultFile(rig=rig.name, pairs=(deployed,))
@@ -79,13 +75,13 @@ def judge_corrupted(
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", CORRUPTIONS)
-def test_a_corruption_is_never_an_all_clear(seen, name) -> None:
+def test_a_corruption_is_never_an_all_clear(seen, name):
     pair = judge_corrupted(seen.rig, seen.captures, seen.truth, CORRUPTIONS[name])
     assert pair.state != "unchanged"
     assert pair.summary.code.startswith("scene.") and pair.summary.severity != "note"
 
 
-def test_another_rig_s_result_is_changed(seen) -> None:
+def test_another_rig_s_result_is_changed(seen):
     other = replace(seen.truth, T_cam_lidar=truth_extrinsics(seen.rig, SEED + 1)["cam", "lidar"])
     pair = judge_corrupted(seen.rig, seen.captures, other, lambda image, scan, _: (image, scan))
     assert pair.state == "changed"

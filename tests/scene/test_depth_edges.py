@@ -42,7 +42,7 @@ def azimuth_of(edges):
     return np.arctan2(edges.points[:, 1], edges.points[:, 0])
 
 
-def test_without_rings_outlines_lie_between_the_last_return_and_the_next() -> None:
+def test_without_rings_outlines_lie_between_the_last_return_and_the_next():
     def leaning(az, el):
         return np.where(np.abs(az - el / 3) < 0.1, 3.0, 6.0)
 
@@ -64,11 +64,11 @@ def test_without_rings_outlines_lie_between_the_last_return_and_the_next() -> No
     ],
     ids=["floor", "walls of a corridor", "upper edge", "foliage"],
 )
-def test_without_rings_slopes_and_clutter_have_hardly_any_outlines(surface) -> None:
+def test_without_rings_slopes_and_clutter_have_hardly_any_outlines(surface):
     assert len(find_depth_edges(scattered(surface), NEEDLE)) < 0.01 * 60_000
 
 
-def test_without_rings_changes_of_reflectivity_lie_on_the_borders_of_a_stripe() -> None:
+def test_without_rings_changes_of_reflectivity_lie_on_the_borders_of_a_stripe():
     edges = find_depth_edges(scattered(lambda az, el: 4.0 + 0 * az, stripe), NEEDLE)
     elevation = np.arcsin(edges.points[:, 2] / 4.0)
     from_border = np.abs(azimuth_of(edges) - elevation / 2) - 0.05
@@ -76,7 +76,7 @@ def test_without_rings_changes_of_reflectivity_lie_on_the_borders_of_a_stripe() 
     assert np.abs(from_border).max() < 2 * STEP
 
 
-def test_upright_outlines_lie_between_the_last_return_and_the_next() -> None:
+def test_upright_outlines_lie_between_the_last_return_and_the_next():
     edges = find_depth_edges(scan_of(pillar, range(-15, 16, 2)), NEEDLE)
     azimuth = np.arctan2(edges.points[:, 1], edges.points[:, 0])
     assert len(edges) == 2 * 16
@@ -85,12 +85,12 @@ def test_upright_outlines_lie_between_the_last_return_and_the_next() -> None:
     assert edges.weight == pytest.approx(np.sqrt(3.0), abs=1e-3)
 
 
-def test_a_floor_has_no_outlines_though_its_rings_lie_far_apart() -> None:
+def test_a_floor_has_no_outlines_though_its_rings_lie_far_apart():
     floor = scan_of(lambda az, el: 1.0 / np.sin(-el) + 0 * az, np.arange(-20, -4, 0.5))
     assert len(find_depth_edges(floor, NEEDLE)) == 0
 
 
-def test_a_wall_seen_at_a_grazing_angle_has_no_outline_though_its_steps_are_large() -> None:
+def test_a_wall_seen_at_a_grazing_angle_has_no_outline_though_its_steps_are_large():
     wall = scan_of(lambda az, el: 0.4 / np.sin(np.maximum(np.abs(az), 0.02)), [0])
     assert np.abs(np.diff(np.linalg.norm(wall.points, axis=1))).max() > 1.0
     assert len(find_depth_edges(wall, NEEDLE)) == 0
@@ -101,7 +101,7 @@ def stripe(az, el):
     return np.where(np.abs(az - el / 2) < 0.05, 10.0, 60.0)
 
 
-def test_changes_of_reflectivity_lie_on_the_borders_of_a_stripe() -> None:
+def test_changes_of_reflectivity_lie_on_the_borders_of_a_stripe():
     edges = find_depth_edges(scan_of(lambda az, el: 4.0 + 0 * az, range(-15, 16, 2), stripe), NEEDLE)
     azimuth = np.arctan2(edges.points[:, 1], edges.points[:, 0])
     elevation = np.arcsin(edges.points[:, 2] / 4.0)
@@ -109,7 +109,7 @@ def test_changes_of_reflectivity_lie_on_the_borders_of_a_stripe() -> None:
     assert np.abs(np.abs(azimuth - elevation / 2) - 0.05).max() < 0.51 * STEP
 
 
-def test_reflectivity_of_other_surfaces_and_noise_are_no_changes() -> None:
+def test_reflectivity_of_other_surfaces_and_noise_are_no_changes():
     rng = np.random.default_rng(0)
 
     def noisy(az, el):
@@ -119,7 +119,7 @@ def test_reflectivity_of_other_surfaces_and_noise_are_no_changes() -> None:
     assert set(edges.channel) == {CHANNELS.index("depth")}
 
 
-def test_single_returns_between_two_surfaces_are_no_outline() -> None:
+def test_single_returns_between_two_surfaces_are_no_outline():
     def mixed(az, el):
         return np.where(np.abs(az) < STEP / 2, 4.0, 6.0)
 
@@ -128,11 +128,11 @@ def test_single_returns_between_two_surfaces_are_no_outline() -> None:
 
 @pytest.mark.parametrize("scan", [scan_of(lambda az, el: 3.0 + az, [0]), scattered(lambda az, el: 3.0 + az)])
 @pytest.mark.parametrize("n", [0, 1, 2])
-def test_an_almost_empty_scan_has_no_outlines(n, scan) -> None:
+def test_an_almost_empty_scan_has_no_outlines(n, scan):
     assert len(find_depth_edges(scan.select(np.arange(n)), NEEDLE)) == 0
 
 
-def test_the_board_and_its_stand_move_before_a_standing_rig_and_are_left_out(seen) -> None:
+def test_the_board_and_its_stand_move_before_a_standing_rig_and_are_left_out(seen):
     found = [view.edges for view in seen.views]
     standing = leave_standing(found)
     shares = []
@@ -146,7 +146,7 @@ def test_the_board_and_its_stand_move_before_a_standing_rig_and_are_left_out(see
     assert min(shares) > 0.8
 
 
-def test_a_rig_that_moves_keeps_its_edges(seen) -> None:
+def test_a_rig_that_moves_keeps_its_edges(seen):
     moving = [
         DepthEdges(view.edges.points + [0.4 * k, 0, 0], view.edges.weight, view.edges.channel)
         for k, view in enumerate(seen.views)

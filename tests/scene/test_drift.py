@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import Calibration
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.scene.alignment import AXES, Alignment
 from lce_rig.scene.depth_edges import CHANNELS
@@ -14,7 +13,7 @@ from lce_rig.scene.edge_field import build_edge_field
 
 
 def judge(seen, tangent=(0.0,) * 6, views=None, is_joint=False):
-    c: Calibration = seen.truth
+    c = seen.truth
     lens = seen.rig.cameras["cam"].to_intrinsics()
     moved = perturb(c.T_cam_lidar, np.array(tangent))
     return watch(seen.views if views is None else views, lens, moved, c.cov, is_joint=is_joint)
@@ -24,7 +23,7 @@ def along(axis, size):
     return size * np.eye(6)[AXES.index(axis)]
 
 
-def test_the_truth_is_unchanged(seen) -> None:
+def test_the_truth_is_unchanged(seen):
     drift = judge(seen, is_joint=True)
     assert drift.state == "unchanged"
     assert all(abs(axis.change) < 2 * axis.sigma for axis in drift.axes)
@@ -45,7 +44,7 @@ def test_the_truth_is_unchanged(seen) -> None:
         ("translation_z", 0.10),
     ],
 )
-def test_one_changed_axis_is_seen_with_its_size(seen, axis, size, sign) -> None:
+def test_one_changed_axis_is_seen_with_its_size(seen, axis, size, sign):
     drift = judge(seen, along(axis, sign * size))
     assert drift.state == "changed"
     (found,) = [each for each in drift.axes if each.state == "changed"]
@@ -55,7 +54,7 @@ def test_one_changed_axis_is_seen_with_its_size(seen, axis, size, sign) -> None:
         assert found.change == pytest.approx(-sign * injected, abs=3 * found.sigma)
 
 
-def test_changes_of_two_axes_are_both_seen(seen) -> None:
+def test_changes_of_two_axes_are_both_seen(seen):
     turned = along("rotation_y", np.radians(1.0)) + along("rotation_x", np.radians(1.2))
     drift = judge(seen, turned, is_joint=True)
     assert {axis.axis for axis in drift.axes if axis.state == "changed"} >= {"rotation_y"}
@@ -64,7 +63,7 @@ def test_changes_of_two_axes_are_both_seen(seen) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_best_extrinsics_are_found_from_3_deg_and_20_cm_off_or_reported_uncertain(seen, seed) -> None:
+def test_the_best_extrinsics_are_found_from_3_deg_and_20_cm_off_or_reported_uncertain(seen, seed):
     shift, turn = np.random.default_rng(seed).standard_normal((2, 3))
     start = (*0.2 * shift / np.linalg.norm(shift), *np.radians(3.0) * turn / np.linalg.norm(turn))
     drift = judge(seen, start, is_joint=True)
@@ -75,7 +74,7 @@ def test_the_best_extrinsics_are_found_from_3_deg_and_20_cm_off_or_reported_unce
 
 
 @pytest.mark.parametrize("size_deg", [4.0, 8.0, -15.0])
-def test_a_change_beyond_the_range_is_never_an_all_clear(seen, size_deg) -> None:
+def test_a_change_beyond_the_range_is_never_an_all_clear(seen, size_deg):
     assert judge(seen, along("rotation_y", np.radians(size_deg))).state != "unchanged"
 
 
@@ -101,12 +100,12 @@ NOISE = np.random.default_rng(0)
     ],
     ids=["even", "dark", "mirrored", "upside down"],
 )
-def test_images_without_the_scene_s_edges_cannot_tell(seen, change) -> None:
+def test_images_without_the_scene_s_edges_cannot_tell(seen, change):
     drift = judge(seen, views=of_images(seen, change))
     assert {axis.state for axis in drift.axes} == {"unknown"}
 
 
-def test_changes_of_reflectivity_alone_show_pitch_and_yaw(seen) -> None:
+def test_changes_of_reflectivity_alone_show_pitch_and_yaw(seen):
     lens = seen.rig.cameras["cam"].to_intrinsics()
     is_painted = [view.edges.channel == CHANNELS.index("reflectivity") for view in seen.views]
     views = [
@@ -119,7 +118,7 @@ def test_changes_of_reflectivity_alone_show_pitch_and_yaw(seen) -> None:
         assert abs(np.degrees(curve.peak)) < 0.15
 
 
-def test_too_few_edges_cannot_tell(seen) -> None:
+def test_too_few_edges_cannot_tell(seen):
     view = seen.views[0]
     edges = view.edges
     few = edges.select(np.arange(len(edges)) < 9)
@@ -128,7 +127,7 @@ def test_too_few_edges_cannot_tell(seen) -> None:
         assert drift.state == "unknown" and drift.findings[0].code == "scene.few_edges"
 
 
-def test_a_side_without_edges_is_named(seen) -> None:
+def test_a_side_without_edges_is_named(seen):
     lens = seen.rig.cameras["cam"].to_intrinsics()
     T = seen.truth.T_cam_lidar
     views = []

@@ -39,14 +39,14 @@ def turned(seen, tmp_path):
     return tmp_path / "result.json"
 
 
-def test_unchanged_exits_with_0_and_draws(room, tmp_path, capsys) -> None:
+def test_unchanged_exits_with_0_and_draws(room, tmp_path, capsys):
     assert run(["drift", str(room), "-o", str(tmp_path), "--json"]) == 0
     (pair,) = json.loads(capsys.readouterr().out)["pairs"]
     assert pair["state"] == "unchanged" and len(pair["axes"]) == 6
     assert cv2.imread(str(tmp_path / "drift_cam_lidar.png")).shape[1] == 1600
 
 
-def test_changed_exits_with_7_and_names_the_axis(room, turned, capsys) -> None:
+def test_changed_exits_with_7_and_names_the_axis(room, turned, capsys):
     assert run(["drift", str(room), "--result", str(turned)]) == 7
     captured = capsys.readouterr()
     assert len(captured.out.splitlines()) <= 6
@@ -54,7 +54,7 @@ def test_changed_exits_with_7_and_names_the_axis(room, turned, capsys) -> None:
     assert " y " in changed and "deg" in changed
 
 
-def test_a_folder_is_compared_as_a_session_is(room, seen, turned, tmp_path) -> None:
+def test_a_folder_is_compared_as_a_session_is(room, seen, turned, tmp_path):
     folder = tmp_path / "folder"
     session = Session.open(room)
     for place in ("img", "pcd"):
@@ -69,7 +69,7 @@ def test_a_folder_is_compared_as_a_session_is(room, seen, turned, tmp_path) -> N
     assert run(words) == 4
 
 
-def test_even_images_exit_with_6(room, tmp_path, seen) -> None:
+def test_even_images_exit_with_6(room, tmp_path, seen):
     path = tmp_path / "even"
     with Session.create(path, seen.rig) as session:
         for capture in seen.captures:
@@ -79,7 +79,7 @@ def test_even_images_exit_with_6(room, tmp_path, seen) -> None:
     assert run(["drift", str(path), "--result", str(room / "calibration" / "result.json")]) == 6
 
 
-def test_a_result_of_another_rig_is_refused(room, seen, tmp_path) -> None:
+def test_a_result_of_another_rig_is_refused(room, seen, tmp_path):
     write_result(tmp_path / "result.json", "another", [seen.truth])
     assert run(["drift", str(room), "--result", str(tmp_path / "result.json")]) == 4
 
@@ -111,7 +111,7 @@ def two_cameras(seen):
 
 
 @pytest.mark.parametrize("name", ["room.bag", "room_mcap"])
-def test_a_bag_is_compared_as_a_session_is(room, seen, turned, tmp_path, name, capsys) -> None:
+def test_a_bag_is_compared_as_a_session_is(room, seen, turned, tmp_path, name, capsys):
     bag = record(tmp_path / name, seen.rig, seen.captures)
     (tmp_path / "rig.yaml").write_text(dump_rig(seen.rig))
     words = ["drift", str(bag), "--rig", str(tmp_path / "rig.yaml"), "--json", "--result"]
@@ -123,7 +123,7 @@ def test_a_bag_is_compared_as_a_session_is(room, seen, turned, tmp_path, name, c
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([name, "result.json", "rig.yaml"])
 
 
-def test_of_several_cameras_the_worst_counts(seen, two_cameras, tmp_path, capsys) -> None:
+def test_of_several_cameras_the_worst_counts(seen, two_cameras, tmp_path, capsys):
     bag = record(tmp_path / "two.bag", two_cameras, seen.captures, ("cam", "cam2"))
     (tmp_path / "rig.yaml").write_text(dump_rig(two_cameras))
     turned = perturb(seen.truth.T_cam_lidar, np.array([0, 0, 0, 0, np.radians(2.0), 0]))
@@ -135,7 +135,7 @@ def test_of_several_cameras_the_worst_counts(seen, two_cameras, tmp_path, capsys
     assert states == {"cam": "unchanged", "cam2": "changed"}
 
 
-def test_a_camera_that_was_not_recorded_costs_only_itself(seen, two_cameras, tmp_path) -> None:
+def test_a_camera_that_was_not_recorded_costs_only_itself(seen, two_cameras, tmp_path):
     bag = record(tmp_path / "one.bag", seen.rig, seen.captures)
     result = ResultFile(rig=seen.rig.name, pairs=(seen.truth, replace(seen.truth, camera="cam2")))
     first, second = drift(bag, result, rig=two_cameras).pairs
@@ -143,7 +143,7 @@ def test_a_camera_that_was_not_recorded_costs_only_itself(seen, two_cameras, tmp
     assert second.summary.code == "scene.no_samples" and second.summary.subject == "cam2"
 
 
-def test_a_recording_without_the_result_s_camera_is_an_error(seen, two_cameras, tmp_path) -> None:
+def test_a_recording_without_the_result_s_camera_is_an_error(seen, two_cameras, tmp_path):
     bag = record(tmp_path / "one.bag", seen.rig, seen.captures[:1])
     result = ResultFile(rig=seen.rig.name, pairs=(replace(seen.truth, camera="cam2"),))
     with pytest.raises(SourceError, match="cam2"):
@@ -152,7 +152,7 @@ def test_a_recording_without_the_result_s_camera_is_an_error(seen, two_cameras, 
         drift(bag, replace(result, pairs=(replace(seen.truth, camera="cam3"),)), rig=two_cameras)
 
 
-def test_long_recordings_are_thinned_evenly_while_they_are_read() -> None:
+def test_long_recordings_are_thinned_evenly_while_they_are_read():
     for n in (59, 60, 61, 1000):
         kept = Thinned()
         for number in range(n):
@@ -162,7 +162,7 @@ def test_long_recordings_are_thinned_evenly_while_they_are_read() -> None:
 
 
 @pytest.mark.long
-def test_attached_sensors_are_watched(seen, tmp_path, capsys) -> None:
+def test_attached_sensors_are_watched(seen, tmp_path, capsys):
     capture = seen.captures[0]
     here = Attached(seen.rig, pixels=capture.images[0].grey, scan=capture.scans[0], has_board=False)
     with attach(here, tmp_path) as (rig, _):
@@ -177,7 +177,7 @@ def test_attached_sensors_are_watched(seen, tmp_path, capsys) -> None:
 
 
 @pytest.mark.long
-def test_ctrl_c_ends_the_watch_and_judges_what_was_seen(seen, tmp_path) -> None:
+def test_ctrl_c_ends_the_watch_and_judges_what_was_seen(seen, tmp_path):
     capture = seen.captures[0]
     here = Attached(seen.rig, pixels=capture.images[0].grey, scan=capture.scans[0], has_board=False)
     with attach(here, tmp_path) as (rig, _):
@@ -198,7 +198,7 @@ def test_ctrl_c_ends_the_watch_and_judges_what_was_seen(seen, tmp_path) -> None:
     assert pair["state"] != "changed" and pair["n_captures"] > 0
 
 
-def test_packets_of_a_lidar_and_a_file_of_a_davis_are_compared(seen, turned, tmp_path) -> None:
+def test_packets_of_a_lidar_and_a_file_of_a_davis_are_compared(seen, turned, tmp_path):
     """As two recorders leave them: a pcap of the VLP-16, and frames of the camera's own file."""
     starts_ns = [T0_NS + k * PERIOD_NS for k in range(len(seen.captures))]
     scans = [
@@ -220,7 +220,7 @@ def test_packets_of_a_lidar_and_a_file_of_a_davis_are_compared(seen, turned, tmp
         assert (pair.state, pair.drift.n_captures) == (state, len(scans))
 
 
-def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen) -> None:
+def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen):
     result = ResultFile(rig=seen.rig.name, pairs=(seen.truth,))
     captures = SceneCaptures(seen.rig, result, "a standing rig")
     rng = np.random.default_rng(0)
@@ -238,14 +238,14 @@ def test_events_of_a_standing_rig_cannot_tell_and_say_why(seen) -> None:
     assert told == ["cam"]
 
 
-def test_arguments_that_contradict_each_other_are_refused(room, seen, tmp_path) -> None:
+def test_arguments_that_contradict_each_other_are_refused(room, seen, tmp_path):
     (tmp_path / "rig.yaml").write_text(dump_rig(seen.rig))
     assert run(["drift", str(room), "--seconds", "3"]) == 2
     assert run(["drift", "--rig", str(tmp_path / "rig.yaml")]) == 2
     assert run(["drift", str(tmp_path / "nothing"), "--rig", "rlfs"]) == 4
 
 
-def test_a_board_in_view_has_an_opinion_of_its_own(room, turned) -> None:
+def test_a_board_in_view_has_an_opinion_of_its_own(room, turned):
     for result, state in ((None, "unchanged"), (read_result(turned), "changed")):
         (pair,) = drift(room, result).pairs
         assert pair.state == state

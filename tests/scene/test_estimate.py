@@ -20,23 +20,23 @@ def alone(seen):
     return estimate(seen.views, lens(seen), seen.truth.T_cam_lidar)
 
 
-def in_sigmas(estimated, truth) -> float:
+def in_sigmas(estimated, truth):
     """Squared Mahalanobis distance of the error."""
     error = difference(estimated.T_cam_lidar, truth)
     return float(error @ np.linalg.solve(estimated.cov, error))
 
 
-def test_the_truth_lies_within_the_covariance(seen, alone) -> None:
+def test_the_truth_lies_within_the_covariance(seen, alone):
     assert in_sigmas(alone, seen.truth.T_cam_lidar) < 16.8  # chi2, 6 axes, 99 %
     assert np.degrees(np.sqrt(alone.cov[4, 4])) < 0.5
 
 
-def test_captures_of_the_same_scene_count_once(seen, alone) -> None:
+def test_captures_of_the_same_scene_count_once(seen, alone):
     again = estimate(seen.views * 3, lens(seen), seen.truth.T_cam_lidar)
     assert np.sqrt(np.diag(again.cov)) == pytest.approx(np.sqrt(np.diag(alone.cov)), rel=0.3)
 
 
-def test_a_prior_is_improved_where_the_scene_shows_something(seen) -> None:
+def test_a_prior_is_improved_where_the_scene_shows_something(seen):
     off = np.array([0.02, 0.01, 0.0, 0.004, 0.010, -0.004])
     T_prior = perturb(seen.truth.T_cam_lidar, off)
     joint = estimate(seen.views, lens(seen), T_prior, (T_prior, WIDE))
@@ -46,14 +46,14 @@ def test_a_prior_is_improved_where_the_scene_shows_something(seen) -> None:
     assert np.all(np.linalg.eigvalsh(WIDE - joint.cov) > -0.1 * np.diag(WIDE).min())
 
 
-def test_a_certain_prior_stays(seen) -> None:
+def test_a_certain_prior_stays(seen):
     cov = 1e-4 * WIDE
     T_prior = perturb(seen.truth.T_cam_lidar, np.array([0.0, 0.0, 0.0, 0.0, 0.003, 0.0]))
     joint = estimate(seen.views, lens(seen), T_prior, (T_prior, cov))
     assert np.all(np.abs(difference(joint.T_cam_lidar, T_prior)) < 2 * np.sqrt(np.diag(cov)))
 
 
-def test_directions_that_nothing_shows_keep_the_prior(seen) -> None:
+def test_directions_that_nothing_shows_keep_the_prior(seen):
     """Images in which nothing fits: no certainty arises from chance."""
     views = [replace(v, field=replace(v.field, values=0 * v.field.values)) for v in seen.views]
     T = seen.truth.T_cam_lidar

@@ -14,7 +14,7 @@ def events_at(x, y):
     return Events("cam", np.arange(n), x.astype(np.uint16), y.astype(np.uint16), on, WIDTH, HEIGHT)
 
 
-def test_an_edge_that_moved_stands_out_and_is_near_its_pixels_only() -> None:
+def test_an_edge_that_moved_stands_out_and_is_near_its_pixels_only():
     y = np.repeat(np.arange(HEIGHT), 3)
     field = build_event_field(events_at(np.full(len(y), 200), y), FOCAL_PX)
     at, beside, far = field.sample(np.array([[200.0, 130.0], [206.0, 130.0], [40.0, 130.0]]))
@@ -23,7 +23,7 @@ def test_an_edge_that_moved_stands_out_and_is_near_its_pixels_only() -> None:
     assert near.tolist() == [True, False, False]
 
 
-def test_no_events_are_no_edges() -> None:
+def test_no_events_are_no_edges():
     none = np.zeros(0)
     field = build_event_field(events_at(none, none), FOCAL_PX)
     assert not field.values.any()

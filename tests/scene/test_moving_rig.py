@@ -47,7 +47,7 @@ def watch_captures(driven, late_ns=0, change=lambda scan: scan, T_cam_lidar=None
     return pair.drift
 
 
-def test_two_scans_tell_the_motion(driven) -> None:
+def test_two_scans_tell_the_motion(driven):
     for rig, before, scan, _ in driven:
         motion = estimate_motion(before, scan)
         T_world_lidar = rig.sensor_at("lidar", before.stamp_ns)
@@ -56,7 +56,7 @@ def test_two_scans_tell_the_motion(driven) -> None:
         assert motion.rate_rad_s == pytest.approx([0, 0, rig.turn_rad_s], abs=0.012)
 
 
-def test_scans_of_a_standing_rig_tell_no_motion(seen) -> None:
+def test_scans_of_a_standing_rig_tell_no_motion(seen):
     standing = MovingRig.build(small_rig(), 2, (0, 0, 0), 0.0)
     before, scan = (standing.scan("lidar", START_NS + k * PERIOD_NS, k) for k in range(2))
     assert estimate_motion(before, scan).is_still
@@ -64,7 +64,7 @@ def test_scans_of_a_standing_rig_tell_no_motion(seen) -> None:
     assert estimate_motion(before, replace(scan, stamp_ns=before.stamp_ns + 4 * 10**9)) is None
 
 
-def test_a_drive_with_true_extrinsics_shows_no_change(driven) -> None:
+def test_a_drive_with_true_extrinsics_shows_no_change(driven):
     drift = watch_captures(driven)
     assert drift.n_captures == len(driven)
     assert not [f.code for f in drift.findings if f.code in ("scene.clocks_apart", "scene.axis_changed")]
@@ -74,7 +74,7 @@ def test_a_drive_with_true_extrinsics_shows_no_change(driven) -> None:
 
 
 @pytest.mark.parametrize("late_ns", [-100_000_000, 100_000_000])
-def test_clocks_apart_while_moving_are_never_an_all_clear(driven, late_ns) -> None:
+def test_clocks_apart_while_moving_are_never_an_all_clear(driven, late_ns):
     drift = watch_captures(driven, late_ns)
     assert not [axis for axis in drift.axes if axis.state == "unchanged"]
     apart = [f.figures["apart_s"] for f in drift.findings if f.code == "scene.clocks_apart"]
@@ -92,7 +92,7 @@ def straight():
     return captures
 
 
-def test_clocks_are_named_beside_a_change_that_they_explain(straight) -> None:
+def test_clocks_are_named_beside_a_change_that_they_explain(straight):
     drift = watch_captures(straight, 100_000_000)
     assert drift.state == "changed" and not [a for a in drift.axes if a.state == "unchanged"]
     summary, clocks, *_ = drift.findings
@@ -100,14 +100,14 @@ def test_clocks_are_named_beside_a_change_that_they_explain(straight) -> None:
     assert clocks.figures["apart_s"] == pytest.approx(0.1, abs=0.03)
 
 
-def test_clocks_are_not_named_where_only_the_extrinsics_explain(driven) -> None:
+def test_clocks_are_not_named_where_only_the_extrinsics_explain(driven):
     shifted = perturb(driven[0][0].truth("cam", "lidar"), np.array([0.08, 0, 0, 0, 0, 0]))
     drift = watch_captures(driven, T_cam_lidar=shifted)
     assert drift.axes[AXES.index("translation_x")].state == "changed"
     assert not [f for f in drift.findings if f.code.startswith("scene.clocks")]
 
 
-def test_scans_without_firing_times_are_not_used_while_moving(driven) -> None:
+def test_scans_without_firing_times_are_not_used_while_moving(driven):
     drift = watch_captures(driven, change=lambda scan: replace(scan, offset_ns=None))
     assert drift.n_captures == 0 and drift.state == "unknown"
     assert [f.figures["n_captures"] for f in drift.findings if f.code == "scene.no_firing_times"] == [6]

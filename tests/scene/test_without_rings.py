@@ -25,7 +25,7 @@ SEED = 3
 
 
 @pytest.fixture(scope="module")
-def seen() -> Seen:
+def seen():
     """Three captures of a Mid-360 in a room."""
     rig = small_rig("mid360")
     captures = list(simulate_captures(rig, n_captures=3, seed=SEED))
@@ -41,7 +41,7 @@ def judge(seen, tangent=(0.0,) * 6):
     )
 
 
-def test_the_truth_has_no_change(seen) -> None:
+def test_the_truth_has_no_change(seen):
     drift = judge(seen)
     assert {axis.state for axis in drift.axes} <= {"unchanged", "unknown"}
     assert {axis.axis for axis in drift.axes if axis.state == "unchanged"} >= {"translation_x", "rotation_y"}
@@ -49,7 +49,7 @@ def test_the_truth_has_no_change(seen) -> None:
 
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("axis", AXES)
-def test_1_deg_or_10_cm_is_never_called_unchanged(seen, axis, sign) -> None:
+def test_1_deg_or_10_cm_is_never_called_unchanged(seen, axis, sign):
     size = sign * (np.radians(1.0) if axis.startswith("rotation") else 0.1)
     drift = judge(seen, size * np.eye(6)[AXES.index(axis)])
     assert drift.state != "unchanged"
@@ -58,7 +58,7 @@ def test_1_deg_or_10_cm_is_never_called_unchanged(seen, axis, sign) -> None:
         assert axis in (change.axis, *change.instead)
 
 
-def test_drift_and_calibrate_hear_the_scene_beside_the_boards(seen, tmp_path, capsys) -> None:
+def test_drift_and_calibrate_hear_the_scene_beside_the_boards(seen, tmp_path, capsys):
     with Session.create(tmp_path / "room", seen.rig) as session:
         for capture in seen.captures:
             session.add_capture(capture.images, capture.scans, {})
@@ -90,7 +90,7 @@ def drives(recordings):
 
 @pytest.mark.dataset
 @pytest.mark.parametrize("axis", [None, *range(6)])
-def test_drives_have_no_false_alarm_and_1_deg_or_20_cm_is_never_called_unchanged(drives, axis) -> None:
+def test_drives_have_no_false_alarm_and_1_deg_or_20_cm_is_never_called_unchanged(drives, axis):
     for views in list(combinations(drives.views, 3))[::7]:
         three = drives._replace(views=list(views))
         if axis is None:
@@ -103,7 +103,7 @@ def test_drives_have_no_false_alarm_and_1_deg_or_20_cm_is_never_called_unchanged
 
 
 @pytest.mark.dataset
-def test_drift_reads_a_folder_of_drives(drives, recordings, tmp_path, capsys) -> None:
+def test_drift_reads_a_folder_of_drives(drives, recordings, tmp_path, capsys):
     write_result(tmp_path / "result.json", drives.rig.name, [drives.truth])
     result, folder = str(tmp_path / "result.json"), str(recordings / "kitti_drives")
     words = ["drift", folder, "--rig", str(KITTI), "--result", result]

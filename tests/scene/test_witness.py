@@ -30,7 +30,7 @@ def turned(calibration, degrees):
     return replace(calibration, T_cam_lidar=T)
 
 
-def test_the_truth_agrees_in_the_axes_that_the_scene_tells(heard, seen) -> None:
+def test_the_truth_agrees_in_the_axes_that_the_scene_tells(heard, seen):
     opinion = hear_scene(*heard, seen.truth)
     assert opinion.state == "agrees" and opinion.n_captures == 4
     assert {axis.axis for axis in opinion.of("agrees")} >= {"rotation_y", "translation_x"}
@@ -39,7 +39,7 @@ def test_the_truth_agrees_in_the_axes_that_the_scene_tells(heard, seen) -> None:
 
 
 @pytest.mark.parametrize("degrees", [-1.0, 1.0])
-def test_a_result_turned_by_1_deg_is_contradicted_by_that(heard, seen, degrees) -> None:
+def test_a_result_turned_by_1_deg_is_contradicted_by_that(heard, seen, degrees):
     result = turned(seen.truth, degrees)
     opinion = hear_scene(*heard, result)
     assert opinion.state == "contradicts"
@@ -55,7 +55,7 @@ def test_a_result_turned_by_1_deg_is_contradicted_by_that(heard, seen, degrees) 
 @pytest.mark.parametrize(("axis", "action"), [("rotation_x", ""), ("translation_z", "distances")])
 def test_the_size_of_a_contradiction_decides_and_its_axis_names_the_cause(
     seen, sigmas, verdict, axis, action
-) -> None:
+):
     slight = AxisOpinion("rotation_y", "contradicts", "deg", 0.31, 0.1, 0.5)
     strong = AxisOpinion(axis, "contradicts", "m", 0.02 * sigmas, 0.02, 0.1)
     judged = with_opinion(seen.truth, SceneOpinion(6, 500, (strong, slight)))
@@ -67,7 +67,7 @@ def test_the_size_of_a_contradiction_decides_and_its_axis_names_the_cause(
     assert finding.figures["n_axes"] == 2
 
 
-def test_of_moving_boards_the_times_may_be_wrong(seen) -> None:
+def test_of_moving_boards_the_times_may_be_wrong(seen):
     channel = ChannelResult("frames", 9, 0.1, seen.truth.T_cam_lidar, seen.truth.cov, 0.01, 0.02, 0.03, 0.004)
     moving = replace(seen.truth, channel_results=(channel,))
     slight = AxisOpinion("rotation_y", "contradicts", "deg", 0.31, 0.1, 0.5)
@@ -82,7 +82,7 @@ def session_of(seen, path, images_of):
     return Session.open(path)
 
 
-def test_a_scene_without_features_cannot_tell_and_changes_no_verdict(seen, tmp_path) -> None:
+def test_a_scene_without_features_cannot_tell_and_changes_no_verdict(seen, tmp_path):
     def even(capture):
         (image,) = capture.images
         return [replace(image, pixels=np.full_like(image.pixels, 90))]
@@ -93,12 +93,12 @@ def test_a_scene_without_features_cannot_tell_and_changes_no_verdict(seen, tmp_p
     assert with_opinion(seen.truth, opinion).verdict == "pass"
 
 
-def test_without_frames_it_cannot_tell(seen, tmp_path) -> None:
+def test_without_frames_it_cannot_tell(seen, tmp_path):
     session = session_of(seen, tmp_path / "blind", lambda capture: [])
     assert hear_scene(session, detect(session), seen.truth) == SceneOpinion(0, 0)
 
 
-def test_a_damaged_capture_costs_itself_only(room, seen, tmp_path) -> None:
+def test_a_damaged_capture_costs_itself_only(room, seen, tmp_path):
     copy = tmp_path / "damaged"
     shutil.copytree(room, copy)
     session = Session.open(copy)
@@ -108,7 +108,7 @@ def test_a_damaged_capture_costs_itself_only(room, seen, tmp_path) -> None:
     assert opinion.n_captures == 3 and opinion.state != "contradicts"
 
 
-def test_verify_hears_the_session_s_own_scene(heard, seen, tmp_path) -> None:
+def test_verify_hears_the_session_s_own_scene(heard, seen, tmp_path):
     session, detections = heard
     write_result(tmp_path / "result.json", seen.rig.name, [turned(seen.truth, 1.0)])
     (check,) = verify(session, read_result(tmp_path / "result.json"), detections).checks
@@ -118,7 +118,7 @@ def test_verify_hears_the_session_s_own_scene(heard, seen, tmp_path) -> None:
     assert check.document()["scene"]["state"] == "contradicts"
 
 
-def test_the_verbs_tell_the_opinion(heard, room, seen, tmp_path, capsys) -> None:
+def test_the_verbs_tell_the_opinion(heard, room, seen, tmp_path, capsys):
     copy = tmp_path / "session"
     shutil.copytree(room, copy)
     result = turned(seen.truth, 1.0)

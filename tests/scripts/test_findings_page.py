@@ -7,7 +7,7 @@ SCRIPT = PAGE.parents[1] / "scripts" / "findings_page.py"
 PRINT = "import runpy, sys; sys.stdout.buffer.write(runpy.run_path(sys.argv[1])['page']().encode())"
 
 
-def test_the_page_lists_the_codes_as_they_are_declared() -> None:
+def test_the_page_lists_the_codes_as_they_are_declared():
     """Run scripts/findings_page.py after a change of a kind."""
     # A process of its own declares no kinds of tests.
     fresh = subprocess.run([sys.executable, "-c", PRINT, str(SCRIPT)], check=True, capture_output=True)

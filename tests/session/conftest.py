@@ -1,24 +1,22 @@
 """Small sessions for the tests of `lce_rig.session`."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from lce_rig.core.data import Image, Scan
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 
 
 @pytest.fixture
-def rig() -> Rig:
+def rig():
     return load_rig("rlfs")
 
 
 @pytest.fixture
-def samples() -> Callable[[int], tuple[list[Image], list[Scan]]]:
+def samples():
     """A picture and a scan of noise for each seed."""
 
-    def build(seed: int, n_points: int = 300) -> tuple[list[Image], list[Scan]]:
+    def build(seed, n_points=300):
         rng = np.random.default_rng(seed)
         image = Image("cam", "frames", 10**18 + seed, rng.integers(0, 256, (24, 32, 3), dtype=np.uint8), None)
         scan = Scan(

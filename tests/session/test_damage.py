@@ -4,7 +4,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ while True:
 @pytest.mark.long
 def test_a_writer_killed_at_any_moment_leaves_only_whole_captures(tmp_path):
     path = tmp_path / "s"
-    promised: set[str] = set()
+    promised = set()
     for k in range(6):
         # The writer's standard output tells which captures it was promised before it died.
         process = subprocess.Popen(
@@ -78,7 +77,7 @@ def test_every_damaged_byte_is_noticed_and_the_file_named(tmp_path, rig, samples
     session = Session.create(tmp_path / "s", rig)
     session.add_capture(*samples(0), {}, events)
     session.add_capture(*samples(1), {}, events)
-    file: Path = session.captures[0].path / name
+    file = session.captures[0].path / name
     whole = file.read_bytes()
     flipped = [
         whole[:position] + bytes([whole[position] ^ 128]) + whole[position + 1 :]

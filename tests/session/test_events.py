@@ -3,15 +3,13 @@
 import hashlib
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SessionError
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from lce_rig.session import Session, content_hash
 
 T0_NS = 1_700_000_000_123_456_000
@@ -19,18 +17,18 @@ FILE = "davis.events.npz"
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return load_rig("rles")
 
 
-def noise_events(seed: int, n: int = 500) -> Events:
+def noise_events(seed, n=500):
     rng = np.random.default_rng(seed)
     t_ns = T0_NS + 1000 * np.sort(rng.integers(0, 1_350_000, n))
     x, y = rng.integers(0, 346, n).astype(np.uint16), rng.integers(0, 260, n).astype(np.uint16)
     return Events("davis", t_ns, x, y, rng.random(n) < 0.5, 346, 260, T0_NS + 77)
 
 
-def noise_samples(seed: int) -> tuple[list[Image], list[Scan]]:
+def noise_samples(seed):
     rng = np.random.default_rng(seed)
     pixels = rng.integers(0, 256, (24, 32), dtype=np.uint8)
     points = rng.normal(size=(50, 3)).astype(np.float32)
@@ -38,7 +36,7 @@ def noise_samples(seed: int) -> tuple[list[Image], list[Scan]]:
     return [Image("davis", "frames", T0_NS, pixels)], [scan]
 
 
-def make_session(path: Path, rig: Rig) -> Session:
+def make_session(path, rig):
     """A session with one capture that has events and one that has none."""
     session = Session.create(path, rig)
     session.add_capture(*noise_samples(0), {}, [noise_events(0)])
@@ -46,7 +44,7 @@ def make_session(path: Path, rig: Rig) -> Session:
     return session
 
 
-def assert_equal(found: Events, given: Events) -> None:
+def assert_equal(found, given):
     for column in ("t_ns", "x", "y", "polarity"):
         assert getattr(found, column).dtype == getattr(given, column).dtype
         assert np.array_equal(getattr(found, column), getattr(given, column)), column
@@ -54,7 +52,7 @@ def assert_equal(found: Events, given: Events) -> None:
         assert getattr(found, name) == getattr(given, name), name
 
 
-def test_events_come_back_to_the_microsecond(tmp_path: Path, rig: Rig) -> None:
+def test_events_come_back_to_the_microsecond(tmp_path, rig):
     make_session(tmp_path / "s", rig).close()
     with_events, without = Session.open(tmp_path / "s").captures
     assert_equal(with_events.events("davis"), noise_events(0))
@@ -63,7 +61,7 @@ def test_events_come_back_to_the_microsecond(tmp_path: Path, rig: Rig) -> None:
     with_events.check()
 
 
-def test_the_file_is_plain_and_the_manifest_vouches_for_it(tmp_path: Path, rig: Rig) -> None:
+def test_the_file_is_plain_and_the_manifest_vouches_for_it(tmp_path, rig):
     capture = make_session(tmp_path / "s", rig).captures[0]
     events, data = noise_events(0), (capture.path / FILE).read_bytes()
     with np.load(capture.path / FILE) as archive:
@@ -82,7 +80,7 @@ def test_the_file_is_plain_and_the_manifest_vouches_for_it(tmp_path: Path, rig: 
     }
 
 
-def test_captures_without_events_are_written_as_before_and_both_are_read(tmp_path: Path, rig: Rig) -> None:
+def test_captures_without_events_are_written_as_before_and_both_are_read(tmp_path, rig):
     captures = make_session(tmp_path / "s", rig).captures
     manifests = [json.loads((capture.path / "meta.json").read_text()) for capture in captures]
     assert [manifest["format_version"] for manifest in manifests] == [2, 1]
@@ -92,7 +90,7 @@ def test_captures_without_events_are_written_as_before_and_both_are_read(tmp_pat
     assert captures[1].content_sha256 == content_hash(*noise_samples(1))
 
 
-def test_captures_that_differ_in_their_events_alone_are_no_duplicates(tmp_path: Path, rig: Rig) -> None:
+def test_captures_that_differ_in_their_events_alone_are_no_duplicates(tmp_path, rig):
     session = make_session(tmp_path / "s", rig)
     images, scans = noise_samples(0)
     events = noise_events(0)
@@ -118,9 +116,7 @@ def test_captures_that_differ_in_their_events_alone_are_no_duplicates(tmp_path: 
         {"x": np.full(500, 346, np.uint16)},
     ],
 )
-def test_events_that_cannot_be_the_rigs_are_refused(
-    tmp_path: Path, rig: Rig, changes: dict[str, Any]
-) -> None:
+def test_events_that_cannot_be_the_rigs_are_refused(tmp_path, rig, changes):
     session = Session.create(tmp_path / "s", rig)
     with pytest.raises(SessionError):
         session.add_capture(*noise_samples(0), {}, [replace(noise_events(0), **changes)])

@@ -1,23 +1,22 @@
 """A session takes another profile of its rig, keeps the earlier one, and refuses another rig's."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from lce_rig.cli.main import run
 from lce_rig.core.errors import SessionError
-from lce_rig.rig import Rig, dump_rig, load_rig, read_profile
+from lce_rig.rig import dump_rig, load_rig, read_profile
 from lce_rig.session import Session
 from lce_rig.session.session import discard_if_empty
 from tests.shared import changed, contents
 
 
-def with_square(rig: Rig, square_m: float) -> Rig:
+def with_square(rig, square_m):
     return changed(rig, board__square_m=square_m)
 
 
-def test_the_new_profile_counts_and_every_earlier_one_stays(rig: Rig, tmp_path: Path) -> None:
+def test_the_new_profile_counts_and_every_earlier_one_stays(rig, tmp_path):
     path = tmp_path / "s"
     named = rig.of_robot("kestrel")
     Session.create(path, named).close()
@@ -34,9 +33,7 @@ def test_the_new_profile_counts_and_every_earlier_one_stays(rig: Rig, tmp_path: 
 
 
 @pytest.mark.parametrize("changes", [{"name": "other"}, {"lidars__lidar__serial": "B"}, {"cameras": "front"}])
-def test_the_profile_of_another_rig_is_refused_and_nothing_changes(
-    rig: Rig, tmp_path: Path, changes: dict[str, Any]
-) -> None:
+def test_the_profile_of_another_rig_is_refused_and_nothing_changes(rig, tmp_path, changes):
     if changes == {"cameras": "front"}:
         changes = {"cameras": {"front": rig.cameras["cam"]}, "nominal_extrinsics": ()}
     Session.create(tmp_path / "s", changed(rig, lidars__lidar__serial="A")).close()
@@ -47,7 +44,7 @@ def test_the_profile_of_another_rig_is_refused_and_nothing_changes(
     assert contents(tmp_path / "s") == before
 
 
-def test_the_author_s_comments_are_kept_as_long_as_the_text_says_the_same(tmp_path: Path) -> None:
+def test_the_author_s_comments_are_kept_as_long_as_the_text_says_the_same(tmp_path):
     path, rig = tmp_path / "s", load_rig("rlfs")
     text = "# mine\n" + read_profile(Path(__file__).parents[2] / "rigs" / "rlfs.yaml")
     with Session.create(path, rig.of_robot("kestrel")) as session:
@@ -60,7 +57,7 @@ def test_the_author_s_comments_are_kept_as_long_as_the_text_says_the_same(tmp_pa
         assert session.profile_text() == dump_rig(session.rig)
 
 
-def test_a_session_that_stayed_empty_is_removed_with_its_comments(rig: Rig, tmp_path: Path) -> None:
+def test_a_session_that_stayed_empty_is_removed_with_its_comments(rig, tmp_path):
     with Session.create(tmp_path / "s", rig) as session:
         session.keep_text(dump_rig(rig))
     assert discard_if_empty(tmp_path / "s")

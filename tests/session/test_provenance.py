@@ -3,13 +3,11 @@
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lce_rig.core.errors import SessionError, UsageError
-from lce_rig.rig import Rig
 from lce_rig.session import Session
 from lce_rig.session.capture import SERIALS
 from lce_rig.session.provenance import content_sha256, provenance_of
@@ -19,10 +17,10 @@ Samples = Callable[..., tuple[list[Any], list[Any]]]
 
 
 @pytest.fixture
-def fill(rig: Rig, samples: Samples) -> Callable[..., Session]:
+def fill(rig, samples):
     """Make a session of two captures whose sensors told these serial numbers."""
 
-    def make(folder: Path, rig: Rig = rig, *told: dict[str, str], seeds: tuple[int, ...] = (1, 2)) -> Session:
+    def make(folder, rig=rig, *told, seeds=(1, 2)):
         with Session.create(folder, rig) as session:
             for k, seed in enumerate(seeds):
                 meta = {"source": {"label": folder.name}} | ({SERIALS: told[k]} if k < len(told) else {})
@@ -32,9 +30,7 @@ def fill(rig: Rig, samples: Samples) -> Callable[..., Session]:
     return make
 
 
-def test_what_captures_tell_and_what_the_profile_states_come_together(
-    fill: Callable[..., Session], rig: Rig, tmp_path: Path
-) -> None:
+def test_what_captures_tell_and_what_the_profile_states_come_together(fill, rig, tmp_path):
     named = changed(rig.of_robot("kestrel"), cameras__cam__serial="C7")
     found = provenance_of(fill(tmp_path / "a", named, {}, {"lidar": "AG43510116"}))
     assert (found.robot, found.serials) == ("kestrel", {"cam": "C7", "lidar": "AG43510116"})
@@ -42,9 +38,7 @@ def test_what_captures_tell_and_what_the_profile_states_come_together(
     assert (found.date, found.imported) == ("2001-09-09T01:46:40Z", None)
 
 
-def test_two_units_of_one_sensor_are_no_result(
-    fill: Callable[..., Session], rig: Rig, tmp_path: Path
-) -> None:
+def test_two_units_of_one_sensor_are_no_result(fill, rig, tmp_path):
     with pytest.raises(SessionError):
         provenance_of(fill(tmp_path / "a", rig, {"lidar": "A"}, {"lidar": "B"}))
     one, other = (fill(tmp_path / s, rig, {"lidar": s}, seeds=(k,)) for k, s in enumerate("XY"))
@@ -54,9 +48,7 @@ def test_two_units_of_one_sensor_are_no_result(
         provenance_of(one)
 
 
-def test_the_fingerprint_changes_with_inputs_only(
-    fill: Callable[..., Session], rig: Rig, samples: Samples, tmp_path: Path
-) -> None:
+def test_the_fingerprint_changes_with_inputs_only(fill, rig, samples, tmp_path):
     first = fill(tmp_path / "a")
     shutil.copytree(tmp_path / "a", tmp_path / "elsewhere")
     same = [
@@ -79,9 +71,7 @@ def test_the_fingerprint_changes_with_inputs_only(
     assert content_sha256(Session.open(tmp_path / "f")) not in hashes
 
 
-def test_a_session_without_times_has_no_date_but_tells_when_it_was_imported(
-    rig: Rig, samples: Samples, tmp_path: Path
-) -> None:
+def test_a_session_without_times_has_no_date_but_tells_when_it_was_imported(rig, samples, tmp_path):
     with Session.create(tmp_path / "a", rig) as session:
         images, scans = samples(1)
         # A clock that counts from the sensor's start tells no date.
@@ -100,7 +90,7 @@ def test_a_session_without_times_has_no_date_but_tells_when_it_was_imported(
     assert (origin.date, origin.imported, origin.date_words) == (None, None, "")
 
 
-def test_a_robot_is_named_later_and_not_renamed(rig: Rig, tmp_path: Path, samples: Any) -> None:
+def test_a_robot_is_named_later_and_not_renamed(rig, tmp_path, samples):
     with Session.create(tmp_path / "a", rig) as session:
         session.add_capture(*samples(0), {})
     Session.resume(tmp_path / "a", rig.of_robot("kestrel")).close()

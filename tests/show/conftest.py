@@ -1,7 +1,6 @@
 """A real browser."""
 
 import shutil
-from collections.abc import Iterator
 
 import pytest
 
@@ -11,7 +10,7 @@ _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 @pytest.fixture(scope="session")
-def started_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def started_browser(tmp_path_factory):
     """A headless browser for all tests."""
     executable = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if executable is None:
@@ -21,7 +20,7 @@ def started_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browse
 
 
 @pytest.fixture
-def browser(started_browser: Browser) -> Iterator[Browser]:
+def browser(started_browser):
     """A headless browser without open pages."""
     yield started_browser
     started_browser.close_pages()

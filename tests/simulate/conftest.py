@@ -1,24 +1,19 @@
 """Small rigs and scenes that render fast."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.data import Image, Scan
+from lce_rig.core.data import Image
 from lce_rig.core.data_sheets import VLP_16
-from lce_rig.core.geometry import Array, exp_so3, pose
+from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.rig import Rig
-from lce_rig.simulate.backdrop import Backdrop, build_backdrop
+from lce_rig.simulate.backdrop import build_backdrop
 from lce_rig.simulate.image_rendering import expose, render_radiance
 from lce_rig.simulate.lidar import LidarModel, measure_sweep, sweep_scene
-from lce_rig.simulate.options import CameraNoise, EventNoise, LidarNoise
-from lce_rig.simulate.room import Room, build_room
-from lce_rig.simulate.scene import Scene
+from lce_rig.simulate.options import CameraNoise, EventNoise
+from lce_rig.simulate.room import build_room
 
 PERFECT = CameraNoise(blur_px=0.6, full_well_e=np.inf, read_noise_e=0.0, vignetting=0.0)
 QUIET_EVENTS = EventNoise(0.30, 0.25, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 0.0)
@@ -31,7 +26,7 @@ CAMERA_FORWARD = np.array(
 )  # R_world_cam looking along +x
 
 
-def make_rig(name: str = "small", **changes: Any) -> Rig:
+def make_rig(name="small", **changes):
     """A VLP-16 and a DAVIS-sized camera side by side, with changes."""
     camera = {
         "resolution_px": (346, 260),
@@ -46,7 +41,7 @@ def make_rig(name: str = "small", **changes: Any) -> Rig:
         "quaternion_wxyz": (0.5, 0.5, -0.5, 0.5),
         "translation_m": (0.126, -0.065, -0.080),
     }
-    profile: dict[str, Any] = {
+    profile = {
         "format_version": 1,
         "name": name,
         "board": {"inner_corners": (9, 6), "square_m": 0.068, "width_m": 0.8, "height_m": 0.6},
@@ -57,29 +52,29 @@ def make_rig(name: str = "small", **changes: Any) -> Rig:
     return Rig.model_validate({**profile, **changes})
 
 
-def board_before_lidar(distance_m: float, *, roll_deg: float = 45.0, yaw_deg: float = 0.0) -> Array:
+def board_before_lidar(distance_m, *, roll_deg=45.0, yaw_deg=0.0):
     """T_world_board (4, 4) of a board at the LiDAR's height, straight ahead, facing it."""
     turn = exp_so3(np.array([[0.0, np.radians(yaw_deg), 0.0], [0.0, 0.0, np.radians(roll_deg)]]))
     return pose(FACING_LIDAR @ turn[0] @ turn[1], np.array([distance_m, 0.0, 1.0]))
 
 
 @pytest.fixture(scope="session")
-def board() -> Board:
+def board():
     return Board(cols=9, rows=6, square_m=0.068, width_m=0.8, height_m=0.6)
 
 
 @pytest.fixture(scope="session")
-def room() -> Room:
+def room():
     return build_room(0.0, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="session")
-def T_world_lidar() -> Array:
+def T_world_lidar():
     return pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
 
 
 @pytest.fixture(scope="session")
-def T_world_cam() -> Array:
+def T_world_cam():
     return pose(CAMERA_FORWARD, np.array([0.05, 0.1, 1.05]))
 
 
@@ -92,25 +87,15 @@ LENSES = {
 
 
 @pytest.fixture(scope="session", params=sorted(LENSES))
-def backdrop(request: pytest.FixtureRequest, room: Room, T_world_cam: Array) -> Backdrop:
+def backdrop(request, room, T_world_cam):
     return build_backdrop(room, T_world_cam, LENSES[request.param])
 
 
-def render_image(scene: Scene, backdrop: Backdrop, noise: CameraNoise, rng: np.random.Generator) -> Image:
+def render_image(scene, backdrop, noise, rng):
     return Image("cam", "frames", 0, expose(render_radiance(scene, backdrop), noise, rng))
 
 
-def simulate_scan(
-    scene: Scene,
-    T_world_lidar: Array,
-    model: LidarModel,
-    noise: LidarNoise,
-    rng: np.random.Generator,
-    *,
-    stamp_ns: int = 0,
-    board_at: Callable[[NDArray[np.int64]], Array] | None = None,
-    **measured: Any,
-) -> Scan:
+def simulate_scan(scene, T_world_lidar, model, noise, rng, *, stamp_ns=0, board_at=None, **measured):
     """One revolution; what is measured is told as to `measure_sweep`."""
     sweep = sweep_scene(scene, T_world_lidar, model, noise, rng, stamp_ns, board_at)
     return measure_sweep(sweep, model, noise, rng, stamp_ns=stamp_ns, **measured)

@@ -5,17 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, exp_so3, invert, pose, transform
-from lce_rig.simulate.backdrop import Backdrop, lens_reach, pixel_corner_rays, pixel_rays
+from lce_rig.core.geometry import exp_so3, invert, pose, transform
+from lce_rig.simulate.backdrop import lens_reach, pixel_corner_rays, pixel_rays
 from lce_rig.simulate.options import CameraNoise
-from lce_rig.simulate.room import Room, build_carrier
+from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import Scene
 
 from .conftest import FACING_LIDAR, LENSES, PERFECT, render_image
 
 
-def placed(distance_m: float, left_m: float, up_m: float, tilt_deg: float, roll_deg: float) -> Array:
+def placed(distance_m, left_m, up_m, tilt_deg, roll_deg):
     turn = exp_so3(np.radians(np.array([[0.6 * tilt_deg, 0.8 * tilt_deg, 0.0], [0.0, 0.0, roll_deg]])))
     return pose(FACING_LIDAR @ turn[0] @ turn[1], np.array([distance_m, left_m, 1.05 + up_m]))
 
@@ -23,7 +22,7 @@ def placed(distance_m: float, left_m: float, up_m: float, tilt_deg: float, roll_
 PLACEMENTS = [placed(1.5, 0.1, 0.0, 10, 45), placed(1.9, -0.4, 0.2, -30, 52), placed(2.4, 0.9, -0.2, 35, 38)]
 
 
-def refined(picture: np.ndarray, truth: Array) -> Array:
+def refined(picture, truth):
     """Find corners (N, 2) px in a picture from where the truth has them, and a little beside."""
     import cv2
 
@@ -32,9 +31,7 @@ def refined(picture: np.ndarray, truth: Array) -> Array:
 
 
 @pytest.mark.parametrize("T_world_board", PLACEMENTS, ids=["near", "middle", "side"])
-def test_corners_lie_where_the_truth_projects_them(
-    room: Room, board: Board, backdrop: Backdrop, T_world_board: Array
-) -> None:
+def test_corners_lie_where_the_truth_projects_them(room, board, backdrop, T_world_board):
     scene = Scene(
         room.raycaster,
         build_carrier("stand", board, T_world_board, np.random.default_rng(0)),
@@ -51,7 +48,7 @@ def test_corners_lie_where_the_truth_projects_them(
 
 
 @pytest.mark.parametrize("model", sorted(LENSES))
-def test_rays_through_pixels_project_back_onto_them(model: str) -> None:
+def test_rays_through_pixels_project_back_onto_them(model):
     lens = LENSES[model]
     rays = pixel_rays(pixel_corner_rays(lens))
     assert np.isfinite(rays).all()
@@ -64,7 +61,7 @@ def test_rays_through_pixels_project_back_onto_them(model: str) -> None:
     assert np.abs(pixels - np.stack([u, v], axis=-1))[is_valid].max() < 2e-3
 
 
-def test_noise_follows_shot_and_read_noise(room: Room, board: Board, backdrop: Backdrop) -> None:
+def test_noise_follows_shot_and_read_noise(room, board, backdrop):
     scene = Scene(room.raycaster, [], board, PLACEMENTS[0])
     noise = CameraNoise(blur_px=0.0, vignetting=0.0)
     clean = replace(noise, full_well_e=float("inf"))

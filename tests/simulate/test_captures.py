@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from lce_rig.core.errors import LceRigError, ProfileError
-from lce_rig.core.geometry import Array, invert, rotation_angle, transform
-from lce_rig.rig import Rig
-from lce_rig.simulate import SimulatedCapture, simulate_captures, truth_extrinsics
+from lce_rig.core.geometry import invert, rotation_angle, transform
+from lce_rig.simulate import simulate_captures, truth_extrinsics
 
 from .conftest import make_rig
 
@@ -16,21 +15,21 @@ N_CAPTURES = 4
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return make_rig()
 
 
 @pytest.fixture(scope="module")
-def captures(rig: Rig) -> list[SimulatedCapture]:
+def captures(rig):
     return list(simulate_captures(rig, n_captures=N_CAPTURES, seed=11))
 
 
-def corners_px(rig: Rig, camera: str, capture: SimulatedCapture) -> Array:
+def corners_px(rig, camera, capture):
     corners = transform(capture.T_cam_board[camera], rig.board.to_board().corners())
     return rig.cameras[camera].to_intrinsics().project(corners)[0]
 
 
-def n_rings_on_board(rig: Rig, lidar: str, capture: SimulatedCapture) -> int:
+def n_rings_on_board(rig, lidar, capture):
     board = rig.board.to_board()
     scan = next(scan for scan in capture.scans if scan.sensor == lidar)
     xyz = transform(invert(capture.T_lidar_board[lidar]), scan.points.astype(float))
@@ -38,7 +37,7 @@ def n_rings_on_board(rig: Rig, lidar: str, capture: SimulatedCapture) -> int:
     return int(np.sum(np.bincount(scan.ring[inside], minlength=16) >= 5))
 
 
-def test_truth_differs_from_the_nominal_within_its_tolerance(rig: Rig) -> None:
+def test_truth_differs_from_the_nominal_within_its_tolerance(rig):
     entry = rig.nominal_extrinsics[0]
     nominal = entry.to_matrix()
     truths = [truth_extrinsics(rig, seed)["cam", "lidar"] for seed in range(20)]
@@ -49,16 +48,14 @@ def test_truth_differs_from_the_nominal_within_its_tolerance(rig: Rig) -> None:
     assert not np.allclose(truths[0], truths[1])
 
 
-def test_the_papers_simulated_rig_has_exactly_its_extrinsic() -> None:
+def test_the_papers_simulated_rig_has_exactly_its_extrinsic():
     rig = make_rig("sss")
     assert np.allclose(
         truth_extrinsics(rig, 3)["cam", "lidar"], rig.nominal_extrinsics[0].to_matrix(), atol=1e-12
     )
 
 
-def test_boards_are_in_the_picture_on_enough_rings_spread_and_tilted(
-    rig: Rig, captures: list[SimulatedCapture]
-) -> None:
+def test_boards_are_in_the_picture_on_enough_rings_spread_and_tilted(rig, captures):
     lens = rig.cameras["cam"].to_intrinsics()
     for capture in captures:
         assert lens.is_inside(corners_px(rig, "cam", capture), 2.0).all()
@@ -72,9 +69,7 @@ def test_boards_are_in_the_picture_on_enough_rings_spread_and_tilted(
     assert angles.max() > 25
 
 
-def test_the_same_seed_gives_the_same_bytes_however_many_captures(
-    rig: Rig, captures: list[SimulatedCapture]
-) -> None:
+def test_the_same_seed_gives_the_same_bytes_however_many_captures(rig, captures):
     again = list(simulate_captures(rig, n_captures=1, seed=11))
     for one, other in zip(captures, again, strict=False):
         assert one.images[0].pixels.tobytes() == other.images[0].pixels.tobytes()
@@ -84,7 +79,7 @@ def test_the_same_seed_gives_the_same_bytes_however_many_captures(
     assert different.scans[0].points.tobytes() != captures[0].scans[0].points.tobytes()
 
 
-def nominal(camera: str, **rotation: Any) -> dict[str, Any]:
+def nominal(camera, **rotation):
     return {"camera": camera, "lidar": "lidar", "translation_m": (0.05, -0.08, -0.1), **rotation}
 
 
@@ -97,14 +92,14 @@ MOUNTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("mount", sorted(MOUNTS))
-def test_cameras_mounted_anyhow_see_the_board(mount: str) -> None:
+def test_cameras_mounted_anyhow_see_the_board(mount):
     rig = make_rig(nominal_extrinsics=(nominal("cam", **MOUNTS[mount]),))
     for capture in simulate_captures(rig, n_captures=1, seed=0):
         assert rig.cameras["cam"].to_intrinsics().is_inside(corners_px(rig, "cam", capture)).all()
         assert n_rings_on_board(rig, "lidar", capture) >= 4
 
 
-def test_two_cameras_take_turns_as_the_one_the_board_is_placed_for() -> None:
+def test_two_cameras_take_turns_as_the_one_the_board_is_placed_for():
     one = make_rig()
     cameras = {
         "left": {**one.cameras["cam"].model_dump(), "frame": "left", "optical_frame": "left_optical"},
@@ -121,14 +116,14 @@ def test_two_cameras_take_turns_as_the_one_the_board_is_placed_for() -> None:
     assert set(truth_extrinsics(rig, 0)) == {("left", "lidar"), ("rear", "lidar")}
 
 
-def test_a_lidar_nobody_can_simulate_is_named(rig: Rig) -> None:
+def test_a_lidar_nobody_can_simulate_is_named(rig):
     odd = make_rig(lidars={"lidar": {"model": "XY-64"}})
     with pytest.raises(ProfileError, match=r"lidars\.lidar\.model") as caught:
         next(simulate_captures(odd, n_captures=1, seed=0))
     assert "OS1-64" in caught.value.hint
 
 
-def test_a_rig_whose_lidar_cannot_see_what_the_camera_sees_is_refused() -> None:
+def test_a_rig_whose_lidar_cannot_see_what_the_camera_sees_is_refused():
     ceiling = nominal("cam", matrix=((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
     with pytest.raises(LceRigError):
         next(simulate_captures(make_rig(nominal_extrinsics=(ceiling,)), n_captures=1, seed=0))

@@ -1,6 +1,5 @@
 """Event pixels follow their own law exactly when quiet, and err as they claim to when not."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +8,7 @@ from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events
-from lce_rig.core.geometry import Array
-from lce_rig.simulate.event_camera import EventCamera, EventPixels, draw_pixels
+from lce_rig.simulate.event_camera import EventCamera, draw_pixels
 from lce_rig.simulate.options import EventNoise
 
 from .conftest import QUIET_EVENTS
@@ -24,28 +22,18 @@ SECOND_NS = 1_000_000_000
 Radiance = NDArray[np.float32]
 
 
-def ripples(seed: int = 0) -> Callable[[float], Radiance]:
+def ripples(seed=0):
     """Intensities that rise and fall smoothly, each pixel in its own way, by a factor of up to twenty."""
     rng = np.random.default_rng(seed)
     swing, rate, phase = rng.uniform(0.1, 1.5, SHAPE), rng.uniform(3, 20, SHAPE), rng.uniform(0, 6.3, SHAPE)
     return lambda t_s: np.exp(swing * np.sin(rate * t_s + phase) - 1.6).astype(np.float32)
 
 
-def flat(value: float) -> Callable[[float], Radiance]:
+def flat(value):
     return lambda t_s: np.full(SHAPE, value, dtype=np.float32)
 
 
-def record(
-    noise: EventNoise,
-    scene: Callable[[float], Radiance],
-    *,
-    duration_s: float = 0.5,
-    step_s: float = 0.002,
-    seed: int = 0,
-    n_packets: int = 1,
-    pixels: EventPixels | None = None,
-    offset_ns: int = 0,
-) -> list[Events]:
+def record(noise, scene, *, duration_s=0.5, step_s=0.002, seed=0, n_packets=1, pixels=None, offset_ns=0):
     pixels = pixels or draw_pixels(LENS, noise, np.random.default_rng(seed))
     camera = EventCamera(
         pixels, noise, scene(0.0), START_NS, np.random.default_rng(seed), sensor="dvs", offset_ns=offset_ns
@@ -59,27 +47,27 @@ def record(
     return packets
 
 
-def pixel_of(events: Events) -> NDArray[np.int64]:
+def pixel_of(events):
     return events.y.astype(np.int64) * events.width_px + events.x
 
 
-def counts(events: Events, polarity: bool) -> Array:
+def counts(events, polarity):
     chosen = events.polarity == polarity
     return np.bincount(pixel_of(events)[chosen], minlength=SHAPE[0] * SHAPE[1]).astype(float)
 
 
-def logs(scene: Callable[[float], Radiance], noise: EventNoise, t_s: float) -> Array:
+def logs(scene, noise, t_s):
     return np.log(scene(t_s).astype(np.float64).ravel() + noise.dark_radiance)
 
 
-def intervals_ns(events: Events) -> NDArray[np.int64]:
+def intervals_ns(events):
     order = np.lexsort((events.t_ns, pixel_of(events)))
     same = np.diff(pixel_of(events)[order]) == 0
     return np.diff(events.t_ns[order])[same]
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
-def test_quiet_pixels_reproduce_the_change_of_ln_intensity_within_one_threshold(sigma: float) -> None:
+def test_quiet_pixels_reproduce_the_change_of_ln_intensity_within_one_threshold(sigma):
     noise = replace(QUIET_EVENTS, threshold_sigma=sigma)
     pixels, scene = draw_pixels(LENS, noise, np.random.default_rng(4)), ripples()
     for duration_s in (0.1, 0.37, 0.5):
@@ -90,8 +78,8 @@ def test_quiet_pixels_reproduce_the_change_of_ln_intensity_within_one_threshold(
         assert len(events) > 1000
 
 
-def test_a_ramp_gives_as_many_events_of_its_sign_as_thresholds_fit_into_it() -> None:
-    def ramp(t_s: float) -> Radiance:
+def test_a_ramp_gives_as_many_events_of_its_sign_as_thresholds_fit_into_it():
+    def ramp(t_s):
         left = np.arange(SHAPE[1]) < 32
         up = 0.1 * np.exp(4.01 * t_s * 0.30)
         down = 0.1 * np.exp(-4.01 * t_s * 0.25)
@@ -106,7 +94,7 @@ def test_a_ramp_gives_as_many_events_of_its_sign_as_thresholds_fit_into_it() -> 
     assert np.allclose(1e-9 * (first.t_ns - START_NS), expected_s, atol=1e-4)
 
 
-def test_events_come_in_order_of_whole_microseconds_across_packets() -> None:
+def test_events_come_in_order_of_whole_microseconds_across_packets():
     packets = record(EventNoise(), ripples(), n_packets=10)
     t_ns = np.concatenate([packet.t_ns for packet in packets])
     assert np.all(np.diff(t_ns) >= 0)
@@ -117,7 +105,7 @@ def test_events_come_in_order_of_whole_microseconds_across_packets() -> None:
     assert max(int(packet.x.max()) for packet in packets) == 63
 
 
-def test_no_pixel_fires_within_its_refractory_period() -> None:
+def test_no_pixel_fires_within_its_refractory_period():
     fast = ripples(1)
     noise = EventNoise(refractory_s=0.004, noise_hz=20.0, threshold_on=0.1, threshold_off=0.1)
     packets = record(noise, lambda t_s: fast(4 * t_s), n_packets=7)
@@ -129,8 +117,8 @@ def test_no_pixel_fires_within_its_refractory_period() -> None:
     assert np.mean(intervals_ns(free) < 4_000_000) > 0.1
 
 
-def test_slow_pixels_lag_behind_and_dark_ones_more() -> None:
-    def step(level: float) -> Callable[[float], Radiance]:
+def test_slow_pixels_lag_behind_and_dark_ones_more():
+    def step(level):
         return lambda t_s: flat(level if t_s <= 0.01 else 1.3 * level)(t_s)
 
     delay_s = []
@@ -144,7 +132,7 @@ def test_slow_pixels_lag_behind_and_dark_ones_more() -> None:
     assert np.allclose(delay_s, expected, atol=1e-3)
 
 
-def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark() -> None:
+def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark():
     noise = replace(QUIET_EVENTS, noise_hz=10.0)
     halves = np.where(np.arange(SHAPE[1]) < 32, 0.0, 1.0).astype(np.float32) * np.ones(SHAPE, np.float32)
     (events,) = record(noise, lambda t_s: halves, duration_s=2.0, step_s=0.05)
@@ -153,14 +141,14 @@ def test_noise_comes_at_its_rate_and_more_of_it_in_the_dark() -> None:
     assert events.polarity.mean() == pytest.approx(0.5, abs=0.02)
 
 
-def test_thresholds_spread_from_pixel_to_pixel_and_from_event_to_event() -> None:
+def test_thresholds_spread_from_pixel_to_pixel_and_from_event_to_event():
     noise = replace(QUIET_EVENTS, threshold_sigma=0.04)
     pixels = draw_pixels(LENS, noise, np.random.default_rng(0))
     assert pixels.threshold_on.mean() == pytest.approx(noise.threshold_on, abs=0.004)
     assert pixels.threshold_on.std() == pytest.approx(0.04, rel=0.05)
     assert abs(np.corrcoef(pixels.threshold_on, pixels.threshold_off)[0, 1]) < 0.1
 
-    def rise(t_s: float) -> Radiance:
+    def rise(t_s):
         return 0.01 * np.exp(np.float32(10 * t_s)) * flat(1.0)(0)
 
     steady, shaky = (

@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.board import Board
-from lce_rig.core.data import Scan
-from lce_rig.core.geometry import Array, invert, transform
+from lce_rig.core.geometry import invert, transform
 from lce_rig.simulate.options import LidarNoise
-from lce_rig.simulate.room import Room, build_carrier
+from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import PLATE, Raycaster, Scene, Surface
 from lce_rig.simulate.surfaces import merge, rectangle
 
@@ -20,22 +18,22 @@ BEAM = replace(EXACT, divergence_rad=LidarNoise().divergence_rad, exit_size_m=Li
 FOOTPRINT_REACH_M = 0.010  # half the beam's exit plus half its divergence at 3 m, rounded up
 
 
-def scan_of(scene: Scene, T_world_lidar: Array, noise: LidarNoise, seed: int = 0, **changes: float) -> Scan:
+def scan_of(scene, T_world_lidar, noise, seed=0, **changes):
     return simulate_scan(scene, T_world_lidar, VLP16, noise, np.random.default_rng(seed), **changes)
 
 
 @pytest.fixture(scope="module")
-def scene(room: Room, board: Board) -> Scene:
+def scene(room, board):
     T = board_before_lidar(2.2, yaw_deg=20.0)
     return Scene(room.raycaster, build_carrier("person", board, T, np.random.default_rng(3)), board, T)
 
 
 @pytest.fixture(scope="module")
-def exact(scene: Scene, T_world_lidar: Array) -> Scan:
+def exact(scene, T_world_lidar):
     return scan_of(scene, T_world_lidar, EXACT)
 
 
-def distance_to_surfaces(scene: Scene, points_world: Array) -> Array:
+def distance_to_surfaces(scene, points_world):
     """Distance of each point from the nearest triangle, or from that triangle's plane if less."""
     import open3d as o3d
 
@@ -53,26 +51,26 @@ def distance_to_surfaces(scene: Scene, points_world: Array) -> Array:
     return np.minimum(distance, off_plane)
 
 
-def lasers(scan: Scan) -> np.ndarray:
+def lasers(scan):
     return np.argsort(VLP16.rings)[scan.ring]
 
 
-def azimuths(scan: Scan) -> Array:
+def azimuths(scan):
     return np.arctan2(scan.points[:, 1], scan.points[:, 0], dtype=np.float64)
 
 
-def in_board(scene: Scene, T_world_lidar: Array, scan: Scan) -> Array:
+def in_board(scene, T_world_lidar, scan):
     return transform(invert(scene.T_world_board) @ T_world_lidar, scan.points.astype(float))
 
 
-def test_points_without_noise_lie_on_surfaces(scene: Scene, exact: Scan, T_world_lidar: Array) -> None:
+def test_points_without_noise_lie_on_surfaces(scene, exact, T_world_lidar):
     points = transform(T_world_lidar, exact.points.astype(float))
     assert len(points) > 25_000
     # One point in ten thousand may fall to Open3D's distances, not to ours.
     assert np.mean(distance_to_surfaces(scene, points) < 1e-3) > 0.9999
 
 
-def test_firings_follow_the_manuals_timing_table(exact: Scan) -> None:
+def test_firings_follow_the_manuals_timing_table(exact):
     assert exact.offset_ns is not None
     sequence_start = exact.offset_ns - 2_304 * lasers(exact)
     assert np.all(sequence_start % 55_296 == 0)
@@ -80,7 +78,7 @@ def test_firings_follow_the_manuals_timing_table(exact: Scan) -> None:
     assert exact.offset_ns.min() >= 0 and exact.offset_ns.max() < 100_000_000
 
 
-def test_rings_have_the_beam_tables_elevations_and_vertical_offsets(exact: Scan) -> None:
+def test_rings_have_the_beam_tables_elevations_and_vertical_offsets(exact):
     expected = np.radians(np.arange(-15, 16, 2))
     for ring in range(16):
         points = exact.points[exact.ring == ring].astype(float)
@@ -89,9 +87,7 @@ def test_rings_have_the_beam_tables_elevations_and_vertical_offsets(exact: Scan)
         assert np.abs(elevation - expected[ring]).max() < 1e-5
 
 
-def test_quantised_scans_step_by_two_millimetres_and_a_hundredth_of_a_degree(
-    scene: Scene, T_world_lidar: Array
-) -> None:
+def test_quantised_scans_step_by_two_millimetres_and_a_hundredth_of_a_degree(scene, T_world_lidar):
     scan = scan_of(scene, T_world_lidar, replace(EXACT, is_quantised=True))
     points = scan.points.astype(float)
     points[:, 2] -= VLP16.vertical_offsets_m[lasers(scan)]
@@ -101,7 +97,7 @@ def test_quantised_scans_step_by_two_millimetres_and_a_hundredth_of_a_degree(
     assert np.abs(steps - np.rint(steps)).max() < 5e-3
 
 
-def test_mixed_pixels_occur_and_only_at_the_boards_border(board: Board, T_world_lidar: Array) -> None:
+def test_mixed_pixels_occur_and_only_at_the_boards_border(board, T_world_lidar):
     T = board_before_lidar(3.0)
     behind = rectangle(6.0, 6.0).moved(board_before_lidar(3.3, roll_deg=0.0))
     scene = Scene(Raycaster([Surface("wall", behind, PLATE, np.eye(4))]), [], board, T)
@@ -123,9 +119,7 @@ def test_mixed_pixels_occur_and_only_at_the_boards_border(board: Board, T_world_
 @pytest.mark.parametrize(
     "noise, growth_mm", [(EXACT, 0.0), (BEAM, 7.5), (replace(BEAM, edge_growth_m=0.005), 11.5)]
 )
-def test_returns_reach_beyond_the_border_by_the_footprint_on_average(
-    board: Board, T_world_lidar: Array, noise: LidarNoise, growth_mm: float
-) -> None:
+def test_returns_reach_beyond_the_border_by_the_footprint_on_average(board, T_world_lidar, noise, growth_mm):
     # Footprint at 3 m: half of 10 mm + 3 m * 3 mrad = 9.5 mm; the outermost 4 % of its energy are too weak.
     scene = Scene(Raycaster(()), [], board, board_before_lidar(3.0, roll_deg=0.0))
     step_m = 3.0 * VLP16.step_rad
@@ -140,7 +134,7 @@ def test_returns_reach_beyond_the_border_by_the_footprint_on_average(
     assert 1e3 * np.mean(growth) == pytest.approx(growth_mm, abs=1.0)
 
 
-def test_range_noise_has_the_sigma_it_claims(board: Board, T_world_lidar: Array) -> None:
+def test_range_noise_has_the_sigma_it_claims(board, T_world_lidar):
     scene = Scene(Raycaster(()), [], board, board_before_lidar(2.0, roll_deg=0.0))
     noise = replace(EXACT, range_sigma_m=0.02)
     error = in_board(scene, T_world_lidar, scan_of(scene, T_world_lidar, noise))[:, 2]
@@ -150,7 +144,7 @@ def test_range_noise_has_the_sigma_it_claims(board: Board, T_world_lidar: Array)
     assert abs(error.mean()) < 4 * 0.02 / np.sqrt(n)
 
 
-def test_laser_bias_shifts_each_ring_by_its_own_amount(board: Board, T_world_lidar: Array) -> None:
+def test_laser_bias_shifts_each_ring_by_its_own_amount(board, T_world_lidar):
     scene = Scene(Raycaster(()), [], board, board_before_lidar(2.0, roll_deg=0.0))
     bias = 0.001 * np.arange(16.0)
     scan = simulate_scan(scene, T_world_lidar, VLP16, EXACT, np.random.default_rng(0), laser_bias_m=bias)
@@ -159,7 +153,7 @@ def test_laser_bias_shifts_each_ring_by_its_own_amount(board: Board, T_world_lid
     assert np.abs(plane / cosine - bias[lasers(scan)]).max() < 1e-4
 
 
-def test_dark_squares_and_weak_returns_read_long(board: Board, T_world_lidar: Array) -> None:
+def test_dark_squares_and_weak_returns_read_long(board, T_world_lidar):
     T = board_before_lidar(1.5, roll_deg=0.0)
     scene = Scene(Raycaster(()), [], board, T, print_reflectivity=0.2)
     scan = scan_of(scene, T_world_lidar, replace(EXACT, dark_bias_m=0.01, weak_bias_m=0.03))
@@ -169,7 +163,7 @@ def test_dark_squares_and_weak_returns_read_long(board: Board, T_world_lidar: Ar
     assert np.median(depth[is_dark]) == pytest.approx(0.008 + 0.03 * (1 - 20 / 30), abs=1e-3)
 
 
-def test_rim_noise_moves_points_near_the_border_and_no_others(board: Board, T_world_lidar: Array) -> None:
+def test_rim_noise_moves_points_near_the_border_and_no_others(board, T_world_lidar):
     scene = Scene(Raycaster(()), [], board, board_before_lidar(2.5))
     plain, rimmed = (scan_of(scene, T_world_lidar, replace(EXACT, rim_spread_rad=w)) for w in (0.0, 0.0015))
     moved_m = np.linalg.norm(plain.points - rimmed.points, axis=1)

@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
-from lce_rig.core.board import Board
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.geometry import Array, pose, rotation_angle
+from lce_rig.core.geometry import pose, rotation_angle
 from lce_rig.simulate.image_rendering import expose, render_radiance
 from lce_rig.simulate.lidar import sweep_again, sweep_scene
 from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.options import LidarNoise, SimulationOptions
 from lce_rig.simulate.placements import between
-from lce_rig.simulate.room import Room, build_carrier
+from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import Scene
 
 from .conftest import VLP16, board_before_lidar, make_rig
@@ -21,8 +20,8 @@ FAR_BELOW = pose(np.eye(3), np.array([0.0, 0.0, -1e6]))
 
 @pytest.mark.parametrize(("distance_m", "yaw_deg", "carrier"), [(1.3, 20.0, "person"), (3.5, -25.0, "stand")])
 def test_beams_that_cannot_meet_the_board_need_not_be_sent_again(
-    room: Room, board: Board, T_world_lidar: Array, distance_m: float, yaw_deg: float, carrier: str
-) -> None:
+    room, board, T_world_lidar, distance_m, yaw_deg, carrier
+):
     T = board_before_lidar(distance_m, yaw_deg=yaw_deg)
     bodies = build_carrier(carrier, board, T, np.random.default_rng(3))  # type: ignore[arg-type]
     scene, noise = Scene(room.raycaster, bodies, board, T), LidarNoise()
@@ -38,19 +37,19 @@ def test_beams_that_cannot_meet_the_board_need_not_be_sent_again(
 
 
 @pytest.fixture(scope="module")
-def live() -> LiveScene:
+def live():
     scene = LiveScene(make_rig(), 3, SimulationOptions())
     scene.hold(board_before_lidar(2.2, yaw_deg=20.0))
     return scene
 
 
-def samples(live: LiveScene, stamp_ns: int) -> tuple[Image, Scan]:
+def samples(live, stamp_ns):
     image, scan = live.take(stamp_ns)
     assert isinstance(image, Image) and isinstance(scan, Scan)
     return image, scan
 
 
-def test_pictures_of_a_held_board_differ_by_the_sensor_s_noise_alone(live: LiveScene) -> None:
+def test_pictures_of_a_held_board_differ_by_the_sensor_s_noise_alone(live):
     taken = np.array([samples(live, k)[0].pixels for k in range(16)], dtype=np.float64)
     assert not np.array_equal(taken[0], taken[1])
     backdrop, noise = live.stage.backdrops["cam"], live.stage.options.camera
@@ -60,7 +59,7 @@ def test_pictures_of_a_held_board_differ_by_the_sensor_s_noise_alone(live: LiveS
     assert taken.std(axis=0).mean() == pytest.approx(at_once.std(axis=0).mean(), rel=0.02)
 
 
-def test_a_board_on_its_way_is_seen_where_it_is(live: LiveScene) -> None:
+def test_a_board_on_its_way_is_seen_where_it_is(live):
     start, end = board_before_lidar(2.2, yaw_deg=20.0), board_before_lidar(2.6, yaw_deg=-10.0)
     live.pass_by(start, end, 0.5)
     on_its_way, _ = samples(live, 0)

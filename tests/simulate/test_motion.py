@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from lce_rig.core.board import Board
-from lce_rig.core.data import Scan
-from lce_rig.core.geometry import Array, difference, exp_so3, invert, pose
+from lce_rig.core.geometry import difference, exp_so3, invert, pose
 from lce_rig.simulate.options import HandMotion, LidarNoise
-from lce_rig.simulate.placements import Trajectory, carry_board, sway_board
+from lce_rig.simulate.placements import carry_board, sway_board
 from lce_rig.simulate.scene import Raycaster, Scene
 
 from .conftest import VLP16, board_before_lidar, simulate_scan
@@ -16,12 +14,12 @@ ANCHOR_NS = 1_700_000_000_050_000_000
 BEFORE_NS = ANCHOR_NS + 1_000_000 * np.arange(-1000, 201, 5)
 
 
-def sway(hand: HandMotion, seed: int) -> Trajectory:
+def sway(hand, seed):
     return sway_board(board_before_lidar(2.0), ANCHOR_NS, hand, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_swaying_board_passes_its_placement_exactly(seed: int) -> None:
+def test_a_swaying_board_passes_its_placement_exactly(seed):
     trajectory = sway(HandMotion(), seed)
     assert np.allclose(trajectory.at(ANCHOR_NS), board_before_lidar(2.0), atol=1e-12)
     assert trajectory.at(BEFORE_NS).shape == (len(BEFORE_NS), 4, 4)
@@ -29,14 +27,14 @@ def test_a_swaying_board_passes_its_placement_exactly(seed: int) -> None:
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 0.05, 0.3])
-def test_speed_is_the_one_asked_for_over_the_second_before(speed_mps: float) -> None:
+def test_speed_is_the_one_asked_for_over_the_second_before(speed_mps):
     for seed in range(4):
         trajectory = sway(HandMotion(speed_mps=(speed_mps, speed_mps), tremor_m=0.0), seed)
         rms_mps = np.sqrt(np.mean(trajectory.speed_mps(BEFORE_NS) ** 2))
         assert rms_mps == pytest.approx(speed_mps, rel=0.02, abs=1e-6)
 
 
-def test_a_carried_board_rests_at_each_placement_and_never_jumps() -> None:
+def test_a_carried_board_rests_at_each_placement_and_never_jumps():
     placements = [board_before_lidar(2.0), board_before_lidar(3.0, roll_deg=30.0, yaw_deg=25.0)]
     placements.append(
         pose(placements[0][:3, :3] @ exp_so3(np.array([0.3, -0.4, 0.1])), np.array([1.5, 0.7, 1.2]))
@@ -52,7 +50,7 @@ def test_a_carried_board_rests_at_each_placement_and_never_jumps() -> None:
     assert np.linalg.norm(step[:, 3:], axis=1).max() / 0.002 < np.radians(61)
 
 
-def moving_scan(board: Board, T_world_lidar: Array, trajectory: Trajectory, noise: LidarNoise) -> Scan:
+def moving_scan(board, T_world_lidar, trajectory, noise):
     stamp_ns = ANCHOR_NS - 50_000_000
     scene = Scene(Raycaster(()), [], board, trajectory.at(ANCHOR_NS))
     return simulate_scan(
@@ -66,7 +64,7 @@ def moving_scan(board: Board, T_world_lidar: Array, trajectory: Trajectory, nois
     )
 
 
-def heights_m(scan: Scan, T_world_lidar: Array, T_world_board: Array) -> Array:
+def heights_m(scan, T_world_lidar, T_world_board):
     """Distance of each point from the plane of its own pose (N, 4, 4), or of one for all."""
     T_board_lidar = invert(T_world_board) @ T_world_lidar
     along = np.broadcast_to(T_board_lidar[..., 2, :3], scan.points.shape)
@@ -74,9 +72,7 @@ def heights_m(scan: Scan, T_world_lidar: Array, T_world_board: Array) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_lidar_meets_a_moving_board_where_it_is_at_each_firing(
-    board: Board, T_world_lidar: Array, seed: int
-) -> None:
+def test_the_lidar_meets_a_moving_board_where_it_is_at_each_firing(board, T_world_lidar, seed):
     trajectory = sway(HandMotion(speed_mps=(0.5, 0.5), turn_deg_s=40.0), seed)
     scan = moving_scan(board, T_world_lidar, trajectory, LidarNoise.none())
     assert scan.offset_ns is not None and scan.stamp_ns is not None and len(scan.points) > 500

@@ -1,23 +1,13 @@
 """Captures of a moving board: pictures, scans and events tell of one board at their own times."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Image
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.geometry import Array, transform
-from lce_rig.rig import Rig
-from lce_rig.simulate import (
-    HandMotion,
-    LidarNoise,
-    SimulatedCapture,
-    SimulationOptions,
-    simulate_captures,
-    truth_extrinsics,
-)
+from lce_rig.core.geometry import transform
+from lce_rig.simulate import HandMotion, LidarNoise, SimulationOptions, simulate_captures, truth_extrinsics
 from lce_rig.simulate.sampling import StagedBoard
 from lce_rig.simulate.stage import set_stage
 
@@ -37,32 +27,32 @@ BRIEF = replace(QUIET, events_span_s=(0.2, 0.1))
 CHANNELS = {"frames": {"kind": "frames"}, "events": {"kind": "events"}}
 
 
-def moving_rig(**channels: Any) -> Rig:
+def moving_rig(**channels):
     camera = make_rig().cameras["cam"].model_dump()
     return make_rig(cameras={"cam": {**camera, "channels": channels or CHANNELS}})
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return moving_rig()
 
 
 @pytest.fixture(scope="module")
-def captures(rig: Rig) -> list[SimulatedCapture]:
+def captures(rig):
     return list(simulate_captures(rig, n_captures=2, seed=5, options=MOVING))
 
 
 @pytest.fixture(scope="module")
-def quiet(rig: Rig) -> SimulatedCapture:
+def quiet(rig):
     return next(simulate_captures(rig, n_captures=1, seed=6, options=BRIEF))
 
 
-def stamp_of(image: Image) -> int:
+def stamp_of(image):
     assert image.stamp_ns is not None
     return image.stamp_ns
 
 
-def found_corners(rig: Rig, image: Image, T_cam_board: Array) -> tuple[Array, Array]:
+def found_corners(rig, image, T_cam_board):
     """Corners refined in a picture from where the truth has them, and the truth (N, 2)."""
     import cv2
 
@@ -74,9 +64,7 @@ def found_corners(rig: Rig, image: Image, T_cam_board: Array) -> tuple[Array, Ar
 
 
 @pytest.mark.long
-def test_truth_at_any_time_is_the_same_for_camera_and_lidar(
-    rig: Rig, captures: list[SimulatedCapture]
-) -> None:
+def test_truth_at_any_time_is_the_same_for_camera_and_lidar(rig, captures):
     T_cam_lidar = truth_extrinsics(rig, 5, MOVING)["cam", "lidar"]
     for capture in captures:
         scan_ns = capture.scans[0].stamp_ns or 0
@@ -89,7 +77,7 @@ def test_truth_at_any_time_is_the_same_for_camera_and_lidar(
 
 
 @pytest.mark.long
-def test_pictures_and_events_surround_the_scan(captures: list[SimulatedCapture]) -> None:
+def test_pictures_and_events_surround_the_scan(captures):
     phases_ns = []
     for capture in captures:
         scan_ns, events = capture.scans[0].stamp_ns or 0, capture.events[0]
@@ -104,7 +92,7 @@ def test_pictures_and_events_surround_the_scan(captures: list[SimulatedCapture])
 
 
 @pytest.mark.long
-def test_event_rates_are_those_of_a_davis346(captures: list[SimulatedCapture]) -> None:
+def test_event_rates_are_those_of_a_davis346(captures):
     for capture in captures:
         events = capture.events[0]
         rate_hz = len(events) / 1.35
@@ -116,7 +104,7 @@ def test_event_rates_are_those_of_a_davis346(captures: list[SimulatedCapture]) -
         assert np.sum(per_pixel > 9.0) >= 5 and per_pixel.max() > 50
 
 
-def test_quiet_events_reproduce_what_the_camera_saw(rig: Rig, quiet: SimulatedCapture) -> None:
+def test_quiet_events_reproduce_what_the_camera_saw(rig, quiet):
     stage = set_stage(rig, 6, BRIEF)
     view = StagedBoard(stage, quiet.trajectory, stage.rng(0)).view("cam")
     noise, events = BRIEF.events, quiet.events[0]
@@ -131,7 +119,7 @@ def test_quiet_events_reproduce_what_the_camera_saw(rig: Rig, quiet: SimulatedCa
     assert np.abs(told).max() > 2.0
 
 
-def test_stamps_mark_the_middle_of_the_exposure(rig: Rig) -> None:
+def test_stamps_mark_the_middle_of_the_exposure(rig):
     options = replace(BRIEF, exposure_s=0.02, events_span_s=(0.0, 0.01))
     for capture in simulate_captures(rig, n_captures=1, seed=8, options=options):
         picture_ns = stamp_of(capture.images[0])
@@ -145,9 +133,7 @@ def test_stamps_mark_the_middle_of_the_exposure(rig: Rig) -> None:
 
 
 @pytest.mark.long
-def test_stamps_read_more_than_the_rigs_clock_by_their_channels_offset(
-    rig: Rig, quiet: SimulatedCapture
-) -> None:
+def test_stamps_read_more_than_the_rigs_clock_by_their_channels_offset(rig, quiet):
     late = replace(BRIEF, frame_offset_s=0.12, event_offset_s=-0.015)
     capture = next(simulate_captures(rig, n_captures=1, seed=6, options=late))
     assert stamp_of(capture.images[0]) == stamp_of(quiet.images[0])
@@ -165,7 +151,7 @@ def test_stamps_read_more_than_the_rigs_clock_by_their_channels_offset(
     assert capture.scans[0].points.tobytes() == quiet.scans[0].points.tobytes()
 
 
-def test_a_camera_of_events_alone_is_enough_for_a_moving_board_only() -> None:
+def test_a_camera_of_events_alone_is_enough_for_a_moving_board_only():
     rig = moving_rig(dvs={"kind": "events"})
     capture = next(
         simulate_captures(rig, n_captures=1, seed=6, options=replace(BRIEF, events_span_s=(0.02, 0.0)))

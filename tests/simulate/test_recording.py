@@ -5,8 +5,7 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import invert, transform
-from lce_rig.rig import Rig
-from lce_rig.simulate import HandMotion, SimulatedRecording, SimulationOptions, simulate_recording
+from lce_rig.simulate import HandMotion, SimulationOptions, simulate_recording
 from lce_rig.simulate.sampling import stamp_of
 
 from .test_moving_captures import found_corners, moving_rig
@@ -16,23 +15,21 @@ OPTIONS = SimulationOptions(carrier="person", hand=HandMotion(rest_s=0.1, carry_
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return moving_rig()
 
 
 @pytest.fixture(scope="module")
-def recording(rig: Rig) -> SimulatedRecording:
+def recording(rig):
     return simulate_recording(rig, duration_s=0.6, seed=3, options=OPTIONS)
 
 
 @pytest.fixture(scope="module")
-def samples(recording: SimulatedRecording) -> list[Image | Scan | Events]:
+def samples(recording):
     return list(recording)
 
 
-def test_samples_come_in_order_at_each_sensors_own_rate(
-    recording: SimulatedRecording, samples: list[Image | Scan | Events]
-) -> None:
+def test_samples_come_in_order_at_each_sensors_own_rate(recording, samples):
     assert np.all(np.diff([stamp_of(sample) for sample in samples]) >= 0)
     counts = {kind: sum(isinstance(sample, kind) for sample in samples) for kind in (Image, Scan, Events)}
     assert counts == {Image: 12, Scan: 6, Events: 30}
@@ -40,9 +37,7 @@ def test_samples_come_in_order_at_each_sensors_own_rate(
     assert max(stamp_of(sample) for sample in samples) < recording.end_ns == recording.start_ns + 600_000_000
 
 
-def test_pictures_and_scans_show_the_board_where_the_truth_has_it(
-    rig: Rig, recording: SimulatedRecording, samples: list[Image | Scan | Events]
-) -> None:
+def test_pictures_and_scans_show_the_board_where_the_truth_has_it(rig, recording, samples):
     lens, n_seen = rig.cameras["cam"].to_intrinsics(), 0
     for sample in samples:
         if isinstance(sample, Image):

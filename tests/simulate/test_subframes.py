@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 
-from lce_rig.core.board import Board
-from lce_rig.core.geometry import Array, invert, transform
-from lce_rig.simulate.backdrop import Backdrop
+from lce_rig.core.geometry import invert, transform
 from lce_rig.simulate.image_rendering import render_radiance
-from lce_rig.simulate.options import Carrier
-from lce_rig.simulate.placements import Trajectory, hold_board
-from lce_rig.simulate.room import Room, build_carrier
+from lce_rig.simulate.placements import hold_board
+from lce_rig.simulate.room import build_carrier
 from lce_rig.simulate.scene import Scene
 from lce_rig.simulate.subframes import GREY, MovingView
 
@@ -19,10 +16,8 @@ from .test_camera import PLACEMENTS, refined
 T_NS = 1_700_000_000_123_000_000
 
 
-def make_view(
-    room: Room, board: Board, backdrop: Backdrop, trajectory: Trajectory, carrier: Carrier = "person"
-) -> MovingView:
-    def scene_at(t_ns: int) -> Scene:
+def make_view(room, board, backdrop, trajectory, carrier="person"):
+    def scene_at(t_ns):
         T = trajectory.at(t_ns)
         return Scene(room.raycaster, build_carrier(carrier, board, T, np.random.default_rng(0)), board, T)
 
@@ -30,9 +25,7 @@ def make_view(
 
 
 @pytest.mark.parametrize("T_world_board", PLACEMENTS, ids=["near", "middle", "side"])
-def test_corners_lie_where_truth_and_pictures_have_them(
-    room: Room, board: Board, backdrop: Backdrop, T_world_board: Array
-) -> None:
+def test_corners_lie_where_truth_and_pictures_have_them(room, board, backdrop, T_world_board):
     view = make_view(room, board, backdrop, hold_board(T_world_board))
     seen = view.at(T_NS)
     subframe = np.rint(255 * np.clip(seen, 0, 1) ** (1 / 2.2)).astype(np.uint8)
@@ -44,9 +37,7 @@ def test_corners_lie_where_truth_and_pictures_have_them(
     assert np.abs(in_subframe - in_picture).max() < 0.1
 
 
-def test_the_board_and_its_carrier_are_as_bright_as_in_pictures(
-    room: Room, board: Board, backdrop: Backdrop
-) -> None:
+def test_the_board_and_its_carrier_are_as_bright_as_in_pictures(room, board, backdrop):
     import cv2
 
     view = make_view(room, board, backdrop, hold_board(PLACEMENTS[0]))

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Image, Scan
-from lce_rig.core.geometry import Array, invert, perturb, transform
-from lce_rig.rig import Rig
+from lce_rig.core.geometry import invert, perturb, transform
 from lce_rig.simulate import (
     HandMotion,
     SimulatedCapture,
@@ -17,7 +16,7 @@ from lce_rig.simulate import (
     rig_truth,
     truth_extrinsics,
 )
-from lce_rig.simulate.placements import Trajectory, hold_board, sway_board
+from lce_rig.simulate.placements import hold_board, sway_board
 
 from .conftest import board_before_lidar, make_rig
 
@@ -26,11 +25,11 @@ T_WORLD_BOARD = board_before_lidar(2.0)
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return make_rig()
 
 
-def scan_of(T_lidar_board: Array, offset_ns: Array, on_board: Array) -> Scan:
+def scan_of(T_lidar_board, offset_ns, on_board):
     """Points all over the plate, and as many a metre behind it, at their firing times (N,)."""
     rng = np.random.default_rng(0)
     points_board = rng.uniform([-0.35, -0.25, -0.01], [0.35, 0.25, 0.01], (len(offset_ns), 3))
@@ -40,7 +39,7 @@ def scan_of(T_lidar_board: Array, offset_ns: Array, on_board: Array) -> Scan:
     return Scan("lidar", STAMP_NS, points, np.zeros(n, np.float32), np.zeros(n, np.int16), offset_ns)
 
 
-def capture_of(trajectory: Trajectory, on_board: Array) -> SimulatedCapture:
+def capture_of(trajectory, on_board):
     offset_ns = np.linspace(30_000_000, 70_000_000, len(on_board)).astype(np.int64)
     T_world_sensor = {"lidar": np.eye(4), "cam": perturb(np.eye(4), np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.1]))}
     T_lidar_board = trajectory.at(STAMP_NS + offset_ns)
@@ -50,7 +49,7 @@ def capture_of(trajectory: Trajectory, on_board: Array) -> SimulatedCapture:
 
 
 @pytest.mark.parametrize("share", [0.2, 0.9])
-def test_the_lidars_time_is_the_mean_of_its_returns_from_the_board(rig: Rig, share: float) -> None:
+def test_the_lidars_time_is_the_mean_of_its_returns_from_the_board(rig, share):
     hand = HandMotion(speed_mps=(0.6, 0.6))
     swaying = sway_board(T_WORLD_BOARD, STAMP_NS, hand, np.random.default_rng(1))
     on_board = np.arange(500) < 500 * share
@@ -62,7 +61,7 @@ def test_the_lidars_time_is_the_mean_of_its_returns_from_the_board(rig: Rig, sha
         assert board_time_ns(rig, capture, scan) == pytest.approx(expected_ns, abs=1)
 
 
-def test_without_returns_or_times_it_is_the_middle_of_the_sweep(rig: Rig) -> None:
+def test_without_returns_or_times_it_is_the_middle_of_the_sweep(rig):
     capture = capture_of(hold_board(T_WORLD_BOARD), np.zeros(50, np.bool_))
     assert board_time_ns(rig, capture, capture.scans[0]) == STAMP_NS + 50_000_000
     capture = capture_of(hold_board(T_WORLD_BOARD), np.ones(50, np.bool_))
@@ -70,7 +69,7 @@ def test_without_returns_or_times_it_is_the_middle_of_the_sweep(rig: Rig) -> Non
     assert board_time_ns(rig, capture, timeless) == STAMP_NS + 50_000_000
 
 
-def test_each_sensors_pose_is_that_at_its_own_time_of_the_rigs_clock(rig: Rig) -> None:
+def test_each_sensors_pose_is_that_at_its_own_time_of_the_rigs_clock(rig):
     swaying = sway_board(T_WORLD_BOARD, STAMP_NS, HandMotion(speed_mps=(0.3, 0.3)), np.random.default_rng(2))
     capture = capture_of(swaying, np.ones(50, np.bool_))
     truth = capture_truth(rig, capture, SimulationOptions(motion="moving", frame_offset_s=0.12))
@@ -85,7 +84,7 @@ def test_each_sensors_pose_is_that_at_its_own_time_of_the_rigs_clock(rig: Rig) -
     assert capture_truth(rig, blind, SimulationOptions())["boards"]["cam"]["t_ns"] == lidar["t_ns"]
 
 
-def test_the_rigs_truth_names_every_pair_and_the_clocks(rig: Rig) -> None:
+def test_the_rigs_truth_names_every_pair_and_the_clocks(rig):
     options = SimulationOptions(motion="moving", frame_offset_s=-0.12, event_offset_s=0.015)
     truth = rig_truth(rig, 4, options)
     assert np.array_equal(truth["T_cam_lidar"], truth_extrinsics(rig, 4, options)["cam", "lidar"])

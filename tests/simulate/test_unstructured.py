@@ -11,17 +11,17 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference
 from lce_rig.core.results import Observation
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrinsics
 from tests.shared import changed
 
 
-def of_model(model: str) -> Rig:
+def of_model(model):
     return changed(load_rig("mid360"), lidars__lidar__model=model)
 
 
 @pytest.mark.parametrize("model", ["Mid-360", "Avia"])
-def test_beams_fill_the_field_of_view_and_the_board_is_found_where_it_is(model: str) -> None:
+def test_beams_fill_the_field_of_view_and_the_board_is_found_where_it_is(model):
     rig = of_model(model)
     sheet = rig.lidars["lidar"].data_sheet()
     assert sheet is not None
@@ -41,7 +41,7 @@ def test_beams_fill_the_field_of_view_and_the_board_is_found_where_it_is(model: 
 
 
 @pytest.mark.long
-def test_extrinsics_lie_within_their_covariance() -> None:
+def test_extrinsics_lie_within_their_covariance():
     rig, seed = of_model("Mid-360"), 4
     finder, lidar, seen = BoardFinder(rig), rig.lidars["lidar"], []
     fewer = replace(SimulationOptions(), truth_rotation_deg=3.0)

@@ -1,7 +1,6 @@
 """Frames get exactly the events around their scan, in whatever packets these come, with bounded memory."""
 
 import tracemalloc
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -10,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.core.data import Events, Image, Sample, Scan
+from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Losses
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from lce_rig.timing.rig_time import rig_time_ns
-from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, Frame, pair_by_time
+from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, pair_by_time
 from tests.shared import changed
 
 T0_NS = 1_700_000_000 * 10**9
@@ -22,15 +21,15 @@ MS = 1_000_000
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig():
     return load_rig("rles")
 
 
-def image(time_ms: float) -> Image:
+def image(time_ms):
     return Image("davis", "frames", T0_NS + round(time_ms * MS), np.zeros((2, 2), np.uint8))
 
 
-def scan(time_ms: float) -> Scan:
+def scan(time_ms):
     """A sweep of 100 ms that begins at `time_ms`."""
     offset_ns = np.array([0, 100 * MS])
     zeros = np.zeros(2, np.float32)
@@ -44,24 +43,24 @@ def scan(time_ms: float) -> Scan:
     )
 
 
-def stream(begin_ms: float, end_ms: float, n: int, seed: int = 0) -> Events:
+def stream(begin_ms, end_ms, n, seed=0):
     rng = np.random.default_rng(seed)
     t_ns = T0_NS + np.sort(rng.integers(round(begin_ms * 1000), round(end_ms * 1000), n)) * 1000
     x, y = rng.integers(0, 346, n).astype(np.uint16), rng.integers(0, 260, n).astype(np.uint16)
     return Events("davis", t_ns, x, y, rng.random(n) < 0.5, 346, 260, host_ns=1)
 
 
-def packets(events: Events, edges: Sequence[int]) -> list[Events]:
+def packets(events, edges):
     bounds = [0, *edges, len(events)]
     return [events.select(slice(a, b)) for a, b in pairwise(bounds) if b > a]
 
 
-def frames_of(samples: list[Sample], rig: Rig) -> list[Frame]:
+def frames_of(samples, rig):
     ordered = sorted(samples, key=lambda sample: rig_time_ns(sample, rig) or 0)
     return list(pair_by_time(ordered, rig, Losses()))
 
 
-def is_cut_exactly(frame: Frame, events: Events, begin_ms: float) -> bool:
+def is_cut_exactly(frame, events, begin_ms):
     (cut,) = frame.events
     start_ns = T0_NS + round(begin_ms * MS) - BEFORE_NS
     truth = events.between(start_ns, start_ns + BEFORE_NS + 100 * MS + AFTER_NS)
@@ -71,7 +70,7 @@ def is_cut_exactly(frame: Frame, events: Events, begin_ms: float) -> bool:
 
 
 @given(edges=st.lists(st.integers(0, 4000), max_size=30).map(sorted))
-def test_the_events_around_each_scan_are_cut_exactly_whatever_their_packets(edges: list[int]) -> None:
+def test_the_events_around_each_scan_are_cut_exactly_whatever_their_packets(edges):
     rig = load_rig("rles")
     events = stream(0, 3000, 4000)
     begins_ms = (1300, 1400, 1700)
@@ -83,7 +82,7 @@ def test_the_events_around_each_scan_are_cut_exactly_whatever_their_packets(edge
     assert frames[0].events[0].events.host_ns is None
 
 
-def test_a_stream_that_begins_late_or_ends_early_gives_what_it_has_and_says_what_is_missing(rig: Rig) -> None:
+def test_a_stream_that_begins_late_or_ends_early_gives_what_it_has_and_says_what_is_missing(rig):
     events = stream(900, 1800, 5000)
     samples = [*packets(events, range(100, 5000, 100)), *(scan(t) for t in (100, 1000, 1700, 3500))]
     frames = frames_of([*samples, *(image(t + 50) for t in (100, 1000, 1700, 3500))], rig)
@@ -94,7 +93,7 @@ def test_a_stream_that_begins_late_or_ends_early_gives_what_it_has_and_says_what
     assert frames[2].events[0].missing_ns == first_ns - (T0_NS + 1700 * MS - BEFORE_NS)
 
 
-def test_a_frame_waits_for_its_events_but_not_for_ever(rig: Rig) -> None:
+def test_a_frame_waits_for_its_events_but_not_for_ever(rig):
     events = stream(0, 1500, 3000)
     first, *others = packets(events, range(50, 3000, 50))
     early = [first, scan(1000), image(1050), image(1200), *others]
@@ -109,7 +108,7 @@ def test_a_frame_waits_for_its_events_but_not_for_ever(rig: Rig) -> None:
     assert earliest.time_ns == T0_NS + 1050 * MS and next(taken).stamp_ns < T0_NS + 2500 * MS
 
 
-def test_two_event_cameras_get_a_stretch_each(rig: Rig) -> None:
+def test_two_event_cameras_get_a_stretch_each(rig):
     both = changed(rig, cameras__right=rig.cameras["davis"])
     left, right = stream(0, 3000, 2000, 1), replace(stream(0, 3000, 2000, 2), sensor="right")
     samples = [
@@ -125,8 +124,8 @@ def test_two_event_cameras_get_a_stretch_each(rig: Rig) -> None:
     ]
 
 
-def test_memory_holds_some_seconds_of_a_long_stream_also_while_the_lidar_is_silent(rig: Rig) -> None:
-    def samples(n_packets: int) -> Iterator[Sample]:
+def test_memory_holds_some_seconds_of_a_long_stream_also_while_the_lidar_is_silent(rig):
+    def samples(n_packets):
         for k in range(n_packets):
             yield replace(packet, t_ns=packet.t_ns + k * 20 * MS)
             if k % 5 == 0 and not 300 < k < 1800:

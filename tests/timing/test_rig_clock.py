@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Image, Pulse, Scan
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from lce_rig.rig.profile import SyncSettings
-from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import TimePairs, fit_clock
 from lce_rig.timing.rig_clock import RigClock
 
@@ -18,7 +17,7 @@ PERIOD_NS = 50_000_000
 LOCKED = ["lidar"]
 
 
-def tie(source_ns: np.ndarray, reference_ns: np.ndarray) -> ClockModel:
+def tie(source_ns, reference_ns):
     model = fit_clock(TimePairs.from_edges(source_ns, reference_ns), "edges")
     assert model is not None
     return model
@@ -29,36 +28,36 @@ class Board:
     """A board whose clock counts from its power-up; the computer is ahead of its UTC by 37 ms."""
 
     @property
-    def host_clock(self) -> ClockModel:
+    def host_clock(self):
         times_ns = np.arange(0, 20_000_000_000, 500_000_000)
         return tie(times_ns, times_ns + T0_NS + HOST_AHEAD_NS)
 
     @property
-    def utc_clock(self) -> ClockModel:
+    def utc_clock(self):
         times_ns = np.arange(0, 20_000_000_000, 500_000_000)
         return tie(times_ns, times_ns + T0_NS)
 
 
-def refresh(clock: RigClock, board: Board, locked: list[str]) -> None:
+def refresh(clock, board, locked):
     clock.refresh(board.host_clock, board.utc_clock, locked)
 
 
-def synced(rig_name: str, camera: str, max_delay_s: float = 0.03) -> Rig:
+def synced(rig_name, camera, max_delay_s=0.03):
     trigger = {camera: {"channel": 0, "rate_hz": 20, "max_delay_s": max_delay_s}}
     sync = SyncSettings.model_validate({"type": "lce1", "device": "/dev/null", "triggers": trigger})
     return load_rig(rig_name).model_copy(update={"sync": sync})
 
 
-def picture(stamp_ns: int, count: int | None = None) -> Image:
+def picture(stamp_ns, count=None):
     return Image("cam", "frames", stamp_ns, np.zeros((2, 2), np.uint8), stamp_ns, count)
 
 
-def scan(stamp_ns: int) -> Scan:
+def scan(stamp_ns):
     nothing = np.zeros(0)
     return Scan("lidar", stamp_ns, np.zeros((0, 3), np.float32), nothing, nothing.astype(np.int16))
 
 
-def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still() -> None:
+def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still():
     clock = RigClock(load_rig("rlfs"), has_board=False)
     clock.refresh(None, None, [])
     assert clock.take("cam", picture(T0_NS))[0].stamp_ns == T0_NS
@@ -67,7 +66,7 @@ def test_without_a_board_everything_keeps_its_time_and_boards_must_stand_still()
     assert [reason.code for reason in clock.verdict().reasons] == ["sync.no_board"]
 
 
-def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_brought_to_it() -> None:
+def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_brought_to_it():
     rig = load_rig("rlfs").model_copy(update={"sync": synced("rlfs", "cam").sync})
     clock = RigClock(rig, has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)
@@ -77,14 +76,14 @@ def test_a_locked_lidar_keeps_its_utc_and_pictures_of_the_computers_time_are_bro
     assert not clock.verdict().requires_still_boards
 
 
-def test_an_unlocked_lidar_counts_by_the_computers_clock() -> None:
+def test_an_unlocked_lidar_counts_by_the_computers_clock():
     clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), [])
     placed = clock.take("lidar", scan(T0_NS + 2_000_000_000 + HOST_AHEAD_NS))[0]
     assert placed.stamp_ns == pytest.approx(T0_NS + 2_000_000_000, abs=2000)
 
 
-def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arrival() -> None:
+def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arrival():
     clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)
     rng = np.random.default_rng(3)
@@ -104,10 +103,10 @@ def test_pictures_take_the_time_of_the_pulses_that_made_them_not_of_their_arriva
     assert abs(np.mean(errors_ns)) < 2_000_000
 
 
-def test_images_keep_their_time_while_a_clock_that_jumped_has_no_model() -> None:
+def test_images_keep_their_time_while_a_clock_that_jumped_has_no_model():
     clock, board = RigClock(synced("rlfs", "cam"), has_board=True), Board()
     refresh(clock, board, LOCKED)
-    came: list[Image] = []
+    came = []
     for k in range(20):
         if k == 10:
             clock.refresh(None, None, [])
@@ -121,7 +120,7 @@ def test_images_keep_their_time_while_a_clock_that_jumped_has_no_model() -> None
     assert came[-1].count == 19 and came[-1].stamp_ns == came[-1].host_ns
 
 
-def test_a_pulse_that_the_camera_missed_is_found_and_told() -> None:
+def test_a_pulse_that_the_camera_missed_is_found_and_told():
     clock = RigClock(synced("rlfs", "cam"), has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)
     number = 100
@@ -137,7 +136,7 @@ def test_a_pulse_that_the_camera_missed_is_found_and_told() -> None:
     assert (slipped.code, slipped.subject, slipped.figures["n_slips"]) == ("pulses.slipped", "cam", 1)
 
 
-def test_lines_too_fast_for_their_delay_begin_slowly_and_then_run_at_full_rate() -> None:
+def test_lines_too_fast_for_their_delay_begin_slowly_and_then_run_at_full_rate():
     clock = RigClock(synced("rlfs", "cam", max_delay_s=0.1), has_board=True, edge_cameras=["davis"])
     assert clock.needs_slow_triggers
     refresh(clock, Board(), LOCKED)
@@ -149,7 +148,7 @@ def test_lines_too_fast_for_their_delay_begin_slowly_and_then_run_at_full_rate()
     assert not clock.needs_slow_triggers
 
 
-def test_a_davis_is_tied_by_the_edges_it_saw() -> None:
+def test_a_davis_is_tied_by_the_edges_it_saw():
     rig = synced("rles", "davis")
     clock = RigClock(rig, has_board=True, edge_cameras=["davis"])
     refresh(clock, Board(), LOCKED)

@@ -4,9 +4,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
-from types import TracebackType
 
 from lce_rig.session import Session
 from wire.rig import ENVIRONMENT
@@ -21,7 +18,7 @@ class Collecting:
         session: the folder it fills.
     """
 
-    def __init__(self, profile: Path, session: Path, *options: str, prelude: str = "") -> None:
+    def __init__(self, profile, session, *options, prelude=""):
         """Prepare.
 
         Args:
@@ -35,36 +32,34 @@ class Collecting:
         words = ["collect", "--rig", str(profile), str(session), "--plain", *options]
         self._command = [sys.executable, "-c", f"{prelude}\n{_MAIN}", *words]
 
-    def __enter__(self) -> "Collecting":
+    def __enter__(self):
         with self._log.open("w") as log:
             self._process = subprocess.Popen(
                 self._command, stdin=subprocess.DEVNULL, stderr=log, stdout=log, env=ENVIRONMENT
             )
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind, error, trace):
         self._process.kill()
         self._process.wait()
 
     @property
-    def pid(self) -> int:
+    def pid(self):
         """Of the process."""
         return self._process.pid
 
     @property
-    def said(self) -> str:
+    def said(self):
         """What it has written to the terminal so far."""
         return self._log.read_text(errors="replace")
 
     @property
-    def n_captures(self) -> int:
+    def n_captures(self):
         """Captures that are listed in the session."""
         marker = self.session / "session.json"
         return len(Session.open(self.session).captures) if marker.exists() else 0
 
-    def wait_for(self, text: str, within_s: float = 60.0, times: int = 1) -> None:
+    def wait_for(self, text, within_s=60.0, times=1):
         """Wait until it has said something so often.
 
         Raises:
@@ -72,7 +67,7 @@ class Collecting:
         """
         self._wait(lambda: self.said.count(text) >= times, f"{text!r} was not said", within_s)
 
-    def wait_for_captures(self, n: int, within_s: float = 60.0) -> None:
+    def wait_for_captures(self, n, within_s=60.0):
         """Wait until the session holds so many.
 
         Raises:
@@ -80,16 +75,16 @@ class Collecting:
         """
         self._wait(lambda: self.n_captures >= n, f"there are not {n} captures", within_s)
 
-    def wait(self, within_s: float = 60.0) -> int:
+    def wait(self, within_s=60.0):
         """Wait for its end, and give its exit code."""
         return self._process.wait(within_s)
 
-    def end(self, number: signal.Signals = signal.SIGTERM) -> int:
+    def end(self, number=signal.SIGTERM):
         """Send it a signal, and give its exit code."""
         self._process.send_signal(number)
         return self.wait()
 
-    def _wait(self, is_so: Callable[[], bool], otherwise: str, within_s: float) -> None:
+    def _wait(self, is_so, otherwise, within_s):
         deadline_s = time.monotonic() + within_s
         while not is_so():
             code = self._process.poll()

@@ -2,11 +2,9 @@
 
 import time
 from datetime import timedelta
-from typing import Any
 
 import numpy as np
 
-from wire.reel import Reel
 from wire.timing import placement_at
 
 EVENTS_HZ = 2_000_000
@@ -23,7 +21,7 @@ class RandomDavis:
     writer takes more than half a core for itself, however little is sent.
     """
 
-    def __init__(self, reel: Reel, camera: str, loops_per_hold: int, *, has_frames: bool) -> None:
+    def __init__(self, reel, camera, loops_per_hold, *, has_frames):
         """Prepare.
 
         Args:
@@ -35,7 +33,7 @@ class RandomDavis:
         import dv_processing
 
         self._has_frames, self._loops = has_frames, loops_per_hold
-        self._dv: Any = dv_processing
+        self._dv = dv_processing
         self._batch = self._frame = time.time_ns() // 1000 // _BATCH_US
         self._n_placements = reel.n_placements
         self._frames = [
@@ -45,7 +43,7 @@ class RandomDavis:
         self._pulse = time.time_ns() // 1000 // _SECOND_US + 1
         self.n_events = self.n_frames = 0
 
-    def getNextEventBatch(self) -> Any:
+    def getNextEventBatch(self):
         """Give the events of the next 10 ms, once they are over."""
         start_us = self._batch * _BATCH_US
         if time.time_ns() // 1000 < start_us + _BATCH_US:
@@ -60,7 +58,7 @@ class RandomDavis:
         self.n_events += events.size()
         return events
 
-    def getNextFrame(self) -> Any:
+    def getNextFrame(self):
         """Give the picture of the next 40 ms, once it is exposed."""
         start_us = self._frame * _BATCH_US
         if not self._has_frames or time.time_ns() // 1000 < start_us + _EXPOSURE_US:
@@ -71,7 +69,7 @@ class RandomDavis:
         self.n_frames += 1
         return self._dv.Frame(start_us, _EXPOSURE_US, 0, 0, image, self._dv.FrameSource.SENSOR)
 
-    def getNextTriggerBatch(self) -> Any:
+    def getNextTriggerBatch(self):
         """Give the edge of the last whole second, once."""
         stamp_us = self._pulse * _SECOND_US
         if time.time_ns() // 1000 < stamp_us:
@@ -79,7 +77,7 @@ class RandomDavis:
         self._pulse += 1
         return [self._dv.Trigger(stamp_us, self._dv.TriggerType.EXTERNAL_SIGNAL_RISING_EDGE)]
 
-    def isEventStreamAvailable(self) -> bool:
+    def isEventStreamAvailable(self):
         """It has events."""
         return True
 
@@ -87,10 +85,10 @@ class RandomDavis:
 
     isTriggerStreamAvailable = isEventStreamAvailable
 
-    def isImuStreamAvailable(self) -> bool:
+    def isImuStreamAvailable(self):
         """It does not move."""
         return False
 
 
-def _read_frame(data: bytes) -> Any:
+def _read_frame(data):
     return np.frombuffer(data, np.uint8).reshape(_SIZE[::-1])

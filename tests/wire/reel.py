@@ -1,7 +1,6 @@
 """What the senders show: packets and pictures of a board held still at several places, simulated once."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from lce_rig.core import velodyne
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.findings import Refusal
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.rig import Rig
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
 from lce_rig.simulate.stage import PLACEMENT
@@ -42,17 +40,17 @@ class Reel:
     picture_bytes: dict[str, int]
 
     @classmethod
-    def load(cls, folder: Path) -> "Reel":
+    def load(cls, folder):
         """Read the figures of a reel."""
         return cls(**json.loads((folder / "reel.json").read_text()))
 
-    def packets(self, placement: int) -> list[bytes]:
+    def packets(self, placement):
         """Read the payloads of the data packets of a placement, one loop; their times are to be set."""
         n_bytes = PACKETS_PER_LOOP * velodyne.DATA_BYTES
         data = (Path(self.folder) / "packets.bin").read_bytes()[placement * n_bytes :][:n_bytes]
         return [data[k : k + velodyne.DATA_BYTES] for k in range(0, n_bytes, velodyne.DATA_BYTES)]
 
-    def pictures(self, camera: str, placement: int) -> list[bytes]:
+    def pictures(self, camera, placement):
         """Read the pictures of a placement as they are sent."""
         n_bytes = self.picture_bytes[camera]
         data = (Path(self.folder) / f"{camera}.bin").read_bytes()
@@ -60,7 +58,7 @@ class Reel:
         return [data[k * n_bytes : (k + 1) * n_bytes] for k in range(first, first + self.n_pictures)]
 
 
-def make_reel(folder: Path, rig: Rig, n_placements: int, seed: int = 0) -> Reel:
+def make_reel(folder, rig, n_placements, seed=0):
     """Simulate a reel.
 
     Args:
@@ -73,7 +71,7 @@ def make_reel(folder: Path, rig: Rig, n_placements: int, seed: int = 0) -> Reel:
     scene = LiveScene(rig, seed, replace(SimulationOptions.for_rig(rig.name), carrier="person"))
     scene.stage = replace(scene.stage, models=dict.fromkeys(rig.lidars, STREAMED_VLP16))
     sender = Vlp16Packets()
-    n_bytes: dict[str, int] = {}
+    n_bytes = {}
     packets = bytearray()
     for index, (scans, images) in enumerate(_placements(scene, rig, n_placements)):
         for k, scan in enumerate(scans):
@@ -91,7 +89,7 @@ def make_reel(folder: Path, rig: Rig, n_placements: int, seed: int = 0) -> Reel:
     return reel
 
 
-def _turn_evenly(packets: bytearray) -> bytes:
+def _turn_evenly(packets):
     """Give all loops the same azimuths: a rotor goes on evenly, whatever is shown next.
 
     Each simulated placement begins anywhere within a step, by which it is turned here; 0.2 deg at most.
@@ -105,7 +103,7 @@ def _turn_evenly(packets: bytearray) -> bytes:
     return fields.tobytes()
 
 
-def _placements(scene: LiveScene, rig: Rig, n: int) -> Iterator[tuple[list[Scan], list[Image]]]:
+def _placements(scene, rig, n):
     """Measure the board at places where every sensor finds it."""
     index = n_found = 0
     while n_found < n:
@@ -121,7 +119,7 @@ def _placements(scene: LiveScene, rig: Rig, n: int) -> Iterator[tuple[list[Scan]
             yield scans, images
 
 
-def _encode(image: Image, rig: Rig) -> bytes:
+def _encode(image, rig):
     height, width = image.pixels.shape[:2]
     if rig.cameras[image.sensor].driver.pixel_format != "UYVY":
         return image.grey.tobytes()

@@ -5,11 +5,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import TracebackType
-from typing import Any
 
-from lce_rig.rig import Rig, dump_rig, load_rig
-from wire.reel import Reel
+from lce_rig.rig import dump_rig, load_rig
 from wire.vlp16_packets import free_ports
 
 _TESTS = Path(__file__).parents[1]
@@ -17,7 +14,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{_TESTS}:{_TESTS.parent}", "OMP_NUM
 """For processes of these senders and of lce-rig."""
 
 
-def small_rig(*, is_guided: bool = True) -> Rig:
+def small_rig(*, is_guided=True):
     """Build a rig of a VLP-16 and the camera `cam` of 346x260 px.
 
     Args:
@@ -47,7 +44,7 @@ class WireRig:
         sent: data packets, after `stop`.
     """
 
-    def __init__(self, folder: Path, rig: Rig, reel: Reel, loops_per_hold: int, **camera: Any) -> None:
+    def __init__(self, folder, rig, reel, loops_per_hold, **camera):
         """Prepare.
 
         Args:
@@ -63,9 +60,9 @@ class WireRig:
         self.rig = self._reachable(rig)
         self.profile = folder / "wire.yaml"
         self.profile.write_text(dump_rig(self.rig))
-        self.sent: dict[str, int] = {}
+        self.sent = {}
 
-    def __enter__(self) -> "WireRig":
+    def __enter__(self):
         """Start the VLP-16; it sends when somebody listens."""
         ports = ["--port", str(self._ports[0]), "--position-port", str(self._ports[1])]
         command = [sys.executable, "-m", "wire.send_packets", self._reel.folder, "--loops", str(self._loops)]
@@ -76,41 +73,39 @@ class WireRig:
         assert self._sensor.stdout.readline() == "ready\n"
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind, error, trace):
         """End the VLP-16."""
         self._sensor.kill()
         self._sensor.communicate()
 
     @property
-    def pid(self) -> int:
+    def pid(self):
         """Of the VLP-16."""
         return self._sensor.pid
 
-    def tell(self, order: str) -> None:
+    def tell(self, order):
         """Tell the VLP-16 something; see send_packets.py."""
         assert self._sensor.stdin is not None
         self._sensor.stdin.write(order + "\n")
         self._sensor.stdin.flush()
 
-    def stop(self) -> dict[str, int]:
+    def stop(self):
         """Let the VLP-16 fall silent for good, and give the numbers of packets `sent` and `withheld`."""
         self.tell("stop")
         assert self._sensor.stdout is not None
         self.sent = json.loads(self._sensor.stdout.readline())
         return self.sent
 
-    def unplug(self) -> None:
+    def unplug(self):
         """Take the cameras away."""
         self._camera["unplug"].touch()
 
-    def plug_in(self) -> None:
+    def plug_in(self):
         """Bring the cameras back."""
         self._camera["unplug"].unlink()
 
-    def _reachable(self, rig: Rig) -> Rig:
-        def driven(sensor: Any, **driver: Any) -> Any:
+    def _reachable(self, rig):
+        def driven(sensor, **driver):
             return sensor.model_copy(update={"driver": sensor.driver.model_copy(update=driver)})
 
         port, position_port = self._ports
@@ -122,7 +117,7 @@ class WireRig:
             cameras[name] = driven(camera, **pipe, pixel_format=camera.driver.pixel_format or "GREY")
         return rig.model_copy(update={"lidars": lidars, "cameras": cameras})
 
-    def _command(self, camera: str) -> tuple[str, ...]:
+    def _command(self, camera):
         options = [text for key, value in self._camera.items() for text in (f"--{key}", str(value))]
         interpreter = ("env", f"PYTHONPATH={ENVIRONMENT['PYTHONPATH']}", sys.executable)
         where = (self._reel.folder, camera, "--loops", str(self._loops))

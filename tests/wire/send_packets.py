@@ -34,7 +34,7 @@ class Sensor:
         n_sent, n_withheld: data packets.
     """
 
-    def __init__(self, reel: Path, loops_per_hold: int, data_port: int, position_port: int) -> None:
+    def __init__(self, reel, loops_per_hold, data_port, position_port):
         figures = json.loads((reel / "reel.json").read_text())
         data = (reel / "packets.bin").read_bytes()
         size = velodyne.DATA_BYTES
@@ -47,7 +47,7 @@ class Sensor:
         self.loss = 0.0
         self.pps, self.error_us = velodyne.PPS_LOCKED, 0
 
-    def send(self, number: int) -> None:
+    def send(self, number):
         """Send the packet of this number since the epoch."""
         start_ns = number * PACKET_NS
         placement = placement_at(start_ns, self._loops_per_hold, self._n_placements)
@@ -61,7 +61,7 @@ class Sensor:
         if number % _DATA_PER_POSITION == 0:
             self._socket.sendto(self._position(start_ns + PACKET_NS), ("127.0.0.1", self._ports[1]))
 
-    def _position(self, now_ns: int) -> bytearray:
+    def _position(self, now_ns):
         packet = bytearray(velodyne.POSITION_BYTES)
         _US.pack_into(packet, _POSITION_US_AT, self._count_us(now_ns))
         packet[_PPS_AT] = self.pps
@@ -70,17 +70,17 @@ class Sensor:
             packet[_NMEA_AT : _NMEA_AT + len(sentence)] = sentence
         return packet
 
-    def _count_us(self, time_ns: int) -> int:
+    def _count_us(self, time_ns):
         return (time_ns // 1000 + self.error_us) % velodyne.HOUR_US
 
 
-def is_heard(port: int) -> bool:
+def is_heard(port):
     """Tell whether a process listens on a UDP port."""
     table = Path("/proc/net/udp").read_text().splitlines()[1:]
     return any(line.split()[1].endswith(f":{port:04X}") for line in table)
 
 
-def run(sensor: Sensor, port: int) -> None:
+def run(sensor, port):
     """Send until told to stop."""
     number, is_open, paused_s = 0, False, 0.0
     while True:
@@ -104,7 +104,7 @@ def run(sensor: Sensor, port: int) -> None:
             number += 1
 
 
-def main() -> None:
+def main():
     """Read the arguments and send."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("reel", type=Path)

@@ -16,7 +16,7 @@ from pathlib import Path
 from wire.timing import placement_at
 
 
-def main() -> None:
+def main():
     """Send until there is nobody to send to."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("reel", type=Path)
@@ -60,7 +60,7 @@ def main() -> None:
             given.report.write_text(json.dumps({"sent": sent, "late": late}))
 
 
-def write_all(data: memoryview) -> None:
+def write_all(data):
     """Write a picture to standard output; waits while the pipe is full."""
     while data:
         data = data[os.write(1, data) :]

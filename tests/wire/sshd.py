@@ -8,7 +8,6 @@ import socket
 import subprocess
 import time
 from pathlib import Path
-from typing import Any
 
 SSHD = shutil.which("sshd", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin")
 _START_S = 10.0
@@ -26,7 +25,7 @@ class Sshd:
         to: [user@]host.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         """Make keys and start it.
 
         Raises:
@@ -56,7 +55,7 @@ class Sshd:
         if os.geteuid() == 0:
             Path("/run/sshd").mkdir(exist_ok=True)  # of privilege separation
         self.to = f"{getpass.getuser()}@127.0.0.1"
-        self.options: dict[str, Any] = {
+        self.options = {
             "Port": port,
             "IdentityFile": str(folder / "user_key"),
             "IdentitiesOnly": "yes",
@@ -71,16 +70,16 @@ class Sshd:
         )
         self._wait(folder, port)
 
-    def __enter__(self) -> "Sshd":
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self.lose_connections()
         self._process.terminate()
         self._process.wait()
         self._log.close()
 
-    def lose_connections(self) -> int:
+    def lose_connections(self):
         """Kill what serves the connections, and what runs in them; give how many processes these were."""
         found = _below(self._process.pid)
         for number in found:
@@ -90,7 +89,7 @@ class Sshd:
                 continue
         return len(found)
 
-    def _wait(self, folder: Path, port: int) -> None:
+    def _wait(self, folder, port):
         words = ["ssh", "-o", "BatchMode=yes", *self._words(), self.to, "true"]
         deadline_s = time.monotonic() + _START_S
         while time.monotonic() < deadline_s and self._process.poll() is None:
@@ -101,13 +100,13 @@ class Sshd:
         self.__exit__()
         raise NoServerError((folder / "sshd.log").read_text(errors="replace")[-500:])
 
-    def _words(self) -> list[str]:
+    def _words(self):
         return [word for name, value in self.options.items() for word in ("-o", f"{name}={value}")]
 
 
-def _below(process: int) -> list[int]:
+def _below(process):
     """List the processes that a process has started, and those that they have, by /proc."""
-    parents: dict[int, list[int]] = {}
+    parents = {}
     for entry in Path("/proc").glob("[0-9]*/stat"):
         try:
             parent = int(entry.read_text().rpartition(")")[2].split()[1])

@@ -8,6 +8,6 @@ SCANS_PER_LOOP, PACKETS_PER_LOOP = 3, 226
 LOOP_NS = PACKETS_PER_LOOP * PACKET_NS
 
 
-def placement_at(time_ns: int, loops_per_hold: int, n_placements: int) -> int:
+def placement_at(time_ns, loops_per_hold, n_placements):
     """Tell which placement of the board is shown at a time of day."""
     return time_ns // LOOP_NS // loops_per_hold % n_placements

@@ -5,12 +5,9 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core import velodyne
-from lce_rig.core.data import Scan
 from lce_rig.core.data_sheets import VLP_16
-from lce_rig.core.geometry import Array
 from lce_rig.simulate.lidar import LidarModel
 
 #: A revolution of whole blocks, 10.0025 Hz: scans follow each other without a gap, as a real rotor's do.
@@ -67,12 +64,7 @@ class Vlp16Packets:
         clock: how the sensor's clock is kept; may be replaced between scans.
     """
 
-    def __init__(
-        self,
-        mode: int = velodyne.STRONGEST,
-        clock: Vlp16Clock | None = None,
-        model: LidarModel = STREAMED_VLP16,
-    ) -> None:
+    def __init__(self, mode=velodyne.STRONGEST, clock=None, model=STREAMED_VLP16):
         self.clock = clock or Vlp16Clock()
         self._mode = mode
         self._model = model
@@ -81,7 +73,7 @@ class Vlp16Packets:
         self._n_data = 0
         self._next_ns = 0
 
-    def feed(self, scan: Scan, last: Scan | None = None) -> list[SensorPacket]:
+    def feed(self, scan, last=None):
         """Send a scan; returns the packets that are full.
 
         A scan that does not follow the one before at once begins a new packet, as after a break.
@@ -98,7 +90,7 @@ class Vlp16Packets:
         n_whole = len(self._blocks) // velodyne.N_BLOCKS
         return packets + [packet for _ in range(n_whole) for packet in self._pop()]
 
-    def finish(self) -> list[SensorPacket]:
+    def finish(self):
         """Send what waits, filled up with blocks that follow without returns."""
         n_missing = -len(self._blocks) % velodyne.N_BLOCKS
         if not n_missing:
@@ -115,10 +107,10 @@ class Vlp16Packets:
         return self._pop()
 
     @property
-    def _is_dual(self) -> bool:
+    def _is_dual(self):
         return self._mode == velodyne.DUAL
 
-    def _to_blocks(self, strongest: Scan, last: Scan) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+    def _to_blocks(self, strongest, last):
         """Lay a revolution out as blocks (B,) with the time (B,) of each one's first firing."""
         n_blocks = -(-int(self._model.period_ns // velodyne.SEQUENCE_NS) // 2)
         starts_ns = int(strongest.stamp_ns or 0) + velodyne.BLOCK_NS * np.arange(n_blocks)
@@ -136,7 +128,7 @@ class Vlp16Packets:
             blocks["returns"] = _returns(strongest, self._model, n_blocks)
         return blocks, starts_ns
 
-    def _pop(self) -> list[SensorPacket]:
+    def _pop(self):
         """Take one data packet, and the position packet that follows it now and then."""
         start_ns = int(self._starts_ns[0])
         sent_ns = start_ns + velodyne.READ[0].packet_ns(self._is_dual)
@@ -151,7 +143,7 @@ class Vlp16Packets:
         self._n_data += 1
         return packets
 
-    def _position(self, now_ns: int) -> bytes:
+    def _position(self, now_ns):
         packet = np.zeros((), velodyne.POSITION_PACKET)
         packet["us"] = self._count_us(now_ns)
         packet["pps"] = velodyne.PPS_STATES.index(self.clock.pps)
@@ -159,11 +151,11 @@ class Vlp16Packets:
             packet["nmea"] = gprmc(now_ns - _SENTENCE_DELAY_NS, self.clock.is_valid).encode() + b"\r\n"
         return packet.tobytes()
 
-    def _count_us(self, time_ns: int) -> int:
+    def _count_us(self, time_ns):
         return (time_ns // 1000 + self.clock.error_us) % velodyne.HOUR_US
 
 
-def free_ports() -> tuple[int, int]:
+def free_ports():
     """Find two UDP ports that nobody uses."""
     kind = socket.AF_INET, socket.SOCK_DGRAM
     with socket.socket(*kind) as data, socket.socket(*kind) as position:
@@ -172,7 +164,7 @@ def free_ports() -> tuple[int, int]:
         return data.getsockname()[1], position.getsockname()[1]
 
 
-def gprmc(time_ns: int, is_valid: bool = True) -> str:
+def gprmc(time_ns, is_valid=True):
     """Word the sentence for the pulse that came last before a time, without its line end."""
     when = datetime.fromtimestamp(time_ns // _NS_PER_S, timezone.utc)
     status = "A" if is_valid else "V"
@@ -181,7 +173,7 @@ def gprmc(time_ns: int, is_valid: bool = True) -> str:
     return f"${body}*{checksum:02X}"
 
 
-def _start_azimuth_rad(scan: Scan, model: LidarModel) -> float:
+def _start_azimuth_rad(scan, model):
     """Find the sensor's azimuth at the first firing from all points: the rotor turns evenly."""
     assert scan.offset_ns is not None
     azimuth_rad = np.arctan2(-scan.points[:, 1].astype(float), scan.points[:, 0].astype(float))
@@ -189,13 +181,13 @@ def _start_azimuth_rad(scan: Scan, model: LidarModel) -> float:
     return float(np.angle(np.exp(1j * (azimuth_rad - turned_rad)).mean()))
 
 
-def _returns(scan: Scan, model: LidarModel, n_blocks: int) -> NDArray[np.void]:
+def _returns(scan, model, n_blocks):
     """Lay the points out as returns (n_blocks, 32)."""
     assert scan.offset_ns is not None
     laser = np.argsort(model.rings)[scan.ring]
     sequence, rest_ns = np.divmod(scan.offset_ns - laser * velodyne.FIRING_NS, velodyne.SEQUENCE_NS)
     assert not rest_ns.any() and 0 <= sequence.min() <= sequence.max() < 2 * n_blocks
-    from_laser: Array = scan.points.astype(np.float64)
+    from_laser = scan.points.astype(np.float64)
     from_laser[:, 2] -= model.vertical_offsets_m[laser]
     steps = np.rint(np.linalg.norm(from_laser, axis=1) / velodyne.RANGE_STEP_M)
     returns = np.zeros((2 * n_blocks, velodyne.N_LASERS), velodyne.DATA_BLOCK["returns"].base)

@@ -4,7 +4,7 @@ import numpy as np
 
 from lce_rig.collect.guidance.evidence import combine, weigh_placements
 from lce_rig.collect.guidance.sensor_model import ErrorModel, SensorModel, SensorPlace
-from lce_rig.core.geometry import Array, invert
+from lce_rig.core.geometry import invert
 from lce_rig.rig import QualitySettings
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, random_pose, scan_board
 
@@ -21,7 +21,7 @@ SURROGATE = ErrorModel(
 )
 
 
-def model(errors: ErrorModel | None = None) -> SensorModel:
+def model(errors=None):
     """Describe a VLP-16 and a camera before the board of the calibration's tests."""
     return SensorModel(
         board=BOARD,
@@ -35,16 +35,16 @@ def model(errors: ErrorModel | None = None) -> SensorModel:
     )
 
 
-def view(errors: ErrorModel | None = None) -> SensorPlace:
+def view(errors=None):
     """Look along the LiDAR's x axis."""
     return SensorPlace.upright(model(errors), T_FORWARD)
 
 
-def placements(n: int, seed: int) -> Array:
+def placements(n, seed):
     """Draw T_cam_board (n, 4, 4) that the LiDAR sees well."""
     rng = np.random.default_rng(seed)
     exact = Scenario(range_sigma_m=0.0)
-    found: list[Array] = []
+    found = []
     while len(found) < n:
         T_cam_board = random_pose(rng, exact, BOARD)
         if scan_board(invert(T_FORWARD) @ T_cam_board, rng, exact, BOARD) is not None:
@@ -52,6 +52,6 @@ def placements(n: int, seed: int) -> Array:
     return np.array(found)
 
 
-def predict_covariance(model: SensorModel, T_cam_board: Array, T_cam_lidar: Array) -> Array:
+def predict_covariance(model, T_cam_board, T_cam_lidar):
     """Predict the covariance (6, 6) of T_cam_lidar from boards at T_cam_board (N, 4, 4)."""
     return combine(weigh_placements(model, T_cam_board, T_cam_lidar), model.errors).cov

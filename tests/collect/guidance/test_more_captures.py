@@ -6,12 +6,11 @@ import pytest
 from lce_rig.collect.guidance.planner import Planner, common_third, plan_captures
 from lce_rig.collect.guidance.sensor_model import SensorModel, SensorPlace
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from tests.shared import changed
 
 
-def plan(rig: Rig, held: Array) -> dict:
+def plan(rig, held):
     (finding,) = plan_captures(rig, "cam", "lidar", held)
     assert sum(group[0] for group in finding.figures["placements"]) == finding.figures["n_captures"]
     assert len(f"    -> {finding.advice}") <= 80
@@ -19,7 +18,7 @@ def plan(rig: Rig, held: Array) -> dict:
 
 
 @pytest.fixture(scope="module")
-def placements() -> Array:
+def placements():
     """Placements that guidance itself would choose, the best first."""
     rig = load_rig("rlfs")
     view = SensorPlace.upright(SensorModel.of(rig, "cam", "lidar"), rig.nominal("cam", "lidar").to_matrix())
@@ -29,19 +28,19 @@ def placements() -> Array:
     return held
 
 
-def test_a_session_with_too_few_captures_gets_at_least_the_minimum(placements: Array) -> None:
+def test_a_session_with_too_few_captures_gets_at_least_the_minimum(placements):
     rig = load_rig("rlfs")
     for n in (0, 3, 5):
         assert n + plan(rig, placements[:n])["n_captures"] >= rig.quality.min_captures
 
 
-def test_boards_that_face_one_way_are_followed_by_tilted_ones(placements: Array) -> None:
+def test_boards_that_face_one_way_are_followed_by_tilted_ones(placements):
     alike = np.repeat(placements[:1], 5, axis=0)
     alike[:, :3, 3] *= np.linspace(0.7, 1.0, 5)[:, None]
     assert any(group[3] for group in plan(load_rig("rlfs"), alike)["placements"])
 
 
-def test_a_plan_needs_no_nominal_extrinsics_but_the_beams_of_the_lidar(placements: Array) -> None:
+def test_a_plan_needs_no_nominal_extrinsics_but_the_beams_of_the_lidar(placements):
     rig = load_rig("rlfs").model_copy(update={"nominal_extrinsics": ()})
     assert plan(rig, placements)["n_captures"] >= 1
     assert not plan_captures(changed(rig, lidars__lidar__model="other"), "cam", "lidar", placements)
@@ -50,7 +49,7 @@ def test_a_plan_needs_no_nominal_extrinsics_but_the_beams_of_the_lidar(placement
 @pytest.mark.parametrize(
     ("shares", "word"), [((0.02, 0.6), ""), ((0.02, 0.3), "on your right"), ((0.7, 0.98), "on your left")]
 )
-def test_an_outer_third_is_named_only_where_all_boards_are(shares: tuple[float, ...], word: str) -> None:
+def test_an_outer_third_is_named_only_where_all_boards_are(shares, word):
     lens = Intrinsics(900, 900, 499.5, 299.5, 1000, 600, "radtan", (0.0,) * 4)
     centres = 2.0 * lens.unproject(np.array([[1000 * share, 300] for share in shares]))
     assert common_third(lens, centres) == word

@@ -10,11 +10,7 @@ import pytest
 from lce_rig.collect.guidance.evidence import sigmas
 from lce_rig.collect.guidance.instructions import HeldPose, build_pose, is_there
 from lce_rig.collect.guidance.planner import Coverage, Planner, measure_coverage
-from lce_rig.collect.guidance.sensor_model import (
-    NEAREST_M,
-    SensorPlace,
-    is_reachable,
-)
+from lce_rig.collect.guidance.sensor_model import NEAREST_M, SensorPlace, is_reachable
 from lce_rig.core.geometry import invert, perturb, transform
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.rig import load_rig

@@ -2,27 +2,26 @@
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 
 from lce_rig.collect.live.simulated import SimulatedSource
-from lce_rig.rig import Rig, load_rig
-from lce_rig.simulate import SimulatedCapture, simulate_captures
+from lce_rig.rig import load_rig
+from lce_rig.simulate import simulate_captures
 from tests.shared import compute_once
 
 PERIOD_NS = 100_000_000
 
 
 @cache
-def rig() -> Rig:
+def rig():
     """Give the shipped event rig, whose small pictures are searched quickly."""
     return load_rig("rles")
 
 
 @cache
-def placements(n: int = 4, seed: int = 5) -> tuple[SimulatedCapture, ...]:
+def placements(n=4, seed=5):
     """Simulate boards held still."""
     name = f"placements_{n}_{seed}"
     return compute_once(name, lambda: tuple(simulate_captures(rig(), n_captures=n, seed=seed)))
@@ -36,15 +35,15 @@ class Show:
         stamps: of the scans that were sent, by placement.
     """
 
-    def __init__(self, captures: Sequence[SimulatedCapture], each_s: float) -> None:
+    def __init__(self, captures, each_s):
         self.sources = [SimulatedSource("davis"), SimulatedSource("lidar")]
-        self.stamps: list[list[int]] = [[] for _ in captures]
+        self.stamps = [[] for _ in captures]
         self._captures = captures
         self._each_s = each_s
         self._stop = threading.Event()
 
     @contextmanager
-    def running(self) -> Iterator["Show"]:
+    def running(self):
         thread = threading.Thread(target=self._run, daemon=True)
         thread.start()
         try:
@@ -53,7 +52,7 @@ class Show:
             self._stop.set()
             thread.join()
 
-    def _run(self) -> None:
+    def _run(self):
         began_s = due_s = time.monotonic()
         while not self._stop.is_set():
             k = int((due_s - began_s) / self._each_s) % len(self._captures)
@@ -61,11 +60,11 @@ class Show:
             due_s += 0.1
             self._stop.wait(max(0.0, due_s - time.monotonic()))
 
-    def pause(self) -> None:
+    def pause(self):
         """Send nothing more."""
         self._stop.set()
 
-    def send(self, k: int, stamp_ns: int) -> None:
+    def send(self, k, stamp_ns):
         """Send a placement's picture and scan."""
         capture = self._captures[k]
         image = replace(capture.images[0], stamp_ns=stamp_ns + PERIOD_NS // 2, host_ns=stamp_ns + PERIOD_NS)

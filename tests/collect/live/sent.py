@@ -4,19 +4,15 @@ import json
 import re
 import struct
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from wire.reel import Reel
 from wire.timing import LOOP_NS, PACKET_NS, placement_at
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
 from lce_rig.io.velodyne_scans import Vlp16Stream
-from lce_rig.rig import LidarSettings
-from lce_rig.session import Capture, Session
+from lce_rig.session import Session
 from tests.collect.live.conftest import LOOPS_PER_HOLD
 
 
@@ -28,7 +24,7 @@ class Sent:
     scans: list[list[Scan]]
 
 
-def read_sent(reel: Reel, lidar: LidarSettings) -> Sent:
+def read_sent(reel, lidar):
     """Decode a reel without any transport."""
     shape = reel.n_pictures, 260, 346
     pictures = [
@@ -38,7 +34,7 @@ def read_sent(reel: Reel, lidar: LidarSettings) -> Sent:
     return Sent(pictures, [_decode(reel.packets(k), lidar) for k in range(reel.n_placements)])
 
 
-def check_whole(session: Path) -> list[Capture]:
+def check_whole(session):
     """Read every file of every listed capture, and make sure that the journal lists no other."""
     opened = Session.open(session)
     captures = opened.captures
@@ -50,7 +46,7 @@ def check_whole(session: Path) -> list[Capture]:
     return captures
 
 
-def check_sent(capture: Capture, sent: Sent) -> int:
+def check_sent(capture, sent):
     """Make sure that a capture is bit for bit what was sent of one placement, and give that."""
     scan, image = capture.scan("lidar"), capture.image("cam", "frames")
     shown = [k for k, pictures in enumerate(sent.pictures) if (pictures == image.pixels).all((1, 2)).any()]
@@ -59,7 +55,7 @@ def check_sent(capture: Capture, sent: Sent) -> int:
     return shown[0]
 
 
-def check_stamps(capture: Capture, placement: int, n_placements: int) -> None:
+def check_stamps(capture, placement, n_placements):
     """Make sure that a capture's stamps lie where its placement was shown."""
     stamp_ns, image = capture.scan("lidar").stamp_ns, capture.image("cam", "frames")
     assert stamp_ns is not None and image.stamp_ns is not None
@@ -71,23 +67,23 @@ def check_stamps(capture: Capture, placement: int, n_placements: int) -> None:
     assert abs(pair["difference_s"]) < 0.05
 
 
-def captured_names(said: str) -> list[str]:
+def captured_names(said):
     """List the captures that were said to be safe."""
     return re.findall(r"captured (\d{6}) \(", said)
 
 
-def errors(said: str) -> list[str]:
+def errors(said):
     """List the errors that were printed."""
     return [line for line in said.splitlines() if line.startswith("error:")]
 
 
-def journal_of(session: Path) -> list[dict[str, Any]]:
+def journal_of(session):
     """Read how each run ended."""
     lines = (session / "journal.jsonl").read_text().splitlines()
     return [entry for entry in map(json.loads, lines) if entry["event"] == "collected live"]
 
 
-def _decode(packets: list[bytes], lidar: LidarSettings) -> list[Scan]:
+def _decode(packets, lidar):
     """Decode a loop of three revolutions, with its beginning behind it to close the last."""
     stream, scans = Vlp16Stream("lidar", lidar), []
     for k, packet in enumerate([*packets, *packets]):
@@ -100,7 +96,7 @@ def _decode(packets: list[bytes], lidar: LidarSettings) -> list[Scan]:
     return scans
 
 
-def _are_alike(a: Scan, b: Scan) -> bool:
+def _are_alike(a, b):
     return a.points.shape == b.points.shape and bool(
         (a.points == b.points).all() and (a.ring == b.ring).all()
     )

@@ -5,15 +5,13 @@ import re
 import threading
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from lce_rig.collect.live.collection import collect_live
 from lce_rig.collect.live.guide import make_guides
-from lce_rig.collect.live.state import Key, LiveOptions, LiveState, TakeBack
+from lce_rig.collect.live.state import LiveOptions, LiveState, TakeBack
 from lce_rig.core.errors import SourceError
 from lce_rig.session import Session
 from tests.collect.live.replay import Show, placements, rig
@@ -24,7 +22,7 @@ HERE = "000000 shows the board here"
 
 
 @pytest.mark.long
-def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Path) -> None:
+def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path):
     show, states = Show(placements(), each_s=2.0), list[LiveState]()
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
         report = collect_live(session, show.sources, QUICK, states.append)
@@ -60,12 +58,12 @@ def test_boards_that_stand_still_become_captures_and_others_do_not(tmp_path: Pat
 
 
 @pytest.mark.long
-def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path: Path) -> None:
-    asked: list[Key] = ["next", "capture"]
-    states: list[LiveState] = []
+def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path):
+    asked = ["next", "capture"]
+    states = []
     show = Show(placements()[:1], each_s=100.0)
 
-    def key() -> Key | None:
+    def key():
         if not states or not states[-1].streams or not states[-1].streams[0].sees_board:
             return None
         return asked.pop(0) if asked else "stop" if states[-1].n_captures else None
@@ -81,13 +79,13 @@ def test_keys_capture_at_once_ask_for_another_place_and_stop(tmp_path: Path) -> 
 
 
 @pytest.mark.long
-def test_captures_are_taken_back_one_by_one_and_nothing_is_lost_or_counted_twice(tmp_path: Path) -> None:
+def test_captures_are_taken_back_one_by_one_and_nothing_is_lost_or_counted_twice(tmp_path):
     path, states = tmp_path / "session", list[LiveState]()
     show = Show(placements(), each_s=2.0)
     # Both, the last first; then one that is gone already, as a second tap on a slow page asks for.
-    asked: list[Key | TakeBack] = [TakeBack(), TakeBack(), TakeBack("000001")]
+    asked = [TakeBack(), TakeBack(), TakeBack("000001")]
 
-    def key() -> Key | TakeBack | None:
+    def key():
         has_two = any(state.n_captures == 2 for state in states)
         return asked.pop(0) if asked and has_two else None
 
@@ -108,13 +106,11 @@ def test_captures_are_taken_back_one_by_one_and_nothing_is_lost_or_counted_twice
 
 
 @pytest.mark.long
-def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    states: list[LiveState] = []
+def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(tmp_path, monkeypatch):
+    states = []
     show = Show(placements()[:1], each_s=100.0)
 
-    def key() -> Key | TakeBack | None:
+    def key():
         if not states or not states[-1].last_capture:
             return "stop" if any(state.last_capture for state in states) else None
         return TakeBack()
@@ -122,14 +118,14 @@ def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
         add, is_asked = session.add_capture, threading.Event()
 
-        def add_slowly(*given: Any) -> str:
+        def add_slowly(*given):
             """Write as a disk does that is busy until somebody has pressed the key."""
             is_asked.wait(20.0)
             return add(*given)
 
         monkeypatch.setattr(session, "add_capture", add_slowly)
 
-        def watch(state: LiveState) -> None:
+        def watch(state):
             states.append(state)
             if any(each.last_capture for each in states[:-1]):
                 is_asked.set()
@@ -141,11 +137,11 @@ def test_a_capture_on_its_way_to_the_disk_is_taken_back_too(
 
 
 @pytest.mark.long
-def test_a_board_that_stands_where_it_was_captured_is_captured_no_more_by_key_neither(tmp_path: Path) -> None:
+def test_a_board_that_stands_where_it_was_captured_is_captured_no_more_by_key_neither(tmp_path):
     states, told_s = list[LiveState](), list[float]()
     show = Show(placements()[:1], each_s=100.0)
 
-    def key() -> Key | None:
+    def key():
         if not states or not states[-1].n_captures:
             return None
         told_s.extend(state.elapsed_s for state in states[-1:] if any(HERE in line for line in state.log))
@@ -158,15 +154,15 @@ def test_a_board_that_stands_where_it_was_captured_is_captured_no_more_by_key_ne
     assert states[-2].drawing is not None and states[-2].drawing.wanted_px is not None
 
 
-def test_what_was_seen_before_the_sensors_fell_silent_is_not_shown_as_seen_now(tmp_path: Path) -> None:
+def test_what_was_seen_before_the_sensors_fell_silent_is_not_shown_as_seen_now(tmp_path):
     show, states = Show(placements()[:1], each_s=100.0), list[LiveState]()
 
-    def watch(state: LiveState) -> None:
+    def watch(state):
         states.append(state)
         if all(stream.sees_board for stream in state.streams[:1]):
             show.pause()
 
-    def key() -> Key | None:
+    def key():
         return "stop" if states and "no image" in states[-1].detail else None
 
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
@@ -177,11 +173,11 @@ def test_what_was_seen_before_the_sensors_fell_silent_is_not_shown_as_seen_now(t
     assert [stream.sees_board for stream in told.streams] == [None] * len(told.streams)
 
 
-def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(tmp_path: Path) -> None:
-    states: list[LiveState] = []
+def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(tmp_path):
+    states = []
     show = Show(placements(), each_s=2.0)
 
-    def unplug(state: LiveState) -> None:
+    def unplug(state):
         states.append(state)
         if state.n_captures == 1:
             show.sources[1].fail(SourceError("lidar: no packets for 2 s", "Check the cable."))
@@ -198,7 +194,7 @@ def test_a_sensor_that_is_gone_for_good_ends_the_collection_with_what_was_saved(
 
 
 @pytest.mark.long
-def test_a_run_that_nobody_looks_after_ends_when_nothing_new_is_shown(tmp_path: Path) -> None:
+def test_a_run_that_nobody_looks_after_ends_when_nothing_new_is_shown(tmp_path):
     show = Show(placements()[:1], each_s=100.0)
     options = replace(QUICK, n_wanted=5, idle_s=8.0)
     with show.running(), Session.create(tmp_path / "session", rig()) as session:
@@ -210,7 +206,7 @@ def test_a_run_that_nobody_looks_after_ends_when_nothing_new_is_shown(tmp_path: 
 
 
 @pytest.fixture
-def met(tmp_path: Path) -> Path:
+def met(tmp_path):
     """A session whose captures meet a modest target, wherever its pictures were taken."""
     profile = changed(rig(), calibration__target_sigma_deg=5.0, calibration__target_sigma_m=0.5)
     (guide,) = make_guides(profile)
@@ -225,7 +221,7 @@ def met(tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
-def test_who_wants_more_than_enough_goes_on_being_guided_and_captured(met: Path) -> None:
+def test_who_wants_more_than_enough_goes_on_being_guided_and_captured(met):
     show, states = Show(placements(), each_s=2.0), list[LiveState]()
     with show.running(), Session.open(met, writable=True) as session:
         report = collect_live(session, show.sources, replace(QUICK, n_wanted=14), states.append)
@@ -237,7 +233,7 @@ def test_who_wants_more_than_enough_goes_on_being_guided_and_captured(met: Path)
     assert said.endswith("14 captures")
 
 
-def test_who_wants_no_more_than_enough_is_done_at_once(met: Path) -> None:
+def test_who_wants_no_more_than_enough_is_done_at_once(met):
     show = Show(placements()[:1], each_s=2.0)
     with show.running(), Session.open(met, writable=True) as session:
         report = collect_live(session, show.sources, replace(QUICK, n_wanted=None))
@@ -245,7 +241,7 @@ def test_who_wants_no_more_than_enough_is_done_at_once(met: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_board_that_one_camera_has_seen_enough_of_is_sent_before_the_other(met: Path) -> None:
+def test_a_board_that_one_camera_has_seen_enough_of_is_sent_before_the_other(met):
     profile = Session.open(met).rig
     nominal = profile.nominal_extrinsics[0]
     both = (nominal, changed(nominal, camera="right"))

@@ -7,8 +7,7 @@ import numpy as np
 
 from lce_rig.collect.board_tracker import BoardDetection
 from lce_rig.collect.live.guide import StillBoards, make_guides
-from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import ImageBoard
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.timing.scan_pairing import Frame
 from tests.collect.live.replay import PERIOD_NS, placements, rig
@@ -18,39 +17,39 @@ KEY = ("davis", "frames")
 
 
 @cache
-def boards(k: int = 0) -> tuple[ImageBoard, list[LidarBoard]]:
+def boards(k=0):
     finder, seen = BoardFinder(rig()), placements()[k]
     image, scan = finder.image(seen.images[0]), finder.scan(seen.scans[0])
     assert isinstance(image, ImageBoard) and isinstance(scan, list)
     return image, scan
 
 
-def detection(step: int, shift_px: float = 0.0, k: int = 0) -> BoardDetection:
+def detection(step, shift_px=0.0, k=0):
     """Show a placement at a time, its corners shifted."""
     image, scan = boards(k)
     moved = replace(image, corners_px=image.corners_px + shift_px)
     return BoardDetection(Frame(step * PERIOD_NS, (), ()), {KEY: moved}, {"lidar": scan})
 
 
-def present() -> Array:
+def present():
     return boards()[0].T_cam_board
 
 
-def test_a_board_is_captured_once_when_it_was_held_long_enough() -> None:
+def test_a_board_is_captured_once_when_it_was_held_long_enough():
     gate = StillBoards(rig(), HOLD_S)
     taken = [step for step in range(40) if gate.take(detection(step))]
     # Half a second tells that it stands still, the hold comes after that.
     assert taken == [12]
 
 
-def test_a_board_that_is_moved_on_before_its_time_is_not_captured() -> None:
+def test_a_board_that_is_moved_on_before_its_time_is_not_captured():
     gate = StillBoards(rig(), HOLD_S)
     shifts = [0.0] * 9 + [30.0 * k for k in range(1, 6)] + [180.0] * 14
     taken = [step for step, shift in enumerate(shifts) if gate.take(detection(step, shift))]
     assert taken == [14 + 12]
 
 
-def test_what_is_said_counts_the_hold_down_and_then_goes_on() -> None:
+def test_what_is_said_counts_the_hold_down_and_then_goes_on():
     (guide,) = make_guides(rig())
     guide.plan(None, 0.0)
     gate = StillBoards(rig(), HOLD_S)
@@ -70,7 +69,7 @@ def test_what_is_said_counts_the_hold_down_and_then_goes_on() -> None:
     assert all(each.headline not in ("", "hold still") for each in said[13:])
 
 
-def test_a_place_that_adds_nothing_is_refused_while_the_board_stands_there() -> None:
+def test_a_place_that_adds_nothing_is_refused_while_the_board_stands_there():
     (guide,) = make_guides(rig())
     guide.add("000007", present())
     guide.plan(None, 0.0)

@@ -1,6 +1,5 @@
 """Guidance over a session: what is wanted next, what adds nothing, what is learned on the way."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,22 +7,21 @@ import pytest
 
 from lce_rig.collect.guidance.instructions import HeldPose, build_pose
 from lce_rig.collect.guidance.sensor_model import SensorPlace
-from lce_rig.collect.live.guide import GIVE_UP_S, Guide, make_guides
+from lce_rig.collect.live.guide import GIVE_UP_S, make_guides
 from lce_rig.collect.live.simulated import Person
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.geometry import Array
-from lce_rig.rig import Rig
 from tests.collect.live.replay import rig
 from tests.shared import changed
 
 
 @pytest.fixture
-def guide() -> Guide:
+def guide():
     (guide,) = make_guides(rig())
     return guide
 
 
-def test_each_capture_moves_the_wanted_placement_and_lowers_the_prediction(guide: Guide) -> None:
+def test_each_capture_moves_the_wanted_placement_and_lowers_the_prediction(guide):
     sigmas = []
     for k in range(8):
         guide.plan(None, float(k))
@@ -38,7 +36,7 @@ def test_each_capture_moves_the_wanted_placement_and_lowers_the_prediction(guide
     assert guide.n_held == 8
 
 
-def test_a_capture_that_is_taken_back_is_forgotten(guide: Guide) -> None:
+def test_a_capture_that_is_taken_back_is_forgotten(guide):
     for k in range(3):
         guide.plan(None, float(k))
         last = guide.wanted
@@ -54,7 +52,7 @@ def test_a_capture_that_is_taken_back_is_forgotten(guide: Guide) -> None:
     assert guide.adds_nothing(last) is None
 
 
-def test_it_says_why_it_goes_on_and_for_how_long_until_there_are_enough() -> None:
+def test_it_says_why_it_goes_on_and_for_how_long_until_there_are_enough():
     modest = changed(rig(), calibration__target_sigma_deg=5.0, calibration__target_sigma_m=0.5)
     (guide,) = make_guides(modest)
     assert guide.explain() is None and guide.predict() is None, "before the first capture nothing is known"
@@ -73,7 +71,7 @@ def test_it_says_why_it_goes_on_and_for_how_long_until_there_are_enough() -> Non
     assert predicted.figures["n_captures"] == 6
 
 
-def test_what_more_captures_cannot_reach_is_said_without_their_number() -> None:
+def test_what_more_captures_cannot_reach_is_said_without_their_number():
     (guide,) = make_guides(changed(rig(), calibration__target_sigma_m=0.005))
     for k in range(12):
         guide.plan(None, float(k))
@@ -85,7 +83,7 @@ def test_what_more_captures_cannot_reach_is_said_without_their_number() -> None:
     assert why.figure("position_mm") > why.figure("limit_mm") == pytest.approx(4.5)
 
 
-def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide: Guide) -> None:
+def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide):
     guide.plan(None, 0.0)
     first = guide.wanted
     guide.plan(None, GIVE_UP_S - 1)
@@ -101,7 +99,7 @@ def test_the_wanted_placement_stays_until_it_is_captured_or_given_up(guide: Guid
         assert np.linalg.norm(guide.wanted[:3, 3] - old[:3, 3]) > 0.3
 
 
-def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(guide: Guide) -> None:
+def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(guide):
     (blind,) = make_guides(changed(rig(), nominal_extrinsics=()))
     blind.plan(None, 0.0)
     assert blind.problem is not None and blind.problem.code == "guide.no_nominal"
@@ -118,7 +116,7 @@ def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(
     assert blind.problem is not None and blind.wanted is None, "what was learned was taken back"
 
 
-def test_a_lidar_whose_beams_are_not_known_is_collected_without_guidance() -> None:
+def test_a_lidar_whose_beams_are_not_known_is_collected_without_guidance():
     (guide,) = make_guides(changed(rig(), lidars__lidar__model="HDL-64"))
     guide.plan(None, 0.0)
     assert guide.problem is not None and guide.problem.code == "guide.no_beams"
@@ -126,7 +124,7 @@ def test_a_lidar_whose_beams_are_not_known_is_collected_without_guidance() -> No
     assert guide.outline_px(np.eye(4)) is None
 
 
-def test_where_a_board_is_as_wanted_and_refused_another_placement_is_wanted(guide: Guide) -> None:
+def test_where_a_board_is_as_wanted_and_refused_another_placement_is_wanted(guide):
     guide.plan(None, 0.0)
     first = guide.wanted
     assert first is not None
@@ -137,7 +135,7 @@ def test_where_a_board_is_as_wanted_and_refused_another_placement_is_wanted(guid
     assert guide.wanted is not None and not np.array_equal(guide.wanted, first)
 
 
-def test_patience_is_not_lost_with_a_guide_that_is_not_followed(guide: Guide) -> None:
+def test_patience_is_not_lost_with_a_guide_that_is_not_followed(guide):
     guide.plan(None, 0.0)
     first = guide.wanted
     for now_s in (10.0, 50.0, 90.0):
@@ -167,12 +165,7 @@ class Followed:
     simulated_s: float = 0.0
 
 
-def follow_guide(
-    rig: Rig,
-    n_wanted: int,
-    person: Person | None = None,
-    can_be_held: Callable[[Array], bool] = lambda _T_cam_board: True,
-) -> Followed:
+def follow_guide(rig, n_wanted, person=None, can_be_held=lambda _T_cam_board: True):
     """Follow a rig's first guide until there are as many captures as wanted, or none for ten minutes.
 
     Args:
@@ -205,7 +198,7 @@ def follow_guide(
     return walk
 
 
-def test_a_person_who_goes_on_is_sent_to_new_places_until_there_are_as_many_captures_as_wanted() -> None:
+def test_a_person_who_goes_on_is_sent_to_new_places_until_there_are_as_many_captures_as_wanted():
     walk = follow_guide(rig(), 20)
     assert len(walk.captured) == 20
     assert len(walk.proposed) >= 20
@@ -214,10 +207,10 @@ def test_a_person_who_goes_on_is_sent_to_new_places_until_there_are_as_many_capt
         assert not any(places.are_alike({key: T_cam_board}, {key: T}) for T in walk.captured[:n_held])
 
 
-def test_half_a_room_and_a_careless_person_will_do() -> None:
+def test_half_a_room_and_a_careless_person_will_do():
     careless = Person(place_sigma_m=0.2, turn_sigma_deg=15.0, ignored_share=0.5)
 
-    def is_left(T_cam_board: Array) -> bool:
+    def is_left(T_cam_board):
         return bool(T_cam_board[0, 3] < 0)
 
     walk = follow_guide(rig(), 16, person=careless, can_be_held=is_left)
@@ -225,7 +218,7 @@ def test_half_a_room_and_a_careless_person_will_do() -> None:
     assert all(is_left(T_cam_board) for T_cam_board in walk.captured)
 
 
-def test_who_reaches_nothing_is_asked_for_other_places_until_patience_ends() -> None:
+def test_who_reaches_nothing_is_asked_for_other_places_until_patience_ends():
     walk = follow_guide(rig(), 3, can_be_held=lambda _T_cam_board: False)
     assert not walk.captured and walk.simulated_s == pytest.approx(600.0, abs=10.0)
     places = np.array([T_cam_board[:3, 3] for T_cam_board, _ in walk.proposed])

@@ -6,23 +6,23 @@ import pytest
 from lce_rig.collect.guidance.instructions import HeldPose, build_pose
 from lce_rig.collect.guidance.sensor_model import SensorPlace
 from lce_rig.collect.live.simulated import WALK_MPS, Person, Walker
-from lce_rig.core.geometry import Array, invert
+from lce_rig.core.geometry import invert
 from lce_rig.simulate import SimulationOptions
 from lce_rig.simulate.live_scene import LiveScene
 from tests.collect.live.replay import rig
 
 
 @pytest.fixture(scope="module")
-def scene() -> LiveScene:
+def scene():
     return LiveScene(rig(), 0, SimulationOptions.for_rig("rles"))
 
 
 @pytest.fixture
-def view() -> SensorPlace:
+def view():
     return SensorPlace.nominal(rig(), "davis", "lidar")
 
 
-def walk(scene: LiveScene, view: SensorPlace, wanted: HeldPose) -> tuple[Array, float]:
+def walk(scene, view, wanted):
     """Stand in front, be sent somewhere and go: T_cam_board then, and how long it took."""
     T_world_cam = scene.stage.T_world_sensor["davis"]
     scene.hold(T_world_cam @ build_pose(view, HeldPose(0.0, 2.5, 0.0, 0.0, 0.0, 45.0)))
@@ -36,7 +36,7 @@ def walk(scene: LiveScene, view: SensorPlace, wanted: HeldPose) -> tuple[Array, 
     return invert(T_world_cam) @ scene.T_world_board, now_s - 100.0
 
 
-def test_the_person_walks_to_where_the_board_is_wanted(scene: LiveScene, view: SensorPlace) -> None:
+def test_the_person_walks_to_where_the_board_is_wanted(scene, view):
     reached, took_s = walk(scene, view, HeldPose(0.3, 3.0, 0.0, 10.0, 0.0, 45.0))
     wanted = build_pose(view, HeldPose(0.3, 3.0, 0.0, 10.0, 0.0, 45.0))
     assert np.linalg.norm(reached[:3, 3] - wanted[:3, 3]) < 0.15
@@ -44,9 +44,7 @@ def test_the_person_walks_to_where_the_board_is_wanted(scene: LiveScene, view: S
     assert took_s == pytest.approx(way_m / WALK_MPS, abs=0.4)
 
 
-def test_where_a_wall_is_in_the_way_the_person_goes_as_far_as_they_can(
-    scene: LiveScene, view: SensorPlace
-) -> None:
+def test_where_a_wall_is_in_the_way_the_person_goes_as_far_as_they_can(scene, view):
     reached, _ = walk(scene, view, HeldPose(0.0, 12.0, 0.0, 0.0, 0.0, 45.0))
     # The room ends nine metres ahead.
     assert 3.0 < reached[2, 3] < 9.0

@@ -6,11 +6,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from wire.collecting import Collecting
-from wire.reel import Reel
 from wire.rig import ENVIRONMENT, WireRig
 from wire.timing import placement_at
 
@@ -36,9 +34,7 @@ Start = Callable[..., WireRig]
     [(signal.SIGTERM, 0), (signal.SIGINT, 130), pytest.param(signal.SIGHUP, 0, marks=pytest.mark.slow)],
     ids=["SIGTERM", "SIGINT", "SIGHUP"],
 )
-def test_signals_end_a_collection_cleanly(
-    wire: Start, tmp_path: Path, number: signal.Signals, code: int
-) -> None:
+def test_signals_end_a_collection_cleanly(wire, tmp_path, number, code):
     with Collecting(wire().profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
         assert collecting.end(number) == code
@@ -51,7 +47,7 @@ def test_signals_end_a_collection_cleanly(
 
 
 @pytest.mark.long
-def test_a_collection_that_is_killed_loses_no_capture(wire: Start, tmp_path: Path) -> None:
+def test_a_collection_that_is_killed_loses_no_capture(wire, tmp_path):
     rig, session, said = wire(), tmp_path / "session", list[str]()
     chance = random.Random(0)
     for turn in range(3):
@@ -65,9 +61,7 @@ def test_a_collection_that_is_killed_loses_no_capture(wire: Start, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_what_is_recorded_beside_a_collection_can_be_collected_from(
-    wire: Start, reel: Reel, tmp_path: Path
-) -> None:
+def test_what_is_recorded_beside_a_collection_can_be_collected_from(wire, reel, tmp_path):
     rig, record = wire(), tmp_path / "recording"
     live, later = tmp_path / "live", tmp_path / "later"
     began_ns = time.time_ns()
@@ -95,9 +89,7 @@ def test_what_is_recorded_beside_a_collection_can_be_collected_from(
 
 
 @pytest.mark.long
-def test_a_camera_whose_command_writes_no_pictures_is_named_where_nothing_was_captured(
-    wire: Start, tmp_path: Path
-) -> None:
+def test_a_camera_whose_command_writes_no_pictures_is_named_where_nothing_was_captured(wire, tmp_path):
     rig = wire()
     command = ("sh", "-c", "while :; do echo this is no picture; sleep 0.1; done")
     broken = changed(rig.rig, cameras__cam__driver__command=command, cameras__cam__driver__pixel_format=None)
@@ -109,9 +101,7 @@ def test_a_camera_whose_command_writes_no_pictures_is_named_where_nothing_was_ca
 
 
 @pytest.mark.long
-def test_captures_appear_by_themselves_and_hold_what_was_sent(
-    wire: Start, reel: Reel, tmp_path: Path
-) -> None:
+def test_captures_appear_by_themselves_and_hold_what_was_sent(wire, reel, tmp_path):
     rig, session = wire(), tmp_path / "session"
     with Collecting(rig.profile, session, "--hold", "0", "--captures", "2") as collecting:
         assert collecting.wait() == 0
@@ -126,9 +116,7 @@ def test_captures_appear_by_themselves_and_hold_what_was_sent(
 
 
 @pytest.mark.long
-def test_a_collection_without_captures_ends_in_time_and_says_what_to_check(
-    wire: Start, tmp_path: Path
-) -> None:
+def test_a_collection_without_captures_ends_in_time_and_says_what_to_check(wire, tmp_path):
     with Collecting(wire().profile, tmp_path / "session", "--hold", "30", "--timeout", "1") as collecting:
         assert collecting.wait() == 6
     assert len(errors(collecting.said)) == 1

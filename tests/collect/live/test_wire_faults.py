@@ -4,11 +4,9 @@ import os
 import resource
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from wire.collecting import Collecting
-from wire.reel import Reel
 from wire.rig import WireRig
 
 from lce_rig.collect.live.collection import collect_live
@@ -30,7 +28,7 @@ time.time_ns = lambda: real_ns() + ({set_ns} if os.path.exists({file!r}) else 0)
 
 
 @pytest.mark.long
-def test_a_camera_that_is_unplugged_is_waited_for_and_taken_again(wire: Start, tmp_path: Path) -> None:
+def test_a_camera_that_is_unplugged_is_waited_for_and_taken_again(wire, tmp_path):
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -46,9 +44,7 @@ def test_a_camera_that_is_unplugged_is_waited_for_and_taken_again(wire: Start, t
 
 
 @pytest.mark.long
-def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(
-    wire: Start, reel: Reel, tmp_path: Path
-) -> None:
+def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(wire, reel, tmp_path):
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -70,7 +66,7 @@ def test_a_lidar_that_falls_silent_for_a_while_is_taken_again(
 
 
 @pytest.mark.slow
-def test_a_lidar_that_is_gone_for_a_minute_is_an_error_of_the_command(wire: Start, tmp_path: Path) -> None:
+def test_a_lidar_that_is_gone_for_a_minute_is_an_error_of_the_command(wire, tmp_path):
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -82,9 +78,7 @@ def test_a_lidar_that_is_gone_for_a_minute_is_an_error_of_the_command(wire: Star
 
 
 @pytest.mark.slow
-def test_a_lidar_whose_counter_jumps_as_its_pulses_end_goes_on_by_arrival(
-    wire: Start, reel: Reel, tmp_path: Path
-) -> None:
+def test_a_lidar_whose_counter_jumps_as_its_pulses_end_goes_on_by_arrival(wire, reel, tmp_path):
     rig = wire()
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -103,7 +97,7 @@ def test_a_lidar_whose_counter_jumps_as_its_pulses_end_goes_on_by_arrival(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("set_s", [-3600, 3600], ids=["back", "forward"])
-def test_a_computer_whose_clock_is_set_goes_on(wire: Start, reel: Reel, tmp_path: Path, set_s: int) -> None:
+def test_a_computer_whose_clock_is_set_goes_on(wire, reel, tmp_path, set_s):
     rig, file = wire(), tmp_path / "set"
     prelude = SET_CLOCK.format(set_ns=set_s * 10**9, file=str(file))
     with Collecting(rig.profile, tmp_path / "session", "--hold", "0", prelude=prelude) as collecting:
@@ -118,7 +112,7 @@ def test_a_computer_whose_clock_is_set_goes_on(wire: Start, reel: Reel, tmp_path
 
 
 @pytest.mark.long
-def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire: Start, tmp_path: Path) -> None:
+def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire, tmp_path):
     rig, session = wire(), tmp_path / "session"
     with Collecting(rig.profile, session, "--hold", "0") as collecting:
         collecting.wait_for_captures(1)
@@ -135,9 +129,7 @@ def test_a_full_disk_is_one_clear_error_and_spares_the_captures(wire: Start, tmp
 
 
 @pytest.mark.long
-def test_a_recording_cut_by_a_full_disk_is_told_by_the_exit_code_and_spares_the_captures(
-    wire: Start, tmp_path: Path
-) -> None:
+def test_a_recording_cut_by_a_full_disk_is_told_by_the_exit_code_and_spares_the_captures(wire, tmp_path):
     rig, session, streams = wire(), tmp_path / "session", tmp_path / "streams"
     with Collecting(rig.profile, session, "--hold", "0", "--record", str(streams)) as collecting:
         collecting.wait_for_captures(1)
@@ -150,13 +142,11 @@ def test_a_recording_cut_by_a_full_disk_is_told_by_the_exit_code_and_spares_the_
 
 
 @pytest.mark.long
-def test_guidance_goes_on_while_a_slow_disk_takes_a_capture(
-    wire: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_guidance_goes_on_while_a_slow_disk_takes_a_capture(wire, tmp_path, monkeypatch):
     rig = wire()
     flush, begun_s, states_s = os.fsync, [], []
 
-    def flush_slowly(descriptor: int) -> None:
+    def flush_slowly(descriptor):
         begun_s.append(time.monotonic())
         time.sleep(0.5)
         flush(descriptor)

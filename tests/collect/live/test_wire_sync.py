@@ -3,12 +3,9 @@
 import contextlib
 import os
 import threading
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
-from wire.reel import Reel
-from wire.rig import WireRig, small_rig
+from wire.rig import small_rig
 from wire.sync_board import FakeBoard
 
 from lce_rig.collect.live.collection import collect_live
@@ -22,13 +19,13 @@ from tests.collect.live.sent import check_sent, check_whole, read_sent
 class TriggeringBoard(FakeBoard):
     """Sends a pulse to the camera ten times a second, on the tenths of a second of UTC."""
 
-    def __init__(self, trigger: Path) -> None:
+    def __init__(self, trigger):
         super().__init__(drift=30e-6, period_s=0.1, knows_utc=True)
         self._trigger = trigger
         self._line = -1
-        self.pulses_ns: dict[int, int] = {}
+        self.pulses_ns = {}
 
-    def _pulse(self, due_ns: int) -> None:
+    def _pulse(self, due_ns):
         # A pipe can be written to when its reader is there; ours is the camera's process.
         if self._line < 0:
             with contextlib.suppress(OSError):
@@ -44,9 +41,7 @@ class TriggeringBoard(FakeBoard):
 
 
 @pytest.mark.long
-def test_pulses_tie_the_cameras_pictures_to_the_lidars_time(
-    wire: Callable[..., WireRig], reel: Reel, tmp_path: Path
-) -> None:
+def test_pulses_tie_the_cameras_pictures_to_the_lidars_time(wire, reel, tmp_path):
     trigger = tmp_path / "trigger"
     os.mkfifo(trigger)
     with TriggeringBoard(trigger) as board:
@@ -56,15 +51,15 @@ def test_pulses_tie_the_cameras_pictures_to_the_lidars_time(
         rig = wire(rig=base.model_copy(update={"sync": sync}), trigger=trigger).rig
         states, is_tied = list[LiveState](), threading.Event()
 
-        def watch(state: LiveState) -> None:
+        def watch(state):
             states.append(state)
             if not state.requires_still_boards:
                 is_tied.set()
 
         with Session.create(tmp_path / "session", rig) as session:
-            n_tied: list[int] = []
+            n_tied = []
 
-            def stop() -> str | None:
+            def stop():
                 if is_tied.is_set() and not n_tied:
                     n_tied.append(states[-1].n_captures)
                 done = n_tied and states[-1].n_captures >= n_tied[0] + 3

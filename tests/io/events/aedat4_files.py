@@ -1,14 +1,10 @@
 """AEDAT4 files of a DAVIS, events and frames, laid out independently of the readers."""
 
 import struct
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import lz4.frame
 import numpy as np
-
-from lce_rig.core.data import Events
 
 Value = tuple[str, int] | bytes
 """A number with its struct code, or the content of a vector of bytes or of structs."""
@@ -36,7 +32,7 @@ class RawFrame:
     style: str = "dv-processing"
 
 
-def flatbuffer(identifier: bytes, fields: dict[int, Value], n_of_vector: int | None = None) -> bytes:
+def flatbuffer(identifier, fields, n_of_vector=None):
     """Lay out one table with its size in front, from which alignment counts; eight bytes a field."""
     n_slots = max(fields) + 1
     vtable_bytes = 4 + 2 * n_slots
@@ -61,18 +57,18 @@ def flatbuffer(identifier: bytes, fields: dict[int, Value], n_of_vector: int | N
     return struct.pack("<I", len(body)) + body
 
 
-def event_packet(events: Events) -> bytes:
+def event_packet(events):
     """Lay out EventPacket."""
     raw = np.zeros(len(events), [("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("on", "?"), ("pad", "V3")])
     raw["t"], raw["x"], raw["y"], raw["on"] = events.t_ns // 1000, events.x, events.y, events.polarity
     return flatbuffer(b"EVTS", {0: raw.tobytes()}, len(events))
 
 
-def frame_packet(frame: RawFrame) -> bytes:
+def frame_packet(frame):
     """Lay out Frame: DV stamps the middle of the exposure, dv-processing its start."""
     height, width = frame.pixels.shape[:2]
     end_us = frame.start_us + frame.exposure_us
-    fields: dict[int, Value] = {6: ("h", width), 7: ("h", height), 10: frame.pixels.tobytes()}
+    fields = {6: ("h", width), 7: ("h", height), 10: frame.pixels.tobytes()}
     if frame.pixels.ndim == 3:
         fields[5] = ("b", {3: 16, 4: 24}[frame.pixels.shape[2]])
     if frame.style == "dv":
@@ -96,14 +92,7 @@ def frame_packet(frame: RawFrame) -> bytes:
     return flatbuffer(b"FRME", fields)
 
 
-def write_davis(
-    path: Path,
-    events: Sequence[Events],
-    frames: Sequence[RawFrame],
-    resolution_px: tuple[int, int] = (346, 260),
-    camera: str = "DAVIS346_0",
-    pack: Callable[[bytes], bytes] = bytes,
-) -> Path:
+def write_davis(path, events, frames, resolution_px=(346, 260), camera="DAVIS346_0", pack=bytes):
     """Write a file whose recorder was not closed: packets by time of their first stamp."""
     width, height = resolution_px
     kinds = (["EVTS"] if events or not frames else []) + (["FRME"] if frames else [])
@@ -122,7 +111,7 @@ def write_davis(
     return path
 
 
-def write_aedat4(path: Path, stretches: Iterable[Events], camera: str = "lce_rig") -> None:
+def write_aedat4(path, stretches, camera="lce_rig"):
     """Write events as a DVXplorer's recorder does, in packets of 8192; without any, an empty stream."""
     parts = list(stretches)
     packets = [part.select(slice(k, k + 8192)) for part in parts for k in range(0, len(part), 8192)]

@@ -1,22 +1,18 @@
 """Bags with event messages for the tests."""
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
-
-from lce_rig.core.data import Events
 from lce_rig.io.ros.bag_file import RawMessage
 from lce_rig.io.ros.bag_recorder import open_bag_writer
-from lce_rig.io.ros.event_messages import EventPacket, parse_packet
+from lce_rig.io.ros.event_messages import parse_packet
 from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, encode_event_array, typestore
 
 
-def parsed(data: bytes, is_ros1: bool) -> EventPacket:
+def parsed(data, is_ros1):
     """Parse an EventPacket's bytes."""
     encoding = "ros1" if is_ros1 else "cdr"
     return parse_packet(RawMessage("/events", "event_camera_msgs/EventPacket", encoding, 0, data))
 
 
-def write_packet_bag(path: Path, messages: Sequence[tuple[str, int, bytes]]) -> Path:
+def write_packet_bag(path, messages):
     """Write (topic, time of receipt, message) as EventPackets; ROS 1 where the path ends in .bag."""
     store, name = typestore(path.suffix == ".bag"), "event_camera_msgs/msg/EventPacket"
     with open_bag_writer(path) as writer:
@@ -27,7 +23,7 @@ def write_packet_bag(path: Path, messages: Sequence[tuple[str, int, bytes]]) -> 
     return path
 
 
-def write_event_bag(path: Path, stretches: Iterable[Events]) -> None:
+def write_event_bag(path, stretches):
     """Write events as EventArrays: a ROS 1 bag where the path ends in .bag, else a ROS 2 folder."""
     is_ros1 = path.suffix == ".bag"
     with open_bag_writer(path) as writer:

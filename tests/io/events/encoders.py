@@ -1,7 +1,6 @@
 """Small encoders for the formats that cameras and drivers write, one event after the other."""
 
 import struct
-from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -11,16 +10,14 @@ Event = tuple[int, int, int, bool]
 """t_us, x, y, polarity."""
 
 
-def listed(events: Events) -> list[Event]:
+def listed(events):
     t_us = events.t_ns // 1000
     return list(
         zip(t_us.tolist(), events.x.tolist(), events.y.tolist(), events.polarity.tolist(), strict=True)
     )
 
 
-def random_events(
-    n: int, seed: int, size: tuple[int, int] = (346, 260), start_us: int = 0, step_us: int = 20
-) -> Events:
+def random_events(n, seed, size=(346, 260), start_us=0, step_us=20):
     """Events in order, some with equal stamps, neighbours in runs so that vectors have something to pack."""
     rng = np.random.default_rng(seed)
     steps_us = rng.integers(0, step_us, n) * (rng.random(n) < 0.4)
@@ -35,7 +32,7 @@ def random_events(
     return Events("events", t_us * 1000, x.astype(np.uint16), y.astype(np.uint16), polarity, *size)
 
 
-def evt2(events: Iterable[Event]) -> bytes:
+def evt2(events):
     words, high = [], -1
     for t, x, y, p in events:
         if t >> 6 != high:
@@ -45,9 +42,9 @@ def evt2(events: Iterable[Event]) -> bytes:
     return struct.pack(f"<{len(words)}I", *words)
 
 
-def evt3(events: Sequence[Event], with_vectors: bool = True) -> bytes:
+def evt3(events, with_vectors=True):
     """Prophesee's EVT3; runs in a row become a base and vectors of 12 and 8."""
-    words: list[int] = []
+    words = []
     high = low = row = -1
     for (t, x, y, p), mask in _spans(events, 20 if with_vectors else 1):
         if t >> 12 != high:
@@ -70,9 +67,9 @@ def evt3(events: Sequence[Event], with_vectors: bool = True) -> bytes:
     return struct.pack(f"<{len(words)}H", *words)
 
 
-def libcaer_cmp(events: Sequence[Event], base_us: int) -> bytes:
+def libcaer_cmp(events, base_us):
     """The ROS driver's compressed DAVIS events; runs in a column become a base and vectors of 8."""
-    words: list[int] = []
+    words = []
     high = low = column = -1
     swapped = [(t, y, x, p) for t, x, y, p in events]
     for (t, y, x, p), mask in _spans(swapped, 16):
@@ -94,26 +91,17 @@ def libcaer_cmp(events: Sequence[Event], base_us: int) -> bytes:
     return struct.pack(f"<{len(words)}H", *words)
 
 
-def packet(
-    payload: bytes,
-    encoding: str,
-    *,
-    is_ros1: bool,
-    number: int = 0,
-    base_ns: int = 0,
-    stamp_ns: int = 0,
-    size: tuple[int, int] = (346, 260),
-) -> bytes:
+def packet(payload, encoding, *, is_ros1, number=0, base_ns=0, stamp_ns=0, size=(346, 260)):
     """An event_camera_msgs/EventPacket."""
     message = b"" if is_ros1 else b"\0\1\0\0"
 
-    def add(kind: str, value: int) -> None:
+    def add(kind, value):
         nonlocal message
         if not is_ros1:
             message += bytes(-(len(message) - 4) % struct.calcsize(kind))
         message += struct.pack(f"<{kind}", value)
 
-    def add_text(text: str) -> None:
+    def add_text(text):
         nonlocal message
         data = text.encode() + (b"" if is_ros1 else b"\0")
         add("I", len(data))
@@ -134,7 +122,7 @@ def packet(
     return message + payload
 
 
-def _spans(events: Sequence[Event], width: int) -> Iterator[tuple[Event, int]]:
+def _spans(events, width):
     """Gather events of one stamp, row and polarity whose columns rise within `width` into a mask."""
     i = 0
     while i < len(events):

@@ -2,13 +2,12 @@
 
 import re
 from datetime import timedelta
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lce_rig.core.findings import Losses
-from lce_rig.io.events.aedat4 import Aedat4File, Aedat4Frame, decode_frame
+from lce_rig.io.events.aedat4 import Aedat4File, decode_frame
 from tests.io.events.aedat4_files import RawFrame, flatbuffer, write_davis
 from tests.io.events.encoders import random_events
 
@@ -18,7 +17,7 @@ GREY = RNG.integers(0, 256, (260, 346), dtype=np.uint8)
 COLOUR = RNG.integers(0, 256, (260, 346, 3), dtype=np.uint8)
 
 
-def read(path: Path, losses: Losses | None = None) -> list[Aedat4Frame]:
+def read(path, losses=None):
     file = Aedat4File(path)
     number = file.first_stream("FRME")
     assert number is not None
@@ -26,9 +25,7 @@ def read(path: Path, losses: Losses | None = None) -> list[Aedat4Frame]:
 
 
 @pytest.mark.parametrize("style", ["dv", "dv-processing", "exposure only"])
-def test_frames_are_stamped_at_mid_exposure_whatever_their_own_stamp_marks(
-    tmp_path: Path, style: str
-) -> None:
+def test_frames_are_stamped_at_mid_exposure_whatever_their_own_stamp_marks(tmp_path, style):
     frames = [RawFrame(START_US + 40_000 * k, 8001, GREY, style) for k in range(3)]
     found = read(write_davis(tmp_path / "a.aedat4", [random_events(500, 1, start_us=START_US)], frames))
     assert [f.mid_exposure_ns for f in found] == [
@@ -37,19 +34,19 @@ def test_frames_are_stamped_at_mid_exposure_whatever_their_own_stamp_marks(
     assert all(f.exposure_ns == 8_001_000 and np.array_equal(f.pixels, GREY) for f in found)
 
 
-def test_an_exposure_that_is_not_known_leaves_the_stamp_as_it_is(tmp_path: Path) -> None:
+def test_an_exposure_that_is_not_known_leaves_the_stamp_as_it_is(tmp_path):
     (frame,) = read(write_davis(tmp_path / "a.aedat4", [], [RawFrame(START_US, 8000, GREY, "stamp only")]))
     assert (frame.mid_exposure_ns, frame.exposure_ns) == (START_US * 1000, 0)
 
 
-def test_colour_frames_are_blue_green_red(tmp_path: Path) -> None:
+def test_colour_frames_are_blue_green_red(tmp_path):
     with_alpha = np.dstack([COLOUR, np.full((260, 346), 9, np.uint8)])
     frames = [RawFrame(START_US, 0, COLOUR), RawFrame(START_US + 1, 0, with_alpha)]
     for frame in read(write_davis(tmp_path / "a.aedat4", [], frames)):
         assert np.array_equal(frame.pixels, COLOUR)
 
 
-def test_dv_processings_own_frames_are_read(tmp_path: Path) -> None:
+def test_dv_processings_own_frames_are_read(tmp_path):
     dv = pytest.importorskip("dv_processing")
     for compression in (dv.CompressionType.NONE, dv.CompressionType.LZ4, dv.CompressionType.ZSTD):
         path = tmp_path / f"{compression.name}.aedat4"
@@ -68,7 +65,7 @@ def test_dv_processings_own_frames_are_read(tmp_path: Path) -> None:
         assert np.array_equal(grey.pixels, GREY) and np.array_equal(colour.pixels, COLOUR)
 
 
-def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path: Path) -> None:
+def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path):
     frames = [RawFrame(START_US + 40_000 * k, 8000, GREY) for k in range(3)]
     path = write_davis(tmp_path / "a.aedat4", [], frames)
     data = bytearray(path.read_bytes())
@@ -81,14 +78,14 @@ def test_a_damaged_frame_costs_only_itself_and_is_counted(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("n_bytes", [0, 99, 101])
-def test_a_frame_whose_size_contradicts_its_pixels_is_refused(n_bytes: int) -> None:
+def test_a_frame_whose_size_contradicts_its_pixels_is_refused(n_bytes):
     table = flatbuffer(b"FRME", {0: ("q", START_US), 6: ("h", 10), 7: ("h", 10), 10: bytes(n_bytes)})
     with pytest.raises(ValueError):
         decode_frame(table[4:])
 
 
 @pytest.mark.dataset
-def test_a_real_davis_file_is_read_as_its_makers_read_it(recordings: Path) -> None:
+def test_a_real_davis_file_is_read_as_its_makers_read_it(recordings):
     dv = pytest.importorskip("dv_processing")
     path = recordings / "events" / "davis346_short.aedat4"
     truth = dv.io.MonoCameraRecording(str(path))

@@ -1,31 +1,29 @@
 """Events come back event for event as cameras encode them; in bags, lost and broken packets are counted."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.core.data import EventColumns, Events, join_events
+from lce_rig.core.data import Events, join_events
 from lce_rig.core.errors import SourceError
-from lce_rig.io.events import EventRecording, open_events
+from lce_rig.io.events import open_events
 from lce_rig.io.events.prophesee import EVT3, Evt2Decoder, WordDecoder
 from lce_rig.io.ros.event_messages import PacketDecoder
 from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, decode_event_array, encode_event_array, typestore
 from tests.io.events import encoders
 from tests.io.events.bags import parsed, write_event_bag, write_packet_bag
-from tests.io.events.encoders import Event, listed, random_events
+from tests.io.events.encoders import listed, random_events
 from tests.notes import has_note
 
 WORDS = {"evt2": (encoders.evt2, "<u4"), "evt3": (encoders.evt3, "<u2")}
 
 
-def columns_listed(columns: EventColumns) -> list[Event]:
+def columns_listed(columns):
     return listed(Events("", columns.t_ns, columns.x, columns.y, columns.polarity, 1, 1))
 
 
-def decoder_of(name: str) -> WordDecoder | Evt2Decoder:
+def decoder_of(name):
     return WordDecoder(EVT3) if name == "evt3" else Evt2Decoder()
 
 
@@ -36,9 +34,7 @@ def decoder_of(name: str) -> WordDecoder | Evt2Decoder:
     cuts=st.lists(st.integers(0, 300), max_size=6),
     start_us=st.integers(0, 1 << 23),
 )
-def test_streams_come_back_however_they_are_cut_into_blocks(
-    name: str, n: int, seed: int, cuts: list[int], start_us: int
-) -> None:
+def test_streams_come_back_however_they_are_cut_into_blocks(name, n, seed, cuts, start_us):
     encode, dtype = WORDS[name]
     truth = listed(random_events(n, seed, (1280, 720), start_us))
     words = np.frombuffer(encode(truth), dtype)
@@ -47,7 +43,7 @@ def test_streams_come_back_however_they_are_cut_into_blocks(
     assert columns_listed(join_events(parts)) == truth
 
 
-def test_a_vector_of_evt3_goes_on_where_the_last_one_ended() -> None:
+def test_a_vector_of_evt3_goes_on_where_the_last_one_ended():
     # Base 100, then 12 + 12 + 8 places, of which the first of each is set.
     words = [8 << 12, 6 << 12 | 5, 7, 3 << 12 | 1 << 11 | 100, 4 << 12 | 1, 4 << 12 | 1, 5 << 12 | 1]
     events = WordDecoder(EVT3).decode(np.array(words, "<u2"))
@@ -55,21 +51,21 @@ def test_a_vector_of_evt3_goes_on_where_the_last_one_ended() -> None:
 
 
 @pytest.mark.parametrize(("name", "bits"), [("evt3", 24), ("evt2", 34)])
-def test_clocks_of_the_sensor_wrap_without_a_trace(name: str, bits: int) -> None:
+def test_clocks_of_the_sensor_wrap_without_a_trace(name, bits):
     encode, dtype = WORDS[name]
     truth = listed(random_events(400, 1, (640, 480), (1 << bits) - 400))
     assert truth[0][0] < 1 << bits < truth[-1][0]
     assert columns_listed(decoder_of(name).decode(np.frombuffer(encode(truth), dtype))) == truth
 
 
-def test_a_time_word_that_steps_back_a_little_is_no_wrap() -> None:
+def test_a_time_word_that_steps_back_a_little_is_no_wrap():
     words = [8 << 12 | 50, 6 << 12, 9, 2 << 12 | 1, 8 << 12 | 49, 2 << 12 | 2, 8 << 12 | 51, 2 << 12 | 3]
     events = WordDecoder(EVT3).decode(np.array(words, "<u2"))
     assert (events.t_ns // 4_096_000).tolist() == [50, 49, 51]
 
 
 @pytest.mark.parametrize("name", sorted(WORDS))
-def test_a_damaged_time_word_is_repaired(name: str) -> None:
+def test_a_damaged_time_word_is_repaired(name):
     encode, dtype = WORDS[name]
     truth = [(5000 * i, i, i, True) for i in range(100)]
     words = np.frombuffer(encode(truth), dtype).copy()
@@ -85,7 +81,7 @@ def test_a_damaged_time_word_is_repaired(name: str) -> None:
 @pytest.mark.parametrize("is_ros1", [True, False])
 @pytest.mark.parametrize("encoding", ["evt3", "libcaer_cmp"])
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 60))
-def test_packets_of_every_encoding_come_back(encoding: str, is_ros1: bool, seed: int, n: int) -> None:
+def test_packets_of_every_encoding_come_back(encoding, is_ros1, seed, n):
     start_us = 0 if encoding == "evt3" else 1_700_000_000_000_000
     truth = listed(random_events(n, seed, start_us=start_us))
     payloads = {
@@ -104,7 +100,7 @@ def test_packets_of_every_encoding_come_back(encoding: str, is_ros1: bool, seed:
 
 
 @pytest.mark.parametrize("is_ros1", [True, False])
-def test_event_arrays_are_what_ros_itself_reads(is_ros1: bool) -> None:
+def test_event_arrays_are_what_ros_itself_reads(is_ros1):
     store = typestore(is_ros1)
     events = random_events(20, 4, start_us=1_700_000_000_000_000)
     data = encode_event_array(events, "cam", "ros1" if is_ros1 else "cdr")
@@ -117,7 +113,7 @@ def test_event_arrays_are_what_ros_itself_reads(is_ros1: bool) -> None:
 
 
 @given(data=st.binary(max_size=200), is_ros1=st.booleans())
-def test_rubbish_is_refused_in_words_and_nothing_else(data: bytes, is_ros1: bool) -> None:
+def test_rubbish_is_refused_in_words_and_nothing_else(data, is_ros1):
     for decode in (parsed, lambda data, is_ros1: decode_event_array(data, "ros1" if is_ros1 else "cdr")):
         try:
             decode(data, is_ros1)
@@ -130,7 +126,7 @@ TRUTH = listed(random_events(2000, 11))
 PIECES = [TRUTH[i : i + 100] for i in range(0, 2000, 100)]
 
 
-def messages(is_ros1: bool, encoding: str = "libcaer_cmp") -> list[tuple[str, int, bytes]]:
+def messages(is_ros1, encoding="libcaer_cmp"):
     encode = {"libcaer_cmp": lambda piece: encoders.libcaer_cmp(piece, 0), "evt3": encoders.evt3}[encoding]
     return [
         (TOPIC, 10**9 + 10**7 * i, encoders.packet(encode(piece), encoding, is_ros1=is_ros1, number=i))
@@ -138,13 +134,13 @@ def messages(is_ros1: bool, encoding: str = "libcaer_cmp") -> list[tuple[str, in
     ]
 
 
-def everything(recording: EventRecording) -> list[Event]:
+def everything(recording):
     return [event for stretch in recording for event in listed(stretch)]
 
 
 @pytest.mark.parametrize("name", ["a.bag", "ros2"])
 @pytest.mark.parametrize("encoding", ["libcaer_cmp", "evt3"])
-def test_packets_of_a_topic_are_one_recording(tmp_path: Path, name: str, encoding: str) -> None:
+def test_packets_of_a_topic_are_one_recording(tmp_path, name, encoding):
     path = write_packet_bag(tmp_path / name, messages(name == "a.bag", encoding))
     recording = open_events(path)
     assert everything(recording) == TRUTH
@@ -152,9 +148,7 @@ def test_packets_of_a_topic_are_one_recording(tmp_path: Path, name: str, encodin
 
 
 @pytest.mark.parametrize("name", ["a.bag", "ros2"])
-def test_broken_and_lost_packets_are_counted_and_the_first_broken_one_is_named(
-    tmp_path: Path, name: str
-) -> None:
+def test_broken_and_lost_packets_are_counted_and_the_first_broken_one_is_named(tmp_path, name):
     is_ros1 = name == "a.bag"
     sent = messages(is_ros1)
     for i in (5, 9, 17):
@@ -171,7 +165,7 @@ def test_broken_and_lost_packets_are_counted_and_the_first_broken_one_is_named(
     assert has_note(recording.notes, "5 packets lost"), "the broken ones and two that never came"
 
 
-def test_a_damaged_record_ends_the_events_and_the_loss_is_said(tmp_path: Path) -> None:
+def test_a_damaged_record_ends_the_events_and_the_loss_is_said(tmp_path):
     path = tmp_path / "a.bag"
     events = random_events(100_000, 3, start_us=1_700_000_000_000_000, step_us=100)
     write_event_bag(path, [events])
@@ -186,7 +180,7 @@ def test_a_damaged_record_ends_the_events_and_the_loss_is_said(tmp_path: Path) -
     assert any("torn" in note for note in recording.notes)
 
 
-def test_two_cameras_need_a_topic_and_the_topics_are_listed(tmp_path: Path) -> None:
+def test_two_cameras_need_a_topic_and_the_topics_are_listed(tmp_path):
     sent = messages(is_ros1=True)
     path = write_packet_bag(tmp_path / "a.bag", sent + [("/other", t, data) for _, t, data in sent[:3]])
     with pytest.raises(SourceError, match="2 ") as caught:

@@ -1,7 +1,5 @@
 """Recordings of real cameras by others, against the makers' own library or kept figures."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -9,13 +7,13 @@ from lce_rig.io.events import open_events
 
 
 @pytest.fixture
-def folder(recordings: Path) -> Path:
+def folder(recordings):
     if not (recordings / "events").is_dir():
         pytest.skip("no recordings of events")
     return recordings / "events"
 
 
-def columns(path: Path) -> tuple[np.ndarray, ...]:
+def columns(path):
     stretches = list(open_events(path))
     return tuple(
         np.concatenate([getattr(stretch, name) for stretch in stretches])
@@ -24,7 +22,7 @@ def columns(path: Path) -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.parametrize("name", ["davis346_short.aedat4", "dvs_320x240.aedat4"])
-def test_aedat4_is_read_as_its_makers_read_it(folder: Path, name: str) -> None:
+def test_aedat4_is_read_as_its_makers_read_it(folder, name):
     dv = pytest.importorskip("dv_processing")
     recording = dv.io.MonoCameraRecording(str(folder / name))
     batches = []
@@ -45,9 +43,7 @@ def test_aedat4_is_read_as_its_makers_read_it(folder: Path, name: str) -> None:
         ("evt3_pedestrians.raw", 5000, 45_210_000, [3_415_152, 1_425_333, 2_894]),
     ],
 )
-def test_events_of_recorded_cameras_keep_their_number_duration_and_sums(
-    folder: Path, name: str, n: int, duration_ns: int, sums: list[int]
-) -> None:
+def test_events_of_recorded_cameras_keep_their_number_duration_and_sums(folder, name, n, duration_ns, sums):
     t_ns, *others = columns(folder / name)
     assert (len(t_ns), np.ptp(t_ns)) == (n, duration_ns)
     assert [int(column.sum(dtype=np.int64)) for column in others] == sums

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError
-from lce_rig.io.events import EventRecording, open_events
+from lce_rig.io.events import open_events
 from tests.damage import damaged
 from tests.io.events import encoders
 from tests.io.events.aedat4_files import write_aedat4
@@ -25,17 +25,17 @@ START_US = 1_700_000_000_000_000
 EVENTS = random_events(30_000, 7, start_us=START_US)
 
 
-def everything(recording: EventRecording) -> list[encoders.Event]:
+def everything(recording):
     return [event for stretch in recording for event in listed(stretch)]
 
 
-def write_text(path: Path, events: Events, with_size: bool = True) -> None:
+def write_text(path, events, with_size=True):
     lines = [f"{t // 10**6}.{t % 10**6:06d} {x} {y} {p:d}" for t, x, y, p in listed(events)]
     head = [f"{events.width_px} {events.height_px}"] if with_size else []
     path.write_text("\n".join(head + lines) + "\n")
 
 
-def write_dsec(path: Path, events: Events) -> None:
+def write_dsec(path, events):
     import h5py
 
     t_us = events.t_ns // 1000
@@ -47,7 +47,7 @@ def write_dsec(path: Path, events: Events) -> None:
         file["ms_to_idx"] = np.zeros(1, np.uint64)
 
 
-def write_raw(path: Path, events: Events) -> None:
+def write_raw(path, events):
     head = "% evt 3.0\n% geometry 346x260\n% end\n"
     # The raw formats count from the sensor's start, and so do their stamps here.
     local = [(t - START_US, x, y, p) for t, x, y, p in listed(events)]
@@ -65,7 +65,7 @@ WRITERS: dict[str, Callable[[Path, Events], object]] = {
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
-def test_every_format_gives_every_event_back_to_the_microsecond(tmp_path: Path, name: str) -> None:
+def test_every_format_gives_every_event_back_to_the_microsecond(tmp_path, name):
     WRITERS[name](tmp_path / name, EVENTS)
     recording = open_events(tmp_path / name, sensor="davis")
     shift_us = START_US if name == "a.raw" else 0
@@ -79,20 +79,20 @@ def test_every_format_gives_every_event_back_to_the_microsecond(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
-def test_no_events_is_an_error_that_names_the_file(tmp_path: Path, name: str) -> None:
+def test_no_events_is_an_error_that_names_the_file(tmp_path, name):
     WRITERS[name](tmp_path / name, EVENTS.select(slice(0, 0)))
     with pytest.raises(SourceError, match=name):
         open_events(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
-def test_events_of_another_camera_are_refused(tmp_path: Path, name: str) -> None:
+def test_events_of_another_camera_are_refused(tmp_path, name):
     WRITERS[name](tmp_path / name, EVENTS)
     with pytest.raises(SourceError, match="240x180"):
         list(open_events(tmp_path / name, sensor="davis", resolution=(240, 180)))
 
 
-def test_what_dv_processing_writes_is_read(tmp_path: Path) -> None:
+def test_what_dv_processing_writes_is_read(tmp_path):
     dv = pytest.importorskip("dv_processing")
     few = EVENTS.select(slice(0, 3000))
     store = dv.EventStore()
@@ -107,7 +107,7 @@ def test_what_dv_processing_writes_is_read(tmp_path: Path) -> None:
         assert everything(open_events(path)) == listed(few)
 
 
-def test_a_damaged_packet_costs_only_itself(tmp_path: Path) -> None:
+def test_a_damaged_packet_costs_only_itself(tmp_path):
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     data = bytearray((tmp_path / "a.aedat4").read_bytes())
     begin = 14 + 4 + struct.unpack_from("<I", data, 14)[0]
@@ -127,9 +127,7 @@ def test_a_damaged_packet_costs_only_itself(tmp_path: Path) -> None:
         ("% format EVT3;height=480;width=640\n% end\n", encoders.evt3),
     ],
 )
-def test_raw_files_of_every_version_and_header_are_read(
-    tmp_path: Path, head: str, encode: Callable[[list[encoders.Event]], bytes]
-) -> None:
+def test_raw_files_of_every_version_and_header_are_read(tmp_path, head, encode):
     truth = listed(random_events(500, 8, (640, 480)))
     (tmp_path / "a.raw").write_bytes(head.encode() + encode(truth))
     recording = open_events(tmp_path / "a.raw")
@@ -137,7 +135,7 @@ def test_raw_files_of_every_version_and_header_are_read(
     assert everything(recording) == truth
 
 
-def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path: Path) -> None:
+def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path):
     few = EVENTS.select(slice(0, 100))
     write_text(tmp_path / "a.txt", few, with_size=False)
     lines = (tmp_path / "a.txt").read_text().splitlines()
@@ -151,7 +149,7 @@ def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path:
         everything(open_events(tmp_path / "a.txt", resolution=(346, 260)))
 
 
-def test_hdf5_compressed_by_a_plugin_is_read(tmp_path: Path) -> None:
+def test_hdf5_compressed_by_a_plugin_is_read(tmp_path):
     h5py, hdf5plugin = pytest.importorskip("h5py"), pytest.importorskip("hdf5plugin")
     write_dsec(tmp_path / "a.h5", EVENTS)
     with h5py.File(tmp_path / "a.h5", "a") as file:
@@ -161,7 +159,7 @@ def test_hdf5_compressed_by_a_plugin_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.txt", "a.bag", "a.raw", "a.mp4"])
-def test_rubbish_by_any_name_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+def test_rubbish_by_any_name_is_refused_in_one_line(tmp_path, name):
     for rubbish in (b"", b"rubbish\n" * 100, bytes(1000)):
         (tmp_path / name).write_bytes(rubbish)
         with pytest.raises(SourceError, match=name) as caught:
@@ -173,16 +171,14 @@ FEW_EVENTS = EVENTS.select(slice(0, 200))
 
 
 @cache
-def whole(folder: Path, name: str) -> bytes:
+def whole(folder, name):
     WRITERS[name](folder / name, FEW_EVENTS)
     return (folder / name).read_bytes()
 
 
 @pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.raw", "a.txt"])
 @given(data=st.data())
-def test_damaged_events_are_read_or_refused_in_one_line(
-    tmp_path_factory: pytest.TempPathFactory, name: str, data: st.DataObject
-) -> None:
+def test_damaged_events_are_read_or_refused_in_one_line(tmp_path_factory, name, data):
     folder = tmp_path_factory.getbasetemp()
     path = folder / "damaged" / name
     path.parent.mkdir(exist_ok=True)
@@ -197,7 +193,7 @@ def test_damaged_events_are_read_or_refused_in_one_line(
         assert "\n" not in error.what
 
 
-def test_a_long_recording_is_never_in_memory_as_a_whole(tmp_path: Path) -> None:
+def test_a_long_recording_is_never_in_memory_as_a_whole(tmp_path):
     piece = random_events(20_000, 1)
     span_ns = int(piece.t_ns[-1])
     pieces = (

@@ -1,6 +1,5 @@
 """Order, clocks and windows of recordings, told apart by small streams of known content."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from hypothesis import strategies as st
 
 from lce_rig.core.data import MAX_TIME_NS, EventColumns
 from lce_rig.core.errors import SourceError
-from lce_rig.core.findings import Losses
 from lce_rig.io.events.event_recording import REORDER_NS, EventRecording, EventStream
 from tests.io.events.encoders import random_events
 from tests.notes import has_note
@@ -22,29 +20,27 @@ PATH = Path("recording.test")
 class ListedStream(EventStream):
     """A stream of stretches given in advance."""
 
-    def __init__(
-        self, stretches: Sequence[EventColumns], resolution_px: tuple[int, int] | None = (346, 260)
-    ) -> None:
+    def __init__(self, stretches, resolution_px=(346, 260)):
         self.resolution_px = resolution_px
         self.notes: list[str] = []
         self._stretches = stretches
 
-    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
+    def stretches(self, losses):
         yield from self._stretches
 
 
-def columns(t_us: Sequence[int] | np.ndarray) -> EventColumns:
+def columns(t_us):
     """Events at given times; the column says how many came before."""
     n = len(t_us)
     x = (np.arange(n) % 346).astype(np.uint16)
     return EventColumns(np.asarray(t_us, np.int64) * 1000, x, np.zeros(n, np.uint16), np.ones(n, bool))
 
 
-def record(*stretches: EventColumns, resolution: tuple[int, int] | None = (346, 260)) -> EventRecording:
+def record(*stretches, resolution=(346, 260)):
     return EventRecording(PATH, ListedStream(stretches, resolution), "events", None)
 
 
-def stamps_us(recording: EventRecording) -> list[int]:
+def stamps_us(recording):
     return [t // 1000 for stretch in recording for t in stretch.t_ns.tolist()]
 
 
@@ -53,9 +49,7 @@ def stamps_us(recording: EventRecording) -> list[int]:
     seed=st.integers(0, 10**6),
     cuts=st.lists(st.integers(1, 999), max_size=8),
 )
-def test_stamps_mixed_a_little_are_sorted_and_none_is_lost(
-    jitter_us: int, seed: int, cuts: list[int]
-) -> None:
+def test_stamps_mixed_a_little_are_sorted_and_none_is_lost(jitter_us, seed, cuts):
     rng = np.random.default_rng(seed)
     t_us = np.arange(1000) * 997 + rng.integers(0, jitter_us + 1, 1000)
     # Stretches are longer than the mixing, as packets are.
@@ -64,7 +58,7 @@ def test_stamps_mixed_a_little_are_sorted_and_none_is_lost(
     assert stamps_us(recording) == sorted(t_us.tolist())
 
 
-def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound() -> None:
+def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound():
     first, second = np.arange(1000) * 1000, np.arange(1000) * 1000 - 5_000_000
     delivered = []
     with pytest.raises(SourceError, match=r"5\.999 s") as caught:
@@ -74,7 +68,7 @@ def test_a_clock_that_was_set_back_is_refused_with_figures_after_what_is_sound()
     assert delivered == (first * 1000).tolist()
 
 
-def test_events_before_the_clock_is_set_at_the_start_are_left_out_and_counted() -> None:
+def test_events_before_the_clock_is_set_at_the_start_are_left_out_and_counted():
     before, after = 10**12 + np.arange(200) * 1000, np.arange(1000) * 1000
     recording = record(columns(before), columns(after[:400]), columns(after[400:]))
     assert stamps_us(recording) == after.tolist()
@@ -85,7 +79,7 @@ def test_events_before_the_clock_is_set_at_the_start_are_left_out_and_counted() 
 
 @pytest.mark.parametrize("stray_us", [10**9, -(10**9)])
 @pytest.mark.parametrize("at", [3, 499, 500, 700])
-def test_a_single_stray_stamp_is_left_out_and_counted(stray_us: int, at: int) -> None:
+def test_a_single_stray_stamp_is_left_out_and_counted(stray_us, at):
     truth = np.arange(1000) * 1000
     t_us = truth.copy()
     t_us[at] += stray_us
@@ -94,7 +88,7 @@ def test_a_single_stray_stamp_is_left_out_and_counted(stray_us: int, at: int) ->
     assert has_note(recording.notes, "1 events", "stray")
 
 
-def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many() -> None:
+def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many():
     stretch = columns(np.arange(1000))
     few, many = stretch.x.copy(), stretch.x.copy()
     few[7], many[::2] = 2000, 400
@@ -109,9 +103,7 @@ def test_events_off_the_sensor_are_left_out_when_few_and_refused_when_many() -> 
     windows=st.lists(st.tuples(st.integers(-100, 6000), st.integers(0, 3000)), min_size=1, max_size=8),
     n_parts=st.integers(1, 40),
 )
-def test_windows_hold_what_lies_between_their_ends_in_any_order(
-    windows: list[tuple[int, int]], n_parts: int
-) -> None:
+def test_windows_hold_what_lies_between_their_ends_in_any_order(windows, n_parts):
     events = random_events(2000, 5)
     whole = EventColumns(events.t_ns, events.x, events.y, events.polarity)
     cuts = np.array_split(np.arange(2000), n_parts)
@@ -125,7 +117,7 @@ def test_windows_hold_what_lies_between_their_ends_in_any_order(
         assert (window.width_px, window.height_px, window.sensor) == (346, 260, "events")
 
 
-def test_a_clock_of_its_own_is_tied_by_the_packet_that_waited_least() -> None:
+def test_a_clock_of_its_own_is_tied_by_the_packet_that_waited_least():
     delays_ms = [7, 3, 5]
     recording = record(
         *(
@@ -142,7 +134,7 @@ def test_a_clock_of_its_own_is_tied_by_the_packet_that_waited_least() -> None:
     assert stamps_us(unknown) == [1] and not unknown.notes
 
 
-def test_stamps_at_the_ends_of_64_bits_are_left_out_and_the_others_kept() -> None:
+def test_stamps_at_the_ends_of_64_bits_are_left_out_and_the_others_kept():
     stretch = columns(range(1000))
     stretch.t_ns[[100, 200, 300, 400]] = MAX_TIME_NS, -MAX_TIME_NS, (1 << 63) - 1, -(1 << 63)
     recording = record(stretch)

@@ -1,21 +1,18 @@
 """Pictures for people: what must be drawn, what must not, and that sizes and files are right."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image, Scan
 from lce_rig.core.errors import SessionError
-from lce_rig.core.geometry import Array, transform
+from lce_rig.core.geometry import transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.findings import IMAGE_TILTED
 from lce_rig.rig import QualitySettings
-from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, PANEL, Picture
+from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, PANEL
 from lce_rig.show.overlays.debug_image import draw_debug
 from lce_rig.show.overlays.overlay import draw_overlay
 from lce_rig.show.overlays.overlay_files import (
@@ -36,26 +33,26 @@ T_CAM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]
 T_CAM_BOARD = np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.0], [0, 0, 0, 1]], dtype=np.float64)
 
 
-def scan_of(points: Array) -> Scan:
+def scan_of(points):
     n = len(points)
     return Scan("lidar", None, points.astype(np.float32), np.zeros(n, np.float32), np.zeros(n, np.int16))
 
 
-def wall(x_m: float = 2.0) -> Array:
+def wall(x_m=2.0):
     y, z = np.meshgrid(np.linspace(-0.38, 0.38, 39), np.linspace(-0.3, 0.3, 8))
     return np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], axis=1)
 
 
-def grey(camera: Intrinsics) -> NDArray[np.uint8]:
+def grey(camera):
     return np.full((camera.height_px, camera.width_px), 128, np.uint8)
 
 
-def image_board(camera: Intrinsics) -> ImageBoard:
+def image_board(camera):
     corners, _ = camera.project(transform(T_CAM_BOARD, BOARD.corners()))
     return ImageBoard(corners, T_CAM_BOARD, np.eye(6) * 1e-6, None, np.inf, False, 0.1, 0.07)
 
 
-def lidar_board(points: Array) -> LidarBoard:
+def lidar_board(points):
     T_lidar_board = np.linalg.inv(T_CAM_LIDAR) @ T_CAM_BOARD
     ends = points[np.abs(points[:, 1]) > 0.37]
     return LidarBoard(
@@ -74,7 +71,7 @@ def lidar_board(points: Array) -> LidarBoard:
     )
 
 
-def overlay(camera: Intrinsics, points: Array, **boards: object) -> Picture:
+def overlay(camera, points, **boards):
     return draw_overlay(
         Image("cam", "frames", None, grey(camera)),
         scan_of(points),
@@ -90,19 +87,19 @@ def overlay(camera: Intrinsics, points: Array, **boards: object) -> Picture:
     )
 
 
-def picture_part(drawn: Picture, camera: Intrinsics) -> Picture:
+def picture_part(drawn, camera):
     """Cut title and legend off."""
     factor = drawn.shape[1] // camera.width_px
     top = round(2.6 * 13 * drawn.shape[1] / 1000)
     return drawn[top : top + factor * camera.height_px]
 
 
-def count(drawn: Picture, colour: tuple[int, int, int]) -> int:
+def count(drawn, colour):
     return int(np.all(np.abs(drawn.astype(int) - colour) < 20, axis=-1).sum())
 
 
 @pytest.mark.parametrize("camera", [FOLDING, LARGE], ids=["346x260", "1920x1208"])
-def test_points_board_and_ends_are_drawn_at_any_size(camera: Intrinsics) -> None:
+def test_points_board_and_ends_are_drawn_at_any_size(camera):
     points = wall()
     drawn = overlay(camera, points, lidar=lidar_board(points), image=image_board(camera))
     assert drawn.dtype == np.uint8 and drawn.shape[1] >= 960 and drawn.shape[1] % camera.width_px == 0
@@ -111,14 +108,14 @@ def test_points_board_and_ends_are_drawn_at_any_size(camera: Intrinsics) -> None
     assert count(part, ORANGE) > 50
 
 
-def test_a_point_appears_where_the_camera_sees_it() -> None:
+def test_a_point_appears_where_the_camera_sees_it():
     part = picture_part(overlay(FOLDING, np.array([[2.0, 0.4, 0.2]])), FOLDING)
     v, u = np.argwhere(np.any(part != 128, axis=-1)).mean(axis=0)
     truth, _ = FOLDING.project(np.array([-0.4, -0.2, 2.0]))
     assert (u, v) == pytest.approx(tuple((truth + 0.5) * 3 - 0.5), abs=0.8)
 
 
-def test_points_behind_the_camera_or_folded_by_the_distortion_are_not_drawn() -> None:
+def test_points_behind_the_camera_or_folded_by_the_distortion_are_not_drawn():
     behind = wall(-2.0)
     # At 60 deg r = 1.73, beyond the fold of 1 - 0.4 r^2 at r = 0.91, where the polynomial draws it at -0.35.
     folded = np.stack([np.ones(20), np.full(20, np.tan(np.radians(60))), np.linspace(-0.2, 0.2, 20)], axis=1)
@@ -126,7 +123,7 @@ def test_points_behind_the_camera_or_folded_by_the_distortion_are_not_drawn() ->
     assert np.all(part == 128)
 
 
-def test_near_points_cover_far_ones() -> None:
+def test_near_points_cover_far_ones():
     far, near = wall(4.0) * [1, 2, 2], wall(2.0)
     both = picture_part(overlay(FOLDING, np.concatenate([near, far])), FOLDING)
     swapped = picture_part(overlay(FOLDING, np.concatenate([far, near])), FOLDING)
@@ -135,7 +132,7 @@ def test_near_points_cover_far_ones() -> None:
 
 @pytest.mark.parametrize("has_image", [True, False])
 @pytest.mark.parametrize("has_lidar", [True, False])
-def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar: bool) -> None:
+def test_a_debug_picture_is_made_of_whatever_there_is(has_image, has_lidar):
     points = wall()
     refusal = IMAGE_TILTED.refusal(tilt_deg=71.0, max_tilt_deg=70.0, turn_deg=6.0)
     drawn = draw_debug(
@@ -155,14 +152,14 @@ def test_a_debug_picture_is_made_of_whatever_there_is(has_image: bool, has_lidar
 HEAD = SheetHead("rig  cam and lidar", "fail", ("7 captures", "the board moved: hold it still"), (1.0, 9.0))
 
 
-def tile(index: int, warning: str = "") -> Overlay:
+def tile(index, warning=""):
     colour = (10 + 3 * index, 200, 30 + 2 * index)
     return Overlay(f"{index:06d}", drawn := np.full((270, 480, 3), colour, np.uint8), drawn, "", warning)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("n", [1, 2, 7, 18, 40])
-def test_contact_sheets_hold_every_picture_once_and_are_at_most_2000_px_wide(n: int) -> None:
+def test_contact_sheets_hold_every_picture_once_and_are_at_most_2000_px_wide(n):
     tiles = [tile(index) for index in range(n)]
     sheets = contact_sheets(tiles, HEAD)
     assert all(sheet.shape[1] <= 2000 and sheet.shape[0] <= 2000 for sheet in sheets)
@@ -172,7 +169,7 @@ def test_contact_sheets_hold_every_picture_once_and_are_at_most_2000_px_wide(n: 
     assert all(np.all(sheet[0, 0] == PANEL) for sheet in sheets)
 
 
-def test_overlays_are_written_with_contact_sheets_and_read_back_unchanged(tmp_path: Path) -> None:
+def test_overlays_are_written_with_contact_sheets_and_read_back_unchanged(tmp_path):
     drawn = overlay(FOLDING, wall())
     names = ("000000", "000001")
     files, sheets = write_overlays(tmp_path / "overlays", [Overlay(n, drawn, drawn) for n in names], HEAD)
@@ -182,13 +179,13 @@ def test_overlays_are_written_with_contact_sheets_and_read_back_unchanged(tmp_pa
     assert write_overlays(tmp_path / "none", [], HEAD) == ([], [])
 
 
-def test_many_overlays_have_numbered_contact_sheets_which_are_known_as_such(tmp_path: Path) -> None:
+def test_many_overlays_have_numbered_contact_sheets_which_are_known_as_such(tmp_path):
     files, sheets = write_overlays(tmp_path, [tile(index) for index in range(40)], HEAD)
     assert [sheet.name for sheet in sheets] == ["contact_sheet_1.png", "contact_sheet_2.png"]
     assert all(map(is_overlay, [*files, *sheets])) and not is_overlay(tmp_path / "contact_sheet_mine.png")
 
 
-def test_a_picture_that_cannot_be_written_names_the_file(tmp_path: Path) -> None:
+def test_a_picture_that_cannot_be_written_names_the_file(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(SessionError, match=r"file.a\.png"):
         write_picture(tmp_path / "file" / "a.png", np.zeros((4, 4, 3), np.uint8))

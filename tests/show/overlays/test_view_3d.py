@@ -14,7 +14,7 @@ FORWARD = pose(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.1, -
 LENS = Intrinsics(300.0, 300.0, 159.5, 119.5, 320, 240)
 
 
-def _wall() -> CaptureIn3D:
+def _wall():
     y, z = np.meshgrid(np.linspace(-1, 1, 200), np.linspace(-1, 1, 200))
     points = np.stack([np.full(y.size, 2.0), y.ravel(), z.ravel()], axis=1).astype(np.float32)
     return CaptureIn3D("000000", points, np.full((y.size, 3), (255, 0, 0), np.uint8), points[:, 1] > 0)

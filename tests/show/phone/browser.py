@@ -6,13 +6,11 @@ import itertools
 import json
 import subprocess
 import time
-from pathlib import Path
 from typing import Any
 
 import aiohttp
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 _START_S = 30.0
 _ANSWER_S = 60.0
@@ -30,19 +28,19 @@ class Browser:
     Each page has a context of its own, in memory: what one keeps, no other sees, and no slow disk delays it.
     """
 
-    def __init__(self, executable: str, folder: Path) -> None:
+    def __init__(self, executable, folder):
         """Start it with an empty folder as its profile."""
         self._folder = folder
         command = [executable, *_FLAGS, f"--user-data-dir={folder}", "about:blank"]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         port, path = self._address()
         self._url = f"ws://127.0.0.1:{port}"
-        self._contexts: list[tuple[str, Page]] = []
+        self._contexts = []
         self._loop = asyncio.new_event_loop()
         self._http = self._loop.run_until_complete(_http())
         self._line = Line(self._loop, self._connect(path))
 
-    def open(self, url: str, width: int = 1280, height: int = 720, first: str = "") -> "Page":
+    def open(self, url, width=1280, height=720, first=""):
         """Open a page; `first` is run before its own scripts."""
         context = self._line.call("Target.createBrowserContext")["browserContextId"]
         target = self._line.call("Target.createTarget", url="about:blank", browserContextId=context)
@@ -57,17 +55,17 @@ class Browser:
         page.wait_until("location.protocol !== 'about:' && document.readyState === 'complete'")
         return page
 
-    def close_pages(self) -> None:
+    def close_pages(self):
         """Close all pages; the browser stays."""
         for context, page in self._contexts:
             page.close()
             self._line.call("Target.disposeBrowserContext", browserContextId=context)
         self._contexts.clear()
 
-    def __enter__(self) -> "Browser":
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         try:
             self.close_pages()
             self._line.close()
@@ -76,7 +74,7 @@ class Browser:
         finally:
             self._end()
 
-    def _end(self) -> None:
+    def _end(self):
         self._process.terminate()
         try:
             self._process.wait(10)
@@ -84,7 +82,7 @@ class Browser:
             self._process.kill()
             self._process.wait()
 
-    def _address(self) -> tuple[int, str]:
+    def _address(self):
         written = self._folder / "DevToolsActivePort"
         deadline = time.monotonic() + _START_S
         while time.monotonic() < deadline and self._process.poll() is None:
@@ -95,23 +93,23 @@ class Browser:
         self._end()
         raise RuntimeError("the browser did not start")
 
-    def _connect(self, path: str) -> aiohttp.ClientWebSocketResponse:
+    def _connect(self, path):
         return self._loop.run_until_complete(_connect(self._http, self._url + path))
 
 
 class Line:
     """A connection that takes commands."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, socket: aiohttp.ClientWebSocketResponse) -> None:
+    def __init__(self, loop, socket):
         self._loop = loop
         self._socket = socket
         self._numbers = itertools.count(1)
 
-    def call(self, method: str, **params: Any) -> Any:
+    def call(self, method, **params):
         """Call a method of the protocol."""
         return self._loop.run_until_complete(asyncio.wait_for(self._call(method, params), _ANSWER_S))
 
-    def close(self) -> None:
+    def close(self):
         self._loop.run_until_complete(self._socket.close())
 
     async def _call(self, method: str, params: dict[str, Any]) -> Any:
@@ -125,7 +123,7 @@ class Line:
                 return message["result"]
             self._note(message.get("method"), message.get("params", {}))
 
-    def _note(self, event: str | None, params: dict[str, Any]) -> None:
+    def _note(self, event, params):
         """Take what came unasked."""
 
 
@@ -137,12 +135,12 @@ class Page(Line):
         requested: addresses of everything that it loaded.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, socket: aiohttp.ClientWebSocketResponse) -> None:
+    def __init__(self, loop, socket):
         super().__init__(loop, socket)
-        self.complaints: list[str] = []
-        self.requested: list[str] = []
+        self.complaints = []
+        self.requested = []
 
-    def resize(self, width: int, height: int) -> None:
+    def resize(self, width, height):
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -151,7 +149,7 @@ class Page(Line):
             mobile=False,
         )
 
-    def evaluate(self, expression: str) -> Any:
+    def evaluate(self, expression):
         """Give the value of an expression, as if it followed from a tap."""
         answer = self.call(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True, userGesture=True
@@ -160,27 +158,27 @@ class Page(Line):
             raise AssertionError(answer["exceptionDetails"])
         return answer["result"].get("value")
 
-    def _describe(self, expression: str) -> str:
+    def _describe(self, expression):
         where = self.evaluate("`${location.href}, ${document.readyState}`")
         return f"not true: {expression}; {where}; loaded {self.requested}; {self.complaints}"
 
-    def text(self, element: str) -> str:
+    def text(self, element):
         """Give the text of the element with this id."""
         return str(self.evaluate(f"document.getElementById({element!r})?.innerText ?? ''"))
 
-    def each(self, selector: str, name: str = "id") -> list[str]:
+    def each(self, selector, name="id"):
         """Give a property of every element that a selector finds."""
         found = f"[...document.querySelectorAll({selector!r})].map((each) => each[{name!r}])"
         return [str(value) for value in self.evaluate(found)]
 
-    def wait_until(self, expression: str, timeout_s: float = 40.0) -> None:
+    def wait_until(self, expression, timeout_s=40.0):
         """Wait until an expression is true."""
         deadline = time.monotonic() + timeout_s
         while not self.evaluate(expression):
             assert time.monotonic() < deadline, self._describe(expression)
             time.sleep(0.03)
 
-    def tap(self, element: str) -> None:
+    def tap(self, element):
         """Press the mouse on the middle of an element."""
         box = self.evaluate(
             f"(() => {{ const b = document.getElementById({element!r}).getBoundingClientRect();"
@@ -189,13 +187,13 @@ class Page(Line):
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=box[0], y=box[1], button="left", clickCount=1)
 
-    def screenshot(self) -> NDArray[np.uint8]:
+    def screenshot(self):
         """Take a picture of the page, BGR."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        picture: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         return np.asarray(picture, np.uint8)
 
-    def _note(self, event: str | None, params: dict[str, Any]) -> None:
+    def _note(self, event, params):
         if event == "Runtime.exceptionThrown":
             self.complaints.append(str(params["exceptionDetails"]))
         elif event == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):

@@ -1,7 +1,5 @@
 """States of a collection, and a page that shows them."""
 
-from collections.abc import Iterator
-from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -16,16 +14,16 @@ PRESENT_PX = np.array([[100, 80], [200, 80], [200, 180], [100, 180], [100, 80]],
 WANTED_PX = np.array([[400, 100], [560, 100], [560, 260], [400, 260], [400, 100]], float)
 
 
-def picture(level: int = 60) -> np.ndarray:
+def picture(level=60):
     """Grey, with the board's place brighter: (360, 640, 3)."""
     pixels = np.full((HEIGHT_PX, WIDTH_PX, 3), level, np.uint8)
     pixels[80:180, 100:200] = 200
     return pixels
 
 
-def state(**changes: Any) -> LiveState:
+def state(**changes):
     """A collection in its middle."""
-    given: dict[str, Any] = {
+    given = {
         "rig": "rlfs",
         "session": "session",
         "elapsed_s": 83.4,
@@ -53,11 +51,11 @@ def state(**changes: Any) -> LiveState:
 
 
 @pytest.fixture
-def preview() -> Iterator[Preview]:
+def preview():
     """A page for this computer alone, on any free port."""
     with Preview(port=0) as opened:
         yield opened
 
 
-def port_of(preview: Preview) -> int:
+def port_of(preview):
     return urlsplit(preview.urls[0]).port or 0

@@ -12,7 +12,7 @@ from .watcher import Watcher
 FILES = ("", "page.css", "page.js", "stage.js", "live", "nothing-here")
 
 
-def test_every_page_has_a_token_of_its_own() -> None:
+def test_every_page_has_a_token_of_its_own():
     with Preview("127.0.0.1", 0) as first, Preview("0.0.0.0", 0) as second:
         tokens = [preview.urls[0].partition("?token=")[2] for preview in (first, second)]
         assert all(re.fullmatch(r"[A-Za-z0-9_-]{12}", token) for token in tokens)
@@ -22,7 +22,7 @@ def test_every_page_has_a_token_of_its_own() -> None:
 @pytest.mark.parametrize(
     "query", ["", "?token=", "?token=wrong-one", "?token=abcdefg", "?token=abcdefghi", "?token=%FF"]
 )
-def test_without_the_token_there_is_nothing(query: str) -> None:
+def test_without_the_token_there_is_nothing(query):
     with Preview(port=0, token="abcdefgh") as preview, Watcher(preview.urls[0].partition("?")[0]) as watcher:
         preview.publish(state())
         for path in FILES:
@@ -31,7 +31,7 @@ def test_without_the_token_there_is_nothing(query: str) -> None:
             watcher.watch(query)
 
 
-def test_the_link_opens_the_page_and_its_cookie_all_it_loads() -> None:
+def test_the_link_opens_the_page_and_its_cookie_all_it_loads():
     with Preview(port=0, token="abcdefgh") as preview, Watcher(preview.urls[0]) as watcher:
         preview.publish(state())
         status, headers, content = watcher.get("?token=abcdefgh")
@@ -45,12 +45,12 @@ def test_the_link_opens_the_page_and_its_cookie_all_it_loads() -> None:
 
 
 @pytest.mark.parametrize("token", ["", "short", "with space", "a&b=cdefgh", "x" * 200])
-def test_a_token_that_cannot_be_part_of_a_link_is_refused(token: str) -> None:
+def test_a_token_that_cannot_be_part_of_a_link_is_refused(token):
     with pytest.raises(UsageError):
         Preview(token=token)
 
 
-def test_pages_may_load_nothing_from_elsewhere_and_are_not_framed_or_kept(preview: Preview) -> None:
+def test_pages_may_load_nothing_from_elsewhere_and_are_not_framed_or_kept(preview):
     with Watcher(preview.urls[0]) as watcher:
         for path in ("", "page.js", "nothing-here"):
             headers = watcher.get(path)[1]
@@ -64,6 +64,6 @@ def test_pages_may_load_nothing_from_elsewhere_and_are_not_framed_or_kept(previe
 @pytest.mark.parametrize(
     "path", ["../preview.py", "..%2Fpreview.py", "%2e%2e/preview.py", "page/index.html", "__init__.py"]
 )
-def test_only_files_of_the_page_are_served(preview: Preview, path: str) -> None:
+def test_only_files_of_the_page_are_served(preview, path):
     with Watcher(preview.urls[0]) as watcher:
         assert watcher.get(path)[0] == 404

@@ -26,7 +26,7 @@ from .conftest import port_of
         ("fe80::1:9000", "fe80::1:9000", 8765),
     ],
 )
-def test_addresses_are_read_as_people_write_them(text: str, host: str, port: int) -> None:
+def test_addresses_are_read_as_people_write_them(text, host, port):
     assert parse_address(text) == (host, port)
 
 
@@ -35,13 +35,13 @@ def test_addresses_are_read_as_people_write_them(text: str, host: str, port: int
     ["host:port", "host:70000", "1:2:3", "[::1", "[::1]9000", "[host]:1", "http://host:1", "a b", "host:-1",
      "host:8_0", "host:٣"],
 )  # fmt: skip
-def test_what_is_no_address_is_refused_with_examples(text: str) -> None:
+def test_what_is_no_address_is_refused_with_examples(text):
     with pytest.raises(UsageError) as caught:
         parse_address(text)
     assert "0.0.0.0:8765" in caught.value.hint
 
 
-def test_a_port_in_use_is_said_to_be() -> None:
+def test_a_port_in_use_is_said_to_be():
     with Preview(port=0) as first:
         port = port_of(first)
         with pytest.raises(UsageError) as caught:
@@ -52,13 +52,13 @@ def test_a_port_in_use_is_said_to_be() -> None:
 
 
 @pytest.mark.parametrize("host", ["192.0.2.7", "no-such-host.invalid", "a" * 70, "2001:db8::1"])
-def test_an_address_of_another_computer_is_refused(host: str) -> None:
+def test_an_address_of_another_computer_is_refused(host):
     with pytest.raises(UsageError) as caught:
         Preview(host, 0).start()
     assert caught.value.hint
 
 
-def test_links_lead_to_addresses_of_this_computer_that_others_reach() -> None:
+def test_links_lead_to_addresses_of_this_computer_that_others_reach():
     with listen("0.0.0.0", 0) as opened:
         port = opened.getsockname()[1]
         found = links(opened, "abcdefgh")
@@ -71,7 +71,7 @@ def test_links_lead_to_addresses_of_this_computer_that_others_reach() -> None:
                 pass  # only own addresses can be bound
 
 
-def test_the_link_of_an_ipv6_address_has_brackets() -> None:
+def test_the_link_of_an_ipv6_address_has_brackets():
     try:
         opened = listen("::1", 0)
     except UsageError:

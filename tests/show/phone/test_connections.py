@@ -4,7 +4,6 @@ import contextlib
 import gc
 import socket
 import time
-from collections.abc import Iterator
 
 import pytest
 
@@ -23,7 +22,7 @@ HALF = {
 
 
 @contextlib.contextmanager
-def connected(preview: Preview, n: int) -> Iterator[list[socket.socket]]:
+def connected(preview, n):
     with contextlib.ExitStack() as stack:
         lines = [stack.enter_context(socket.socket()) for _ in range(n)]
         for line in lines:
@@ -32,7 +31,7 @@ def connected(preview: Preview, n: int) -> Iterator[list[socket.socket]]:
         yield lines
 
 
-def is_ended(line: socket.socket, within_s: float = 0.0) -> bool:
+def is_ended(line, within_s=0.0):
     line.settimeout(within_s)
     try:
         while line.recv(65536):
@@ -44,11 +43,11 @@ def is_ended(line: socket.socket, within_s: float = 0.0) -> bool:
     return True
 
 
-def n_open(lines: list[socket.socket]) -> int:
+def n_open(lines):
     return sum(not is_ended(line) for line in lines)
 
 
-def test_strangers_have_so_many_connections_and_for_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strangers_have_so_many_connections_and_for_so_long(monkeypatch):
     monkeypatch.setattr(pages, "CONNECTION_S", 1.5)
     with Preview(port=0) as preview, Watcher(preview.urls[0]) as early:
         early.watch()
@@ -66,7 +65,7 @@ def test_strangers_have_so_many_connections_and_for_so_long(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("sent", HALF.values(), ids=HALF)
-def test_what_is_sent_half_ends_in_time(monkeypatch: pytest.MonkeyPatch, sent: bytes) -> None:
+def test_what_is_sent_half_ends_in_time(monkeypatch, sent):
     monkeypatch.setattr(pages, "CONNECTION_S", 0.5)
     with Preview(port=0) as preview, connected(preview, 1) as (line,):
         line.sendall(sent)
@@ -77,7 +76,7 @@ def test_what_is_sent_half_ends_in_time(monkeypatch: pytest.MonkeyPatch, sent: b
                 line.sendall(b"x" if sent else b"")
 
 
-def test_a_page_that_shows_nothing_makes_way(preview: Preview, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_that_shows_nothing_makes_way(preview, monkeypatch):
     monkeypatch.setattr(pages, "ANSWER_S", 0.3)
     with Watcher(preview.urls[0]) as asleep, Watcher(preview.urls[0]) as awake:
         asleep.watch()
@@ -89,7 +88,7 @@ def test_a_page_that_shows_nothing_makes_way(preview: Preview, monkeypatch: pyte
         assert any(isinstance(asleep.receive(), int) for _ in range(6))
 
 
-def test_connections_that_arrive_while_it_closes_are_closed() -> None:
+def test_connections_that_arrive_while_it_closes_are_closed():
     for _ in range(20):
         with contextlib.ExitStack() as stack:
             with Preview(port=0) as preview:
@@ -99,10 +98,8 @@ def test_connections_that_arrive_while_it_closes_are_closed() -> None:
     gc.collect()
 
 
-def test_a_page_that_fails_altogether_ends_alone(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def broken(_pages: Pages) -> None:
+def test_a_page_that_fails_altogether_ends_alone(monkeypatch, caplog):
+    def broken(_pages):
         raise RuntimeError("broken")
 
     monkeypatch.setattr(Pages, "application", broken)

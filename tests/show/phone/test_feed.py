@@ -17,7 +17,7 @@ from .conftest import PRESENT_PX, picture, port_of, state
 from .watcher import Watcher
 
 
-def ask_for_states(port: int, query: str) -> bytes:
+def ask_for_states(port, query):
     return (
         f"GET /live?{query} HTTP/1.1\r\nHost: localhost:{port}\r\n"
         "Upgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -25,7 +25,7 @@ def ask_for_states(port: int, query: str) -> bytes:
     )
 
 
-def test_all_of_a_state_arrives(preview: Preview) -> None:
+def test_all_of_a_state_arrives(preview):
     present = PRESENT_PX + 0.04
     present[1] = np.nan
     sent = state(sigma_deg=float("nan"), drawing=Drawing("cam", picture(), present, None, True), hold_s=1.5)
@@ -62,7 +62,7 @@ def test_all_of_a_state_arrives(preview: Preview) -> None:
         ((1, 5000), (1, 833)),
     ],
 )
-def test_pictures_are_made_small_enough_for_a_phone(shape: tuple[int, ...], size: tuple[int, int]) -> None:
+def test_pictures_are_made_small_enough_for_a_phone(shape, size):
     pixels = np.zeros(shape, np.uint8)
     pixels[: shape[0] // 2] = 200
     decoded = cv2.imdecode(np.frombuffer(encode_picture(pixels), np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -72,7 +72,7 @@ def test_pictures_are_made_small_enough_for_a_phone(shape: tuple[int, ...], size
     assert abs(decoded.mean() - pixels.mean()) < 2
 
 
-def test_pictures_are_compressed_while_somebody_looks_and_once_for_all(preview: Preview) -> None:
+def test_pictures_are_compressed_while_somebody_looks_and_once_for_all(preview):
     for level in range(20):
         preview.publish(state(drawing=Drawing("cam", picture(level))))
     assert preview.n_pictures == 0
@@ -91,7 +91,7 @@ def test_pictures_are_compressed_while_somebody_looks_and_once_for_all(preview: 
         assert preview.n_pictures == 2
 
 
-def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pages(preview: Preview) -> None:
+def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pages(preview):
     big = [np.random.default_rng(k).integers(0, 255, (720, 1280, 3), np.uint8) for k in range(5)]
     with Watcher(preview.urls[0]) as stuck, Watcher(preview.urls[0]) as quick:
         stuck.watch()
@@ -112,7 +112,7 @@ def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pag
         assert sum(isinstance(message, dict) for message in got) <= MAX_UNDER_WAY
 
 
-def test_a_page_that_vanished_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_that_vanished_is_forgotten(monkeypatch):
     monkeypatch.setattr(pages, "HEARTBEAT_S", 0.2)
     monkeypatch.setattr(pages, "MAX_VIEWERS", 1)
     with Preview(port=0) as preview, Watcher(preview.urls[0]) as watcher:
@@ -133,7 +133,7 @@ def test_a_page_that_vanished_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> N
         assert watcher.next_state()[0]["n_captures"] == 7
 
 
-def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview: Preview) -> None:
+def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview):
     with Watcher(preview.urls[0]) as watcher:
         watcher.watch()
         preview.publish(state(last_capture="000006"))
@@ -155,7 +155,7 @@ def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview: Preview) -> N
      '{"shown": 0, "visible": 1}', '{"shown": -1, "visible": true}', "[" * 200, "x" * 5000,
      '{"take_back": 6}', '{"take_back": "../../etc"}', '{"take_back": ""}', "7", '"take_back"'],
 )  # fmt: skip
-def test_what_no_page_sends_ends_its_connection_only(preview: Preview, text: str) -> None:
+def test_what_no_page_sends_ends_its_connection_only(preview, text):
     with Watcher(preview.urls[0]) as odd, Watcher(preview.urls[0]) as other:
         odd.watch()
         odd.send(text)
@@ -165,7 +165,7 @@ def test_what_no_page_sends_ends_its_connection_only(preview: Preview, text: str
         assert other.next_state()[0]["n_captures"] == 7
 
 
-def test_noise_on_the_port_is_survived_in_silence(preview: Preview, caplog: pytest.LogCaptureFixture) -> None:
+def test_noise_on_the_port_is_survived_in_silence(preview, caplog):
     port = port_of(preview)
     random = np.random.default_rng(1)
     said = [random.bytes(300) for _ in range(20)]
@@ -184,7 +184,7 @@ def test_noise_on_the_port_is_survived_in_silence(preview: Preview, caplog: pyte
     assert not caplog.records
 
 
-def test_pages_have_the_last_state_when_the_collection_ends() -> None:
+def test_pages_have_the_last_state_when_the_collection_ends():
     preview = Preview(port=0)
     with Watcher(preview.start()) as watcher:
         watcher.watch()
@@ -202,7 +202,7 @@ def test_pages_have_the_last_state_when_the_collection_ends() -> None:
     preview.close()
 
 
-def test_closing_does_not_wait_for_pages_whose_line_is_full() -> None:
+def test_closing_does_not_wait_for_pages_whose_line_is_full():
     preview = Preview(port=0)
     query = preview.start().partition("?")[2]
     port = port_of(preview)

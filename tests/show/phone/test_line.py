@@ -4,12 +4,11 @@ import pytest
 
 from lce_rig.show.phone.preview import Preview
 
-from .browser import Browser
 from .conftest import port_of
 from .screen import OPEN, has_text, shown
 
 
-def test_it_says_that_the_line_is_lost_and_finds_back(browser: Browser) -> None:
+def test_it_says_that_the_line_is_lost_and_finds_back(browser):
     first = Preview(port=0, token="one-token")
     page = browser.open(first.start())
     port = port_of(first)
@@ -32,7 +31,7 @@ def test_it_says_that_the_line_is_lost_and_finds_back(browser: Browser) -> None:
 
 
 @pytest.mark.long
-def test_a_line_that_falls_silent_is_opened_anew(preview: Preview, browser: Browser) -> None:
+def test_a_line_that_falls_silent_is_opened_anew(preview, browser):
     counting = """
       const Plain = WebSocket;
       window.lines = [];
@@ -47,7 +46,7 @@ def test_a_line_that_falls_silent_is_opened_anew(preview: Preview, browser: Brow
     shown(preview, page, has_text("count", "9"), n_captures=9)
 
 
-def test_it_says_when_the_collection_has_no_news_and_when_it_has_ended(browser: Browser) -> None:
+def test_it_says_when_the_collection_has_no_news_and_when_it_has_ended(browser):
     preview = Preview(port=0)
     page = browser.open(preview.start())
     shown(preview, page, has_text("count", "7"))
@@ -63,7 +62,7 @@ def test_it_says_when_the_collection_has_no_news_and_when_it_has_ended(browser: 
 
 
 @pytest.mark.long
-def test_an_old_link_is_said_to_be_old(browser: Browser) -> None:
+def test_an_old_link_is_said_to_be_old(browser):
     first = Preview(port=0, token="first-token")
     page = browser.open(first.start())
     shown(first, page, has_text("count", "7"))

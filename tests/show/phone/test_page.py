@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.live.state import Drawing, StreamState
-from lce_rig.show.phone.preview import Preview
 
-from .browser import Browser, Page
 from .conftest import HEIGHT_PX, PRESENT_PX, WANTED_PX, WIDTH_PX, picture, state
 from .screen import has_text, shown
 
@@ -26,7 +24,7 @@ _ON_SCREEN = """(() => {
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_a_state_is_on_the_screen_whole(preview: Preview, browser: Browser, width: int, height: int) -> None:
+def test_a_state_is_on_the_screen_whole(preview, browser, width, height):
     page = browser.open(preview.urls[0], width, height)
     shown(preview, page, has_text("headline", "one step left, 0.5 m closer"))
     assert page.text("phase") == "move"
@@ -61,9 +59,7 @@ def test_a_state_is_on_the_screen_whole(preview: Preview, browser: Browser, widt
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_outlines_lie_where_the_boards_are_in_the_picture(
-    preview: Preview, browser: Browser, width: int, height: int
-) -> None:
+def test_outlines_lie_where_the_boards_are_in_the_picture(preview, browser, width, height):
     page = browser.open(preview.urls[0], width, height)
     shown(preview, page, "document.querySelector('#wanted .ink') !== null")
     for is_mirrored in (True, False):
@@ -72,7 +68,7 @@ def test_outlines_lie_where_the_boards_are_in_the_picture(
     assert not page.complaints
 
 
-def _compare_with_picture(page: Page, is_mirrored: bool) -> None:
+def _compare_with_picture(page, is_mirrored):
     found = np.array(page.evaluate(_ON_SCREEN % "present"))
     wanted = np.array(page.evaluate(_ON_SCREEN % "wanted"))
     page.evaluate("document.querySelectorAll('#outlines, #legend').forEach((each) => each.style.opacity = 0)")
@@ -94,7 +90,7 @@ def _compare_with_picture(page: Page, is_mirrored: bool) -> None:
     assert (wanted[:, 0].mean() < found[:, 0].mean()) == is_mirrored
 
 
-def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview: Preview, browser: Browser) -> None:
+def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview, browser):
     page = browser.open(preview.urls[0])
     tip = "document.querySelector('#arrow .head')?.getAttribute('d').split('L')[0]"
     # From (150, 130) towards (480, 180), whose outline begins at x = 400.
@@ -106,7 +102,7 @@ def test_an_arrow_leads_to_the_place_until_the_board_is_there(preview: Preview, 
     assert page.each("#arrow path") == []
 
 
-def test_the_last_capture_is_taken_back_by_a_tap(preview: Preview, browser: Browser) -> None:
+def test_the_last_capture_is_taken_back_by_a_tap(preview, browser):
     page = browser.open(preview.urls[0], 390, 844)
     shown(preview, page, has_text("take_back", "take back\n000006"), last_capture="000006")
     page.tap("take_back")
@@ -119,7 +115,7 @@ def test_the_last_capture_is_taken_back_by_a_tap(preview: Preview, browser: Brow
     assert not page.complaints
 
 
-def test_the_countdown_runs_while_the_board_is_held(preview: Preview, browser: Browser) -> None:
+def test_the_countdown_runs_while_the_board_is_held(preview, browser):
     page = browser.open(preview.urls[0])
     offset = "Number(document.getElementById('ring').style.strokeDashoffset)"
     shown(preview, page, "!document.getElementById('countdown').hidden", phase="holding", hold_s=2.0)
@@ -131,7 +127,7 @@ def test_the_countdown_runs_while_the_board_is_held(preview: Preview, browser: B
     assert page.evaluate("document.body.dataset.phase") == "saving"
 
 
-def test_what_sensors_say_is_text_and_not_markup(preview: Preview, browser: Browser) -> None:
+def test_what_sensors_say_is_text_and_not_markup(preview, browser):
     page = browser.open(preview.urls[0])
     evil = "<img src=x onerror=alert(1)><b>bold</b>"
     stream = StreamState(evil, reason=evil, figures=evil)

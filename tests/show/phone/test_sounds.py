@@ -5,14 +5,12 @@ import time
 import pytest
 
 from lce_rig.collect.live.state import Cue
-from lce_rig.show.phone.preview import Preview
 
-from .browser import Browser
 from .conftest import state
 from .screen import OPEN, has_text, shown
 
 
-def test_sounds_are_played_once_each_after_a_tap(preview: Preview, browser: Browser) -> None:
+def test_sounds_are_played_once_each_after_a_tap(preview, browser):
     counting = """
       window.tones = [];
       const make = AudioContext.prototype.createOscillator;
@@ -43,9 +41,7 @@ def test_sounds_are_played_once_each_after_a_tap(preview: Preview, browser: Brow
 
 
 @pytest.mark.long
-def test_the_voice_reads_settled_instructions_once_and_is_quiet_while_the_board_is_held(
-    preview: Preview, browser: Browser
-) -> None:
+def test_the_voice_reads_settled_instructions_once_and_is_quiet_while_the_board_is_held(preview, browser):
     # Headless browsers have no voices: this one remembers what it is told to say.
     listening = """
       window.said = [];
@@ -59,7 +55,7 @@ def test_the_voice_reads_settled_instructions_once_and_is_quiet_while_the_board_
     page = browser.open(preview.urls[0], first=listening)
     page.wait_until(OPEN)
 
-    def stand(headline: str, phase: str, duration_s: float) -> None:
+    def stand(headline, phase, duration_s):
         end_s = time.monotonic() + duration_s
         while time.monotonic() < end_s:
             preview.publish(state(headline=headline, phase=phase, drawing=None))

@@ -11,17 +11,15 @@ import aiohttp
 class Watcher:
     """One client with its own cookies; closed at the end of its `with` block."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url):
         self.url, _, query = url.partition("?")
         self._loop = asyncio.new_event_loop()
         self._http = self._run(_client())
-        self.socket: Any = None
+        self.socket = None
         if query:
             self.get(f"?{query}")  # the link leaves a cookie
 
-    def get(
-        self, path: str = "", headers: Mapping[str, str] | None = None
-    ) -> tuple[int, Mapping[str, str], bytes]:
+    def get(self, path="", headers=None):
         """Give status, headers and content."""
 
         async def ask() -> tuple[int, Mapping[str, str], bytes]:
@@ -30,7 +28,7 @@ class Watcher:
 
         return self._run(ask())
 
-    def watch(self, query: str = "", headers: Mapping[str, str] | None = None) -> None:
+    def watch(self, query="", headers=None):
         """Open the connection that feeds the page.
 
         Raises:
@@ -40,7 +38,7 @@ class Watcher:
             self._http.ws_connect(f"{self.url}live{query}", headers=headers, max_msg_size=0)
         )
 
-    def receive(self, timeout_s: float = 5.0) -> Any:
+    def receive(self, timeout_s=5.0):
         """Give the next message: a document, bytes, or the number with which the connection was closed."""
         message = self._run(self.socket.receive(timeout_s))
         if message.type is aiohttp.WSMsgType.TEXT:
@@ -49,9 +47,9 @@ class Watcher:
             return message.data
         return message.data if message.type is aiohttp.WSMsgType.CLOSE else self.socket.close_code
 
-    def receive_all(self, quiet_s: float) -> list[Any]:
+    def receive_all(self, quiet_s):
         """Give what comes until nothing has come for so long, without beats."""
-        found: list[Any] = []
+        found = []
         while True:
             try:
                 message = self.receive(quiet_s)
@@ -62,7 +60,7 @@ class Watcher:
             if not (isinstance(message, dict) and message.get("beat")):
                 found.append(message)
 
-    def next_state(self, visible: bool = True) -> tuple[dict[str, Any], bytes | None]:
+    def next_state(self, visible=True):
         """Give the next state and its picture, and answer that it is on the screen."""
         while "beat" in (state := self.receive()):
             pass
@@ -71,22 +69,22 @@ class Watcher:
         self.answer(state["update"], visible)
         return state, jpeg
 
-    def answer(self, shown: int, visible: bool = True) -> None:
+    def answer(self, shown, visible=True):
         self.send(json.dumps({"shown": shown, "visible": visible}))
 
-    def send(self, text: str) -> None:
+    def send(self, text):
         self._run(self.socket.send_str(text))
 
-    def __enter__(self) -> "Watcher":
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         if self.socket is not None:
             self._run(self.socket.close())
         self._run(self._http.close())
         self._loop.close()
 
-    def _run(self, work: Any) -> Any:
+    def _run(self, work):
         async def within() -> Any:
             return await asyncio.wait_for(work, 10)
 

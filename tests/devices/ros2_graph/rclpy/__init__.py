@@ -8,8 +8,6 @@ import os
 import select
 import socket
 import struct
-from collections.abc import Callable
-from typing import Any, BinaryIO
 
 
 class Context:
@@ -18,39 +16,37 @@ class Context:
     is_open = False
 
 
-def init(*, context: Context) -> None:
+def init(*, context):
     context.is_open = True
 
 
-def try_shutdown(*, context: Context) -> None:
+def try_shutdown(*, context):
     context.is_open = False
 
 
 class Node:
     """A member: knows the topics, and receives what it has subscribed to."""
 
-    def __init__(self, name: str, context: Context) -> None:
+    def __init__(self, name, context):
         assert context.is_open and name.isidentifier()
         self._socket = socket.create_connection(("127.0.0.1", int(os.environ["ROS_GRAPH_PORT"])))
-        self._stream: BinaryIO = self._socket.makefile("rb")
-        self._topics: dict[str, list[str]] = json.loads(self._stream.readline())
-        self._receivers: dict[str, Callable[[bytes], None]] = {}
+        self._stream = self._socket.makefile("rb")
+        self._topics = json.loads(self._stream.readline())
+        self._receivers = {}
 
-    def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
+    def get_topic_names_and_types(self):
         return list(self._topics.items())
 
-    def create_subscription(
-        self, msg_type: Any, topic: str, callback: Callable[[bytes], None], qos_profile: Any, *, raw: bool
-    ) -> None:
+    def create_subscription(self, msg_type, topic, callback, qos_profile, *, raw):
         assert raw and self._topics[topic] == [msg_type.name] and qos_profile == "best effort"
         self._receivers[topic] = callback
         self._socket.sendall(b"go\n")
 
-    def destroy_node(self) -> None:
+    def destroy_node(self):
         self._stream.close()
         self._socket.close()
 
-    def receive(self, timeout_s: float) -> None:
+    def receive(self, timeout_s):
         if select.select([self._socket], [], [], timeout_s)[0]:
             head = self._stream.read(8)
             if len(head) < 8:
@@ -61,5 +57,5 @@ class Node:
                 self._receivers[topic](data)
 
 
-def create_node(name: str, *, context: Context) -> Node:
+def create_node(name, *, context):
     return Node(name, context)

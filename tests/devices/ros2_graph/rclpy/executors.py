@@ -1,19 +1,17 @@
 """See `rclpy`."""
 
-import rclpy
-
 
 class SingleThreadedExecutor:
     """Calls the receivers of its node, one message a time."""
 
-    def __init__(self, *, context: rclpy.Context) -> None:
+    def __init__(self, *, context):
         assert context.is_open
 
-    def add_node(self, node: rclpy.Node) -> None:
+    def add_node(self, node):
         self._node = node
 
-    def spin_once(self, timeout_sec: float) -> None:
+    def spin_once(self, timeout_sec):
         self._node.receive(timeout_sec)
 
-    def shutdown(self) -> None:
+    def shutdown(self):
         pass
