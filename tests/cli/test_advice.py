@@ -53,6 +53,7 @@ def _advised():
 
 
 ADVISED = sorted(set(_advised()))
+assert len(ADVISED) > 20
 
 
 def _lacking(command):
@@ -94,11 +95,6 @@ def test_an_action_takes_one_line_of_a_terminal():
                 assert len(filled) <= 80 - 7, (kind.code, action)
 
 
-def test_commands_are_found():
-    verbs = {command.split()[0] for _, command in ADVISED}
-    assert {"calibrate", "check", "collect", "intrinsics", "drift", "doctor", "rigs"} <= verbs
-
-
 @pytest.mark.parametrize(("place", "command"), ADVISED)
 def test_an_advised_command_can_be_typed(place, command):
     assert _lacking(command) == ""
@@ -119,19 +115,7 @@ _VALUES = {
     "--restore": "000001",
     "-o": "new",
 }
-_PLACEHOLDERS = {
-    "X",
-    "R",
-    "RIG",
-    "FILE",
-    "FOLDER",
-    "NAME",
-    "TARGET",
-    "ROOT",
-    "SESSION",
-    "OTHER_SESSION",
-    "RECORDING",
-}
+_PLACEHOLDER = re.compile("X|R|RIG|FILE|FOLDER|NAME|TARGET|ROOT|SESSION|OTHER_SESSION|RECORDING")
 
 
 def _typed(command):
@@ -141,7 +125,7 @@ def _typed(command):
     typed = []
     for word in words:
         before = typed[-1] if typed else ""
-        if word not in _PLACEHOLDERS:
+        if not _PLACEHOLDER.fullmatch(word):
             value = word
         elif before in _VALUES:
             value = _VALUES[before]
@@ -186,9 +170,7 @@ def workbench():
         calls("captures", session, "--reject", "000001")
         calls("calibrate", session, "--robot", "kestrel")
         shutil.copytree(session, folder / "sessions" / "other")
-        calls(
-            "simulate", "--rig", rig, folder / "other", "--captures", "10", "--seed", "4", "--mounting", "3"
-        )
+        calls("simulate", "--rig", rig, folder / "other", "--captures", 10, "--seed", 4, "--mounting", 3)
         wrong = folder / "wrong.yaml"
         # A focal length 3 % too long.
         wrong.write_text(re.sub(r"(f[xy]_px): [0-9.]+", r"\1: 924.0", rig.read_text()))

@@ -27,10 +27,8 @@ def test_the_block_that_it_prints_is_that_of_a_new_profile(lce_rig, tmp_path, wo
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
     settings = BoardSettings.model_validate(yaml.safe_load(outcome.out)["board"])
     profile = tmp_path / "mine.yaml"
-    assert (
-        lce_rig("rigs", "new", "mine", "--from", "rlfs", "--board", f"{board},0.8x0.7", "-o", profile).code
-        == 0
-    )
+    new = lce_rig("rigs", "new", "mine", "--from", "rlfs", "--board", f"{board},0.8x0.7", "-o", profile)
+    assert new.code == 0
     assert load_rig(profile).board.to_board() == settings.to_board()
     assert BoardSettings.model_validate(board_block(settings.to_board())).to_board() == settings.to_board()
     # And back to a checkerboard.

@@ -72,7 +72,7 @@ def test_a_page_that_cannot_be_served_is_said_before_anything_is_made(lce_rig, t
 
 def start(path, *arguments, rig="rles", **options):
     command = [sys.executable, "-m", "lce_rig", "collect", "--rig", rig, str(path), "--simulated", *arguments]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload, no-any-return]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
 
 
 @pytest.mark.long
@@ -90,7 +90,6 @@ def test_the_simulated_rig_is_guided_to_captures_with_truth_beside_them(tmp_path
     expected = truth_extrinsics(load_rig(rig), 0)[camera, "lidar"]
     assert np.allclose(truth["T_cam_lidar"], expected)
     assert "2 captures (2 new)" in said and "holding:" in said
-    assert "lce-rig calibrate" not in said
 
 
 @pytest.mark.long

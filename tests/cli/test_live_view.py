@@ -44,9 +44,7 @@ STATE = LiveState(
 def drawn(state, links=(), width=80, height=24):
     console = Console(width=width, height=height, file=io.StringIO(), force_terminal=False)
     console.print(render(state, links=links, height=height, width=width))
-    out = console.file
-    assert isinstance(out, io.StringIO)
-    return out.getvalue().rstrip("\n").split("\n")
+    return console.file.getvalue().rstrip("\n").split("\n")
 
 
 def test_everything_fits_into_80_by_24():
@@ -54,17 +52,8 @@ def test_everything_fits_into_80_by_24():
     assert len(lines) <= 24
     assert max(len(line) for line in lines) <= 80
     text = "\n".join(lines)
-    for wanted in (
-        "HOLD STILL",
-        "1.2 s",
-        "7 of 15",
-        "come 0.8 m closer",
-        "3 lost",
-        "1.20M/s",
-        "below 0.12 deg",
-    ):
+    for wanted in ("HOLD STILL", "1.2 s", "7 of 15", "0.8 m", "3 lost", "1.20M/s", "0.12 deg", "01:04"):
         assert wanted in text
-    assert "01:04 not captured" in text and "boards must" in text and "q stop" in text
 
 
 def test_of_several_cameras_the_picture_says_whose_it_is():
@@ -105,11 +94,10 @@ def test_no_sentence_is_cut_and_a_wide_terminal_has_a_larger_drawing(width, heig
 
 
 def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same():
-    bare = replace(
-        STATE, drawing=None, coverage=None, sigma_deg=np.nan, sigma_mm=np.nan, hold_s=None, streams=()
-    )
-    text = "\n".join(drawn(bare))
-    assert "rotation   -" in text and "HOLD STILL" in text
+    nothing = {"drawing": None, "coverage": None, "sigma_deg": np.nan, "sigma_mm": np.nan, "hold_s": None}
+    assert "HOLD STILL" in "\n".join(drawn(replace(STATE, streams=(), **nothing)))
+    beyond = np.array([[-500.0, 100.0], [np.nan, np.nan], [3000, 400], [100, 5000], [-500, 100]])
+    assert len(draw_outlines((346, 260), beyond, beyond, (40, 9))) == 9
 
 
 def test_the_bell_rings_once_for_a_capture_and_twice_for_a_refused_one_apart_in_time():
@@ -155,16 +143,8 @@ def test_plain_lines_say_what_changes_once(capsys):
     view.show(moving)
     view.show(replace(moving, elapsed_s=75.4, headline="30 cm left"))
     view.show(replace(moving, elapsed_s=79.0, headline="20 cm left", detail="2 rings"))
-    view.show(
-        replace(
-            moving,
-            elapsed_s=79.1,
-            headline="20 cm left",
-            cues=(Cue(1, "captured"),),
-            log=("01:19 captured 000001",),
-            n_logged=1,
-        )
-    )
+    captured = {"cues": (Cue(1, "captured"),), "log": ("01:19 captured 000001",), "n_logged": 1}
+    view.show(replace(moving, elapsed_s=79.1, headline="20 cm left", **captured))
     # A message without a sound, such as a sensor that is back, is said as well.
     told = ("01:19 captured 000001", "01:19 lidar is back")
     view.show(replace(moving, elapsed_s=79.2, phase="ended", headline="over", log=told, n_logged=2))
@@ -176,12 +156,7 @@ def test_plain_lines_say_what_changes_once(capsys):
     assert tuple(lines[3:]) == told
 
 
-def test_outlines_that_leave_the_picture_or_the_lens_break_nothing():
-    beyond = np.array([[-500.0, 100.0], [np.nan, np.nan], [3000, 400], [100, 5000], [-500, 100]])
-    assert len(draw_outlines((346, 260), beyond, beyond, (40, 9))) == 9
-
-
-def test_the_drawing_keeps_its_size_when_the_first_prediction_arrives() -> None:
+def test_the_drawing_keeps_its_size_when_the_first_prediction_arrives():
     before = replace(STATE, goes_on="", notes=("boards must stand still: no sync board",), log=())
     after = replace(before, goes_on="captures to go: 10 (minimum 6, below 0.18 deg, 9 mm)")
     borders = [[line.find("┌") for line in drawn(state)] for state in (before, after)]

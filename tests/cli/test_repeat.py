@@ -70,9 +70,7 @@ def test_sessions_that_disagree_exit_with_7_and_the_odd_one_is_named(lce_rig, ma
         made("tuesday", [0.001] * 6),
         made("moved", [0.02, 0, 0, 0, 0.01, 0]),
     ]
-    outcome = lce_rig("repeat", *sessions, "--json")
-    assert outcome.code == 7
-    document = json.loads(outcome.out)["pairs"][0]
+    document = compared(lce_rig, *sessions, code=7)["pairs"][0]
     assert not document["agrees"]
     assert document["odd_one"] == "moved"
     found = document["finding"]
@@ -89,36 +87,27 @@ def test_a_session_alone_or_twice_is_a_usage_error(lce_rig, made):
     assert outcome.code == 2
 
 
-def test_a_copy_is_no_second_session(lce_rig, made, tmp_path):
-    a = made("monday", [0] * 6)
-    shutil.copytree(a, tmp_path / "copy")
-    outcome = lce_rig("repeat", a, tmp_path / "copy")
-    assert outcome.code == 4
-    assert "monday" in outcome.err and "copy" in outcome.err
-
-
-def test_a_picture_in_two_sessions_makes_them_one(lce_rig, made):
+def test_a_copy_and_a_picture_in_two_sessions_make_them_one(lce_rig, made, tmp_path):
     paths = {name: made(name, [0] * 6) for name in ("monday", "wednesday")}
     assert lce_rig("repeat", paths["monday"], paths["wednesday"]).code == 0
     pixels = np.full((260, 346), 80, np.uint8)
     for name, stamp_ns in (("monday", 1), ("wednesday", None)):
         with Session.open(paths[name], writable=True) as session:
             session.add_capture([Image("davis", "frames", stamp_ns, pixels)], [], {})
-    outcome = lce_rig("repeat", paths["monday"], paths["wednesday"])
-    assert outcome.code == 4
-    assert "monday" in outcome.err and "wednesday" in outcome.err
+    paths["copy"] = shutil.copytree(paths["monday"], tmp_path / "copy")
+    for other in ("wednesday", "copy"):
+        outcome = lce_rig("repeat", paths["monday"], paths[other])
+        assert outcome.code == 4
+        assert "monday" in outcome.err and other in outcome.err
 
 
 def test_other_rigs_and_other_lenses_are_refused_and_another_board_is_remarked(lce_rig, made):
     a = made("monday", [0] * 6)
     other = made("other", [0] * 6, set_value(RLES, "name", "rles02"))
-    outcome = lce_rig("repeat", a, other)
-    assert outcome.code == 4
-    assert "'rles'" in outcome.err and "'rles02'" in outcome.err
     refocused = made("refocused", [0] * 6, set_value(RLES, "cameras.davis.intrinsics.fx_px", "355.0"))
-    outcome = lce_rig("repeat", a, refocused)
-    assert outcome.code == 4
-    assert "cameras.davis.intrinsics.fx_px" in outcome.err
+    for session, named in ((other, "'rles02'"), (refocused, "cameras.davis.intrinsics.fx_px")):
+        outcome = lce_rig("repeat", a, session)
+        assert outcome.code == 4 and named in outcome.err
     board = made("board", [0.001] * 6, set_value(RLES, "board.width_m", "0.81"))
     (found,) = compared(lce_rig, a, board)["findings"]
     assert (found["code"], found["subject"]) == ("repeat.other_board", "board")
@@ -142,14 +131,10 @@ def test_a_session_that_cannot_be_calibrated_is_named(lce_rig, made, tmp_path):
     a = made("monday", [0] * 6)
     with Session.create(tmp_path / "empty", load_rig("rles")):
         pass
-    outcome = lce_rig("repeat", a, tmp_path / "empty")
-    assert outcome.code == 6
-    assert "empty:" in outcome.err
-    uncalibrated = made("unfinished", [0] * 6)
-    shutil.rmtree(uncalibrated / "calibration")
-    outcome = lce_rig("repeat", a, uncalibrated)
-    assert outcome.code == 6
-    assert "unfinished:" in outcome.err
+    shutil.rmtree(made("unfinished", [0] * 6) / "calibration")
+    for name in ("empty", "unfinished"):
+        outcome = lce_rig("repeat", a, tmp_path / name)
+        assert outcome.code == 6 and f"{name}:" in outcome.err
 
 
 def test_a_damaged_result_names_its_file(lce_rig, made):
