@@ -76,7 +76,6 @@ class Inbox(Generic[T]):
         self._n_waiting: Counter[str] = Counter()
         self._items: deque[tuple[str, T]] = deque()
         self._is_closed = False
-        self._error: SourceError | None = None
         self._changed = threading.Condition()
 
     def put(self, sender: str, items: Iterable[T], n_slots: int = _N_SLOTS) -> None:
@@ -99,28 +98,21 @@ class Inbox(Generic[T]):
                 self.n_put[sender] += 1
             self._changed.notify()
 
-    def close(self, error: SourceError | None = None) -> None:
-        """End the queue: items in it can still be taken, then `error` is raised if there is one."""
+    def close(self) -> None:
+        """End the queue: items in it can still be taken, and nothing is waited for."""
         with self._changed:
             self._is_closed = True
-            self._error = self._error or error
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> tuple[str, T] | None:
-        """Take the oldest item with its sender; None where nothing came in time, or the queue has ended.
-
-        Raises:
-            SourceError: the reader failed, and all that it read before has been taken.
-        """
+        """Take the oldest item with its sender; None where nothing came in time, or the queue has ended."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._is_closed, timeout_s)
-            if self._items:
-                sender, item = self._items.popleft()
-                self._n_waiting[sender] -= 1
-                return sender, item
-            if self._error is not None:
-                raise self._error
-            return None
+            if not self._items:
+                return None
+            sender, item = self._items.popleft()
+            self._n_waiting[sender] -= 1
+            return sender, item
 
 
 class RateMeter:

@@ -7,7 +7,7 @@ from types import TracebackType
 
 from lce_rig.collect.event_pictures import with_event_pictures
 from lce_rig.core.data import Sample
-from lce_rig.core.errors import LceRigError, SourceError
+from lce_rig.core.errors import LceRigError
 from lce_rig.core.findings import Losses
 from lce_rig.devices.reading import AttachedSensors, Inbox
 from lce_rig.devices.sync_board import SyncBoard
@@ -101,7 +101,7 @@ class FrameFeed:
                 self._frames.put("pairs", [frame], n_slots=1)
         except BaseException as error:  # The taker of frames learns of bugs as well.
             self._failure = error
-            self._frames.close(error if isinstance(error, SourceError) else None)
+            self._frames.close()
             if not isinstance(error, LceRigError):
                 raise
 

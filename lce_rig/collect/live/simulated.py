@@ -62,6 +62,8 @@ class SimulatedSource(LiveSource):
     def read(self) -> list[Image | Scan]:
         """Give what the simulation has put; see `LiveSource`."""
         came = self._taken.take(_WAIT_S)
+        if came is None and self._failure is not None:
+            raise self._failure
         return [] if came is None else [came[1]]
 
     def close(self) -> None:
@@ -80,7 +82,7 @@ class SimulatedSource(LiveSource):
     def fail(self, error: SourceError) -> None:
         """End for good."""
         self._failure = error
-        self._taken.close(error)
+        self._taken.close()
 
 
 class SimulatedRig:

@@ -143,7 +143,9 @@ def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path)
     (tmp_path / "a.txt").write_text("\n".join(lines) + "\n1700000000.1 3")
     recording = open_events(tmp_path / "a.txt", resolution=(346, 260))
     assert everything(recording) == listed(few)
-    assert has_note(recording.notes, "1 events with stray") and has_note(recording.notes, "1 torn", "line 10")
+    assert has_note(recording.notes, "1 events with stray") and has_note(
+        recording.notes, "1 torn", "line 103"
+    )
     (tmp_path / "a.txt").write_text("\n".join([*lines, "what is this?", ""]))
     with pytest.raises(SourceError, match=r"a\.txt"):
         everything(open_events(tmp_path / "a.txt", resolution=(346, 260)))
