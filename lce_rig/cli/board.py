@@ -5,15 +5,13 @@ from pathlib import Path
 
 import click
 import numpy as np
-from pydantic import ValidationError
 
 from lce_rig.cli import show
 from lce_rig.core.board import Board, BoardType
 from lce_rig.core.errors import TargetError, UsageError
 from lce_rig.core.pattern import DICTIONARIES, dark_rectangles, n_markers_of
-from lce_rig.rig import BoardSettings
 from lce_rig.rig.board_settings import KEYS_OF_TYPE, board_block
-from lce_rig.rig.loading import Document, dump_yaml, explain
+from lce_rig.rig.loading import board_of, dump_yaml
 
 _SIZE = re.compile(r"(\d+)x(\d+)")
 _PLATE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)x(\d+(?:\.\d*)?|\.\d+)")
@@ -80,24 +78,13 @@ def board(
     elif kind == "aprilgrid":
         more = {"tag_spacing": _TAG_SPACING}
     less = 1 if kind == "checkerboard" else 0
-    document = {
-        "type": kind,
-        KEYS_OF_TYPE[kind][0]: (cols - less, rows - less),
-        "square_m": square_m,
-        **more,
-        "width_m": 5.0,
-        "height_m": 5.0,
-    }
-    try:
-        drawn = BoardSettings.model_validate(document).to_board()
-        width_m, height_m = map(float, outline.groups())
-        if plate is None:
-            margin_m = square_m * (2 * drawn.gap_share if kind == "aprilgrid" else 1)
-            width_m, height_m = (round(size + 2 * margin_m + 0.005, 2) for size in drawn.pattern_size_m)
-        document |= {"width_m": width_m, "height_m": height_m}
-        drawn = BoardSettings.model_validate(document).to_board()
-    except ValidationError as error:
-        raise explain(error, Document("the board", {}, root=None)) from error
+    values = {"type": kind, KEYS_OF_TYPE[kind][0]: (cols - less, rows - less), "square_m": square_m, **more}
+    width_m, height_m = map(float, outline.groups())
+    if plate is None:
+        drawn = board_of(values | {"width_m": 5.0, "height_m": 5.0}, "the board")
+        margin_m = square_m * (2 * drawn.gap_share if kind == "aprilgrid" else 1)
+        width_m, height_m = (round(size + 2 * margin_m + 0.005, 2) for size in drawn.pattern_size_m)
+    drawn = board_of(values | {"width_m": width_m, "height_m": height_m}, "the board")
     block = dump_yaml({"board": board_block(drawn)})
     try:
         _draw(drawn, block, output)
@@ -111,7 +98,7 @@ def board(
 
 def _draw(board: Board, block: str, output: str) -> None:
     """Draw the print, the plate's outline and the words on a page of its own size."""
-    from matplotlib.collections import PolyCollection
+    from matplotlib.collections import PatchCollection
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
@@ -123,17 +110,10 @@ def _draw(board: Board, block: str, output: str) -> None:
     left, lower = -width_mm / 2 - _MARGIN_MM, -height_mm / 2 - _MARGIN_MM - _TEXT_MM
     axes.set_xlim(left, left + page_mm[0])
     axes.set_ylim(lower, lower + page_mm[1])
-    x, y, w, h = 1e3 * dark_rectangles(board).T
-    corners = np.stack(
-        [np.stack([x, y], 1), np.stack([x + w, y], 1), np.stack([x + w, y + h], 1), np.stack([x, y + h], 1)],
-        1,
-    )
-    axes.add_collection(PolyCollection(list(corners), facecolors="black", linewidths=0))
-    axes.add_patch(
-        Rectangle(
-            (-width_mm / 2, -height_mm / 2), width_mm, height_mm, fill=False, linewidth=0.3, edgecolor="0.5"
-        )
-    )
+    dark = [Rectangle((x, y), w, h) for x, y, w, h in 1e3 * dark_rectangles(board)]
+    axes.add_collection(PatchCollection(dark, facecolors="black", linewidths=0))
+    corner = -width_mm / 2, -height_mm / 2
+    axes.add_patch(Rectangle(corner, width_mm, height_mm, fill=False, linewidth=0.3, edgecolor="0.5"))
     lines = [
         f"{board.type}, {board.summary}, plate {width_mm:g} x {height_mm:g} mm: cut or glue along the outline"
     ]

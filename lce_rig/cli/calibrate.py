@@ -1,7 +1,7 @@
 """`lce-rig calibrate`: estimate the extrinsics of a session, judge them and write them as files."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -20,20 +20,16 @@ from lce_rig.cli.options import (
     split_names,
 )
 from lce_rig.collect.findings import GUIDE_ADD
-from lce_rig.core.calibration import (
-    DEFAULT_METHOD,
-    Calibration,
-    Method,
-    SceneOpinion,
-)
+from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metrics, SceneOpinion
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.files import read_json
-from lce_rig.core.geometry import Array, sigma_sizes
+from lce_rig.core.findings import Finding
+from lce_rig.core.geometry import sigma_sizes
 from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import consequences, lacks_captures, weakest_words
-from lce_rig.pipeline.result_files import Result, WrittenResult, result_folder
+from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
 
@@ -46,43 +42,49 @@ _CORRECTED = {"verdict.intrinsics", "verdict.scale"}
 _N_REASONS, _FAR_M = 3, 10.0
 
 
-def _uncertainty_lines(c: Calibration, *, is_explained: bool) -> list[str]:
+def causes_of(findings: Sequence[Finding]) -> list[Finding]:
+    """List the reasons of a verdict that do not follow from others."""
+    following = consequences(findings)
+    return [each for each in findings if each.severity != "note" and each.code not in following]
+
+
+def residual_words(metrics: Metrics, c: Calibration, held_out: str = "") -> str:
+    """Write mean residuals; two LiDARs have none of corners."""
+    corners = "" if c.is_of_lidars else f", corners {metrics.reprojection_px:.2f} px"
+    return f"planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm{held_out}{corners}"
+
+
+def _uncertainty(c: Calibration, *, is_explained: bool) -> Iterator[str]:
     """State the standard deviations, by axis unless the result has failed, and for points at distances."""
-    sigmas = np.sqrt(np.diag(c.cov))
-    lines = [_sigma_line(c.sigma_rotation_deg, c.sigma_translation_m)]
+    yield _sigma_line(c.sigma_rotation_deg, c.sigma_translation_m)
     if c.verdict == "fail" and not is_explained:
-        return lines
-    lines += [f"    about      {_by_axis(c, np.degrees(sigmas[3:]), '.3f')} deg"]
-    lines += [f"    along      {_by_axis(c, 1000 * sigmas[:3], '.1f')} mm"]
+        return
+    names = _AXES_OF_LIDAR if c.is_of_lidars else _AXES
+    along_mm, about_deg = np.split(np.sqrt(np.diag(c.cov)) * np.repeat([1000.0, np.degrees(1.0)], 3), 2)
+    for title, values, digits, unit in (("about", about_deg, ".3f", "deg"), ("along", along_mm, ".1f", "mm")):
+        axes = ", ".join(f"{name} {value:{digits}}" for name, value in zip(names, values, strict=True))
+        yield f"    {title}      {axes} {unit}"
     if not is_explained:
-        return lines + [
-            f"  {_FAR_M:g} m away    a point is off by {point.centre_px:.1f} px, "
-            f"{100 * point.centre_m:.1f} cm; in a corner {point.corner_px:.1f} px"
-            for point in c.uncertainty
-            if point.distance_m == _FAR_M
-        ]
+        for point in c.uncertainty:
+            if point.distance_m == _FAR_M:
+                off = f"{point.centre_px:.1f} px, {100 * point.centre_m:.1f} cm"
+                yield f"  {_FAR_M:g} m away    a point is off by {off}; in a corner {point.corner_px:.1f} px"
+        return
     if c.scene_share is not None and c.scene_share.state == "used":
-        sigma_deg, sigma_m = sigma_sizes(c.scene_share.cov_boards)
-        lines.append(f"               of the boards alone {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm")
+        yield f"               of the boards alone {show.sizes(*sigma_sizes(c.scene_share.cov_boards))}"
     if c.weakest:
-        lines.append(f"  weakest: {weakest_words(c.weakest)}")
+        yield f"  weakest: {weakest_words(c.weakest)}"
     rows = {
         "a point": [f"{each.distance_m:g} m away" for each in c.uncertainty],
         "  in centre": [f"{e.centre_px:.1f} px, {100 * e.centre_m:.1f} cm" for e in c.uncertainty],
         "  in corner": [f"{e.corner_px:.1f} px, {100 * e.corner_m:.1f} cm" for e in c.uncertainty],
     }
     for title, cells in rows.items() if c.uncertainty else ():
-        lines.append(f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip())
-    return lines
+        yield f"  {title:<13}" + "".join(f"{cell:<20}" for cell in cells).rstrip()
 
 
 def _sigma_line(sigma_deg: float, sigma_m: float) -> str:
-    return f"  uncertainty  {sigma_deg:.3f} deg, {1000 * sigma_m:.1f} mm (1 sigma)"
-
-
-def _by_axis(c: Calibration, values: Array, digits: str) -> str:
-    axes = _AXES_OF_LIDAR if c.is_of_lidars else _AXES
-    return ", ".join(f"{axis} {value:{digits}}" for axis, value in zip(axes, values, strict=True))
+    return f"  uncertainty  {show.sizes(sigma_deg, sigma_m)} (1 sigma)"
 
 
 def scene_texts(opinion: SceneOpinion) -> list[str]:
@@ -106,47 +108,28 @@ def scene_texts(opinion: SceneOpinion) -> list[str]:
     return texts
 
 
-def together_lines(calibration: Calibration) -> list[str]:
-    """Name the cameras of the joint estimate, and the standard deviation without them."""
-    if not calibration.estimated_with:
-        return []
-    figures = calibration.diagnostics
-    alone = ""
-    if math.isfinite(figures.alone_sigma_rotation_deg):
-        sigma_mm = 1000 * figures.alone_sigma_translation_m
-        alone = f"; uncertainty alone {figures.alone_sigma_rotation_deg:.3f} deg, {sigma_mm:.1f} mm"
-    return [f"  together     with {', '.join(calibration.estimated_with)}{alone}"]
-
-
-def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) -> list[str]:
+def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) -> Iterator[str]:
     """State the poses of cameras earlier in the result relative to this one, each pair of cameras once."""
     camera = calibration.camera
     others = {other.camera: other for other in calibration.other_cameras}
-    lines: list[str] = []
     for earlier in () if calibration.is_of_lidars else calibrations[: calibrations.index(calibration)]:
         name = earlier.camera
         if earlier.lidar != calibration.lidar:
             continue
         if name not in others:
-            lines.append(f"[bold]{name} and {camera}[/]: not compared, as no still board was seen by both")
+            yield f"[bold]{name} and {camera}[/]: not compared, as no still board was seen by both"
             continue
         other = others[name]
-        lines += [
-            f"[bold]{name} and {camera}[/], from {other.n_captures} captures of both",
-            f"  T_{camera}_{name} (p_{camera} = R p_{name} + t)",
-            *show.matrix_lines(other.T_cam_other, "    "),
-        ]
+        yield f"[bold]{name} and {camera}[/], from {other.n_captures} captures of both"
+        yield f"  T_{camera}_{name} (p_{camera} = R p_{name} + t)"
+        yield from show.matrix_lines(other.T_cam_other, "    ")
         if other.cov is not None:
-            sigma_deg, sigma_m = sigma_sizes(other.cov)
-            lines.append(_sigma_line(sigma_deg, sigma_m))
+            yield _sigma_line(*sigma_sizes(other.cov))
         if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
             separately = ", each camera estimated separately" if other.cov is not None else ""
-            lines.append(
-                f"  images       differ by {other.apart_rotation_deg:.3f} deg, "
-                f"{1000 * other.apart_translation_m:.1f} mm{separately}"
-            )
-        lines.append(f"  boards       {1000 * other.board_rms_m:.1f} mm apart")
-    return lines
+            apart = show.sizes(other.apart_rotation_deg, other.apart_translation_m)
+            yield f"  images       differ by {apart}{separately}"
+        yield f"  boards       {1000 * other.board_rms_m:.1f} mm apart"
 
 
 @click.command()
@@ -266,7 +249,18 @@ def calibrate(
         show.warn(f"{reference} has no T_cam_lidar for these sensors")
     # The result is on the disk and on the screen before its report is drawn, which takes about as long.
     written = result.write(name=name, force=force, report=False)
-    _show(result, written, is_explained=explain, as_json=as_json)
+    if as_json:
+        show.print_json(result.document())
+    else:
+        for c in result.pairs:
+            show.print_parts(_parts(c, str(opened.path), is_explained=explain))
+        for c in result.pairs:
+            show.print_parts(camera_lines(c, result.pairs))
+    show.warn_of(finding for finding in written.findings if finding.severity != "note")
+    if written.previous is not None and len(written.files) == 1 and written.has_usable_previous:
+        show.warn(f"this result is not exported; the last usable result is in {written.previous}")
+    elif written.previous is not None and explain:
+        show.note(f"the result before it is in {written.previous}")
     lacking = _lacking(wanted, {pair.camera for pair in detections.pairs}, result.pairs)
     if lacking is not None and any(c.verdict == "fail" for c in result.pairs):
         show.warn(str(lacking))
@@ -315,24 +309,6 @@ def _take_profile(path: Path, profile: str) -> None:
         show.note(f"{profile} is the session's profile now; the earlier one is {path / earlier}")
 
 
-def _show(result: Result, written: WrittenResult, *, is_explained: bool, as_json: bool) -> None:
-    """Print the extrinsics, and the files with them."""
-    if as_json:
-        show.print_json(result.document())
-    else:
-        for calibration in result.pairs:
-            show.print_lines(_lines(calibration, str(result.session.path), is_explained=is_explained))
-        for calibration in result.pairs:
-            show.print_lines(camera_lines(calibration, result.pairs))
-    for finding in written.findings:
-        if finding.severity != "note":
-            show.warn(finding.sentence)
-    if written.previous is not None and len(written.files) == 1 and written.has_usable_previous:
-        show.warn(f"this result is not exported; the last usable result is in {written.previous}")
-    elif written.previous is not None and is_explained:
-        show.note(f"the result before it is in {written.previous}")
-
-
 def _lacking(
     wanted: Sequence[str], cameras: Collection[str], calibrations: Sequence[Calibration]
 ) -> NotEnoughDataError | None:
@@ -368,67 +344,65 @@ def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = 
         raise ResultRefusedError(f"failed: {pairs}; do not use this result", "" if are_printed else causes)
 
 
-def _lines(c: Calibration, path: str, *, is_explained: bool) -> list[str]:
+def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
     """Tell the verdict, its reasons, the extrinsics and their uncertainty; explained, all that was tested."""
     colour, has_failed = show.COLOURS[c.verdict], c.verdict == "fail"
-    following = consequences(c.findings)
-    reasons = [finding for finding in c.findings if finding.severity != "note"]
-    causes = [finding for finding in reasons if finding.code not in following]
+    following, causes = consequences(c.findings), causes_of(c.findings)
     used = f"{len(c.captures_used)} of {c.n_captures} captures used"
-    lines = [f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"]
+    yield f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"
     plan = next((finding.advice for finding in c.findings if finding.code == GUIDE_ADD.code), "")
+    reasons = [finding for finding in c.findings if finding.severity != "note"]
     for finding in reasons if is_explained else causes[:_N_REASONS]:
         follows = "follows: " if finding.code in following else ""
-        lines.append(f"  [{colour}]{follows}{show.escape(finding.text)}[/]")
+        yield f"  [{colour}]{follows}{show.escape(finding.text)}[/]"
         if finding.advice and not follows and (is_explained or finding is causes[0]):
             advice = plan if plan and lacks_captures([finding]) else finding.advice_at(path)
-            lines.append(f"    -> {show.escape(advice)}")
+            yield f"    -> {show.escape(advice)}"
     if plan and not lacks_captures(causes[:1]):
-        lines.append(f"  -> {plan}")
+        yield f"  -> {plan}"
     if len(causes) > _N_REASONS and not is_explained:
         more = show.counted(len(causes) - _N_REASONS, "more reason")
-        lines.append(f"  {more} in report.html and by lce-rig calibrate {path} --explain")
+        yield f"  {more} in report.html and by lce-rig calibrate {path} --explain"
     if is_explained or not has_failed:
         target, source = (c.camera, c.lidar) if c.is_of_lidars else ("cam", "lidar")
-        title = show.escape(f"  T_cam_lidar (p_{target} = R p_{source} + t)")
-        lines += [title, *show.matrix_lines(c.T_cam_lidar, "    ")]
-    lines += _uncertainty_lines(c, is_explained=is_explained)
-    if not is_explained:
-        # Lens and squares that the result has corrected go with its extrinsics.
-        lines += [
-            f"  {show.escape(finding.text)}"
-            for finding in c.findings
-            if finding.code in _CORRECTED and finding.severity == "note"
-        ][:1]
+        yield show.escape(f"  T_cam_lidar (p_{target} = R p_{source} + t)")
+        yield from show.matrix_lines(c.T_cam_lidar, "    ")
+    yield from _uncertainty(c, is_explained=is_explained)
+    # Lens and squares that the result has corrected go with its extrinsics.
+    corrected = [each for each in c.findings if each.code in _CORRECTED and each.severity == "note"]
+    if corrected and not is_explained:
+        yield f"  {show.escape(corrected[0].text)}"
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
-        lines.append(
-            f"  reference    error {c.egt_rotation_deg:.3f} deg, {1000 * c.egt_translation_m:.1f} mm"
-        )
-    return lines + _explanation(c) if is_explained else lines
+        yield f"  reference    error {show.sizes(c.egt_rotation_deg, c.egt_translation_m)}"
+    if is_explained:
+        yield from _explanation(c)
 
 
-def _explanation(c: Calibration) -> list[str]:
+def _explanation(c: Calibration) -> Iterator[str]:
     """State residuals, certificate, channels, cameras, the scene, unused captures and notes."""
-    metrics = c.metrics
-    corners = "" if c.is_of_lidars else f", corners {metrics.reprojection_px:.2f} px"
     held_out = f", held out {1000 * c.held_out_m:.1f} mm" if math.isfinite(c.held_out_m) else ""
     certificate = f"none (method {c.method} has no certificate)"
     if math.isfinite(c.certificate.gap):
         certificate = "global minimum" if c.certificate.is_optimal else "[red]not proven[/]"
         certificate += " of Algorithm 1, where the estimate starts" if c.is_start_certified else ""
         certificate += f", gap {c.certificate.gap:.0e}"
-    lines = [
-        f"  detected     board found by both sensors in {c.n_detected}",
-        f"  residuals    planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm"
-        f"{held_out}{corners}",
-        f"  certificate  {certificate}",
-        *show.titled_lines("channels", _channel_texts(c)),
-        *together_lines(c),
-        *show.titled_lines("scene", [] if c.scene is None else scene_texts(c.scene)),
-    ]
+    yield f"  detected     board found by both sensors in {c.n_detected}"
+    yield f"  residuals    {residual_words(c.metrics, c, held_out)}"
+    yield f"  certificate  {certificate}"
+    yield from show.titled_lines("channels", _channel_texts(c))
+    figures = c.diagnostics
+    if c.estimated_with:
+        alone = ""
+        if math.isfinite(figures.alone_sigma_rotation_deg):
+            sizes = show.sizes(figures.alone_sigma_rotation_deg, figures.alone_sigma_translation_m)
+            alone = f"; uncertainty alone {sizes}"
+        yield f"  together     with {', '.join(c.estimated_with)}{alone}"
+    yield from show.titled_lines("scene", [] if c.scene is None else scene_texts(c.scene))
     for name, why in c.captures_refused.items():
-        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]")
-    return lines + [f"  {show.escape(note.sentence)}" for note in c.findings if note.severity == "note"]
+        yield f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]"
+    for note in c.findings:
+        if note.severity == "note":
+            yield f"  {show.escape(note.sentence)}"
 
 
 def _channel_texts(calibration: Calibration) -> list[str]:

@@ -1,7 +1,7 @@
 """`lce-rig check`: report the detections in every capture, and the cause and action for refused ones."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,39 +44,27 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
         with show.progress_bar("drawing") as progress:
             folder = write_debug_images(opened, detections, progress=progress)
         show.note(f"debug images: {folder}")
-    pairs = [*detections.pairs, *detections.lidar_pairs(opened.rig.lidars)]
-    by_pair = {pair: detections.between(pair) for pair in pairs}
-    refusals = {pair: match_sensors(opened.rig, by_pair[pair], pair)[0] for pair in pairs}
-    plates = {pair: _plates(opened.rig, by_pair[pair], pair, refusals[pair]) for pair in pairs}
-    placements = {pair: _placements(by_pair[pair], pair, refusals[pair]) for pair in pairs}
-    records = {
-        pair: {
-            name: _record(*seen.of(pair, name), refusals[pair].get(name))
-            | {"placement": placements[pair].get(name)}
+    documents, n_usable, is_contradicted = [], 0, False
+    for pair in [*detections.pairs, *detections.lidar_pairs(opened.rig.lidars)]:
+        seen = detections.between(pair)
+        refused, _ = match_sensors(opened.rig, seen, pair)
+        plates, placements = _plates(opened.rig, seen, pair, refused), _placements(seen, pair, refused)
+        records = {
+            name: _record(*seen.of(pair, name), refused.get(name)) | {"placement": placements.get(name)}
             for name in seen.captures(pair)
         }
-        for pair, seen in by_pair.items()
-    }
-    if as_json:
-        documents = [
-            {
-                **{"camera": pair.camera, "channel": pair.channel, "lidar": pair.lidar, "captures": captures},
-                "findings": [finding.as_json() for finding in plates[pair]],
-            }
-            for pair, captures in records.items()
-        ]
-        show.print_json({"format_version": 1, "rig": opened.rig.name, "pairs": documents})
-    else:
-        for pair, refused in refusals.items():
+        sensors = {"camera": pair.camera, "channel": pair.channel, "lidar": pair.lidar}
+        documents.append({**sensors, "captures": records, "findings": plates})
+        if not as_json:
             if explain:
-                show.print_table(_table(by_pair[pair], pair, records[pair]))
-                show.print_lines(_limits(opened.rig, by_pair[pair], pair, refused))
-            names, needed = by_pair[pair].captures(pair), opened.rig.quality.min_captures
-            show.print_lines(_head(pair, names, refused, needed))
-            show.print_lines(_causes(names, refused, plates[pair], str(session), is_whole=explain))
-            show.print_lines(_repeated(placements[pair], is_whole=explain))
-    n_usable = max((len(records[pair]) - len(refused) for pair, refused in refusals.items()), default=0)
-    is_contradicted = any(each.severity == "error" for findings in plates.values() for each in findings)
+                show.print_parts([_table(seen, pair, records), *_limits(opened.rig, seen, pair, refused)])
+            show.print_parts(_head(pair, records, refused, opened.rig.quality.min_captures))
+            show.print_parts(_causes([*records], refused, plates, str(session), is_whole=explain))
+            show.print_parts(_repeated(placements, is_whole=explain))
+        n_usable = max(n_usable, len(records) - len(refused))
+        is_contradicted |= any(each.severity == "error" for each in plates)
+    if as_json:
+        show.print_json({"format_version": 1, "rig": opened.rig.name, "pairs": documents})
     if n_usable >= opened.rig.quality.min_captures and not is_contradicted:
         show.name_next("calibrate", session)
     if n_usable == 0:
@@ -155,18 +143,18 @@ def _table(detections: Detections, pair: Pair, records: Mapping[str, dict[str, A
     # Images from events have their own figures.
     is_from_events = any(not isinstance(image, Refusal) and image.events is not None for image in images)
     columns = (*_IMAGE, *(_EVENTS if is_from_events else _POINTS), *_LIDAR)
-    table = show.plain_table(str(pair), "capture", *(f">{title}" for title, *_ in columns), "")
+    rows = []
     for name, record in records.items():
-        cells = [_cell(record[sensor], key, scale, digits) for _, sensor, key, scale, digits in columns]
+        cells = []
+        for _, sensor, key, scale, digits in columns:
+            figures = record[sensor] or {}
+            sigma_m = figures.get(f"{key.removesuffix('_m')}_sigma_m") or 0.0
+            value = None if sigma_m > _SIDE_SIGMA_MAX_M else figures.get(key)
+            cells.append("-" if value is None else f"{scale * value:.{digits}f}")
         state = "[green]ok[/]" if record["is_usable"] else f"[red]{record['refusal']['stage']}[/]"
-        table.add_row(name, *cells, state)
-    return table
-
-
-def _cell(figures: Mapping[str, float | None] | None, key: str, scale: float, digits: int) -> str:
-    value = None if figures is None else figures.get(key)
-    sigma_m = (figures or {}).get(f"{key.removesuffix('_m')}_sigma_m") or 0.0
-    return "-" if value is None or sigma_m > _SIDE_SIGMA_MAX_M else f"{scale * value:.{digits}f}"
+        rows.append((name, *cells, state))
+    headings = (f">{title}" for title, *_ in columns)
+    return show.plain_table(str(pair), "capture", *headings, "", rows=rows)
 
 
 def _limits(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> list[str]:
@@ -183,18 +171,17 @@ def _limits(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
     return [f"plane: limit {low if low == high else f'{low} to {high}'} mm ({noise})"]
 
 
-def _head(pair: Pair, names: Sequence[str], refused: Mapping[str, Refusal], needed: int) -> list[str]:
+def _head(
+    pair: Pair, captures: Collection[str], refused: Mapping[str, Refusal], needed: int
+) -> Iterator[str]:
     """State how many captures are usable, and whether they suffice."""
-    n_usable = len(names) - len(refused)
+    n_usable = len(captures) - len(refused)
     n_detected = n_usable + sum(why.stage == "pair" for why in refused.values())
     colour = "red" if n_usable < needed else "yellow" if refused else "green"
-    line = f"[bold]{pair}[/]: [{colour}]{n_usable} of {len(names)} captures usable[/]"
-    if n_usable < needed:
-        line += f" (minimum {needed})"
-    lines = [line]
+    minimum = f" (minimum {needed})" if n_usable < needed else ""
+    yield f"[bold]{pair}[/]: [{colour}]{n_usable} of {len(captures)} captures usable[/]{minimum}"
     if n_detected > n_usable:
-        lines.append(f"  both sensors detect the board in {n_detected}")
-    return lines
+        yield f"  both sensors detect the board in {n_detected}"
 
 
 def _causes(

@@ -91,21 +91,22 @@ def deploy(
     _show_done(done, target, as_json=as_json)
 
 
+def _print_json(target: TargetSettings, **content: Any) -> None:
+    show.print_json({"format_version": 1, "to": target.to, **content})
+
+
 def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: bool) -> None:
     if as_json:
-        show.print_json(
-            {
-                "format_version": 1,
-                "to": target.to,
-                "current": _release(plan.state.current),
-                "new": plan.record,
-                "changed": dict(plan.changed),
-                "changed_there": dict(plan.state.changed),
-                "sensors": plan.sensors,
-                "objections": plan.objections,
-                "remarks": plan.remarks,
-                **({"diff": plan.diff} if has_diff else {}),
-            }
+        _print_json(
+            target,
+            current=plan.state.current,
+            new=plan.record,
+            changed=dict(plan.changed),
+            changed_there=dict(plan.state.changed),
+            sensors=plan.sensors,
+            objections=plan.objections,
+            remarks=plan.remarks,
+            **({"diff": plan.diff} if has_diff else {}),
         )
         return
     current = plan.state.current
@@ -113,7 +114,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
     for change in plan.sensors:
         how = "new" if change.is_new else "removed"
         if change.rotation_deg is not None and change.translation_m is not None:
-            how = f"moves by {change.rotation_deg:.3f} deg, {1000 * change.translation_m:.1f} mm"
+            how = f"moves by {show.sizes(change.rotation_deg, change.translation_m)}"
         show.say(f"  {change.camera} and {change.lidar}: {how}")
     _warn_of_changes(plan.state.changed)
     if plan.is_in_place:
@@ -125,37 +126,35 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
         show.note(each.text)
     for each in plan.objections:
         show.warn(f"would be refused: {each.text}")
-    if has_diff:
-        for line in plan.diff:
-            click.echo(line)
+    for line in plan.diff if has_diff else ():
+        click.echo(line)
 
 
 _CHANGES = {"added": "new:", "missing": "removed:", "changed": "changed:"}
 
 
 def _show_standing(state: TargetState, target: TargetSettings, *, as_json: bool) -> None:
+    current = state.current
     if as_json:
-        show.print_json(
-            {
-                "format_version": 1,
-                "to": target.to,
-                "current": _release(state.current),
-                "changed_there": dict(state.changed),
-                "is_pending": state.is_pending,
-                "releases": [_release(each) for each in state.releases],
-            }
+        _print_json(
+            target,
+            current=current,
+            changed_there=dict(state.changed),
+            is_pending=state.is_pending,
+            releases=state.releases,
         )
         return
-    if state.current is None:
+    if current is None:
         show.say(f"{target.to}: nothing deployed yet")
         return
-    show.say(f"{target.to}: {_described(state.current)}")
-    table = show.plain_table("", "release", "deployed", "by", "robot", "captures of")
+    show.say(f"{target.to}: {_described(current)}")
+    rows = []
     for kept in state.releases:
-        mark = " *" if kept.name == state.current.name else ""
+        mark = " *" if kept.name == current.name else ""
         cells = (f"{kept.name}{mark}", kept.time, kept.by, kept.robot or "-", kept.date[:10] or "-")
-        table.add_row(*map(show.escape, cells))
-    show.print_table(table)
+        rows.append(map(show.escape, cells))
+    headings = ("release", "deployed", "by", "robot", "captures of")
+    show.print_table(show.plain_table("", *headings, rows=rows))
     _warn_of_changes(state.changed)
     for kept in state.releases:
         if kept.reason:
@@ -176,24 +175,10 @@ def _described(release: ReleaseRecord) -> str:
     return f"{release.name} ({robot}{dated}{verdicts})"
 
 
-def _release(release: ReleaseRecord | None) -> dict[str, Any] | None:
-    return None if release is None else release.model_dump() | {"set_sha256": release.set_sha256}
-
-
 def _show_done(done: Deployed, target: TargetSettings, *, as_json: bool) -> None:
     if as_json:
-        show.print_json(
-            {
-                "format_version": 1,
-                "to": target.to,
-                "current": _release(done.release),
-                "replaces": done.replaces,
-                "is_new": done.is_new,
-                "output": done.output,
-                "changed_there": dict(done.changed_there),
-                "remarks": done.remarks,
-            }
-        )
+        content = {"current" if name == "release" else name: value for name, value in vars(done).items()}
+        _print_json(target, **content)
         return
     for each in done.remarks:
         show.note(each.text)

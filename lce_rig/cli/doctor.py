@@ -72,7 +72,7 @@ def doctor(rig_name: str, explain: bool, as_json: bool, duration: float, folder:
             show.say(f"fit to collect: all {n['note']} ok")
         worst_first = sorted(checks, key=lambda check: check.severity != "error")
         shown = checks if explain else [check for check in worst_first if check.severity != "note"]
-        show.print_lines(_lines(shown))
+        show.print_parts(_lines(shown))
     return _EXIT_ERROR if severity == "error" else 0
 
 

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -84,9 +85,7 @@ def drift(
         show.print_json({"format_version": 1, "rig": report.rig.name, "pairs": pairs})
     else:
         for pair in report.pairs:
-            if explain:
-                show.print_table(_table(pair))
-            show.print_lines(_lines(pair, is_explained=explain))
+            show.print_parts(_parts(pair, is_explained=explain))
         for file in files:
             show.say(f"image: {file}")
     outcomes: dict[State, type[LceRigError]] = {"changed": ResultRefusedError, "unknown": NotEnoughDataError}
@@ -120,38 +119,8 @@ def _watch_live(rig: Rig, saved: ResultFile, seconds: float | None) -> DriftRepo
 
 # Along such an axis there is no best fit, and so no change that would have been seen.
 _WITHOUT_FIT = ("scene.flat", "scene.no_peak")
-_COLOURS = {"unchanged": "none", "changed": "red", "unknown": "yellow"}
-
-
-def _table(pair: PairDrift) -> Any:
-    opinions = [("scene", pair.drift.axes if pair.drift.curves else None)]
-    opinions += [] if pair.board is None else [("board", pair.board.axes)]
-    title = f"{_sensors(pair)} (camera: x right, y down, z forward)"
-    # With two opinions, all fits into 80 columns.
-    headings = [
-        heading for name, _ in opinions for heading in (f">{name}:\nbest fit at", ">would\nhave seen")
-    ]
-    table = show.plain_table(title, "axis of\nthe camera", "", *headings)
-    for index, axis in enumerate(pair.drift.axes):
-        name = f"about {axis.axis[-1]}, deg" if axis.is_rotation else f"along {axis.axis[-1]}, mm"
-        state = pair.states[axis.axis]
-        figures = [text for _, axes in opinions for text in _figures(axes[index] if axes else None)]
-        table.add_row(name, f"[{_COLOURS[state]}]{STATES[state]}[/]", *figures)
-    return table
-
-
-def _figures(axis: AxisDrift | None) -> tuple[str, str]:
-    """Write the change that fits best, and the smallest that would have been seen."""
-    if axis is None or not math.isfinite(axis.sigma) or axis.reason in _WITHOUT_FIT:
-        return "-", "-"
-    best = f"{show.amount(axis.change, axis.unit, '+')} +- {show.amount(axis.sigma, axis.unit)}"
-    return best, show.amount(axis.smallest, axis.unit).replace("?", "-")
-
-
-def _sensors(pair: PairDrift) -> str:
-    return f"{pair.calibration.camera}, {pair.calibration.lidar}"
-
-
+_COLOURS: dict[State, str] = {"unchanged": "green", "changed": "red", "unknown": "yellow"}
+_TITLES: dict[State, str] = {"changed": "changed", "unknown": "cannot tell", "unchanged": "would see"}
 # Of one axis or one opinion; the lines by state name the axes already.
 _OF_AXES = (
     "scene.axis_unchanged",
@@ -166,12 +135,17 @@ _OF_AXES = (
 _OF_SCENE = ("scene.unchanged", "scene.changed", "scene.unknown")
 
 
-def _lines(pair: PairDrift, *, is_explained: bool) -> list[str]:
+def _sensors(pair: PairDrift) -> str:
+    return f"{pair.calibration.camera}, {pair.calibration.lidar}"
+
+
+def _parts(pair: PairDrift, *, is_explained: bool) -> Iterator[Any]:
     """State the verdict, the axes by their state, further causes, and one action."""
-    colour = {"unchanged": "green", "changed": "red", "unknown": "yellow"}[pair.state]
+    if is_explained:
+        yield _table(pair)
     data = f"{show.counted(pair.drift.n_captures, 'capture')}, {pair.drift.n_edges} edges"
     data += "" if pair.board is None else f", {show.counted(pair.board.n_boards, 'board')}"
-    lines = [f"[bold]{_sensors(pair)}[/]: [{colour}]{STATES[pair.state]}[/] ({data})"]
+    yield f"[bold]{_sensors(pair)}[/]: [{_COLOURS[pair.state]}]{STATES[pair.state]}[/] ({data})"
     opinions = [_opinion(pair, index) for index in range(len(pair.drift.axes))]
     for state, title in _TITLES.items():
         if state != pair.state or state != "unknown" or len(set(pair.states.values())) > 1:
@@ -181,27 +155,20 @@ def _lines(pair: PairDrift, *, is_explained: bool) -> list[str]:
                 for each in opinions
                 if each.state == state
             }
-            parts = show.axes_by_kind(figures)
-            lines += show.titled_lines(title, parts)
+            yield from show.titled_lines(title, show.axes_by_kind(figures))
     if pair.board is not None and is_explained:
-        metrics = pair.board.metrics
-        lines.append(
-            f"  boards at {pair.board.n_placements} places, residuals: planes {1000 * metrics.mpe_m:.1f} mm, "
-            f"edges {1000 * metrics.mee_m:.1f} mm"
-        )
+        metrics, n_placements = pair.board.metrics, pair.board.n_placements
+        residuals = f"planes {1000 * metrics.mpe_m:.1f} mm, edges {1000 * metrics.mee_m:.1f} mm"
+        yield f"  boards at {n_placements} places, residuals: {residuals}"
     # With a board, the verdict on both stands for the scene's own.
     omitted = {pair.summary.code, *(_OF_SCENE if pair.board is not None else ())}
     for finding in pair.findings:
         if finding.code in omitted and finding.code != "scene.few_edges":
             continue
         if is_explained or (finding.severity != "note" and finding.code not in _OF_AXES):
-            lines.append(f"  {show.escape(as_line(finding.text))}")
+            yield f"  {show.escape(as_line(finding.text))}"
     if pair.summary.advice:
-        lines.append(f"  -> {show.escape(as_line(pair.summary.advice))}")
-    return lines
-
-
-_TITLES: dict[State, str] = {"changed": "changed", "unknown": "cannot tell", "unchanged": "would see"}
+        yield f"  -> {show.escape(as_line(pair.summary.advice))}"
 
 
 def _opinion(pair: PairDrift, index: int) -> AxisDrift:
@@ -213,3 +180,28 @@ def _opinion(pair: PairDrift, index: int) -> AxisDrift:
     deciding = [each for each in (scene, pair.board.axes[index]) if each.state == state]
     best = min(deciding or [pair.board.axes[index]], key=lambda axis: axis.smallest)
     return replace(best, state=state)
+
+
+def _table(pair: PairDrift) -> Any:
+    """List the axes with what the scene and the boards measured."""
+    opinions = {"scene": pair.drift.axes if pair.drift.curves else None}
+    opinions |= {} if pair.board is None else {"board": pair.board.axes}
+    # With two opinions, all fits into 80 columns.
+    headings = [heading for name in opinions for heading in (f">{name}:\nbest fit at", ">would\nhave seen")]
+    rows = []
+    for index, axis in enumerate(pair.drift.axes):
+        name = f"about {axis.axis[-1]}, deg" if axis.is_rotation else f"along {axis.axis[-1]}, mm"
+        state = pair.states[axis.axis]
+        colour = "none" if state == "unchanged" else _COLOURS[state]
+        figures = [text for axes in opinions.values() for text in _figures(axes[index] if axes else None)]
+        rows.append((name, f"[{colour}]{STATES[state]}[/]", *figures))
+    title = f"{_sensors(pair)} (camera: x right, y down, z forward)"
+    return show.plain_table(title, "axis of\nthe camera", "", *headings, rows=rows)
+
+
+def _figures(axis: AxisDrift | None) -> tuple[str, str]:
+    """Write the change that fits best, and the smallest that would have been seen."""
+    if axis is None or not math.isfinite(axis.sigma) or axis.reason in _WITHOUT_FIT:
+        return "-", "-"
+    best = f"{show.amount(axis.change, axis.unit, '+')} +- {show.amount(axis.sigma, axis.unit)}"
+    return best, show.amount(axis.smallest, axis.unit).replace("?", "-")

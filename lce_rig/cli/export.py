@@ -9,7 +9,8 @@ import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import path_option, result_option, session_argument, split_names
 from lce_rig.core.errors import UsageError
-from lce_rig.export import EXPORTS, export_formats, require_usable
+from lce_rig.core.findings import Finding
+from lce_rig.export import EXPORTS, require_usable
 from lce_rig.export.urdf import read_robot, write_into_urdf
 from lce_rig.pipeline.result_files import RESULT, result_folder
 
@@ -93,8 +94,16 @@ def export(
     if output is not None:
         robot = None if tree is None else read_robot(tree)
         output.mkdir(parents=True, exist_ok=True)
-        files, findings = export_formats(
-            pairs, opened.rig, output, formats=formats, is_forced=force, session=opened, robot=robot
+        findings: list[Finding] = []
+        files = lce.export(
+            pairs,
+            opened.rig,
+            output,
+            formats=formats,
+            is_forced=force,
+            session=opened,
+            robot=robot,
+            findings=findings,
         )
         for file in files:
             show.say(str(file))

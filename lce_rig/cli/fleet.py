@@ -140,10 +140,8 @@ def run(
     show.say(f"{show.counted(done.n_new, 'session')} run, {done.n_held} held already: {statuses}")
     for cause, n in done.causes.most_common(_MOST_CAUSES):
         show.say(f"  {n} x {cause}")
-    if len(done.causes) > _MOST_CAUSES:
-        show.say(
-            f"  {len(done.causes) - _MOST_CAUSES} more causes: lce-rig fleet table --registry {registry}"
-        )
+    if (n_more := len(done.causes) - _MOST_CAUSES) > 0:
+        show.say(f"  {n_more} more causes: lce-rig fleet table --registry {registry}")
     show.say(f"{place.url}: {show.counted(len(done.table), 'row')} in the table")
     show.note(f"  next         lce-rig fleet report --registry {shlex.quote(registry)}")
 
@@ -183,11 +181,11 @@ def table(
             )
         opened.consolidate(rebuild=True)
     chosen = opened.read_table(columns or (None if as_csv or as_json else _SHOWN), where)
-    batches = chosen.to_batches(max_chunksize=10_000)
+    every = (row for batch in chosen.to_batches(max_chunksize=10_000) for row in batch.to_pylist())
     if as_csv:
         writer = csv.writer(sys.stdout, lineterminator="\n")
         writer.writerow(chosen.column_names)
-        for row in (row for batch in batches for row in batch.to_pylist()):
+        for row in every:
             # A list is JSON in a cell.
             writer.writerow(
                 [json.dumps(value) if isinstance(value, list) else value for value in row.values()]
@@ -195,16 +193,14 @@ def table(
     elif as_json:
         sys.stdout.write('{"format_version": 1, "rows": [')
         end = "\n"
-        for row in (row for batch in batches for row in batch.to_pylist()):
+        for row in every:
             sys.stdout.write(end + json.dumps(row, allow_nan=False))
             end = ",\n"
         sys.stdout.write("\n]}\n")
     else:
-        rows = chosen.slice(0, _MOST_SHOWN).to_pylist()
-        shown = show.plain_table("", *(chosen.column_names if columns else _HEADINGS))
-        for row in rows:
-            shown.add_row(*(map(_cell, row.values()) if columns else _summary(row)))
-        show.print_table(shown)
+        shown = chosen.slice(0, _MOST_SHOWN).to_pylist()
+        rows = [map(_cell, row.values()) if columns else _summary(row) for row in shown]
+        show.print_table(show.plain_table("", *(chosen.column_names if columns else _HEADINGS), rows=rows))
         is_whole = len(chosen) == len(rows)
         count = show.counted(len(chosen), "row")
         show.note(count if is_whole else f"{len(rows)} of {count}; --csv and --json print all")
@@ -311,37 +307,32 @@ def deploy(
     robot, use --where. Robots whose newest session failed are left out. Exits with 7 if it was stopped.
     """
     from lce_rig.fleet.registry import Registry
-    from lce_rig.fleet.rollout import FleetDeployment, newest_results
+    from lce_rig.fleet.rollout import newest_results, roll_out
     from lce_rig.fleet.storage import Storage
 
     if sum((dry_run, status, rollback)) > 1:
         raise UsageError("--dry-run, --status and --rollback exclude each other", "Give one of them.")
-    newest = newest_results(Registry(Storage.at(registry)), where)
+    opened = Registry(Storage.at(registry))
+    newest = newest_results(opened, where)
     if dry_run:
-        table = show.plain_table("", "robot", "result", "")
-        for robot, state in newest.items():
-            table.add_row(*map(show.escape, (robot, state.folder, state.detail)))
-        show.print_table(table)
+        rows = [map(show.escape, (robot, state.folder, state.detail)) for robot, state in newest.items()]
+        show.print_table(show.plain_table("", "robot", "result", "", rows=rows))
         return
-    robots = FleetDeployment(Registry(Storage.at(registry)), target, targets)
+    step: Any = "status" if status else "rollback" if rollback else "deploy"
     with show.progress_bar("robots") as progress:
-        if status:
-            rollout = robots.status(newest, progress=progress)
-        elif rollback:
-            rollout = robots.roll_back(newest, reason, progress=progress)
-        else:
-            rollout = robots.run(newest, progress=progress)
+        rollout = roll_out(opened, target, targets, newest, step, reason=reason, progress=progress)
     if as_json:
         show.print_json({"format_version": 2, **vars(rollout)})
     else:
         counts = ", ".join(f"{_words(state)} {n}" for state, n in rollout.counts.most_common())
         show.say(f"{rollout.target}: {counts or 'no robots'}")
         if status:
-            table = show.plain_table("", "robot", "state", "release", "replaces")
-            for state in rollout.robots.values():
-                cells = (state.robot, _words(state.state), state.release or "-", state.replaces or "-")
-                table.add_row(*map(show.escape, cells))
-            show.print_table(table)
+            cells = (
+                (state.robot, _words(state.state), state.release or "-", state.replaces or "-")
+                for state in rollout.robots.values()
+            )
+            rows = [map(show.escape, each) for each in cells]
+            show.print_table(show.plain_table("", "robot", "state", "release", "replaces", rows=rows))
         for state in rollout.robots.values():
             if state.detail:
                 show.note(f"{state.robot}: {_line(state)}")

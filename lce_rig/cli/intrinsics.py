@@ -1,12 +1,12 @@
 """`lce-rig intrinsics` of cameras, and `lce-rig lidar-intrinsics`, a LiDAR's constant errors."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 
-from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors
 from lce_rig.cli import show
 from lce_rig.cli.options import (
     cameras_option,
@@ -20,10 +20,9 @@ from lce_rig.cli.options import (
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.phrasing import as_line
 from lce_rig.judge.intrinsics_check import describe as figures_of
-from lce_rig.pipeline.intrinsics_files import document, write_intrinsics
-from lce_rig.pipeline.intrinsics_files import save_profile as write_profile
-from lce_rig.pipeline.measure_intrinsics import MeasuredIntrinsics, measure_intrinsics
-from lce_rig.pipeline.measure_lidar import measure_lidar, save_lidar
+from lce_rig.pipeline.intrinsics import MeasuredIntrinsics, document, measure_intrinsics, write_intrinsics
+from lce_rig.pipeline.intrinsics import save_profile as write_profile
+from lce_rig.pipeline.measure_lidar import lidar_document, measure_lidar, save_lidar
 from lce_rig.session import Session
 
 _MODELS = ("radtan4", "radtan5", "rational", "equidistant")
@@ -90,11 +89,8 @@ def intrinsics(
         for one in measured:
             is_followed = save_profile is not None and one.judgement.code == "intrinsics.better"
             advice = "" if is_followed else one.judgement.advice_at(str(session))
-            whole = show.command("intrinsics", session, " --explain")
-            show.print_lines(_lines(one, advice, "" if explain else whole))
-            if explain:
-                show.print_table(_table(one))
-                show.print_lines(_explanation(one))
+            whole = "" if explain else show.command("intrinsics", session, " --explain")
+            show.print_parts(_parts(one, advice, whole))
     show.note(f"  files        {files[0].parent}/: {', '.join(path.name for path in files)}")
     if save_profile is not None:
         replaced = write_profile(opened, measured, save_profile, is_forced=force)
@@ -108,7 +104,7 @@ def intrinsics(
         raise join_shortages(troubles)
 
 
-def _lines(measured: MeasuredIntrinsics, advice: str, whole: str) -> list[str]:
+def _parts(measured: MeasuredIntrinsics, advice: str, whole: str) -> Iterator[Any]:
     """State the judgement with its action, the fit, the intrinsics and the weakness that matters most.
 
     Args:
@@ -119,25 +115,30 @@ def _lines(measured: MeasuredIntrinsics, advice: str, whole: str) -> list[str]:
     estimate, lens, judgement = measured.estimate, measured.intrinsics, measured.judgement
     covered = f"{100 * measured.certainty.is_covered.mean():.0f}"
     colour = {"intrinsics.fit": "green", "intrinsics.better": "red"}.get(judgement.code, "yellow")
-    lines = [f"[bold]{measured.camera}[/]: [{colour}]{show.escape(judgement.text)}[/]"]
-    lines += [f"  -> {show.escape(as_line(advice))}"] if advice else []
+    yield f"[bold]{measured.camera}[/]: [{colour}]{show.escape(judgement.text)}[/]"
+    if advice:
+        yield f"  -> {show.escape(as_line(advice))}"
     if measured.check is None:
         size = f"{measured.given.width_px}x{measured.given.height_px}"
-        lines.append(f"  [red]the profile's intrinsics are for {size} px, the images have another size[/]")
-    lines += [
-        f"  estimate     {estimate.model.name}, {len(estimate.views)} images of "
-        f"{', '.join(measured.channels)}, {covered} % of the image covered",
-        f"  corners      {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on held-out ones",
-        f"  values       fx {lens.fx_px:.1f}, fy {lens.fy_px:.1f}, cx {lens.cx_px:.1f}, "
-        f"cy {lens.cy_px:.1f} px",
-    ]
-    if not whole or judgement.code == "intrinsics.fit":
-        return lines
-    weaknesses = [text for text in measured.weaknesses if text not in judgement.sentence]
-    lines += [f"  [yellow]{show.escape(text)}[/]" for text in weaknesses[:1]]
-    if len(weaknesses) > 1:
-        lines.append(f"  {len(weaknesses) - 1} more: {whole}")
-    return lines
+        yield f"  [red]the profile's intrinsics are for {size} px, the images have another size[/]"
+    images = f"{len(estimate.views)} images of {', '.join(measured.channels)}"
+    yield f"  estimate     {estimate.model.name}, {images}, {covered} % of the image covered"
+    yield f"  corners      {estimate.rms_px:.3f} px rms, {estimate.held_out_rms_px:.3f} px on held-out ones"
+    values = (f"{name} {getattr(lens, f'{name}_px'):.1f}" for name in ("fx", "fy", "cx", "cy"))
+    yield f"  values       {', '.join(values)} px"
+    weaknesses = [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
+    if not whole:
+        yield _table(measured)
+        yield from _explanation(measured)
+        yield from weaknesses
+        for name, why in measured.refused.items():
+            yield f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]"
+    elif judgement.code != "intrinsics.fit":
+        told = zip(measured.weaknesses, weaknesses, strict=True)
+        weaknesses = [line for text, line in told if text not in judgement.sentence]
+        yield from weaknesses[:1]
+        if len(weaknesses) > 1:
+            yield f"  {len(weaknesses) - 1} more: {whole}"
 
 
 def _table(measured: MeasuredIntrinsics) -> Any:
@@ -148,37 +149,32 @@ def _table(measured: MeasuredIntrinsics) -> Any:
         old = None if measured.check is None else estimate.model.vector(lens)
     except ValueError:
         old = None
-    table = show.plain_table("", "", ">measured", ">sigma", ">profile", ">difference")
+    rows = []
     for index, name in enumerate(estimate.model.parameters):
         digits = 2 if name.endswith("_px") else 5
         sigma = float(estimate.sigma[index])
         cells = [f"{values[index]:.{digits}f}", f"{sigma:.{digits}f}", "-", "-"]
         if old is not None:
-            cells[2] = f"{old[index]:.{digits}f}"
-            cells[3] = f"{(values[index] - old[index]) / sigma:+.1f} sigma"
-        table.add_row("  " + name.removesuffix("_px"), *cells)
-    return table
+            cells[2:] = f"{old[index]:.{digits}f}", f"{(values[index] - old[index]) / sigma:+.1f} sigma"
+        rows.append(("  " + name.removesuffix("_px"), *cells))
+    return show.plain_table("", "", ">measured", ">sigma", ">profile", ">difference", rows=rows)
 
 
-def _explanation(measured: MeasuredIntrinsics) -> list[str]:
-    """State the board's shape, what does not fit, and images that are not used."""
+def _explanation(measured: MeasuredIntrinsics) -> Iterator[str]:
+    """State the board's shape and what does not fit."""
     estimate = measured.estimate
     (along_width, along_height, aspect), sigma = estimate.pattern_shape
     # The board's deviation from its nominal shape, estimated with the intrinsics.
-    lines = [
+    yield (
         f"  board     bow {1000 * along_width:+.1f}, {1000 * along_height:+.1f} mm (width, height), pattern "
         f"{100 * aspect:+.2f} +- {100 * sigma[2]:.2f} % too wide, "
-        f"corner error {1000 * estimate.print_rms_m:.2f} mm",
-    ]
+        f"corner error {1000 * estimate.print_rms_m:.2f} mm"
+    )
     if measured.check is not None:
-        lines.append(f"  {figures_of(measured.check)}")
+        yield f"  {figures_of(measured.check)}"
     if measured.misfit is not None:
         colour = "red" if measured.misfit.severity == "error" else "yellow"
-        lines.append(f"  [{colour}]{show.escape(measured.misfit.text)}[/]")
-    lines += [f"  [yellow]{show.escape(text)}[/]" for text in measured.weaknesses]
-    for name, why in measured.refused.items():
-        lines.append(f"  [dim]{show.escape(f'{name} {why.stage}: {why.sentence}')}[/]")
-    return lines
+        yield f"  [{colour}]{show.escape(measured.misfit.text)}[/]"
 
 
 @click.command(name="lidar-intrinsics")
@@ -204,70 +200,52 @@ def lidar_intrinsics(
     opened = [Session.open(path) for path in sessions]
     with show.progress_bar("detecting") as progress:
         errors = measure_lidar(opened, lidar, progress=progress)
-    document = _document(errors)
-    show.print_json(document) if as_json else _print(document, is_explained=explain)
+    document = lidar_document(errors)
+    if as_json:
+        show.print_json(document)
+    else:
+        show.print_parts(_errors(document, is_explained=explain))
     if save_profile is not None:
         save_lidar(opened[0], lidar, errors, save_profile)
         show.note(f"written: {save_profile}")
 
 
-def _print(document: dict[str, Any], *, is_explained: bool) -> None:
-    mm, n_captures = 1e3, document["n_captures"]
-    lateral, vertical = (
-        f"{mm * document[f'lens_{value}']:+.1f} +- {mm * document[f'lens_{sigma}']:.1f} mm"
-        for value, sigma in (
-            ("lateral_m", "lateral_sigma_m"),
-            ("vertical_m_per_rad", "vertical_sigma_m_per_rad"),
-        )
-    )
-    lasers = document["lasers"]
-    lines = [
-        f"{show.counted(sum(n_captures), 'capture')} of {show.counted(len(n_captures), 'session')}, "
-        f"{len(lasers)} lasers"
-    ]
-    for name, key, scale, digits, unit in (
-        ("range", "range{}_m", mm, 1, "mm"),
-        ("azimuth", "azimuth{}_deg", 1.0, 3, "deg"),
-        ("elevation", "elevation{}_deg", 1.0, 3, "deg"),
+# Name, keys of a laser's row, scale to the printed unit, digits, unit.
+_ERRORS = (
+    ("range", "range_m", "range_sigma_m", 1000.0, 1, "mm"),
+    ("azimuth", "azimuth_deg", "azimuth_sigma_deg", 1.0, 3, "deg"),
+    ("elevation", "elevation_deg", "elevation_sigma_deg", 1.0, 3, "deg"),
+)
+
+
+def _errors(document: dict[str, Any], *, is_explained: bool) -> Iterator[Any]:
+    """State the spread of each kind of error over the lasers, and the lens; explained, each laser's."""
+    lasers, n_captures = document["lasers"], document["n_captures"]
+    sessions = show.counted(len(n_captures), "session")
+    yield f"{show.counted(sum(n_captures), 'capture')} of {sessions}, {len(lasers)} lasers"
+    for name, key, sigma_key, scale, digits, unit in _ERRORS:
+        errors = [scale * row[key] for row in lasers]
+        sigma = float(np.median([scale * row[sigma_key] for row in lasers]))
+        spread = f"{min(errors):+.{digits}f} to {max(errors):+.{digits}f} {unit}"
+        yield f"  {name:<13}{spread} (median standard deviation {sigma:.{digits}f} {unit})"
+    for title, key, where in (
+        ("lens", "lens_lateral{}_m", "beside the axis"),
+        ("", "lens_vertical{}_m_per_rad", "per rad of elevation"),
     ):
-        errors = [scale * row[key.format("")] for row in lasers]
-        sigma = float(np.median([scale * row[key.format("_sigma")] for row in lasers]))
-        lines.append(
-            f"  {name:<13}{min(errors):+.{digits}f} to {max(errors):+.{digits}f} {unit} "
-            f"(median standard deviation {sigma:.{digits}f} {unit})"
+        value, sigma = (1000 * document[key.format(part)] for part in ("", "_sigma"))
+        yield f"  {title:<13}{value:+.1f} +- {sigma:.1f} mm {where}"
+    if is_explained:
+        angles = (">azimuth deg", ">sigma", ">elevation deg", ">sigma")
+        rows = (
+            (
+                f"{row['ring']}",
+                *(
+                    f"{scale * row[each]:{sign}.{digits}f}"
+                    for _, key, sigma_key, scale, digits, _ in _ERRORS
+                    for each, sign in ((key, "+"), (sigma_key, ""))
+                ),
+                f"{row['n_points']}",
+            )
+            for row in lasers
         )
-    show.print_lines(
-        [*lines, f"  {'lens':<13}{lateral} beside the axis", f"  {'':<13}{vertical} per rad of elevation"]
-    )
-    if not is_explained:
-        return
-    angles = (">azimuth deg", ">sigma", ">elevation deg", ">sigma")
-    table = show.plain_table("", ">laser", ">range mm", ">sigma", *angles, ">returns")
-    for row in document["lasers"]:
-        cells = [f"{row['ring']}", f"{mm * row['range_m']:+.1f}", f"{mm * row['range_sigma_m']:.1f}"]
-        for angle in ("azimuth", "elevation"):
-            cells += [f"{row[f'{angle}_deg']:+.3f}", f"{row[f'{angle}_sigma_deg']:.3f}"]
-        table.add_row(*cells, f"{row['n_points']}")
-    show.print_table(table)
-
-
-def _document(errors: LidarErrors) -> dict[str, Any]:
-    estimate = errors.found
-    values, sigmas = estimate.lasers.copy(), estimate.lasers_sigma.copy()
-    values[1:], sigmas[1:] = np.degrees(values[1:]), np.degrees(sigmas[1:])
-    lasers = []
-    for k, ring in enumerate(estimate.rings.tolist()):
-        row: dict[str, Any] = {"ring": ring, "n_points": int(errors.n_points[k])}
-        row |= zip(("range_m", "azimuth_deg", "elevation_deg"), values[:, k].tolist(), strict=True)
-        row |= zip(
-            ("range_sigma_m", "azimuth_sigma_deg", "elevation_sigma_deg"), sigmas[:, k].tolist(), strict=True
-        )
-        lasers.append(row)
-    return {
-        "n_captures": list(errors.n_captures),
-        "lens_lateral_m": float(estimate.lens[0]),
-        "lens_lateral_sigma_m": float(estimate.lens_sigma[0]),
-        "lens_vertical_m_per_rad": float(estimate.lens[1]),
-        "lens_vertical_sigma_m_per_rad": float(estimate.lens_sigma[1]),
-        "lasers": lasers,
-    }
+        yield show.plain_table("", ">laser", ">range mm", ">sigma", *angles, ">returns", rows=rows)

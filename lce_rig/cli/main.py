@@ -101,13 +101,6 @@ def cli(debug: bool) -> None:
     """
 
 
-def _comes_of_interrupt(error: BaseException | None) -> bool:
-    """Return whether Ctrl-C caused an error, as when it stops the import of a compiled module (open3d)."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__
-    return error is not None
-
-
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code.
 
@@ -126,7 +119,11 @@ def run(arguments: list[str]) -> int:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
         return 0
     except (Exception, KeyboardInterrupt) as error:
-        if isinstance(error, click.Abort) or _comes_of_interrupt(error):
+        # Ctrl-C may have stopped the import of a compiled module (open3d).
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt | click.Abort):
+            cause = cause.__cause__
+        if cause is not None:
             click.echo(INTERRUPTED, err=True)
             return EXIT_INTERRUPTED
         return _report(error, show_traceback=show_traceback)

@@ -1,6 +1,6 @@
 """`lce-rig reconstruct`: reconstruct images from an event recording."""
 
-from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,6 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, path_option
-from lce_rig.core.data import Events
 from lce_rig.core.errors import SourceError, UsageError
 from lce_rig.core.findings import Refusal
 from lce_rig.core.phrasing import significant
@@ -109,7 +108,11 @@ def _write(
     lines = ["picture,stamp_ns"]
     files: list[Path] = []
     refused: list[str] = []
-    pictures = reconstructor.reconstruct(_stretches(events, stamps_ns), stamps_ns)
+    # The part of the recording that the images need.
+    from_ns, until_ns = stamps_ns[0] - stamps_ns.step - _WARM_UP_NS, stamps_ns[-1] + 1
+    needed = takewhile(lambda stretch: stretch.t_ns[0] <= until_ns, events)
+    stretches = (stretch.between(from_ns, until_ns) for stretch in needed)
+    pictures = reconstructor.reconstruct(stretches, stamps_ns)
     with show.progress_bar("reconstructing") as progress:
         for done, picture in enumerate(pictures, start=1):
             if isinstance(picture, Refusal):
@@ -121,12 +124,3 @@ def _write(
     if files:
         (output / STAMPS).write_text("\n".join(lines) + "\n", encoding="utf-8")
     return files, refused
-
-
-def _stretches(events: EventRecording, stamps_ns: range) -> Iterator[Events]:
-    """Read the part of the recording that the images need."""
-    from_ns, until_ns = stamps_ns[0] - stamps_ns.step - _WARM_UP_NS, stamps_ns[-1] + 1
-    for stretch in events:
-        if stretch.t_ns[0] > until_ns:
-            return
-        yield stretch.between(from_ns, until_ns)

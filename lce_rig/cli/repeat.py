@@ -1,5 +1,6 @@
 """`lce-rig repeat`: compare the extrinsics from independent sessions of one rig, or the results of one."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +49,7 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as
             compared = compare(sessions, name=next(iter(names), None), progress=progress)
     for name in compared.calibrated:
         show.note(f"{name} has no result: calibrated for this comparison, not written")
-    for finding in compared.findings:
-        if finding.severity != "error":
-            show.warn(finding.sentence)
+    show.warn_of(finding for finding in compared.findings if finding.severity != "error")
     if as_json:
         show.print_json(
             {
@@ -71,10 +70,7 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as
         )
     else:
         for comparison in compared.comparisons:
-            show.print_lines(_lines(comparison, str(sessions[0])))
-            if explain:
-                show.print_table(_deviations(comparison))
-                show.print_table(_differences(comparison))
+            show.print_parts(_parts(comparison, str(sessions[0]), is_explained=explain))
     if compared.failed:
         raise ResultRefusedError(
             "; ".join(finding.text for finding in compared.failed), compared.failed[0].advice
@@ -86,44 +82,40 @@ def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as
         )
 
 
-def _deviations(comparison: Repeatability) -> Any:
-    headings = (">x mm", ">y mm", ">z mm", ">about x deg", ">about y deg", ">about z deg")
-    table = show.plain_table(f"{_sensors(comparison)}: difference from the mean", "session", *headings)
-    for name, tangent in zip(comparison.names, comparison.deviations, strict=True):
-        cells = [f"{1000 * value:+.1f}" for value in tangent[:3]]
-        cells += [f"{value:+.3f}" for value in np.degrees(tangent[3:])]
-        table.add_row(show.escape(name), *cells)
-    return table
-
-
-def _differences(comparison: Repeatability) -> Any:
-    headings = ("first", "second", ">deg", ">mm", ">mm at boards", ">distance", ">chance")
-    table = show.plain_table("pairs of sessions", *headings)
-    for pair in comparison.differences:
-        at_boards = ", ".join(f"{1000 * m:.1f} at {at_m:g} m" for at_m, m in pair.displacements_m.items())
-        sizes = f"{pair.rotation_deg:.3f}", f"{1000 * pair.translation_m:.1f}"
-        figures = (*sizes, at_boards or "-", f"{pair.distance:.1f}")
-        table.add_row(show.escape(pair.first), show.escape(pair.second), *figures, significant(pair.p))
-    return table
-
-
-def _lines(comparison: Repeatability, session: str) -> list[str]:
+def _parts(c: Repeatability, session: str, *, is_explained: bool) -> Iterator[Any]:
     """State whether the sessions agree, the mean extrinsics, and the spread with the reported one."""
-    c = comparison
     shared = "" if c.are_independent else ", at least: the results share captures"
     colour = "green" if c.agrees else "red"
-    lines = [f"[{colour}]{show.escape(c.finding.text)}[/]"]
-    advice = c.finding.advice_at(session)
-    lines += [f"  -> {show.escape(as_line(advice))}"] if advice else []
-    return [
-        *lines,
-        "  mean T_cam_lidar (p_cam = R p_lidar + t)",
-        *show.matrix_lines(c.T_cam_lidar, "    "),
-        f"  spread       {c.spread_rotation_deg:.3f} deg, {1000 * c.spread_translation_m:.1f} mm "
-        "(1 sigma of one session)",
-        f"  reported     {c.reported_rotation_deg:.3f} deg, {1000 * c.reported_translation_m:.1f} mm",
-        f"  chance       {significant(c.p)}{shared} (chi2 {c.chi2:.1f}, {c.dof} degrees of freedom)",
+    yield f"[{colour}]{show.escape(c.finding.text)}[/]"
+    if advice := c.finding.advice_at(session):
+        yield f"  -> {show.escape(as_line(advice))}"
+    yield "  mean T_cam_lidar (p_cam = R p_lidar + t)"
+    yield from show.matrix_lines(c.T_cam_lidar, "    ")
+    spread = show.sizes(c.spread_rotation_deg, c.spread_translation_m)
+    yield f"  spread       {spread} (1 sigma of one session)"
+    yield f"  reported     {show.sizes(c.reported_rotation_deg, c.reported_translation_m)}"
+    yield f"  chance       {significant(c.p)}{shared} (chi2 {c.chi2:.1f}, {c.dof} degrees of freedom)"
+    if not is_explained:
+        return
+    headings: tuple[str, ...] = ("session", ">x mm", ">y mm", ">z mm")
+    headings += (">about x deg", ">about y deg", ">about z deg")
+    rows = [
+        (
+            show.escape(name),
+            *(f"{1000 * value:+.1f}" for value in tangent[:3]),
+            *(f"{value:+.3f}" for value in np.degrees(tangent[3:])),
+        )
+        for name, tangent in zip(c.names, c.deviations, strict=True)
     ]
+    yield show.plain_table(f"{_sensors(c)}: difference from the mean", *headings, rows=rows)
+    headings = ("first", "second", ">deg", ">mm", ">mm at boards", ">distance", ">chance")
+    rows = []
+    for pair in c.differences:
+        at_boards = ", ".join(f"{1000 * m:.1f} at {at_m:g} m" for at_m, m in pair.displacements_m.items())
+        sizes = f"{pair.rotation_deg:.3f}", f"{1000 * pair.translation_m:.1f}", at_boards or "-"
+        names = show.escape(pair.first), show.escape(pair.second)
+        rows.append((*names, *sizes, f"{pair.distance:.1f}", significant(pair.p)))
+    yield show.plain_table("pairs of sessions", *headings, rows=rows)
 
 
 def _sensors(comparison: Repeatability) -> str:

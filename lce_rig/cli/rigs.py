@@ -1,6 +1,5 @@
 """`lce-rig rigs`: list, show, check and derive rig profiles."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,10 +15,12 @@ from lce_rig.pipeline.new_profile import BOARD_FORM, clouds_in, parse_board, par
 from lce_rig.pipeline.new_profile import new_profile as draft
 from lce_rig.rig import (
     Rig,
+    as_yaml,
     derive_text,
     dump_rig,
     edit_text,
     find_profile,
+    lens_settings,
     load_rig,
     read_profile,
     shipped_profiles,
@@ -39,12 +40,12 @@ def rigs(ctx: click.Context) -> None:
 @rigs.command("list")
 def list_profiles() -> None:
     """List the shipped profiles."""
-    table = show.plain_table("", "rig", "board", "description")
+    rows = []
     for rig in map(load_rig, shipped_profiles()):
         board = rig.board.to_board()
         pattern = f"{board.cols}x{board.rows} corners, {1e3 * board.square_m:g} mm"
-        table.add_row(rig.name, pattern, rig.description)
-    show.print_table(table)
+        rows.append((rig.name, pattern, rig.description))
+    show.print_table(show.plain_table("", "rig", "board", "description", rows=rows))
     show.note("for your own rig: lce-rig rigs new NAME --from rlfs, then --rig NAME.yaml")
 
 
@@ -59,7 +60,7 @@ def show_profile(rig_name: str, is_whole: bool, as_json: bool) -> None:
         show.print_json(rig.model_dump(mode="json"))
         return
     click.echo(dump_rig(rig, is_whole=is_whole), nl=False)
-    _print_warnings(rig)
+    show.warn_of(rig.warnings())
 
 
 @rigs.command("check")
@@ -69,12 +70,7 @@ def check_profile(file: str) -> None:
     rig = load_rig(file)
     check_networks(rig)
     click.echo(f"{find_profile(file)}: a valid profile of rig {rig.name}")
-    _print_warnings(rig)
-
-
-def _print_warnings(rig: Rig) -> None:
-    for warning in rig.warnings():
-        show.warn(warning.sentence)
+    show.warn_of(rig.warnings())
 
 
 @rigs.command("new")
@@ -188,7 +184,7 @@ def new_profile(
     show.note(f"wrote {path}; compare it with your rig, then: lce-rig rigs check {path}")
     if name in shipped_profiles():
         show.warn(f"--rig {name} is the shipped profile: use --rig {path}")
-    _print_warnings(load_rig(path))
+    show.warn_of(load_rig(path).warnings())
 
 
 _NUMBERS_HINT = (
@@ -227,14 +223,9 @@ def _sensor_settings(
         raise UsageError(
             f"{len(intrinsics)} --intrinsics for {len(names)} cameras", "Give one for each --camera."
         )
-    values = [] if lidar is None else [(f"lidars.{next(iter(parent.lidars))}.model", json.dumps(lidar))]
+    values = [] if lidar is None else [(f"lidars.{next(iter(parent.lidars))}.model", as_yaml(lidar))]
     for name, text in zip(names, intrinsics, strict=True):
-        lens, block = parse_intrinsics(text), f"cameras.{name}.intrinsics"
-        values += [(f"cameras.{name}.resolution_px", f"[{lens.width_px}, {lens.height_px}]")]
-        values += [(f"{block}.model", lens.model), (f"{block}.distortion", f"{list(lens.distortion)}")]
-        values += [
-            (f"{block}.{key}", f"{getattr(lens, key)}") for key in ("fx_px", "fy_px", "cx_px", "cy_px")
-        ]
+        values += lens_settings(name, parse_intrinsics(text))
     if board is not None:
         plate = board_block(parse_board(board))
         values += [(f"board.{key}", f"{value}") for key, value in plate.items()]

@@ -6,12 +6,14 @@ import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
+
+from lce_rig.core.findings import Finding
 
 COLOURS = {"pass": "green", "marginal": "yellow", "fail": "red"}
 """Colour of each verdict."""
@@ -63,7 +65,7 @@ def name_ranges(names: Sequence[str]) -> str:
 
 
 def cause_lines(cause: str, action: str, colour: str = "none") -> list[str]:
-    """Write a cause and its action for `print_lines`, on one line if both fit a terminal's 80 columns."""
+    """Write a cause and its action for `print_parts`, on one line if both fit a terminal's 80 columns."""
     if not action:
         return [f"  [{colour}]{escape(cause)}[/]"]
     if len(f"  {cause} -> {action}") <= _WIDTH:
@@ -95,6 +97,12 @@ def warn(text: str) -> None:
     click.secho(wrapped(f"warning: {text}", sys.stderr), fg="yellow", err=True)
 
 
+def warn_of(findings: Iterable[Finding]) -> None:
+    """Print findings as warnings."""
+    for finding in findings:
+        warn(finding.sentence)
+
+
 def print_json(document: Any) -> None:
     """Print a result for machines: findings, records and arrays as they are, too."""
 
@@ -108,8 +116,8 @@ def print_json(document: Any) -> None:
     click.echo(json.dumps(document, indent=2, allow_nan=False, default=plain))
 
 
-def plain_table(title: str, *headings: str) -> Any:
-    """Start a rich table without rules, so that it can be copied into a message; ">" aligns to the right."""
+def plain_table(title: str, *headings: str, rows: Iterable[Iterable[str]] = ()) -> Any:
+    """Make a rich table without rules, so that it can be copied into a message; ">" aligns to the right."""
     from rich.table import Table
 
     table = Table(
@@ -122,7 +130,14 @@ def plain_table(title: str, *headings: str) -> Any:
     )
     for heading in headings:
         table.add_column(heading.removeprefix(">"), justify="right" if heading.startswith(">") else "left")
+    for cells in rows:
+        table.add_row(*cells)
     return table
+
+
+def sizes(rotation_deg: float, translation_m: float) -> str:
+    """Write the size of a motion, or its standard deviation."""
+    return f"{rotation_deg:.3f} deg, {1000 * translation_m:.1f} mm"
 
 
 def matrix_lines(T: Any, indent: str) -> list[str]:
@@ -215,18 +230,23 @@ def escape(text: str) -> str:
     return escape_markup(text)
 
 
-def print_lines(lines: list[str]) -> None:
-    """Print lines with rich markup on stdout; a terminal gets them wrapped at words, indented."""
+def print_parts(parts: Iterable[Any]) -> None:
+    """Print a result on stdout: lines with rich markup, and tables.
+
+    A terminal gets lines wrapped at words, indented.
+    """
     from rich.console import Console
     from rich.text import Text
 
     is_terminal = sys.stdout.isatty()
     console = Console(highlight=False, soft_wrap=not is_terminal)
-    for line in lines:
-        if not is_terminal:
+    for line in parts:
+        if not isinstance(line, str):
+            print_table(line)
+        elif not is_terminal:
             console.print(line)
-            continue
-        text = Text.from_markup(line.lstrip(" "))
-        indent = " " * min(len(line) - len(line.lstrip(" ")), console.width // 2)
-        for k, part in enumerate(text.wrap(console, console.width - len(indent) - _HANG) or [text]):
-            console.print(Text(indent + " " * (_HANG if k else 0)) + part)
+        else:
+            text = Text.from_markup(line.lstrip(" "))
+            indent = " " * min(len(line) - len(line.lstrip(" ")), console.width // 2)
+            for k, part in enumerate(text.wrap(console, console.width - len(indent) - _HANG) or [text]):
+                console.print(Text(indent + " " * (_HANG if k else 0)) + part)

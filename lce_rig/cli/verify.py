@@ -1,5 +1,6 @@
 """`lce-rig verify` projects the point clouds into the images, `lce-rig view` shows them in 3D."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -7,12 +8,11 @@ import click
 
 import lce_rig as lce
 from lce_rig.cli import show
-from lce_rig.cli.calibrate import exit_by_verdict, scene_texts
+from lce_rig.cli.calibrate import causes_of, exit_by_verdict, residual_words, scene_texts
 from lce_rig.cli.options import explain_option, json_option, path_option, result_option, session_argument
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.findings import worst
 from lce_rig.detect.detection import Pair
-from lce_rig.judge.findings import consequences
 from lce_rig.judge.session_check import SessionCheck
 from lce_rig.pipeline.result_files import RESULT, result_folder
 from lce_rig.pipeline.verification import profile_behind
@@ -47,8 +47,7 @@ def verify(
     profile = None if result is None or saved is None else profile_behind(result, saved)
     with show.progress_bar("detecting") as progress:
         verification = lce.verify(opened, saved, name=name, profile=profile, progress=progress)
-    for note in verification.notes:
-        show.warn(note.sentence)
+    show.warn_of(verification.notes)
     with show.progress_bar("drawing") as progress:
         checks = verification.write(output, progress=progress)
     if as_json:
@@ -57,14 +56,12 @@ def verify(
                 "format_version": 2,
                 "rig": opened.rig.name,
                 "pairs": [c.document() for c in checks],
-                "findings": [note.as_json() for note in verification.notes],
+                "findings": verification.notes,
             }
         )
     else:
         for checked in checks:
-            if explain:
-                show.print_table(_table(checked))
-            show.print_lines(_lines(checked, str(session), is_explained=explain))
+            show.print_parts(_parts(checked, str(session), is_explained=explain))
     for c in verification.unchecked:
         show.warn(f"{session} holds no captures of {Pair.of(c)}: not checked")
     exit_by_verdict(verification.calibrations, are_printed=not as_json)
@@ -78,46 +75,38 @@ def verify(
         )
 
 
-def _table(checked: SessionCheck) -> Any:
-    headings = ("capture", ">planes mm", ">rms", ">edges mm", ">rms", ">corners px", "")
-    table = show.plain_table(str(checked.pair), *headings)
-    for r in checked.residuals:
-        lengths = (r.plane_mean_m, r.plane_rms_m, r.edge_mean_m, r.edge_rms_m)
-        state = "" if r.capture in checked.calibration.captures_used else "[dim]not used[/]"
-        cells = (*(f"{1000 * value:.1f}" for value in lengths), f"{r.reprojection_px:.2f}", state)
-        table.add_row(r.capture, *cells)
-    return table
-
-
-def _lines(checked: SessionCheck, session: str, *, is_explained: bool) -> list[str]:
+def _parts(checked: SessionCheck, session: str, *, is_explained: bool) -> Iterator[Any]:
     """State whether the captures agree with the extrinsics, mean residuals and where the images are."""
-    c, doubts = checked.calibration, checked.findings
+    c, doubts, pair = checked.calibration, checked.findings, str(checked.pair)
+    if is_explained:
+        rows = []
+        for r in checked.residuals:
+            lengths = (r.plane_mean_m, r.plane_rms_m, r.edge_mean_m, r.edge_rms_m)
+            state = "" if r.capture in c.captures_used else "[dim]not used[/]"
+            millimetres = (f"{1000 * value:.1f}" for value in lengths)
+            rows.append((r.capture, *millimetres, f"{r.reprojection_px:.2f}", state))
+        headings = ("capture", ">planes mm", ">rms", ">edges mm", ">rms", ">corners px", "")
+        yield show.plain_table(pair, *headings, rows=rows)
     colour = {"note": "green", "warning": "yellow", "error": "red"}[worst(doubts)]
     opinion = {"note": "agree with", "warning": "fit poorly", "error": "contradict"}[worst(doubts)]
-    lines = [f"[bold]{checked.pair}[/]: [{colour}]the captures {opinion} the extrinsics[/]"]
-    for finding in doubts:
-        lines += show.cause_lines(finding.text, finding.advice_at(session), colour)
-    if c.verdict != "pass":
-        lines[0] += f", [{show.COLOURS[c.verdict]}]whose verdict is {c.verdict.upper()}[/]"
-        following = consequences(c.findings)
-        causes = [each for each in c.findings if each.severity != "note" and each.code not in following]
-        for cause in causes if is_explained else causes[:1]:
-            advice = cause.advice_at(session)
-            lines += show.cause_lines(cause.text, advice, show.COLOURS[c.verdict])
+    of_result = show.COLOURS[c.verdict]
+    verdict = "" if c.verdict == "pass" else f", [{of_result}]whose verdict is {c.verdict.upper()}[/]"
+    yield f"[bold]{pair}[/]: [{colour}]the captures {opinion} the extrinsics[/]{verdict}"
+    causes = [] if c.verdict == "pass" else causes_of(c.findings)
+    for each, tint in (
+        *((doubt, colour) for doubt in doubts),
+        *((cause, of_result) for cause in (causes if is_explained else causes[:1])),
+    ):
+        yield from show.cause_lines(each.text, each.advice_at(session), tint)
     if checked.metrics is not None:
-        m = checked.metrics
-        lines.append(
-            f"  residuals    planes {1000 * m.mpe_m:.1f} mm, edges {1000 * m.mee_m:.1f} mm"
-            f"{'' if c.is_of_lidars else f', corners {m.reprojection_px:.2f} px'} (means)"
-        )
+        yield f"  residuals    {residual_words(checked.metrics, c)} (means)"
     scene = scene_texts(checked.scene)
     if checked.scene.state != "unknown" or is_explained:
-        lines += show.titled_lines("scene", scene if is_explained else scene[:1])
+        yield from show.titled_lines("scene", scene if is_explained else scene[:1])
     if checked.contact_sheets:
         first, *others = checked.contact_sheets
         last = f" to {others[-1].name}" if others else ""
-        lines.append(f"  images       {show.escape(str(first))}{last}")
-    return lines
+        yield f"  images       {show.escape(str(first))}{last}"
 
 
 @click.command()

@@ -183,24 +183,8 @@ def export(
     is_forced: bool = False,
     session: Session | None = None,
     robot: RobotTree | None = None,
+    findings: list[Finding] | None = None,
 ) -> list[Path]:
-    """Write formats into a folder as `export_formats` does, and return the files alone."""
-    files, _ = export_formats(
-        calibrations, rig, folder, formats=formats, is_forced=is_forced, session=session, robot=robot
-    )
-    return files
-
-
-def export_formats(
-    calibrations: Sequence[Calibration],
-    rig: Rig,
-    folder: Path | str,
-    *,
-    formats: Iterable[str] | None = None,
-    is_forced: bool = False,
-    session: Session | None = None,
-    robot: RobotTree | None = None,
-) -> tuple[list[Path], list[Finding]]:
     """Write formats into a folder.
 
     Exports of an earlier run are removed first, even if this one is refused, so that they are not mistaken
@@ -214,10 +198,10 @@ def export_formats(
         is_forced: write failed calibrations too; every file then says so.
         session: with images and scans, for formats that show them.
         robot: its own tree of frames, into which the outputs are to fit.
+        findings: gets those about content that is left out or in another form.
 
     Returns:
-        The files in the order of the formats (those of a bag lie in a folder of their own), and findings
-        about content that is left out or in another form.
+        The files in the order of the formats; those of a bag lie in a folder of their own.
 
     Raises:
         LceRigError: a calibration names sensors that the rig does not have.
@@ -234,7 +218,8 @@ def export_formats(
     exporters = [load_exporter(name) for name in (usual_formats(rig) if formats is None else formats)]
     remove_exports(folder)
     require_usable(calibrations, is_forced=is_forced)
-    job = ExportJob(calibrations, rig.with_lenses(calibrations), folder, robot, session)
+    told = [] if findings is None else findings
+    job = ExportJob(calibrations, rig.with_lenses(calibrations), folder, robot, session, told)
     if rig.mount is not None and robot is not None and rig.mount.of in robot.above:
         joint = robot.above[rig.mount.of]
         angle_deg, distance_m = tangent_sizes(difference(joint.T_parent_child, rig.mount.to_matrix()))
@@ -248,7 +233,7 @@ def export_formats(
     except BaseException:
         remove_exports(folder)
         raise
-    return paths, job.findings
+    return paths
 
 
 def require_usable(calibrations: Sequence[Calibration], *, is_forced: bool = False) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lce_rig.core.calibration import MADE_BY, Calibration
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SessionError, reading
 from lce_rig.core.files import read_json
 from lce_rig.core.geometry import Array, invert, parse_pose, transform
@@ -21,67 +22,56 @@ def export_extrinsics(job: ExportJob) -> list[Path]:
     lines = [f"# {line}" for line in job.head("extrinsics", *job.calibrations)]
     lines += ["format_version: 1", f"rig: {quoted(job.rig.name)}", f"made_by: {quoted(MADE_BY)}", "pairs:"]
     for calibration in job.calibrations:
-        lines += (_lidars if calibration.is_of_lidars else _pair)(calibration, job.rig)
+        lines += _pair(calibration, job.rig)
     return [job.write("extrinsics.yaml", lines)]
 
 
-def _lidars(calibration: Calibration, rig: Rig) -> list[str]:
-    """List the pose of two LiDARs, as `_pair` does."""
-    first, second = rig.lidars[calibration.camera].frame, rig.lidars[calibration.lidar].frame
-    lines = [
-        f"  - lidar: {quoted(calibration.camera)}",
-        f"    other_lidar: {quoted(calibration.lidar)}",
-        f"    lidar_frame: {quoted(first)}",
-        f"    other_lidar_frame: {quoted(second)}",
-        f"    verdict: {calibration.verdict}",
-        f"    reasons: {texts(finding.sentence for finding in calibration.findings)}",
+def _pair(c: Calibration, rig: Rig) -> list[str]:
+    """List the sensors, the verdict, the pose with its inverse and its covariance."""
+    lidar, inverse = rig.lidars[c.lidar].frame, invert(c.T_cam_lidar)
+    points: tuple[list[str], list[str]] = [], []
+    if c.is_of_lidars:
+        first = rig.lidars[c.camera].frame
+        axes = f"the axes of {first}"
+        names = {"lidar": c.camera, "other_lidar": c.lidar, "lidar_frame": first, "other_lidar_frame": lidar}
+        poses = "T_lidar_other", "T_other_lidar"
+        forward = f"takes points from {lidar} to {first}: p_lidar = R p_other + t"
+        forward += f"; the pose of {lidar} in {first}"
+        backward = f"takes points from {first} to {lidar}: p_other = R p_lidar + t"
+    else:
+        camera, axes = rig.cameras[c.camera], "the optical frame's axes"
+        names = {"camera": c.camera, "channel": c.channel, "lidar": c.lidar}
+        names |= {"camera_frame": camera.optical_frame, "lidar_frame": lidar}
+        poses, points = ("T_cam_lidar", "T_lidar_cam"), _worked_point(c, inverse, camera.to_intrinsics())
+        in_lidar = f"the LiDAR's frame {lidar} (x forward, y left, z up)"
+        in_camera = f"the camera's optical frame {camera.optical_frame} (x right, y down, z forward)"
+        forward = f"takes points from {in_lidar} to {in_camera}: p_cam = R p_lidar + t"
+        backward = f"takes points from {in_camera} to {in_lidar}: p_lidar = R p_cam + t"
+        backward += "; the camera's pose on the LiDAR"
+    lines = [f"    {key}: {quoted(name)}" for key, name in names.items()]
+    return [
+        lines[0].replace("    ", "  - ", 1),
+        *lines[1:],
+        f"    verdict: {c.verdict}",
+        f"    reasons: {texts(finding.sentence for finding in c.findings)}",
+        *_pose_block(poses[0], forward, c.T_cam_lidar),
+        *points[0],
+        *_pose_block(poses[1], backward, inverse),
+        *points[1],
+        *_judgement(c, poses[0], axes),
     ]
-    T, inverse = calibration.T_cam_lidar, invert(calibration.T_cam_lidar)
-    forward = (
-        f"takes points from {second} to {first}: p_lidar = R p_other + t; the pose of {second} in {first}"
-    )
-    backward = f"takes points from {first} to {second}: p_other = R p_lidar + t"
-    lines += _pose_block("T_lidar_other", forward, T) + _pose_block("T_other_lidar", backward, inverse)
-    return lines + _judgement(calibration, "T_lidar_other", f"the axes of {first}")
 
 
-def _pair(calibration: Calibration, rig: Rig) -> list[str]:
-    camera, lidar = rig.cameras[calibration.camera], rig.lidars[calibration.lidar]
-    in_lidar = f"the LiDAR's frame {lidar.frame} (x forward, y left, z up)"
-    in_camera = f"the camera's optical frame {camera.optical_frame} (x right, y down, z forward)"
-    T_lidar_cam = invert(calibration.T_cam_lidar)
-    # A point in front of the camera with round coordinates in the LiDAR's frame, easy to check by hand.
+def _worked_point(c: Calibration, T_lidar_cam: Array, lens: Intrinsics) -> tuple[list[str], list[str]]:
+    """Give a point in front of the camera, round in the LiDAR's frame, to check the pose and its inverse."""
     point_lidar = np.round(transform(T_lidar_cam, np.array([[0.3, 0.2, 3.0]])), 2)
-    point_camera = transform(calibration.T_cam_lidar, point_lidar)
-    pixel, _ = camera.to_intrinsics().project(point_camera)
-    forward = f"takes points from {in_lidar} to {in_camera}: p_cam = R p_lidar + t"
-    backward = (
-        f"takes points from {in_camera} to {in_lidar}: p_lidar = R p_cam + t; the camera's pose on the LiDAR"
-    )
-    lines = [
-        f"  - camera: {quoted(calibration.camera)}",
-        f"    channel: {quoted(calibration.channel)}",
-        f"    lidar: {quoted(calibration.lidar)}",
-        f"    camera_frame: {quoted(camera.optical_frame)}",
-        f"    lidar_frame: {quoted(lidar.frame)}",
-        f"    verdict: {calibration.verdict}",
-        f"    reasons: {texts(finding.sentence for finding in calibration.findings)}",
-    ]
-    lines += _pose_block("T_cam_lidar", forward, calibration.T_cam_lidar)
-    lines += [
-        "      worked_point:",
-        f"        p_lidar_m: {numbers(point_lidar[0])}",
-        f"        p_cam_m: {numbers(point_camera[0])}",
-    ]
-    if np.isfinite(pixel).all():
-        lines.append(f"        pixel: {numbers(pixel[0])}")
-    lines += _pose_block("T_lidar_cam", backward, T_lidar_cam)
-    lines += [
-        "      worked_point:",
-        f"        p_cam_m: {numbers(point_camera[0])}",
-        f"        p_lidar_m: {numbers(point_lidar[0])}",
-    ]
-    return lines + _judgement(calibration, "T_cam_lidar", "the optical frame's axes")
+    point_camera = transform(c.T_cam_lidar, point_lidar)
+    pixel, _ = lens.project(point_camera)
+    in_lidar = f"        p_lidar_m: {numbers(point_lidar[0])}"
+    in_camera = f"        p_cam_m: {numbers(point_camera[0])}"
+    drawn = [f"        pixel: {numbers(pixel[0])}"] if np.isfinite(pixel).all() else []
+    head = "      worked_point:"
+    return [head, in_lidar, in_camera, *drawn], [head, in_camera, in_lidar]
 
 
 def _pose_block(name: str, meaning: str, T: Array) -> list[str]:

@@ -24,7 +24,7 @@ from lce_rig.core.errors import (
 )
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, tangent_sizes
-from lce_rig.export import export_formats
+from lce_rig.export import export
 from lce_rig.fleet.findings import (
     DEPLOY_FAILED,
     DEPLOY_OLDER,
@@ -35,7 +35,6 @@ from lce_rig.fleet.findings import (
 from lce_rig.fleet.place import (
     CHANGED,
     COMMIT,
-    DISCARD,
     RECORD,
     RUN,
     SAYS,
@@ -196,14 +195,9 @@ def deploy(
         if planned.objections:
             forced = sorted({finding.code for finding in planned.objections})
             record = record.model_copy(update={"reason": reason, "forced": forced})
-        try:
-            _write(place, record, Path(folder))
-            _commit(place, target, record, record.replaces, "deploy")
-        except TargetError:
-            # Free the space; after a lost connection, the next deployment does.
-            with suppress(TargetError):
-                place.must_run(DISCARD, record.name)
-            raise
+        # What fails leaves a release that never became current; the next deployment removes it.
+        _write(place, record, Path(folder))
+        _commit(place, target, record, record.replaces, "deploy")
     output = _run(place, target, record.name)
     return Deployed(record, record.replaces, True, output, planned.state.changed, planned.remarks)
 
@@ -304,7 +298,7 @@ def _stage(
     saved = read_result(result / RESULT)
     folder.mkdir()
     # A failed result is one of the objections, which are decided on together.
-    export_formats(saved.pairs, rig, folder, formats=target.formats, is_forced=True, session=session)
+    export(saved.pairs, rig, folder, formats=target.formats, is_forced=True, session=session)
     shutil.copyfile(result / RESULT, folder / RESULT)
     for pattern in target.files:
         matching: list[Path] = []

@@ -1,5 +1,14 @@
 """Findings about fleets: robots that moved, sessions without a result, objections to a deployment."""
 
+from lce_rig.core.errors import (
+    LceRigError,
+    NotEnoughDataError,
+    ProfileError,
+    ResultRefusedError,
+    SessionError,
+    SourceError,
+    UsageError,
+)
 from lce_rig.core.findings import Kind
 
 MOVED = Kind(
@@ -10,13 +19,18 @@ MOVED = Kind(
     severity="note",
 )
 
-PROFILE = Kind("fleet.profile", "{what}", "{hint}")
-SESSION = Kind("fleet.session", "{what}", "{hint}")
-SOURCE = Kind("fleet.source", "{what}", "{hint}")
-NOT_ENOUGH_DATA = Kind("fleet.not_enough_data", "{what}", "{hint}")
-REFUSED = Kind("fleet.refused", "{what}", "{hint}")
-USAGE = Kind("fleet.usage", "{what}", "{hint}")
-OTHER_ERROR = Kind("fleet.other_error", "{what}", "{hint}")
+_CODES: dict[type[LceRigError], str] = {
+    ProfileError: "profile",
+    SessionError: "session",
+    SourceError: "source",
+    NotEnoughDataError: "not_enough_data",
+    ResultRefusedError: "refused",
+    UsageError: "usage",
+    LceRigError: "other_error",
+}
+OF_ERRORS = {error: Kind(f"fleet.{code}", "{what}", "{hint}") for error, code in _CODES.items()}
+"""Errors that the user can repair; the first that an error is an instance of counts."""
+
 DAMAGED = Kind(
     "fleet.damaged",
     "its files in the registry are damaged: {what}",

@@ -2,13 +2,13 @@
 
 The table has a row for each camera and LiDAR of a session, or for a session that failed. It is an index: a
 folder of the registry holds result.json, and beside it `ROWS` with what result.json does not hold: `SESSION`.
-`pair_columns` selects the other columns from result.json, here and nowhere else.
+`PAIR` selects the other columns from result.json, here and nowhere else.
 """
 
 import io
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -39,6 +39,7 @@ Row: TypeAlias = dict[str, Any]
 
 _TEXT, _TEXTS, _FLOAT, _INT = pa.string(), pa.list_(pa.string()), pa.float64(), pa.int32()
 _MATRIX, _COVARIANCE = pa.list_(pa.float64(), 16), pa.list_(pa.float64(), 21)
+_UPPER = np.triu_indices(6)
 SESSION: Mapping[str, Any] = {
     **dict.fromkeys(("robot", "rig", "date", "folder", "source", "session_sha256", "profile_sha256"), _TEXT),
     **dict.fromkeys(
@@ -47,79 +48,69 @@ SESSION: Mapping[str, Any] = {
     **dict.fromkeys(("duration_s", "cpu_s", "peak_memory_mb"), _FLOAT),
 }
 """Columns of a session, and their types."""
-PAIR: Mapping[str, Any] = {
-    **dict.fromkeys(("camera", "lidar", "camera_serial", "lidar_serial", "verdict"), _TEXT),
-    **dict.fromkeys(("findings", "severities", "refusals"), _TEXTS),
-    "T_cam_lidar": _MATRIX,
-    "cov": _COVARIANCE,
-    "cov_shared": _COVARIANCE,
-    **dict.fromkeys(("n_captures", "n_detected", "n_used", "n_refused"), _INT),
-    **dict.fromkeys(
-        ("sigma_rotation_deg", "sigma_translation_m", "mpe_m", "mee_m", "reprojection_px"), _FLOAT
-    ),
-    **dict.fromkeys(("time_offset_s", "camera_scale"), _FLOAT),
-    "scene": _TEXT,
+Select: TypeAlias = Callable[[Calibration, Mapping[str, str]], Any]
+PAIR: Mapping[str, tuple[Any, Select]] = {
+    "camera": (_TEXT, lambda c, _: c.camera),
+    "lidar": (_TEXT, lambda c, _: c.lidar),
+    "camera_serial": (_TEXT, lambda c, serials: serials.get(c.camera)),
+    "lidar_serial": (_TEXT, lambda c, serials: serials.get(c.lidar)),
+    "verdict": (_TEXT, lambda c, _: c.verdict),
+    "findings": (_TEXTS, lambda c, _: [finding.code for finding in c.findings]),
+    "severities": (_TEXTS, lambda c, _: [finding.severity for finding in c.findings]),
+    "refusals": (_TEXTS, lambda c, _: [refusal.code for refusal in c.captures_refused.values()]),
+    "T_cam_lidar": (_MATRIX, lambda c, _: c.T_cam_lidar.ravel().tolist()),
+    "cov": (_COVARIANCE, lambda c, _: covariance_alone(c)[_UPPER].tolist()),
+    "cov_shared": (_COVARIANCE, lambda c, _: c.cov_shared[_UPPER].tolist()),
+    "n_captures": (_INT, lambda c, _: c.n_captures),
+    "n_detected": (_INT, lambda c, _: c.n_detected),
+    "n_used": (_INT, lambda c, _: len(c.captures_used)),
+    "n_refused": (_INT, lambda c, _: len(c.captures_refused)),
+    "sigma_rotation_deg": (_FLOAT, lambda c, _: c.sigma_rotation_deg),
+    "sigma_translation_m": (_FLOAT, lambda c, _: c.sigma_translation_m),
+    "mpe_m": (_FLOAT, lambda c, _: c.metrics.mpe_m),
+    "mee_m": (_FLOAT, lambda c, _: c.metrics.mee_m),
+    "reprojection_px": (_FLOAT, lambda c, _: c.metrics.reprojection_px),
+    "time_offset_s": (_FLOAT, lambda c, _: _mean_offset_s(c)),
+    "camera_scale": (_FLOAT, lambda c, _: c.diagnostics.camera_scale),
+    "scene": (_TEXT, lambda c, _: None if c.scene is None else c.scene.state),
 }
-"""Columns of a camera and a LiDAR, and their types."""
-SCHEMA = pa.schema([pa.field(name, kind) for name, kind in {**SESSION, **PAIR}.items()])
+"""Columns of a camera and a LiDAR: type, and the value in a result with the sensors' serial numbers."""
+_TYPES = {**SESSION, **{name: kind for name, (kind, _) in PAIR.items()}}
+SCHEMA = pa.schema([pa.field(name, kind) for name, kind in _TYPES.items()])
 COLUMNS = f"Columns: {', '.join(SCHEMA.names)}.\nText stands in single quotes: verdict = 'fail'."
-_UPPER = np.triu_indices(6)
+
 # Rows that share minima and maxima, by which a query skips them.
 _ROWS_PER_GROUP = 1 << 16
 # Poses and covariances, most of the bytes, do not shrink: the fastest to read wins.
 _COMPRESSION = "lz4"
 
 
-def pair_columns(c: Calibration, serials: Mapping[str, str]) -> Row:
-    """Select the columns `PAIR` from a result.
-
-    Args:
-        c: the result of one camera and LiDAR.
-        serials: serial numbers by sensor.
-    """
+def _mean_offset_s(c: Calibration) -> float:
     offsets = [channel.time_offset_s for channel in c.channel_results if channel.time_offset_s is not None]
-    figures = {
-        "sigma_rotation_deg": c.sigma_rotation_deg,
-        "sigma_translation_m": c.sigma_translation_m,
-        "mpe_m": c.metrics.mpe_m,
-        "mee_m": c.metrics.mee_m,
-        "reprojection_px": c.metrics.reprojection_px,
-        "time_offset_s": float(np.mean(offsets)) if offsets else math.nan,
-        "camera_scale": c.diagnostics.camera_scale,
-    }
-    return {
-        "camera": c.camera,
-        "lidar": c.lidar,
-        "camera_serial": serials.get(c.camera),
-        "lidar_serial": serials.get(c.lidar),
-        "verdict": c.verdict,
-        "findings": [finding.code for finding in c.findings],
-        "severities": [finding.severity for finding in c.findings],
-        "refusals": [refusal.code for refusal in c.captures_refused.values()],
-        "T_cam_lidar": c.T_cam_lidar.ravel().tolist(),
-        "cov": covariance_alone(c)[_UPPER].tolist(),
-        "cov_shared": c.cov_shared[_UPPER].tolist(),
-        "n_captures": c.n_captures,
-        "n_detected": c.n_detected,
-        "n_used": len(c.captures_used),
-        "n_refused": len(c.captures_refused),
-        **{name: float(value) if math.isfinite(value) else None for name, value in figures.items()},
-        "scene": None if c.scene is None else c.scene.state,
-    }
+    return float(np.mean(offsets)) if offsets else math.nan
 
 
 def with_pairs(rows: Iterable[Row], pairs: Iterable[Calibration], serials: Mapping[str, str]) -> list[Row]:
-    """Put the columns of each result into its row.
+    """Put the columns `PAIR` of each result into its row; figures that are not finite are null.
 
     Args:
         rows: of one session, as in `ROWS`: one with status "ok" for all results, and one for each camera and
-            LiDAR without a result. Earlier versions wrote one with all columns for each result.
+            LiDAR without a result.
         pairs: the results.
         serials: serial numbers by sensor.
     """
     known = list(rows)
-    sessions = [{name: row.get(name) for name in SESSION} for row in known if row["status"] == "ok"]
-    solved = [{**sessions[0], **pair_columns(pair, serials)} for pair in pairs] if sessions else []
+    solved = []
+    for session in [row for row in known if row["status"] == "ok"][:1]:
+        for c in pairs:
+            row = {name: session.get(name) for name in SESSION}
+            row |= {name: select(c, serials) for name, (_, select) in PAIR.items()}
+            solved.append(
+                {
+                    name: None if isinstance(value, float) and not math.isfinite(value) else value
+                    for name, value in row.items()
+                }
+            )
     return solved + [row for row in known if row["status"] != "ok"]
 
 

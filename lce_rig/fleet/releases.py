@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -145,6 +145,10 @@ class ReleaseRecord(BaseModel):
     def set_sha256(self) -> str:
         """Fingerprint of all files with their names."""
         return set_sha256(self.files)
+
+    def as_json(self) -> dict[str, Any]:
+        """List its content, and the fingerprint of its files, as plain types."""
+        return self.model_dump() | {"set_sha256": self.set_sha256}
 
     def line(self) -> str:
         """Write it as one line."""

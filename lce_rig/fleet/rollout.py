@@ -6,7 +6,7 @@ continues after an interrupt, and a rollback restores what such robots held befo
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -103,110 +103,96 @@ def newest_results(registry: Registry, where: str = "") -> dict[str, RobotState]
     return states
 
 
-class FleetDeployment:
-    """One target of every robot.
+def roll_out(
+    registry: Registry,
+    target: str,
+    file: Path,
+    wanted: Mapping[str, RobotState],
+    step: Literal["deploy", "status", "rollback"] = "deploy",
+    *,
+    reason: str = "",
+    progress: Progress = silent,
+) -> Rollout:
+    """Deploy to one robot after the other, ask each for what it holds, or restore its earlier release.
+
+    Deploying stops at the first robot that fails; robots that hold their result are not written again. The
+    earlier release is restored on robots that hold their newest result. Robots that are left out stay so.
 
     Args:
         registry: with the results.
         target: name of the target in the file; `{robot}` in its `to` stands for each robot's name.
         file: that lists targets.
+        wanted: as `newest_results` gives them.
+        step: at each robot.
+        reason: of a rollback; it is written down there.
+        progress: called with (done, total) robots.
+
     Raises:
         UsageError: there is no target of this name.
         ProfileError: the file with the targets is invalid.
     """
-
-    def __init__(self, registry: Registry, target: str, file: Path) -> None:
-        self._registry, self._name = registry, target
-        targets = read_targets(file)
-        if target not in targets:
-            raise UsageError(f"no target is called {target!r}", f"Known targets: {', '.join(targets)}.")
-        self._target = targets[target]
-
-    def run(self, wanted: Mapping[str, RobotState], *, progress: Progress = silent) -> Rollout:
-        """Deploy to one robot after the other, and stop at the first that fails.
-
-        Robots that hold their result already are not written again.
-
-        Args:
-            wanted: as `newest_results` gives them.
-            progress: called with (done, total) robots.
-        """
-        return self._each(wanted, self._deploy, progress, is_stopped=True)
-
-    def status(self, wanted: Mapping[str, RobotState], *, progress: Progress = silent) -> Rollout:
-        """Ask every robot for what it holds; the arguments are those of `run`."""
-        return self._each(wanted, self._ask, progress)
-
-    def roll_back(
-        self, wanted: Mapping[str, RobotState], reason: str = "", *, progress: Progress = silent
-    ) -> Rollout:
-        """Restore the earlier release on each robot that holds its newest result, as `run` left it."""
-
-        def restore(state: RobotState, target: TargetSettings) -> RobotState:
-            state = self._ask(state, target)
-            if state.state != "in_place":
-                return state.ended("not_rolled_back", state.detail)
-            if not state.replaces:
-                return state.ended("not_rolled_back", "it is the first release there")
+    targets = read_targets(file)
+    if target not in targets:
+        raise UsageError(f"no target is called {target!r}", f"Known targets: {', '.join(targets)}.")
+    rollout = Rollout(target)
+    for done, state in enumerate(wanted.values(), 1):
+        if state.state != "left_out":
             try:
-                deployment.rollback(target, state.replaces, reason=reason)
-            except CommandError as error:
-                return state.ended("rolled_back", error)
-            return state.ended("rolled_back")
-
-        return self._each(wanted, restore, progress)
-
-    def _each(
-        self,
-        wanted: Mapping[str, RobotState],
-        step: Callable[[RobotState, TargetSettings], RobotState],
-        progress: Progress,
-        *,
-        is_stopped: bool = False,
-    ) -> Rollout:
-        """Take a step at each robot that is not left out; if asked to, stop at the first failure."""
-        rollout = Rollout(self._name)
-        for done, state in enumerate(wanted.values(), 1):
-            if state.state != "left_out":
                 try:
-                    target = self._target_of(state.robot)
-                    state = step(replace(state, to=target.to), target)
-                except (LceRigError, OSError) as error:
-                    state = state.ended("failed", error)
-            rollout.robots[state.robot] = state
-            progress(done, len(wanted))
-            if is_stopped and state.state == "failed":
-                rollout.stopped_by = state.robot
-                break
-        return rollout
+                    of_robot = targets[target].for_robot(state.robot)
+                except ValueError as error:
+                    what = f"it cannot be part of {targets[target].to}"
+                    raise UsageError(what, "Rename the robot.") from error
+                state = replace(state, to=of_robot.to)
+                if step == "deploy":
+                    state = _deploy(registry, state, of_robot)
+                else:
+                    state = _ask(registry, state, of_robot)
+                    state = _restore(state, of_robot, reason) if step == "rollback" else state
+            except (LceRigError, OSError) as error:
+                state = state.ended("failed", error)
+        rollout.robots[state.robot] = state
+        progress(done, len(wanted))
+        if step == "deploy" and state.state == "failed":
+            rollout.stopped_by = state.robot
+            break
+    return rollout
 
-    def _target_of(self, robot: str) -> TargetSettings:
+
+def _ask(registry: Registry, state: RobotState, target: TargetSettings) -> RobotState:
+    """Ask a robot whether its current release has its newest result."""
+    current = deployment.standing(target).current
+    if current is None:
+        return state.ended("waiting", "nothing is deployed there")
+    state = replace(state, release=current.name, replaces=current.replaces)
+    newest = (registry.place / state.folder / RESULT).read() or b""
+    if current.files.get(RESULT) != hashlib.sha256(newest).hexdigest():
+        return state.ended("waiting", f"{current.name} holds another result")
+    return state.ended("in_place")
+
+
+def _restore(state: RobotState, target: TargetSettings, reason: str) -> RobotState:
+    """Restore the release that a robot's newest result has replaced."""
+    if state.state != "in_place":
+        return state.ended("not_rolled_back", state.detail)
+    if not state.replaces:
+        return state.ended("not_rolled_back", "it is the first release there")
+    try:
+        deployment.rollback(target, state.replaces, reason=reason)
+    except CommandError as error:
+        return state.ended("rolled_back", error)
+    return state.ended("rolled_back")
+
+
+def _deploy(registry: Registry, state: RobotState, target: TargetSettings) -> RobotState:
+    """Deploy to a robot."""
+    with TemporaryDirectory(prefix="lce-rig-") as scratch:
+        folder = Path(scratch) / "result"
+        (registry.place / state.folder).fetch(folder)
         try:
-            return self._target.for_robot(robot)
-        except ValueError as error:
-            raise UsageError(f"it cannot be part of {self._target.to}", "Rename the robot.") from error
-
-    def _ask(self, state: RobotState, target: TargetSettings) -> RobotState:
-        """Ask a robot whether its current release has its newest result."""
-        current = deployment.standing(target).current
-        if current is None:
-            return state.ended("waiting", "nothing is deployed there")
-        state = replace(state, release=current.name, replaces=current.replaces)
-        newest = (self._registry.place / state.folder / RESULT).read() or b""
-        if current.files.get(RESULT) != hashlib.sha256(newest).hexdigest():
-            return state.ended("waiting", f"{current.name} holds another result")
-        return state.ended("in_place")
-
-    def _deploy(self, state: RobotState, target: TargetSettings) -> RobotState:
-        """Deploy to a robot."""
-        with TemporaryDirectory(prefix="lce-rig-") as scratch:
-            place, folder = self._registry.place / state.folder, Path(scratch) / "result"
-            place.fetch(folder)
-            try:
-                done = deployment.deploy(folder, load_rig(folder / PROFILE), target)
-            except CommandError as error:
-                with suppress(LceRigError):
-                    state = self._ask(state, target)
-                return state.ended("failed", error)
-            state = replace(state, release=done.release.name, replaces=done.replaces)
-            return state.ended("in_place")
+            done = deployment.deploy(folder, load_rig(folder / PROFILE), target)
+        except CommandError as error:
+            with suppress(LceRigError):
+                state = _ask(registry, state, target)
+            return state.ended("failed", error)
+        return replace(state, release=done.release.name, replaces=done.replaces).ended("in_place")

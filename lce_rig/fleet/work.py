@@ -26,16 +26,8 @@ import psutil  # type: ignore[import-untyped]
 import lce_rig as lce
 import lce_rig.fleet.findings as findings
 from lce_rig.core.calibration import DEFAULT_METHOD, MADE_BY, Method, Provenance, ResultFile
-from lce_rig.core.errors import (
-    LceRigError,
-    NotEnoughDataError,
-    ProfileError,
-    ResultRefusedError,
-    SessionError,
-    SourceError,
-    UsageError,
-)
-from lce_rig.core.findings import Finding, Kind
+from lce_rig.core.errors import LceRigError, NotEnoughDataError, ProfileError, SourceError
+from lce_rig.core.findings import Finding
 from lce_rig.fleet.jobs import Job, folder_name
 from lce_rig.fleet.registry import Registry, Row, Status, with_pairs, write_rows
 from lce_rig.fleet.storage import Storage
@@ -58,15 +50,6 @@ from lce_rig.session.session import (
 
 # Files and folders on which no result depends.
 _NOT_NEEDED = frozenset({CALIBRATION, RESULTS, INTRINSICS, DEBUG, REJECTED, OVERLAYS, LOCK})
-_KINDS: tuple[tuple[type[LceRigError], Kind], ...] = (
-    (ProfileError, findings.PROFILE),
-    (SessionError, findings.SESSION),
-    (SourceError, findings.SOURCE),
-    (NotEnoughDataError, findings.NOT_ENOUGH_DATA),
-    (ResultRefusedError, findings.REFUSED),
-    (UsageError, findings.USAGE),
-    (LceRigError, findings.OTHER_ERROR),
-)
 _HASH_DIGITS = 12
 
 
@@ -137,7 +120,7 @@ def work(job: Job, settings: Settings, tell: Callable[[Row], None]) -> list[Row]
         except (LceRigError, OSError) as error:
             if isinstance(error, OSError):
                 error = SourceError(f"{job.source} cannot be read: {error.strerror or error}")
-            kind = next(kind for error_type, kind in _KINDS if isinstance(error, error_type))
+            kind = next(kind for each, kind in findings.OF_ERRORS.items() if isinstance(error, each))
             cause = error.finding if isinstance(error, NotEnoughDataError) else None
             failed = without_result(row, "failed", cause or kind(what=error.what, hint=error.hint))
             # Name files by where the session lies.

@@ -1,7 +1,7 @@
 """Compare the calibrations of one rig in several sessions."""
 
 import shlex
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
@@ -19,7 +19,6 @@ from lce_rig.pipeline.findings import FAILED, NOT_CALIBRATED, ONLY_ONE, OTHER_BO
 from lce_rig.pipeline.result_files import CURRENT, PREVIOUS, RESULT, result_folder, stored_results
 from lce_rig.session import Session
 from lce_rig.session.identity import differing_keys
-from lce_rig.session.session import CAPTURES
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +70,10 @@ def compare_results(folder: Path | str, names: Sequence[str] = ()) -> Repeat:
             f"{listed} Add one: lce-rig calibrate {session.path} --name NAME, or name a second session.",
         )
     results = {name: list(_read(session, stored[name].folder).pairs) for name in chosen}
-    comparisons, lonely = _compare_sensors(results, are_independent=False)
-    failures = _require_some(comparisons, results, "results")
+    comparisons, findings = _compare_sensors(results, "results", are_independent=False)
     path = shlex.quote(str(session.path))
     outdated = [OUTDATED(name, session=path) for name in chosen if stored[name].is_outdated]
-    return Repeat(session.rig.name, comparisons, (), (*outdated, *lonely, *failures))
+    return Repeat(session.rig.name, comparisons, (), (*outdated, *findings))
 
 
 def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: Progress = silent) -> Repeat:
@@ -90,8 +88,8 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
 
     Raises:
         UsageError: fewer than two sessions, or one given twice.
-        SessionError: sessions of different rigs, a result of another rig, captures in two sessions or behind
-            two results, or no camera and LiDAR in two of them.
+        SessionError: sessions of different rigs, a result of another rig, captures in two sessions, or no
+            camera and LiDAR in two of them.
         NotEnoughDataError: a session holds too few captures to be calibrated; it is named.
     """
     paths = [Path(folder) for folder in folders]
@@ -101,18 +99,12 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
     _require_same(sessions)
     _require_independent(sessions)
     results: dict[str, list[Calibration]] = {}
-    captures: dict[str, frozenset[str]] = {}
     calibrated: list[str] = []
     troubles: list[Finding] = []
     for done, (label, session) in enumerate(sessions.items(), start=1):
         where = result_folder(session.path, name)
         if (where / RESULT).exists() or name not in (None, CURRENT):
-            saved = _read(session, where)
-            results[label] = list(saved.pairs)
-            # Inputs are those of one session or of several; its captures are among them.
-            captures[label] = frozenset(
-                sha for path, sha in saved.inputs_sha256.items() if CAPTURES in path.split("/")
-            )
+            results[label] = list(_read(session, where).pairs)
         else:
             try:
                 result = calibrate(session)
@@ -130,27 +122,15 @@ def repeat(folders: Sequence[Path | str], *, name: str | None = None, progress: 
                 )
                 for shortage in result.shortages
             ]
-            hashes = set()
-            for capture in session.captures:
-                with suppress(SessionError):
-                    hashes.add(capture.manifest_sha256)
-            captures[label] = frozenset(hashes)
         progress(done, len(sessions))
-    # The result of several sessions contains the captures of each.
-    _require_apart(
-        {f"the result of {label}": held for label, held in captures.items()},
-        "Compare results of one session each (without --name), or of sessions that it does not contain.",
-    )
     first_name, first = next(iter(sessions.items()))
     other_boards = [
         OTHER_BOARD(label, first=first_name)
         for label, session in sessions.items()
         if session.rig.board != first.rig.board
     ]
-    comparisons, lonely = _compare_sensors(results)
-    failures = _require_some(comparisons, results, "sessions")
-    findings = (*other_boards, *troubles, *lonely, *failures)
-    return Repeat(first.rig.name, comparisons, tuple(calibrated), findings)
+    comparisons, findings = _compare_sensors(results, "sessions")
+    return Repeat(first.rig.name, comparisons, tuple(calibrated), (*other_boards, *troubles, *findings))
 
 
 def _session_names(paths: Sequence[Path]) -> list[str]:
@@ -196,58 +176,48 @@ def _require_independent(sessions: Mapping[str, Session]) -> None:
             # A damaged capture is reported when it is read.
             with suppress(SessionError):
                 hashes[name] |= capture.file_hashes
-    _require_apart(hashes, "Collect each session separately, with the board mounted again.")
-
-
-def _require_apart(contents: Mapping[str, Set[str]], hint: str) -> None:
-    """Refuse what holds the same samples, known by their hashes.
-
-    Raises:
-        SessionError: two of them share some.
-    """
-    for one, other in combinations(contents, 2):
-        if n_shared := len(contents[one] & contents[other]):
-            what = f"{one} and {other} share {n_shared} samples: they are not independent"
-            raise SessionError(what, hint)
+    for one, other in combinations(hashes, 2):
+        if n_shared := len(hashes[one] & hashes[other]):
+            raise SessionError(
+                f"{one} and {other} share {n_shared} samples: they are not independent",
+                "Collect each session separately, with the board mounted again.",
+            )
 
 
 def _compare_sensors(
-    results: dict[str, list[Calibration]], *, are_independent: bool = True
+    results: Mapping[str, Sequence[Calibration]], kind: str, *, are_independent: bool = True
 ) -> tuple[tuple[Repeatability, ...], list[Finding]]:
-    """Compare each camera and LiDAR, and report those that only one session calibrates."""
+    """Compare each camera and LiDAR.
+
+    Returns:
+        The comparisons; and those that only one session calibrates, and failed results.
+
+    Raises:
+        SessionError: there is nothing to compare.
+    """
     groups: dict[tuple[str, str], dict[str, Calibration]] = {}
     for name, calibrations in results.items():
-        for calibration in calibrations:
-            groups.setdefault((calibration.camera, calibration.lidar), {})[name] = calibration
-    comparisons = [
-        compare_calibrations(group, are_independent=are_independent)
-        for _, group in sorted(groups.items())
-        if len(group) > 1
-    ]
-    lonely = [
-        ONLY_ONE(next(iter(group)), camera=camera, lidar=lidar)
-        for (camera, lidar), group in sorted(groups.items())
-        if len(group) == 1
-    ]
-    return tuple(comparisons), lonely
-
-
-def _require_some(
-    comparisons: Sequence[Repeatability], results: dict[str, list[Calibration]], what: str
-) -> list[Finding]:
-    """Refuse results without a comparison; name those that failed."""
+        for c in calibrations:
+            groups.setdefault((c.camera, c.lidar), {})[name] = c
+    comparisons, findings = [], []
+    for (camera, lidar), group in sorted(groups.items()):
+        if len(group) > 1:
+            comparisons.append(compare_calibrations(group, are_independent=are_independent))
+        else:
+            findings.append(ONLY_ONE(next(iter(group)), camera=camera, lidar=lidar))
     if not comparisons:
         sensors = {name: ", ".join(f"{c.camera} and {c.lidar}" for c in own) for name, own in results.items()}
         raise SessionError(
-            f"no camera and LiDAR are calibrated in two of the {what}",
+            f"no camera and LiDAR are calibrated in two of the {kind}",
             "\n".join(f"{name}: {own or 'its result holds no sensors'}" for name, own in sensors.items()),
         )
-    return [
+    findings += [
         FAILED(name, camera=c.camera, lidar=c.lidar)
         for name, own in results.items()
         for c in own
         if c.verdict == "fail"
     ]
+    return tuple(comparisons), findings
 
 
 def _read(session: Session, folder: Path) -> ResultFile:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,8 @@ from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import candidates_of, detect
-from lce_rig.pipeline.intrinsics_files import write_profile
-from lce_rig.rig import set_value
+from lce_rig.pipeline.intrinsics import write_profile
+from lce_rig.rig import as_yaml, set_value
 from lce_rig.session import Session
 
 # A laser's range must be known so much better than before for a profile to state it.
@@ -102,27 +103,39 @@ def _require_still(session: Session, estimate: CalibrationEstimate) -> None:
     raise ResultRefusedError(what, "Give sessions whose board stood still, on a stand. Leave this one out.")
 
 
+# Of each laser: range, azimuth and elevation, and their standard deviations.
+_OF_LASER = ("range_m", "azimuth_deg", "elevation_deg")
+_SIGMAS = ("range_sigma_m", "azimuth_sigma_deg", "elevation_sigma_deg")
+
+
+def lidar_document(errors: LidarErrors) -> dict[str, Any]:
+    """List a LiDAR's errors by the keys that they have in a profile."""
+    estimate = errors.found
+    in_degrees = np.array([1.0, np.degrees(1.0), np.degrees(1.0)])
+    figures = np.hstack([estimate.lasers.T * in_degrees, estimate.lasers_sigma.T * in_degrees]).round(7)
+    lens, lens_sigma = estimate.lens.round(7).tolist(), estimate.lens_sigma.round(7).tolist()
+    return {
+        "n_captures": list(errors.n_captures),
+        "lens_lateral_m": lens[0],
+        "lens_lateral_sigma_m": lens_sigma[0],
+        "lens_vertical_m_per_rad": lens[1],
+        "lens_vertical_sigma_m_per_rad": lens_sigma[1],
+        "lasers": [
+            {"ring": ring, "n_points": int(n), **dict(zip((*_OF_LASER, *_SIGMAS), row, strict=True))}
+            for ring, n, row in zip(estimate.rings.tolist(), errors.n_points, figures.tolist(), strict=True)
+        ],
+    }
+
+
 def save_lidar(session: Session, lidar: str | None, errors: LidarErrors, path: Path) -> None:
     """Write a session's profile with measured errors of a LiDAR to a new file.
 
     Raises:
         UsageError: the file exists already.
     """
-    name, known = lidar or next(iter(session.rig.lidars)), errors.found
-    # Range m, azimuth deg and elevation deg of each laser, and their standard deviations.
-    in_degrees = np.array([1.0, np.degrees(1.0), np.degrees(1.0)])
-    rows = np.hstack([known.lasers.T * in_degrees, known.lasers_sigma.T * in_degrees]).tolist()
-    lasers = ", ".join(
-        f"{{ring: {ring}, range_m: {r:.5f}, range_sigma_m: {r_sigma:.5f}, azimuth_deg: {a:.4f}, "
-        f"azimuth_sigma_deg: {a_sigma:.4f}, elevation_deg: {e:.4f}, elevation_sigma_deg: {e_sigma:.4f}}}"
-        for ring, (r, a, e, r_sigma, a_sigma, e_sigma) in zip(known.rings.tolist(), rows, strict=True)
-    )
-    block = f"lidars.{name}.intrinsics"
-    values = (
-        f"{{lens_lateral_m: {known.lens[0]:.5f}, lens_lateral_sigma_m: {known.lens_sigma[0]:.5f}, "
-        f"lens_vertical_m_per_rad: {known.lens[1]:.5f}, lens_vertical_sigma_m_per_rad: "
-        f"{known.lens_sigma[1]:.5f}, lasers: [{lasers}]}}"
-    )
-    text = set_value(session.profile_text(), block, values)
-    n = sum(errors.n_captures)
+    name, block = lidar or next(iter(session.rig.lidars)), lidar_document(errors)
+    n = sum(block.pop("n_captures"))
+    for row in block["lasers"]:
+        del row["n_points"]
+    text = set_value(session.profile_text(), f"lidars.{name}.intrinsics", as_yaml(block))
     write_profile(f"# intrinsics of LiDAR {name}, measured by {MADE_BY} from {n} captures\n" + text, path)

@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from lce_rig.core.board import Board, BoardType
 from lce_rig.core.camera import Intrinsics
@@ -21,7 +20,8 @@ from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
 from lce_rig.rig import BoardSettings, LidarSettings
 from lce_rig.rig.board_settings import KEYS_OF_TYPE
-from lce_rig.rig.loading import Document, dump_yaml, explain, rig_from_document
+from lce_rig.rig.loading import Document, board_of, dump_yaml, rig_from_document
+from lce_rig.rig.sensors import lens_block
 
 _UNKNOWN_MODEL = "other"
 # A ring that sees one distance only has no height: 0.1 mrad against 15 mm.
@@ -199,11 +199,7 @@ def _camera(
         "frame": f"{name}_link",
         "optical_frame": optical_frame or f"{name}_optical_frame",
         "resolution_px": [lens.width_px, lens.height_px],
-        "intrinsics": {
-            "model": lens.model,
-            **{key: getattr(lens, key) for key in ("fx_px", "fy_px", "cx_px", "cy_px")},
-            "distortion": list(lens.distortion),
-        },
+        "intrinsics": lens_block(lens),
         "channels": {
             kind: {**channel, "timestamps": dict(timestamps)}
             for kind, channel in (channels or {"frames": {"kind": "frames"}}).items()
@@ -261,21 +257,11 @@ def parse_board(text: str) -> Board:
                 cols, rows, square, more, *lengths = match.groups()
                 marker, _, dictionary = more.partition(",")
                 width, height, *offset = (float(value or 0) for value in lengths)
-                settings = BoardSettings.model_validate(
-                    {
-                        "type": kind,
-                        KEYS_OF_TYPE[kind][0]: (int(cols), int(rows)),
-                        "square_m": float(square),
-                        "width_m": width,
-                        "height_m": height,
-                        "pattern_offset_m": tuple(offset),
-                    }
-                    | ({"marker_m": float(marker), "dictionary": dictionary} if kind == "charuco" else {})
-                    | ({"tag_spacing": float(more)} if kind == "aprilgrid" else {})
-                )
-                return settings.to_board()
-    except ValidationError as error:
-        raise explain(error, Document(f"--board {text}", {}, root=None)) from error
+                values: dict[str, Any] = {"type": kind, KEYS_OF_TYPE[kind][0]: (int(cols), int(rows))}
+                values |= {"square_m": float(square), "pattern_offset_m": tuple(offset)}
+                values |= {"marker_m": float(marker), "dictionary": dictionary} if kind == "charuco" else {}
+                values |= {"tag_spacing": float(more)} if kind == "aprilgrid" else {}
+                return board_of(values | {"width_m": width, "height_m": height}, f"--board {text}")
     except ValueError:
         pass
     raise UsageError(f"--board {text}: give {BOARD_FORM}")

@@ -252,7 +252,13 @@ class _Judge:
             # The picture is of the capture with most edges.
             view = max(whole, key=lambda each: len(each.edges))
             image = next(seen.image for seen in kept if seen.name == view.capture)
-            example = view.capture, image if isinstance(image, Image) else _picture_of(image), view
+            if isinstance(image, Events):
+                # The number of events of each pixel, dark on white.
+                counts = np.zeros((image.height_px, image.width_px))
+                np.add.at(counts, (image.y, image.x), 1.0)
+                grey = np.asarray(np.clip(255 - 60 * counts, 0, 255), dtype=np.uint8)
+                image = Image(image.sensor, "events", None, grey)
+            example = view.capture, image, view
         return PairDrift(c, judged, self._boards(c, boards), example)
 
     def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
@@ -278,14 +284,6 @@ class _Judge:
             motion = estimate_motion(seen.previous, seen.scan)
             self._motions[key] = None if motion is None or motion.is_still else motion
         return self._motions[key]
-
-
-def _picture_of(events: Events) -> Image:
-    """Draw the number of events of each pixel, dark on white."""
-    counts = np.zeros((events.height_px, events.width_px))
-    np.add.at(counts, (events.y, events.x), 1.0)
-    grey = np.asarray(np.clip(255 - 60 * counts, 0, 255), dtype=np.uint8)
-    return Image(events.sensor, "events", None, grey)
 
 
 def _after_s(points: Array, seen: Seen, rig: Rig, c: Calibration) -> Array | None:

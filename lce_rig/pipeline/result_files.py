@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 from lce_rig.core.calibration import Calibration, Provenance, ResultFile, read_result
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, SessionError, UsageError, reading
 from lce_rig.core.findings import Finding
-from lce_rig.export import export_formats, is_export, remove_exports
+from lce_rig.export import export, is_export, remove_exports
 from lce_rig.session import Session
-from lce_rig.session.capture import SAFE_NAME
-from lce_rig.session.capture_files import MANIFEST
+from lce_rig.session.capture import MANIFEST, SAFE_NAME
 from lce_rig.session.durable import check_folder, copy_over, replacing, write_atomically
 from lce_rig.session.provenance import provenance_of
 from lce_rig.session.session import CALIBRATION, CAPTURES, PROFILE, RESULTS
@@ -32,14 +31,17 @@ class WrittenResult(NamedTuple):
         findings: content that exports leave out or change.
         report: the page; None if it was not asked for.
         previous: the folder with the earlier run's files; None if there was none.
-        has_usable_previous: whether that run had a usable result.
     """
 
     files: tuple[Path, ...]
     findings: tuple[Finding, ...]
     report: Path | None
     previous: Path | None = None
-    has_usable_previous: bool = False
+
+    @property
+    def has_usable_previous(self) -> bool:
+        """Whether that run had a usable result."""
+        return self.previous is not None and bool(_usable(self.previous))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,18 +71,14 @@ class Result:
 
     @property
     def provenance(self) -> Provenance:
-        """Robot, sensors and date.
-
-        Raises:
-            SessionError: captures are of different units of a sensor.
-        """
+        """Robot, sensors and date; raises as `provenance_of`."""
         return provenance_of(self.session)
 
     def file(self) -> ResultFile:
         """Build result.json.
 
         Raises:
-            SessionError: a capture that was used is missing, or `provenance` raises it.
+            SessionError: a capture that was used is missing, or captures are of different units of a sensor.
         """
         return ResultFile(
             rig=self.session.rig.name,
@@ -128,13 +126,8 @@ class Result:
             names, findings = self._write_into(place, force=force)
         page = self.write_report(folder, name=name) if report else None
         has_previous = is_in_session and (place / PREVIOUS / RESULT).exists()
-        return WrittenResult(
-            tuple(place / file for file in names),
-            findings,
-            page,
-            place / PREVIOUS if has_previous else None,
-            has_previous and bool(_usable(place / PREVIOUS)),
-        )
+        files = tuple(place / file for file in names)
+        return WrittenResult(files, findings, page, place / PREVIOUS if has_previous else None)
 
     def write_report(self, folder: Path | str | None = None, *, name: str | None = None) -> Path:
         """Draw report.html beside the result.json that `write` has written.
@@ -189,7 +182,8 @@ class Result:
             remove_exports(folder)
             return [RESULT], ()
         rig = self.session.rig
-        files, findings = export_formats(usable, rig, folder, is_forced=force, session=self.session)
+        findings: list[Finding] = []
+        files = export(usable, rig, folder, is_forced=force, session=self.session, findings=findings)
         return [RESULT, *(str(path.relative_to(folder)) for path in files)], tuple(findings)
 
 

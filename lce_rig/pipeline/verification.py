@@ -121,20 +121,13 @@ class Verification:
     def _draw(self, base: Path, progress: Progress) -> tuple[SessionCheck, ...]:
         drawn = []
         for check in self.checks:
-            pair, c = check.pair, check.calibration
+            pair, c, seen = check.pair, check.calibration, self.detections.between(check.pair)
             folder = base if len(self.checks) == 1 else base / pair.folder_name
             view_of = partial(_view, self.session, pair.camera, pair.channel)
             if c.is_of_lidars:
                 check, T_view = seen_through_window(check)
-                view_of = partial(_view_of_cloud, pair.camera, T_view)
-            done = draw_check(
-                self.session,
-                self.detections.between(pair),
-                check,
-                folder,
-                view_of=view_of,
-                progress=progress,
-            )
+                view_of = partial(_view, self.session, pair.camera, "", T_view=T_view)
+            done = draw_check(self.session, seen, check, folder, view_of=view_of, progress=progress)
             drawn.append(replace(done, calibration=c))
         return tuple(drawn)
 
@@ -319,16 +312,13 @@ def write_debug_images(
     return base
 
 
-def _view_of_cloud(lidar: str, T_view: Array, capture: Capture) -> ImageWithEvents | None:
-    """Return a LiDAR's cloud as an image; None if it is damaged."""
+def _view(
+    session: Session, camera: str, channel: str, capture: Capture, *, T_view: Array | None = None
+) -> ImageWithEvents | None:
+    """Return a camera's image, or a LiDAR's cloud as one; None if it is damaged or events gave none."""
     with suppress(SessionError):
-        return ImageWithEvents(draw_cloud(capture.scan(lidar), T_view))
-    return None
-
-
-def _view(session: Session, camera: str, channel: str, capture: Capture) -> ImageWithEvents | None:
-    """Return a camera's image; None if it is damaged or events gave none; its detection says why."""
-    with suppress(SessionError):
+        if T_view is not None:
+            return ImageWithEvents(draw_cloud(capture.scan(camera), T_view))
         if (camera, channel) not in event_channels(session.rig, capture):
             return ImageWithEvents(capture.image(camera, channel))
         picture = event_picture(session, capture, camera, channel)

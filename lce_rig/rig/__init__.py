@@ -1,7 +1,7 @@
 """The profile of a rig: its sensors, its board, and the limits and targets of a calibration."""
 
 from lce_rig.rig.board_settings import BoardSettings
-from lce_rig.rig.editing import derive_text, edit_text, set_value
+from lce_rig.rig.editing import as_yaml, derive_text, edit_text, lens_settings, set_value
 from lce_rig.rig.loading import dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
 from lce_rig.rig.profile import NominalExtrinsic, Rig
 from lce_rig.rig.sensors import (
@@ -31,10 +31,12 @@ __all__ = [
     "Rig",
     "TimestampSettings",
     "VerdictSettings",
+    "as_yaml",
     "derive_text",
     "dump_rig",
     "edit_text",
     "find_profile",
+    "lens_settings",
     "load_rig",
     "parse_rig",
     "read_profile",

@@ -4,13 +4,16 @@ PyYAML's marks tell where a key's text begins and ends. ruamel.yaml would keep c
 comment to the key above it: a key added to or removed from a block takes the next block's comments along.
 """
 
-import json
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import yaml
 
+from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import UsageError
 from lce_rig.rig.loading import BAD_SCALARS, read_document, rig_from_document
+from lce_rig.rig.sensors import lens_block
 
 
 def derive_text(
@@ -40,7 +43,7 @@ def derive_text(
     """
     head = f"# {name}: made from {origin} by `rigs new`; the comments below are from {origin}.\n"
     # The comments above the first key are about the other profile.
-    text = head + set_value(text[_compose(text).start_mark.index :], "name", as_text(name))
+    text = head + set_value(text[_compose(text).start_mark.index :], "name", as_yaml(name))
     if "description" not in [key for key, _ in settings]:
         text = remove_key(text, "description", must_exist=False)
     return edit_text(text, settings, removed, source)
@@ -54,6 +57,24 @@ def edit_text(text: str, settings: Sequence[tuple[str, str]], removed: Sequence[
         text = set_value(text, path, value)
     rig_from_document(read_document(text, source))
     return text
+
+
+def lens_settings(camera: str, lens: Intrinsics, **others: float) -> list[tuple[str, str]]:
+    """List what `edit_text` sets for a camera's lens.
+
+    Args:
+        camera: its name.
+        lens: with the images' size.
+        others: further keys of the block `intrinsics`.
+    """
+    block = {f"cameras.{camera}.intrinsics.{key}": v for key, v in (lens_block(lens) | others).items()}
+    values = {f"cameras.{camera}.resolution_px": [lens.width_px, lens.height_px], **block}
+    return [(key, as_yaml(value)) for key, value in values.items()]
+
+
+def as_yaml(value: Any) -> str:
+    """Write plain data as YAML on one line."""
+    return yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=math.inf).strip()[1:-1]
 
 
 def set_value(text: str, path: str, value: str) -> str:
@@ -130,15 +151,6 @@ def remove_key(text: str, path: str, *, must_exist: bool = True) -> str:
         begin = above
     end = text.find("\n", _end(value))
     return text[:begin] + ("" if end < 0 else text[end + 1 :])
-
-
-def as_text(value: str) -> str:
-    """Write a text as YAML: in quotes if it would be read as something else, as the name 346."""
-    try:
-        is_plain = _load(value) == value
-    except UsageError:
-        is_plain = False
-    return value if is_plain else json.dumps(value, ensure_ascii=False)
 
 
 def _load(text: str) -> object:

@@ -13,7 +13,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 from yaml.constructor import ConstructorError
 
+from lce_rig.core.board import Board
 from lce_rig.core.errors import ProfileError, reading
+from lce_rig.rig.board_settings import BoardSettings
 from lce_rig.rig.profile import Rig
 from lce_rig.rig.settings import PATTERNS
 
@@ -214,6 +216,14 @@ def rig_from_document(document: Document) -> Rig:
         return Rig.model_validate(document.data)
     except ValidationError as error:
         raise explain(error, document) from error
+
+
+def board_of(values: Mapping[str, Any], source: str) -> Board:
+    """Build a board from the keys of its block in a profile; raises a ProfileError as `rig_from_document`."""
+    try:
+        return BoardSettings.model_validate(values).to_board()
+    except ValidationError as error:
+        raise explain(error, Document(source, {}, root=None)) from error
 
 
 def explain(error: ValidationError, document: Document) -> ProfileError:

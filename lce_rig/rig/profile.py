@@ -36,6 +36,7 @@ from lce_rig.rig.settings import (
     Settings,
     Text,
     problem,
+    require,
 )
 from lce_rig.rig.target_settings import OutputFormat, TargetSettings
 from lce_rig.rig.thresholds import CalibrationSettings, QualitySettings, VerdictSettings
@@ -72,12 +73,9 @@ class TriggerSettings(Settings):
     @model_validator(mode="after")
     def _pulses_fit_into_their_period(self) -> "TriggerSettings":
         period_us = 1e6 / self.rate_hz
-        if self.pulse_us >= period_us:
-            what = f"pulses of {self.pulse_us} us exceed the period of {period_us:.0f} us"
-            raise problem(what, "pulse_us")
-        if self.phase_us >= period_us:
-            what = f"{self.phase_us} us is beyond the period of {period_us:.0f} us"
-            raise problem(what, "phase_us")
+        period = f"the period of {period_us:.0f} us"
+        require(self.pulse_us < period_us, f"pulses of {self.pulse_us} us exceed {period}", "pulse_us")
+        require(self.phase_us < period_us, f"{self.phase_us} us is beyond {period}", "phase_us")
         return self
 
 
@@ -100,10 +98,9 @@ class SyncSettings(Settings):
     def _lines_are_used_once(self) -> "SyncSettings":
         cameras: dict[int, str] = {}
         for camera, trigger in self.triggers.items():
-            if trigger.channel in cameras:
-                what = f"line {trigger.channel} triggers {cameras[trigger.channel]} already"
-                raise problem(what, f"triggers.{camera}.channel")
-            cameras[trigger.channel] = camera
+            first = cameras.setdefault(trigger.channel, camera)
+            what = f"line {trigger.channel} triggers {first} already"
+            require(first == camera, what, f"triggers.{camera}.channel")
         return self
 
     @property
@@ -167,20 +164,20 @@ class NominalExtrinsic(Settings):
         rotations = [
             key for key in ("quaternion_wxyz", "rpy_deg", "matrix") if getattr(self, key) is not None
         ]
-        if len(rotations) != 1:
-            names = " and ".join(rotations) if rotations else "none"
-            raise problem(f"{names} given; give the rotation as one of quaternion_wxyz, rpy_deg, matrix")
+        names = " and ".join(rotations) if rotations else "none"
+        ways = "quaternion_wxyz, rpy_deg, matrix"
+        require(len(rotations) == 1, f"{names} given; give the rotation as one of {ways}")
         if self.quaternion_wxyz is not None:
             norm = float(np.linalg.norm(self.quaternion_wxyz))
-            if abs(norm - 1) > _ROUNDING:
-                raise problem(f"not a unit quaternion: its norm is {norm:.4g}", "quaternion_wxyz")
+            what = f"not a unit quaternion: its norm is {norm:.4g}"
+            require(abs(norm - 1) <= _ROUNDING, what, "quaternion_wxyz")
         if self.matrix is not None:
             R = np.array(self.matrix)
             error = float(np.abs(R @ R.T - np.eye(3)).max())
-            if error > 2 * _ROUNDING:
-                raise problem(f"not a rotation: R R^T differs from the identity by {error:.3g}", "matrix")
-            if np.linalg.det(R) < 0:
-                raise problem("not a rotation but a mirroring: its determinant is -1", "matrix")
+            what = f"not a rotation: R R^T differs from the identity by {error:.3g}"
+            require(error <= 2 * _ROUNDING, what, "matrix")
+            what = "not a rotation but a mirroring: its determinant is -1"
+            require(np.linalg.det(R) > 0, what, "matrix")
         return self
 
     def to_matrix(self) -> Array:
@@ -260,17 +257,14 @@ class Rig(Settings):
                 )
             used[frame] = key
         roots = [frame for key, frame in self._frames() if not key.endswith("optical_frame")]
-        if self.base_frame is not None and self.base_frame not in roots:
-            raise problem(f"no sensor has frame {self.base_frame}; there is {', '.join(roots)}", "base_frame")
-        if self.mount is not None:
-            if self.mount.of not in roots:
-                raise problem(f"no sensor has frame {self.mount.of}; there is {', '.join(roots)}", "mount.of")
-            if self.mount.parent in used:
-                what = f"{self.mount.parent} is the frame of {used[self.mount.parent]}, not of the robot"
-                raise problem(what, "mount.parent")
-            if self.base_frame not in (None, self.mount.of):
-                what = f"differs from mount.of, {self.mount.of}, which would give it two parents; remove it"
-                raise problem(what, "base_frame")
+        mount = self.mount
+        for key, root in (("base_frame", self.base_frame), ("mount.of", mount.of if mount else None)):
+            require(root in (None, *roots), f"no sensor has frame {root}; there is {', '.join(roots)}", key)
+        if mount is not None:
+            what = f"{mount.parent} is the frame of {used.get(mount.parent)}, not of the robot"
+            require(mount.parent not in used, what, "mount.parent")
+            what = f"differs from mount.of, {mount.of}, which would give it two parents; remove it"
+            require(self.base_frame in (None, mount.of), what, "base_frame")
         return self
 
     def of_robot(self, name: str | None) -> "Rig":
@@ -303,10 +297,9 @@ class Rig(Settings):
     @model_validator(mode="after")
     def _sensors_are_known(self) -> "Rig":
         for name in self.cameras:
-            if name in self.lidars:
-                raise problem(f"{name} is the name of a LiDAR already", f"cameras.{name}")
-        if not self.cameras and len(self.lidars) < 2:
-            raise problem("a rig has a camera, or two LiDARs", "cameras")
+            require(name not in self.lidars, f"{name} is the name of a LiDAR already", f"cameras.{name}")
+        is_whole = bool(self.cameras) or len(self.lidars) >= 2
+        require(is_whole, "a rig has a camera, or two LiDARs", "cameras")
         if self.cameras and self.board.type == "plain":
             what = f"a plain plate has no pattern for {next(iter(self.cameras))}"
             raise problem(f"{what}; name the print of your board, or remove the cameras", "board.type")
@@ -317,17 +310,15 @@ class Rig(Settings):
                 ("camera", entry.camera, [*self.cameras, *of_lidars]),
                 ("lidar", entry.lidar, list(self.lidars)),
             ):
-                if name not in names_of_rig:
-                    what = f"no {kind} is called {name}; there is {', '.join(names_of_rig)}"
-                    raise problem(what, f"nominal_extrinsics.{index}.{kind}")
-            if (entry.camera, entry.lidar) in used:
-                what = f"a second entry for {entry.camera} and {entry.lidar}"
-                raise problem(what, f"nominal_extrinsics.{index}")
-            used.add((entry.camera, entry.lidar))
+                what = f"no {kind} is called {name}; there is {', '.join(names_of_rig)}"
+                require(name in names_of_rig, what, f"nominal_extrinsics.{index}.{kind}")
+            pair = entry.camera, entry.lidar
+            what = f"a second entry for {entry.camera} and {entry.lidar}"
+            require(pair not in used, what, f"nominal_extrinsics.{index}")
+            used.add(pair)
         for name in self.sync.triggers if self.sync else ():
-            if name not in self.cameras:
-                what = f"no camera is called {name}; there is {', '.join(self.cameras)}"
-                raise problem(what, f"sync.triggers.{name}")
+            what = f"no camera is called {name}; there is {', '.join(self.cameras)}"
+            require(name in self.cameras, what, f"sync.triggers.{name}")
         return self
 
     def _frames(self) -> Iterator[tuple[str, str]]:

@@ -18,7 +18,7 @@ from lce_rig.rig.settings import (
     Settings,
     Text,
     TopicName,
-    problem,
+    require,
 )
 
 MAX_PIXELS = 1 << 26
@@ -198,16 +198,20 @@ class LidarSettings(Settings):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "LidarSettings":
-        if self.elevations_deg is not None and not np.all(np.diff(self.elevations_deg) > 0):
-            raise problem("the elevations do not rise", "elevations_deg")
-        if self.min_range_m >= self.max_range_m:
-            raise problem(
-                f"{self.min_range_m:g} m is not below max_range_m {self.max_range_m:g} m", "min_range_m"
-            )
-        if self.timestamps.reference not in ("first_firing", "last_firing"):
-            what = f"{self.timestamps.reference} belongs to a camera; a LiDAR has first_firing or last_firing"
-            raise problem(what, "timestamps.reference")
+        is_rising = self.elevations_deg is None or bool(np.all(np.diff(self.elevations_deg) > 0))
+        require(is_rising, "the elevations do not rise", "elevations_deg")
+        what = f"{self.min_range_m:g} m is not below max_range_m {self.max_range_m:g} m"
+        require(self.min_range_m < self.max_range_m, what, "min_range_m")
+        what = f"{self.timestamps.reference} belongs to a camera; a LiDAR has first_firing or last_firing"
+        is_of_lidar = self.timestamps.reference in ("first_firing", "last_firing")
+        require(is_of_lidar, what, "timestamps.reference")
         return self
+
+
+def lens_block(lens: Intrinsics) -> dict[str, Any]:
+    """List the keys of a lens in a camera's block `intrinsics`."""
+    pixels = {key: getattr(lens, key) for key in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    return {"model": lens.model, **pixels, "distortion": list(lens.distortion)}
 
 
 class IntrinsicsSettings(Settings):
@@ -235,9 +239,8 @@ class IntrinsicsSettings(Settings):
     @model_validator(mode="after")
     def _has_right_number_of_coefficients(self) -> "IntrinsicsSettings":
         counts, wanted = _COUNTS[self.model]
-        if len(self.distortion) not in counts:
-            what = f"{len(self.distortion)} coefficients given, {self.model} has {wanted}"
-            raise problem(what, "distortion")
+        what = f"{len(self.distortion)} coefficients given, {self.model} has {wanted}"
+        require(len(self.distortion) in counts, what, "distortion")
         return self
 
 
@@ -258,8 +261,8 @@ class ReconstructionSettings(Settings):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "ReconstructionSettings":
-        if self.window_s is not None and self.window_events is not None:
-            raise problem("window_s and window_events exclude each other", "window_events")
+        what = "window_s and window_events exclude each other"
+        require(self.window_s is None or self.window_events is None, what, "window_events")
         return self
 
 
@@ -278,16 +281,11 @@ class ChannelSettings(Settings):
     reconstruction: ReconstructionSettings | None = None
 
     @model_validator(mode="after")
-    def _has_a_camera_reference(self) -> "ChannelSettings":
-        if self.timestamps.reference not in ("start", "mid_exposure"):
-            what = f"{self.timestamps.reference} belongs to a LiDAR; a camera has start or mid_exposure"
-            raise problem(what, "timestamps.reference")
-        return self
-
-    @model_validator(mode="after")
-    def _only_events_are_reconstructed(self) -> "ChannelSettings":
-        if self.reconstruction is not None and self.kind != "events":
-            raise problem("belongs to a channel of kind events", "reconstruction")
+    def _is_consistent(self) -> "ChannelSettings":
+        what = f"{self.timestamps.reference} belongs to a LiDAR; a camera has start or mid_exposure"
+        require(self.timestamps.reference in ("start", "mid_exposure"), what, "timestamps.reference")
+        is_of_kind = self.reconstruction is None or self.kind == "events"
+        require(is_of_kind, "belongs to a channel of kind events", "reconstruction")
         return self
 
     def located(self, folder: Path) -> "ChannelSettings":
@@ -324,34 +322,27 @@ class CameraSettings(Settings):
     @model_validator(mode="after")
     def _intrinsics_belong_to_resolution(self) -> "CameraSettings":
         lens, size = self.intrinsics, self.resolution_px
-        if size[0] * size[1] > MAX_PIXELS:
-            raise problem(f"{size[0]}x{size[1]} px exceed the limit of {MAX_PIXELS} pixels", "resolution_px")
-        sides = (
+        what = f"{size[0]}x{size[1]} px exceed the limit of {MAX_PIXELS} pixels"
+        require(size[0] * size[1] <= MAX_PIXELS, what, "resolution_px")
+        doubled = f"{round(2 * lens.cx_px)}x{round(2 * lens.cy_px)}"
+        hint = f"; check whether they belong to another resolution (about {doubled} px)"
+        for axis, side, centre, focal, length in (
             ("x", "width", lens.cx_px, lens.fx_px, size[0]),
             ("y", "height", lens.cy_px, lens.fy_px, size[1]),
-        )
-        for axis, side, centre, focal, length in sides:
-            if not 0 < centre < length - 1:
-                what = f"{centre:g} lies outside the image, whose {side} is {length} px"
-                raise problem(what + self._other_resolution(), f"intrinsics.c{axis}_px")
-            if not 0.1 <= focal / length <= 30:
-                what = (
-                    f"a focal length of {focal:g} px is implausible for images with a {side} of {length} px"
-                )
-                raise problem(what + self._other_resolution(), f"intrinsics.f{axis}_px")
+        ):
+            what = f"{centre:g} lies outside the image, whose {side} is {length} px"
+            require(0 < centre < length - 1, what + hint, f"intrinsics.c{axis}_px")
+            what = f"a focal length of {focal:g} px is implausible for images with a {side} of {length} px"
+            require(0.1 <= focal / length <= 30, what + hint, f"intrinsics.f{axis}_px")
         # A lens is near the middle; numbers of another resolution differ by the same factor in x and y.
         x, y = lens.cx_px / size[0], lens.cy_px / size[1]
-        if max(x, y) < 0.4 or min(x, y) > 0.6 or not (0.2 < x < 0.8 and 0.2 < y < 0.8):
-            point = f"{lens.cx_px:g}, {lens.cy_px:g}"
-            what = f"the principal point {point} is far from the middle of {size[0]}x{size[1]} px"
-            raise problem(what + self._other_resolution(), "intrinsics")
-        if not 0.5 < self.intrinsics.fx_px / self.intrinsics.fy_px < 2:
-            raise problem("fx_px and fy_px differ by more than a factor of two", "intrinsics.fy_px")
+        is_near = max(x, y) >= 0.4 and min(x, y) <= 0.6 and 0.2 < x < 0.8 and 0.2 < y < 0.8
+        point = f"{lens.cx_px:g}, {lens.cy_px:g}"
+        what = f"the principal point {point} is far from the middle of {size[0]}x{size[1]} px"
+        require(is_near, what + hint, "intrinsics")
+        what = "fx_px and fy_px differ by more than a factor of two"
+        require(0.5 < lens.fx_px / lens.fy_px < 2, what, "intrinsics.fy_px")
         return self
-
-    def _other_resolution(self) -> str:
-        width, height = round(2 * self.intrinsics.cx_px), round(2 * self.intrinsics.cy_px)
-        return f"; check whether they belong to another resolution (about {width}x{height} px)"
 
     def first_channel(self, kind: Literal["frames", "events"]) -> str | None:
         """Name the first channel of a kind; None if there is none."""
@@ -359,8 +350,7 @@ class CameraSettings(Settings):
 
     def with_intrinsics(self, lens: Intrinsics) -> "CameraSettings":
         """Replace the camera's intrinsics; their standard deviations stay those of the profile."""
-        values = {"model": lens.model, "distortion": lens.distortion}
-        values |= {name: getattr(lens, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+        values = lens_block(lens) | {"distortion": lens.distortion}
         return self.model_copy(update={"intrinsics": self.intrinsics.model_copy(update=values)})
 
     def to_intrinsics(self) -> Intrinsics:

@@ -62,6 +62,12 @@ class Settings(BaseModel):
         return {key: value for key, value in data.items() if key not in _RETIRED}
 
 
+def require(is_met: bool, what: str, key: str = "") -> None:
+    """Raise the error `problem` unless a condition is met."""
+    if not is_met:
+        raise problem(what, key)
+
+
 def problem(what: str, key: str = "") -> PydanticCustomError:
     """Build the error of a check across several keys.
 

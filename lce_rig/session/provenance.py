@@ -25,13 +25,19 @@ def provenance_of(session: Session) -> Provenance:
     Raises:
         SessionError: two units of one sensor took the captures.
     """
-    date = date_of(session)
+    date, imported = date_of(session), []
+    # When a capture came into the session, by its journal.
+    for entry in [] if date else session.read_journal():
+        if entry.get("event") == CAPTURED:
+            with suppress(TypeError, ValueError, OverflowError):
+                time = datetime.fromisoformat(str(entry.get("time")))
+                imported.append(time.astimezone(timezone.utc))
     return Provenance(
         robot=session.rig.robot or "",
         serials=serials_of(session),
         date=date,
         session_sha256=content_sha256(session),
-        imported=None if date else _imported(session),
+        imported=_in_utc(max(imported)) if imported else None,
     )
 
 
@@ -69,16 +75,6 @@ def date_of(session: Session) -> str | None:
     times_ns = [time_ns for capture in _readable(session.captures) for time_ns in capture.times_ns]
     in_utc = [time_ns for time_ns in times_ns if _FIRST_UTC_NS <= time_ns < _LAST_UTC_NS]
     return _in_utc(datetime.fromtimestamp(max(in_utc) // 10**9, timezone.utc)) if in_utc else None
-
-
-def _imported(session: Session) -> str | None:
-    """Give the time at which a session's last capture came into it, by its journal."""
-    noted = [entry.get("time") for entry in session.read_journal() if entry.get("event") == CAPTURED]
-    dates = []
-    for time in noted:
-        with suppress(TypeError, ValueError, OverflowError):
-            dates.append(datetime.fromisoformat(str(time)).astimezone(timezone.utc))
-    return _in_utc(max(dates)) if dates else None
 
 
 def _in_utc(time: datetime) -> str:

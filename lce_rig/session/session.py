@@ -20,8 +20,7 @@ from lce_rig import __version__
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import LceRigError, SessionError, reading
 from lce_rig.rig import Rig, dump_rig, find_profile, load_rig, parse_rig, read_profile, shipped_profiles
-from lce_rig.session.capture import Capture, check_samples, event_channel
-from lce_rig.session.capture_files import content_hash, write_capture
+from lce_rig.session.capture import Capture, check_samples, content_hash, event_channel, write_capture
 from lce_rig.session.durable import (
     WriterLock,
     append_line,

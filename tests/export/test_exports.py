@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, ResultRefusedError, SessionError
 from lce_rig.core.geometry import exp_so3, invert, pose
-from lce_rig.export import EXPORTS, export, export_formats
+from lce_rig.export import EXPORTS, export
 from lce_rig.export.other_tools import fit_coefficients
 from lce_rig.export.robot_tree import Joint, RobotTree, build_trees
 from lce_rig.export.ros_files import load_camera_info
@@ -196,7 +196,8 @@ def test_a_result_of_another_rig_is_refused(rles, make, tmp_path):
 def test_kalibrs_chain_leads_from_each_camera_to_the_next(three_sensor_rig, make, tmp_path):
     names = ("davis", "left", "fish")
     calibrations = [make(random_pose(i), camera=name, lidar="front") for i, name in enumerate(names)]
-    files, findings = export_formats(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"])
+    findings = []
+    files = export(calibrations, three_sensor_rig, tmp_path, formats=["kalibr"], findings=findings)
     chain = yaml.safe_load(files[0].read_text(encoding="utf-8"))
     assert [block["distortion_model"] for block in chain.values()] == ["radtan", "radtan", "equidistant"]
     for index in (1, 2):

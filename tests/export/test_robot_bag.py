@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.errors import LceRigError, SessionError, SourceError
 from lce_rig.core.geometry import Array, pose
-from lce_rig.export import export, export_formats
+from lce_rig.export import export
 from lce_rig.export.robot_tree import build_trees, fit_tree
 from lce_rig.export.urdf import read_robot, read_robot_bag
 from lce_rig.export.writing import R_BODY_OPTICAL
@@ -152,7 +152,8 @@ def test_the_mount_adds_a_sensor_and_never_a_second_parent(rles, make, tmp_path)
         build_trees([make()], elsewhere, whole)
     # The robot's own pose counts, and that is told.
     rig = rles.model_copy(update={"mount": mount})
-    _, findings = export_formats([make()], rig, tmp_path / "out", formats=["urdf"], robot=whole)
+    findings = []
+    export([make()], rig, tmp_path / "out", formats=["urdf"], robot=whole, findings=findings)
     (finding,) = findings
     assert finding.code == "export.mount_unused"
     assert (finding.figures["angle_deg"], finding.figures["distance_m"]) == pytest.approx(

@@ -11,7 +11,7 @@ from lce_rig.cli.main import run
 from lce_rig.core.calibration import Provenance
 from lce_rig.core.errors import ProfileError, UsageError
 from lce_rig.fleet.registry import Registry, as_table, write_rows
-from lce_rig.fleet.rollout import FleetDeployment, newest_results
+from lce_rig.fleet.rollout import newest_results, roll_out
 from lce_rig.fleet.storage import Storage
 from lce_rig.rig import dump_rig, load_rig
 from tests.export.conftest import calibration, some_pose
@@ -68,7 +68,7 @@ def whole(add):
 
 
 def deploy(registry, targets):
-    return FleetDeployment(registry, "nav", targets).run(newest_results(registry))
+    return roll_out(registry, "nav", targets, newest_results(registry))
 
 
 def held(targets, robot):
@@ -89,9 +89,7 @@ def test_every_robot_gets_its_own_newest_result(registry, targets, add):
         content = json.loads(held(targets, robot) or b"{}")
         assert content["provenance"]["robot"] == robot
         assert content["pairs"][0]["T_cam_lidar"][0][3] == (0.2 if robot == "r2" else 0.1)
-    assert states(FleetDeployment(registry, "nav", targets).status(newest_results(registry))) == states(
-        rollout
-    )
+    assert states(roll_out(registry, "nav", targets, newest_results(registry), "status")) == states(rollout)
 
 
 @pytest.mark.usefixtures("whole")
@@ -153,7 +151,7 @@ def test_all_robots_are_rolled_back_byte_for_byte(registry, targets, add):
     assert deploy(registry, targets).stopped_by == "r2"
     assert held(targets, "r1") != first["r1"] and held(targets, "r2") != first["r2"]
     (targets.parent / "robots" / "r2" / "broken").unlink()
-    rollout = FleetDeployment(registry, "nav", targets).roll_back(newest_results(registry), "sensor recall")
+    rollout = roll_out(registry, "nav", targets, newest_results(registry), "rollback", reason="sensor recall")
     assert {robot: held(targets, robot) for robot in ROBOTS} == first
     # The last one's release is its first: nothing came before.
     assert states(rollout) == dict.fromkeys(ROBOTS[:-1], "rolled_back") | {"r3": "not_rolled_back"}
@@ -164,10 +162,14 @@ def test_robots_that_hold_another_result_are_not_rolled_back(registry, targets, 
     deploy(registry, targets)
     add("r1", "2026-04-01T10:00:00Z", 0.4)
     deploy(registry, targets)
-    rolling = FleetDeployment(registry, "nav", targets)
     for state in ("rolled_back", "not_rolled_back"):
-        assert states(rolling.roll_back(newest_results(registry, "robot = 'r1'"))) == {"r1": state}
-    assert rolling.status(newest_results(registry)).counts == {"in_place": 2, "waiting": 1}
+        assert states(
+            roll_out(registry, "nav", targets, newest_results(registry, "robot = 'r1'"), "rollback")
+        ) == {"r1": state}
+    assert roll_out(registry, "nav", targets, newest_results(registry), "status").counts == {
+        "in_place": 2,
+        "waiting": 1,
+    }
 
 
 @pytest.mark.usefixtures("whole")
@@ -201,4 +203,4 @@ def test_a_mistake_is_an_error_before_anything_is_deployed(registry, targets, ta
     if text is not None:
         targets.write_text(text)
     with pytest.raises(error):
-        FleetDeployment(registry, target, targets)
+        roll_out(registry, target, targets, {})
