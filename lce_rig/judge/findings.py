@@ -390,7 +390,7 @@ PLATE_EDGE = Kind(
 INTRINSICS = Kind(
     "verdict.intrinsics",
     _intrinsics,
-    "if the lens was changed: " + _SAVE,
+    "if rough or changed: " + _SAVE,
     actions={
         "refocused": "if rough or refocused: " + _SAVE,
         "collect": "cover the corners, then " + _SAVE,

@@ -131,7 +131,7 @@ def draw_from_above(
     axes.plot(0, 0, "o", color=INK, markersize=4)
     low, high = shown.min(axis=0) - 0.1 * far_m, shown.max(axis=0) + 0.1 * far_m
     axes.set(xlim=(high[0], low[0]), ylim=(low[1], high[1]))
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.set_xlabel("left of the LiDAR, m")
     axes.set_title("ahead, m")
     axes.grid()
