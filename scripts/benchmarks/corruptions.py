@@ -14,7 +14,7 @@ from benchmarks.corruption_sessions import (
     recorded_samples,
     simulated_samples,
 )
-from benchmarks.recordings import RIGS, SETS, RecordedSet, recordings
+from benchmarks.recordings import RIGS, SETS
 from benchmarks.tables import compare, print_head, print_row
 from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.calibration import Calibration, Method
@@ -31,19 +31,8 @@ from lce_rig.simulate import SimulationOptions, simulate_captures, truth_extrins
 METHODS: tuple[Method, ...] = ("paper", "ml")
 _SIMULATED = ("rlfs", "rles")
 _EXCHANGED = "two_cameras"
-_FRAMES_OF = ("rlfs02", "rles01", "rles02", "acfr_vlp16")
-_RECORDED = (
-    *(replace(each, folders=each.folders[:1]) for each in SETS if each.name in _FRAMES_OF),
-    RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)),
-    *(
-        RecordedSet(
-            f"vlp32c_{side}",
-            f"{recordings()}/vlp32c_stereo/{side}.yaml",
-            ((f"vlp32c_stereo/{side}", "frames"),),
-        )
-        for side in (("left", "right") if os.environ.get("LCE_RIG_DATA") else ())
-    ),
-)
+_FRAMES_OF = ("rlfs02", "rles01", "rles02", "acfr_vlp16", "os1_64", "vlp32c_left", "vlp32c_right")
+_RECORDED = tuple(replace(each, folders=each.folders[:1]) for each in SETS if each.name in _FRAMES_OF)
 _VERDICTS = (*get_args(Verdict), "refused")
 # An error beyond so many reported standard deviations, or targets of the profile, is a wrong result.
 _WRONG = 3.0

@@ -13,16 +13,18 @@ from lce_rig.core.calibration import Method
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections
+from lce_rig.judge.repeatability import compare_calibrations
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig
+
+# 95 % of the chi-squared distribution with six degrees of freedom.
+_CHI2_95 = 12.59
 
 
 def bench_real(n_splits: int, only: str, method: Method) -> None:
     """Tabulate every recorded set that is there, each channel alone and all together."""
-    head = (
-        "set, captures, image, LiDAR, used, EGT deg, EGT mm, split deg, split mm, MGE mm, reported deg / mm"
-    )
-    print_head(*head.split(", "), "verdict")
+    head = "set, captures, image, LiDAR, used, EGT deg / mm, halves deg / mm, chi2 / 6, in 95 %, MGE mm"
+    print_head(*head.split(", "), "reported deg / mm", "verdict")
     clocks: list[tuple[object, ...]] = []
     for recorded in SETS:
         if recorded.is_there and only in recorded.name:
@@ -59,28 +61,34 @@ def _row(
     seen = [detections.of(pair, name) for pair in pairs for name in detections.captures(pair)]
     options = EstimateSettings(method)
     (calibration, *_), _ = calibrate_detections(rig, detections, options, channels=channels)
-    deg, mm = compare(calibration.T_cam_lidar, recorded.reference())
-    split_deg, split_mm = _split_halves(rig, detections, channels, n_splits, method)
+    reference = recorded.reference()
+    halves = np.array(list(_halves(rig, detections, channels, n_splits, method)))
+    apart_deg, apart_m = np.sqrt(np.mean(halves[:, :2] ** 2, axis=0))
     return (
         recorded.name if len(recorded.folders) == 1 else f"{recorded.name} {' + '.join(channels)}",
         len(seen),
         sum(isinstance(image, ImageBoard) for image, _ in seen),
         sum(isinstance(lidar, list) for _, lidar in seen),
         len(calibration.captures_used),
-        f"{deg:.3f}",
-        f"{mm:.1f}",
-        f"{split_deg:.3f}",
-        f"{split_mm:.1f}",
+        "-" if reference is None else "{:.3f} / {:.1f}".format(*compare(calibration.T_cam_lidar, reference)),
+        f"{apart_deg:.3f} / {1000 * apart_m:.1f}",
+        f"{np.mean(halves[:, 2]) / 6:.2f}",
+        f"{np.count_nonzero(halves[:, 2] < _CHI2_95)} of {len(halves)}",
         f"{1000 * calibration.metrics.mge_m:.1f}",
         f"{calibration.sigma_rotation_deg:.3f} / {1000 * calibration.sigma_translation_m:.1f}",
         calibration.verdict,
     )
 
 
-def _split_halves(
+def _halves(
     rig: Rig, detections: Detections, channels: tuple[str, ...], n_splits: int, method: Method
-) -> tuple[float, float]:
-    """Calibrate random halves of the scans apart and give the rms of their differences, deg and mm."""
+) -> Iterator[tuple[float, float, float]]:
+    """Calibrate halves of the scans apart: first and second, odd and even, then random ones.
+
+    Yields:
+        The difference of each two as they draw points, deg and m, and its chi-squared of six freedoms for the
+        part of the covariances that they do not share.
+    """
     rng = np.random.default_rng(0)
     ((_lidar, scans),) = detections.lidars.items()
     # Captures may hold copies of one scan: they go into the same half.
@@ -89,25 +97,25 @@ def _split_halves(
     # Half of a small set has fewer captures than a result would be given for.
     fewest = max(3, min(rig.quality.min_captures, len(keys) // 2))
     rig = rig.model_copy(update={"quality": rig.quality.model_copy(update={"min_captures": fewest})})
-    differences = []
-    for _ in range(n_splits):
-        order = rng.permutation(len(keys))
+    in_time = np.arange(len(keys))
+    orders = [in_time, np.argsort(in_time % 2, kind="stable")]
+    orders += [rng.permutation(len(keys)) for _ in range(n_splits - 2)]
+    for order in orders[:n_splits]:
         halves = [{keys[i] for i in part} for part in np.array_split(order, 2)]
         try:
-            T = [
+            results = [
                 calibrate_detections(
                     rig,
                     _only(detections, {n for n, key in prints.items() if key in half}),
                     EstimateSettings(method),
                     channels=channels,
-                )[0][0].T_cam_lidar
+                )[0][0]
                 for half in halves
             ]
         except NotEnoughDataError:
             continue
-        differences.append(compare(T[0], T[1]))
-    deg, mm = np.sqrt(np.mean(np.square(differences), axis=0))
-    return float(deg), float(mm)
+        compared = compare_calibrations(dict(zip(("first", "second"), results, strict=True)))
+        yield compared.max_rotation_deg, compared.max_translation_m, compared.chi2
 
 
 def _only(detections: Detections, names: set[str]) -> Detections:

@@ -33,19 +33,21 @@ class RecordedSet:
     def collect(self, session: Path) -> None:
         """Build a session with the commands a user would type."""
         for folder, channel in self.folders:
-            words = ["collect", "--rig", self.rig, "--channel", channel, "--from", recordings() / folder]
+            # Some profiles come with their recording.
+            rig = recordings() / self.rig if (recordings() / self.rig).is_file() else self.rig
+            words = ["collect", "--rig", rig, "--channel", channel, "--from", recordings() / folder]
             command = [sys.executable, "-m", "lce_rig", *map(str, words), str(session)]
             subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
 
-    def reference(self) -> Array:
-        """Read the reference extrinsic that comes with it."""
+    def reference(self) -> Array | None:
+        """Read the reference extrinsic that comes with it, if one does."""
         from lce_rig.export.extrinsics import read_reference
 
         folder = recordings() / self.folders[0][0]
         if (folder / "reference.json").exists():
-            T = read_reference(folder / "reference.json").of("", "")
-            assert T is not None
-            return T
+            return read_reference(folder / "reference.json").of("", "")
+        if not (folder / "reference_50_runs.csv").exists():
+            return None
         # 50 runs of another tool, LiDAR <- camera: roll, pitch, yaw about fixed axes and a translation.
         with (folder / "reference_50_runs.csv").open() as file:
             runs = np.array([[float(cell) for cell in row] for row in list(csv.reader(file))[1:]])
@@ -63,6 +65,10 @@ SETS = (
     RecordedSet("rles02", str(RIGS / "rles02.yaml"), (("rles02_lf", "frames"), ("rles02_le", "events"))),
     RecordedSet("rles03", str(RIGS / "rles02.yaml"), (("rles03_lf", "frames"), ("rles03_le", "events"))),
     RecordedSet("acfr_vlp16", str(RIGS / "acfr.yaml"), (("acfr_vlp16", "frames"),)),
+    RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)),
+    RecordedSet("vlp32c_left", "vlp32c_stereo/left.yaml", (("vlp32c_stereo/left", "frames"),)),
+    RecordedSet("vlp32c_right", "vlp32c_stereo/right.yaml", (("vlp32c_stereo/right", "frames"),)),
+    RecordedSet("vlp16_tilted", "vlp16_tilted/rig.yaml", (("vlp16_tilted", "frames"),)),
 )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import lce_rig as lce
-from benchmarks.recordings import RIGS, SETS, RecordedSet
+from benchmarks.recordings import SETS, RecordedSet
 from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.calibration import Calibration, ResultFile
@@ -27,7 +27,6 @@ from lce_rig.scene.views import build_view, without_board
 from lce_rig.session import Session
 
 _NAMES = ("rlfs01", "rlfs02", "acfr_vlp16", "os1_64")
-_SETS = (*SETS, RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)))
 _OF_ONE_RIG = (("rlfs01", "rlfs02"), ("rlfs02", "rlfs01"))
 _PART = 5
 _N_ROOMS = 10
@@ -129,7 +128,7 @@ def bench_scene(n_splits: int, only: str = "") -> None:
     """Print the tables of docs/drift.md; simulated rooms are split once, as one set."""
     for ignore_board in (False, True):
         print(f"\n### {'Edges at the board left out' if ignore_board else 'All edges'}")
-        sets = [each for each in _SETS if each.name in _NAMES and each.is_there and only in each.name]
+        sets = [each for each in SETS if each.name in _NAMES and each.is_there and only in each.name]
         watched = {each.name: _Watched.recorded(each, ignore_board=ignore_board) for each in sets}
         seeds = range(_N_ROOMS if only in "rooms" else 0)
         rooms = [_Watched.room(seed, ignore_board=ignore_board) for seed in seeds]

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import lce_rig as lce
-from benchmarks.recordings import RIGS, SETS, RecordedSet
+from benchmarks.recordings import SETS, RecordedSet
 from benchmarks.scene_rooms import ROOMS, FurnishedRoom, furnished_room, only, with_few
 from benchmarks.tables import print_head, print_row
 from lce_rig.core.calibration import Calibration, SceneShare
@@ -24,7 +24,6 @@ from lce_rig.scene.views import without_movers
 from lce_rig.session import Session
 
 _SIZES = {"rlfs": (3, 5, 10), "rles": (3, 5, 10), "os1_64": (11,)}
-_RECORDED = (*SETS, RecordedSet("os1_64", str(RIGS / "os1_64.yaml"), (("os1_64", "frames"),)))
 # Claims of drawn board results: weak as os1_64's, and usual.
 _DRAWN = {"0.5 deg, 30 mm an axis": (0.5, 0.030), "0.15 deg, 10 mm": (0.15, 0.010)}
 _COLUMNS = (
@@ -63,7 +62,7 @@ def bench_scene_sharpen(n_rooms: int, n_splits: int, only_sets: str = "", folder
     for name, n in (("rlfs", n_rooms), ("rles", n_rooms // 3), ("os1_64", n_rooms // 3)):
         if only_sets in f"rooms_{name}":
             _bench_rooms(name, n, folder)
-    for recorded in _RECORDED:
+    for recorded in SETS:
         if (
             recorded.name in ("rlfs01", "rlfs02", "os1_64")
             and recorded.is_there
