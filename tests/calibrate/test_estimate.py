@@ -5,12 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import (
-    EstimateSettings,
-    capture_residual,
-    error_to_reference,
-    fit_extrinsic,
-)
+from lce_rig.calibrate import EstimateSettings, capture_residual, error_to_reference, fit_extrinsic
 from lce_rig.calibrate.result import summarise
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import difference, exp_so3, pose
@@ -157,10 +152,7 @@ def test_the_same_placements_captured_again_claim_no_smaller_sigma(method):
     once = simulate(14, seed=4)
     again = [replace(item, capture=f"1{item.capture[1:]}") for item in once]
     options = EstimateSettings(method)
-    single, double = (
-        fit_extrinsic(once, BOARD, options),
-        fit_extrinsic([*once, *again], BOARD, options),
-    )
+    single, double = (fit_extrinsic(once, BOARD, options), fit_extrinsic([*once, *again], BOARD, options))
     assert double.diagnostics.n_placements == single.diagnostics.n_placements == 14
     ratio = np.sqrt(np.diag(double.cov) / np.diag(single.cov))
     assert np.all(ratio > 0.85)

@@ -8,7 +8,7 @@ import pytest
 from lce_rig.calibrate import Clocks, EstimateSettings, estimate_extrinsics, fit_extrinsic
 from lce_rig.calibrate.motion.board_motion import deskew, fit_motions, sample_poses
 from lce_rig.calibrate.observations import SharedScan
-from lce_rig.core.geometry import Array, difference, invert
+from lce_rig.core.geometry import difference, invert
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, random_pose, scan_board
 from tests.calibrate.moving_boards import Moving, simulate_moving, skew
 
@@ -16,7 +16,7 @@ OPTIONS = EstimateSettings("paper")
 TRACKED = Moving(tracked=("events",))
 
 
-def errors(T_cam_lidar: Array) -> Array:
+def errors(T_cam_lidar):
     """Measure an extrinsic's error as (deg, mm)."""
     off = difference(T_cam_lidar, T_FORWARD)
     return np.array([np.degrees(np.linalg.norm(off[3:])), 1000 * np.linalg.norm(off[:3])])

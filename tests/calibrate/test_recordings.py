@@ -1,7 +1,6 @@
 """Recordings by others: the extrinsic against their reference, which the algorithm never sees."""
 
 import json
-from pathlib import Path
 from typing import get_args
 
 import cv2
@@ -21,12 +20,12 @@ from lce_rig.detect.image.search import find_image_board
 from lce_rig.detect.lidar.search import find_lidar_boards
 from lce_rig.io.cloud import rings_from_elevation, to_scan
 from lce_rig.judge.validate import validate
-from lce_rig.rig import Rig, load_rig, parse_rig
+from lce_rig.rig import load_rig, parse_rig
 
 pytestmark = pytest.mark.dataset
 
 
-def read_scan(path: Path) -> Scan:
+def read_scan(path):
     cloud = decode_pcd(path.read_bytes())
     points = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=1).astype(np.float32)
     kept = np.isfinite(points).all(axis=1) & (np.linalg.norm(points, axis=1) > 0.1)
@@ -34,7 +33,7 @@ def read_scan(path: Path) -> Scan:
     return Scan("lidar", None, points[kept], np.zeros(kept.sum(), dtype=np.float32), ring)
 
 
-def detect(folder: Path, rig: Rig) -> list[Observation]:
+def detect(folder, rig):
     (camera,) = rig.cameras.values()
     board, intrinsics = rig.board.to_board(), camera.to_intrinsics()
     pictures, clouds = ({f.stem: f for f in (folder / name).iterdir()} for name in ("img", "pcd"))

@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from lce_rig.simulate.scene import PLATE
 from lce_rig.simulate.surfaces import rectangle
 
 
-def edit_profile(session: Path, **changes) -> None:
+def edit_profile(session, **changes):
     """Change keys of the session's profile, as somebody who measured the rig wrongly would have them."""
     path = session / "rig.yaml"
     document = yaml.safe_load(path.read_text())
@@ -32,7 +31,7 @@ def edit_profile(session: Path, **changes) -> None:
     path.write_text(yaml.safe_dump(document))
 
 
-def keep(session: Path, n_captures: int) -> None:
+def keep(session, n_captures):
     """Take all but the first captures away, where what is said of one is said of all."""
     for capture in Session.open(session).captures[n_captures:]:
         shutil.rmtree(capture.path)
@@ -134,8 +133,7 @@ def test_a_plate_of_the_boards_size_that_stands_in_the_room_is_not_taken_for_the
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{"file": True}, {"file": "../../../secret.png"}, {"camera": "other"}, {"channel": "none"}],
+    "changes", [{"file": True}, {"file": "../../../secret.png"}, {"camera": "other"}, {"channel": "none"}]
 )
 def test_a_capture_with_a_bad_manifest_is_refused_alone(lce_rig, session, changes):
     keep(session, 3)

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from lce_rig.collect.board_search import sight_ahead
-from lce_rig.collect.board_tracker import BoardDetection, BoardTracker, CaptureMoment
+from lce_rig.collect.board_tracker import BoardTracker, CaptureMoment
 from lce_rig.collect.gates import StillnessGate, find_moments
 from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import transform
 from lce_rig.detect.finder import BoardFinder
-from lce_rig.rig import Rig
 from lce_rig.timing.scan_pairing import Frame
 from tests.collect.live.replay import placements, rig
 from tests.shared import changed
@@ -18,17 +17,17 @@ from tests.shared import changed
 T0_NS = 1_700_000_000_000_000_000
 
 
-def frame_of(k: int, time_s: float) -> Frame:
+def frame_of(k, time_s):
     """Give what the sensors saw of a placement, as at another time."""
     capture = placements()[k]
     return Frame(T0_NS + round(time_s * 1e9), capture.images[:1], capture.scans)
 
 
-def see(watcher: BoardTracker, k: int, time_s: float) -> BoardDetection:
+def see(watcher, k, time_s):
     return watcher.sight(frame_of(k, time_s))
 
 
-def nearest_m(detection: BoardDetection, k: int) -> float:
+def nearest_m(detection, k):
     """Tell how far the nearest candidate lies from where the picture has the board."""
     (image,) = detection.images.values()
     nominal = rig().nominal("davis", "lidar")
@@ -40,13 +39,13 @@ def nearest_m(detection: BoardDetection, k: int) -> float:
     return float(min(np.linalg.norm(each - image.T_cam_board[:3, 3]) for each in seen))
 
 
-def test_a_board_that_jumps_is_found_in_the_scan_long_before_the_next_search_is_due() -> None:
+def test_a_board_that_jumps_is_found_in_the_scan_long_before_the_next_search_is_due():
     watcher = BoardTracker(rig(), rescan_interval_s=1000.0)
     for k, time_s in ((0, 0.0), (0, 0.1), (0, 0.5), (1, 0.9), (1, 1.0), (2, 1.4)):
         assert nearest_m(see(watcher, k, time_s), k) < 0.3, (k, time_s)
 
 
-def test_a_board_that_was_out_of_sight_is_searched_for_at_once() -> None:
+def test_a_board_that_was_out_of_sight_is_searched_for_at_once():
     watcher = BoardTracker(rig(), rescan_interval_s=1000.0)
     assert nearest_m(see(watcher, 0, 0.0), 0) < 0.3
     capture = placements()[0]
@@ -56,12 +55,12 @@ def test_a_board_that_was_out_of_sight_is_searched_for_at_once() -> None:
     assert nearest_m(see(watcher, 3, 1.0), 3) < 0.3
 
 
-def strict(**limits: float) -> Rig:
+def strict(**limits):
     """Give the rig with other limits on boards."""
     return changed(rig(), quality=changed(rig().quality, **limits))
 
 
-def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> None:
+def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment():
     watcher = BoardTracker(strict(min_square_px=1000.0))
     seen = [see(watcher, 0, 0.1 * k) for k in range(30)]
     assert all(("davis", "frames") in each.images for each in seen)
@@ -72,7 +71,7 @@ def test_a_board_beyond_the_profiles_limits_is_followed_but_never_a_moment() -> 
     assert watcher.refusals.by_code()["image.small_squares"] == 30
 
 
-def test_single_shots_of_a_recording_are_moments_and_passing_samples_are_not() -> None:
+def test_single_shots_of_a_recording_are_moments_and_passing_samples_are_not():
     watcher = BoardTracker(rig())
     times_s = (0.0, 4.0, 8.0, 8.1, 12.0)
     seen = [see(watcher, k % len(placements()), time_s) for k, time_s in enumerate(times_s)]
@@ -83,7 +82,7 @@ def test_single_shots_of_a_recording_are_moments_and_passing_samples_are_not() -
     assert not list(find_moments(seen, StillnessGate(watcher.finder.board, 0.01)))
 
 
-def test_live_and_offline_take_the_same_boards() -> None:
+def test_live_and_offline_take_the_same_boards():
     for limits in ({"max_distance_m": 3.0}, {"max_tilt_deg": 20.0, "min_rings": 8}):
         profile = strict(**limits)
         finder, watcher = BoardFinder(profile), BoardTracker(profile)
@@ -96,7 +95,7 @@ def test_live_and_offline_take_the_same_boards() -> None:
                 assert ("lidar" in detection.lidars) != isinstance(scan, Refusal)
 
 
-def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
+def test_a_moment_is_confirmed_by_the_search_that_check_makes():
     watcher = BoardTracker(rig())
     for time_s in (0.0, 0.1, 0.2):
         detection = see(watcher, 0, time_s)
@@ -111,7 +110,7 @@ def test_a_moment_is_confirmed_by_the_search_that_check_makes() -> None:
     assert isinstance(refused, Refusal) and refused.stage == "image"
 
 
-def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have_fitted() -> None:
+def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have_fitted():
     watcher = BoardTracker(rig())
     whole = see(watcher, 0, 0.0)
     (scan,) = whole.frame.scans
@@ -125,7 +124,7 @@ def test_other_things_in_the_scan_are_not_the_board_once_nominal_extrinsics_have
     assert float(refused.figures["distance_m"]) > 1
 
 
-def test_images_searched_ahead_give_the_same_detections() -> None:
+def test_images_searched_ahead_give_the_same_detections():
     order = (0, 0, 0, 1, 1, 2, 3, 3, 0, 0, 1, 2)
     frames = [frame_of(k, 0.1 * i) for i, k in enumerate(order)]
     one, two = BoardTracker(rig()), BoardTracker(rig())

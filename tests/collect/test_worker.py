@@ -13,31 +13,31 @@ from lce_rig.core.errors import ProfileError, SourceError
 class Adder:
     """Sums what it is given, and remembers it."""
 
-    def __init__(self, first: int) -> None:
+    def __init__(self, first):
         self.total = first
-        self.kept: np.ndarray | None = None
+        self.kept = None
 
-    def add(self, values: np.ndarray) -> int:
+    def add(self, values):
         self.total += int(values.sum())
         self.kept = values if self.kept is None else self.kept
         return self.total
 
-    def keep(self) -> np.ndarray | None:
+    def keep(self):
         return self.kept
 
-    def process(self) -> int:
+    def process(self):
         return os.getpid()
 
-    def threads(self) -> str | None:
+    def threads(self):
         return os.environ.get("OPENBLAS_NUM_THREADS")
 
-    def refuse(self) -> None:
+    def refuse(self):
         raise ProfileError("what", "hint")
 
-    def fail(self) -> None:
+    def fail(self):
         raise ZeroDivisionError
 
-    def die(self) -> None:
+    def die(self):
         os.kill(os.getpid(), signal.SIGKILL)
 
 

@@ -5,7 +5,6 @@ to a few decimetres, which tells the board from everything else in the room.
 """
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,12 +22,12 @@ pytestmark = pytest.mark.dataset
 SETS = ["rlfs01", "sss_noise15mm", "rles01_lf", "rles01_le", "rles02_lf", "rles02_le", "acfr_vlp16"]
 
 
-def board_of(folder: Path) -> Board:
+def board_of(folder):
     spec = json.loads((folder / "params.json").read_text())["board"]
     return Board(*spec["inner_corners"], spec["square_m"], spec["width_m"], spec["height_m"])
 
 
-def scans_of(folder: Path) -> dict[str, Scan]:
+def scans_of(folder):
     scans = {}
     for path in sorted((folder / "pcd").glob("*.pcd")):
         cloud = decode_pcd(path.read_bytes())
@@ -38,7 +37,7 @@ def scans_of(folder: Path) -> dict[str, Scan]:
     return scans
 
 
-def expected_centre(image: Path, folder: Path, board: Board) -> np.ndarray | None:
+def expected_centre(image, folder, board):
     """Find the board's centre in the LiDAR frame by the picture and the reference; None without corners."""
     spec = json.loads((folder / "params.json").read_text())
     K, D = np.array(spec["K"], dtype=float), np.array(spec["D"], dtype=float)

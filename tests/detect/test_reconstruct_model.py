@@ -26,15 +26,6 @@ def test_pictures_have_the_sensors_size_whatever_it_is(width, height):
     assert np.isfinite(picture).all()
 
 
-def test_the_state_remembers_what_the_window_before_showed():
-    model = ReconstructionModel()
-    rng = np.random.default_rng(0)
-    states = model.initial_states(64, 64)
-    _, seen = model.step(rng.standard_normal((5, 64, 64)).astype(np.float32), states)
-    empty = np.zeros((5, 64, 64), np.float32)
-    assert np.abs(model.step(empty, seen)[0] - model.step(empty, states)[0]).max() > 0.05
-
-
 @pytest.mark.parametrize("content", [None, b"", b"not a network", "half of the shipped one"])
 def test_a_file_that_is_missing_torn_or_no_network_is_named(tmp_path, content):
     path = tmp_path / "other.onnx"

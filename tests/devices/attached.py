@@ -1,23 +1,21 @@
 """One attached sensor by itself: its samples as they come, then the reason of the end."""
 
-from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-from lce_rig.core.data import LiveSample
 from lce_rig.devices.reading import AttachedSensors, LiveSource
 
 Source = TypeVar("Source", bound=LiveSource)
 
 
 @contextmanager
-def attached(source: Source) -> Iterator[tuple[Source, Iterator[LiveSample]]]:
+def attached(source):
     """Open a sensor; gives it and what comes from it, which ends with the error that ends its reading."""
     with AttachedSensors([source], reopen_every_s=None) as sensors:
         yield source, _samples(source, sensors)
 
 
-def _samples(source: LiveSource, sensors: AttachedSensors) -> Iterator[LiveSample]:
+def _samples(source, sensors):
     while True:
         lost = source.lost
         came = sensors.take(0.1)

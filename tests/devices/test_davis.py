@@ -6,22 +6,19 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from itertools import islice
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Events, Image, LiveSample, Pulse
+from lce_rig.core.data import Events, Image, Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import davis
 from lce_rig.devices.davis import DavisSource, OpenedCamera, bias_of, number_of
-from lce_rig.rig import CameraSettings, load_rig
+from lce_rig.rig import load_rig
 from tests.devices.attached import attached
 
 dv = pytest.importorskip("dv_processing")
@@ -30,15 +27,15 @@ SIZE = (346, 260)
 INTERVAL_US, EXPOSURE_US = 40_000, 4_001
 
 
-def camera(**changes: Any) -> CameraSettings:
+def camera(**changes):
     return load_rig("rles").cameras["davis"].model_copy(update=changes)
 
 
-def only_events() -> CameraSettings:
+def only_events():
     return camera(channels={"events": camera().channels["events"]})
 
 
-def store(start_us: int, n: int = 500) -> Any:
+def store(start_us, n=500):
     rng = np.random.default_rng(start_us % 1000)
     events = dv.EventStore()
     for k, (x, y) in enumerate(zip(rng.integers(0, 346, n), rng.integers(0, 260, n), strict=True)):
@@ -46,7 +43,7 @@ def store(start_us: int, n: int = 500) -> Any:
     return events
 
 
-def edges(start_us: int) -> Any:
+def edges(start_us):
     kinds = (
         "APS_EXPOSURE_START",
         "EXTERNAL_SIGNAL_RISING_EDGE",
@@ -58,7 +55,7 @@ def edges(start_us: int) -> Any:
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Path:
+def recording(tmp_path):
     """A file with all streams: 8 x 10 ms of events, 8 frames of which one is missing, 8 trigger edges."""
     config = dv.io.MonoCameraWriter.Config("DAVIS346_00000499")
     config.addEventStream(SIZE)
@@ -80,15 +77,15 @@ def recording(tmp_path: Path) -> Path:
 A_NOTE = Finding("clock.trigger_input_off", "warning")
 
 
-def playing(path: Path, device: str = "DAVIS346_00000499") -> Any:
+def playing(path, device="DAVIS346_00000499"):
     return lambda sensor, settings: OpenedCamera(
         dv.io.MonoCameraRecording(str(path)), device, (A_NOTE,), "00000499"
     )
 
 
-def play(path: Path, settings: CameraSettings) -> tuple[list[LiveSample], DavisSource]:
+def play(path, settings):
     """Read a file to its end, as if it were a camera that is then unplugged."""
-    came: list[LiveSample] = []
+    came = []
     with (
         attached(DavisSource("davis", settings, playing(path))) as (source, samples),
         pytest.raises(SourceError, match="DAVIS346_00000499"),
@@ -97,7 +94,7 @@ def play(path: Path, settings: CameraSettings) -> tuple[list[LiveSample], DavisS
     return came, source
 
 
-def test_all_that_dv_processing_wrote_comes_out(recording: Path) -> None:
+def test_all_that_dv_processing_wrote_comes_out(recording):
     came, source = play(recording, camera())
     events = [sample for sample in came if isinstance(sample, Events)]
     t_us = np.concatenate([part.t_ns for part in events]) // 1000
@@ -110,7 +107,7 @@ def test_all_that_dv_processing_wrote_comes_out(recording: Path) -> None:
     assert source.status().serial == "00000499"
 
 
-def test_frames_are_stamped_in_the_middle_of_their_exposure(recording: Path) -> None:
+def test_frames_are_stamped_in_the_middle_of_their_exposure(recording):
     came, source = play(recording, camera())
     images = [sample for sample in came if isinstance(sample, Image)]
     starts_us = [START_US + INTERVAL_US * k for k in range(8) if k != 5]
@@ -120,7 +117,7 @@ def test_frames_are_stamped_in_the_middle_of_their_exposure(recording: Path) -> 
     assert source.status().n_lost == 1
 
 
-def test_rising_edges_become_counted_pulses_and_others_do_not(recording: Path) -> None:
+def test_rising_edges_become_counted_pulses_and_others_do_not(recording):
     came, _ = play(recording, camera())
     pulses = [sample for sample in came if isinstance(sample, Pulse)]
     assert [pulse.stamp_ns for pulse in pulses] == [
@@ -130,7 +127,7 @@ def test_rising_edges_become_counted_pulses_and_others_do_not(recording: Path) -
     assert {pulse.sensor for pulse in pulses} == {"davis"}
 
 
-def test_stamps_far_from_this_computers_clock_are_a_problem(recording: Path) -> None:
+def test_stamps_far_from_this_computers_clock_are_a_problem(recording):
     _, source = play(recording, camera())
     status = source.status()
     assert status.problems[0] == A_NOTE and status.problems[1].code == "clock.differs_from_computer"
@@ -138,7 +135,7 @@ def test_stamps_far_from_this_computers_clock_are_a_problem(recording: Path) -> 
     assert status.clock is not None and status.clock.code == "clock.davis"
 
 
-def test_another_size_is_another_camera(recording: Path) -> None:
+def test_another_size_is_another_camera(recording):
     small = camera(resolution_px=(240, 180))
     with (
         attached(DavisSource("davis", small, playing(recording))) as (_, samples),
@@ -147,7 +144,7 @@ def test_another_size_is_another_camera(recording: Path) -> None:
         list(samples)
 
 
-def test_a_reset_of_the_cameras_clock_is_noticed_and_colour_frames_stay_bgr(tmp_path: Path) -> None:
+def test_a_reset_of_the_cameras_clock_is_noticed_and_colour_frames_stay_bgr(tmp_path):
     config = dv.io.MonoCameraWriter.Config("DAVIS346_00000499")
     config.addEventStream(SIZE)
     config.addFrameStream(SIZE)
@@ -184,7 +181,7 @@ time.sleep(60)
 
 
 @contextmanager
-def sender(n_batches: int) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+def sender(n_batches):
     """A process that sends events live, as dv-processing's network writer does."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -199,11 +196,11 @@ def sender(n_batches: int) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
             process.kill()
 
 
-def over_network(port: int) -> Any:
+def over_network(port):
     return lambda sensor, settings: OpenedCamera(dv.io.NetworkReader("127.0.0.1", port), "a sender")
 
 
-def test_live_events_come_with_a_small_delay_and_a_lost_sender_is_gone() -> None:
+def test_live_events_come_with_a_small_delay_and_a_lost_sender_is_gone():
     with (
         sender(10_000) as (process, port),
         attached(DavisSource("davis", only_events(), over_network(port))) as (source, samples),
@@ -221,7 +218,7 @@ def test_live_events_come_with_a_small_delay_and_a_lost_sender_is_gone() -> None
     assert "unplugged" in caught.value.hint
 
 
-def test_a_stream_that_the_profile_wants_must_be_there() -> None:
+def test_a_stream_that_the_profile_wants_must_be_there():
     with sender(1) as (_, port):
         source = DavisSource("davis", camera(), over_network(port))
         with pytest.raises(SourceError, match="'frames'"), attached(source):
@@ -230,7 +227,7 @@ def test_a_stream_that_the_profile_wants_must_be_there() -> None:
 
 @pytest.mark.skipif(bool(dv.io.camera.discover()), reason="a camera is attached")
 @pytest.mark.parametrize(("device", "name"), [(None, "DAVIS"), ("DAVIS346_00000499", "DAVIS 00000499")])
-def test_without_a_camera_there_is_one_clear_error(device: str | None, name: str) -> None:
+def test_without_a_camera_there_is_one_clear_error(device, name):
     settings = camera(driver=camera().driver.model_copy(update={"device": device}))
     with pytest.raises(SourceError) as caught, attached(DavisSource("davis", settings)):
         pass
@@ -238,7 +235,7 @@ def test_without_a_camera_there_is_one_clear_error(device: str | None, name: str
     assert "lsusb" in caught.value.hint and "udev" in caught.value.hint
 
 
-def test_every_call_to_a_camera_exists_in_dv_processing() -> None:
+def test_every_call_to_a_camera_exists_in_dv_processing():
     source = inspect.getsource(davis)
     called = set(re.findall(r"[( ]camera\.(\w+)", source[source.index("def open_davis") :]))
     assert len(called) >= 15
@@ -250,7 +247,7 @@ def test_every_call_to_a_camera_exists_in_dv_processing() -> None:
     assert [name for name in sorted(asked) if not hasattr(dv.io.camera.DAVIS, name)] == []
 
 
-def test_controls_that_make_no_sense_are_named() -> None:
+def test_controls_that_make_no_sense_are_named():
     assert number_of("davis", "exposure_us", 4000) * timedelta(microseconds=1) == timedelta(milliseconds=4)
     for value in (True, "long", 0, -3):
         with pytest.raises(SourceError, match=r"driver\.controls\.exposure_us"):
@@ -262,7 +259,7 @@ def test_controls_that_make_no_sense_are_named() -> None:
 
 
 @pytest.mark.hardware
-def test_an_attached_davis_sends_all_its_streams() -> None:
+def test_an_attached_davis_sends_all_its_streams():
     with attached(DavisSource("davis", camera())) as (source, samples):
         ends_s = time.monotonic() + 3
         came = []

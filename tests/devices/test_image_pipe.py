@@ -3,43 +3,42 @@
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lce_rig.core.data import Image, LiveSample
+from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.pipe import ImagePipeSource, ImageStream
 from lce_rig.devices.pixel_formats import PixelDecoder
-from lce_rig.rig import CameraSettings, load_rig
+from lce_rig.rig import load_rig
 from tests.devices.attached import attached
 from tests.shared import has_ended, wait_until
 
 WIDTH, HEIGHT = 32, 18
 
 
-def camera(*command: str, pixel_format: str | None = None) -> CameraSettings:
+def camera(*command, pixel_format=None):
     settings = load_rig("rlfs").cameras["cam"]
     driver = settings.driver.model_copy(update={"command": command, "pixel_format": pixel_format})
     return settings.model_copy(update={"driver": driver, "resolution_px": (WIDTH, HEIGHT)})
 
 
-def grey_pictures(n: int) -> list[np.ndarray]:
+def grey_pictures(n):
     return [np.full((HEIGHT, WIDTH), 30 + 10 * k, np.uint8) for k in range(n)]
 
 
-def y4m(pictures: list[np.ndarray], colour: str = "420jpeg") -> bytes:
+def y4m(pictures, colour="420jpeg"):
     chroma = b"" if colour == "mono" else b"\x80" * (WIDTH * HEIGHT // 2)
     frames = b"".join(b"FRAME Ip\n" + picture.tobytes() + chroma for picture in pictures)
     return f"YUV4MPEG2 W{WIDTH} H{HEIGHT} F10:1 Ip A1:1 C{colour} XNOTE\n".encode() + frames
 
 
-def raw(pictures: list[np.ndarray]) -> bytes:
+def raw(pictures):
     return b"".join(picture.tobytes() for picture in pictures)
 
 
@@ -50,13 +49,13 @@ STREAMS: dict[str, tuple[Callable[[list[np.ndarray]], bytes], Callable[[], Image
 }
 
 
-def levels(images: list[np.ndarray]) -> list[float]:
+def levels(images):
     return [float(image.mean()) for image in images]
 
 
 @pytest.mark.parametrize("kind", STREAMS)
 @given(data=st.data())
-def test_the_same_pictures_come_however_the_bytes_are_cut(kind: str, data: st.DataObject) -> None:
+def test_the_same_pictures_come_however_the_bytes_are_cut(kind, data):
     write, make = STREAMS[kind]
     stream, whole, payload = make(), make(), write(grey_pictures(3))
     cuts = sorted(data.draw(st.lists(st.integers(0, len(payload)), max_size=12)))
@@ -68,13 +67,13 @@ def test_the_same_pictures_come_however_the_bytes_are_cut(kind: str, data: st.Da
 
 
 @pytest.mark.parametrize("kind", ["grey y4m", "raw"])
-def test_grey_values_are_kept(kind: str) -> None:
+def test_grey_values_are_kept(kind):
     write, make = STREAMS[kind]
     assert levels(list(make().feed(write(grey_pictures(3))))) == pytest.approx([30, 40, 50], abs=0.6)
 
 
 @pytest.mark.parametrize("colour", ["420", "420mpeg2"])
-def test_y4m_luma_is_of_video_range(colour: str) -> None:
+def test_y4m_luma_is_of_video_range(colour):
     came = levels(list(ImageStream().feed(y4m(grey_pictures(3), colour))))
     assert came == pytest.approx([(level - 16) * 255 / 219 for level in (30, 40, 50)], abs=1)
 
@@ -93,7 +92,7 @@ def test_y4m_luma_is_of_video_range(colour: str) -> None:
         b"YUV4MPEG2 " + b"x" * 5000,
     ],
 )
-def test_streams_that_cannot_be_read_are_refused(begin: bytes) -> None:
+def test_streams_that_cannot_be_read_are_refused(begin):
     with pytest.raises(ValueError):
         list(ImageStream().feed(begin))
 
@@ -106,16 +105,16 @@ WRITE = (
 )
 
 
-def child(tmp_path: Path, data: bytes, then: str = "time.sleep(60)") -> list[str]:
+def child(tmp_path, data, then="time.sleep(60)"):
     (tmp_path / "pictures").write_bytes(data)
     return [sys.executable, "-c", WRITE + then, str(tmp_path / "pictures")]
 
 
-def take(samples: Iterator[LiveSample], n: int) -> list[Image]:
+def take(samples, n):
     return [sample for sample in islice(samples, n) if isinstance(sample, Image)]
 
 
-def test_pictures_of_a_program_are_taken_as_they_arrive(tmp_path: Path) -> None:
+def test_pictures_of_a_program_are_taken_as_they_arrive(tmp_path):
     command = child(tmp_path, y4m(grey_pictures(5)))
     before_ns = time.time_ns()
     with attached(ImagePipeSource("cam", camera(*command))) as (source, samples):
@@ -131,7 +130,7 @@ def test_pictures_of_a_program_are_taken_as_they_arrive(tmp_path: Path) -> None:
     assert status.clock is not None and status.clock.code == "clock.arrival"
 
 
-def test_raw_pictures_need_their_format_in_the_profile(tmp_path: Path) -> None:
+def test_raw_pictures_need_their_format_in_the_profile(tmp_path):
     command = child(tmp_path, raw(grey_pictures(2)))
     with attached(ImagePipeSource("cam", camera(*command, pixel_format="GREY"))) as (source, samples):
         assert levels([image.pixels for image in take(samples, 2)]) == [30, 40]
@@ -144,7 +143,7 @@ def test_raw_pictures_need_their_format_in_the_profile(tmp_path: Path) -> None:
     assert "driver.pixel_format" in caught.value.hint
 
 
-def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path: Path) -> None:
+def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path):
     payload = y4m(grey_pictures(2))[:-100]
     command = child(tmp_path, payload, "sys.stderr.write('no signal\\nbye\\n'); sys.exit(3)")
     with (
@@ -156,7 +155,7 @@ def test_a_program_that_dies_is_quoted_with_what_it_left(tmp_path: Path) -> None
     assert "signal | bye" in caught.value.hint
 
 
-def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:
+def test_pictures_of_another_size_are_refused(tmp_path):
     command = child(tmp_path, b"YUV4MPEG2 W32 H20 Cmono\nFRAME\n" + bytes(32 * 20))
     with (
         attached(ImagePipeSource("cam", camera(*command))) as (_, samples),
@@ -165,7 +164,7 @@ def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:
         take(samples, 1)
 
 
-def test_a_program_that_is_not_there_is_named() -> None:
+def test_a_program_that_is_not_there_is_named():
     with pytest.raises(SourceError, match="no-such-program") as caught:
         attached(ImagePipeSource("cam", camera("no-such-program"))).__enter__()
     assert "installed" in caught.value.hint
@@ -175,7 +174,7 @@ def test_a_program_that_is_not_there_is_named() -> None:
         attached(ImagePipeSource("cam", camera("true", pixel_format="H264"))).__enter__()
 
 
-def test_a_talkative_stubborn_program_and_its_children_are_stopped(tmp_path: Path) -> None:
+def test_a_talkative_stubborn_program_and_its_children_are_stopped(tmp_path):
     then = (
         "import os, signal, subprocess; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
         "inner = subprocess.Popen(['sleep', '60']); "
@@ -190,7 +189,7 @@ def test_a_talkative_stubborn_program_and_its_children_are_stopped(tmp_path: Pat
         wait_until(lambda pid=pid: has_ended(pid))
 
 
-def test_ffmpeg_is_read() -> None:
+def test_ffmpeg_is_read():
     ffmpeg = shutil.which("ffmpeg")
     if ffmpeg is None:
         pytest.skip("ffmpeg is not installed")

@@ -1,12 +1,10 @@
 """Which driver a sensor gets; samples in order, the reason of the end, and reading again when it is back."""
 
 import time
-from collections.abc import Iterable
-from typing import Any
 
 import pytest
 
-from lce_rig.core.data import LiveSample, Pulse
+from lce_rig.core.data import Pulse
 from lce_rig.core.errors import SourceError
 from lce_rig.devices import driver_of, open_live, sensors, source_of
 from lce_rig.devices.reading import AttachedSensors, LiveSource, RateMeter, SourceStatus
@@ -17,24 +15,22 @@ from tests.shared import changed
 HINT = "Check the plug."
 
 
-def pulse(count: int) -> Pulse:
+def pulse(count):
     return Pulse("cam", count, count, 0)
 
 
 class Script(LiveSource):
     """A device that gives what it was told to, one entry a call; an error is raised; then nothing."""
 
-    def __init__(
-        self, *entries: list[Pulse] | Exception, name: str = "s", n_slots: int = 9, silence_s: float = 5.0
-    ) -> None:
+    def __init__(self, *entries, name="s", n_slots=9, silence_s=5.0):
         super().__init__(name, f"sensor {name!r}", silence_s, HINT, n_slots)
         self.entries = list(entries)
         self.is_open = False
 
-    def open(self) -> None:
+    def open(self):
         self.is_open = True
 
-    def read(self) -> list[Pulse]:
+    def read(self):
         if not self.entries:
             time.sleep(0.01)
             return []
@@ -43,18 +39,18 @@ class Script(LiveSource):
             raise entry
         return entry
 
-    def close(self) -> None:
+    def close(self):
         self.is_open = False
 
-    def describe(self) -> SourceStatus:
+    def describe(self):
         return SourceStatus(self.sensor)
 
 
-def counts(samples: Iterable[LiveSample]) -> list[int]:
+def counts(samples):
     return [sample.count for sample in samples if isinstance(sample, Pulse)]
 
 
-def test_samples_come_in_order_and_then_the_reason_of_the_end() -> None:
+def test_samples_come_in_order_and_then_the_reason_of_the_end():
     with attached(Script([pulse(0), pulse(1)], [pulse(2)], SourceError("gone"))) as (source, samples):
         came = []
         with pytest.raises(SourceError, match="gone"):
@@ -64,13 +60,13 @@ def test_samples_come_in_order_and_then_the_reason_of_the_end() -> None:
     assert not source.is_open
 
 
-def test_nothing_for_too_long_is_an_error_with_a_hint() -> None:
+def test_nothing_for_too_long_is_an_error_with_a_hint():
     with attached(Script(silence_s=0.1)) as (_, samples), pytest.raises(SourceError) as caught:
         counts(samples)
     assert caught.value.hint == HINT
 
 
-def test_what_nobody_takes_is_dropped_oldest_first_and_counted() -> None:
+def test_what_nobody_takes_is_dropped_oldest_first_and_counted():
     came = []
     with attached(Script(n_slots=4)) as (source, samples):
         source.entries += [[pulse(k) for k in range(10)], SourceError("gone")]
@@ -83,7 +79,7 @@ def test_what_nobody_takes_is_dropped_oldest_first_and_counted() -> None:
     assert [sample.count for sample in came if isinstance(sample, Pulse)] == [6, 7, 8, 9]
 
 
-def test_a_bug_in_a_driver_ends_the_samples_and_is_called_one() -> None:
+def test_a_bug_in_a_driver_ends_the_samples_and_is_called_one():
     with (
         attached(Script([pulse(0)], ZeroDivisionError("oops"))) as (_, samples),
         pytest.raises(SourceError) as caught,
@@ -92,7 +88,7 @@ def test_a_bug_in_a_driver_ends_the_samples_and_is_called_one() -> None:
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 
-def test_one_of_several_sensors_that_fails_is_opened_again_and_nothing_of_the_others_is_lost() -> None:
+def test_one_of_several_sensors_that_fails_is_opened_again_and_nothing_of_the_others_is_lost():
     lossy = Script([pulse(0)], SourceError("gone"), [pulse(1)])
     steady = Script(*[[pulse(k)] for k in range(5)], name="t")
     with AttachedSensors([lossy, steady], reopen_every_s=0.05) as sensors:
@@ -106,9 +102,9 @@ def test_one_of_several_sensors_that_fails_is_opened_again_and_nothing_of_the_ot
         assert {name: status.n_dropped for name, status in sensors.statuses().items()} == {"s": 0, "t": 0}
 
 
-def test_what_comes_while_others_are_being_opened_is_no_loss() -> None:
+def test_what_comes_while_others_are_being_opened_is_no_loss():
     class Slow(Script):
-        def open(self) -> None:
+        def open(self):
             while early.entries:
                 time.sleep(0.005)
 
@@ -118,13 +114,13 @@ def test_what_comes_while_others_are_being_opened_is_no_loss() -> None:
         assert sensors.statuses()["s"].n_dropped == 0
 
 
-def test_all_is_closed_at_once_while_a_lost_sensor_is_being_opened_again() -> None:
+def test_all_is_closed_at_once_while_a_lost_sensor_is_being_opened_again():
     class Absent(Script):
         """Gone for good: opening it waits until it is told to give up."""
 
         n_opened = 0
 
-        def open(self) -> None:
+        def open(self):
             self.n_opened += 1
             while self.n_opened > 1 and not self.is_stopping:
                 time.sleep(0.001)
@@ -138,7 +134,7 @@ def test_all_is_closed_at_once_while_a_lost_sensor_is_being_opened_again() -> No
     assert not source.is_open
 
 
-def test_a_rate_is_that_of_what_came_and_falls_when_nothing_comes() -> None:
+def test_a_rate_is_that_of_what_came_and_falls_when_nothing_comes():
     clock_s = [100.0]
     meter = RateMeter(lambda: clock_s[0])
     assert meter.rate_hz == 0
@@ -161,7 +157,7 @@ def test_a_rate_is_that_of_what_came_and_falls_when_nothing_comes() -> None:
         ("rles", [("lidar", "Vlp16Source"), ("davis", "DavisSource")]),
     ],
 )
-def test_the_shipped_rigs_get_their_drivers(rig: str, sources: list[tuple[str, str]]) -> None:
+def test_the_shipped_rigs_get_their_drivers(rig, sources):
     made = [(source.sensor, type(source).__name__) for source in open_live(load_rig(rig))]
     assert made[:2] == sources
     assert all(name == "SyncBoard" for _, name in made[2:])
@@ -175,14 +171,14 @@ def test_the_shipped_rigs_get_their_drivers(rig: str, sources: list[tuple[str, s
         ({"driver__type": "ros2"}, "Ros2Source"),
     ],
 )
-def test_the_profile_may_choose_the_driver(changes: dict[str, Any], source: str) -> None:
+def test_the_profile_may_choose_the_driver(changes, source):
     rig = load_rig("rlfs")
     rig = changed(rig, cameras__cam=changed(rig.cameras["cam"], **changes))
     assert type(open_live(rig)[1]).__name__ == source
 
 
 @pytest.mark.parametrize("wanted", ["v4l", "vlp16", "sync_board"])
-def test_an_unknown_driver_or_one_of_another_kind_keeps_no_other_sensor_from_opening(wanted: str) -> None:
+def test_an_unknown_driver_or_one_of_another_kind_keeps_no_other_sensor_from_opening(wanted):
     rig = changed(load_rig("rlfs"), cameras__cam__driver__type=wanted)
     with pytest.raises(SourceError) as caught:
         open_live(rig)
@@ -190,7 +186,7 @@ def test_an_unknown_driver_or_one_of_another_kind_keeps_no_other_sensor_from_ope
     assert sensors(rig)[:2] == ["lidar", "cam"] and source_of(rig, "lidar").sensor == "lidar"
 
 
-def test_a_lidar_of_an_unknown_model_is_not_guessed() -> None:
+def test_a_lidar_of_an_unknown_model_is_not_guessed():
     rig = load_rig("rlfs")
     unknown = changed(rig, lidars__lidar__model="XY-32", lidars__lidar__driver__type=None)
     with pytest.raises(SourceError) as caught:

@@ -10,11 +10,9 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +23,7 @@ from lce_rig.devices import open_live
 from lce_rig.devices.reading import AttachedSensors
 from lce_rig.devices.ros2 import Ros2Source
 from lce_rig.io.ros.bag_recorder import encode_image, encode_scan
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from tests.devices.attached import attached
 from tests.shared import changed
 
@@ -38,7 +36,7 @@ TOPICS = {
 
 
 @pytest.fixture
-def rig() -> Rig:
+def rig():
     """The rig rlfs with both sensors on ROS 2 topics."""
     return changed(
         load_rig("rlfs"),
@@ -50,7 +48,7 @@ def rig() -> Rig:
     )
 
 
-def samples(rig: Rig, n: int) -> Iterator[tuple[str, bytes]]:
+def samples(rig, n):
     """Messages of both topics whose headers rise; every fifth image is torn."""
     height, width = 48, 64
     begin_ns = time.time_ns()
@@ -67,13 +65,13 @@ def samples(rig: Rig, n: int) -> Iterator[tuple[str, bytes]]:
 
 
 @pytest.fixture
-def graph(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def graph(rig, monkeypatch):
     """A graph in which both topics are published to whoever subscribes, at 50 messages a second."""
     monkeypatch.syspath_prepend(str(Path(__file__).with_name("ros2_graph")))
     listener = socket.create_server(("127.0.0.1", 0))
     monkeypatch.setenv("ROS_GRAPH_PORT", str(listener.getsockname()[1]))
 
-    def serve(member: socket.socket) -> None:
+    def serve(member):
         with suppress(OSError), member:
             member.sendall(json.dumps(TOPICS).encode() + b"\n")
             if member.recv(3) != b"go\n":
@@ -82,7 +80,7 @@ def graph(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
                 member.sendall(struct.pack("<II", len(topic), len(data)) + topic.encode() + data)
                 time.sleep(0.01)
 
-    def accept() -> None:
+    def accept():
         with suppress(OSError):
             while True:
                 threading.Thread(target=serve, args=(listener.accept()[0],), daemon=True).start()
@@ -95,8 +93,8 @@ def graph(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("graph")
-def test_images_and_scans_of_topics_come_as_from_a_bag(rig: Rig) -> None:
-    came: dict[str, list[Any]] = {"cam": [], "lidar": []}
+def test_images_and_scans_of_topics_come_as_from_a_bag(rig):
+    came = {"cam": [], "lidar": []}
     with AttachedSensors(open_live(rig)) as sensors:
         until_s = time.monotonic() + 20
         while min(map(len, came.values())) < 10 and time.monotonic() < until_s:
@@ -118,20 +116,18 @@ def test_images_and_scans_of_topics_come_as_from_a_bag(rig: Rig) -> None:
     assert statuses["lidar"].n_lost == 0 and POINTS in statuses["lidar"].device
 
 
-def refusal(source: Ros2Source) -> SourceError:
+def refusal(source):
     with pytest.raises(SourceError) as caught, attached(source):
         pass
     return caught.value
 
 
-def with_topic(rig: Rig, topic: str | None) -> Ros2Source:
+def with_topic(rig, topic):
     return Ros2Source("lidar", rig.lidars["lidar"].model_copy(update={"topic": topic}))
 
 
 @pytest.mark.usefixtures("graph")
-def test_topics_that_do_not_serve_are_refused_with_those_that_would(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_topics_that_do_not_serve_are_refused_with_those_that_would(rig, monkeypatch):
     monkeypatch.setattr("lce_rig.devices.ros2._DISCOVERY_S", 0.2)
     absent, wrong, unnamed = (refusal(with_topic(rig, topic)) for topic in ("/velodyne", IMAGES, None))
     assert "/velodyne" in absent.what and POINTS in absent.hint
@@ -139,7 +135,7 @@ def test_topics_that_do_not_serve_are_refused_with_those_that_would(
     assert "lidars.lidar" in unnamed.hint
 
 
-def test_without_ros_2_the_way_to_it_is_told(rig: Rig) -> None:
+def test_without_ros_2_the_way_to_it_is_told(rig):
     if find_spec("rclpy") is not None:
         pytest.skip("ROS 2 is there")
     error = refusal(Ros2Source("cam", rig.cameras["cam"]))

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from ctypes import sizeof
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,37 +15,37 @@ from lce_rig.core.errors import SourceError
 from lce_rig.devices import v4l2_abi as abi
 from lce_rig.devices.v4l2 import V4l2Source
 from lce_rig.devices.video_device import serial_number
-from lce_rig.rig import CameraSettings, load_rig
+from lce_rig.rig import load_rig
 from tests.devices.attached import attached
 from tests.notes import has_note
 
 HEADER = Path("/usr/include/linux/videodev2.h")
 
 
-def camera(device: str | None) -> CameraSettings:
+def camera(device):
     settings = load_rig("rlfs").cameras["cam"]
     return settings.model_copy(update={"driver": settings.driver.model_copy(update={"device": device})})
 
 
-def refusal(device: str | None) -> SourceError:
+def refusal(device):
     with pytest.raises(SourceError) as caught, attached(V4l2Source("cam", camera(device))):
         pass
     return caught.value
 
 
-def test_a_camera_that_is_not_there_is_named_with_what_to_check() -> None:
+def test_a_camera_that_is_not_there_is_named_with_what_to_check():
     error = refusal("/dev/video-of-nobody")
     assert has_note([error.what], "'cam'", "/dev/video-of-nobody", "not there")
     assert "driver.device" in error.hint or "camera's cable" in error.hint
 
 
-def test_a_missing_device_setting_is_said() -> None:
+def test_a_missing_device_setting_is_said():
     error = refusal(None)
     assert error.what.startswith("cam:") and "profile" in error.what
     assert "this computer" in error.hint
 
 
-def test_what_is_no_camera_is_refused_by_name(tmp_path: Path) -> None:
+def test_what_is_no_camera_is_refused_by_name(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     os.mkfifo(tmp_path / "fifo")
     for path in (tmp_path / "file", tmp_path / "fifo", tmp_path, Path("/dev/null")):
@@ -105,7 +104,7 @@ OFFSETS = {
 }
 
 
-def test_structures_and_numbers_are_those_of_the_kernels_header(tmp_path: Path) -> None:
+def test_structures_and_numbers_are_those_of_the_kernels_header(tmp_path):
     compiler = shutil.which("cc")
     if compiler is None or not HEADER.exists():
         pytest.skip("no C compiler, or no kernel headers")
@@ -122,7 +121,7 @@ def test_structures_and_numbers_are_those_of_the_kernels_header(tmp_path: Path) 
     assert dict(zip(asked, map(int, said), strict=True)) == dict(zip(asked, ours, strict=True))
 
 
-def test_the_serial_number_is_that_of_the_usb_device_behind_a_camera(tmp_path: Path) -> None:
+def test_the_serial_number_is_that_of_the_usb_device_behind_a_camera(tmp_path):
     # As the kernel lists a webcam and a camera of a CSI port.
     interface = tmp_path / "devices" / "usb1" / "1-4" / "1-4:1.0"
     interface.mkdir(parents=True)
@@ -162,7 +161,7 @@ print(json.dumps({
 
 
 @pytest.fixture(scope="module")
-def kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def kernel(tmp_path_factory):
     compiler = shutil.which("cc")
     if compiler is None or not Path("/usr/include/linux/videodev2.h").exists():
         pytest.skip("no C compiler, or no kernel headers")
@@ -171,7 +170,7 @@ def kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return library
 
 
-def read(kernel: Path, form: str, is_planar: bool = False) -> subprocess.CompletedProcess[str]:
+def read(kernel, form, is_planar=False):
     told = {"LD_PRELOAD": str(kernel), "VIDEO_FORMAT": form, "VIDEO_PLANES": str(int(is_planar))}
     return subprocess.run(
         [sys.executable, "-c", READ], env={**os.environ, **told}, capture_output=True, text=True, timeout=60
@@ -179,10 +178,10 @@ def read(kernel: Path, form: str, is_planar: bool = False) -> subprocess.Complet
 
 
 @pytest.mark.parametrize("form", ["NV12", "UYVY"])
-def test_images_come_whole_counted_and_stamped(kernel: Path, form: str) -> None:
+def test_images_come_whole_counted_and_stamped(kernel, form):
     ran = read(kernel, form)
     assert ran.returncode == 0, ran.stderr
-    said: dict[str, Any] = json.loads(ran.stdout)
+    said = json.loads(ran.stdout)
     assert (
         form in said["device"]
         and said["clock"] == "clock.mid_exposure"
@@ -198,6 +197,6 @@ def test_images_come_whole_counted_and_stamped(kernel: Path, form: str) -> None:
         assert np.abs(np.array(pixels) - grey[None, :, None]).max() <= 2
 
 
-def test_a_camera_that_delivers_planes_only_is_refused_with_the_way_to_read_it(kernel: Path) -> None:
+def test_a_camera_that_delivers_planes_only_is_refused_with_the_way_to_read_it(kernel):
     ran = read(kernel, "NM12", is_planar=True)
     assert ran.returncode != 0 and "SourceError" in ran.stderr and "gst-launch" in ran.stderr

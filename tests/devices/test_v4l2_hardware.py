@@ -1,20 +1,18 @@
 """A real video device, named by LCE_RIG_VIDEO: any camera, or the kernel's own (`sudo modprobe vivid`)."""
 
 import os
-from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from lce_rig.core.data import Image, LiveSample
+from lce_rig.core.data import Image
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.pixel_formats import FORMATS
 from lce_rig.devices.v4l2 import V4l2Source
 from lce_rig.devices.video_device import VideoDevice, list_controls, read_control
-from lce_rig.rig import CameraSettings, load_rig
+from lce_rig.rig import load_rig
 from tests.devices.attached import attached
 
 pytestmark = pytest.mark.hardware
@@ -25,7 +23,7 @@ VIVID = {"timestamp_source": 1, "osd_text_mode": 2}
 
 
 @pytest.fixture(autouse=True)
-def device_name() -> str:
+def device_name():
     """The driver's name; skips where there is no device."""
     if not Path(DEVICE).exists():
         pytest.skip(f"{DEVICE} is not there: set LCE_RIG_VIDEO")
@@ -37,23 +35,23 @@ def device_name() -> str:
 
 
 @pytest.fixture
-def vivid(device_name: str) -> None:
+def vivid(device_name):
     """Skips where the device is not the kernel's virtual camera."""
     if device_name != "vivid":
         pytest.skip(f"{DEVICE} is a {device_name}, not vivid")
 
 
-def camera(controls: dict[str, Any] | None = None, **driver: Any) -> CameraSettings:
+def camera(controls=None, **driver):
     settings = load_rig("rlfs").cameras["cam"]
     changed = settings.driver.model_copy(update={"device": DEVICE, "controls": controls or {}, **driver})
     return settings.model_copy(update={"driver": changed, "resolution_px": SIZE})
 
 
-def take(samples: Iterator[LiveSample], n: int) -> list[Image]:
+def take(samples, n):
     return [sample for sample in islice(samples, n) if isinstance(sample, Image)]
 
 
-def test_pictures_come_counted_stamped_and_in_order(device_name: str) -> None:
+def test_pictures_come_counted_stamped_and_in_order(device_name):
     with attached(V4l2Source("cam", camera(VIVID if device_name == "vivid" else {}))) as (source, samples):
         images = take(samples, 20)
         status = source.status()
@@ -68,7 +66,7 @@ def test_pictures_come_counted_stamped_and_in_order(device_name: str) -> None:
     assert status.n_samples >= 20
 
 
-def test_a_running_camera_is_busy_for_others() -> None:
+def test_a_running_camera_is_busy_for_others():
     with attached(V4l2Source("cam", camera())):
         with pytest.raises(SourceError, match=DEVICE) as caught, attached(V4l2Source("cam", camera())):
             pass
@@ -85,9 +83,7 @@ def test_a_running_camera_is_busy_for_others() -> None:
         ({"read_only_integer_32_bits": 1}, "v4l2-ctl"),
     ],
 )
-def test_controls_it_cannot_take_are_refused_by_name(
-    controls: dict[str, Any], hint: str, vivid: None
-) -> None:
+def test_controls_it_cannot_take_are_refused_by_name(controls, hint, vivid):
     with (
         pytest.raises(SourceError, match=next(iter(controls))) as caught,
         attached(V4l2Source("cam", camera(controls))),
@@ -96,7 +92,7 @@ def test_controls_it_cannot_take_are_refused_by_name(
     assert hint in caught.value.hint
 
 
-def test_controls_are_set_by_number(vivid: None) -> None:
+def test_controls_are_set_by_number(vivid):
     wanted = {"brightness": 77, "integer_64_bits": 1 << 40, "menu": 4, "gain_automatic": False}
     with attached(V4l2Source("cam", camera(wanted))) as (source, _):
         assert source.status().problems == ()
@@ -106,9 +102,9 @@ def test_controls_are_set_by_number(vivid: None) -> None:
     device.close()
 
 
-def test_all_formats_show_the_same_picture(vivid: None) -> None:
+def test_all_formats_show_the_same_picture(vivid):
     still = VIVID | {"test_pattern": 0, "brightness": 128}
-    pictures: dict[str, np.ndarray] = {}
+    pictures = {}
     device = VideoDevice(DEVICE, "cam")
     offered = [code for code in device.formats() if code in FORMATS]
     device.close()
@@ -125,7 +121,7 @@ def test_all_formats_show_the_same_picture(vivid: None) -> None:
             assert np.mean(apart > 4) <= 0.05, code
 
 
-def test_a_camera_without_pulses_falls_silent(vivid: None) -> None:
+def test_a_camera_without_pulses_falls_silent(vivid):
     with attached(V4l2Source("cam", camera({"percentage_of_dropped_buffers": 100}), silence_s=1.5)) as (
         _,
         samples,

@@ -3,24 +3,20 @@
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import islice
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from wire.vlp16_packets import SensorPacket, Vlp16Clock, free_ports
+from wire.vlp16_packets import SensorPacket, free_ports
 
 from lce_rig.core import velodyne
-from lce_rig.core.data import LiveSample, Scan
+from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.disk_writer import DiskWriter
 from lce_rig.devices.vlp16 import N_AT_ONCE, UdpPort, Vlp16Source
 from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.velodyne_scans import PcapRecording
-from lce_rig.rig import LidarSettings, Rig
 from lce_rig.rig.sensors import DriverSettings
 from tests.devices.attached import attached
 from tests.devices.test_vlp16_web import PAGES, serving
@@ -32,7 +28,7 @@ PATIENT_S = 10.0
 
 
 @pytest.fixture
-def lidar() -> LidarSettings:
+def lidar():
     """A sensor at 127.0.0.1 on ports that nobody uses."""
     data, position = free_ports()
     driver = DriverSettings(port=data, address=HERE, controls={"position_port": position})
@@ -42,7 +38,7 @@ def lidar() -> LidarSettings:
 class Sender:
     """A thread that sends packets to a source once it has opened its ports, each when its time has come."""
 
-    def __init__(self, lidar: LidarSettings, source: Vlp16Source, address: str = HERE) -> None:
+    def __init__(self, lidar, source, address=HERE):
         self._ports = {
             velodyne.DATA_PORT: lidar.driver.port,
             velodyne.POSITION_PORT: int(lidar.driver.controls["position_port"]),
@@ -53,7 +49,7 @@ class Sender:
         self._stop = threading.Event()
 
     @contextmanager
-    def sending(self, make_packets: Callable[[int], list[SensorPacket]]) -> Iterator[None]:
+    def sending(self, make_packets):
         """Send what is made for a time a little ahead."""
         thread = threading.Thread(target=self._run, args=(make_packets,))
         thread.start()
@@ -64,7 +60,7 @@ class Sender:
             thread.join()
             self._socket.close()
 
-    def _run(self, make_packets: Callable[[int], list[SensorPacket]]) -> None:
+    def _run(self, make_packets):
         while self._source.status().n_packets is None:
             if self._stop.wait(0.005):
                 return
@@ -80,7 +76,7 @@ class Sender:
             self._socket.sendto(packet.payload, (HERE, self._ports[packet.port]))
 
     @staticmethod
-    def _make_in_time(make_packets: Callable[[int], list[SensorPacket]]) -> list[SensorPacket]:
+    def _make_in_time(make_packets):
         """Make packets before they are due; a busy computer needs longer."""
         for ahead_ms in (200, 800, 3000):
             start_ns = (time.time_ns() + 1_000_000 * ahead_ms) // 1000 * 1000
@@ -91,12 +87,7 @@ class Sender:
 
 
 @contextmanager
-def streaming(
-    lidar: LidarSettings,
-    make_packets: Callable[[int], list[SensorPacket]],
-    record_to: Path | None = None,
-    **options: Any,
-) -> Iterator[tuple[Vlp16Source, Iterator[LiveSample]]]:
+def streaming(lidar, make_packets, record_to=None, **options):
     """An open source that packets come to, and its samples."""
     source = Vlp16Source("lidar", lidar, **{"silence_s": PATIENT_S, **options})
     with DiskWriter() as disk:
@@ -109,28 +100,28 @@ def streaming(
 class Room:
     """Makes the packets of some revolutions, and keeps the scans they were made from."""
 
-    def __init__(self, n: int, mode: int = velodyne.STRONGEST, clock: Vlp16Clock | None = None) -> None:
-        self.scans: list[Scan] = []
+    def __init__(self, n, mode=velodyne.STRONGEST, clock=None):
+        self.scans = []
         self._arguments = n, mode, clock
 
-    def __call__(self, start_ns: int) -> list[SensorPacket]:
+    def __call__(self, start_ns):
         n, mode, clock = self._arguments
         self.scans = room_scans(n, start_ns)
         return packets_of(self.scans, mode, clock)
 
 
-def take(samples: Iterator[LiveSample], n: int) -> list[Scan]:
+def take(samples, n):
     return [sample for sample in islice(samples, n) if isinstance(sample, Scan)]
 
 
-def stamps(scans: list[Scan]) -> np.ndarray:
+def stamps(scans):
     return np.array([scan.stamp_ns for scan in scans], np.int64)
 
 
 # What comes
 
 
-def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(lidar: LidarSettings) -> None:
+def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(lidar):
     room = Room(13)
     with streaming(lidar, room) as (source, samples):
         scans = take(samples, 12)
@@ -146,7 +137,7 @@ def test_packets_at_full_rate_arrive_without_a_loss_and_with_the_sensors_time(li
         assert int(scan.host_ns or 0) - int(scan.stamp_ns or 0) >= PERIOD_NS - 2_000_000
 
 
-def test_the_serial_number_is_asked_of_the_web_page_beside_the_packets(lidar: LidarSettings) -> None:
+def test_the_serial_number_is_asked_of_the_web_page_beside_the_packets(lidar):
     with serving(PAGES) as port, streaming(lidar, Room(3), web_port=port) as (source, samples):
         take(samples, 1)
         wait_until(lambda: source.status().serial == PAGES["info"]["serial"])
@@ -159,14 +150,12 @@ def test_the_serial_number_is_asked_of_the_web_page_beside_the_packets(lidar: Li
 
 
 @pytest.mark.parametrize("address", [HERE, None])
-def test_only_packets_of_the_profiles_address_or_the_first_heard_are_taken(
-    lidar: LidarSettings, address: str | None
-) -> None:
+def test_only_packets_of_the_profiles_address_or_the_first_heard_are_taken(lidar, address):
     room = Room(3)
     source = Vlp16Source("lidar", changed(lidar, driver__address=address), silence_s=PATIENT_S)
     stranger = Sender(lidar, source, ELSEWHERE)
 
-    def make_later(start_ns: int) -> list[SensorPacket]:
+    def make_later(start_ns):
         wait_until(lambda: HERE in source.status().device)
         return packets_of(room_scans(1))
 
@@ -175,7 +164,7 @@ def test_only_packets_of_the_profiles_address_or_the_first_heard_are_taken(
     assert [len(scan.points) for scan in scans] == [len(scan.points) for scan in room.scans[:2]]
 
 
-def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar: LidarSettings) -> None:
+def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar):
     source = Vlp16Source("lidar", lidar, silence_s=PATIENT_S)
     for _ in range(2):
         with Sender(lidar, source).sending(Room(3)), attached(source) as (_, samples):
@@ -186,7 +175,7 @@ def test_an_open_source_ends_when_it_is_closed_and_can_be_opened_again(lidar: Li
 # What does not come
 
 
-def explain(lidar: LidarSettings, packets: list[SensorPacket] | None = None, **options: Any) -> SourceError:
+def explain(lidar, packets=None, **options):
     """The error of opening a source that nothing good comes to."""
     source = Vlp16Source("lidar", lidar, **{"silence_s": 0.3, "web_port": 9, **options})
     sending = Sender(lidar, source).sending(lambda _: packets or [])
@@ -195,24 +184,21 @@ def explain(lidar: LidarSettings, packets: list[SensorPacket] | None = None, **o
     return caught.value
 
 
-def test_an_absent_sensor_is_an_error_that_says_what_to_check(lidar: LidarSettings) -> None:
+def test_an_absent_sensor_is_an_error_that_says_what_to_check(lidar):
     error = explain(lidar)
     assert HERE in error.what and str(lidar.driver.port) in error.what
     for word in ("power", "cable", "192.168.1.x", "driver.address", "firewall"):
         assert word in error.hint
 
 
-def test_a_sensor_that_falls_silent_is_an_error_after_what_it_sent(lidar: LidarSettings) -> None:
-    with streaming(lidar, lambda _: packets_of(room_scans(3)), silence_s=1.0, web_port=9) as (
-        _,
-        samples,
-    ):
+def test_a_sensor_that_falls_silent_is_an_error_after_what_it_sent(lidar):
+    with streaming(lidar, lambda _: packets_of(room_scans(3)), silence_s=1.0, web_port=9) as (_, samples):
         assert len(take(samples, 2)) == 2
         with pytest.raises(SourceError, match=str(lidar.driver.port)):
             list(samples)
 
 
-def test_another_model_is_refused_by_name(lidar: LidarSettings) -> None:
+def test_another_model_is_refused_by_name(lidar):
     others = [
         SensorPacket(p.port, p.sent_ns, p.payload[:-1] + b"\x21")
         for p in packets_of(room_scans(1))
@@ -221,17 +207,17 @@ def test_another_model_is_refused_by_name(lidar: LidarSettings) -> None:
     assert "HDL-32E" in explain(lidar, others).what
 
 
-def test_packets_of_another_address_are_named(lidar: LidarSettings) -> None:
+def test_packets_of_another_address_are_named(lidar):
     error = explain(changed(lidar, driver__address=ELSEWHERE), packets_of(room_scans(1)))
     assert HERE in error.hint and "driver.address" in error.hint
 
 
-def test_rubbish_on_the_port_is_counted_and_named(lidar: LidarSettings) -> None:
+def test_rubbish_on_the_port_is_counted_and_named(lidar):
     rubbish = [SensorPacket(velodyne.DATA_PORT, T0_NS, b"hello")] * 7
     assert "7 damaged packets" in explain(lidar, rubbish).what
 
 
-def test_a_port_that_another_program_holds_is_named(lidar: LidarSettings) -> None:
+def test_a_port_that_another_program_holds_is_named(lidar):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", lidar.driver.port))
         error = explain(lidar)
@@ -241,7 +227,7 @@ def test_a_port_that_another_program_holds_is_named(lidar: LidarSettings) -> Non
 # What is kept
 
 
-def test_what_was_recorded_replays_to_the_same_scans(lidar: LidarSettings, rig: Rig, tmp_path: Path) -> None:
+def test_what_was_recorded_replays_to_the_same_scans(lidar, rig, tmp_path):
     path = tmp_path / "lidar.pcap"
     with streaming(lidar, Room(6), record_to=tmp_path) as (_, samples):
         live = take(samples, 5)
@@ -252,7 +238,7 @@ def test_what_was_recorded_replays_to_the_same_scans(lidar: LidarSettings, rig: 
         np.testing.assert_array_equal(a.offset_ns, b.offset_ns)
 
 
-def test_a_recording_is_never_written_over(lidar: LidarSettings, tmp_path: Path) -> None:
+def test_a_recording_is_never_written_over(lidar, tmp_path):
     path = tmp_path / "lidar.pcap"
     path.write_bytes(b"kept")
     with DiskWriter() as disk, pytest.raises(SourceError) as caught:
@@ -261,7 +247,7 @@ def test_a_recording_is_never_written_over(lidar: LidarSettings, tmp_path: Path)
     assert path.read_bytes() == b"kept"
 
 
-def test_a_full_disk_ends_the_recording_and_nothing_else(lidar: LidarSettings, tmp_path: Path) -> None:
+def test_a_full_disk_ends_the_recording_and_nothing_else(lidar, tmp_path):
     with files_up_to(200_000), streaming(lidar, Room(6), record_to=tmp_path) as (source, samples):
         scans = take(samples, 5)
         wait_until(lambda: any(p.code == "device.recording_stopped" for p in source.status().problems))
@@ -271,11 +257,11 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(lidar: LidarSettings, t
 # What is said
 
 
-def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken() -> None:
+def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken():
     port = UdpPort(free_ports()[0], "test")
     late_s = 0.02
 
-    def is_stamped_before_taken() -> bool:
+    def is_stamped_before_taken():
         before_ns = time.time_ns()
         sender.sendto(b"x", (HERE, port.port))
         time.sleep(late_s)
@@ -292,7 +278,7 @@ def test_arrivals_are_stamped_by_the_kernel_not_when_they_are_taken() -> None:
     port.close()
 
 
-def test_datagrams_taken_at_once_are_those_that_were_sent() -> None:
+def test_datagrams_taken_at_once_are_those_that_were_sent():
     port = UdpPort(free_ports()[0], "test")
     wanted = [b"%d" % k * (k % 5) for k in range(N_AT_ONCE + 6)]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:

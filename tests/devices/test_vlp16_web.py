@@ -2,7 +2,6 @@
 
 import json
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -36,11 +35,11 @@ PAGES: dict[str, Any] = {"info": INFO, "status": STATUS, "settings": SETTINGS}
 
 
 @contextmanager
-def serving(pages: dict[str, Any]) -> Iterator[int]:
+def serving(pages):
     """Serve a sensor's pages by name on a port; bytes are sent as they are."""
 
     class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
+        def do_GET(self):
             name = self.path.removeprefix("/cgi/").removesuffix(".json")
             if name not in pages:
                 self.send_error(404)
@@ -50,7 +49,7 @@ def serving(pages: dict[str, Any]) -> Iterator[int]:
             self.end_headers()
             self.wfile.write(content if isinstance(content, bytes) else json.dumps(content).encode())
 
-        def log_message(self, format: str, *arguments: Any) -> None:
+        def log_message(self, format, *arguments):
             return
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
@@ -63,7 +62,7 @@ def serving(pages: dict[str, Any]) -> Iterator[int]:
             thread.join()
 
 
-def test_the_page_of_a_healthy_sensor_is_read_without_a_complaint() -> None:
+def test_the_page_of_a_healthy_sensor_is_read_without_a_complaint():
     with serving(PAGES) as port:
         report = read_web("127.0.0.1", port)
     assert (report["model"], report["serial"], report["firmware"]) == ("VLP-16", "AG43510116", "3.0.41.1")
@@ -74,8 +73,8 @@ def test_the_page_of_a_healthy_sensor_is_read_without_a_complaint() -> None:
     assert find_problems(report, settings()) == []
 
 
-def test_types_that_differ_by_firmware_do_not_matter() -> None:
-    odd: dict[str, Any] = {
+def test_types_that_differ_by_firmware_do_not_matter():
+    odd = {
         "info": {"model": "VLP-16", "version": "3.0.29.0", "serial": 43510116},
         "status": {"gps": {"pps_state": "Locked"}, "motor": {"state": True, "rpm": "600"}},
         "settings": {
@@ -95,15 +94,12 @@ def test_types_that_differ_by_firmware_do_not_matter() -> None:
 
 
 @pytest.mark.parametrize("body", [b"<html>router</html>", b"[1, 2]", b"\xff\xfe", b"", b"[" * 100_000])
-def test_another_device_at_the_address_is_told_from_a_sensor(body: bytes) -> None:
-    with (
-        serving({**PAGES, "info": body}) as port,
-        pytest.raises(SourceError, match="cgi/info"),
-    ):
+def test_another_device_at_the_address_is_told_from_a_sensor(body):
+    with serving({**PAGES, "info": body}) as port, pytest.raises(SourceError, match="cgi/info"):
         read_web("127.0.0.1", port)
 
 
-def test_an_address_where_nothing_answers_is_an_error_with_what_to_check() -> None:
+def test_an_address_where_nothing_answers_is_an_error_with_what_to_check():
     with pytest.raises(SourceError, match=":9/") as caught:
         read_web("127.0.0.1", 9, 0.5)
     assert "192.168.1.x" in caught.value.hint
@@ -124,9 +120,7 @@ WRONG: list[tuple[dict[str, Any], tuple[str, Any, Any]]] = [
 
 
 @pytest.mark.parametrize(("changes", "figures"), WRONG, ids=[figures[0] for _, figures in WRONG])
-def test_what_keeps_scans_from_coming_is_found_with_its_figures(
-    changes: dict[str, Any], figures: tuple[str, Any, Any]
-) -> None:
+def test_what_keeps_scans_from_coming_is_found_with_its_figures(changes, figures):
     with serving({key: {**page, **changes.get(key, {})} for key, page in PAGES.items()}) as port:
         (problem,) = find_problems(read_web("127.0.0.1", port), settings())
     assert problem.code == "settings.differs"

@@ -4,10 +4,8 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,7 +15,6 @@ from wire.sync_board import FakeBoard
 from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, free_ports
 
 from lce_rig.core import velodyne
-from lce_rig.core.board import Board
 from lce_rig.core.data import Scan
 from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.rig import Rig
@@ -45,13 +42,13 @@ while True:
 class Vlp16Sender(threading.Thread):
     """Sends the same scan again and again, as fast as a rotor turns, each packet when its time has come."""
 
-    def __init__(self, scan: Scan, ports: tuple[int, int], clock: Vlp16Clock | None) -> None:
+    def __init__(self, scan, ports, clock):
         super().__init__(daemon=True)
         self.stop = threading.Event()
         self._scan, self._clock = scan, clock
         self._ports = dict(zip((velodyne.DATA_PORT, velodyne.POSITION_PORT), ports, strict=True))
 
-    def run(self) -> None:
+    def run(self):
         packets = Vlp16Packets(clock=self._clock)
         stamp_ns = (time.time_ns() + 50_000_000) // 1000 * 1000
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -84,7 +81,7 @@ class Attached:
 
 
 @contextmanager
-def attach(attached: Attached, folder: Path) -> Iterator[tuple[Rig, int]]:
+def attach(attached, folder):
     """Attach everything; gives the profile that reaches it, and the web server's port."""
     ports = free_ports()
     document = attached.rig.model_dump()
@@ -111,7 +108,7 @@ def attach(attached: Attached, folder: Path) -> Iterator[tuple[Rig, int]]:
         yield Rig.model_validate(document), web
 
 
-def scan_of(board: Board, distance_m: float) -> Scan:
+def scan_of(board, distance_m):
     """A round room with a board on one corner straight ahead, on the grid of a VLP-16's firings."""
     scan = room_scan(T0_NS, dropout=0.0)
     reach = np.linalg.norm(scan.points, axis=1, keepdims=True)
@@ -125,7 +122,7 @@ def scan_of(board: Board, distance_m: float) -> Scan:
     return replace(scan, points=points.astype(np.float32))
 
 
-def picture_of(board: Board, square_px: int = 20) -> NDArray[np.uint8]:
+def picture_of(board, square_px=20):
     """The board from straight ahead in a picture of 346x260 px, as a lens without distortion shows it."""
     picture = np.full((260, 346), 120, np.uint8)
     rows, cols = board.rows + 1, board.cols + 1
@@ -140,7 +137,7 @@ def picture_of(board: Board, square_px: int = 20) -> NDArray[np.uint8]:
     return cv2.GaussianBlur(picture, (0, 0), 0.7)
 
 
-def _camera(pixels: NDArray[np.uint8], folder: Path) -> list[str]:
+def _camera(pixels, folder):
     path = folder / "picture"
     path.write_bytes(pixels.tobytes())
     return [sys.executable, "-c", CAMERA, str(path), str(PERIOD_S), str(DELAY_S)]

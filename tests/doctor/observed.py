@@ -1,8 +1,5 @@
 """Sensors as they might have been observed, written down by hand: what the checks of them look at."""
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
-
 import numpy as np
 
 from lce_rig.core.data import Image, Pulse, Scan
@@ -22,7 +19,7 @@ BOARD_NS = 5 * S
 """What the board's clock shows at START_NS."""
 
 
-def make_rig(**changes: Any) -> Rig:
+def make_rig(**changes):
     """A VLP-16 and a camera without distortion at a pipe, triggered at 20 Hz."""
     camera = {
         "resolution_px": (346, 260),
@@ -30,12 +27,12 @@ def make_rig(**changes: Any) -> Rig:
         "channels": {"frames": {"timestamps": {"reference": "mid_exposure", "sync": "hardware"}}},
         "driver": {"type": "command", "command": ("true",)},
     }
-    profile: dict[str, Any] = {
+    profile = {
         "format_version": 1,
         "name": "attached",
         "board": {"inner_corners": (9, 6), "square_m": 0.068, "width_m": 0.8, "height_m": 0.6},
         "lidars": {
-            "lidar": {"timestamps": {"clock": "utc", "reference": "first_firing", "sync": "hardware"}},
+            "lidar": {"timestamps": {"clock": "utc", "reference": "first_firing", "sync": "hardware"}}
         },
         "cameras": {"cam": camera},
         "sync": {
@@ -46,25 +43,23 @@ def make_rig(**changes: Any) -> Rig:
     return Rig.model_validate({**profile, **changes})
 
 
-def examination(
-    *seen: ObservedSensor, rig: Rig | None = None, web: Mapping[str, Any] | None = None
-) -> Examination:
+def examination(*seen, rig=None, web=None):
     return Examination(rig or make_rig(), seen={each.sensor: each for each in seen}, web=web or {})
 
 
-def look(check: Callable[..., Iterable[Finding]], *arguments: Any) -> Check | None:
+def look(check, *arguments):
     """Make the line of a check; None where it finds nothing."""
     line = Check(arguments[1] if len(arguments) > 1 else "line", "check", tuple(check(*arguments)))
     return line if line.findings else None
 
 
-def codes(line: Check | None) -> list[str]:
+def codes(line):
     """List the codes of what a line of the doctor's found."""
     assert line is not None
     return [found.code for found in line.findings]
 
 
-def lidar(rate_hz: float = 10.0, duration_s: float = 5.0, **status: Any) -> ObservedSensor:
+def lidar(rate_hz=10.0, duration_s=5.0, **status):
     """A LiDAR whose scans come on time."""
     seen = ObservedSensor("lidar", SourceStatus("lidar", **status), watched_s=duration_s)
     seen.ended_ns = START_NS + round(duration_s * S)
@@ -76,9 +71,7 @@ def lidar(rate_hz: float = 10.0, duration_s: float = 5.0, **status: Any) -> Obse
     return seen
 
 
-def camera(
-    rate_hz: float = 20.0, duration_s: float = 5.0, delay_s: float = 0.015, **status: Any
-) -> ObservedSensor:
+def camera(rate_hz=20.0, duration_s=5.0, delay_s=0.015, **status):
     """A camera whose pictures follow each beginning of a period."""
     seen = ObservedSensor("cam", SourceStatus("cam", **status), watched_s=duration_s)
     seen.ended_ns = START_NS + round(duration_s * S)
@@ -88,9 +81,7 @@ def camera(
     return seen
 
 
-def sync_board(
-    rate_hz: float = 20.0, duration_s: float = 5.0, line: str = "cam", drift: float = 40e-6, **status: Any
-) -> ObservedSensor:
+def sync_board(rate_hz=20.0, duration_s=5.0, line="cam", drift=4e-05, **status):
     """A board whose clock runs too fast by `drift`, and whose pulses begin with each period."""
     seen = ObservedSensor("sync", SourceStatus("sync", **status), watched_s=duration_s)
     seen.ended_ns = START_NS + round(duration_s * S)

@@ -1,7 +1,6 @@
 """Clocks: offsets and drifts are recovered, and boards may move only where every clock is tied."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -16,19 +15,19 @@ from lce_rig.timing.clock import ClockModel
 from .observed import LOCKED, START_NS, S, camera, codes, examination, lidar, look, make_rig, sync_board
 
 
-def with_utc(board: ObservedSensor) -> ObservedSensor:
+def with_utc(board):
     """The board knows UTC, which the computer has exactly."""
     assert board.host_clock is not None
     return replace(board, utc_clock=board.host_clock)
 
 
-def davis_rig() -> Rig:
+def davis_rig():
     document = make_rig().model_dump()
     document["cameras"]["cam"] |= {"model": "DAVIS346", "driver": {"type": "davis"}}
     return Rig.model_validate(document)
 
 
-def davis(drift: float = -25e-6, offset_ns: int = 3_000_000, n: int = 20, **status: Any) -> ObservedSensor:
+def davis(drift=-2.5e-05, offset_ns=3000000, n=20, **status):
     """A camera that sees each of the board's pulses, by a clock of its own."""
     seen = camera(**status)
     for number in range(n):
@@ -38,7 +37,7 @@ def davis(drift: float = -25e-6, offset_ns: int = 3_000_000, n: int = 20, **stat
     return seen
 
 
-def test_a_davis_is_fitted_to_the_edges_it_saw() -> None:
+def test_a_davis_is_fitted_to_the_edges_it_saw():
     exam = examination(davis(), sync_board(4.0, drift=0.0), rig=davis_rig())
     line = look(check_edges, exam, "cam")
     assert line is not None and line.severity == "note"
@@ -46,14 +45,14 @@ def test_a_davis_is_fitted_to_the_edges_it_saw() -> None:
     assert line.findings[0].figure("rms_us") < 2
 
 
-def test_a_davis_that_sees_no_edges_is_red_and_says_what_to_wire() -> None:
+def test_a_davis_that_sees_no_edges_is_red_and_says_what_to_wire():
     line = look(check_edges, examination(davis(n=0), sync_board(4.0), rig=davis_rig()), "cam")
     assert line is not None and line.severity == "error"
     assert codes(line) == ["edges.not_fitted", "edges.none_seen"]
     assert (line.figures["n_edges"], line.figures["n_pulses"]) == (0, 20)
 
 
-def test_boards_may_move_where_every_clock_is_tied() -> None:
+def test_boards_may_move_where_every_clock_is_tied():
     exam = examination(lidar(clock=LOCKED), camera(), with_utc(sync_board()))
     line = look(check_sync, exam)
     assert line is not None and (line.severity, codes(line)) == ("note", ["sync.boards_may_move"])
@@ -62,7 +61,7 @@ def test_boards_may_move_where_every_clock_is_tied() -> None:
     assert model.convert(START_NS + S) == pytest.approx(START_NS + S, abs=1000)
 
 
-def test_a_clock_that_is_not_tied_is_named_with_the_way_out() -> None:
+def test_a_clock_that_is_not_tied_is_named_with_the_way_out():
     line = look(check_sync, examination(lidar(clock=LOCKED), camera(), rig=make_rig(sync=None)))
     assert line is not None and line.severity == "warning"
     verdict, reason = line.findings
@@ -70,7 +69,7 @@ def test_a_clock_that_is_not_tied_is_named_with_the_way_out() -> None:
     assert reason.code == "sync.no_board"
 
 
-def test_still_boards_are_no_fault_where_the_profile_promises_nothing() -> None:
+def test_still_boards_are_no_fault_where_the_profile_promises_nothing():
     rig = make_rig(
         sync=None,
         lidars={"lidar": {}},
@@ -80,12 +79,12 @@ def test_still_boards_are_no_fault_where_the_profile_promises_nothing() -> None:
     assert line is not None and line.severity == "note" and codes(line)[0] == "sync.boards_must_stand"
 
 
-def test_absent_sensors_are_left_out_of_the_verdict() -> None:
+def test_absent_sensors_are_left_out_of_the_verdict():
     absent = ObservedSensor("cam", failure=SourceError("it is not there"))
     assert look(check_sync, examination(lidar(clock=LOCKED), absent, with_utc(sync_board()))) is None
 
 
-def test_doubts_of_a_driver_about_its_clock_stand_in_its_line() -> None:
+def test_doubts_of_a_driver_about_its_clock_stand_in_its_line():
     problem = Finding("clock.missing", "warning", figures={"clock": "tsc"})
     arrival = Finding("clock.arrival", "note")
     line = look(check_clock, examination(camera(clock=arrival, problems=(problem,))), "cam")

@@ -13,7 +13,7 @@ from lce_rig.rig import load_rig
 from .observed import S, camera, codes, examination, lidar, look, make_rig
 
 
-def test_what_does_not_open_is_red_with_what_to_check() -> None:
+def test_what_does_not_open_is_red_with_what_to_check():
     seen = ObservedSensor(
         "cam", failure=SourceError("camera 'cam': /dev/video0 is busy", "fuser -v names it.")
     )
@@ -23,7 +23,7 @@ def test_what_does_not_open_is_red_with_what_to_check() -> None:
     assert look(check_stream, examination(seen), "cam") is None
 
 
-def test_a_lidar_is_named_with_what_its_web_page_says() -> None:
+def test_a_lidar_is_named_with_what_its_web_page_says():
     web = {"lidar": {"model": "VLP-16", "serial": "AG43510116", "firmware": "3.0.41.1"}}
     line = look(check_device, examination(lidar(device="VLP-16 at 127.0.0.1"), web=web), "lidar")
     assert codes(line) == ["sensor.answers"] and line.severity == "note"
@@ -31,7 +31,7 @@ def test_a_lidar_is_named_with_what_its_web_page_says() -> None:
     assert [line.figures[name] for name in told] == ["VLP-16 at 127.0.0.1", "3.0.41.1", "AG43510116"]
 
 
-def test_complaints_of_a_driver_stand_in_the_line_they_belong_to() -> None:
+def test_complaints_of_a_driver_stand_in_the_line_they_belong_to():
     status = {
         "device": "DAVIS346",
         "problems": (
@@ -53,7 +53,7 @@ def test_complaints_of_a_driver_stand_in_the_line_they_belong_to() -> None:
     ("rate_hz", "severity", "code"),
     [(10.0, "note", "stream.rate"), (20.0, "warning", "stream.rate_off"), (10.3, "note", "stream.rate")],
 )
-def test_the_rotors_rate_is_compared_with_the_profile(rate_hz: float, severity: str, code: str) -> None:
+def test_the_rotors_rate_is_compared_with_the_profile(rate_hz, severity, code):
     line = look(check_stream, examination(lidar(rate_hz, n_packets=3770)), "lidar")
     assert line is not None
     assert line.severity == severity and codes(line) == [code, "stream.complete"]
@@ -62,19 +62,19 @@ def test_the_rotors_rate_is_compared_with_the_profile(rate_hz: float, severity: 
     assert line.findings[0].action == ("" if severity == "note" else "rotor")
 
 
-def test_scans_that_arrive_late_do_not_make_the_rotor_slow() -> None:
+def test_scans_that_arrive_late_do_not_make_the_rotor_slow():
     line = look(check_stream, examination(lidar(8.0, rates_hz={"scans": 10.01})), "lidar")
     assert line is not None and line.severity == "note" and line.figures["rate_hz"] == 10.01
 
 
 @pytest.mark.parametrize(("n_lost", "severity"), [(0, "note"), (1, "warning"), (40, "error")])
-def test_losses_are_counted_and_judged_by_their_share(n_lost: int, severity: str) -> None:
+def test_losses_are_counted_and_judged_by_their_share(n_lost, severity):
     line = look(check_stream, examination(lidar(n_lost=n_lost, n_packets=3770)), "lidar")
     assert line is not None and line.severity == severity
     assert ("stream.losses" in codes(line)) == (n_lost > 0)
 
 
-def test_a_stream_that_stopped_before_the_end_is_red() -> None:
+def test_a_stream_that_stopped_before_the_end_is_red():
     seen = camera(duration_s=2.0)
     seen.ended_ns += 3 * S
     line = look(check_stream, examination(seen), "cam")
@@ -85,19 +85,19 @@ def test_a_stream_that_stopped_before_the_end_is_red() -> None:
     )
 
 
-def test_a_triggered_camera_without_pictures_is_red() -> None:
+def test_a_triggered_camera_without_pictures_is_red():
     line = look(check_stream, examination(camera(duration_s=0.0)), "cam")
     assert line is not None and line.severity == "error" and codes(line)[0] == "stream.none"
 
 
-def test_the_wanted_rate_is_the_triggers_the_drivers_or_the_davis_own() -> None:
+def test_the_wanted_rate_is_the_triggers_the_drivers_or_the_davis_own():
     assert wanted_rate_hz(make_rig(), "cam", "command") == 20
     assert wanted_rate_hz(make_rig(), "lidar", "vlp16") == 10
     assert wanted_rate_hz(make_rig(sync=None), "cam", "command") is None
     assert wanted_rate_hz(load_rig("rles"), "davis", "davis") == 25
 
 
-def test_the_disk_of_a_folder_that_is_not_there_yet_is_measured_and_left_clean(tmp_path: Path) -> None:
+def test_the_disk_of_a_folder_that_is_not_there_yet_is_measured_and_left_clean(tmp_path):
     line = look(check_disk, Examination(make_rig(), tmp_path / "not" / "yet"))
     assert line is not None
     disk = line.findings[0]
@@ -106,13 +106,13 @@ def test_the_disk_of_a_folder_that_is_not_there_yet_is_measured_and_left_clean(t
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_written_is_red() -> None:
+def test_a_folder_that_cannot_be_written_is_red():
     line = look(check_disk, Examination(make_rig(), Path("/proc")))
     assert line is not None
     assert line.severity == "error" and codes(line) == ["computer.disk_not_writable"]
 
 
-def test_the_clock_is_judged_by_the_kernel() -> None:
+def test_the_clock_is_judged_by_the_kernel():
     line = look(check_computer_clock, Examination(make_rig()))
     assert line is not None
     code = "computer.clock" if line.severity == "note" else "computer.clock_not_synchronised"

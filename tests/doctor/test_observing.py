@@ -1,12 +1,10 @@
 """Sensors are watched side by side; one that is absent, or a bug in one driver, keeps no other from it."""
 
 import time
-from pathlib import Path
 
 import pytest
 from wire.sync_board import FakeBoard
 
-from lce_rig.core.data import LiveSample
 from lce_rig.core.errors import SourceError
 from lce_rig.devices.reading import LiveSource, SourceStatus
 from lce_rig.devices.sync_board import SyncBoard
@@ -18,27 +16,27 @@ from lce_rig.rig.profile import SyncSettings
 class Unusable(LiveSource):
     """A sensor that cannot be opened."""
 
-    def __init__(self, sensor: str, error: Exception) -> None:
+    def __init__(self, sensor, error):
         super().__init__(sensor, sensor, 5.0)
         self.error = error
 
-    def open(self) -> None:
+    def open(self):
         raise self.error
 
-    def read(self) -> list[LiveSample]:
+    def read(self):
         return []
 
-    def close(self) -> None:
+    def close(self):
         pass
 
-    def describe(self) -> SourceStatus:
+    def describe(self):
         return SourceStatus(self.sensor)
 
 
 ABSENT = Unusable("gone", SourceError("it is not there", "Plug it in."))
 
 
-def test_what_fails_is_said_and_the_others_are_watched_all_the_same() -> None:
+def test_what_fails_is_said_and_the_others_are_watched_all_the_same():
     with FakeBoard(period_s=0.05) as fake:
         settings = SyncSettings.model_validate(
             {"device": fake.path, "triggers": {"cam": {"channel": 0, "rate_hz": 20.0}}}
@@ -52,13 +50,13 @@ def test_what_fails_is_said_and_the_others_are_watched_all_the_same() -> None:
     assert board.host_clock is not None
 
 
-def test_where_nothing_opens_nothing_is_waited_for() -> None:
+def test_where_nothing_opens_nothing_is_waited_for():
     start_s = time.monotonic()
     seen = observe([ABSENT], 60.0)
     assert time.monotonic() - start_s < 10 and seen["gone"].status is None
 
 
-def test_a_davis_over_the_network_has_its_events_counted(tmp_path: Path) -> None:
+def test_a_davis_over_the_network_has_its_events_counted(tmp_path):
     pytest.importorskip("dv_processing")
     from lce_rig.devices.davis import DavisSource
     from tests.devices.test_davis import only_events, over_network, sender

@@ -1,7 +1,5 @@
 """Bags of Livox drivers: their own messages, point clouds with tags, and scans that are accumulated."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
@@ -32,8 +30,8 @@ def write_custom(path, package, n, is_ros1):
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(POINT, f"{package}/msg/CustomPoint"))
     store.register(get_types_from_msg(MESSAGE, f"{package}/msg/CustomMsg"))
-    types: dict[str, Any] = store.types
-    writer: Any = Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    types = store.types
+    writer = Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP)
     if is_ros1:
         writer = Writer1(path.with_suffix(".bag"))
     with writer:

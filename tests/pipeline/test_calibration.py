@@ -14,20 +14,20 @@ from tests.calibrate.boards import simulate
 RLFS = find_profile("rlfs").read_text(encoding="utf-8")
 
 
-def systematic_sigma_m(*lines: str) -> float:
+def systematic_sigma_m(*lines):
     """Calibrate simulated boards for an RLFS whose LiDAR has these lines in its profile."""
     rig = parse_rig(RLFS.replace("    rate_hz: 10\n", "".join(f"    {line}\n" for line in lines), 1))
     (calibration,), _ = calibrate_detections(rig, found(), CalibrateOptions("paper"))
     return calibration.diagnostics.sigma_systematic_translation_m
 
 
-def found() -> Detections:
+def found():
     captures = simulate(10, 3)
     images = {item.capture: item.image for item in captures}
     return Detections({("cam", "frames"): images}, {"lidar": {c.capture: list(c.places) for c in captures}})
 
 
-def test_the_lidars_range_errors_come_from_the_profile() -> None:
+def test_the_lidars_range_errors_come_from_the_profile():
     exact = systematic_sigma_m("laser_bias_sigma_m: 0", "range_offset_sigma_m: 0")
     assert exact == 0
     usual = systematic_sigma_m()
@@ -37,7 +37,7 @@ def test_the_lidars_range_errors_come_from_the_profile() -> None:
 
 
 @pytest.mark.parametrize("method", get_args(Method))
-def test_a_profile_that_says_that_all_is_exact_is_believed(method: Method) -> None:
+def test_a_profile_that_says_that_all_is_exact_is_believed(method):
     text = RLFS
     for key in ("square_sigma_m", "pattern_offset_sigma_m", "plate_sigma_m", "bow_sigma_m"):
         text = set_value(text, f"board.{key}", "0.0")

@@ -10,8 +10,7 @@ pytest.importorskip("onnx", reason="the extra `train` is not installed")
 
 import evaluate_reconstruction  # noqa: E402
 import train_reconstruction  # noqa: E402
-from training.event_simulation import EventStream, Pixels, normalised  # noqa: E402
-from training.loss import reconstruction_loss, structural_similarity  # noqa: E402
+from training.event_simulation import Pixels, normalised  # noqa: E402
 from training.network import ReconstructionNetwork  # noqa: E402
 from training.onnx_export import export_onnx, export_recurrent  # noqa: E402
 
@@ -76,33 +75,6 @@ def test_the_simulators_grids_are_those_the_package_makes_of_events():
     grid = voxel_grid(events, 5, 0, 1000)
     of_training = normalised(torch.from_numpy(grid)[None])[0].numpy()
     np.testing.assert_allclose(of_training, normalise_voxels(grid.copy()), atol=1e-4)
-
-
-def test_the_refractory_period_limits_what_a_pixel_says():
-    generator = torch.Generator().manual_seed(4)
-    pixels = quiet_pixels(2)
-    pixels.most = torch.full_like(pixels.most, 2.0)
-    pixels.start(torch.full((2, 1, SIZE, SIZE), 0.02))
-    early, late = pixels.expose(torch.full((2, 1, SIZE, SIZE), 1.0), generator)
-    np.testing.assert_allclose((early + late).numpy(), 2.0, atol=1e-4)
-
-
-def test_streams_repeat_with_their_seed_and_differ_with_another():
-    first, again, other = (EventStream(2, 32, seed, CPU) for seed in (5, 5, 6))
-    for _ in range(3):
-        windows = [stream.window() for stream in (first, again, other)]
-        for a, b in zip(windows[0], windows[1], strict=True):
-            assert torch.equal(a, b)
-        assert not torch.equal(windows[0][1], windows[2][1])
-        assert all(torch.isfinite(part).all() for window in windows for part in window)
-
-
-def test_the_loss_is_zero_for_the_truth_alone():
-    truth = torch.rand(2, 1, 32, 32, generator=torch.Generator().manual_seed(8))
-    weights = torch.ones_like(truth)
-    assert float(reconstruction_loss(truth, truth, weights)) == pytest.approx(0, abs=1e-5)
-    assert float(reconstruction_loss(1 - truth, truth, weights)) > 0.5
-    assert float(structural_similarity(truth, truth).mean()) == pytest.approx(1, abs=1e-4)
 
 
 def test_the_exported_file_computes_what_the_network_computes(tmp_path):
@@ -173,14 +145,6 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
     for name, value in weights_of(unbroken).items():
         assert torch.equal(value, weights_of(broken)[name]), name
     assert (broken / "reconstruction.onnx").read_bytes() == (unbroken / "reconstruction.onnx").read_bytes()
-
-
-def test_a_finished_run_is_not_trained_further(tmp_path):
-    arguments = [*TINY, "--out", str(tmp_path), "--updates", "6"]
-    train_reconstruction.main(arguments)
-    before = weights_of(tmp_path)
-    train_reconstruction.main([*arguments, "--resume"])
-    assert all(torch.equal(value, before[name]) for name, value in weights_of(tmp_path).items())
 
 
 def test_truth_of_held_out_boards_is_where_a_perfect_picture_shows_them():

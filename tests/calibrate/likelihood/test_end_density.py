@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lce_rig.calibrate.likelihood.end_density import density, information
+from lce_rig.calibrate.likelihood.end_density import density
 
 LOST = 0.07
 CASES = [(0.03, LOST), (0.2, LOST), (0.6, 0.3), (2.0, LOST), (10.0, 0.3), (100.0, LOST)]
@@ -26,22 +26,3 @@ def test_it_is_a_density_and_its_slope_is_its_derivative(blur, lost):
     there = np.linspace(-3, 5, 801)
     ahead, behind = (density(there + s * step, np.full(801, blur), lost)[0] for s in (1, -1))
     assert np.allclose(density(there, np.full(801, blur), lost)[1], (ahead - behind) / (2 * step), atol=1e-6)
-
-
-@pytest.mark.parametrize(("blur", "lost"), CASES)
-def test_the_information_is_the_mean_square_of_the_score(blur, lost):
-    x, p, slope = at(blur, lost)
-    assert np.isclose(information(np.array([blur]), lost)[0], np.trapezoid(slope**2 / p, x), rtol=0.01)
-
-
-def test_a_sharp_interval_tells_more_than_its_variance_and_a_wide_blur_as_much():
-    sharp, *wide = information(np.array([0.1, 5.0, 100.0, 1000.0]), LOST)
-    assert sharp > 1.1 / (1 / 12 + 0.1**2)
-    assert np.all(np.abs(np.array(wide) * (1 / 12 + np.square([5.0, 100.0, 1000.0])) - 1) < 0.1)
-
-
-def test_ends_far_outside_hardly_pull():
-    near, far = (np.array([x]) for x in (-0.6, -8.0))
-    blur = np.array([0.1])
-    scores = [float(slope[0] / p[0]) for p, slope in (density(near, blur, LOST), density(far, blur, LOST))]
-    assert abs(scores[1]) < 0.05 * abs(scores[0])

@@ -22,7 +22,7 @@ class ListedStream(EventStream):
 
     def __init__(self, stretches, resolution_px=(346, 260)):
         self.resolution_px = resolution_px
-        self.notes: list[str] = []
+        self.notes = []
         self._stretches = stretches
 
     def stretches(self, losses):

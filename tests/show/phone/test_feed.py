@@ -72,25 +72,6 @@ def test_pictures_are_made_small_enough_for_a_phone(shape, size):
     assert abs(decoded.mean() - pixels.mean()) < 2
 
 
-def test_pictures_are_compressed_while_somebody_looks_and_once_for_all(preview):
-    for level in range(20):
-        preview.publish(state(drawing=Drawing("cam", picture(level))))
-    assert preview.n_pictures == 0
-    with Watcher(preview.urls[0]) as first, Watcher(preview.urls[0]) as second:
-        for watcher in (first, second):
-            watcher.watch()
-            assert watcher.next_state()[1] is not None
-        assert preview.n_pictures == 1
-        # A page in the background is told everything but the picture, and has it when it comes back.
-        first.answer(1, visible=False)
-        preview.publish(state(drawing=Drawing("cam", picture(99)), headline="next"))
-        got, jpeg = first.next_state(visible=False)
-        assert (got["headline"], jpeg) == ("next", None)
-        first.answer(got["update"], visible=True)
-        assert first.next_state()[1] is not None
-        assert preview.n_pictures == 2
-
-
 def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pages(preview):
     big = [np.random.default_rng(k).integers(0, 255, (720, 1280, 3), np.uint8) for k in range(5)]
     with Watcher(preview.urls[0]) as stuck, Watcher(preview.urls[0]) as quick:

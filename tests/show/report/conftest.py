@@ -1,18 +1,15 @@
 """Results of simulated boards, with all that a report shows."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from lce_rig.calibrate import CalibrateOptions
-from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Image
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import calibrate_detections
-from lce_rig.rig import Rig, load_rig
+from lce_rig.rig import load_rig
 from lce_rig.session import Session
 from lce_rig.show.report.calibration_page import report_page
 from tests.calibrate.boards import simulate
@@ -24,10 +21,10 @@ TWO = load_rig(str(Path(__file__).parents[2] / "rigs" / "two_cameras.yaml"))
 
 
 @pytest.fixture(scope="session")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+def page(tmp_path_factory):
     """Write the report of results of a rig, whose session holds an even image of each camera."""
 
-    def write(rig: Rig, *calibrations: Calibration, **options: Any) -> str:
+    def write(rig, *calibrations, **options):
         path = tmp_path_factory.mktemp("report") / "s"
         with Session.create(path, rig) as session:
             for k in range(12):
@@ -42,7 +39,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
 
 
 @pytest.fixture(scope="session")
-def one() -> Calibration:
+def one():
     """One camera."""
     captures = simulate(12, 3)
     images = {item.capture: item.image for item in captures}
@@ -53,7 +50,7 @@ def one() -> Calibration:
 
 
 @pytest.fixture(scope="session")
-def two() -> list[Calibration]:
+def two():
     """Two cameras that saw the same boards, estimated together."""
     session = simulate_two(12, 0)
     images = {(name, "frames"): {c.capture: c.image for c in own} for name, own in session.items()}
@@ -63,10 +60,10 @@ def two() -> list[Calibration]:
 
 
 @pytest.fixture(scope="session")
-def one_page(page: Callable[..., str], one: Calibration) -> str:
+def one_page(page, one):
     return page(RLFS, one)
 
 
 @pytest.fixture(scope="session")
-def two_page(page: Callable[..., str], two: list[Calibration]) -> str:
+def two_page(page, two):
     return page(TWO, *two)

@@ -2,24 +2,22 @@
 
 import base64
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import Calibration
 from lce_rig.show.report.calibration_page import data_uri, worst_first
 from tests.show.report.conftest import RLFS
 
 
-def decoded(uri: str) -> np.ndarray:
+def decoded(uri):
     return cv2.imdecode(np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
 
 
 @pytest.mark.parametrize("shape", [(1200, 1920, 3), (260, 346), (3000, 200), (40, 30)])
-def test_a_picture_is_small_and_of_its_image_s_shape(shape: tuple[int, ...]) -> None:
+def test_a_picture_is_small_and_of_its_image_s_shape(shape):
     pixels = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
     uri = data_uri(pixels, np.array([[np.nan, 1.0], [1e9, -1e9]]))
     height, width = decoded(uri).shape[:2]
@@ -27,23 +25,21 @@ def test_a_picture_is_small_and_of_its_image_s_shape(shape: tuple[int, ...]) -> 
     assert width / height == pytest.approx(shape[1] / shape[0], rel=0.05)
 
 
-def test_the_outline_lies_where_the_board_is() -> None:
+def test_the_outline_lies_where_the_board_is():
     square = np.array([[400.0, 200.0], [800.0, 200.0], [800.0, 500.0], [400.0, 500.0]])
     drawn = decoded(data_uri(np.zeros((720, 1280, 3), np.uint8), square)).astype(int)
     v, u = np.nonzero(drawn.sum(axis=2) > 150)
     assert (u.min(), v.min(), u.max(), v.max()) == pytest.approx((100, 50, 200, 125), abs=3)
 
 
-def test_the_capture_that_stands_out_comes_first() -> None:
+def test_the_capture_that_stands_out_comes_first():
     order = worst_first([0.004, 0.005, 0.006, float("nan")], [0.01, 0.05, 0.01, 0.01])
     assert order[0][0] == 1 and order[0][1] == pytest.approx(5.0)
     assert sorted(k for k, _ in order) == [0, 1, 2, 3]
     assert worst_first([], []) == []
 
 
-def test_the_page_shows_every_capture_with_the_command_that_rejects_the_worst(
-    one: Calibration, page: Callable[..., str]
-) -> None:
+def test_the_page_shows_every_capture_with_the_command_that_rejects_the_worst(one, page):
     residuals = list(one.residuals)
     residuals[3] = residuals[3]._replace(plane_mean_m=0.2)
     text = page(RLFS, replace(one, residuals=tuple(residuals)))
