@@ -207,8 +207,8 @@ def _is_bag(path: Path) -> bool:
             _NUMBERS_HINT,
         )
     if path.is_file() and path.suffix.lower() in RECORDINGS and path.suffix not in SUFFIXES:
-        raise SourceError(f"{path}: a {path.suffix} file does not tell the rig's sensors", _NUMBERS_HINT)
-    if path.suffix in SUFFIXES and not path.exists():
+        raise SourceError(f"{path}: a {path.suffix} file does not describe the rig's sensors", _NUMBERS_HINT)
+    if path.suffix.lower() in RECORDINGS and not path.exists():
         raise SourceError(f"{path} does not exist")
     return path.suffix in SUFFIXES
 

@@ -85,7 +85,10 @@ def listen(host: str, port: int) -> socket.socket:
             hint = f"Ports below 1024 need root: --preview {_bracketed(host)}:{DEFAULT_PORT}."
         elif number == errno.EADDRNOTAVAIL or isinstance(error, (socket.gaierror, UnicodeError)):
             why = "not an address of this computer"
-            hint = "`hostname -I` lists this computer's addresses; 0.0.0.0 stands for all of them."
+            hint = (
+                "`hostname -I` lists this computer's addresses; 0.0.0.0 stands for all. "
+                "A session's name goes before --preview."
+            )
         raise UsageError(f"the page cannot be served at {address}: {why}", hint) from None
 
 
