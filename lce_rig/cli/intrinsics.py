@@ -20,8 +20,13 @@ from lce_rig.cli.options import (
 from lce_rig.core.errors import NotEnoughDataError, UsageError, join_shortages
 from lce_rig.core.phrasing import as_line
 from lce_rig.judge.intrinsics_check import describe as figures_of
-from lce_rig.pipeline.intrinsics import MeasuredIntrinsics, document, measure_intrinsics, write_intrinsics
-from lce_rig.pipeline.intrinsics import save_profile as write_profile
+from lce_rig.pipeline.camera_intrinsics import (
+    MeasuredIntrinsics,
+    document,
+    measure_intrinsics,
+    write_intrinsics,
+)
+from lce_rig.pipeline.camera_intrinsics import save_profile as write_profile
 from lce_rig.pipeline.measure_lidar import lidar_document, measure_lidar, save_lidar
 from lce_rig.session import Session
 

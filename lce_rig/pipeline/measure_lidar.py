@@ -13,8 +13,8 @@ from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageErr
 from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections
 from lce_rig.pipeline.calibration import clocks_of
+from lce_rig.pipeline.camera_intrinsics import write_profile
 from lce_rig.pipeline.detect_session import candidates_of, detect
-from lce_rig.pipeline.intrinsics import write_profile
 from lce_rig.rig import as_yaml, set_value
 from lce_rig.session import Session
 

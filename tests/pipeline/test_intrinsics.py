@@ -11,7 +11,12 @@ from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.export.ros_files import load_camera_info
 from lce_rig.judge.intrinsics_check import judge_lens
-from lce_rig.pipeline.intrinsics import measure_intrinsics, profile_block, save_profile, write_intrinsics
+from lce_rig.pipeline.camera_intrinsics import (
+    measure_intrinsics,
+    profile_block,
+    save_profile,
+    write_intrinsics,
+)
 from lce_rig.rig import find_profile, load_rig, parse_rig, set_value
 from lce_rig.session import Session
 from tests.detect.test_image_board import draw, looking
