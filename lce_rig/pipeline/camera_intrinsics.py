@@ -145,21 +145,7 @@ def measure_intrinsics(
     frames = tuple(name for name, settings in have.items() if settings.kind == "frames")
     chosen = tuple(dict.fromkeys(channels)) or frames or tuple(have)
     given = rig.cameras[camera].to_intrinsics()
-    jobs = []
-    for capture in session.captures:
-        # Every channel reports a capture with a damaged manifest.
-        held = [(camera, channel) for channel in chosen]
-        with suppress(SessionError):
-            held = capture.image_keys
-        jobs += [(capture, channel) for channel in chosen if (camera, channel) in held]
-    pictured = {channel for _, channel in jobs}
-    of_events = [name for name in chosen if have[name].kind == "events" and name not in pictured]
-    in_events = detect(session).images if of_events else {}
-    seen_in_events: dict[Key, ImageDetection] = {
-        (capture, channel): detection
-        for channel in of_events
-        for capture, detection in in_events.get((camera, channel), {}).items()
-    }
+    jobs, seen_in_events = _images_of(session, camera, chosen)
     start = given
     found = _look(rig, camera, jobs, start, _ANY_REPROJECTION_PX, progress) | seen_in_events
     if _n_captures(found) < rig.quality.min_captures:
@@ -207,6 +193,29 @@ def measure_intrinsics(
         weaknesses=find_weaknesses(estimate, certainty),
         refused=dict(sorted({**refused, **estimate.refused}.items())),
     )
+
+
+def _images_of(
+    session: Session, camera: str, channels: Sequence[str]
+) -> tuple[list[tuple[Capture, str]], dict[Key, ImageDetection]]:
+    """List a camera's images in a session, and what was detected in those that are made of raw events."""
+    jobs = []
+    for capture in session.captures:
+        # Every channel reports a capture with a damaged manifest.
+        held = [(camera, channel) for channel in channels]
+        with suppress(SessionError):
+            held = capture.image_keys
+        jobs += [(capture, channel) for channel in channels if (camera, channel) in held]
+    pictured = {channel for _, channel in jobs}
+    have = session.rig.cameras[camera].channels
+    of_events = [name for name in channels if have[name].kind == "events" and name not in pictured]
+    in_events = detect(session).images if of_events else {}
+    seen_in_events: dict[Key, ImageDetection] = {
+        (capture, channel): detection
+        for channel in of_events
+        for capture, detection in in_events.get((camera, channel), {}).items()
+    }
+    return jobs, seen_in_events
 
 
 def _look(
