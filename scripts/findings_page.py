@@ -21,8 +21,8 @@ are stable; texts may change in any release.
 | `severity` | `note`: changes nothing; `warning`: usable, less well; `error`: must not be used |
 | `subject` | a sensor, a capture, a profile key or a file; "" where it is plain |
 | `figures` | by name with units (`_m`, `_deg`, `_s`, `_px`, `_mps`), *in italics* below; null if unknown |
-| `action_code` | which of several actions applies; "" for the usual one |
-| `text`, `action` | the same in words |
+| `action_code` | which of several actions applies, listed below; "" for the usual one |
+| `text`, `action` | the same in words, with the command to type |
 
 Refused captures have `stage` and `cause` in place of `severity` and `text`; the code begins with the stage:
 `read`, `image`, `lidar`, `pair` (camera and LiDAR disagree) or `calibrate`. Codes that end in `.text` come
@@ -47,20 +47,19 @@ def page() -> str:
         import_module(f"lce_rig.{path.parent.name}.findings")
     parts = [HEAD]
     for family, codes in groupby(sorted(KINDS), key=lambda code: code.partition(".")[0]):
-        parts.append(f"## {family}\n| code | text | action |\n|---|---|---|")
+        parts.append(f"## {family}\n| code | text | action codes |\n|---|---|---|")
         parts.extend(_row(KINDS[code]) for code in codes)
         parts.append("")
     return "\n".join(parts)
 
 
 def _row(kind: Kind) -> str:
-    actions = [_shown(kind.action), *(f"`{name}`: {_shown(action)}" for name, action in kind.actions.items())]
     templates = [kind.text, kind.action, *kind.actions.values()]
     names = dict.fromkeys(name for template in templates for name in _figures(template))
     text = _shown(kind.text)
-    hidden = [name for name in names if f"*{name}*" not in " ".join([text, *actions])]
-    text += f" ({', '.join(f'*{name}*' for name in hidden)})" if hidden else ""
-    cells = f"`{kind.code}`", text, "<br>".join(action for action in actions if action)
+    hidden = [f"*{name}*" for name in names if f"*{name}*" not in text]
+    text += f" ({', '.join(hidden)})" if hidden else ""
+    cells = f"`{kind.code}`", text, ", ".join(f"`{name}`" for name in kind.actions)
     return f"| {' | '.join(cell.replace('|', '/').replace(chr(10), '<br>') for cell in cells)} |"
 
 
