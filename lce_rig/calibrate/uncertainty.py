@@ -72,7 +72,9 @@ def by_likelihood(
         camera: its number.
         n_seen: number of placements that it saw; all if None.
     """
-    cov, inflation = inflate(joint, placement, camera, n_seen)
+    moves = replace(joint.cost, placement=placement).moves() @ joint.to_extrinsics[camera].T
+    n_placements = int(placement.max()) + 1 if n_seen is None else n_seen
+    cov, inflation = widen(joint.cov[camera], jackknife_scatter(moves), n_placements)
     figures = _add_figures(start.diagnostics, joint, camera, inflation)
     estimate = report(start, joint.T_cam_lidar[camera], cov, board, figures)
     return replace(estimate, method="ml", lidar=lidar_of(joint), cost=_expand_joint(joint, camera, placement))
@@ -173,30 +175,11 @@ def _moves_under(
     return np.asarray(-(joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, changes.T)).T)
 
 
-def inflate(
-    joint: JointEstimate, placement: NDArray[np.intp], camera: int = 0, n_seen: int | None = None
-) -> tuple[Array, float]:
-    """Multiply a camera's covariance (6, 6) according to the spread over placements.
-
-    The spread of the optimum without each placement (`lce_rig.calibrate.quadratics`) is independent of the
-    noise model. If it significantly exceeds the model's covariance, there are errors that the model lacks.
-
-    Args:
-        joint: of F captures.
-        placement: (F,) number of each capture's placement.
-        camera: its number.
-        n_seen: number of placements that it saw; all if None.
-
-    Returns:
-        The covariance and the factor, 1 if model and spread agree.
-    """
-    n = int(placement.max()) + 1 if n_seen is None else n_seen
-    moves = replace(joint.cost, placement=placement).moves() @ joint.to_extrinsics[camera].T
-    return widen(joint.cov[camera], jackknife_scatter(moves), n)
-
-
 def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:
     """Multiply a covariance (6, 6) where the spread (6, 6) over placements significantly exceeds it.
+
+    The spread of the optimum without each placement (`lce_rig.calibrate.quadratics`) is independent of the
+    noise model. If it exceeds the model's covariance, there are errors that the model lacks.
 
     Returns:
         The covariance and the factor, 1 if they agree.

@@ -103,10 +103,7 @@ def solve_globally(Q: Array, R_start: Array) -> tuple[Array, Certificates]:
     candidates, cost = minimise_on_so3(np.repeat(Q[left], n, axis=0), starts.reshape(-1, 3, 3))
     best = np.argmin(cost.reshape(-1, n), axis=1)
     R[left] = candidates.reshape(-1, n, 3, 3)[np.arange(len(left)), best]
-    again = certify(Q[left], R[left])
-    gap, is_optimal, costs = certificates.gap.copy(), certificates.is_optimal.copy(), certificates.cost.copy()
-    gap[left], is_optimal[left], costs[left] = again.gap, again.is_optimal, again.cost
-    return R, Certificates(gap, costs, is_optimal)
+    return R, certify(Q, R)
 
 
 @dataclass(frozen=True, eq=False)

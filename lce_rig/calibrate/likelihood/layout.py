@@ -60,10 +60,8 @@ class Columns:
 
 
 _OF_LASER = dict.fromkeys(LASER, 1)
-RETURN = Columns({"plane": 3, **_OF_LASER, **_FIELDS, "residual": 1})
-"""Row of a return; plane: the three freedoms of its board's plane."""
 RING = Columns({"pose": 6, **_OF_LASER, **_FIELDS, "residual": 1})
-"""Row of a ring's returns in a capture, by the board's pose."""
+"""Row of a return."""
 END = Columns({"pose": 6, **_OF_LASER, **_FIELDS, "shifts": len(SHIFTS), "own_shift": 1, "residual": 1})
 """Row of a ring end."""
 IMAGE = Columns({"camera": 6, "pose": 6, "scale": 1, "residual": 1})

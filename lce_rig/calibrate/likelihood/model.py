@@ -20,7 +20,6 @@ from lce_rig.calibrate.likelihood.rays import (
     RangeSums,
     StackedScans,
     edge_rows,
-    ring_systems,
     sum_ranges,
     weigh_ranges,
 )
@@ -107,7 +106,7 @@ def _of_returns(terms: Terms, levels: Levels) -> Iterator[Products]:
     weighted, log_volumes = weigh_ranges(terms.ranges, levels.range_m, levels.ring_m)
     F, L = log_volumes.shape
     place = np.tile(_ring_places(RING, terms.state.layout), (F, 1))
-    products = ring_systems(terms.ranges, weighted).reshape(F * L, RING.size, RING.size)
+    products = weighted.reshape(F * L, RING.size, RING.size)
     yield Products(np.repeat(np.arange(F), L), place, products, log_volumes.ravel())
 
 

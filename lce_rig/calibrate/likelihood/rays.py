@@ -5,13 +5,13 @@ laser and displaced by f theta (the lens, below) and by the laser's errors a of 
 
     rho = r - n . (f theta + r u' a) / (n . u) + o + noise                                               (1)
 
-with u' the derivative of the ray by the two. The points determine three parameters of a plane's motion
-(`freedoms_of_plane`), so that all that an estimate needs of the returns of a ring in a capture are the sums
-of products of
+with u' the derivative of the ray by the two. A board's motion (tau, phi) about its middle t moves r by
+n . (tau + phi x (r u - t)) / (n . u). All that an estimate needs of the returns of a ring in a capture,
+however many there are, are the sums of products of
 
-    v = [(1, x, y) / (n . u); 1; -r n . u' / (n . u); -n . f / (n . u); residual of (1)]
+    v = [n / (n . u); (r u - t) x n / (n . u); 1; -r n . u' / (n . u); -n . f / (n . u); residual of (1)]
 
-(`layout.RETURN`, 11 x 11) with x and y on the board, however many there are.
+in columns of `layout.RING`.
 
 Ring ends. A ring's last ray on the board meets its plane s inside an edge, the next ray a step D
 farther out along the edge's normal. The beam has a width, so that the board is lost where the ray passes d
@@ -52,18 +52,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lce_rig.calibrate.features import turn_about_z
-from lce_rig.calibrate.likelihood.layout import END, RETURN, RING, Indices, State
+from lce_rig.calibrate.likelihood.layout import END, RING, Indices, State
 from lce_rig.calibrate.plane_and_ends import (
     BLENDS,
     describe_background,
     differentiate,
     distance_inside,
-    freedoms_of_plane,
 )
 from lce_rig.core.board import Board
 from lce_rig.core.geometry import Array
@@ -213,50 +213,41 @@ def turn_rays(rays: Array) -> Array:
     return turned
 
 
-@dataclass(frozen=True, eq=False)
-class RangeSums:
+class RangeSums(NamedTuple):
     """Sums of v v^T by capture and ring, at given board poses.
 
     Attributes:
-        sums: (F, L, 11, 11), weighted by capture.
+        sums: (F, L, 14, 14) in columns of `RING`, weighted by capture.
         n_returns: (F, L) how many.
-        by_pose: (F, 3, 6) derivative of the plane's three freedoms by the tangent of T_lidar_board.
     """
 
     sums: Array
     n_returns: Array
-    by_pose: Array
 
 
 def sum_ranges(scans: StackedScans, state: State) -> RangeSums:
     """Sum the returns' terms at a state."""
-    R, n = state.T_lidar_board[:, :3, :3], state.T_lidar_board[:, :3, 2]
-    k = scans.capture
-    # Rays and the boards' middles in the axes of each board; returns are ordered by capture.
-    by_capture = np.split(scans.rays, np.searchsorted(k, np.arange(1, scans.n_captures)))
-    x, y, cosine = np.concatenate([u @ axes for u, axes in zip(by_capture, R, strict=True)]).T
-    middle = np.einsum("fji,fj->fi", R, state.T_lidar_board[:, :3, 3])
-    r = middle[k, 2] / cosine
-    across = -n[k] / cosine[:, None]
-    v = np.empty((len(r), RETURN.size))
-    freedoms = np.column_stack([np.ones_like(r), r * x - middle[k, 0], r * y - middle[k, 1]])
-    v[:, RETURN["plane"]] = freedoms / cosine[:, None]
-    v[:, RETURN["range"]] = 1
-    v[:, RETURN.span("azimuth", "elevation")] = r[:, None] * np.einsum("ni,nij->nj", across, scans.turned)
-    v[:, RETURN.span("lens", "bow")] = np.einsum("ni,nij->nj", across, scans.fields)
-    by_laser, by_fields = v[:, RETURN.span("range", "elevation")], v[:, RETURN.span("lens", "bow")]
+    T = state.T_lidar_board[scans.capture]
+    n, t = T[:, :3, 2], T[:, :3, 3]
+    cosine = np.sum(n * scans.rays, axis=1)
+    r = np.sum(n * t, axis=1) / cosine
+    across = -n / cosine[:, None]
+    v = np.empty((len(r), RING.size))
+    v[:, RING["pose"]] = differentiate(across, r[:, None] * scans.rays - t)
+    v[:, RING["range"]] = 1
+    v[:, RING.span("azimuth", "elevation")] = r[:, None] * np.einsum("ni,nij->nj", across, scans.turned)
+    v[:, RING.span("lens", "bow")] = np.einsum("ni,nij->nj", across, scans.fields)
+    by_laser, by_fields = v[:, RING.span("range", "elevation")], v[:, RING.span("lens", "bow")]
     of_laser = np.einsum("ni,ni->n", by_laser, state.lasers.T[scans.ring])
     v[:, -1] = r + of_laser + by_fields @ state.fields - scans.range_m
-    v *= scans.weight[k, None]
-    sums = np.zeros((scans.n_captures * len(scans.rings), RETURN.size, RETURN.size))
+    v *= scans.weight[scans.capture, None]
+    by_ring = scans.n_captures, len(scans.rings)
+    sums = np.zeros((by_ring[0] * by_ring[1], RING.size, RING.size))
     bounds = np.flatnonzero(np.diff(scans.group, prepend=-1, append=-1))
     # A product of matrices for each ring: several times faster than sums of products of columns.
     sums[scans.group[bounds[:-1]]] = [v[a:b].T @ v[a:b] for a, b in pairwise(bounds.tolist())]
-    K = freedoms_of_plane()
-    by_pose = np.concatenate([K[:, :3] @ np.swapaxes(R, 1, 2), K[:, 3:] @ np.swapaxes(R, 1, 2)], axis=2)
     n_returns = np.bincount(scans.group, minlength=len(sums)).astype(np.float64)
-    by_ring = scans.n_captures, len(scans.rings)
-    return RangeSums(sums.reshape(*by_ring, RETURN.size, RETURN.size), n_returns.reshape(by_ring), by_pose)
+    return RangeSums(sums.reshape(*by_ring, RING.size, RING.size), n_returns.reshape(by_ring))
 
 
 def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tuple[Array, Array]:
@@ -269,23 +260,14 @@ def weigh_ranges(ranges: RangeSums, sigma_m: float, sigma_ring_m: float) -> tupl
     With weights w_i, sigma^2 I is diag(sigma^2 / w_i^2), and n the sum of their squares.
 
     Returns:
-        The weighted sums (F, L, 11, 11) and the logs (F, L) of the covariances' determinants.
+        The weighted sums (F, L, 14, 14) and the logs (F, L) of the covariances' determinants.
     """
     n = ranges.n_returns
-    shared = ranges.sums[..., RETURN["range"].start, :]
-    total = sigma_m**2 + shared[..., RETURN["range"].start] * sigma_ring_m**2
+    shared = ranges.sums[..., RING["range"].start, :]
+    total = sigma_m**2 + shared[..., RING["range"].start] * sigma_ring_m**2
     k = (sigma_ring_m**2 / total)[..., None, None]
     weighted = (ranges.sums - k * shared[..., :, None] * shared[..., None, :]) / sigma_m**2
     return weighted, np.where(n > 0, (n - 1) * np.log(sigma_m**2) + np.log(total), 0.0)
-
-
-def ring_systems(ranges: RangeSums, weighted: Array) -> Array:
-    """Expand weighted sums (F, L, 11, 11) into normal equations by capture and ring, in columns of `RING`."""
-    B = np.zeros((len(weighted), 1, RETURN.size, RING.size))
-    B[:, 0, RETURN["plane"], RING["pose"]] = ranges.by_pose
-    names = [name for name in RETURN if name != "plane"]
-    B[:, :, RETURN.of(names), RING.of(names)] = 1
-    return np.asarray(np.swapaxes(B, 2, 3) @ weighted @ B)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from lce_rig.calibrate.likelihood.levels import Levels, Priors
 from lce_rig.calibrate.observations import group_placements
 from lce_rig.calibrate.quadratics import jackknife_scatter
 from lce_rig.calibrate.tolerances import vary
-from lce_rig.calibrate.uncertainty import inflate, widen
+from lce_rig.calibrate.uncertainty import widen
 from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, photograph, simulate
 
@@ -177,8 +177,8 @@ def test_captures_that_disagree_by_more_than_the_model_knows_widen_the_claim():
     seen = observations(20, 6, REAL)
     good = maximise_likelihood([seen], BOARD, [T_FORWARD])
     placement = group_placements(seen)
-    assert inflate(good, placement)[1] < 2
     spread = jackknife_scatter(replace(good.cost, placement=placement).moves() @ good.to_extrinsics[0].T)
+    assert widen(good.cov[0], spread, placement.max() + 1)[1] < 2
     too_sure = good.cov[0] / 20
     cov, factor = widen(too_sure, spread, placement.max() + 1)
     assert factor > 5
