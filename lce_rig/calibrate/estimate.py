@@ -95,7 +95,7 @@ def estimate_extrinsics(
         alone = estimate_observations(observations, board, fast)
         result = result_of(name, alone, motion.widened(alone.cov), still[name])
         if motion.offsets is not None:
-            index = motion.offsets.channels.index(name)
+            index = motion.samples.channels.index(name)
             offset_s, variance = motion.offsets.offset_s[index], motion.offsets.cov[index, index]
             result = replace(
                 result, time_offset_s=float(offset_s), time_offset_sigma_s=float(np.sqrt(variance))

@@ -125,19 +125,14 @@ def end_rows(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple[Arra
     return inside_m, np.column_stack([by_tangent, np.ones(len(edge)), -normals @ f.centre])
 
 
-def is_blended(lidar: LidarBoard) -> NDArray[np.bool_]:
-    """Return for each ring end (M,) whether an object is close behind the board along the beam."""
-    cosine = np.abs(lidar.edge_points @ lidar.plane[:3]) / np.linalg.norm(lidar.edge_points, axis=1)
-    return np.asarray(lidar.edge_behind_m < BLENDS_M * cosine)
-
-
 def describe_background(lidar: LidarBoard) -> Array:
     """Describe the background of each ring end (M, 3).
 
     Columns are the background's share of the power where it is far behind, whether it blends, and its share
     where it does. The share acts in proportion to the beam's width: without rings, it is multiplied by that.
     """
-    blends, echo = is_blended(lidar), lidar.edge_echo
+    cosine = np.abs(lidar.edge_points @ lidar.plane[:3]) / np.linalg.norm(lidar.edge_points, axis=1)
+    blends, echo = lidar.edge_behind_m < BLENDS_M * cosine, lidar.edge_echo
     if lidar.edge_beam_m is not None:
         echo = echo * lidar.edge_beam_m.sum(axis=1) / _HALF_BEAM_M
     return np.stack([echo * ~blends, blends, echo * blends], axis=1)

@@ -21,7 +21,7 @@ from lce_rig.calibrate.observations import group_placements
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, difference, perturb
-from lce_rig.core.results import ImageBoard, Observation
+from lce_rig.core.results import Observation
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.fit import fit_poses, pose_moves
@@ -95,11 +95,19 @@ class SessionLens:
         variance = np.maximum(cost / np.maximum(2 * n - 6, 1), 1e-12)
         gap = np.where(has_other, (cost_other - cost) / variance, np.inf)
         cov = variance[:, None, None] * np.linalg.inv(H)
+        # Poses in the images shortly before and after move by the same tangent.
+        moved = difference(T, np.array([board.T_cam_board for board in boards]))
+        tracks = [
+            None if board.track_T_cam_board is None else perturb(board.track_T_cam_board, tangent)
+            for board, tangent in zip(boards, moved, strict=True)
+        ]
         return [
             replace(
                 observation,
                 image=replace(
-                    _moved(observation.image, T[k]),
+                    observation.image,
+                    T_cam_board=T[k],
+                    track_T_cam_board=tracks[k],
                     cov=cov[k],
                     T_cam_board_alternative=T_other[k] if has_other[k] else None,
                     chi2_gap=float(gap[k]),
@@ -135,11 +143,3 @@ def fit_session_lens(
     ]
     estimate = estimate_intrinsics(views, board, prior.lens, model_of(prior.lens), prior=prior, n_folds=0)
     return SessionLens(estimate, prior)
-
-
-def _moved(image: ImageBoard, T_cam_board: Array) -> ImageBoard:
-    """Replace a pose; images shortly before and after move by the same tangent."""
-    track = image.track_T_cam_board
-    if track is not None:
-        track = perturb(track, difference(T_cam_board, image.T_cam_board))
-    return replace(image, T_cam_board=T_cam_board, track_T_cam_board=track)

@@ -96,15 +96,6 @@ class Setup:
         """Coordinates of each board's corners less its pose's (K,)."""
         return np.asarray(np.isfinite(self.corners_px).sum(axis=(1, 2)) - 6)
 
-    def minus_measured(self, pixels: Array) -> Array:
-        """Subtract the measured corners from predicted ones (K, N, 2)."""
-        return np.where(np.isnan(self.corners_px), 0.0, pixels - self.corners_px)
-
-    def without_hidden(self, by_corner: Array) -> Array:
-        """Clear derivatives (K, N, 2, n) of hidden corners."""
-        hidden = np.isnan(self.corners_px)
-        return np.where(hidden[..., None], 0.0, by_corner) if hidden.any() else by_corner
-
     def select(self, keep: NDArray[np.bool_]) -> "Setup":
         """Keep some boards (K,)."""
         return replace(self, corners_px=self.corners_px[keep])
@@ -199,8 +190,10 @@ def _project(setup: Setup, state: LensState) -> tuple[Array, Array, Array, Array
     T = state.T_cam_board
     turned = corners_of(setup, state.shape) @ np.swapaxes(T[:, :3, :3], 1, 2)
     pixels, by_point, by_lens = setup.model.project(state.lens, turned + T[:, None, :3, 3])
-    by_point, by_lens = setup.without_hidden(by_point), setup.without_hidden(by_lens)
-    return setup.minus_measured(pixels), by_point, by_lens, turned
+    is_seen = ~np.isnan(setup.corners_px)
+    if not is_seen.all():
+        by_point, by_lens = (np.where(is_seen[..., None], each, 0.0) for each in (by_point, by_lens))
+    return np.where(is_seen, pixels - setup.corners_px, 0.0), by_point, by_lens, turned
 
 
 def linearise(setup: Setup, state: LensState) -> tuple[Array, Array, Array]:

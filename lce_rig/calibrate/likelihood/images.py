@@ -74,13 +74,11 @@ def image_rows(images: StackedImages, T_cam_lidar: Array, T_lidar_board: Array, 
     """
     Y = T_lidar_board[images.capture]
     R = T_cam_lidar[:3, :3]
-    by_camera, by_pose, by_scale = (np.zeros((len(Y), 6, n)) for n in (6, 6, 1))
-    by_camera[:, :3, :3] = by_camera[:, 3:, 3:] = np.eye(3)
-    by_camera[:, :3, 3:] = -skew(Y[:, :3, 3] @ R.T)
-    by_pose[:, :3, :3] = by_pose[:, 3:, 3:] = R
-    by_scale[:, :3, 0] = -images.T_cam_board[:, :3, 3]
     rows = np.zeros((len(Y), 6, IMAGE.size))
-    rows[:, :, IMAGE["camera"]], rows[:, :, IMAGE["pose"]] = by_camera, by_pose
-    rows[:, :, IMAGE["scale"]] = by_scale
+    by_camera, by_scale = (rows[:, :, IMAGE[name]] for name in ("camera", "scale"))
+    by_camera[:] = np.eye(6)
+    by_camera[:, :3, 3:] = -skew(Y[:, :3, 3] @ R.T)
+    rows[:, :, IMAGE["pose"]] = np.kron(np.eye(2), R)
+    by_scale[:, :3, 0] = -images.T_cam_board[:, :3, 3]
     rows[:, :, -1] = difference(T_cam_lidar @ Y, images.T_cam_board) + scale * by_scale[..., 0]
     return rows

@@ -55,13 +55,11 @@ class TimeOffsets:
     """Offsets from the timestamps of each channel's images to the LiDAR's time.
 
     Attributes:
-        channels: names.
-        offset_s: (C,).
+        offset_s: (C,), in the order of `PoseSamples.channels`.
         cov: (C, C) s^2, from the scatter between captures.
         sensitivity: (6, C) change of the extrinsics (m, rad) per second of each offset.
     """
 
-    channels: tuple[str, ...]
     offset_s: Array
     cov: Array
     sensitivity: Array
@@ -149,7 +147,7 @@ def estimate_motion(
     widen = np.sqrt(np.maximum(np.diag(inverse) / np.diag(cov), 1.0))
     if fit_motions(samples, offset_s).significance <= _MOVED:
         return still
-    offsets = TimeOffsets(samples.channels, offset_s, np.asarray(widen[:, None] * cov * widen), T_rates)
+    offsets = TimeOffsets(offset_s, np.asarray(widen[:, None] * cov * widen), T_rates)
     return replace(still, offsets=offsets)
 
 
