@@ -123,7 +123,7 @@ def draw_debug(
             _write_refusal(panes["scan"], heading, refused)
         else:
             rivals = len(lidar_result) - 1
-            notes = [f"{rivals} other plate{'s' if rivals > 1 else ''} of the board's size"] if rivals else []
+            notes = [f"{rivals} other plate{'s' if rivals > 1 else ''} of its size"] if rivals else []
             figures = lidar_result[chosen].figures()
             limit_m = plane_limit_m(limits.max_thickness_m, figures["range_noise_m"])
             notes.append(f"plane limit {1000 * limit_m:.1f} mm")

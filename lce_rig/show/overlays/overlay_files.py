@@ -134,7 +134,9 @@ def _head(head: SheetHead, width_px: int, page: tuple[int, int]) -> Picture:
     for line in lines:
         canvas.draw_text(strip, line, left, baseline, _TEXT_PX, INK)
         baseline += _LINE_PX
-    marks = draw_legend(width_px, head.limits_m, {"orange frame": "not used"})
+    legend = draw_legend(min(width_px, 1000), head.limits_m, {"orange frame": "not used"})
+    marks = canvas.panel(width_px, legend.shape[0])
+    marks[:, : legend.shape[1]] = legend
     return np.vstack([strip, marks])
 
 
