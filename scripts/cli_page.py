@@ -11,10 +11,12 @@ import click
 from lce_rig.cli.main import EXIT_BUG, cli
 from lce_rig.core.interrupts import EXIT_INTERRUPTED
 
+# Options of most verbs begin so; they are explained once.
+_COMMON = "Print all figures"
 PAGE = Path(__file__).parents[1] / "docs" / "cli.md"
 HEAD = f"""# Command line
 Every verb with its options, as `lce-rig VERB --help` prints them. Results go to stdout, with `--json` as
-[findings](findings.md) and figures; everything else goes to stderr.
+[findings](findings.md) and figures; all else goes to stderr. `--explain` prints all figures and causes.
 
 | exit code | meaning |
 |---|---|
@@ -60,7 +62,10 @@ def _verb(group: click.Group, name: str, parent: click.Context, heading: str) ->
         usage = " ".join([context.command_path, *command.collect_usage_pieces(context)])
         yield f"{heading} {context.command_path}\n\n```text\n{usage}\n```\n"
         yield _text(command)
-        yield from _table(_options(command, context))
+        options = _options(command, context)
+        yield from _table([(name, text) for name, text in options if not text.startswith(_COMMON)])
+        if common := [f"`{name}`" for name, text in options if text.startswith(_COMMON)]:
+            yield f"Also {', '.join(common)}.\n"
         for each in command.list_commands(context) if isinstance(command, click.Group) else ():
             yield from _verb(command, each, context, heading + "#")
 

@@ -143,17 +143,16 @@ def collect(
 ) -> None:
     """Build or continue SESSION (default: session/), live or from recordings.
 
-    Without --from, read the rig's attached sensors and guide the person who holds the board. A capture is
-    taken automatically when the board stands still, or moves slowly before an event camera. Collection ends
-    when the calibration is predicted to meet the profile's target; run the command again to continue.
-    Without a terminal it also ends after 30 minutes without a capture, with --simulated after 10. Run
-    `lce-rig doctor` first to check the rig.
+    Without --from, read the attached sensors (check them with `lce-rig doctor`) and guide the person who
+    holds the board. Captures are taken automatically when the board stands still, or moves slowly before an
+    event camera, until the profile's target is predicted to be met. Without a terminal it also ends after 30
+    minutes without a capture, with --simulated after 10.
 
-    With --from, each image-scan pair of a folder becomes a capture. Images of several cameras in img/CAMERA/
-    share the point cloud. A bag gives a capture wherever the board stands still in both sensors at a new
-    placement; a bag with raw events gives one wherever it moves slowly, with the events. Simultaneous
-    recordings, such as --from lidar.bag --from events.aedat4, are joined: each adds a sensor to those before
-    it. Run the command again to continue; existing captures are not repeated.
+    With --from, each image-scan pair of a folder becomes a capture; in other recordings, each new placement
+    where the board stands still, or moves slowly if there are events. Simultaneous recordings, such as --from
+    lidar.bag --from events.aedat4, are joined.
+
+    Run the same command again to continue; existing captures are not repeated.
     """
     if session is not None and output is not None:
         raise UsageError(f"SESSION is named twice: {session} and {output}", "Omit one of them.")

@@ -50,8 +50,8 @@ def deploy(
     """Put the result of SESSION (default: session/) on a robot, all files at once.
 
     A target is a folder on this computer or USER@HOST:PATH, reached by OpenSSH without a question. Robot
-    software reads PATH/current/. The files are written aside and read back, then one rename makes them
-    current; whatever interrupts it, the robot has the earlier set or the new one. Earlier sets are kept.
+    software reads PATH/current/. One rename makes the new files current, after they were read back; whatever
+    interrupts it, the robot has the earlier set or the new one. Earlier sets are kept.
 
     Refused with exit code 7: a failed result, another robot's name or serial numbers, captures older than
     those deployed. Exits with 8 if the target was not reached or written and holds the earlier set, and with

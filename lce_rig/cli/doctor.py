@@ -40,9 +40,7 @@ _EXIT_ERROR = 5
 def doctor(rig_name: str, explain: bool, as_json: bool, duration: float, folder: Path) -> int:
     """Check this computer and every sensor of a rig, and print faults with an action each.
 
-    ok: no fault; --explain prints these checks, too. warn: collecting works, with limits. FAIL: collecting
-    does not work, or its data would be wrong. An absent device has one line; the others are checked all the
-    same.
+    warn: collecting works, with limits. FAIL: collecting does not work, or its data would be wrong.
 
     Exits with 5 if a check reports FAIL, else with 0.
     """

@@ -55,12 +55,10 @@ def drift(
 ) -> None:
     """Check on RECORDING (default: session/), without a board, whether extrinsics still hold.
 
-    RECORDING is a session or, with --rig, a folder of images and point clouds, a ROS 1 or ROS 2 bag, an mcap,
-    or several recordings of the same time, such as a pcap and a camera's file. With --rig and no RECORDING,
-    the attached sensors are watched; Ctrl-C ends this and judges what was seen. Edges of the scans are
-    compared with edges of the images; where the board is in view, it is asked as well, and both are shown.
-    Exits with 0 if no axis has changed, with 7 if one has, and with 6 if neither the scene nor the board can
-    tell; of several cameras the worst counts.
+    RECORDING is a session or, with --rig, a folder of images and point clouds, a bag, an mcap, or several
+    simultaneous recordings. With --rig and no RECORDING, the attached sensors are watched until Ctrl-C. Edges
+    of the scans are compared with edges of the images, and with the board where it is in view.
+    Exits with 0 if no axis has changed, with 7 if one has, and with 6 if neither opinion can tell.
     """
     is_live = rig_name is not None and not recordings
     if seconds is not None and not is_live:

@@ -72,9 +72,8 @@ def export(
 ) -> None:
     """Write the result of SESSION (default: session/) for other programs.
 
-    `calibrate` has written the usual formats into SESSION/calibration/ already. With --tree or --into the
-    sensor that is nearest to the root of the robot's tree stays where it is. Each other one keeps its parent,
-    and its pose there changes; one that the robot lacks is added. The rest of a URDF stays as it is.
+    `calibrate` has written the usual formats already. With --tree or --into, the sensor nearest to the root
+    of the robot's tree stays where it is; the poses of the others change, and missing ones are added.
     """
     if str(session) in EXPORTS and not session.exists():
         raise UsageError(

@@ -67,10 +67,9 @@ def intrinsics(
 ) -> None:
     """Estimate each camera's intrinsics from the boards in the images of SESSION (default: session/).
 
-    Reports the standard deviation of every parameter, what the captures do not determine, and whether the
-    profile's intrinsics still fit. Writes SESSION/intrinsics/: a block for the profile, camera_info and a
-    page of plots per camera. The profile is not changed. Exits with 6 if the captures are insufficient, with
-    7 if --save-profile has nothing to write, as the session determines no intrinsics better than the profile.
+    Reports whether the profile's intrinsics still fit, and what the captures do not determine. Writes
+    SESSION/intrinsics/: a block for the profile, camera_info and a page of plots per camera. Exits with 6 if
+    the captures are insufficient, with 7 if --save-profile has nothing better than the profile to write.
     """
     opened = Session.open(session)
     require_sensors("camera", cameras, opened.rig.cameras)
@@ -195,9 +194,8 @@ def lidar_intrinsics(
 ) -> None:
     """Estimate the constant errors of a LiDAR from the boards of one or several SESSIONs.
 
-    Prints the errors of range, azimuth and elevation of each laser and the displacement of the beams' origin,
-    with standard deviations. The sessions' extrinsics may differ; boards must have stood still. With the
-    profile written by --save-profile, `calibrate` of later sessions starts from these errors.
+    These are range, azimuth and elevation of each laser and the displacement of the beams' origin. Boards
+    must have stood still. `calibrate` starts from the errors in the profile that --save-profile writes.
     Exits with 6 for too few captures, with 7 if boards moved or captures do not determine the lasers' ranges.
     """
     if save_profile is not None and save_profile.exists():

@@ -30,12 +30,10 @@ from lce_rig.pipeline.comparison import repeat as compare
 def repeat(sessions: tuple[Path, ...], names: tuple[str, ...], explain: bool, as_json: bool) -> None:
     """Compare the calibrations of two or more independent SESSIONs of one rig, or the results of one SESSION.
 
-    The best test of extrinsics: collect again with new board placements, and compare the differences of the
-    results with their reported uncertainties. It cannot show errors that all sessions share: those of the
-    intrinsics, the board's size, and constant errors of the LiDAR's ranges.
+    The best test of extrinsics: collect again with new placements of the board. Errors that all sessions
+    share stay hidden: intrinsics, the board's size, constant range errors.
 
-    With one session, compare its results, such as that of `calibrate --channels events --name events` with
-    the current one. They share captures, so that common errors stay hidden.
+    With one session, compare the results of `lce-rig calibrate SESSION --name NAME` with the current one.
 
     A session without a result is calibrated for the comparison; nothing is written. Exits with 7 if the
     calibrations disagree, or if one of them failed.

@@ -121,9 +121,8 @@ def _parts(checked: SessionCheck, session: str, *, is_explained: bool) -> Iterat
 def view(session: Path, name: str | None, capture: str | None, output: Path | None) -> None:
     """Show the point cloud of SESSION (default: session/) in the colours of its cameras.
 
-    The cameras' fields of view are drawn, too. Where extrinsics are wrong, edges of things have the colours
-    of what is behind them. Drag to turn, scroll to zoom; N and P change to the next and the previous capture.
-    Points that no camera sees are grey.
+    With wrong extrinsics, edges of things have the colours of their background. Points that no camera sees
+    are grey. Drag to turn, scroll to zoom; N and P change to the next and the previous capture.
 
     Exits with 5 where there is no display, or Open3D cannot open a window.
     """
