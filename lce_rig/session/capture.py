@@ -199,8 +199,7 @@ class Capture:
         import cv2
 
         entries = [e for e in self._manifest.images if (e.camera, e.channel) == (camera, channel)]
-        entry: ImageEntry = self._only(entries, f"nothing from {camera}.{channel}")
-        data = self._read(entry)
+        entry, data = self._only(entries, f"nothing from {camera}.{channel}")
         with self._reading(entry.file):
             pixels = decode_pixels(data, cv2.IMREAD_UNCHANGED)
             return Image(camera, channel, entry.stamp_ns, pixels, entry.host_ns)
@@ -212,8 +211,7 @@ class Capture:
             SessionError: there is none, or it is damaged.
         """
         entries = [e for e in self._manifest.scans if e.lidar == lidar]
-        entry: ScanEntry = self._only(entries, f"nothing from {lidar}")
-        data = self._read(entry)
+        entry, data = self._only(entries, f"nothing from {lidar}")
         with self._reading(entry.file):
             cloud = decode_pcd(data)
             return Scan(
@@ -233,8 +231,7 @@ class Capture:
             SessionError: there are none, or they are damaged.
         """
         entries = [e for e in self._manifest.events if e.camera == camera]
-        entry: EventsEntry = self._only(entries, f"no events from {camera}")
-        data = self._read(entry)
+        entry, data = self._only(entries, f"no events from {camera}")
         with self._reading(entry.file):
             return decode_events(data, camera)
 
@@ -260,10 +257,10 @@ class Capture:
                 first = error.errors(include_url=False)[0]
                 raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
-    def _only(self, entries: Sequence[_SOME_ENTRY], lacking: str) -> _SOME_ENTRY:
-        """Return the entry of a sensor, at most one."""
+    def _only(self, entries: Sequence[_SOME_ENTRY], lacking: str) -> tuple[_SOME_ENTRY, bytes]:
+        """Return the entry of a sensor, at most one, with its file's content."""
         if entries:
-            return entries[0]
+            return entries[0], self._read(entries[0])
         have = [".".join(key) for key in self.image_keys] + self.lidars
         have += [f"events of {camera}" for camera in self.event_cameras]
         raise SessionError(f"capture {self.name} has {lacking}; it has {', '.join(have) or 'nothing'}")
