@@ -422,7 +422,15 @@ def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path(), web_port: 
         except SourceError as error:
             seen[sensor] = ObservedSensor(sensor, failure=error)
     exam = Examination(rig, folder, seen | observe(sources, duration_s))
-    web = {name: _read_web(rig, name, web_port) for name in rig.lidars if exam.driver(name) == "vlp16"}
+    web: dict[str, WebReport | SourceError] = {}
+    for name, lidar in rig.lidars.items():
+        if exam.driver(name) == "vlp16":
+            try:
+                web[name] = read_web(
+                    lidar.driver.address or velodyne.FACTORY_ADDRESS, web_port, _WEB_TIMEOUT_S
+                )
+            except SourceError as error:
+                web[name] = error
     exam = replace(exam, web=web)
     subjects = [("computer", "computer"), *((name, "lidar") for name in rig.lidars)]
     subjects += [*((name, "camera") for name in rig.cameras), *([(BOARD, "sync")] if rig.sync else [])]
@@ -432,12 +440,3 @@ def examine(rig: Rig, duration_s: float = 5.0, folder: Path = Path(), web_port: 
         for name, check in CHECKS[kind].items()
     ]
     return [line for line in lines if line.findings]
-
-
-def _read_web(rig: Rig, lidar: str, port: int) -> WebReport | SourceError:
-    """Ask the web page of a VLP-16; why it says nothing where it does not."""
-    address = rig.lidars[lidar].driver.address or velodyne.FACTORY_ADDRESS
-    try:
-        return read_web(address, port, _WEB_TIMEOUT_S)
-    except SourceError as error:
-        return error

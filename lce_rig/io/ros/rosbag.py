@@ -60,19 +60,29 @@ class TopicDecoder:
     def decode(self, message: RawMessage) -> list[Image | Scan]:
         """Decode one message; empty, and counted, where it is damaged, sent twice or late."""
         try:
-            content = deserialize(message)
+            content, samples = deserialize(message), list[Image | Scan]()
             if message.msgtype in PACKET_TYPES:
-                return self._in_order(self._assemble(content))
-            stamp_ns = header_stamp_ns(content)
-            if stamp_ns == 0:
-                self.notes.add("headers have no timestamps; the time of receipt is used")
-                stamp_ns = message.log_ns
-            return self._accumulate(self._in_order([self._to_sample(message, content, stamp_ns)]))
+                samples += self._assemble(content)
+            else:
+                samples.append(self._to_sample(message, content))
         except (SourceError, ValueError) as error:
             cause = error.what if isinstance(error, SourceError) else str(error)
             self.hint = error.hint if isinstance(error, SourceError) else ""
             self.losses.add(findings.NOT_DECODED(where=cause))
             return []
+        samples = self._in_order(samples)
+        if isinstance(self._settings, CameraSettings) or self._settings.has_rings:
+            return samples
+        # Scans without rings are sparse: they are joined to scans of the profile's rate.
+        ready: list[Image | Scan] = []
+        for scan in samples:
+            assert isinstance(scan, Scan)  # as a LiDAR has no images
+            first_ns = self._parts[0].stamp_ns if self._parts else None
+            least_ns = (1 - _EARLY) * 1e9 / self._settings.rate_hz
+            if first_ns is not None and (scan.stamp_ns or 0) - first_ns >= least_ns:
+                ready.append(self._join())
+            self._parts.append(scan)
+        return ready
 
     def finish(self) -> list[Image | Scan]:
         """Return the last scan where a revolution, or what accumulates, ends with the recording."""
@@ -103,8 +113,11 @@ class TopicDecoder:
             raise SourceError(what, f"Set the model of {self._target.sensor!r} in the profile.")
         return scans
 
-    def _to_sample(self, message: RawMessage, content: Any, stamp_ns: int) -> Image | Scan:
-        sensor, channel = self._target.sensor, self._target.channel
+    def _to_sample(self, message: RawMessage, content: Any) -> Image | Scan:
+        sensor, channel, stamp_ns = self._target.sensor, self._target.channel, header_stamp_ns(content)
+        if stamp_ns == 0:
+            self.notes.add("headers have no timestamps; the time of receipt is used")
+            stamp_ns = message.log_ns
         if isinstance(self._settings, CameraSettings):
             assert channel is not None  # as every topic of a camera has
             if self._settings.channels[channel].timestamps.reference == "start":
@@ -115,21 +128,6 @@ class TopicDecoder:
         cloud = (decode_livox if message.msgtype in LIVOX_TYPES else decode_pointcloud2)(content)
         return to_scan(cloud, sensor, self._settings, message.topic, stamp_ns, message.log_ns, self.notes)
 
-    def _accumulate(self, samples: list[Image | Scan]) -> list[Image | Scan]:
-        """Join scans without rings, which are sparse, to scans of the profile's rate; pass others on."""
-        ready: list[Image | Scan] = []
-        for sample in samples:
-            if not isinstance(self._settings, LidarSettings) or self._settings.has_rings:
-                ready.append(sample)
-                continue
-            assert isinstance(sample, Scan)  # as a LiDAR has no images
-            period_ns = 1e9 / self._settings.rate_hz
-            first_ns = self._parts[0].stamp_ns if self._parts else None
-            if first_ns is not None and (sample.stamp_ns or 0) - first_ns >= (1 - _EARLY) * period_ns:
-                ready.append(self._join())
-            self._parts.append(sample)
-        return ready
-
     def _join(self) -> Scan:
         """Put the scans that have accumulated together."""
         parts, self._parts = self._parts, []
@@ -137,20 +135,20 @@ class TopicDecoder:
         if len(parts) == 1:
             return parts[0]
         self.notes.add(f"scans are accumulated to {getattr(self._settings, 'rate_hz', 0):g} per second")
-        since_ns = [(part.stamp_ns or 0) - first_ns for part in parts]
-        offsets = [part.offset_ns for part in parts]
+        offsets_ns = [
+            np.zeros(len(part.points), np.int64)
+            + (part.stamp_ns or 0)
+            - first_ns
+            + (0 if part.offset_ns is None else part.offset_ns)
+            for part in parts
+        ]
         return Scan(
             parts[0].sensor,
             parts[0].stamp_ns,
             np.concatenate([part.points for part in parts]),
             np.concatenate([part.intensity for part in parts]),
             np.concatenate([part.ring for part in parts]),
-            np.concatenate(
-                [
-                    np.full(len(part.points), since, dtype=np.int64) if offset is None else offset + since
-                    for part, offset, since in zip(parts, offsets, since_ns, strict=True)
-                ]
-            ),
+            np.concatenate(offsets_ns),
             parts[-1].host_ns,
         )
 

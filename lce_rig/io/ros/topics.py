@@ -106,12 +106,18 @@ def choose_topics(
             raise SourceError(f"{path}: {topic} for {target} is {msgtype}, not {types}", there)
         else:
             notes.append(f"{path.name}: {topic} is {msgtype} and is not read")
+
+    def only(types: frozenset[str]) -> str:
+        fitting = [
+            each for each, (msgtype, n) in topics.items() if msgtype in types and n > 0 and each not in chosen
+        ]
+        return fitting[0] if len(fitting) == 1 else ""
+
     # The only topic of its kind is taken where the profile names none.
     for target, profile_topic in targets.items():
-        fitting = [topic for topic in _fitting(topics, EVENT_TYPES) if topic not in chosen]
-        is_open = target.has_events and profile_topic is None and target not in chosen.values()
-        if is_open and len(fitting) == 1:
-            take(target, fitting[0], ", the only topic with events")
+        topic = only(EVENT_TYPES)
+        if topic and target.has_events and profile_topic is None and target not in chosen.values():
+            take(target, topic, ", the only topic with events")
     failures = []
     for is_lidar, what in enumerate(("images", "point clouds")):
         of_kind = [target for target in targets if (target.channel is None) == is_lidar]
@@ -119,9 +125,9 @@ def choose_topics(
             continue
         target, profile_topic = of_kind[0], targets[of_kind[0]]
         # Packets are read where a driver's point clouds of them were not recorded.
-        fitting = _fitting(topics, target.types & CLOUD_TYPES) or _fitting(topics, target.types)
-        if profile_topic is None and len(fitting) == 1:
-            take(target, fitting[0], f", the only topic with {what}")
+        topic = only(target.types & CLOUD_TYPES) or only(target.types)
+        if profile_topic is None and topic:
+            take(target, topic, f", the only topic with {what}")
             continue
         fault = f"no topic {profile_topic}" if profile_topic else f"no single topic with {what}"
         hint = f"{there}. Say which with --topic {target}=TOPIC, or set topic in the profile."
@@ -152,10 +158,6 @@ def _list_targets(rig: Rig, options: SourceOptions) -> tuple[dict[Target, str | 
         sensors = ", ".join(sorted(by_name))
         raise SourceError(f"rig {rig.name!r} has no sensor {unknown[0]!r}; it has {sensors}")
     return targets, {by_name[name]: topic for name, topic in options.topics.items()}
-
-
-def _fitting(topics: Topics, types: frozenset[str]) -> list[str]:
-    return sorted(topic for topic, (msgtype, n) in topics.items() if msgtype in types and n > 0)
 
 
 @dataclass(frozen=True)
