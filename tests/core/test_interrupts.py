@@ -44,7 +44,6 @@ def running(busy):
     words = [sys.executable, "-c", PROGRAM.format(busy=busy)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
             time.sleep(0.05)
             yield process

@@ -11,7 +11,6 @@ import pytest
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import ProfileError
-from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, pose, rotation_angle, transform
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.image.search import find_image_board
@@ -36,7 +35,6 @@ def found(pixels, board, camera):
 
 def refused(pixels, board, camera):
     result = find_image_board(picture(pixels), board, camera)
-    assert isinstance(result, Refusal)
     assert result.stage == "image"
     return result
 
@@ -191,7 +189,6 @@ def test_dark_bright_empty_and_blurred_pictures_are_refused_with_their_figures()
 def test_an_empty_event_picture_asks_for_motion():
     grey = np.clip(140 + np.random.default_rng(0).normal(0, 3, (260, 346)), 0, 255).astype(np.uint8)
     result = find_image_board(picture(grey, "events"), ASYMMETRIC, DAVIS, is_from_events=True)
-    assert isinstance(result, Refusal)
     assert (result.code, result.action) == ("image.flat", "events")
 
 

@@ -189,7 +189,6 @@ def sender(n_batches):
     command = [sys.executable, "-c", SENDER, str(port), str(n_batches)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         try:
-            assert process.stdout is not None
             assert process.stdout.readline() == b"ready\n"
             yield process, port
         finally:

@@ -85,7 +85,6 @@ def test_ctrl_c_at_a_terminal_ends_all_processes_with_one_line(fleet_root, tmp_p
         f"--registry={tmp_path / 'r'}",
     ]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True) as ran:
-        assert ran.stderr is not None
         while "dashboard" not in ran.stderr.readline():
             assert ran.poll() is None
         os.killpg(ran.pid, signal.SIGINT)  # a terminal's Ctrl-C reaches the workers, too

@@ -5,7 +5,6 @@ import numpy as np
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.io import open_recording
 from lce_rig.io.events import open_events
-from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import BagRecorder
 
 T0_NS = 1_700_000_000_123_456_789
@@ -58,7 +57,6 @@ def record(path, rig, samples):
 
 def read(path, rig, options=None):
     recording = open_recording(path, rig, options)
-    assert isinstance(recording, ContinuousRecording)
     samples = list(recording.samples())
     return [s for s in samples if isinstance(s, Image)], [s for s in samples if isinstance(s, Scan)]
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from lce_rig.core.errors import SourceError
 from lce_rig.core.files import encode_pcd
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.folder import FolderRecording, pair_names, parse_times
+from lce_rig.io.folder import pair_names, parse_times
 from lce_rig.rig import load_rig
 from tests.notes import has_note
 
@@ -39,7 +39,6 @@ def make_folder(tmp_path, room):
 )
 def test_folders_are_found_by_name_or_by_what_they_hold(make_folder, rig, room, names):
     recording = open_recording(make_folder(names=names), rig)
-    assert isinstance(recording, FolderRecording)
     (note,) = recording.notes
     assert has_note([note], "2 pairs", "equal file") and "partner" not in note
     assert recording.pairs[1].label == "00001.png + 00001.pcd"

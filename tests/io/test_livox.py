@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from lce_rig.core.data import NO_RING, Scan
 from lce_rig.io import open_recording
 from lce_rig.io.cloud import to_scan
-from lce_rig.io.protocol import ContinuousRecording, SourceOptions
+from lce_rig.io.protocol import SourceOptions
 from lce_rig.rig import load_rig
 from tests.shared import changed
 
@@ -58,7 +58,6 @@ def write_custom(path, package, n, is_ros1):
 
 def scans_of(path, rig):
     recording = open_recording(path, rig, SourceOptions(is_part=True))
-    assert isinstance(recording, ContinuousRecording)
     return [sample for sample in recording.samples() if isinstance(sample, Scan)]
 
 
@@ -76,7 +75,6 @@ def test_messages_of_both_drivers_are_read_without_noise_and_accumulated(tmp_pat
     first = scans[0]
     assert set(first.ring) == {NO_RING} and set(first.intensity) == {40.0}
     np.testing.assert_allclose(np.unique(first.points[:, 0]), 3.0 + np.arange(10))
-    assert first.offset_ns is not None
     assert first.offset_ns.min() == 0 and first.offset_ns.max() == pytest.approx(10**9, rel=1e-3)
     assert len(scans_of(path, of_model("Avia", lidars__lidar__rate_hz=10.0))) == 25
 

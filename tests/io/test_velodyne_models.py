@@ -78,7 +78,6 @@ def test_scans_have_the_models_rings_and_times(product):
     assert seen == pytest.approx(sheet.rings_rad, abs=0.006)
     n_per_ring = np.bincount(scan.ring)
     assert n_per_ring == pytest.approx(2 * np.pi / sheet.step_rad(RATE_HZ), abs=2)
-    assert scan.offset_ns is not None
     assert 0 <= scan.offset_ns.min() < 60_000 and scan.offset_ns.max() == pytest.approx(0.1e9, abs=200_000)
 
 
@@ -97,7 +96,6 @@ def test_packets_in_bags_become_the_scans_that_they_are_in_a_pcap(tmp_path, rig,
     pushed = [stream.push_data(payload, t) for payload, t in zip(payloads, arrivals_ns, strict=True)]
     bag = write_packets(tmp_path / name, payloads, arrivals_ns)
     recording = open_recording(bag, rig, SourceOptions(topics={"lidar": "/velodyne_packets"}, is_part=True))
-    assert isinstance(recording, BagRecording)
     scans = list(recording.samples())
     wanted = [scan for scan in pushed if scan is not None]
     assert len(scans) == len(wanted) == 2
@@ -121,7 +119,6 @@ def test_a_bag_of_another_models_packets_is_refused_with_its_name(tmp_path, rig)
 def test_a_recorded_hdl32e_is_read(recordings):
     path = recordings / "vlp16_packets" / "mrpt" / "sample_velodyne_hdl32.pcap"
     recording = open_recording(path, load_rig("hdl32e"), SourceOptions(is_part=True))
-    assert isinstance(recording, PcapRecording)
     (scan,) = recording.samples()
     elevation = np.degrees(np.arctan2(scan.points[:, 2], np.hypot(scan.points[:, 0], scan.points[:, 1])))
     top = np.median(elevation[scan.ring == 31])

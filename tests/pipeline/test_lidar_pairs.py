@@ -153,7 +153,6 @@ def test_boards_that_one_lidar_does_not_see_whole_are_named_with_their_cause():
     scans["right"] |= dict.fromkeys(list(scans["right"])[:5], cut)
     with pytest.raises(NotEnoughDataError) as caught:
         calibrate(rig, scans)
-    assert caught.value.finding is not None
     assert caught.value.finding.code == "shortage.few_detected"
 
 

@@ -43,7 +43,6 @@ def test_shipped_profiles_carry_the_published_numbers():
 
 def test_nominal_pose_puts_the_lidars_forward_axis_before_the_camera():
     entry = load_rig("rles").nominal("davis", "lidar")
-    assert entry is not None
     np.testing.assert_allclose(entry.to_matrix()[:3, :3], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(entry.to_matrix()[:3, 3], [0.126, -0.065, -0.080])
 
@@ -139,7 +138,6 @@ def test_every_way_to_write_a_nominal_rotation_gives_the_same_pose(phi):
     head, tail = RLFS.split("quaternion_wxyz: [0.664, 0.664, -0.242, 0.242]")
     for text in (f"quaternion_wxyz: {wxyz}", f"matrix: {rows(rotation.as_matrix())}"):
         entry = parse_rig(head + text + tail).nominal("cam", "lidar")
-        assert entry is not None
         np.testing.assert_allclose(entry.to_matrix()[:3, :3], exp_so3(np.array(phi)), atol=1e-9)
 
 

@@ -69,7 +69,6 @@ class WireRig:
         self._sensor = subprocess.Popen(
             command + ports, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
         )
-        assert self._sensor.stdout is not None
         assert self._sensor.stdout.readline() == "ready\n"
         return self
 
@@ -85,14 +84,12 @@ class WireRig:
 
     def tell(self, order):
         """Tell the VLP-16 something; see send_packets.py."""
-        assert self._sensor.stdin is not None
         self._sensor.stdin.write(order + "\n")
         self._sensor.stdin.flush()
 
     def stop(self):
         """Let the VLP-16 fall silent for good, and give the numbers of packets `sent` and `withheld`."""
         self.tell("stop")
-        assert self._sensor.stdout is not None
         self.sent = json.loads(self._sensor.stdout.readline())
         return self.sent
 

@@ -213,7 +213,6 @@ def met(tmp_path):
     with Session.create(tmp_path / "met", profile) as session:
         for k in range(12):
             guide.plan(None, float(k))
-            assert guide.wanted is not None
             meta = {"T_cam_board": {"davis.frames": guide.wanted.tolist()}}
             guide.add(str(k), guide.wanted)
             session.add_capture(placements()[0].images, placements()[0].scans, meta)

@@ -106,7 +106,6 @@ def test_without_a_nominal_extrinsic_guidance_begins_with_the_first_calibration(
     assert blind.wanted is None
     assert blind.coverage() is None and blind.adds_nothing(np.eye(4)) is None
     nominal = rig().nominal("davis", "lidar")
-    assert nominal is not None
     planner = blind.prepare(nominal.to_matrix(), 0.004, 0.006, 6)
     assert planner is not None
     blind.adopt(planner)
