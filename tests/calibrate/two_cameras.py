@@ -18,16 +18,7 @@ Session = dict[str, list[Observation]]
 
 
 def simulate_two(n, seed, scenario=REAL, *, right_corner_sigma_px=None, nudge=None, nudged_from=0):
-    """Simulate n captures in which both cameras and the LiDAR see the board.
-
-    Args:
-        n: captures.
-        seed: of everything random.
-        scenario: noise, beam, and how the board is held.
-        right_corner_sigma_px: noise of the right camera's corners, where it differs.
-        nudge: (6,) tangent by which the right camera is moved.
-        nudged_from: capture from which on it is.
-    """
+    """Simulate n captures in which both cameras and the LiDAR see the board."""
     captures = _captures(seed, scenario, right_corner_sigma_px, nudge, nudged_from)
     pairs = [next(captures) for _ in range(n)]
     return {LEFT: [left for left, _ in pairs], RIGHT: [right for _, right in pairs]}

@@ -42,14 +42,7 @@ def value(name, dims):
 
 
 def write_network(path, inputs, outputs, *, drops_rows=False):
-    """Write a graph of opset 17: the first output is the mean over bins, the others copy inputs.
-
-    Args:
-        path: of the file.
-        inputs: names and shapes.
-        outputs: shapes.
-        drops_rows: whether the second output is the mean over the rows of its input.
-    """
+    """Write a graph of opset 17: the first output is the mean over bins, the others copy inputs."""
 
     def mean(name, output, axis):
         return node("ReduceMean", [name], [output], integers("axes", [axis]) + integer("keepdims", 1))

@@ -61,16 +61,7 @@ class Vlp16Sender(threading.Thread):
 
 @dataclass(frozen=True, eq=False)
 class Attached:
-    """What is attached, and how it does.
-
-    Attributes:
-        rig: a profile with LiDAR "lidar" and camera "cam"; where they are is filled in.
-        pixels: the picture that the camera sends again and again; None for no camera.
-        scan: what the LiDAR sends; None for no LiDAR.
-        clock: of the LiDAR.
-        has_board: whether there is a sync board; the profile has one at all events.
-        pages: of the LiDAR's web server in place of the usual, by name.
-    """
+    """What is attached, and how it does."""
 
     rig: Rig
     pixels: NDArray[np.uint8] | None = None

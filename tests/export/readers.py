@@ -33,13 +33,7 @@ Lens = tuple[str, Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What was exported, and what readers may know beside the files: names, no figures of the result.
-
-    Attributes:
-        folder: of the export.
-        points_lidar: (N, 3) m to be drawn.
-        lens: of the profile, for files without one.
-    """
+    """What was exported, and what readers may know beside the files: names, no figures of the result."""
 
     folder: Path
     rig: Rig
@@ -347,14 +341,7 @@ def session_image(rig, camera):
 
 
 def outputs_case(rig_name, folder, *, model="radtan", seed=0):
-    """Export all formats of a random result.
-
-    Args:
-        rig_name: a shipped profile, mounted on a base_link.
-        folder: to write into.
-        model: the kind of lens, of `MODELS`.
-        seed: of the pose.
-    """
+    """Export all formats of a random result."""
     rig = load_rig(rig_name)
     (camera,), (lidar,) = rig.cameras, rig.lidars
     mount = Mount(parent="base_link", of=rig.lidars[lidar].frame, xyz_m=(0.2, -0.1, 0.9), rpy_deg=(1, 2, 30))

@@ -20,11 +20,7 @@ def doctor(rig, folder, web_port, duration_s=2.0):
 
 
 def doctor_until_scanned(rig, folder, web_port, duration_s=2.0):
-    """Examine a rig whose LiDAR is there; longer where a computer that is busy with others sends too late.
-
-    Returns:
-        The lines, how long the sensors were watched for, and how long that took.
-    """
+    """Examine a rig whose LiDAR is there; longer where a computer that is busy with others sends too late."""
     for watch_s in (duration_s, 3 * duration_s, 9 * duration_s):
         start_s = time.monotonic()
         lines = doctor(rig, folder, web_port, watch_s)

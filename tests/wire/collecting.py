@@ -12,21 +12,10 @@ _MAIN = "from lce_rig.cli.main import main; main()"
 
 
 class Collecting:
-    """A running `lce-rig collect --plain`; it is killed where the `with` block ends before it does.
-
-    Attributes:
-        session: the folder it fills.
-    """
+    """A running `lce-rig collect --plain`; it is killed where the `with` block ends before it does."""
 
     def __init__(self, profile, session, *options, prelude=""):
-        """Prepare.
-
-        Args:
-            profile: of the rig.
-            session: new or not.
-            options: of the command line.
-            prelude: Python that its process runs first, to make its computer worse.
-        """
+        """Prepare."""
         self.session = session
         self._log = session.with_name(f"{session.name}.{time.monotonic_ns()}.log")
         words = ["collect", "--rig", str(profile), str(session), "--plain", *options]
@@ -60,19 +49,11 @@ class Collecting:
         return len(Session.open(self.session).captures) if marker.exists() else 0
 
     def wait_for(self, text, within_s=60.0, times=1):
-        """Wait until it has said something so often.
-
-        Raises:
-            AssertionError: it has ended, or did not in time.
-        """
+        """Wait until it has said something so often."""
         self._wait(lambda: self.said.count(text) >= times, f"{text!r} was not said", within_s)
 
     def wait_for_captures(self, n, within_s=60.0):
-        """Wait until the session holds so many.
-
-        Raises:
-            AssertionError: it has ended, or did not in time.
-        """
+        """Wait until the session holds so many."""
         self._wait(lambda: self.n_captures >= n, f"there are not {n} captures", within_s)
 
     def wait(self, within_s=60.0):

@@ -22,14 +22,7 @@ class RandomDavis:
     """
 
     def __init__(self, reel, camera, loops_per_hold, *, has_frames):
-        """Prepare.
-
-        Args:
-            reel: whose pictures are shown.
-            camera: in the reel.
-            loops_per_hold: how many times 0.3 s the board stands at each place.
-            has_frames: whether it takes pictures at all.
-        """
+        """Prepare."""
         import dv_processing
 
         self._has_frames, self._loops = has_frames, loops_per_hold

@@ -25,14 +25,7 @@ _CUT = velodyne.AZIMUTH_STEPS / 2 + 20
 
 @dataclass(frozen=True)
 class Reel:
-    """A folder with packets.bin, CAMERA.bin for each camera, and reel.json with these figures.
-
-    Attributes:
-        folder: where they are.
-        n_placements: of the board.
-        n_pictures: of each placement and camera, alike but for their noise.
-        picture_bytes: of each picture as it is sent, by camera.
-    """
+    """A folder with packets.bin, CAMERA.bin for each camera, and reel.json with these figures."""
 
     folder: str
     n_placements: int
@@ -59,14 +52,7 @@ class Reel:
 
 
 def make_reel(folder, rig, n_placements, seed=0):
-    """Simulate a reel.
-
-    Args:
-        folder: a new one.
-        rig: with one VLP-16; cameras with frames send UYVY where their driver names it, else GREY.
-        n_placements: places of the board that all sensors find it at.
-        seed: of truth, room, placements and noise.
-    """
+    """Simulate a reel."""
     folder.mkdir(parents=True)
     scene = LiveScene(rig, seed, replace(SimulationOptions.for_rig(rig.name), carrier="person"))
     scene.stage = replace(scene.stage, models=dict.fromkeys(rig.lidars, STREAMED_VLP16))

@@ -15,11 +15,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{_TESTS}:{_TESTS.parent}", "OMP_NUM
 
 
 def small_rig(*, is_guided=True):
-    """Build a rig of a VLP-16 and the camera `cam` of 346x260 px.
-
-    Args:
-        is_guided: whether captures that add nothing are refused; else every board that stands still counts.
-    """
+    """Build a rig of a VLP-16 and the camera `cam` of 346x260 px."""
     rles = load_rig("rles")
     davis = rles.cameras["davis"]
     cam = davis.model_copy(update={"model": "wire", "channels": {"frames": davis.channels["frames"]}})
@@ -36,24 +32,10 @@ def small_rig(*, is_guided=True):
 
 
 class WireRig:
-    """A rig whose VLP-16 sends while the `with` block lasts; its cameras send when they are read.
-
-    Attributes:
-        rig: the profile, with the ports and commands by which its sensors are reached.
-        profile: its file.
-        sent: data packets, after `stop`.
-    """
+    """A rig whose VLP-16 sends while the `with` block lasts; its cameras send when they are read."""
 
     def __init__(self, folder, rig, reel, loops_per_hold, **camera):
-        """Prepare.
-
-        Args:
-            folder: for its files.
-            rig: as a reel was made of it.
-            reel: what is shown.
-            loops_per_hold: how many times 0.3 s the board stands at each place.
-            **camera: further options of send_pictures.py.
-        """
+        """Prepare."""
         self._folder, self._reel, self._loops = folder, reel, loops_per_hold
         self._ports = free_ports()
         self._camera = {"rate": 30, "unplug": folder / "unplugged", **camera}

@@ -28,11 +28,7 @@ _US_AT, _POSITION_US_AT, _PPS_AT, _NMEA_AT = 1200, 0xC6, 0xCA, 0xCE
 
 
 class Sensor:
-    """A VLP-16 that shows a reel.
-
-    Attributes:
-        n_sent, n_withheld: data packets.
-    """
+    """A VLP-16 that shows a reel."""
 
     def __init__(self, reel, loops_per_hold, data_port, position_port):
         figures = json.loads((reel / "reel.json").read_text())

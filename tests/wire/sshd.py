@@ -18,19 +18,10 @@ class NoServerError(Exception):
 
 
 class Sshd:
-    """A server on 127.0.0.1 that lets this user in by a key; a context manager.
-
-    Attributes:
-        options: of ssh_config, by which it is reached.
-        to: [user@]host.
-    """
+    """A server on 127.0.0.1 that lets this user in by a key; a context manager."""
 
     def __init__(self, folder):
-        """Make keys and start it.
-
-        Raises:
-            NoServerError: there is none, or it does not start.
-        """
+        """Make keys and start it."""
         if SSHD is None or shutil.which("ssh-keygen") is None:
             raise NoServerError("sshd or ssh-keygen is not installed")
         folder.mkdir(parents=True, exist_ok=True)

@@ -14,13 +14,7 @@ HELLO = "LCEHI,1,1.0,fake,1000000"
 
 
 class FakeBoard:
-    """Talks like a sync board while its block lasts.
-
-    Attributes:
-        path: the port that the host opens.
-        commands: what the host has said, sentence by sentence or line by line.
-        n_sent: pulses sent on channel 0.
-    """
+    """Talks like a sync board while its block lasts."""
 
     def __init__(
         self,

@@ -23,13 +23,7 @@ _NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True)
 class SensorPacket:
-    """One UDP packet of the sensor.
-
-    Attributes:
-        port: it is sent to: data or position packets.
-        sent_ns: when it leaves the sensor, true time: after its last firing.
-        payload: what it carries.
-    """
+    """One UDP packet of the sensor."""
 
     port: int
     sent_ns: int
@@ -38,15 +32,7 @@ class SensorPacket:
 
 @dataclass(frozen=True)
 class Vlp16Clock:
-    """The sensor's clock.
-
-    Attributes:
-        pps: one of PPS_STATES.
-        has_nmea: whether sentences arrive.
-        is_valid: whether the sentences say so (status A; V otherwise).
-        error_us: by how much the sensor's counter is ahead of true time past the hour; a sensor without
-            pulses counts from when it was switched on.
-    """
+    """The sensor's clock."""
 
     pps: str = "locked"
     has_nmea: bool = True
@@ -58,11 +44,7 @@ class Vlp16Packets:
     """Cuts scans into packets; an incomplete packet waits for the next scan.
 
     Scans simulated with STREAMED_VLP16 and timestamped one period apart come out as they went in, within the
-    steps of range and azimuth, if they begin at one azimuth, as those of a rotor do.
-
-    Attributes:
-        clock: how the sensor's clock is kept; may be replaced between scans.
-    """
+    steps of range and azimuth, if they begin at one azimuth, as those of a rotor do."""
 
     def __init__(self, mode=velodyne.STRONGEST, clock=None, model=STREAMED_VLP16):
         self.clock = clock or Vlp16Clock()
@@ -76,12 +58,7 @@ class Vlp16Packets:
     def feed(self, scan, last=None):
         """Send a scan; returns the packets that are full.
 
-        A scan that does not follow the one before at once begins a new packet, as after a break.
-
-        Args:
-            scan: the strongest returns, on the model's grid of firings (as `simulate_scan` makes them).
-            last: the last returns of the same revolution, in dual mode; None for the same.
-        """
+        A scan that does not follow the one before at once begins a new packet, as after a break."""
         packets = self.finish() if scan.stamp_ns != self._next_ns else []
         blocks, starts_ns = self._to_blocks(scan, last or scan)
         self._next_ns = int(scan.stamp_ns or 0) + self._model.period_ns

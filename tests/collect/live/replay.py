@@ -28,12 +28,7 @@ def placements(n=4, seed=5):
 
 
 class Show:
-    """Shows captures to two sources, each for a while, stamped as if they were taken now.
-
-    Attributes:
-        sources: of the camera and the LiDAR.
-        stamps: of the scans that were sent, by placement.
-    """
+    """Shows captures to two sources, each for a while, stamped as if they were taken now."""
 
     def __init__(self, captures, each_s):
         self.sources = [SimulatedSource("davis"), SimulatedSource("lidar")]

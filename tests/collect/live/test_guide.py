@@ -151,13 +151,7 @@ _TRY_S = 7.0
 
 @dataclass
 class Followed:
-    """How a person followed a guide.
-
-    Attributes:
-        captured: (4, 4) each.
-        proposed: (4, 4) each, with what was held when it was.
-        simulated_s: how long it took them.
-    """
+    """How a person followed a guide."""
 
     captured: list[Array] = field(default_factory=list)
     proposed: list[tuple[Array, int]] = field(default_factory=list)
@@ -165,14 +159,7 @@ class Followed:
 
 
 def follow_guide(rig, n_wanted, person=None, can_be_held=lambda _T_cam_board: True):
-    """Follow a rig's first guide until there are as many captures as wanted, or none for ten minutes.
-
-    Args:
-        rig: the profile.
-        n_wanted: captures.
-        person: who follows.
-        can_be_held: tells where nothing is in the way of T_cam_board (4, 4).
-    """
+    """Follow a rig's first guide until there are as many captures as wanted, or none for ten minutes."""
     guide = make_guides(rig)[0]
     view = SensorPlace.nominal(rig, guide.key[0], guide.lidar)
     person, rng, walk = person or Person(), np.random.default_rng(0), Followed()

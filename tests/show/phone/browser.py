@@ -128,12 +128,7 @@ class Line:
 
 
 class Page(Line):
-    """One open page.
-
-    Attributes:
-        complaints: errors that it raised or the browser logged about it.
-        requested: addresses of everything that it loaded.
-    """
+    """One open page."""
 
     def __init__(self, loop, socket):
         super().__init__(loop, socket)

@@ -29,11 +29,7 @@ class Watcher:
         return self._run(ask())
 
     def watch(self, query="", headers=None):
-        """Open the connection that feeds the page.
-
-        Raises:
-            aiohttp.WSServerHandshakeError: it is refused.
-        """
+        """Open the connection that feeds the page."""
         self.socket = self._run(
             self._http.ws_connect(f"{self.url}live{query}", headers=headers, max_msg_size=0)
         )
