@@ -46,10 +46,10 @@ def collect(lce_rig, folder, session, *names):
             ["lidar.bag", "late.aedat4"],
             ["s apart", "cameras.davis.channels.events.timestamps.expected_offset_s"],
         ),
-        (["lidar.bag", "other.aedat4"], ["of a sensor of 640x480 pixels, camera 'davis' has 346x260"]),
-        (["lidar.bag", "none.aedat4"], ["none.aedat4 holds no events"]),
-        (["davis.aedat4"], ["no scans of a LiDAR", "--from lidar.bag --from events.aedat4"]),
-        (["lidar.bag"], ["no topic /davis/image_raw for davis.frames"]),
+        (["lidar.bag", "other.aedat4"], ["640x480", "346x260"]),
+        (["lidar.bag", "none.aedat4"], ["none.aedat4"]),
+        (["davis.aedat4"], ["--from lidar.bag --from events.aedat4"]),
+        (["lidar.bag"], ["/davis/image_raw", "davis.frames"]),
     ],
 )
 def test_what_cannot_be_used_is_said_with_what_to_do(lce_rig, folder, tmp_path, names, said):

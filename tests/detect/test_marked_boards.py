@@ -109,6 +109,7 @@ def test_tags_with_a_border_of_one_module_are_read():
     np.testing.assert_allclose(result.corners_px[0], [69.5, 39.5], atol=0.1)
 
 
+@pytest.mark.long
 def test_other_markers_than_the_profiles_are_named_with_what_to_correct():
     pixels, grid = draw(CHARUCO, WIDE, NEAR), draw(APRILGRID, WIDE, NEAR)
     assert code(pixels, replace(CHARUCO, dictionary="6X6_100")) == "image.other_dictionary"

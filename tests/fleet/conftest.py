@@ -16,7 +16,7 @@ from lce_rig.session import Session
 from lce_rig.simulate import simulate_captures
 from tests.export.conftest import calibration, some_pose
 from tests.saved_results import result_file
-from tests.shared import half_size
+from tests.shared import half_size, make_once
 
 ORIGIN = Provenance("kestrel", {"lidar": "AG1", "davis": "499"}, "2026-11-20T10:22:03Z", "0f" * 32)
 
@@ -52,13 +52,15 @@ def small_rig():
 
 
 @pytest.fixture(scope="session")
-def simulated(small_rig, tmp_path_factory):
+def simulated(small_rig):
     """Simulate a session of eight captures."""
-    path = tmp_path_factory.mktemp("simulated") / "session"
-    with Session.create(path, small_rig) as session:
-        for capture in simulate_captures(small_rig, n_captures=8, seed=3):
-            session.add_capture(capture.images, capture.scans, {"source": "simulated"})
-    return path
+
+    def make(path):
+        with Session.create(path, small_rig) as session:
+            for capture in simulate_captures(small_rig, n_captures=8, seed=3):
+                session.add_capture(capture.images, capture.scans, {"source": "simulated"})
+
+    return make_once("fleet_session", make)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from lce_rig.scene.views import build_view
 from lce_rig.session import Session
 from lce_rig.simulate import SimulatedCapture, simulate_captures, truth_extrinsics
 from tests.saved_results import made_calibration, write_result
-from tests.shared import half_size
+from tests.shared import compute_once, half_size
 
 COV = np.diag([0.003] * 3 + [0.0015] * 3) ** 2
 SEED = 2
@@ -37,14 +37,17 @@ def deployed(T_cam_lidar):
     return made_calibration(T_cam_lidar, COV, n_captures=4, n_detected=4)
 
 
+def simulate_seen(rig, n_captures, seed):
+    captures = list(simulate_captures(rig, n_captures=n_captures, seed=seed))
+    truth = deployed(truth_extrinsics(rig, seed)["cam", "lidar"])
+    views = [build_view(rig, truth, str(c.index), c.images[0], c.scans[0]) for c in captures]
+    return Seen(rig, captures, truth, views)
+
+
 @pytest.fixture(scope="session")
 def seen():
     """Simulate the captures once."""
-    rig = small_rig()
-    captures = list(simulate_captures(rig, n_captures=4, seed=SEED))
-    truth = deployed(truth_extrinsics(rig, SEED)["cam", "lidar"])
-    views = [build_view(rig, truth, str(c.index), c.images[0], c.scans[0]) for c in captures]
-    return Seen(rig, captures, truth, views)
+    return compute_once("scene", lambda: simulate_seen(small_rig(), 4, SEED))
 
 
 @pytest.fixture(scope="session")

@@ -17,9 +17,9 @@ from lce_rig.scene.alignment import AXES
 from lce_rig.scene.drift import watch
 from lce_rig.scene.views import build_view
 from lce_rig.session import Session
-from lce_rig.simulate import simulate_captures, truth_extrinsics
 from tests.saved_results import made_calibration, result_file, write_result
-from tests.scene.conftest import Seen, deployed, small_rig
+from tests.scene.conftest import Seen, simulate_seen, small_rig
+from tests.shared import compute_once
 
 SEED = 3
 
@@ -27,11 +27,7 @@ SEED = 3
 @pytest.fixture(scope="module")
 def seen():
     """Three captures of a Mid-360 in a room."""
-    rig = small_rig("mid360")
-    captures = list(simulate_captures(rig, n_captures=3, seed=SEED))
-    truth = deployed(truth_extrinsics(rig, SEED)["cam", "lidar"])
-    views = [build_view(rig, truth, str(c.index), c.images[0], c.scans[0]) for c in captures]
-    return Seen(rig, captures, truth, views)
+    return compute_once("scene_without_rings", lambda: simulate_seen(small_rig("mid360"), 3, SEED))
 
 
 def judge(seen, tangent=(0.0,) * 6):
@@ -58,6 +54,7 @@ def test_1_deg_or_10_cm_is_never_called_unchanged(seen, axis, sign):
         assert axis in (change.axis, *change.instead)
 
 
+@pytest.mark.long
 def test_drift_and_calibrate_hear_the_scene_beside_the_boards(seen, tmp_path, capsys):
     with Session.create(tmp_path / "room", seen.rig) as session:
         for capture in seen.captures:

@@ -8,6 +8,7 @@ import pytest
 from lce_rig.core.errors import LceRigError, ProfileError
 from lce_rig.core.geometry import invert, rotation_angle, transform
 from lce_rig.simulate import simulate_captures, truth_extrinsics
+from tests.shared import compute_once
 
 from .conftest import make_rig
 
@@ -21,7 +22,7 @@ def rig():
 
 @pytest.fixture(scope="module")
 def captures(rig):
-    return list(simulate_captures(rig, n_captures=N_CAPTURES, seed=11))
+    return compute_once("captures", lambda: list(simulate_captures(rig, n_captures=N_CAPTURES, seed=11)))
 
 
 def corners_px(rig, camera, capture):

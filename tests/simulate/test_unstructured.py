@@ -20,7 +20,7 @@ def of_model(model):
     return changed(load_rig("mid360"), lidars__lidar__model=model)
 
 
-@pytest.mark.parametrize("model", ["Mid-360", "Avia"])
+@pytest.mark.parametrize("model", ["Mid-360", pytest.param("Avia", marks=pytest.mark.long)])
 def test_beams_fill_the_field_of_view_and_the_board_is_found_where_it_is(model):
     rig = of_model(model)
     sheet = rig.lidars["lidar"].data_sheet()

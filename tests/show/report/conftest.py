@@ -15,6 +15,7 @@ from lce_rig.show.report.calibration_page import report_page
 from tests.calibrate.boards import simulate
 from tests.calibrate.two_cameras import simulate_two
 from tests.saved_results import result_file
+from tests.shared import compute_once
 
 RLFS = load_rig("rlfs")
 TWO = load_rig(str(Path(__file__).parents[2] / "rigs" / "two_cameras.yaml"))
@@ -41,6 +42,16 @@ def page(tmp_path_factory):
 @pytest.fixture(scope="session")
 def one():
     """One camera."""
+    return compute_once("report_one", _calibrate_one)
+
+
+@pytest.fixture(scope="session")
+def two():
+    """Two cameras that saw the same boards, estimated together."""
+    return compute_once("report_two", _calibrate_two)
+
+
+def _calibrate_one():
     captures = simulate(12, 3)
     images = {item.capture: item.image for item in captures}
     scans = {item.capture: list(item.places) for item in captures}
@@ -49,9 +60,7 @@ def one():
     return calibration
 
 
-@pytest.fixture(scope="session")
-def two():
-    """Two cameras that saw the same boards, estimated together."""
+def _calibrate_two():
     session = simulate_two(12, 0)
     images = {(name, "frames"): {c.capture: c.image for c in own} for name, own in session.items()}
     seen = Detections(images, {"lidar": {c.capture: list(c.places) for c in next(iter(session.values()))}})
