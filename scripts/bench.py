@@ -38,6 +38,10 @@ PARTS: dict[str, tuple[str, Part]] = {
         "the joint estimate: errors against their bound, coverage of its claim",
         lambda bench, a: bench(a.seeds or 100, a.output, a.only, a.captures or 30),
     ),
+    "wrong_profiles": (
+        "profiles with a wrong focal length, principal point or squares",
+        lambda bench, a: bench(a.seeds or 6, a.output, a.captures or 16),
+    ),
     "live": ("live collection under load, over real transports", lambda bench, a: bench(a.seconds or 60.0)),
     "offline": ("a bag of VLP-16 and 1280x720 at 30 Hz", lambda bench, a: bench(a.seconds or 15.0)),
     "scene": (

@@ -65,6 +65,31 @@ def with_profile_errors(
     return profile, found, lens
 
 
+def draw_session(
+    rig: Rig, profile: Rig, session: StillSession, seed: int, sigma_px: float
+) -> tuple[Detections, Intrinsics]:
+    """Draw what the sensors of a rig see, read by another profile of it; also the true lens.
+
+    Args:
+        rig: that was simulated, of one camera and one LiDAR.
+        profile: that reads the corners.
+        session: of the rig.
+        seed: of the noise.
+        sigma_px: noise of each corner's coordinates.
+    """
+    rng = np.random.default_rng([seed, _STREAM])
+    (camera, settings), lidar = next(iter(rig.cameras.items())), next(iter(rig.lidars))
+    lens, corners = settings.to_intrinsics(), rig.board.to_board().corners()
+    drawn = {
+        name: draw_corners(profile, T, sigma_px, rng, lens, corners)
+        for name, T in session.T_cam_board.items()
+    }
+    places = {item.capture: list(item.places) for item in session.candidates}
+    images = {name: image for name, image in drawn.items() if image is not None and name in places}
+    scans = {name: places[name] for name in images}
+    return Detections({(camera, next(iter(settings.channels))): images}, {lidar: scans}), lens
+
+
 def _draw_lens(known: Tolerances, rng: np.random.Generator) -> Intrinsics:
     prior = known.lens
     lens = prior.lens

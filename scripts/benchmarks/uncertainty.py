@@ -179,13 +179,13 @@ def _runs_in_error(
         profile, found, lens = with_profile_errors(rig, session, seed, CORNER_SIGMA_PX)
         options = CalibrateOptions(method=method)
         (calibration,), _ = calibrate_detections(profile, found, options)
-        error = _error_in_use(calibration, session.T_cam_lidar, lens)
+        error = error_in_use(calibration, session.T_cam_lidar, lens)
         point_px = _point_error_px(calibration, session.T_cam_lidar, lens)
         (claimed_px,) = (u.centre_px for u in calibration.uncertainty if u.distance_m == _POINT_M)
         yield JudgedRun(error, calibration.cov, calibration.verdict, point_px, claimed_px)
 
 
-def _error_in_use(calibration: Calibration, T_cam_lidar: Array, lens: Intrinsics) -> Array:
+def error_in_use(calibration: Calibration, T_cam_lidar: Array, lens: Intrinsics) -> Array:
     """Measure the error (6,) of extrinsics used with their intrinsics, whose errors turn them back."""
     assert calibration.intrinsics is not None
     model = model_of(lens)

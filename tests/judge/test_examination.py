@@ -143,8 +143,9 @@ def test_boards_held_near_first_and_far_later_are_told_by_their_places_and_not_a
     assert {finding.code for finding in findings} == {"verdict.shares_differ"}
 
 
-def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest():
-    nudge = perturb(np.eye(4), np.array([0, 0, 0, np.radians(1.0), 0, 0]))
+@pytest.mark.parametrize("angle_deg", [1.0, 0.45])
+def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest(angle_deg):
+    nudge = perturb(np.eye(4), np.array([0, 0, 0, np.radians(angle_deg), 0, 0]))
     away = (1, 4, 5, 9, 13)
     nudged = [
         moved(seen, nudge @ seen.image.T_cam_board) if k in away else seen
@@ -155,7 +156,7 @@ def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest():
     assert finding.code == "verdict.two_groups"
     assert finding.figures["captures"] == tuple(f"{k:06d}" for k in away)
     assert "5 captures (000001, 000004, 000005, 000009, 000013) fit" in finding.text
-    assert finding.figures["rotation_deg"] == pytest.approx(1.0, abs=0.3)
+    assert finding.figures["rotation_deg"] == pytest.approx(angle_deg, abs=0.3)
 
 
 def test_a_change_at_one_capture_is_not_told_as_two_groups_as_well():
