@@ -35,6 +35,7 @@ from lce_rig.fleet.findings import (
 from lce_rig.fleet.place import (
     CHANGED,
     COMMIT,
+    DISCARD,
     RECORD,
     RUN,
     SAYS,
@@ -195,9 +196,14 @@ def deploy(
         if planned.objections:
             forced = sorted({finding.code for finding in planned.objections})
             record = record.model_copy(update={"reason": reason, "forced": forced})
-        # What fails leaves a release that never became current; the next deployment removes it.
-        _write(place, record, Path(folder))
-        _commit(place, target, record, record.replaces, "deploy")
+        try:
+            _write(place, record, Path(folder))
+            _commit(place, target, record, record.replaces, "deploy")
+        except TargetError:
+            # Free the space, and the name; after a lost connection, the next deployment does.
+            with suppress(TargetError):
+                place.must_run(DISCARD, record.name)
+            raise
     output = _run(place, target, record.name)
     return Deployed(record, record.replaces, True, output, planned.state.changed, planned.remarks)
 

@@ -169,6 +169,16 @@ main
 """
 """Make a release current: PATH, RELEASE, EXPECTED current one, KEEP, PENDING, LINE of the log."""
 
+DISCARD = rf"""{_COMMON}
+main() {{
+  enter
+  check
+  if is_release "$2" && [ "$2" != "$c" ] && ! [ -e "releases/$2/{USED}" ]; then rm -rf -- "releases/$2"; fi
+}}
+main "$@"
+"""
+"""Remove a release that has not been current: PATH, RELEASE."""
+
 RUN = rf"""{_COMMON}
 main() {{
   enter

@@ -359,6 +359,6 @@ def test_a_target_whose_shell_is_killed_at_any_step_has_one_whole_set(result, ri
         deploy(folders[0], rig, settings, place=sound)
         assert content_of(robot / "current") == before
         assert {entry.name for entry in robot.glob(".*")} <= {".lock", ".current.new"}, f"step {n}"
-    assert n > 10 and n_new > 2 and n_old > 2
+    assert n > 15 and n_new > 2 and n_old > 2
     deploy(result("c", 0.2), rig, settings, place=sound)
     assert len(list((robot / "releases").glob(f"*/{RECORD}"))) == 2
