@@ -24,7 +24,7 @@ from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.motion.board_motion import sample_poses
 from lce_rig.calibrate.motion.time_offsets import MIN_MOVING, Motion, estimate_motion
-from lce_rig.calibrate.observations import Clocks, group_placements, join_scans
+from lce_rig.calibrate.observations import Clocks, join_scans
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.plane_and_ends import along_normals
 from lce_rig.calibrate.result import CalibrationEstimate
@@ -160,8 +160,7 @@ def estimate_observations(
         return by_scatter(start, board, settings)
     priors, usual = what_is_known(settings)
     joint = maximise_likelihood([start.observations], board, [start.T_cam_lidar], priors, usual)
-    estimate = by_likelihood(start, joint, board, group_placements(start.observations))
-    return with_profile(estimate, joint, board, settings)
+    return with_profile(by_likelihood(start, joint, board), joint, board, settings)
 
 
 def _with_session_lens(

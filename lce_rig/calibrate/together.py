@@ -8,7 +8,7 @@ import numpy as np
 from lce_rig.calibrate.findings import TWO_PLACES
 from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import OF_IMAGES, what_is_known
-from lce_rig.calibrate.observations import group_shared_placements, scan_key
+from lce_rig.calibrate.observations import scan_key
 from lce_rig.calibrate.options import EstimateSettings
 from lce_rig.calibrate.result import CalibrationEstimate, Start
 from lce_rig.calibrate.uncertainty import by_likelihood
@@ -72,14 +72,11 @@ def calibrate_together(
     logs = np.log([[d.noise_tilt_deg, d.noise_spin_deg, d.noise_depth_m, d.noise_across_m] for d in figures])
     ratios = [dict(zip(OF_IMAGES, own, strict=True)) for own in np.exp(logs - logs.mean(axis=0)).tolist()]
     joint = maximise_likelihood(labelled, board, T_start, priors, usual, pose_ratios=ratios)
-    order = {name: k for k, name in enumerate(sorted({o.capture for own in labelled for o in own}))}
-    placement = group_shared_placements(labelled, order)
     J = joint.to_extrinsics.reshape(-1, joint.to_extrinsics.shape[2])
     scales, estimates = [], {}
     for k, (name, start) in enumerate(zip(names, starts, strict=True)):
         own = alone[name]
-        n_seen = len(np.unique(placement[[order[o.capture] for o in labelled[k]]]))
-        estimate = by_likelihood(start, joint, board, placement, k, n_seen)
+        estimate = by_likelihood(start, joint, board, k)
         scales.append(np.full(6, np.sqrt(estimate.diagnostics.covariance_inflation)))
         estimates[name] = replace(
             estimate,

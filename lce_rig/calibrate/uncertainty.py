@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.likelihood.fit import JointEstimate
@@ -52,14 +51,7 @@ def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> C
     )
 
 
-def by_likelihood(
-    start: Start,
-    joint: JointEstimate,
-    board: Board,
-    placement: NDArray[np.intp],
-    camera: int = 0,
-    n_seen: int | None = None,
-) -> CalibrationEstimate:
+def by_likelihood(start: Start, joint: JointEstimate, board: Board, camera: int = 0) -> CalibrationEstimate:
     """Report the joint estimate of a camera, without errors of its lens and the board.
 
     Certificate, outliers and held-out residuals are those of Algorithm 1, from whose solution it starts.
@@ -68,16 +60,14 @@ def by_likelihood(
         start: Algorithm 1's solution.
         joint: of F captures.
         board: its specification.
-        placement: (F,) number of each capture's placement.
         camera: its number.
-        n_seen: number of placements that it saw; all if None.
     """
-    moves = replace(joint.cost, placement=placement).moves() @ joint.to_extrinsics[camera].T
-    n_placements = int(placement.max()) + 1 if n_seen is None else n_seen
+    moves = joint.cost.moves() @ joint.to_extrinsics[camera].T
+    n_placements = len(np.unique(joint.placement[joint.terms.images[camera].capture]))
     cov, inflation = widen(joint.cov[camera], jackknife_scatter(moves), n_placements)
     figures = _add_figures(start.diagnostics, joint, camera, inflation)
     estimate = report(start, joint.T_cam_lidar[camera], cov, board, figures)
-    return replace(estimate, method="ml", lidar=lidar_of(joint), cost=_expand_joint(joint, camera, placement))
+    return replace(estimate, method="ml", lidar=lidar_of(joint), cost=_expand_joint(joint, camera))
 
 
 def with_profile(
@@ -94,7 +84,7 @@ def with_profile(
     return replace(estimate, lens=settings.lens, sensitivities=sensitivities)
 
 
-def _expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]) -> Quadratics:
+def _expand_joint(joint: JointEstimate, camera: int) -> Quadratics:
     """Expand the cost about a joint estimate, in the extrinsics alone, the camera's own first.
 
     Constant errors are held fixed.
@@ -102,14 +92,13 @@ def _expand_joint(joint: JointEstimate, camera: int, placement: NDArray[np.intp]
     Args:
         joint: of F captures.
         camera: its number.
-        placement: (F,) number of each capture's placement.
     """
     n_cameras = len(joint.T_cam_lidar)
     order = [camera, *(c for c in range(n_cameras) if c != camera)]
     mine = np.concatenate([joint.state.layout.camera(c) for c in order])
     # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
     prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
-    return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)), placement=placement)
+    return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)))
 
 
 def _add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:

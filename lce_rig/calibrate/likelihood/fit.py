@@ -50,11 +50,13 @@ class JointEstimate:
         terms: linearised there.
         levels: of the noise.
         priors: of the constants.
+        placement: (F,) number of the placement that each capture shows; each its own without cameras.
     """
 
     terms: Terms
     levels: Levels
     priors: Priors
+    placement: NDArray[np.intp]
 
     @property
     def state(self) -> State:
@@ -66,10 +68,10 @@ class JointEstimate:
         """The normal equations."""
         return assemble(self.terms, self.levels, self.priors)
 
-    @property
+    @cached_property
     def cost(self) -> Quadratics:
         """Of the F captures, in z."""
-        return self.reduced.cost
+        return replace(self.reduced.cost, placement=self.placement)
 
     @cached_property
     def covariances(self) -> tuple[Array, Array]:
@@ -150,15 +152,13 @@ def fit_boards(lidars: Sequence[LidarBoard], board: Board, priors: Priors, usual
     scans = stack_scans([interior(lidar, board) for lidar in lidars], board)
     T_lidar_board = np.array([lidar.T_lidar_board for lidar in lidars])
     state = State.without_errors(np.zeros((0, 4, 4)), T_lidar_board, len(scans.rings))
-    return _maximise(linearise(scans, (), board, state), priors, usual)
+    return _maximise(linearise(scans, (), board, state), priors, usual, np.arange(len(lidars)))
 
 
-def _maximise(
-    terms: Terms, priors: Priors, usual: Levels, placement: NDArray[np.intp] | None = None
-) -> JointEstimate:
+def _maximise(terms: Terms, priors: Priors, usual: Levels, placement: NDArray[np.intp]) -> JointEstimate:
     """Alternate between steps towards the optimum and fits of the noise levels.
 
-    Captures are weighed by how they disagree where their placements (F,) are given.
+    Captures, whose placements (F,) are given, are weighed by how they disagree on the extrinsics.
     """
     now = usual = replace(usual, laser_m=max(usual.laser_m, NO_LASER_M))
     for blur_rad in _BLURS_RAD:
@@ -168,9 +168,9 @@ def _maximise(
         if k == len(_LEVEL_ROUNDS) - 1:
             priors = priors.freed(terms.state.scale)
         now = fit_levels(terms, now, usual, priors, n_rounds)
-        if placement is not None:
+        if terms.images:
             terms = replace(terms, trust=trust_captures(terms, now, priors, placement))
-    return JointEstimate(settle(terms, now, priors, _LAST_STEPS, _SETTLED), now, priors)
+    return JointEstimate(settle(terms, now, priors, _LAST_STEPS, _SETTLED), now, priors, placement)
 
 
 def settle(terms: Terms, levels: Levels, priors: Priors, n_steps: int, short: float) -> Terms:

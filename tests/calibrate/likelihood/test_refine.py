@@ -176,7 +176,8 @@ def test_captures_that_disagree_by_more_than_the_model_knows_widen_the_claim():
     seen = observations(20, 6, REAL)
     good = maximise_likelihood([seen], BOARD, [T_FORWARD])
     placement = group_placements(seen)
-    spread = jackknife_scatter(replace(good.cost, placement=placement).moves() @ good.to_extrinsics[0].T)
+    assert np.array_equal(good.placement, placement)
+    spread = jackknife_scatter(good.cost.moves() @ good.to_extrinsics[0].T)
     assert widen(good.cov[0], spread, placement.max() + 1)[1] < 2
     too_sure = good.cov[0] / 20
     cov, factor = widen(too_sure, spread, placement.max() + 1)
