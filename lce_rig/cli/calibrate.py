@@ -55,13 +55,14 @@ def residual_words(metrics: Metrics, c: Calibration, held_out: str = "") -> str:
 
 
 def _uncertainty(c: Calibration, *, is_explained: bool) -> Iterator[str]:
-    """State the standard deviations, by axis unless the result has failed, and for points at distances."""
+    """State the standard deviations, by axis if the result passes, and for points at distances."""
     yield _sigma_line(c.sigma_rotation_deg, c.sigma_translation_m)
     if c.verdict == "fail" and not is_explained:
         return
     names = _AXES_OF_LIDAR if c.is_of_lidars else _AXES
     along_mm, about_deg = np.split(np.sqrt(np.diag(c.cov)) * np.repeat([1000.0, np.degrees(1.0)], 3), 2)
-    for title, values, digits, unit in (("about", about_deg, ".3f", "deg"), ("along", along_mm, ".1f", "mm")):
+    by_axis = (("about", about_deg, ".3f", "deg"), ("along", along_mm, ".1f", "mm"))
+    for title, values, digits, unit in by_axis if is_explained or c.verdict == "pass" else ():
         axes = ", ".join(f"{name} {value:{digits}}" for name, value in zip(names, values, strict=True))
         yield f"    {title}      {axes} {unit}"
     if not is_explained:
@@ -356,7 +357,9 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
     yield f"[bold]{Pair.of(c)}[/]: [bold {colour}]{c.verdict.upper()}[/], {used}"
     plan = next((finding.advice for finding in c.findings if finding.code == GUIDE_ADD.code), "")
     reasons = [finding for finding in c.findings if finding.severity != "note"]
-    for finding in reasons if is_explained else causes[:_N_REASONS]:
+    # A line counts those that are not shown.
+    n_shown = _N_REASONS if len(causes) <= _N_REASONS else _N_REASONS - 1
+    for finding in reasons if is_explained else causes[:n_shown]:
         follows = "follows: " if finding.code in following else ""
         yield f"  [{colour}]{follows}{show.escape(finding.text)}[/]"
         if finding.advice and not follows and (is_explained or finding is causes[0]):
@@ -364,8 +367,8 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
             yield f"    -> {show.escape(advice)}"
     if plan and not lacks_captures(causes[:1]):
         yield f"  -> {plan}"
-    if len(causes) > _N_REASONS and not is_explained:
-        more = show.counted(len(causes) - _N_REASONS, "more reason")
+    if len(causes) > n_shown and not is_explained:
+        more = show.counted(len(causes) - n_shown, "more reason")
         yield f"  {more} in report.html and by lce-rig calibrate {path} --explain"
     if is_explained or not has_failed:
         target, source = (c.camera, c.lidar) if c.is_of_lidars else ("cam", "lidar")
@@ -374,7 +377,7 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
     yield from _uncertainty(c, is_explained=is_explained)
     # Lens and squares that the result has corrected go with its extrinsics.
     corrected = [each for each in c.findings if each.code in _CORRECTED and each.severity == "note"]
-    if corrected and not is_explained:
+    if corrected and c.verdict == "pass" and not is_explained:
         yield f"  {show.escape(corrected[0].text)}"
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
         yield f"  reference    error {show.sizes(c.egt_rotation_deg, c.egt_translation_m)}"

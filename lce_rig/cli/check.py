@@ -215,8 +215,9 @@ def _causes(
             who = f"all {len(names)}" if len(captures) == len(names) > 1 else show.name_ranges(captures)
             lines += show.cause_lines(f"{who} {stage}: {texts[0]}", advice)
         elif len(captures) > _MOST_LISTED and not is_whole:
-            who = show.name_ranges(captures)
-            lines += show.cause_lines(f"{who} {stage}, such as {captures[0]}: {texts[0]}", advice)
+            lines += show.cause_lines(
+                f"{len(captures)} captures, {stage}, such as {captures[0]}: {texts[0]}", advice
+            )
         else:
             lines += [
                 f"  {name} {stage}: {show.escape(text)}" for name, text in zip(captures, texts, strict=True)

@@ -181,7 +181,7 @@ def _intrinsics(finding: Finding) -> str:
     q = finding.figures
     if finding.severity == "note":
         return f"boards correct intrinsics{_correction(q) or ' slightly'}"
-    fit = "do not fit" if finding.severity == "error" else "fit only roughly"
+    fit = "do not fit" if finding.severity == "error" else "fit roughly"
     displacement_px, correction = q["displacement_px"], _correction(q)
     if not isinstance(displacement_px, float) or not math.isfinite(displacement_px):
         reason = "they project to no pixels where boards were seen"
@@ -192,7 +192,7 @@ def _intrinsics(finding: Finding) -> str:
     else:
         percent, sigma = 100 * (finding.figure("focal_ratio") - 1), 100 * finding.figure("focal_sigma")
         reason = f"focal length {abs(percent):.1f} +- {sigma:.1f} % {'larger' if percent > 0 else 'smaller'}"
-    return f"the profile's intrinsics {fit}: {reason}"
+    return f"intrinsics {fit}: {reason}"
 
 
 def _lens_model(finding: Finding) -> str:
@@ -323,13 +323,13 @@ NOT_CERTIFIED = Kind(
 )
 ROTATION_UNCERTAIN = Kind(
     "verdict.rotation_uncertain",
-    "rotation standard deviation {sigma_deg:deg}, target {target_deg:deg} (x, y, z {by_axis_deg:.2g} deg)",
+    "rotation sigma {sigma_deg:deg}, target {target_deg:deg} (x, y, z {by_axis_deg:.2g} deg)",
     "add captures; least determined: {weakest:motion}",
     actions={"measure_ranges": _RANGES, **_MEASURE},
 )
 TRANSLATION_UNCERTAIN = Kind(
     "verdict.translation_uncertain",
-    "translation standard deviation {sigma_m:1mm}, target {target_m:1mm} (x, y, z {by_axis_m:1mm})",
+    "translation sigma {sigma_m:1mm}, target {target_m:1mm} (x, y, z {by_axis_m:1mm})",
     "add captures; least determined: {weakest:motion}",
     actions={"measure_ranges": _RANGES, **_MEASURE},
 )
