@@ -47,7 +47,8 @@ def _topics(_ctx: click.Context, _param: click.Parameter, values: tuple[str, ...
     "--from",
     "paths",
     "PATH",
-    "Read a recording: a folder with img/ (several cameras: img/CAMERA/) and pcd/, a folder of "
+    "Read a recording: a folder with img/ (several cameras: img/CAMERA/) and pcd/ (a rig without cameras: "
+    "folders of point clouds named after its LiDARs), a folder of "
     "--record, a ROS 1 or ROS 2 bag, an mcap or pcap file, an event camera's file (AEDAT4, Prophesee "
     "RAW, HDF5), or beside these a folder of images named after their times. "
     "Repeatable, also for simultaneous recordings of several sensors.",

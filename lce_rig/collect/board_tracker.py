@@ -49,12 +49,16 @@ class BoardDetection:
 
     @property
     def poses(self) -> dict[ImageKey, Array]:
-        """Where each camera sees it, T_cam_board (4, 4)."""
+        """Where each camera sees it, T_cam_board (4, 4); without cameras, where each LiDAR does."""
+        if not self.images:
+            return {(lidar, ""): boards[0].T_lidar_board for lidar, boards in self.lidars.items()}
         return {key: board.T_cam_board for key, board in self.images.items()}
 
     @property
     def is_usable(self) -> bool:
-        """Whether a camera and a LiDAR see the board as the profile's limits want it."""
+        """Whether a camera and a LiDAR, or of a rig without cameras two LiDARs, see a board within limits."""
+        if not self.images:
+            return len(self.lidars) > 1
         return bool(self.images.keys() - self.unfit.keys() and self.lidars)
 
 
@@ -135,13 +139,17 @@ class BoardTracker:
         lidars: dict[str, list[LidarBoard]] = {}
         unscanned: dict[str, Refusal] = {}
         # Nothing is gained from scans while no camera sees the board.
-        for scan in detection.frame.scans if detection.images else ():
+        are_scans_enough = not self.rig.cameras
+        for scan in detection.frame.scans if detection.images or are_scans_enough else ():
             candidates = self._find_in_scan(scan, detection.frame.time_ns)
             if isinstance(candidates, Refusal):
                 unscanned[scan.sensor] = candidates
             else:
                 lidars[scan.sensor] = candidates
-        if not detection.images:
+        if are_scans_enough:
+            for refusal in unscanned.values():
+                self.refusals.add(refusal)
+        elif not detection.images:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
             self.refusals.add(IMAGE_NONE.refusal())
         elif not lidars:
@@ -164,8 +172,9 @@ class BoardTracker:
         scans = {scan.sensor: self.finder.scan(scan) for scan in detection.frame.scans}
         usable = {key: board for key, board in images.items() if isinstance(board, ImageBoard)}
         lidars = {name: boards for name, boards in scans.items() if isinstance(boards, list)}
-        for found, refused in ((usable, images), (lidars, scans)):
-            if not found:
+        n_lidars = 1 if self.rig.cameras else 2
+        for found, refused, n_needed in ((usable, images, min(len(images), 1)), (lidars, scans, n_lidars)):
+            if len(found) < n_needed:
                 return next(why for why in refused.values() if isinstance(why, Refusal))
         elsewhere = self._find_elsewhere(usable, lidars)
         if elsewhere is not None:

@@ -21,7 +21,7 @@ from lce_rig.collect.findings import IMAGE_MADE_FEW_EVENTS, IMAGE_STOOD_STILL, R
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Losses, Refusal
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, transform
 from lce_rig.core.results import LidarBoard
 from lce_rig.detect.events.figures import MEMORY_NS, event_quality, outline_px
 from lce_rig.detect.limits_met import explain_missing_board, look_for_flicker, too_fast
@@ -143,13 +143,20 @@ def _motion_m(window: deque[BoardDetection], board: Board, max_motion_m: float) 
         )
         square_px = _square_px(reference.corners_px, board)
         motions.append(shift_px * board.square_m / max(square_px, 1e-6))
+    # Corners show turns; without a camera the planes must, at the plate's.
+    where = np.zeros((1, 3)) if motions else board.outline()
     lidar_motions = [
-        max(_plane_motion_m(candidate, detection.lidars.get(lidar, []), max_motion_m) for detection in window)
+        min(
+            max(
+                _plane_motion_m(each, detection.lidars.get(lidar, []), max_motion_m, where)
+                for detection in window
+            )
+            for each in candidates
+        )
         for lidar, candidates in middle.lidars.items()
-        for candidate in candidates
     ]
     # Walls and tables always stand still: the cameras, which identify the board by its pattern, must agree.
-    return max(max(motions), min(lidar_motions))
+    return max(max(motions), min(lidar_motions)) if motions else max(lidar_motions)
 
 
 def _square_px(corners_px: Array, board: Board) -> float:
@@ -172,8 +179,10 @@ def _rms(difference: Array) -> float:
     return float(np.sqrt(np.mean(squares))) if len(squares) else np.inf
 
 
-def _plane_motion_m(reference: LidarBoard, candidates: list[LidarBoard], max_motion_m: float) -> float:
-    """Measure by how much the plane of the nearest candidate passes by the reference's centre.
+def _plane_motion_m(
+    reference: LidarBoard, candidates: list[LidarBoard], max_motion_m: float, where: Array
+) -> float:
+    """Measure by how much the plane of the nearest candidate passes by points (K, 3) of the reference.
 
     The centre itself is known along the board to a few centimetres only, and serves to tell plates apart.
     """
@@ -182,7 +191,7 @@ def _plane_motion_m(reference: LidarBoard, candidates: list[LidarBoard], max_mot
     if not distances or min(distances) > 0.1 + max_motion_m:
         return float("inf")
     plane = candidates[int(np.argmin(distances))].plane
-    return float(abs(plane[:3] @ centre + plane[3]))
+    return float(np.abs(transform(reference.T_lidar_board, where) @ plane[:3] + plane[3]).max())
 
 
 SPEED_WINDOW_S = 0.5

@@ -147,9 +147,9 @@ class _Collector:
                 if key in self._names_by_key:
                     message = self._count_known(files.label, self._names_by_key[key])
                 else:
-                    images, scan, notes = files.read()
+                    images, scans, notes = files.read()
                     self.report.note(notes)
-                    message = self._store(key, files.label, images, (scan,), {})
+                    message = self._store(key, files.label, images, scans, {})
             except SourceError as error:
                 failures.append(error)
                 self.report.refused[files.label] = refusal_of("read", error, "record it again")
@@ -169,12 +169,7 @@ class _Collector:
             SourceError: it lacks a LiDAR or a camera, or their clocks do not overlap; or it is torn: what
                 came before has been captured.
         """
-        if not self._session.rig.cameras:
-            raise SourceError(
-                f"{recording.path}: collect needs a camera that sees the board, and the rig has none",
-                "Add placements from Python: `session.add_capture([], scans, {})` (docs/own-rig.md).",
-            )
-        require_sensors(recording)
+        require_sensors(recording, has_cameras=bool(self._session.rig.cameras))
         options = self._options
         known = Placements(options.min_move_m, options.min_turn_deg)
         # Where a capture of this recording was rejected, another moment of that placement is not wanted.
@@ -219,7 +214,7 @@ class _Collector:
         # Scans without an image made of events are counted by `with_event_pictures`.
         frames = pair_by_time(samples, rig, Losses() if cameras else losses)
         detections: Iterable[BoardDetection] = map(tracker.sight, frames)
-        if recording.n_samples >= _LONG_SAMPLES:
+        if recording.n_samples >= _LONG_SAMPLES and rig.cameras:
             detections = sight_ahead(tracker, frames)
         gate: StillnessGate | MotionGate = StillnessGate(
             rig.board.to_board(), max_motion_m, takes_singles=True, window_s=stillness_window_s(rig)

@@ -66,12 +66,12 @@ class Placements:
 
 
 def pose_figures(poses: Mapping[ImageKey, Array]) -> dict[str, Any]:
-    """List where each camera saw the board, for a capture's meta data."""
+    """List where each camera, or without cameras each LiDAR, saw the board, for a capture's meta data."""
     return {"T_cam_board": {".".join(key): np.round(T, 9).tolist() for key, T in sorted(poses.items())}}
 
 
 def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
-    """Find where each camera saw the board, T_cam_board (4, 4), by (camera, channel).
+    """Find where each camera saw the board, T_cam_board (4, 4), by (camera, channel); or each LiDAR.
 
     Raises:
         SessionError: the capture is damaged, or of another rig.
@@ -83,7 +83,8 @@ def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
         cameras = session.rig.cameras
         for name, value in stored.items():
             camera, _, channel = name.partition(".")
-            if camera in cameras and channel in cameras[camera].channels:
+            is_lidar = not cameras and camera in session.rig.lidars
+            if is_lidar or (camera in cameras and channel in cameras[camera].channels):
                 with suppress(ValueError):
                     poses[camera, channel] = parse_pose(value)
         return poses
@@ -92,4 +93,8 @@ def capture_poses(capture: Capture, session: Session) -> dict[ImageKey, Array]:
         board = finder.search_image(capture.image(camera, channel)).located
         if isinstance(board, ImageBoard):
             poses[camera, channel] = board.T_cam_board
+    for lidar in () if session.rig.cameras else capture.lidars:
+        boards = finder.scan(capture.scan(lidar))
+        if isinstance(boards, list):
+            poses[lidar, ""] = boards[0].T_lidar_board
     return poses

@@ -85,7 +85,13 @@ def parse_times(stems: Sequence[str]) -> NDArray[np.int64] | None:
 
 
 def pair_names(
-    images: Sequence[str], clouds: Sequence[str], method: PairMethod = "auto", tolerance_s: float = 0.05
+    images: Sequence[str],
+    clouds: Sequence[str],
+    method: PairMethod = "auto",
+    tolerance_s: float = 0.05,
+    *,
+    what: str = "images",
+    other: str = "point clouds",
 ) -> Pairing:
     """Match images and point clouds by their names (without suffix).
 
@@ -97,6 +103,7 @@ def pair_names(
         images, clouds: names in natural order.
         method: "stem", "order", "time", or "auto".
         tolerance_s: largest difference in time, for "time".
+        what, other: name them in messages.
 
     Raises:
         SourceError: the names do not allow the method, or no method.
@@ -124,7 +131,7 @@ def pair_names(
     if best is None or not best.pairs:
         by = "" if method == "auto" else f" by {method}"
         raise SourceError(
-            f"{n} images and {len(clouds)} point clouds cannot be paired{by}: names and numbers differ",
+            f"{n} {what} and {len(clouds)} {other} cannot be paired{by}: names and numbers differ",
             "Give both files of a pair the same name, or remove files without a partner (--pair order).",
         )
     return best
@@ -248,7 +255,7 @@ class PairOnDisk:
                 digest.update(hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 
-    def read(self) -> tuple[tuple[Image, ...], Scan, list[str]]:
+    def read(self) -> tuple[tuple[Image, ...], tuple[Scan, ...], list[str]]:
         """Decode all files; also says, in words, what was assumed or skipped.
 
         Raises:
@@ -258,7 +265,29 @@ class PairOnDisk:
         cloud, notes = read_cloud(self.cloud_path), set[str]()
         where, stamp_ns = str(self.cloud_path), self.cloud_stamp_ns
         scan = to_scan(cloud, self.lidar, self.settings, where, stamp_ns, notes=notes)
-        return images, scan, sorted(notes)
+        return images, (scan,), sorted(notes)
+
+
+@dataclass(frozen=True)
+class ScansOnDisk:
+    """The point clouds of one placement by several LiDARs, each as one of a pair without images."""
+
+    parts: tuple[PairOnDisk, ...]
+
+    @property
+    def label(self) -> str:
+        """The files' names, for messages."""
+        return " + ".join(f"{part.lidar}/{part.label}" for part in self.parts)
+
+    def key(self) -> str:
+        """Fingerprint as `PairOnDisk.key`."""
+        return hashlib.sha256(" ".join(part.key() for part in self.parts).encode()).hexdigest()
+
+    def read(self) -> tuple[tuple[Image, ...], tuple[Scan, ...], list[str]]:
+        """Decode as `PairOnDisk.read`."""
+        readings = [part.read() for part in self.parts]
+        scans = tuple(scan for _, of_part, _ in readings for scan in of_part)
+        return (), scans, [note for _, _, notes in readings for note in notes]
 
 
 def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) -> list[list[ImageOnDisk]]:
@@ -369,7 +398,11 @@ class FolderRecording:
         """
         self.path = path
         self.notes: list[str] = []
+        self.pairs: Sequence[PairOnDisk | ScansOnDisk]
         self._rig, self._options = rig, options
+        if not rig.cameras:
+            self.pairs = self._pair_scans()
+            return
         lidar = choose_lidar(rig, options, self.notes)
         images = _images(path, rig, options, self.notes)
         clouds = _list(path, CLOUD_FOLDERS, frozenset(DECODERS), "point clouds", self.notes)
@@ -401,6 +434,48 @@ class FolderRecording:
             )
             for (j, _), held in sorted(together.items(), key=lambda item: item[0])
         ]
+
+    def _pair_scans(self) -> list[ScansOnDisk]:
+        """Match the point clouds of a rig without cameras, in folders named after its LiDARs.
+
+        Raises:
+            SourceError: a LiDAR has no folder or no point clouds, or they cannot be matched.
+        """
+        folders = _folders(self.path)
+        place = next((folders[n] for n in CLOUD_FOLDERS if n in folders and n not in self._rig.lidars), None)
+        folders = folders if place is None else {**folders, **_folders(place)}
+        clouds: dict[str, list[PairOnDisk]] = {}
+        for name, settings in self._rig.lidars.items():
+            files = _files(folders[name.lower()], frozenset(DECODERS)) if name.lower() in folders else []
+            if files:
+                times_ns = parse_times([file.stem for file in files])
+                stamps = [None] * len(files) if times_ns is None else times_ns.tolist()
+                clouds[name] = [
+                    PairOnDisk((), file, name, settings, stamp)
+                    for file, stamp in zip(files, stamps, strict=True)
+                ]
+        if len(clouds) < 2:
+            names = [f"{name}/" for name in self._rig.lidars]
+            raise SourceError(
+                f"{self.path}: point clouds of fewer than two LiDARs found",
+                f"Put each LiDAR's into a folder of its name: {', '.join(names)}; equal file names match.",
+            )
+        (first, firsts), *others = clouds.items()
+        together: dict[int, list[PairOnDisk]] = {}
+        for name, seconds in others:
+            tolerance_s = self._options.pair_tolerance_s
+            if tolerance_s is None:
+                limits = (self._rig.lidars[each].timestamps.tolerance_s for each in (first, name))
+                tolerance_s = max(limits)
+            of_second, of_first = ([part.cloud_path.stem for part in parts] for parts in (seconds, firsts))
+            both = {"what": f"point clouds of {name}", "other": f"of {first}"}
+            pairing = pair_names(of_second, of_first, self._options.pair, tolerance_s, **both)
+            self.notes.append(
+                f"{self.path.name}: {first} and {name}: {len(pairing.pairs)} pairs, {pairing.reason}"
+            )
+            for i, j in pairing.pairs:
+                together.setdefault(j, [firsts[j]]).append(seconds[i])
+        return [ScansOnDisk(tuple(parts)) for _, parts in sorted(together.items())]
 
     def _pair(self, images: Sequence[Sequence[ImageOnDisk]], clouds: Sequence[Path]) -> list[Pairing]:
         """Match each camera's images with the point clouds, all cameras' in one way."""

@@ -135,8 +135,8 @@ def _belongs(recording: Recording, group: Sequence[Recording], later: Sequence[R
     return bool(recording.streams - held) or {"scans"} not in kinds_later
 
 
-def require_sensors(recording: ContinuousRecording) -> None:
-    """Make sure that a recording holds a LiDAR and a camera.
+def require_sensors(recording: ContinuousRecording, *, has_cameras: bool = True) -> None:
+    """Make sure that a recording holds a LiDAR and a camera, or two LiDARs of a rig without cameras.
 
     Raises:
         SourceError: it does not; the hint names the recording to add.
@@ -147,6 +147,14 @@ def require_sensors(recording: ContinuousRecording) -> None:
     if "scans" not in kinds:
         what = f"{recording.path}: no scans of a LiDAR; it holds {holds}"
         raise SourceError(what, f"Also give the LiDAR's {example}")
+    if not has_cameras:
+        if len([stream for stream in recording.streams if stream.kind == "scans"]) < 2:
+            what = f"{recording.path}: scans of one LiDAR only; it holds {holds}"
+            hint = (
+                "Also give the other LiDAR's recording of the same time: --from front.pcap --from side.pcap"
+            )
+            raise SourceError(what, f"{hint} --lidar front --lidar side.")
+        return
     if kinds == {"scans"}:
         what = f"{recording.path}: no images and no events; it holds {holds}"
         raise SourceError(what, f"Also give the camera's {example}, or a folder of images")

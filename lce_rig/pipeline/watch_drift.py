@@ -136,8 +136,8 @@ class SceneCaptures:
         failures: list[SourceError] = []
         for done, files in enumerate(pairs, start=1):
             try:
-                images, scan, _ = files.read()
-                self._take(files.label, images, (scan,))
+                images, scans, _ = files.read()
+                self._take(files.label, images, scans)
             except SourceError as error:
                 failures.append(error)
             progress(done, len(pairs))

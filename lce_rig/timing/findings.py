@@ -75,3 +75,6 @@ def _no_image(finding: Finding) -> str:
 
 
 READ_NO_IMAGE_AT_SCAN = Kind("read.no_image_at_scan", _no_image)
+READ_NO_OTHER_SCAN = Kind(
+    "read.no_other_scan", "no scan of another LiDAR at that time", "check that their clocks agree"
+)

@@ -11,7 +11,7 @@ import numpy as np
 from lce_rig.core.data import Events, Image, Sample, Scan, join_events
 from lce_rig.core.findings import Losses
 from lce_rig.rig import Rig
-from lce_rig.timing.findings import READ_NO_IMAGE_AT_SCAN
+from lce_rig.timing.findings import READ_NO_IMAGE_AT_SCAN, READ_NO_OTHER_SCAN
 from lce_rig.timing.rig_time import rig_offset_ns, rig_time_ns, stream_of
 
 BEFORE_NS = 1_200_000_000
@@ -147,6 +147,8 @@ def pair_by_time(
 ) -> Iterator[Frame]:
     """Return each scan of the first LiDAR heard the nearest image of each camera channel, and its events.
 
+    Of a rig without cameras, return each with the nearest scans of other LiDARs.
+
     Samples come in order of receipt: a scan waits until every other sensor has passed its time, or a second
     has gone by. Where clocks are set back, what waits is given up.
 
@@ -249,8 +251,11 @@ class _Pairing:
         events: tuple[EventCut, ...] = ()
         if images or self._are_events_enough:
             events = self._events.cut(time_ns - half_ns - BEFORE_NS, time_ns + half_ns + AFTER_NS)
-        if images or events:
+        are_scans_enough = not self._rig.cameras
+        if images or events or (are_scans_enough and len(scans) > 1):
             yield Frame(time_ns, tuple(images), tuple(scans), events)
+        elif are_scans_enough:
+            self._losses.add(READ_NO_OTHER_SCAN.refusal())
         else:
             is_best = nearest_ns is not None and nearest_ns < (self._nearest_ns or 2**62)
             nearest_s = None if nearest_ns is None else nearest_ns * 1e-9

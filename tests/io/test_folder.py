@@ -42,7 +42,7 @@ def test_folders_are_found_by_name_or_by_what_they_hold(make_folder, rig, room, 
     (note,) = recording.notes
     assert has_note([note], "2 pairs", "equal file") and "partner" not in note
     assert recording.pairs[1].label == "00001.png + 00001.pcd"
-    (image,), scan, _ = recording.pairs[1].read()
+    (image,), (scan,), _ = recording.pairs[1].read()
     assert image.pixels.shape == (72, 128, 3) and image.pixels.max() == 11
     assert (image.sensor, image.channel, scan.sensor) == ("cam", "frames", "lidar")
     np.testing.assert_array_equal(scan.ring, room["ring"])
@@ -51,7 +51,7 @@ def test_folders_are_found_by_name_or_by_what_they_hold(make_folder, rig, room, 
 def test_names_that_are_times_become_stamps(make_folder, rig):
     path = make_folder(["2311.422000", "2376.322000"], ["2311.405000", "2376.205000"])
     recording = open_recording(path, rig)
-    (image,), scan, _ = recording.pairs[0].read()
+    (image,), (scan,), _ = recording.pairs[0].read()
     assert image.stamp_ns == 2311_422_000_000 and scan.stamp_ns == 2311_405_000_000
     assert has_note(recording.notes[:1], "sorted order", "0.117 s")
 
@@ -174,7 +174,7 @@ def test_las_without_its_reader_is_one_error_that_names_the_extra(make_folder, r
 def test_recordings_by_others_are_paired_as_their_makers_meant(recordings, rig, name, n_pairs, method):
     recording = open_recording(recordings / name, rig)
     assert len(recording.pairs) == n_pairs and method in recording.notes[0]
-    _, scan, _ = recording.pairs[-1].read()
+    _, (scan,), _ = recording.pairs[-1].read()
     assert len(scan.points) > 10_000 and scan.ring.max() <= 15
 
 
