@@ -72,8 +72,8 @@ def _report() -> None:
     from figures.report import draw_report
 
     with tempfile.TemporaryDirectory() as folder:
-        session = Path(folder, "session")
-        assert run(["simulate", str(session), "--rig", "rlfs", "--captures", "16", "--seed", "3"]) == 0
+        session = Path(folder, "demo")
+        assert run(["simulate", str(session), "--rig", "rlfs", "--captures", "16", "--seed", "1"]) == 0
         assert run(["calibrate", str(session)]) == 0
         Path(folder, "browser").mkdir()
         drawn = draw_report(session / "calibration" / "report.html", Path(folder, "browser"))
