@@ -209,7 +209,8 @@ def open_davis(sensor: str, settings: CameraSettings) -> OpenedCamera:
         listing = ", ".join(f"{d.cameraModel.name} {serial}" for serial, d in sorted(attached.items()))
         n = len(davis) if davis and not wanted else "no"
         what = (
-            f"camera {sensor!r}: {n} DAVIS {wanted}".rstrip() + f" is attached; attached: {listing or 'none'}"
+            f"camera {sensor!r}: {n} DAVIS {wanted}".rstrip()
+            + f" is attached{listing and f'; attached: {listing}'}"
         )
         raise SourceError(what, f"Set driver.device to a serial number. {_CHECK}")
     try:

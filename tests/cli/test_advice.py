@@ -113,6 +113,7 @@ _VALUES = {
     "--target": "kestrel",
     "--formats": "opencv",
     "--restore": "000001",
+    "--model": "radtan5",
     "-o": "new",
 }
 _PLACEHOLDER = re.compile("X|R|RIG|FILE|FOLDER|NAME|TARGET|ROOT|SESSION|OTHER_SESSION|RECORDING")
