@@ -25,9 +25,9 @@ from lce_rig.rig.target_settings import TargetSettings
     "Read targets from this file [default: deploy.yaml beside SESSION, and the session's profile].",
 )
 @result_option("Deploy")
-@click.option("--dry-run", is_flag=True, help="Print what would change; change nothing.")
+@click.option("--dry-run", is_flag=True, help="Print the changes; change nothing.")
 @click.option("--diff", is_flag=True, help="With --dry-run: print the lines that would change.")
-@click.option("--status", is_flag=True, help="Print what is at the target; change nothing.")
+@click.option("--status", is_flag=True, help="Print the releases at the target; change nothing.")
 @click.option("--rollback", is_flag=True, help="Restore the files that were there before.")
 @click.option("--release", metavar="NAME", help="With --rollback: restore this release (see --status).")
 @click.option("--force", is_flag=True, help="Deploy against objections; requires --reason.")
@@ -50,8 +50,8 @@ def deploy(
     """Put the result of SESSION (default: session/) on a robot, all files at once.
 
     A target is a folder on this computer or USER@HOST:PATH, reached by OpenSSH without a question. Robot
-    software reads PATH/current/. One rename makes the new files current, after they were read back; whatever
-    interrupts it, the robot has the earlier set or the new one. Earlier sets are kept.
+    software reads PATH/current/. One rename makes the new files current, after they were read back; after any
+    interruption, the robot has the earlier set or the new one. Earlier sets are kept.
 
     Refused with exit code 7: a failed result, another robot's name or serial numbers, captures older than
     those deployed. Exits with 8 if the target was not reached or written and holds the earlier set, and with

@@ -281,7 +281,7 @@ def report(registry: str, output: Path, json_file: Path | None) -> None:
     help="Choose robots by a condition in SQL, as `fleet table` does.",
 )
 @click.option("--dry-run", is_flag=True, help="Print which result would go where; change nothing.")
-@click.option("--status", is_flag=True, help="Ask every robot for what it holds; change nothing.")
+@click.option("--status", is_flag=True, help="Print the release on every robot; change nothing.")
 @click.option(
     "--rollback", is_flag=True, help="Restore the earlier files of every robot that holds its newest result."
 )

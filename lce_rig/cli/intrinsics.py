@@ -67,7 +67,7 @@ def intrinsics(
 ) -> None:
     """Estimate each camera's intrinsics from the boards in the images of SESSION (default: session/).
 
-    Reports whether the profile's intrinsics still fit, and what the captures do not determine. Writes
+    Reports whether the profile's intrinsics still fit, and the weaknesses of the captures. Writes
     SESSION/intrinsics/: a block for the profile, camera_info and a page of plots per camera. Exits with 6 if
     the captures are insufficient, with 7 if --save-profile has nothing better than the profile to write.
     """

@@ -137,7 +137,7 @@ CLOCKS_INSTEAD = Kind(
 )
 EVENTS_OF_STANDING_RIG = Kind(
     "scene.events_of_standing_rig",
-    "{subject} is judged by events, which show only what moves, and the rig was not seen to move",
+    "{subject} is judged by events, which show only moving things, and the rig was not seen to move",
     "move the rig slowly past upright edges, or record images as well",
     severity="warning",
 )
