@@ -224,8 +224,8 @@ LIDAR_TOO_THICK = Kind(
 LIDAR_SMEARED = Kind(
     "lidar.smeared",
     "border of the board at {distance_m:.1f} m smeared by {smear_m:mm} (limit {max_smear_m:mm}): "
-    "board or LiDAR moved while scans were accumulated",
-    "keep board and LiDAR still for each placement",
+    "board or LiDAR moved while scans were accumulated, or something touches an edge",
+    "keep board and LiDAR still for each placement, and boxes and hands 0.1 m away from its edges",
 )
 LIDAR_TOUCHING = Kind(
     "lidar.touching",
