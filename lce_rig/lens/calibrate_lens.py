@@ -36,8 +36,10 @@ _PRIOR_DOF = 30.0
 # Errors that a board's corners share and residuals hide: model of the lens, blur. Sessions of one rig whose
 # corners fit to 0.01 px differ as if all had at least this error.
 _SHARED_PX = 0.02
-# A profile's intrinsics that the boards contradict by more (squared, in standard deviations) are trusted
-# less: 98 % of chi-squared with nine degrees of freedom.
+# Focal length, principal point or distortion of a profile that agree with the boards with less than this
+# probability are trusted less: 2 % for the three together.
+_CHANCE = 0.02 / 3
+# Fitted intrinsics that lie farther from the profile's (squared, in its standard deviations) contradict it.
 CONTRADICTION = 20.0
 # Rounds of comparing the scatter of captures with the stated deviations.
 _SCATTER_ROUNDS = 3
@@ -225,18 +227,25 @@ def _weigh_scatter(
         Setup, state and weights with the covariance (Q, Q) of lens and shape, and the ratio of standard
         deviations to those of independent corners.
     """
-    inflation = 1.0
+    inflation, P = 1.0, setup.model.size
     for _ in range(_SCATTER_ROUNDS):
         ratio = _scatter_ratio(setup, state, weights, captures)
         inflation, weights = inflation * ratio, weights / ratio
-        is_contradicted = has_prior and setup.surprise(state.lens) > CONTRADICTION
-        setup = setup.doubting(state.lens) if is_contradicted else setup
-        if ratio == 1.0 and not is_contradicted:
+        state = fit(setup, state, weights) if ratio > 1.0 else state
+        cov = _covariance(setup, state, weights)
+        parts = setup.contradicted(state.lens, cov[:P, :P], _CHANCE) if has_prior else []
+        if parts:
+            setup = setup.doubting(state.lens, parts)
+            state = fit(setup, state, weights)
+        elif ratio == 1.0:
             break
-        state = fit(setup, state, weights)
+    return setup, state, weights, _covariance(setup, state, weights), float(np.sqrt(inflation))
+
+
+def _covariance(setup: Setup, state: LensState, weights: Array) -> Array:
+    """Compute the covariance (Q, Q) of lens and shape."""
     _, information = reduced(setup, state, weights)
-    cov = solve_scaled(information.sum(axis=0) + setup.information, np.eye(len(setup.mean)))
-    return setup, state, weights, cov, float(np.sqrt(inflation))
+    return solve_scaled(information.sum(axis=0) + setup.information, np.eye(len(setup.mean)))
 
 
 def _scatter_ratio(setup: Setup, state: LensState, weights: Array, captures: NDArray[np.intp]) -> float:

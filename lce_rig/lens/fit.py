@@ -9,6 +9,7 @@ principal point by more than the noise of the corners does, and alike in every i
 plate bent by 6 mm, a fit of two bows alone puts the principal point 20 px off.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -33,6 +34,8 @@ _EXACT_M = 1e-7
 # corners' own offsets.
 N_MODES = 15
 _MAX_STEPS = 40
+# Below this share of what is known of a direction of the lens, boards tell nothing of it.
+_TOLD = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +108,41 @@ class Setup:
         off = lens - self.mean[: len(lens)]
         return float(off @ self.information[: len(lens), : len(lens)] @ off)
 
-    def doubting(self, lens: Array) -> "Setup":
-        """Widen the prior of focal lengths, principal point and distortion, each alone, to what was fitted.
+    def contradicted(self, lens: Array, cov: Array, chance: float) -> list[slice]:
+        """Compare the boards with the prior of focal lengths, principal point and distortion, each alone.
 
-        One that the fitted lens (P,) is far from becomes one standard deviation per parameter.
+        A fitted lens (P,) is the compromise of boards and prior. Its distance d from the prior's has the
+        covariance C_0 - C, with the prior's C_0 and the fitted lens's C: d^T (C_0 - C)^-1 d is chi-squared if
+        both are right. In units of C_0, the eigenvalues of C_0 - C are the boards' shares of what is known;
+        directions of small shares are left to the prior.
+
+        Args:
+            lens: the fitted one.
+            cov: (P, P) its covariance.
+            chance: probability below which a part contradicts.
+
+        Returns:
+            The parts that contradict, of the lens's parameters.
         """
+        from scipy.special import chdtrc
+
+        P = len(lens)
+        of_prior, found = np.linalg.inv(self.information[:P, :P]), []
+        for part in (slice(0, 2), slice(2, 4), slice(4, P)):
+            variances, axes = np.linalg.eigh(of_prior[part, part])
+            units = (axes / np.sqrt(variances)).T
+            left, axes = np.linalg.eigh(units @ cov[part, part] @ units.T)
+            along, share = axes.T @ units @ (lens - self.mean[:P])[part], 1 - left
+            told = share > _TOLD
+            chi2 = float(np.sum(along[told] ** 2 / share[told]))
+            if told.any() and float(chdtrc(np.count_nonzero(told), chi2)) < chance:
+                found.append(part)
+        return found
+
+    def doubting(self, lens: Array, parts: Sequence[slice]) -> "Setup":
+        """Widen parts of the prior: a fitted lens (P,) lies one standard deviation per parameter away."""
         information, off = self.information.copy(), lens - self.mean[: len(lens)]
-        for part in (slice(0, 2), slice(2, 4), slice(4, len(lens))):
+        for part in parts:
             surprise = float(off[part] @ information[part, part] @ off[part])
             information[part, part] *= min(1.0, len(off[part]) / max(surprise, 1e-12))
         return replace(self, information=information)

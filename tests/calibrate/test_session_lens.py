@@ -10,6 +10,7 @@ from lce_rig.calibrate.session_lens import fit_session_lens
 from lce_rig.core.geometry import difference, invert, perturb, transform
 from lce_rig.judge.contributions import profile_covariance
 from lce_rig.judge.reach import covariance_alone, point_uncertainties, with_lens
+from lce_rig.lens.fit import Setup
 from lce_rig.lens.models import LensPrior
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, in_use, simulate
 from tests.calibrate.test_tolerances import KNOWN, REAL, as_profiled, with_errors
@@ -29,14 +30,30 @@ def captures():
     return simulate(20, 1, REAL)
 
 
-@pytest.mark.parametrize("errors", [(0.003, 4.0, -5.0, 2.0), (0.02, 10.0, -10.0, 0.0)])
+@pytest.mark.parametrize(
+    "errors",
+    [(0.003, 4.0, -5.0, 2.0), (0.02, 10.0, -10.0, 0.0), (0.02, 0.0, 0.0, 0.0), (-0.02, 0.0, 0.0, 0.0)],
+)
 def test_the_lens_is_the_true_one_within_its_deviations_wherever_the_profile_lies(captures, errors):
     prior = replace(ROUGH, lens=with_errors(CAMERA, errors))
     lens = fit_session_lens({"frames": as_profiled(captures, prior.lens)}, BOARD, prior)
     model = lens.estimate.model
     off = model.vector(lens.intrinsics) - model.vector(CAMERA)
     assert np.all(np.abs(off[:5]) < 3.5 * lens.estimate.sigma[:5])
-    assert (lens.estimate.surprise > 16) == (errors[0] > 0.01)
+    assert (lens.estimate.surprise > 16) == (abs(errors[0]) > 0.01)
+
+
+def test_boards_contradict_few_profiles_within_their_deviations(captures):
+    contradicted = 0
+    for errors in np.random.default_rng(0).normal(size=(12, 4)) * (0.004, 3.6, 3.6, 2.2):
+        prior = replace(ROUGH, lens=with_errors(CAMERA, tuple(errors)))
+        seen = as_profiled(captures, prior.lens)
+        estimate = fit_session_lens({"frames": seen}, BOARD, prior).estimate
+        corners_px = np.array([o.image.corners_px for o in seen])
+        setup = Setup.of(corners_px, BOARD, estimate.model, prior)
+        lens = estimate.model.vector(estimate.intrinsics)
+        contradicted += bool(setup.contradicted(lens, estimate.cov, 0.02))
+    assert contradicted <= 3
 
 
 def test_an_exact_profile_stays_as_it_is(captures):
