@@ -225,7 +225,7 @@ LIDAR_SMEARED = Kind(
     "lidar.smeared",
     "border of the board at {distance_m:.1f} m smeared by {smear_m:mm} (limit {max_smear_m:mm}): "
     "board or LiDAR moved while scans were accumulated, or something touches an edge",
-    "keep board and LiDAR still for each placement, and boxes and hands 0.1 m away from its edges",
+    "keep board and LiDAR still, boxes and hands 0.1 m from its edges",
 )
 LIDAR_TOUCHING = Kind(
     "lidar.touching",
