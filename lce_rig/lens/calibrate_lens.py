@@ -235,7 +235,7 @@ def _weigh_scatter(
         cov = _covariance(setup, state, weights)
         parts = setup.contradicted(state.lens, cov[:P, :P], _CHANCE) if has_prior else []
         if parts:
-            setup = setup.doubting(state.lens, parts)
+            setup = setup.doubting(parts)
             state = fit(setup, state, weights)
         elif ratio == 1.0:
             break

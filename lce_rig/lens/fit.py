@@ -108,13 +108,14 @@ class Setup:
         off = lens - self.mean[: len(lens)]
         return float(off @ self.information[: len(lens), : len(lens)] @ off)
 
-    def contradicted(self, lens: Array, cov: Array, chance: float) -> list[slice]:
+    def contradicted(self, lens: Array, cov: Array, chance: float) -> list[tuple[slice, float]]:
         """Compare the boards with the prior of focal lengths, principal point and distortion, each alone.
 
         A fitted lens (P,) is the compromise of boards and prior. Its distance d from the prior's has the
         covariance C_0 - C, with the prior's C_0 and the fitted lens's C: d^T (C_0 - C)^-1 d is chi-squared if
-        both are right. In units of C_0, the eigenvalues of C_0 - C are the boards' shares of what is known;
-        directions of small shares are left to the prior.
+        both are right. In units of C_0, the eigenvalues w of C_0 - C are the boards' shares of what is known;
+        directions of small shares are left to the prior. The boards' own distance is d / w, of which
+        (1 - w) / w is the variance of their errors.
 
         Args:
             lens: the fitted one.
@@ -122,7 +123,8 @@ class Setup:
             chance: probability below which a part contradicts.
 
         Returns:
-            The parts that contradict, of the lens's parameters.
+            The parts of the lens's parameters that contradict, each with the ratio of variances that explains
+            the distance.
         """
         from scipy.special import chdtrc
 
@@ -134,17 +136,16 @@ class Setup:
             left, axes = np.linalg.eigh(units @ cov[part, part] @ units.T)
             along, share = axes.T @ units @ (lens - self.mean[:P])[part], 1 - left
             told = share > _TOLD
-            chi2 = float(np.sum(along[told] ** 2 / share[told]))
-            if told.any() and float(chdtrc(np.count_nonzero(told), chi2)) < chance:
-                found.append(part)
+            w, squares = share[told], along[told] ** 2
+            if told.any() and float(chdtrc(len(w), np.sum(squares / w))) < chance:
+                found.append((part, max(float(np.mean(squares / w**2 - (1 - w) / w)), 1.0)))
         return found
 
-    def doubting(self, lens: Array, parts: Sequence[slice]) -> "Setup":
-        """Widen parts of the prior: a fitted lens (P,) lies one standard deviation per parameter away."""
-        information, off = self.information.copy(), lens - self.mean[: len(lens)]
-        for part in parts:
-            surprise = float(off[part] @ information[part, part] @ off[part])
-            information[part, part] *= min(1.0, len(off[part]) / max(surprise, 1e-12))
+    def doubting(self, parts: Sequence[tuple[slice, float]]) -> "Setup":
+        """Widen parts of the prior by ratios of variances."""
+        information = self.information.copy()
+        for part, ratio in parts:
+            information[part, part] /= ratio
         return replace(self, information=information)
 
 
