@@ -113,16 +113,16 @@ def ends_on_board(f: CaptureFeatures, T_cam_lidar: Array) -> Array:
     return transform(f.T_board_cam @ T_cam_lidar, f.edge_points)
 
 
-def end_rows(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple[Array, Array]:
+def end_rows(f: CaptureFeatures, T_cam_lidar: Array, board: Board) -> tuple[Array, Array, NDArray[np.intp]]:
     """Linearise (2) for a capture's ring ends.
 
     Returns:
-        Values (M,), and derivatives (M, 8) by the tangent (6), the shift d and the scale s.
+        Values (M,), derivatives (M, 8) by tangent (6), shift d and scale s, and the edges' numbers (M,).
     """
     inside_m, edge = end_residuals(f, T_cam_lidar, board)
     normals = f.edge_normals[edge]
     by_tangent = differentiate(normals, f.edge_points @ T_cam_lidar[:3, :3].T)
-    return inside_m, np.column_stack([by_tangent, np.ones(len(edge)), -normals @ f.centre])
+    return inside_m, np.column_stack([by_tangent, np.ones(len(edge)), -normals @ f.centre]), edge
 
 
 def describe_background(lidar: LidarBoard) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.likelihood.levels import Priors
-from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, end_residuals, end_rows
+from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, end_rows
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
@@ -76,8 +76,7 @@ def estimate_angles(
         J = np.hstack([J_plane[:, :lens], by_angles(points, seen.lidar.ring, f.normal)])
         weight = PLANE_FREEDOMS / (sigmas.plane_m**2 * max(len(points), 1))
         H, g = H + weight * J.T @ J, g + weight * r_plane @ J
-        r_end, J_end = end_rows(f, T_cam_lidar, board)
-        edge = end_residuals(f, T_cam_lidar, board)[1]
+        r_end, J_end, edge = end_rows(f, T_cam_lidar, board)
         no_ranges = np.zeros((len(r_end), L))
         by_ring = by_angles(f.edge_points, seen.lidar.edge_ring, f.edge_normals[edge])
         by_ring[:, 2] = is_of_width[edge]
@@ -85,9 +84,8 @@ def estimate_angles(
         is_end = np.abs(r_end - np.median(r_end)) < _OUTLIER * sigmas.end_m
         H, g = H + J[is_end].T @ J[is_end] / sigmas.end_m**2, g + r_end[is_end] @ J[is_end] / sigmas.end_m**2
     priors = Priors()
-    H[:lens, :lens] += priors_of_constants(L, lidar.laser_bias_sigma_m, lidar.range_offset_sigma_m)[
-        :lens, :lens
-    ]
+    of_constants = priors_of_constants(L, lidar.laser_bias_sigma_m, lidar.range_offset_sigma_m)
+    H[:lens, :lens] += of_constants[:lens, :lens]
     known = [priors.lateral_m, priors.vertical_m, _PLATE_M, *np.full(2 * L, _LOOSE_RAD)]
     H[lens:, lens:] += np.diag(1 / np.square(known))
     cov = np.linalg.inv(H)

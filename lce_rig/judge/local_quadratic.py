@@ -71,11 +71,11 @@ def expand(
     gradients, hessians = np.zeros((len(features), p)), np.zeros((len(features), p, p))
     for k, (f, seen) in enumerate(zip(features, observations, strict=True)):
         r_plane, J_plane = plane_rows(f, T_cam_lidar, seen.lidar, rings)
-        r_end, by_end = end_rows(f, T_cam_lidar, board)
+        r_end, by_end, edge = end_rows(f, T_cam_lidar, board)
         J_end = np.zeros((len(r_end), p))
         J_end[:, [*range(FIRST_RING), SCALE]] = by_end
         # A pattern that sits farther right has the plate's edges farther left.
-        J_end[:, PATTERN] = -board.edges()[1][end_residuals(f, T_cam_lidar, board)[1], :2]
+        J_end[:, PATTERN] = -board.edges()[1][edge, :2]
         by_plane = PLANE_FREEDOMS / (sigmas.plane_m**2 * max(len(r_plane), 1))
         for r, J, weight in ((r_plane, J_plane, by_plane), (r_end, J_end, 1 / sigmas.end_m**2)):
             gradients[k] += weight * r @ J

@@ -122,19 +122,20 @@ def _weigh_scale(findings: Sequence[Finding], is_weighed: bool) -> list[Finding]
         findings: against extrinsics.
         is_weighed: whether the method estimates the squares.
     """
-    sizes = [f for f in findings if f.code == SCALE_OFF.code]
+    if all(f.code != SCALE_OFF.code for f in findings):
+        return list(findings)
     scattered = [f for f in findings if f.code == MOVED.code and not f.figures["place"]]
-    is_blamed = any(f.code == PLANE_RESIDUAL.code for f in findings) or bool(scattered)
+    is_blamed = bool(scattered) or any(f.code == PLANE_RESIDUAL.code for f in findings)
     # Squares that fail by their size alone are seen in planes first.
     is_seen = any(f.code in (PLANES_APART.code, SHARES_DIFFER.code) for f in findings)
-    severities: dict[int, Severity] = {}
-    for f in sizes:
-        if is_blamed:
-            severities[id(f)] = "error"
-            severities |= {id(other): "note" for other in scattered}
-        elif is_weighed and not (is_seen and f.severity == "error"):
-            severities[id(f)] = "note"
-    return [replace(f, severity=severities.get(id(f), f.severity)) for f in findings]
+
+    def severity_of(f: Finding) -> Severity:
+        if f.code == SCALE_OFF.code:
+            is_note = is_weighed and not (is_seen and f.severity == "error")
+            return "error" if is_blamed else "note" if is_note else f.severity
+        return "note" if f in scattered else f.severity
+
+    return [replace(f, severity=severity_of(f)) for f in findings]
 
 
 def _verdict(findings: Sequence[Finding], cov: Array) -> tuple[Verdict, tuple[Finding, ...]]:

@@ -237,9 +237,10 @@ def _weigh_scatter(
         if parts:
             setup = setup.doubting(parts)
             state = fit(setup, state, weights)
+            cov = _covariance(setup, state, weights)
         elif ratio == 1.0:
             break
-    return setup, state, weights, _covariance(setup, state, weights), float(np.sqrt(inflation))
+    return setup, state, weights, cov, float(np.sqrt(inflation))
 
 
 def _covariance(setup: Setup, state: LensState, weights: Array) -> Array:

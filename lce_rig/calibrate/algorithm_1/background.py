@@ -51,11 +51,11 @@ def estimate_shifts(
     from scipy.special import fdtri
 
     parts = [end_rows(f, T_cam_lidar, board) for f in features]
-    first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _ in parts]))
-    inside = np.concatenate([r for r, _ in parts])
+    first = np.flatnonzero(np.concatenate([np.arange(len(r)) == 0 for r, _, _ in parts]))
+    inside = np.concatenate([r for r, _, _ in parts])
     background = np.concatenate([describe_background(observation.lidar) for observation in observations])
     # Inside distance = - (change of the extrinsics) - beam's width - shifts.
-    by_pose_and_width = np.concatenate([J[:, :7] for _, J in parts])
+    by_pose_and_width = np.concatenate([J[:, :7] for _, J, _ in parts])
     A = -np.column_stack([by_pose_and_width, background])
     # Columns of few captures have no reliable scatter and stay zero, like insignificant ones.
     n_having = np.count_nonzero(np.add.reduceat(background, first, axis=0) > 0, axis=0)
