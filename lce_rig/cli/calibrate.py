@@ -23,12 +23,11 @@ from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metrics, SceneOpinion
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.files import read_json
-from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import sigma_sizes
 from lce_rig.core.phrasing import motion_words
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
-from lce_rig.judge.findings import consequences, lacks_captures, weakest_words
+from lce_rig.judge.findings import advice_of, causes_of, consequences, lacks_captures, weakest_words
 from lce_rig.pipeline.result_files import result_folder
 from lce_rig.rig import find_profile, read_profile
 from lce_rig.session.provenance import serials_of
@@ -40,12 +39,6 @@ _UNITS = {"deg": "deg", "m": "mm"}
 _CORRECTED = {"verdict.intrinsics", "verdict.scale"}
 # Reasons that are printed without --explain, and the distance of the point whose uncertainty is.
 _N_REASONS, _FAR_M = 3, 10.0
-
-
-def causes_of(findings: Sequence[Finding]) -> list[Finding]:
-    """List the reasons of a verdict that do not follow from others."""
-    following = consequences(findings)
-    return [each for each in findings if each.severity != "note" and each.code not in following]
 
 
 def residual_words(metrics: Metrics, c: Calibration, held_out: str = "") -> str:
@@ -363,8 +356,7 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
         follows = "follows: " if finding.code in following else ""
         yield f"  [{colour}]{follows}{show.escape(finding.text)}[/]"
         if finding.advice and not follows and (is_explained or finding is causes[0]):
-            advice = plan if plan and lacks_captures([finding]) else finding.advice_at(path)
-            yield f"    -> {show.escape(advice)}"
+            yield f"    -> {show.escape(advice_of(finding, plan, path))}"
     if plan and not lacks_captures(causes[:1]):
         yield f"  -> {plan}"
     if len(causes) > n_shown and not is_explained:

@@ -8,11 +8,12 @@ import click
 
 import lce_rig as lce
 from lce_rig.cli import show
-from lce_rig.cli.calibrate import causes_of, exit_by_verdict, residual_words, scene_texts
+from lce_rig.cli.calibrate import exit_by_verdict, residual_words, scene_texts
 from lce_rig.cli.options import explain_option, json_option, path_option, result_option, session_argument
 from lce_rig.core.errors import ResultRefusedError, UsageError
 from lce_rig.core.findings import worst
 from lce_rig.detect.detection import Pair
+from lce_rig.judge.findings import causes_of
 from lce_rig.judge.session_check import SessionCheck
 from lce_rig.pipeline.result_files import RESULT, result_folder
 from lce_rig.pipeline.verification import profile_behind

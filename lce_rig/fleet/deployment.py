@@ -308,13 +308,15 @@ def _stage(
     shutil.copyfile(result / RESULT, folder / RESULT)
     for pattern in target.files:
         matching: list[Path] = []
-        with suppress(ValueError, NotImplementedError):
+        is_there = False
+        with suppress(ValueError, IndexError, NotImplementedError):  # what pathlib raises for odd patterns
             # Of the folder itself, and no links, which may lead out of it.
             matching = [
                 path for path in result.glob(pattern) if path.parent == result and not path.is_symlink()
             ]
+            is_there = any(folder.glob(pattern))
         added = sorted(path for path in matching if not (folder / path.name).exists())
-        if not added and not any(folder.glob(pattern)):
+        if not added and not is_there:
             raise SessionError(
                 f"{result} has no file {pattern}", "Correct `files` of the target, or write the file first."
             )

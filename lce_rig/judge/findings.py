@@ -118,11 +118,20 @@ def consequences(findings: Sequence[Finding]) -> dict[str, str]:
     return following
 
 
-def lacks_captures(findings: Iterable[Finding]) -> bool:
+def causes_of(findings: Sequence[Finding]) -> list[Finding]:
+    """List the reasons of a verdict that do not follow from others."""
+    following = consequences(findings)
+    return [each for each in findings if each.severity != "note" and each.code not in following]
+
+
+def lacks_captures(findings: Sequence[Finding]) -> bool:
     """Tell whether one of the causes against a result is that captures are too few, or too much alike."""
-    reasons = [finding for finding in findings if finding.severity != "note"]
-    following = consequences(reasons)
-    return any((each.code, each.action) in _LACKS and each.code not in following for each in reasons)
+    return any((each.code, each.action) in _LACKS for each in causes_of(findings))
+
+
+def advice_of(finding: Finding, plan: str, session: str) -> str:
+    """Give a finding's action in a session; the plan of captures where captures are what it lacks."""
+    return plan if plan and lacks_captures([finding]) else finding.advice_at(session)
 
 
 def by_cause(findings: Sequence[Finding]) -> tuple[Finding, ...]:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -334,12 +335,12 @@ def _lens(camera: str, group: Sequence[SensorTopic]) -> Intrinsics:
 
 
 def _image_size(folder: Path) -> tuple[int, int] | None:
-    """Return the width and height (px) of a folder's first image; None without one."""
-    images = sorted(path for path in folder.glob("img/**/*.*") if path.suffix.lower() in SUFFIXES)
-    if not images:
-        return None
-    height, width = read_image(images[0]).shape[:2]
-    return width, height
+    """Return the width and height (px) of a folder's first sound image; None without one."""
+    for path in sorted(path for path in folder.glob("img/**/*.*") if path.suffix.lower() in SUFFIXES):
+        with suppress(SourceError):
+            height, width = read_image(path).shape[:2]
+            return width, height
+    return None
 
 
 def _rough_lens(size_px: tuple[int, int] | None) -> str:

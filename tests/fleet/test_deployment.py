@@ -1,6 +1,7 @@
 """Deployments: a whole set or the earlier one, refused where it must be, and back byte for byte."""
 
 import contextlib
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -130,8 +131,9 @@ def test_formats_and_further_files_are_chosen(result, rig, local, robot):
     (folder / "plots" / "a.svg").write_text("<svg/>")
     deploy(folder, rig, with_settings(local, formats=["urdf"], files=["report.*", "plots"]))
     assert set(content_of(robot / "current")) == {"result.json", "rles.urdf", "report.html", "plots/a.svg"}
-    with pytest.raises(SessionError, match=r"none\.txt"):
-        deploy(folder, rig, with_settings(local, files=["none.txt"]))
+    for pattern in ("none.txt", "/etc/hosts", "**x", "."):
+        with pytest.raises(SessionError, match=re.escape(pattern)):
+            deploy(folder, rig, with_settings(local, files=[pattern]))
     (folder / "way-out").symlink_to("/etc/hostname")
     with pytest.raises(SessionError):
         deploy(folder, rig, with_settings(local, files=["way-out"]))

@@ -15,6 +15,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from lce_rig.collect.findings import GUIDE_ADD
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
@@ -25,7 +26,7 @@ from lce_rig.core.phrasing import as_line, significant
 from lce_rig.detect.detection import Pair
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
-from lce_rig.judge.findings import cause_words, consequences, lacks_captures, weakest_words
+from lce_rig.judge.findings import advice_of, cause_words, consequences, weakest_words
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
 from lce_rig.show.report import calibration_drawings as drawings
@@ -35,7 +36,7 @@ from lce_rig.show.report.page import as_markup, render, style
 Row = Sequence[object]
 _STEP = 1e-6
 _AXES = {"x": "x right", "y": "y down", "z": "z forward"}
-_LENS_CODES, _PLAN = ("verdict.intrinsics", "verdict.scale"), "guide.add"
+_LENS_CODES, _PLAN = ("verdict.intrinsics", "verdict.scale"), GUIDE_ADD.code
 # The statement names the expected error at this distance.
 _USUAL_M = 10.0
 # Captures with more than this many times the median residual are marked. A page holds so many pictures.
@@ -236,7 +237,7 @@ def _next_steps(c: Calibration, folder: str, has_previous: bool) -> list[str]:
     plan = next((finding.advice for finding in c.findings if finding.code == _PLAN), "")
     asked, optional = [], []
     for finding in sorted(c.findings, key=lambda f: f.severity != "error"):
-        advice = plan if plan and lacks_captures([finding]) else finding.advice_at(folder)
+        advice = advice_of(finding, plan, folder)
         if finding.severity != "note" and finding.code not in following:
             asked.append(advice)
         elif advice and advice != plan and finding.action.startswith("measure"):

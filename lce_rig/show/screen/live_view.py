@@ -301,18 +301,20 @@ def render(
 
     side = _progress(state)
     n_free = height - n_lines([title, Padding(banner, (0, 2)), *above, *below])
-    n_room = n_free - n_lines([newest, *notes[:1]])
+    n_newest, n_beside = n_lines([newest]), n_lines(side, _SIDE_WIDTH)
+    n_room = n_free - n_newest - n_lines(notes[:1])
     # The lines of a prediction are kept free until there is one: the drawing beside them keeps its size.
-    side += [Text(" ")] * (min(n_room, len(_BARS) + 4) - n_lines(side, _SIDE_WIDTH))
-    edge = 1 if n_room - n_lines(side, _SIDE_WIDTH) >= 2 else 0
-    if n_room < n_lines(side, _SIDE_WIDTH):
+    n_blank = max(min(n_room, len(_BARS) + 4) - n_beside, 0)
+    side, n_beside = side + [Text(" ")] * n_blank, n_beside + n_blank
+    edge = 1 if n_room - n_beside >= 2 else 0
+    if n_room < n_beside:
         side = side[len(_BARS) :]
-    n_beside = n_lines(side, _SIDE_WIDTH)
+        n_beside = n_lines(side, _SIDE_WIDTH)
     n_room = n_free - 2 * edge
     if height > _HEIGHT:  # of one size whatever messages come
         n_beside = max(min(height - 14, n_room - 3), n_beside)
     # The newest message, notes, then older messages, as many as there is room for.
-    n_left = n_room - n_beside - n_lines([newest])
+    n_left = n_room - n_beside - n_newest
     kept = []
     for part in [*notes, *older]:
         n_left -= n_lines([part])
