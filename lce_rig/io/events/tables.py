@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading, reason_of
@@ -57,12 +58,18 @@ class Hdf5Events(EventStream):
                 try:
                     t_us, x, y, polarity = (np.asarray(column[begin:end]) for column in columns)
                     t_ns = to_ns(t_us, self._offset_us)
-                    yield EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)
+                    yield EventColumns(t_ns, _pixels(x), _pixels(y), polarity > 0)
                 except (OSError, RuntimeError, ValueError) as error:
                     if not begin:
                         raise
                     losses.add(findings.TORN_END(where=f"event {begin}: {reason_of(error)}"))
                     return
+
+
+def _pixels(numbers: NDArray[Any]) -> NDArray[np.uint16]:
+    """Give columns or rows (N,) as 16 bits; numbers beyond stay off any sensor."""
+    limit = 1 << 16
+    return np.where((numbers >= 0) & (numbers < limit), numbers, limit - 1).astype(np.uint16)
 
 
 @contextmanager
@@ -145,4 +152,4 @@ class TextEvents(EventStream):
                 t_s, x, y, polarity = table.T
                 # Doubles hold today's seconds to 0.24 us: rounding gives the microsecond that was written.
                 t_ns = to_ns(np.rint(t_s * 1e6))
-                yield EventColumns(t_ns, x.astype(np.uint16), y.astype(np.uint16), polarity > 0)
+                yield EventColumns(t_ns, _pixels(x), _pixels(y), polarity > 0)

@@ -151,6 +151,23 @@ def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path)
         everything(open_events(tmp_path / "a.txt", resolution=(346, 260)))
 
 
+@pytest.mark.parametrize("column", [65_538, -1, float("nan")])
+def test_columns_beyond_16_bits_do_not_wrap_onto_the_sensor(tmp_path, column):
+    few = EVENTS.select(slice(0, 100))
+    write_text(tmp_path / "a.txt", few)
+    with (tmp_path / "a.txt").open("a") as file:
+        file.write(f"1700000001.1 {column} 5 1\n")
+    assert everything(open_events(tmp_path / "a.txt")) == listed(few)
+    write_dsec(tmp_path / "a.h5", few)
+    import h5py
+
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["events/x"]
+        file["events/x"] = np.append(few.x[:-1].astype(float), column)
+    recording = open_events(tmp_path / "a.h5", resolution=(346, 260))
+    assert everything(recording) == listed(few)[:-1]
+
+
 def test_hdf5_compressed_by_a_plugin_is_read(tmp_path):
     h5py, hdf5plugin = pytest.importorskip("h5py"), pytest.importorskip("hdf5plugin")
     write_dsec(tmp_path / "a.h5", EVENTS)
