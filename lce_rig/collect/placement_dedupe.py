@@ -50,9 +50,13 @@ class Placements:
     def find_like(self, poses: Mapping[ImageKey, Array]) -> str | None:
         """Name a capture in which every camera saw the board where it is now; None where it is new."""
         likes: dict[str, list[bool]] = {}
-        for name, key, T_cam_board in self._poses:
-            if key in poses:
-                likes.setdefault(name, []).append(self._is_like(T_cam_board, poses[key]))
+        for key, present in poses.items():
+            held = [(name, T) for name, of_camera, T in self._poses if of_camera == key]
+            if held:
+                stored = np.array([T for _, T in held])
+                alike = find_alike(stored, present[None], self._min_move_m, self._min_turn_rad)
+                for (name, _), is_like in zip(held, alike[:, 0], strict=True):
+                    likes.setdefault(name, []).append(bool(is_like))
         return next((name for name in sorted(likes) if all(likes[name])), None)
 
     def are_alike(self, one: Mapping[ImageKey, Array], two: Mapping[ImageKey, Array]) -> bool:

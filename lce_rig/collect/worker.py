@@ -53,10 +53,11 @@ class Worker:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the process at once; a call that waits raises SourceError."""
-        self._is_closed = True
-        if self._process is not None:
-            self._process.terminate()
-            self._process.join(_CLOSE_S)
+        # A call that waits in another thread forgets the process when it ends.
+        self._is_closed, process = True, self._process
+        if process is not None:
+            process.terminate()
+            process.join(_CLOSE_S)
 
     def call(self, method: str, *arguments: object) -> Any:
         """Call a method of the object, and give what it returns.

@@ -197,7 +197,8 @@ def to_scan(
         if is_noise.any():
             notes.add("returns whose tag says noise, rain or bleeding are dropped")
             is_kept &= ~is_noise
-    points, cloud = points[is_kept], cloud[is_kept]
+    if not is_kept.all():
+        points, cloud = points[is_kept], cloud[is_kept]
     if settings.has_rings:
         ring = _ring(cloud, fields, points, where, notes)
     else:

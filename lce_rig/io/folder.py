@@ -290,6 +290,12 @@ class ScansOnDisk:
         return (), scans, [note for _, _, notes in readings for note in notes]
 
 
+def _stamps_ns(files: Sequence[Path]) -> list[int | None]:
+    """Read the times in files' names; None for each where they hold none."""
+    times_ns = parse_times([file.stem for file in files])
+    return [None] * len(files) if times_ns is None else times_ns.tolist()
+
+
 def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) -> list[list[ImageOnDisk]]:
     """List the images of each camera.
 
@@ -306,8 +312,7 @@ def _images(folder: Path, rig: Rig, options: SourceOptions, notes: list[str]) ->
     images = []
     for name, paths in by_camera.items():
         camera, channel = choose_camera(rig, options, notes, name)
-        times_ns = parse_times([path.stem for path in paths])
-        stamps_ns = [None] * len(paths) if times_ns is None else times_ns.tolist()
+        stamps_ns = _stamps_ns(paths)
         labels = [path.name if len(by_camera) == 1 else f"{path.parent.name}/{path.name}" for path in paths]
         images.append(
             [
@@ -408,7 +413,7 @@ class FolderRecording:
         clouds = _list(path, CLOUD_FOLDERS, frozenset(DECODERS), "point clouds", self.notes)
         if any(cloud.suffix.lower() == ".las" for cloud in clouds):
             require_las()
-        cloud_ns = parse_times([cloud.stem for cloud in clouds])
+        cloud_ns = _stamps_ns(clouds)
         # The second image of one camera that goes with a point cloud makes a pair of its own.
         together: dict[tuple[int, int], list[ImageOnDisk]] = {}
         lone: list[str] = []
@@ -430,7 +435,7 @@ class FolderRecording:
                 clouds[j],
                 lidar,
                 rig.lidars[lidar],
-                None if cloud_ns is None else int(cloud_ns[j]),
+                cloud_ns[j],
             )
             for (j, _), held in sorted(together.items(), key=lambda item: item[0])
         ]
@@ -448,11 +453,11 @@ class FolderRecording:
         for name, settings in self._rig.lidars.items():
             files = _files(folders[name.lower()], frozenset(DECODERS)) if name.lower() in folders else []
             if files:
-                times_ns = parse_times([file.stem for file in files])
-                stamps = [None] * len(files) if times_ns is None else times_ns.tolist()
+                if any(file.suffix.lower() == ".las" for file in files):
+                    require_las()
                 clouds[name] = [
-                    PairOnDisk((), file, name, settings, stamp)
-                    for file, stamp in zip(files, stamps, strict=True)
+                    PairOnDisk((), file, name, settings, stamp_ns)
+                    for file, stamp_ns in zip(files, _stamps_ns(files), strict=True)
                 ]
         if len(clouds) < 2:
             names = [f"{name}/" for name in self._rig.lidars]

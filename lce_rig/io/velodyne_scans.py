@@ -177,7 +177,7 @@ class Vlp16Stream:
             self.clock.restart()
         self.mode, self.rotor_hz = packet.mode, packet.steps_per_ns * 1e9 / velodyne.AZIMUTH_STEPS
         self.clock.see_data(packet, self._elapsed_ns)
-        return self._add(packet, self._elapsed_ns)
+        return self._add(packet)
 
     def finish(self) -> Scan | None:
         """End the stream; returns the last scan where it is whole but for the packet that would close it."""
@@ -220,14 +220,14 @@ class Vlp16Stream:
         self.losses.add(findings.CLOCK_SET())
         return "after a step"
 
-    def _add(self, packet: DataPacket, elapsed_ns: int) -> Scan | None:
+    def _add(self, packet: DataPacket) -> Scan | None:
         """Add a packet to its revolution, or to two where the rotor passes the cut within it."""
         past_cut = (packet.azimuth - self._cut) % velodyne.AZIMUTH_STEPS
         scan = None
         if self._pieces:
             last = self._pieces[-1]
             before = (int(last.packet.azimuth[-1]) - self._cut) % velodyne.AZIMUTH_STEPS
-            turned = packet.steps_per_ns * (elapsed_ns - last.elapsed_ns)
+            turned = packet.steps_per_ns * (self._elapsed_ns - last.elapsed_ns)
             if past_cut[0] < before or turned > velodyne.AZIMUTH_STEPS:  # passed between the two packets
                 scan = self._close()
                 self._is_from_cut = True
@@ -235,13 +235,13 @@ class Vlp16Stream:
             self._is_from_cut = bool(past_cut[0] <= packet.steps_per_ns * self.product.block_ns)
         drops = np.flatnonzero(np.diff(past_cut) < 0)
         if len(drops) == 0:
-            self._pieces.append(_Piece(packet, elapsed_ns, slice(0, velodyne.N_BLOCKS)))
+            self._pieces.append(_Piece(packet, self._elapsed_ns, slice(0, velodyne.N_BLOCKS)))
             return scan
         first_after = int(drops[0]) + 1
-        self._pieces.append(_Piece(packet, elapsed_ns, slice(0, first_after)))
+        self._pieces.append(_Piece(packet, self._elapsed_ns, slice(0, first_after)))
         closed = self._close()
         self._is_from_cut = True
-        self._pieces = [_Piece(packet, elapsed_ns, slice(first_after, velodyne.N_BLOCKS))]
+        self._pieces = [_Piece(packet, self._elapsed_ns, slice(first_after, velodyne.N_BLOCKS))]
         return closed or scan
 
     def _close(self) -> Scan | None:

@@ -99,7 +99,8 @@ def edge_products(
     weight, score = information(blur, lost_share) / D**2, -slope / p / D
     J = edges.rows[:, :-1]
     weighted = np.concatenate([J * weight[:, None], score[:, None]], axis=1)
-    first = np.flatnonzero(np.diff(edges.group, prepend=-1))
+    group = edges.group
+    first = np.flatnonzero(np.diff(group, prepend=-1))
     counts = np.diff(first, append=len(J))
     products = np.zeros((len(first), J.shape[1] + 1, J.shape[1] + 1))
     # A ring has two ends on a board, and more where it is hidden in part.
@@ -109,7 +110,7 @@ def edge_products(
     products[:, -1, :-1] = products[:, :-1, -1]
     if len(J):
         products[:, -1, -1] = np.add.reduceat(-2 * np.log(p / D), first)
-    return edges.group[first], products
+    return group[first], products
 
 
 @lru_cache(maxsize=1)

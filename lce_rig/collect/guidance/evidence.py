@@ -243,7 +243,7 @@ def _pose_covariance(model: SensorModel, T_cam_board: Array) -> Array:
     corners, errors = model.board.corners(), model.errors
     R, lens = T_cam_board[:, :3, :3], model.lens
     points = np.einsum("nij,kj->nki", R, corners) + T_cam_board[:, None, :3, 3]
-    by_point = lens.differentiate(points.reshape(-1, 3)).reshape(*points.shape[:2], 2, 3)
+    by_point = lens.differentiate(points)
     by_shift = by_point @ R[:, None]
     by_turn = -by_shift @ skew(corners)
     J = np.concatenate([by_shift, by_turn], axis=-1).reshape(len(R), 2 * len(corners), 6)

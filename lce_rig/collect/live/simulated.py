@@ -175,19 +175,19 @@ class _Simulation:
         camera = next(iter(views))
         self._scene.hold(self._scene.stage.T_world_sensor[camera] @ build_pose(views[camera], _START))
         self._walker = Walker(self._scene, Person(), views)
+        self._period_ns = max(model.period_ns for model in self._scene.stage.models.values())
         self._stamp_ns, self._due_s = time.time_ns(), time.monotonic()
 
     def take(self, asked: tuple[str, Array] | None) -> list[Image | Scan]:
         """Tell the person a camera and T_cam_board (4, 4), and take a sample of each sensor."""
         time.sleep(max(0.0, self._due_s - time.monotonic()))
-        period_ns = max(model.period_ns for model in self._scene.stage.models.values())
         if asked is not None:
             self._walker.hear(*asked, self._stamp_ns * 1e-9)
         self._walker.walk(self._stamp_ns * 1e-9)
         samples = list(self._scene.take(self._stamp_ns))
-        self._stamp_ns += period_ns
+        self._stamp_ns += self._period_ns
         # Late is late: a turn that took long is not made up for by short ones.
-        self._due_s = max(self._due_s + period_ns * 1e-9, time.monotonic())
+        self._due_s = max(self._due_s + self._period_ns * 1e-9, time.monotonic())
         return samples
 
 
