@@ -12,6 +12,8 @@ from pathlib import Path
 import cv2
 import matplotlib as mpl
 import matplotlib.pyplot as plt
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
 from figures import board, frames, views
 
 from lce_rig.cli.main import run

@@ -337,7 +337,7 @@ def _off_centre(board: BoardSettings, offset_m: float) -> dict[str, object]:
 
 
 def _with_corners(samples: Samples, added_columns: int, added_rows: int) -> Samples:
-    columns, rows = samples.rig.board.inner_corners
+    columns, rows = samples.rig.board.inner_corners or (0, 0)
     return _with_board(samples, {"inner_corners": (columns + added_columns, rows + added_rows)})
 
 

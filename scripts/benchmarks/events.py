@@ -1,7 +1,7 @@
 """The simulated rig with an event camera and boards moved by hand: frames, events and both against truth."""
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,7 +14,7 @@ from benchmarks.tables import compare, print_head, print_row, rms
 from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.geometry import Array, difference, transform
 from lce_rig.core.results import ImageBoard
-from lce_rig.detect.detection import Detections
+from lce_rig.detect.detection import Detections, ImageDetection
 from lce_rig.judge.reach import covariance_alone
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.rig import Rig, load_rig
@@ -138,7 +138,7 @@ def _assess(
 
 
 def _corner_errors(
-    rig: Rig, channel: str, found: dict[str, ImageBoard], captures: dict[str, SimulatedCapture]
+    rig: Rig, channel: str, found: Mapping[str, ImageDetection], captures: dict[str, SimulatedCapture]
 ) -> Iterator[float]:
     """Give the rms corner error of each picture in which the board was found, px for each coordinate."""
     intrinsics, corners = rig.cameras[CAMERA].to_intrinsics(), rig.board.to_board().corners()

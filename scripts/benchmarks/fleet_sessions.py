@@ -82,7 +82,7 @@ def robots(n_robots: int, n_sessions: int, n_nudged: int, seed: int = 0) -> list
     """Draw the robots; nudges of 0.3 to 1 deg or 10 to 30 mm about or along one axis each."""
     rng = np.random.default_rng(seed)
     nudged = set(rng.choice(n_robots, n_nudged, replace=False).tolist())
-    found = []
+    found: list[SimulatedRobot] = []
     for k in range(n_robots):
         own = n_sessions // n_robots + (k < n_sessions % n_robots)
         nudge = None
@@ -114,7 +114,9 @@ def make_fleet(
         return fleet
     rig = small_rig()
     kept = kept_folder(folder, rig, "fleet", is_detected=False)
-    pools = [(kept, mounting, None, _MOST) for mounting in range(_MOUNTINGS)]
+    pools: list[tuple[Path, int, Nudge | None, int]] = [
+        (kept, mounting, None, _MOST) for mounting in range(_MOUNTINGS)
+    ]
     pools += [
         (kept, r.mounting, r.nudge, (r.n_sessions - r.nudge.after) * _CAPTURES) for r in fleet if r.nudge
     ]
@@ -163,7 +165,7 @@ def _simulate_pool(pool: tuple[Path, int, Nudge | None, int]) -> None:
     exact = NominalExtrinsic(
         camera="cam",
         lidar="lidar",
-        matrix=tuple(map(tuple, T[:3, :3].tolist())),
+        matrix=tuple(map(tuple, T[:3, :3].tolist())),  # type: ignore[arg-type]
         translation_m=tuple(T[:3, 3].tolist()),
     )
     options = replace(options, mounting_seed=mounting, truth_rotation_deg=0.0, truth_translation_m=0.0)

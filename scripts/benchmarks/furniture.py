@@ -74,7 +74,7 @@ def _find_place(
     vertices = np.concatenate([mesh.vertices for _, mesh, _ in piece])
     for _ in range(_ATTEMPTS):
         # Furniture mostly stands along the walls, but never exactly.
-        turn_rad = rng.integers(4) * np.pi / 2 + rng.normal(0, np.radians(4.0))
+        turn_rad = float(rng.integers(4) * np.pi / 2 + rng.normal(0, np.radians(4.0)))
         if rng.random() < 0.3:
             turn_rad = rng.uniform(0, 2 * np.pi)
         x, y = rng.uniform([1.0, low[1]], high[:2])

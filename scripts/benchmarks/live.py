@@ -226,7 +226,7 @@ def print_load(load: Load) -> None:
     gaps_s = np.diff(load.shown_ns) * 1e-9
     latencies_s = load.report.latencies_s
     sent = load.sent
-    n_packets, n_events = lidar.n_packets or 0, davis.figures["n_events"]
+    n_packets = lidar.n_packets or 0
     print_head("what", "figure")
     print_row("duration", f"{load.wall_s:.1f} s")
     print_row("packets sent, taken, lost by us", f"{sent['lidar']['sent']}, {n_packets:.0f}, {lidar.n_lost}")
@@ -236,10 +236,9 @@ def print_load(load: Load) -> None:
         f"{sent['cam']['sent']}, {cam.n_samples}, {sent['cam']['late']}, {cam.n_dropped}",
     )
     print_row(
-        "events sent, taken, batches dropped",
-        f"{sent['davis']['events']}, {n_events:.0f}, {davis.n_dropped}",
+        "events sent, events a second taken at the end, batches dropped",
+        f"{sent['davis']['events']}, {davis.rates_hz['events'] / 1e6:.2f} M, {davis.n_dropped}",
     )
-    print_row("events a second", f"{n_events / load.wall_s / 1e6:.2f} M")
     print_row("guidance updates a second", f"{len(gaps_s) / gaps_s.sum():.1f}")
     print_row("longest time without one", f"{gaps_s.max():.2f} s")
     print_row("a moved board is shown after, median / worst", _pair(load.changes_s))

@@ -41,9 +41,9 @@ def bench_paper(n_seeds: int, folder: Path) -> None:
 def _errors(simulated: PaperSet, level: int, method: Method) -> tuple[float, float]:
     """Calibrate a set at one level of noise and return its error in deg and mm."""
     candidates = [
-        Observation.of(f"{index:06d}", placement.image, placement.scans[level])
+        Observation.of(f"{index:06d}", placement.image, boards)
         for index, placement in enumerate(simulated.placements)
-        if isinstance(placement.image, ImageBoard) and isinstance(placement.scans[level], list)
+        if isinstance(placement.image, ImageBoard) and isinstance(boards := placement.scans[level], list)
     ]
     rig = paper_rig()
     settings = EstimateSettings.of(CalibrateOptions(method), rig.lidars[LIDAR])

@@ -142,4 +142,4 @@ def _rebuild(kept: dict[str, Array]) -> Placement:
         return {key[len(prefix) :]: a for key, a in kept.items() if key.startswith(prefix)}
 
     scans = {level: from_arrays(part(f"scan{level}")) for level in LEVELS}
-    return Placement(from_arrays(part("image")), scans)
+    return Placement(from_arrays(part("image")), scans)  # type: ignore[arg-type]

@@ -68,9 +68,8 @@ def bench_sessions() -> None:
                 rows[name].append((float(np.linalg.norm(T_lidar_board[:3, 3])), off[2]))
                 for side, outwards_m in edge_offsets(lidar, T_lidar_board, board).items():
                     edges[name][side].append(outwards_m)
-                picture = cv2.imread(
-                    str(path / "captures" / capture / "cam.frames.png"), cv2.IMREAD_GRAYSCALE
-                )
+                file = path / "captures" / capture / "cam.frames.png"
+                picture: Array = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)  # type: ignore[assignment]
                 prints[name].append(print_offset(picture, solved.T_cam_board, board, lens))
     print_head(
         "session",
@@ -135,7 +134,8 @@ def print_offset(picture: Array, T_cam_board: Array, board: Board, lens: Intrins
         along = first + (last - first) * _ALONG[:, None]
         across = along[:, None] + _ACROSS_M[None, :, None] * normal
         pixels = lens.project(transform(T_cam_board, across.reshape(-1, 3)))[0].reshape(*across.shape[:2], 2)
-        grey = cv2.remap(picture, *np.moveaxis(pixels.astype(np.float32), -1, 0), cv2.INTER_LINEAR)
+        u, v = np.moveaxis(pixels.astype(np.float32), -1, 0)
+        grey = cv2.remap(picture, u, v, cv2.INTER_LINEAR)
         step = np.abs(np.gradient(cv2.GaussianBlur(grey.astype(np.float32), (5, 1), 1.0), axis=1))
         place = step[:, 3:-3].argmax(axis=1) + 3
         before, there, after = (step[np.arange(len(place)), place + d] for d in (-1, 0, 1))

@@ -1,5 +1,7 @@
 """Markdown tables, and the figures that go into them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lce_rig.core.geometry import Array, difference
@@ -21,6 +23,6 @@ def compare(T: Array, T_reference: Array) -> tuple[float, float]:
     return float(np.degrees(np.linalg.norm(tangent[3:]))), float(1000 * np.linalg.norm(tangent[:3]))
 
 
-def rms(values: Array) -> float:
+def rms(values: Array | Sequence[float]) -> float:
     """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))

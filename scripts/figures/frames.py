@@ -16,12 +16,13 @@ _LENGTH_M = 0.1
 
 def draw_frames(urdf: Path) -> Any:
     """Draw both frames of the camera of rig rlfs, each with the LiDAR's, from behind and above."""
-    frames = read_robot_urdf(urdf)
+    tree = read_robot_urdf(urdf)
     figure = plt.figure(figsize=(9.6, 4.4))
+    (root,) = tree.frames - tree.above.keys()
     for column, name in enumerate(_CAMERA_FRAMES):
         axes: Any = figure.add_subplot(1, 2, 1 + column, projection="3d")
-        _draw_axes(axes, frames["velodyne"], 1.4)
-        _draw_axes(axes, frames[name], 4)
+        _draw_axes(axes, tree.find_pose(root, "velodyne"), 1.4)
+        _draw_axes(axes, tree.find_pose(root, name), 4)
         axes.set_title(f"thin: velodyne\nthick: {name}", fontsize=14)
         axes.set(xlim=(-0.05, 0.15), ylim=(-0.05, 0.2), zlim=(-0.17, 0.15))
         axes.set_box_aspect((0.2, 0.25, 0.32), zoom=1.4)

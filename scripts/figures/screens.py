@@ -8,7 +8,6 @@ import re
 import shutil
 import signal
 import struct
-import sys
 import tempfile
 import termios
 import threading
@@ -20,8 +19,7 @@ from typing import Any
 import cv2
 import pyte
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "page"))
-from browser import Browser
+from tests.show.phone.browser import Browser
 
 _COLUMNS, _LINES = 100, 24
 _PHONE_PX = (390, 844)

@@ -80,7 +80,7 @@ def draw_placements(rig: Rig, places: Sequence[Placement], columns: int = 3) -> 
         axes.axis("off")
         axes.set_title(place.caption, fontsize=14, color=_BAD if refused else _GOOD, fontweight="bold")
         if refused:
-            lines = (lce.describe(refused[0]), lce.recommend(refused[0]))
+            lines = (refused[0].text, refused[0].advice)
             text = "\n".join(textwrap.fill(line, 40) for line in lines)
             axes.text(0.5, -0.03, text, transform=axes.transAxes, ha="center", va="top", fontsize=10.5)
     figure.tight_layout(h_pad=1.6)

@@ -40,4 +40,4 @@ def must_end_well(process: "subprocess.Popen[bytes]") -> None:
     """Wait for a process that nobody kills."""
     code = process.wait(PATIENCE_S)
     text = said(process)
-    assert code == 0, f"{process.args} ended with {code}:\n{text[-2000:]}"
+    assert code == 0, f"{process.args!r} ended with {code}:\n{text[-2000:]}"
