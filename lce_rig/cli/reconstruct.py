@@ -52,8 +52,8 @@ def reconstruct(
 ) -> None:
     """Reconstruct grey images from the events of RECORDING into FOLDER, with timestamps in stamps.csv.
 
-    Reads AEDAT4, Prophesee RAW (EVT2, EVT3), ROS 1, ROS 2 and mcap bags, HDF5 in DSEC's layout and E2VID's
-    text. Skips the first images, until the network has settled, and prints how many.
+    Reads AEDAT4, Prophesee RAW (EVT3), ROS 1, ROS 2 and mcap bags, and HDF5 in DSEC's layout. Skips the
+    first images, until the network has settled, and prints how many.
     """
     reconstructor = Reconstructor(model)
     events = open_events(recording, topic=topic)

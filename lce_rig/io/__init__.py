@@ -18,7 +18,7 @@ RECORDINGS = {
     "folder": "lce_rig.io.folder:FolderRecording",
     **dict.fromkeys(SUFFIXES, "lce_rig.io.ros.rosbag:BagRecording"),
     **dict.fromkeys(sorted(_PACKETS), "lce_rig.io.velodyne_scans:PcapRecording"),
-    **dict.fromkeys([*sorted(_EVENTS), ".txt"], "lce_rig.io.events:EventCameraFile"),
+    **dict.fromkeys(sorted(_EVENTS), "lce_rig.io.events:EventCameraFile"),
 }
 """Reader by suffix, or "folder"; imported when wanted."""
 _KINDS = (_BAGS, _PACKETS, _EVENTS)

@@ -71,7 +71,8 @@ def stamps(folder):
 
 
 def test_one_wild_stamp_does_not_ask_for_images_of_centuries(lce_rig, tmp_path):
-    (tmp_path / "a.txt").write_text("346 260\n0.0 1 1 0\n0.001 2 2 1\n1000000000 3 3 1\n")
-    outcome = lce_rig("reconstruct", tmp_path / "a.txt", "-o", tmp_path / "out")
+    t_ns, places = np.array([0, 10**6, 10**18]), np.array([1, 2, 3], np.uint16)
+    write_aedat4(tmp_path / "a.aedat4", [Events("events", t_ns, places, places, places > 1, 346, 260)])
+    outcome = lce_rig("reconstruct", tmp_path / "a.aedat4", "-o", tmp_path / "out")
     assert outcome.code == 2
     assert "maximum 1000000" in outcome.err and "--duration" in outcome.err

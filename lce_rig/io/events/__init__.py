@@ -20,9 +20,8 @@ READERS = {
     ".aedat4": "lce_rig.io.events.aedat4:Aedat4Events",
     **dict.fromkeys(SUFFIXES, "lce_rig.io.ros.event_messages:BagEvents"),
     ".raw": "lce_rig.io.events.prophesee:PropheseeEvents",
-    ".h5": "lce_rig.io.events.tables:Hdf5Events",
-    ".hdf5": "lce_rig.io.events.tables:Hdf5Events",
-    ".txt": "lce_rig.io.events.tables:TextEvents",
+    ".h5": "lce_rig.io.events.hdf5:Hdf5Events",
+    ".hdf5": "lce_rig.io.events.hdf5:Hdf5Events",
 }
 """Reader by suffix; a folder is a ROS 2 bag. Imported when wanted."""
 
@@ -39,7 +38,7 @@ def open_events(
     """Open a recording of events.
 
     Args:
-        path: an AEDAT4, Prophesee .raw, HDF5 (DSEC) or text file, or a ROS 1 or ROS 2 bag.
+        path: an AEDAT4, Prophesee .raw or HDF5 (DSEC) file, or a ROS 1 or ROS 2 bag.
         sensor: name of the camera that its events are taken for.
         resolution: (width, height) px of that camera; None takes the file's, or the extent of its events.
         topic: of a bag; None takes the only one with events.

@@ -1,13 +1,12 @@
-"""Events in words of 16 or 32 bits: Prophesee's EVT2 and EVT3 and their .raw files; libcaer_cmp of ROS.
+"""Events in words of 16 bits: Prophesee's EVT3 and its .raw files; libcaer_cmp of ROS.
 
-A .raw file is lines of text, then words up to the end. All encodings are state machines: some words set the
+A .raw file is lines of text, then words up to the end. Both encodings are state machines: some words set the
 time, the row (or column) or a base; others emit events from that state. A whole block is decoded at once:
 what a word sets is repeated up to the next word of its kind, and the words that hold the state at a block's
 end are put before the next block.
 
 References:
     https://docs.prophesee.ai/stable/data/file_formats/raw.html
-    https://docs.prophesee.ai/stable/data/encoding_formats/evt2.html
     https://docs.prophesee.ai/stable/data/encoding_formats/evt3.html
     https://github.com/ros-event-camera/event_camera_codecs (libcaer_cmp: rows and columns exchanged)
 """
@@ -15,7 +14,7 @@ References:
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,6 @@ from lce_rig.core.findings import Losses
 from lce_rig.io.events.event_recording import NS_PER_US, EventStream, parse_size
 
 _BLOCK_BYTES = 1 << 18
-_WORDS = {"2": "<u4", "3": "<u2"}
 
 
 @dataclass
@@ -58,35 +56,6 @@ class WrappingCounter:
         unwrapped = values + (wraps << self.n_bits)
         self.last = int(unwrapped[-1])
         return np.asarray(unwrapped, dtype=np.int64)
-
-
-class Evt2Decoder:
-    """Decodes EVT2, block by block; events before any timestamp are skipped.
-
-    Attributes:
-        clock: the high part of the time: 28 bits of 64 us.
-    """
-
-    _ON, _TIME_HIGH = 1, 8
-
-    def __init__(self) -> None:
-        self.clock = WrappingCounter(28, 1 << 10)
-        self._state = np.empty(0, np.uint32)
-
-    def decode(self, words: NDArray[np.uint32]) -> EventColumns:
-        """Decode a block of words (N,)."""
-        words = np.concatenate((self._state, words))
-        code = words >> 28
-        at_high = np.flatnonzero(code == self._TIME_HIGH)
-        high = _held(at_high, self.clock.unwrap((words[at_high] & 0xFFFFFFF).astype(np.int64)), len(words))
-        self._state = words[at_high[-1:]]
-        emitting = np.flatnonzero(code <= self._ON)
-        n_untimed = int(np.searchsorted(emitting, at_high[0])) if len(at_high) else len(emitting)
-        emitting = emitting[n_untimed:]
-        event = words[emitting]
-        t_us = (high[emitting] << 6) | ((event >> 22) & 0x3F)
-        x, y = ((event >> 11) & 0x7FF).astype(np.uint16), (event & 0x7FF).astype(np.uint16)
-        return EventColumns(t_us * NS_PER_US, x, y, code[emitting] == self._ON)
 
 
 @dataclass(frozen=True)
@@ -212,10 +181,9 @@ class PropheseeEvents(EventStream):
         # The format line holds more: "EVT3;height=720;width=1280".
         encoding, *fields = header.get("format", "").split(";")
         named = header.get("evt", encoding.upper().removeprefix("EVT"))
-        self._version = named.removesuffix(".0")
-        if self._version not in _WORDS:
+        if named.removesuffix(".0") != "3":
             hint = "Check that it is a Prophesee .raw file, or convert it to EVT3."
-            raise SourceError(f"{path} has the encoding {named[:20]!r}, not EVT2 or EVT3", hint)
+            raise SourceError(f"{path} has the encoding {named[:20]!r}, not EVT3", hint)
         size = dict(field.partition("=")[::2] for field in fields)
         width, height = size.get("width", ""), size.get("height", "")
         if not (width and height):
@@ -224,13 +192,11 @@ class PropheseeEvents(EventStream):
 
     def stretches(self, losses: Losses) -> Iterator[EventColumns]:
         """Yield the events of the file, block by block."""
-        dtype = np.dtype(_WORDS[self._version])
-        decoder: Any = WordDecoder(EVT3) if self._version == "3" else Evt2Decoder()
+        decoder = WordDecoder(EVT3)
         with reading(self._path), self._path.open("rb") as file:
             file.seek(self._begin)
             while block := file.read(_BLOCK_BYTES):
-                words: NDArray[Any] = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
-                yield decoder.decode(words)
+                yield decoder.decode(np.frombuffer(block, "<u2", len(block) // 2))
 
 
 def _read_header(file: BinaryIO) -> dict[str, str]:

@@ -32,16 +32,6 @@ def random_events(n, seed, size=(346, 260), start_us=0, step_us=20):
     return Events("events", t_us * 1000, x.astype(np.uint16), y.astype(np.uint16), polarity, *size)
 
 
-def evt2(events):
-    words, high = [], -1
-    for t, x, y, p in events:
-        if t >> 6 != high:
-            high = t >> 6
-            words.append(8 << 28 | high & 0xFFFFFFF)
-        words.append(int(p) << 28 | (t & 0x3F) << 22 | x << 11 | y)
-    return struct.pack(f"<{len(words)}I", *words)
-
-
 def evt3(events, with_vectors=True):
     """Prophesee's EVT3; runs in a row become a base and vectors of 12 and 8."""
     words = []

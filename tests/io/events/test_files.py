@@ -29,12 +29,6 @@ def everything(recording):
     return [event for stretch in recording for event in listed(stretch)]
 
 
-def write_text(path, events, with_size=True):
-    lines = [f"{t // 10**6}.{t % 10**6:06d} {x} {y} {p:d}" for t, x, y, p in listed(events)]
-    head = [f"{events.width_px} {events.height_px}"] if with_size else []
-    path.write_text("\n".join(head + lines) + "\n")
-
-
 def write_dsec(path, events):
     import h5py
 
@@ -59,7 +53,6 @@ WRITERS: dict[str, Callable[[Path, Events], object]] = {
     "a.bag": lambda path, events: write_event_bag(path, [events]),
     "ros2": lambda path, events: write_event_bag(path, [events]),
     "a.h5": write_dsec,
-    "a.txt": write_text,
     "a.raw": write_raw,
 }
 
@@ -120,44 +113,19 @@ def test_a_damaged_packet_costs_only_itself(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("head", "encode"),
-    [
-        ("% evt 2.0\n% geometry 640x480\n", encoders.evt2),
-        ("% format EVT2;height=480;width=640\n% end\n", encoders.evt2),
-        ("% format EVT3;height=480;width=640\n% end\n", encoders.evt3),
-    ],
+    "head", ["% evt 3.0\n% geometry 640x480\n", "% format EVT3;height=480;width=640\n% end\n"]
 )
-def test_raw_files_of_every_version_and_header_are_read(tmp_path, head, encode):
+def test_raw_files_of_every_header_are_read(tmp_path, head):
     truth = listed(random_events(500, 8, (640, 480)))
-    (tmp_path / "a.raw").write_bytes(head.encode() + encode(truth))
+    (tmp_path / "a.raw").write_bytes(head.encode() + encoders.evt3(truth))
     recording = open_events(tmp_path / "a.raw")
     assert recording.resolution_px == (640, 480)
     assert everything(recording) == truth
 
 
-def test_text_without_a_size_and_with_broken_lines_is_read_around_them(tmp_path):
-    few = EVENTS.select(slice(0, 100))
-    write_text(tmp_path / "a.txt", few, with_size=False)
-    lines = (tmp_path / "a.txt").read_text().splitlines()
-    lines[40:40] = ["# a comment", "nan 1 1 1"]
-    (tmp_path / "a.txt").write_text("\n".join(lines) + "\n1700000000.1 3")
-    recording = open_events(tmp_path / "a.txt", resolution=(346, 260))
-    assert everything(recording) == listed(few)
-    assert has_note(recording.notes, "1 events with stray") and has_note(
-        recording.notes, "1 torn", "line 103"
-    )
-    (tmp_path / "a.txt").write_text("\n".join([*lines, "what is this?", ""]))
-    with pytest.raises(SourceError, match=r"a\.txt"):
-        everything(open_events(tmp_path / "a.txt", resolution=(346, 260)))
-
-
 @pytest.mark.parametrize("column", [65_538, -1, float("nan")])
 def test_columns_beyond_16_bits_do_not_wrap_onto_the_sensor(tmp_path, column):
     few = EVENTS.select(slice(0, 100))
-    write_text(tmp_path / "a.txt", few)
-    with (tmp_path / "a.txt").open("a") as file:
-        file.write(f"1700000001.1 {column} 5 1\n")
-    assert everything(open_events(tmp_path / "a.txt")) == listed(few)
     write_dsec(tmp_path / "a.h5", few)
     import h5py
 
@@ -177,7 +145,7 @@ def test_hdf5_compressed_by_a_plugin_is_read(tmp_path):
     assert everything(open_events(tmp_path / "a.h5")) == listed(EVENTS)
 
 
-@pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.txt", "a.bag", "a.raw", "a.mp4"])
+@pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.bag", "a.raw", "a.mp4"])
 def test_rubbish_by_any_name_is_refused_in_one_line(tmp_path, name):
     for rubbish in (b"", b"rubbish\n" * 100, bytes(1000)):
         (tmp_path / name).write_bytes(rubbish)
@@ -195,7 +163,7 @@ def whole(folder, name):
     return (folder / name).read_bytes()
 
 
-@pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.raw", "a.txt"])
+@pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.raw"])
 @given(data=st.data())
 def test_damaged_events_are_read_or_refused_in_one_line(tmp_path_factory, name, data):
     folder = tmp_path_factory.getbasetemp()

@@ -1,15 +1,11 @@
-"""Tables of events: HDF5 as the DSEC data set lays it out, and E2VID's text.
-
-DSEC has events/{t,x,y,p}, t in us after t_offset; E2VID "width height", then a line "t x y polarity" for
-every event, t in s.
+"""Events in HDF5 as the DSEC data set lays them out: events/{t,x,y,p}, t in us after t_offset.
 
 References:
-    https://dsec.ifi.uzh.ch/data-format/, https://github.com/uzh-rpg/rpg_e2vid
+    https://dsec.ifi.uzh.ch/data-format/
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +16,10 @@ from lce_rig.core.data import EventColumns
 from lce_rig.core.errors import SourceError, reading, reason_of
 from lce_rig.core.findings import Losses
 from lce_rig.io import findings
-from lce_rig.io.events.event_recording import EventStream, parse_size, to_ns
+from lce_rig.io.events.event_recording import EventStream, to_ns
 
-_BLOCK_EVENTS, _BLOCK_LINES = 1 << 20, 1 << 16
+_BLOCK_EVENTS = 1 << 20
 _COLUMNS = ("events/t", "events/x", "events/y", "events/p")
-_NO_LINES = np.empty((0, 4))
 
 
 class Hdf5Events(EventStream):
@@ -106,50 +101,3 @@ def _number(file: Any, name: str) -> int | None:
         if value is not None:
             return int(np.asarray(value).item())
     return None
-
-
-class TextEvents(EventStream):
-    """Events of a text file; see `EventStream`."""
-
-    def __init__(self, path: Path) -> None:
-        """Read the first line.
-
-        Raises:
-            SourceError: it is no such file.
-        """
-        self._path = path
-        self.notes: list[str] = []
-        with reading(path), path.open("rb") as file:
-            line = file.readline()
-        words = line.decode(errors="replace").split()
-        self._has_size = len(words) == 2
-        self.resolution_px = parse_size(*words) if self._has_size else None
-        is_event = len(words) == 4 or line.startswith(b"#")
-        if words and self.resolution_px is None and not is_event:
-            raise SourceError(
-                f"{path} is not a text file of events: the first line is neither a size nor an event",
-                'Expected "width height", then lines "t x y polarity" with t in seconds.',
-            )
-
-    def stretches(self, losses: Losses) -> Iterator[EventColumns]:
-        """Yield the events of some megabytes of text at a time; a torn last line is skipped.
-
-        Raises:
-            SourceError: a line is no event.
-        """
-        n_lines = int(self._has_size)
-        with reading(self._path), self._path.open("rb") as file:
-            next(islice(file, n_lines, n_lines), None)
-            while lines := list(islice(file, _BLOCK_LINES)):
-                if not lines[-1].endswith(b"\n"):
-                    losses.add(findings.TORN_END(where=f"line {n_lines + len(lines)}"))
-                    lines.pop()
-                n_lines += len(lines)
-                has_events = any(line.partition(b"#")[0].strip() for line in lines)
-                table = np.loadtxt(lines, ndmin=2, comments="#") if has_events else _NO_LINES
-                if table.shape[1] != 4:
-                    raise ValueError(f"lines up to {n_lines} have {table.shape[1]} numbers, not 4")
-                t_s, x, y, polarity = table.T
-                # Doubles hold today's seconds to 0.24 us: rounding gives the microsecond that was written.
-                t_ns = to_ns(np.rint(t_s * 1e6))
-                yield EventColumns(t_ns, _pixels(x), _pixels(y), polarity > 0)
