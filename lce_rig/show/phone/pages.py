@@ -5,7 +5,6 @@ import hmac
 import json
 import math
 import re
-import socket
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
@@ -140,13 +139,7 @@ MAX_MESSAGE_BYTES = 256
 ANSWER_S = 5.0
 #: A page that does not answer a ping for so long is gone: a phone out of range says no goodbye.
 HEARTBEAT_S = 10.0
-#: Pages open at once.
-MAX_VIEWERS = 8
-#: Connections open at once: the process needs its descriptors for captures and sensors.
-MAX_CONNECTIONS = 48
-#: A connection that does not feed a page is closed after this time: loading the page takes less.
-CONNECTION_S = 10.0
-_SET_UP_S, _GOODBYE_S = 1.0, 0.5
+_GOODBYE_S = 0.5
 _COOKIE = "lce_rig_preview"
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 # The page loads nothing from elsewhere, and may not be framed.
@@ -304,12 +297,6 @@ class Viewer:
         return True
 
 
-class _Refused(asyncio.Protocol):
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        transport.abort()
-
-
 class Pages:
     """Answers requests that bring the token, in the link or in the cookie that the link leaves.
 
@@ -323,7 +310,7 @@ class Pages:
         self.encoder = Encoder()
         self._token = token
         self._feed = feed
-        self._viewers: dict[web.RequestHandler, Viewer] = {}
+        self._viewers: set[Viewer] = set()
         folder = resources.files("lce_rig.show.phone") / "page"
         self._files = {entry.name: entry.read_bytes() for entry in folder.iterdir()}
 
@@ -336,36 +323,11 @@ class Pages:
         app.router.add_get("/{name}", self._file)
         return app
 
-    async def listen(self, runner: web.AppRunner, opened: socket.socket) -> asyncio.Server:
-        """Accept connections, within limits, for the application of a runner that is set up."""
-        server, loop = runner.server, asyncio.get_running_loop()
-        assert server is not None
-        accepted: dict[web.RequestHandler, float] = {}
-
-        def accept() -> asyncio.Protocol:
-            now_s = loop.time()
-            for other, since_s in list(accepted.items()):
-                # It has no transport before it is set up, and after it is closed.
-                if other.transport is None and now_s - since_s > _SET_UP_S:
-                    del accepted[other]
-            if len(accepted) >= MAX_CONNECTIONS:
-                return _Refused()
-            handler = server()
-            accepted[handler] = now_s
-            loop.call_later(CONNECTION_S, self._cut, handler)
-            return handler
-
-        return await loop.create_server(accept, sock=opened)
-
     async def close(self) -> None:
         """Let the pages have the last state, and close them."""
-        closing = (viewer.close() for viewer in self._viewers.values())
+        closing = (viewer.close() for viewer in self._viewers)
         await asyncio.gather(*closing, return_exceptions=True)
         self.encoder.close()
-
-    def _cut(self, handler: web.RequestHandler) -> None:
-        if handler not in self._viewers and handler.transport is not None:
-            handler.transport.abort()
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -393,17 +355,16 @@ class Pages:
         return response
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
-        if len(self._viewers) >= MAX_VIEWERS:
-            return web.Response(status=503, text=f"{MAX_VIEWERS} pages are open already.\n")
         line = web.WebSocketResponse(
             heartbeat=HEARTBEAT_S, max_msg_size=MAX_MESSAGE_BYTES, timeout=_GOODBYE_S
         )
         await line.prepare(request)
-        viewer = self._viewers[request.protocol] = Viewer(line, self._feed, self.encoder)
+        viewer = Viewer(line, self._feed, self.encoder)
+        self._viewers.add(viewer)
         try:
             await viewer.serve()
         finally:
-            del self._viewers[request.protocol]
+            self._viewers.remove(viewer)
         return line
 
     @staticmethod

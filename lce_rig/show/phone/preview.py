@@ -3,7 +3,6 @@
 import asyncio
 import errno
 import fcntl
-import ipaddress
 import logging
 import re
 import secrets
@@ -24,7 +23,7 @@ LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 8765
 
 _HINT = (
-    "--preview takes HOST:PORT, HOST or PORT, such as 0.0.0.0:8765, [::1]:8765 or 8080. "
+    "--preview takes HOST:PORT, HOST or PORT, such as 0.0.0.0:8765 or 8080. "
     "Give the session before it: lce-rig collect --rig R session/ --preview"
 )
 # linux/sockios.h; Python names neither.
@@ -33,63 +32,45 @@ _INTERFACE = struct.Struct("16s20s")
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Take an address apart: "host:port", "host", "port", ":port", "[ipv6]:port", "ipv6".
-
-    Args:
-        text: by default this computer alone, port 8765.
-
-    Returns:
-        Host without brackets, and port; port 0 is any free one.
+    """Take an address apart: "host:port", "host" or "port"; this computer alone and port 8765 by default.
 
     Raises:
         UsageError: it is none of these.
     """
-    text = text.strip()
-    if _is_ipv6(text):
-        return text, DEFAULT_PORT
-    match = re.fullmatch(r"(?:\[([^\]]*)\]|([^\s/:\[\]]*))(?::([0-9]{0,5}))?", text)
-    if match is None or (match[1] is not None and not _is_ipv6(match[1])):
-        raise UsageError(f"{text!r} is no address for a page", _HINT)
-    host, port = match[1] or match[2] or "", match[3] or ""
-    if ":" not in text and host.isdecimal():
+    host, colon, port = text.strip().partition(":")
+    if not colon and host.isdecimal():
         host, port = "", host
-    if port and not (port.isascii() and int(port) <= 65535):
+    if re.search(r"[\s/\[\]]", host) or not re.fullmatch("[0-9]{0,5}", port) or int(port or 0) > 65535:
         raise UsageError(f"{text!r} is no address for a page", _HINT)
     return host or LOOPBACK, int(port or DEFAULT_PORT)
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Open a socket that listens; on all addresses of both kinds where `host` is "::".
+    """Open a socket that listens.
 
     Raises:
         UsageError: the port is in use or not permitted, or the host is not this computer.
     """
-    address = f"{_bracketed(host)}:{port}"
     try:
-        family, _, _, _, where = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        is_dual = family == socket.AF_INET6 and host == "::" and socket.has_dualstack_ipv6()
-        return socket.create_server(where[:2], family=family, dualstack_ipv6=is_dual)
+        return socket.create_server((host, port))
     except (OSError, UnicodeError) as error:
         number, why, hint = getattr(error, "errno", None), str(error), _HINT
         if number == errno.EADDRINUSE:
-            other = f"{_bracketed(host)}:{min(port + 1, 65535)}"
             why = "the port is in use"
             hint = (
                 f"Another collection may be running: `ss -ltnp sport = :{port}` names it. "
-                f"Or choose another port: --preview {other}."
+                f"Or choose another port: --preview {host}:{min(port + 1, 65535)}."
             )
         elif number in (errno.EACCES, errno.EPERM):
             why = "not permitted"
-            hint = f"Ports below 1024 need root: --preview {_bracketed(host)}:{DEFAULT_PORT}."
+            hint = f"Ports below 1024 need root: --preview {host}:{DEFAULT_PORT}."
         elif number == errno.EADDRNOTAVAIL or isinstance(error, (socket.gaierror, UnicodeError)):
             why = "not an address of this computer"
             hint = (
                 "`hostname -I` lists this computer's addresses; 0.0.0.0 stands for all. "
                 "A session's name goes before --preview."
             )
-        raise UsageError(f"the page cannot be served at {address}: {why}", hint) from None
+        raise UsageError(f"the page cannot be served at {host}:{port}: {why}", hint) from None
 
 
 def links(opened: socket.socket, token: str) -> tuple[str, ...]:
@@ -98,12 +79,11 @@ def links(opened: socket.socket, token: str) -> tuple[str, ...]:
     Where the socket listens on all addresses, there is one for each IPv4 address of this computer: which of
     its networks a phone is in cannot be known.
     """
-    # A link-local address may carry its interface: fe80::1%eth0.
-    host, port = str(opened.getsockname()[0]).partition("%")[0], opened.getsockname()[1]
+    host, port = opened.getsockname()
     hosts = [host]
-    if ipaddress.ip_address(host).is_unspecified:
+    if host == "0.0.0.0":
         hosts = _network_addresses() or [f"{socket.gethostname()}.local"]
-    return tuple(f"http://{_bracketed(host)}:{port}/?token={token}" for host in hosts)
+    return tuple(f"http://{host}:{port}/?token={token}" for host in hosts)
 
 
 def _network_addresses() -> list[str]:
@@ -121,19 +101,7 @@ def _network_addresses() -> list[str]:
             with suppress(OSError):  # an interface without an IPv4 address
                 answer = fcntl.ioctl(probe.fileno(), _SIOCGIFADDR, request)
                 addresses.append(socket.inet_ntoa(answer[20:24]))
-    return [each for each in dict.fromkeys(addresses) if not ipaddress.ip_address(each).is_loopback]
-
-
-def _bracketed(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
-
-
-def _is_ipv6(text: str) -> bool:
-    try:
-        ipaddress.IPv6Address(text)
-    except ValueError:
-        return False
-    return True
+    return [each for each in dict.fromkeys(addresses) if not each.startswith("127.")]
 
 
 # 72 bits: beyond guessing, and can still be typed into a phone.
@@ -173,7 +141,7 @@ class Preview:
         urls: the links, the likeliest first; empty before `start`.
 
     Args:
-        address: host name or address to bind to; "0.0.0.0" or "::" for all networks.
+        address: host name or IPv4 address to bind to; "0.0.0.0" for all networks.
         port: 0 for any free one.
         token: that a browser must bring; None draws one.
 
@@ -270,25 +238,16 @@ class Preview:
             lingering_time=_LINGERING_S,
         )
         await runner.setup()
-        server = await self._pages.listen(runner, opened)
+        await web.SockSite(runner, opened).start()
         self._is_ready.set()
         await self._stop.wait()
         # A connection that is being set up when the server closes would never be closed itself.
         self._loop.remove_reader(opened)
         for _ in range(_TURNS_TO_SET_UP):
             await asyncio.sleep(0)
-        server.close()
         await self._pages.close()
-        assert runner.server is not None
-        with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(_cut(runner.server), _SHUTDOWN_S)
-        await runner.cleanup()
-
-
-async def _cut(handlers: web.Server) -> None:
-    """Cut every connection, as a stuck page would keep its own for ever, and wait until all have closed."""
-    while handlers.connections:
-        for handler in handlers.connections:
+        # A stuck page would keep its connection for ever.
+        for handler in runner.server.connections if runner.server else []:
             if handler.transport is not None:
                 handler.transport.abort()
-        await asyncio.sleep(1e-3)
+        await runner.cleanup()

@@ -20,10 +20,6 @@ from .conftest import port_of
         ("0.0.0.0:80", "0.0.0.0", 80),
         ("rig.local:9000", "rig.local", 9000),
         (" localhost ", "localhost", 8765),
-        ("::1", "::1", 8765),
-        ("[::1]", "::1", 8765),
-        ("[::]:9000", "::", 9000),
-        ("fe80::1:9000", "fe80::1:9000", 8765),
     ],
 )
 def test_addresses_are_read_as_people_write_them(text, host, port):
@@ -32,8 +28,8 @@ def test_addresses_are_read_as_people_write_them(text, host, port):
 
 @pytest.mark.parametrize(
     "text",
-    ["host:port", "host:70000", "1:2:3", "[::1", "[::1]9000", "[host]:1", "http://host:1", "a b", "host:-1",
-     "host:8_0", "host:٣"],
+    ["host:port", "host:70000", "1:2:3", "::1", "[::1]:9000", "http://host:1", "a b", "host:-1", "host:8_0",
+     "host:٣"],
 )  # fmt: skip
 def test_what_is_no_address_is_refused_with_examples(text):
     with pytest.raises(UsageError) as caught:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from lce_rig.collect.live.state import Drawing
-from lce_rig.show.phone import pages
 from lce_rig.show.phone.pages import MAX_UNDER_WAY, MAX_WIDTH_PX, encode_picture
 from lce_rig.show.phone.preview import Preview
 
@@ -89,27 +88,6 @@ def test_a_page_that_does_not_answer_delays_neither_the_collection_nor_other_pag
         assert statistics.median(took_s) < 1e-3
         got = stuck.receive_all(quiet_s=0.5)
         assert sum(isinstance(message, dict) for message in got) <= MAX_UNDER_WAY
-
-
-def test_a_page_that_vanished_is_forgotten(monkeypatch):
-    monkeypatch.setattr(pages, "HEARTBEAT_S", 0.2)
-    monkeypatch.setattr(pages, "MAX_VIEWERS", 1)
-    with Preview(port=0) as preview, Watcher(preview.urls[0]) as watcher:
-        preview.publish(state())
-        port, query = port_of(preview), preview.urls[0].partition("?")[2]
-        with socket.create_connection(("127.0.0.1", port)) as silent:
-            silent.sendall(ask_for_states(port, query))
-            assert silent.recv(12) == b"HTTP/1.1 101"
-            status, _, _ = watcher.get("live")
-            assert status == 503
-            # It answers no ping, and its place is free again.
-            deadline_s = time.monotonic() + 20
-            while watcher.get("live")[0] == 503:
-                assert time.monotonic() < deadline_s
-                time.sleep(0.1)
-        monkeypatch.undo()
-        watcher.watch()
-        assert watcher.next_state()[0]["n_captures"] == 7
 
 
 def test_a_page_asks_for_the_capture_it_shows_as_the_last(preview):
