@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from lce_rig.rig import load_rig
 from tests.shared import Shared, find_folder
 
 # Long runs of the property tests try more examples, and new ones each time (CONTRIBUTING.md, Fuzzing).
@@ -24,6 +25,24 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 @pytest.fixture(scope="session", autouse=True)
 def _shared(tmp_path_factory):
     Shared.folder = find_folder(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def rlfs():
+    """The shipped profile of a camera and a VLP-16."""
+    return load_rig("rlfs")
+
+
+@pytest.fixture(scope="session")
+def rles():
+    """The shipped profile of a DAVIS346 and a VLP-16."""
+    return load_rig("rles")
+
+
+@pytest.fixture(scope="session")
+def rig(rlfs):
+    """The rig of a test that needs any."""
+    return rlfs
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,6 @@ from lce_rig.collect.gates import MotionGate, StillnessGate, find_moments
 from lce_rig.collect.placement_dedupe import Placements
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Losses, Refusal
-from lce_rig.rig import load_rig
 
 from .event_sightings import event_stream, watch
 
@@ -18,14 +17,9 @@ PLENTY = event_stream([(-1.3, 6.0, 6.0)])
 SOME = event_stream([(-1.3, 6.0, 2.0)])
 
 
-@pytest.fixture(scope="module")
-def rig():
-    return load_rig("rles")
-
-
-def choose(detections, rig):
+def choose(detections, rles):
     tally = Losses()
-    moments = find_moments(detections, MotionGate(rig, Placements(0.15, 10.0), tally))
+    moments = find_moments(detections, MotionGate(rles, Placements(0.15, 10.0), tally))
     return list(moments), tally.by_code()
 
 
@@ -33,8 +27,8 @@ def places_m(moments):
     return [float(m.detection.images["davis", "frames"].T_cam_board[0, 3]) for m in moments]
 
 
-def test_a_board_that_passes_slowly_is_taken_once_a_place(rig):
-    moments, refused = choose(watch(rig, lambda t: (0.1 * t - 0.25, 0.0), 5.0, SOME), rig)
+def test_a_board_that_passes_slowly_is_taken_once_a_place(rles):
+    moments, refused = choose(watch(rles, lambda t: (0.1 * t - 0.25, 0.0), 5.0, SOME), rles)
     assert len(moments) in (3, 4) and not refused
     assert np.diff(places_m(moments)).min() >= 0.15
     for moment in moments:
@@ -53,56 +47,56 @@ def test_a_board_that_passes_slowly_is_taken_once_a_place(rig):
     ],
 )
 def test_boards_without_use_for_an_event_camera_are_refused_by_their_cause(
-    rig, speed_mps, rate, lamp_hz, code
+    rles, speed_mps, rate, lamp_hz, code
 ):
     stream = event_stream([(-1.3, 3.0, rate)], lamp_hz=lamp_hz)
-    detections = watch(rig, lambda t: (speed_mps * (t - 0.5), 0.0), 1.0, stream)
-    assert choose(detections, rig) == ([], {code: 10})
+    detections = watch(rles, lambda t: (speed_mps * (t - 0.5), 0.0), 1.0, stream)
+    assert choose(detections, rles) == ([], {code: 10})
 
 
-def test_a_board_that_has_just_stopped_or_a_rig_that_moves_will_do_where_events_are_plenty(rig):
-    moments, refused = choose(watch(rig, lambda _t: (0.0, 0.0), 2.0, PLENTY), rig)
+def test_a_board_that_has_just_stopped_or_a_rig_that_moves_will_do_where_events_are_plenty(rles):
+    moments, refused = choose(watch(rles, lambda _t: (0.0, 0.0), 2.0, PLENTY), rles)
     assert len(moments) == 1 and not refused
     assert moments[0].figures["speed_mps"] < 0.01 and moments[0].figures["events_px"] > 4
 
 
-def test_the_slowest_part_of_a_way_is_preferred_to_a_fast_one_through_the_same_place(rig):
+def test_the_slowest_part_of_a_way_is_preferred_to_a_fast_one_through_the_same_place(rles):
     def way(t):
         """In at 0.4 m/s, then on at 0.1 m/s."""
         return (0.4 * (t - 1.0) if t < 1.0 else 0.1 * (t - 1.0), 0.0)
 
-    moments, _ = choose(watch(rig, way, 2.2, SOME), rig)
+    moments, _ = choose(watch(rles, way, 2.2, SOME), rles)
     near = [moment for moment in moments if abs(places_m([moment])[0]) < 0.15]
     assert any(moment.figures["speed_mps"] == pytest.approx(0.1, abs=0.01) for moment in near)
     assert all(np.diff(sorted(places_m(moments))) >= 0.15)
 
 
-def test_moments_before_the_stream_or_after_it_are_counted(rig):
+def test_moments_before_the_stream_or_after_it_are_counted(rles):
     stream = event_stream([(1.0, 2.0, 4.0)])
-    _, refused = choose(watch(rig, lambda t: (0.05 * t, 0.0), 6.0, stream), rig)
+    _, refused = choose(watch(rles, lambda t: (0.05 * t, 0.0), 6.0, stream), rles)
     # Scans 8 to 31 begin less than 1.2 s after its end and end less than 0.15 s before its beginning.
     assert refused["read.no_events_at_scan"] == 8 + 28
 
 
-def test_a_board_that_the_lidar_does_not_see_is_no_moment(rig):
-    assert choose(watch(rig, lambda t: (0.1 * t, 0.0), 1.0, SOME, has_lidar=False), rig) == ([], {})
+def test_a_board_that_the_lidar_does_not_see_is_no_moment(rles):
+    assert choose(watch(rles, lambda t: (0.1 * t, 0.0), 1.0, SOME, has_lidar=False), rles) == ([], {})
 
 
-def test_a_board_that_comes_back_is_not_taken_twice(rig):
-    moments, _ = choose(watch(rig, lambda t: (0.1 * abs(t - 3.0), 0.0), 6.0, SOME), rig)
+def test_a_board_that_comes_back_is_not_taken_twice(rles):
+    moments, _ = choose(watch(rles, lambda t: (0.1 * abs(t - 3.0), 0.0), 6.0, SOME), rles)
     places = sorted(places_m(moments))
     assert 2 <= len(places) <= 3 and np.diff(places).min() >= 0.15
 
 
-def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig):
+def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rles):
     lit = event_stream([(-1.3, 3.0, 8.0)], lamp_hz=60.0)
     unseen = Refusal("image.no_board")
     for stream, code in [(lit, "image.flicker"), (event_stream([(-1.3, 3.0, 0.3)]), "image.still_scene")]:
         detections = watch(
-            rig, lambda _t: (0.0, 0.0), 1.0, stream, channel="events", is_seen=lambda _t: False
+            rles, lambda _t: (0.0, 0.0), 1.0, stream, channel="events", is_seen=lambda _t: False
         )
         told = [BoardDetection(s.frame, {}, {}, {("davis", "events"): unseen}) for s in detections]
-        moments, refused = choose(told, rig)
+        moments, refused = choose(told, rles)
         assert moments == [] and list(refused) == [code]
 
 
@@ -111,7 +105,7 @@ def test_what_was_not_seen_in_pictures_of_events_is_explained_by_the_events(rig)
     [("charuco", False, True), ("charuco", True, False), ("checkerboard", True, True)],
 )
 def test_markers_tell_a_turned_board_from_a_still_one_and_need_no_neighbours(
-    rig, markers, is_turned, is_still
+    rles, markers, is_turned, is_still
 ):
     board = Board(8, 6, 0.07, 0.767, 0.626)
     corners_px = 100 + 400 * board.corners()[:, :2]
@@ -120,7 +114,7 @@ def test_markers_tell_a_turned_board_from_a_still_one_and_need_no_neighbours(
         # Of these columns no corner has a neighbour in its row.
         corners_px[~np.isin(np.arange(48) % 8, (0, 2, 5, 7))] = np.nan
     gate = StillnessGate(board, 0.01)
-    for k, detection in enumerate(watch(rig, lambda _t: (0.0, 0.0), 1.0, PLENTY)):
+    for k, detection in enumerate(watch(rles, lambda _t: (0.0, 0.0), 1.0, PLENTY)):
         px = corners_px[::-1] if is_turned and k % 2 else corners_px
         images = {key: replace(image, corners_px=px) for key, image in detection.images.items()}
         (plate,) = detection.lidars["lidar"]

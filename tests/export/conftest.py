@@ -17,11 +17,6 @@ Make = Callable[..., Calibration]
 
 
 @pytest.fixture(scope="session")
-def rles():
-    return load_rig("rles")
-
-
-@pytest.fixture(scope="session")
 def three_sensor_rig():
     """Two LiDARs, and three cameras with each kind of lens."""
     data = load_rig("rles").model_dump()

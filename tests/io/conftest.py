@@ -3,13 +3,6 @@
 import numpy as np
 import pytest
 
-from lce_rig.rig import load_rig
-
-
-@pytest.fixture(scope="session")
-def rig():
-    return load_rig("rlfs")
-
 
 @pytest.fixture(scope="session")
 def room():

@@ -10,7 +10,6 @@ from lce_rig.core.errors import SourceError
 from lce_rig.io import SourceOptions, open_recording
 from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import open_bag_writer
-from lce_rig.rig import load_rig
 from lce_rig.timing.rig_time import rig_time_ns
 from tests.io.events.encoders import listed
 from tests.notes import has_note
@@ -21,13 +20,8 @@ from .rig_samples import KINDS, T0_NS, one_second, picture, record, sweep
 SIZE = (346, 260)
 
 
-@pytest.fixture(scope="module")
-def rig():
-    return load_rig("rles")
-
-
-def opened(path, rig, **options):
-    recording = open_recording(path, rig, SourceOptions(**options))
+def opened(path, rles, **options):
+    recording = open_recording(path, rles, SourceOptions(**options))
     assert isinstance(recording, ContinuousRecording)
     return recording
 
@@ -36,14 +30,14 @@ def events_of(samples):
     return [event for sample in samples if isinstance(sample, Events) for event in listed(sample)]
 
 
-def with_topic(rig, topic):
-    return changed(rig, cameras__davis__channels__events__topic=topic)
+def with_topic(rles, topic):
+    return changed(rles, cameras__davis__channels__events__topic=topic)
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(tmp_path, rig, name):
+def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(tmp_path, rles, name):
     given = one_second()
-    recording = opened(record(tmp_path / name, rig, given), rig)
+    recording = opened(record(tmp_path / name, rles, given), rles)
     samples = list(recording.samples())
     assert events_of(samples) == events_of(given)
     assert {e.sensor for e in samples if isinstance(e, Events)} == {"davis"}
@@ -53,46 +47,46 @@ def test_every_event_comes_in_order_of_time_beside_pictures_and_scans(tmp_path, 
         "davis.events": "events", "davis.frames": "images", "lidar": "scans"
     }  # fmt: skip
     # Scans are received 0.1 s after their first firing; nothing is handed out later than that.
-    times_ns = np.array([rig_time_ns(sample, rig) for sample in samples])
+    times_ns = np.array([rig_time_ns(sample, rles) for sample in samples])
     assert (np.maximum.accumulate(times_ns) - times_ns).max() <= 110_000_000
 
 
-def test_a_topic_of_pictures_that_others_reconstructed_is_read_as_such(tmp_path, rig):
+def test_a_topic_of_pictures_that_others_reconstructed_is_read_as_such(tmp_path, rles):
     images = [replace(picture(k), channel="events") for k in range(3)]
-    recording = opened(record(tmp_path / "r.bag", rig, [*images, sweep(0), sweep(1)]), rig)
+    recording = opened(record(tmp_path / "r.bag", rles, [*images, sweep(0), sweep(1)]), rles)
     assert [s.channel for s in recording.samples() if isinstance(s, Image)] == ["events"] * 3
     assert recording.streams == {Stream("davis", "events", "images"), Stream("lidar", "", "scans")}
 
 
-def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path, rig):
-    path = record(tmp_path / "r.bag", rig, one_second(50))
-    open_rig = with_topic(rig, None)
+def test_the_only_topic_of_events_is_taken_where_the_profile_names_none(tmp_path, rles):
+    path = record(tmp_path / "r.bag", rles, one_second(50))
+    open_rig = with_topic(rles, None)
     recording = opened(path, open_rig)
     assert has_note(recording.notes, "r.bag", "davis.events", "/davis/events", "only topic")
     assert len(events_of(list(recording.samples()))) == 2500
-    asked = opened(path, with_topic(rig, "/elsewhere"), topics={"davis.events": "/davis/events"})
+    asked = opened(path, with_topic(rles, "/elsewhere"), topics={"davis.events": "/davis/events"})
     assert Stream("davis", "events", "events") in asked.streams
     for wrong in ("/nowhere", "/velodyne_points"):
         with pytest.raises(SourceError, match=wrong):
-            opened(path, rig, topics={"davis.events": wrong})
+            opened(path, rles, topics={"davis.events": wrong})
 
 
-def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_path, rig):
+def test_one_kind_of_sensor_alone_is_refused_unless_others_are_given_too(tmp_path, rles):
     samples = one_second(50)
     for name, kind in (("events", Events), ("scans", Scan), ("images", Image)):
-        path = record(tmp_path / f"{name}.bag", rig, [s for s in samples if isinstance(s, kind)])
+        path = record(tmp_path / f"{name}.bag", rles, [s for s in samples if isinstance(s, kind)])
         with pytest.raises(SourceError):
-            opened(path, rig)
-        part = opened(path, rig, is_part=True)
+            opened(path, rles)
+        part = opened(path, rles, is_part=True)
         assert [stream.kind for stream in part.streams] == [name]
         assert all(isinstance(sample, kind) for sample in part.samples())
-    nothing = record(tmp_path / "other.bag", rig, [sweep(0)])
+    nothing = record(tmp_path / "other.bag", rles, [sweep(0)])
     with pytest.raises(SourceError) as caught:
-        opened(nothing, changed(rig, lidars__lidar__topic="/other"), is_part=True)
+        opened(nothing, changed(rles, lidars__lidar__topic="/other"), is_part=True)
     assert has_note([caught.value.hint], "/velodyne_points", "PointCloud2, 1")
 
 
-def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path, rig):
+def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path, rles):
     from lce_rig.io.ros.bag_recorder import encode_image, encode_scan
     from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, typestore
 
@@ -101,15 +95,15 @@ def test_no_events_on_their_topic_is_said_and_the_pictures_are_read(tmp_path, ri
             store = typestore(True)
             writer.add_connection("/davis/events", EVENT_ARRAY_TYPE, typestore=store)
             cloud = writer.add_connection("/velodyne_points", "sensor_msgs/msg/PointCloud2", typestore=store)
-            writer.write(cloud, T0_NS, encode_scan(sweep(0), rig.lidars["lidar"], True))
+            writer.write(cloud, T0_NS, encode_scan(sweep(0), rles.lidars["lidar"], True))
             if has_pictures:
                 image = writer.add_connection("/davis/image_raw", "sensor_msgs/msg/Image", typestore=store)
                 writer.write(image, T0_NS, encode_image(picture(0), "davis", True))
         return path
 
-    recording = opened(write(tmp_path / "a.bag", True), rig)
+    recording = opened(write(tmp_path / "a.bag", True), rles)
     assert has_note(recording.notes, "/davis/events", "a.bag", "no events")
     assert [type(sample) for sample in recording.samples()] == [Scan, Image]
     with pytest.raises(SourceError, match="/davis/events") as caught:
-        opened(write(tmp_path / "b.bag", False), rig)
+        opened(write(tmp_path / "b.bag", False), rles)
     assert has_note([caught.value.hint], "/davis/events", "EventArray, 0")

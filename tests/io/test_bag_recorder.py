@@ -10,15 +10,9 @@ from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SourceError
 from lce_rig.io import open_recording
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.rig import load_rig
 from tests.shared import changed, files_up_to
 
 from .rig_samples import KINDS, T0_NS, one_second, packet, picture, read, read_events, record, sweep
-
-
-@pytest.fixture(scope="module")
-def rles():
-    return load_rig("rles")
 
 
 @pytest.mark.parametrize("name", KINDS)

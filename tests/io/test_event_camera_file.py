@@ -25,13 +25,8 @@ FRAMES = [RawFrame(T0_US + 40_000 * k, 8000, GREY) for k in range(5)]
 EVENT_STREAM, FRAME_STREAM = Stream("davis", "events", "events"), Stream("davis", "frames", "images")
 
 
-@pytest.fixture(scope="module")
-def rig():
-    return load_rig("rles")
-
-
-def opened(path, rig, **options):
-    recording = open_recording(path, rig, SourceOptions(**options))
+def opened(path, rles, **options):
+    recording = open_recording(path, rles, SourceOptions(**options))
     assert isinstance(recording, ContinuousRecording)
     return recording
 
@@ -44,8 +39,8 @@ def images_of(recording):
     return [s for s in recording.samples() if isinstance(s, Image)]
 
 
-def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path, rig):
-    recording = opened(write_davis(tmp_path / "a.aedat4", PIECES, FRAMES), rig)
+def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path, rles):
+    recording = opened(write_davis(tmp_path / "a.aedat4", PIECES, FRAMES), rles)
     assert (recording.n_samples, set(recording.streams)) == (5, {EVENT_STREAM, FRAME_STREAM})
     assert events_of(recording) == listed(EVENTS)
     images = images_of(recording)
@@ -55,71 +50,71 @@ def test_a_davis_file_gives_its_events_and_its_frames_at_mid_exposure(tmp_path, 
     assert has_note(recording.notes, "a.aedat4", "davis.frames", "mid exposure", "8.0 ms")
 
 
-def test_frames_alone_are_a_recording_too(tmp_path, rig):
-    recording = opened(write_davis(tmp_path / "a.aedat4", [], FRAMES), rig)
+def test_frames_alone_are_a_recording_too(tmp_path, rles):
+    recording = opened(write_davis(tmp_path / "a.aedat4", [], FRAMES), rles)
     assert set(recording.streams) == {FRAME_STREAM} and len(images_of(recording)) == 5
     assert has_note(recording.notes, "no stream")
 
 
-def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(tmp_path, rig):
-    channels = {"events": rig.cameras["davis"].channels["events"]}
+def test_frames_of_a_camera_without_such_a_channel_are_left_out_and_it_is_said(tmp_path, rles):
+    channels = {"events": rles.cameras["davis"].channels["events"]}
     path = write_davis(tmp_path / "a.aedat4", PIECES, FRAMES)
-    recording = opened(path, changed(rig, cameras__davis__channels=channels))
+    recording = opened(path, changed(rles, cameras__davis__channels=channels))
     assert images_of(recording) == [] and events_of(recording) == listed(EVENTS)
     assert has_note(recording.notes, "frames skipped", "davis", "no channel")
 
 
-def test_frames_out_of_order_are_left_out_and_counted(tmp_path, rig):
+def test_frames_out_of_order_are_left_out_and_counted(tmp_path, rles):
     path = write_davis(
         tmp_path / "a.aedat4", PIECES, [FRAMES[0], replace(FRAMES[1], exposure_us=-90_000), FRAMES[2]]
     )
-    recording = opened(path, rig)
+    recording = opened(path, rles)
     assert len(images_of(recording)) == 2
     assert has_note(recording.notes, "a.aedat4", "frames: 1 sent twice or out")
 
 
 @pytest.mark.parametrize("name", ["a.aedat4", "a.h5", "a.raw"])
-def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path, rig, name):
+def test_every_kind_of_file_is_opened_by_its_suffix(tmp_path, rles, name):
     WRITERS[name](tmp_path / name, EVENTS)
-    assert len(events_of(opened(tmp_path / name, rig))) == len(EVENTS)
+    assert len(events_of(opened(tmp_path / name, rles))) == len(EVENTS)
 
 
-def test_serial_numbers_in_heads_of_files_are_told(tmp_path, rig):
+def test_serial_numbers_in_heads_of_files_are_told(tmp_path, rles):
     write_aedat4(tmp_path / "a.aedat4", [EVENTS], "DAVIS346_00000499")
     local = [(t - T0_US, x, y, p) for t, x, y, p in listed(EVENTS)]
     head = b"% evt 3.0\n% geometry 346x260\n% serial_number 00050423\n% end\n"
     (tmp_path / "b.raw").write_bytes(head + encoders.evt3(local))
     write_aedat4(tmp_path / "c.aedat4", [EVENTS])
-    found = [serials_of(opened(tmp_path / name, rig)) for name in ("a.aedat4", "b.raw", "c.aedat4")]
+    found = [serials_of(opened(tmp_path / name, rles)) for name in ("a.aedat4", "b.raw", "c.aedat4")]
     assert found == [{"davis": "00000499"}, {"davis": "00050423"}, {}]
 
 
-def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path, rig):
+def test_no_events_another_camera_and_rigs_without_events_are_refused(tmp_path, rles):
     write_aedat4(tmp_path / "none.aedat4", [])
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
     with pytest.raises(SourceError, match=r"none\.aedat4"):
-        opened(tmp_path / "none.aedat4", rig)
+        opened(tmp_path / "none.aedat4", rles)
     with pytest.raises(SourceError, match="346x260"):
-        opened(tmp_path / "a.aedat4", changed(rig, cameras__davis__resolution_px=(640, 480)))
+        opened(tmp_path / "a.aedat4", changed(rles, cameras__davis__resolution_px=(640, 480)))
     with pytest.raises(SourceError) as caught:
         opened(tmp_path / "a.aedat4", load_rig("rlfs"))
     assert "kind: events" in caught.value.hint
     with pytest.raises(SourceError):
-        opened(tmp_path / "a.aedat4", rig, camera="left")
+        opened(tmp_path / "a.aedat4", rles, camera="left")
 
 
-def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path, rig):
+def test_the_first_of_several_event_cameras_is_taken_and_it_is_said(tmp_path, rles):
     write_aedat4(tmp_path / "a.aedat4", [EVENTS])
-    both = changed(rig, cameras__right=rig.cameras["davis"])
+    both = changed(rles, cameras__right=rles.cameras["davis"])
     assert has_note(opened(tmp_path / "a.aedat4", both).notes, "events assigned", "camera davis")
     right = opened(tmp_path / "a.aedat4", both, camera="right")
     assert {s.sensor for s in right.samples()} == {"right"} and next(iter(right.streams)).sensor == "right"
 
 
-def test_a_file_that_ends_in_a_packet_gives_what_comes_before(tmp_path, rig):
+def test_a_file_that_ends_in_a_packet_gives_what_comes_before(tmp_path, rles):
     whole = write_davis(tmp_path / "whole.aedat4", PIECES, FRAMES).read_bytes()
     (tmp_path / "torn.aedat4").write_bytes(whole[: len(whole) * 3 // 5])
-    recording = opened(tmp_path / "torn.aedat4", rig)
+    recording = opened(tmp_path / "torn.aedat4", rles)
     found, images = events_of(recording), images_of(recording)
     assert 0 < len(found) < len(EVENTS) and found == listed(EVENTS)[: len(found)] and 1 <= len(images) < 5
     assert has_note(recording.notes, "1 torn ends")

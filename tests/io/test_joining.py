@@ -10,7 +10,6 @@ import pytest
 from lce_rig.core.data import Events, Image, Scan, Stream
 from lce_rig.core.errors import SourceError
 from lce_rig.io.joining import JoinedRecording, check_overlap, join_recordings, merge_by_time, require_sensors
-from lce_rig.rig import load_rig
 from tests.notes import has_note
 from tests.shared import changed
 
@@ -53,11 +52,6 @@ class Listed:
             raise SourceError(self.torn)
 
 
-@pytest.fixture(scope="module")
-def rig():
-    return load_rig("rles")
-
-
 def lidar(name="lidar.bag", step_s=0.1, **kwargs):
     return Listed(name, [(LIDAR, k * step_s) for k in range(3)], **kwargs)
 
@@ -77,7 +71,7 @@ def names(recordings):
     ]
 
 
-def test_each_recording_joins_those_before_it_that_lack_its_sensors(rig):
+def test_each_recording_joins_those_before_it_that_lack_its_sensors(rles):
     events_only = Listed("e", [(EVENTS, 0.0)])
     for given, wanted in [
         ([lidar(), camera()], [["lidar.bag", "events.aedat4"]]),
@@ -89,30 +83,30 @@ def test_each_recording_joins_those_before_it_that_lack_its_sensors(rig):
         ([lidar("1"), camera("2"), lidar("3"), camera("4")], [["1", "2"], ["3", "4"]]),
         ([camera("1"), lidar("2"), camera("3"), lidar("4")], [["1", "2"], ["3", "4"]]),
     ]:
-        assert names(join_recordings(given, rig)) == wanted
+        assert names(join_recordings(given, rles)) == wanted
 
 
-def test_a_copy_of_what_is_there_already_is_left_out_and_it_is_said(rig):
-    (joined,) = join_recordings([whole("a.bag", EVENTS), camera("c.aedat4")], rig)
+def test_a_copy_of_what_is_there_already_is_left_out_and_it_is_said(rles):
+    (joined,) = join_recordings([whole("a.bag", EVENTS), camera("c.aedat4")], rles)
     assert has_note(joined.notes, "davis.events", "a.bag, not", "c.aedat4")
     assert len(list(joined.samples())) == 3
 
 
-def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rig):
-    (joined,) = join_recordings([lidar(), camera()], rig)
+def test_samples_of_all_come_in_order_of_time_with_the_profiles_offsets(rles):
+    (joined,) = join_recordings([lidar(), camera()], rles)
     kinds = [type(s).__name__ for s in joined.samples()]
     assert kinds == ["Scan", "Events", "Image", "Scan", "Events", "Image", "Scan"]
     assert joined.n_samples == 5 and set(joined.streams) == {LIDAR, FRAMES, EVENTS}
     assert [note.split()[0] for note in joined.notes[-2:]] == ["lidar.bag", "events.aedat4"]
-    shifted = changed(rig, cameras__davis__channels__frames__timestamps__expected_offset_s=-0.06)
+    shifted = changed(rles, cameras__davis__channels__frames__timestamps__expected_offset_s=-0.06)
     frames_only = Listed("frames.bag", [(FRAMES, 0.05), (FRAMES, 0.15)])
     kinds = [type(s).__name__ for s in JoinedRecording([lidar(), frames_only], shifted).samples()]
     assert kinds == ["Image", "Scan", "Image", "Scan", "Scan"]
 
 
-def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rig):
-    one, other = JoinedRecording([lidar(), camera()], rig), JoinedRecording([camera(), lidar()], rig)
-    assert one.key == other.key != JoinedRecording([lidar(), camera("x")], rig).key
+def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rles):
+    one, other = JoinedRecording([lidar(), camera()], rles), JoinedRecording([camera(), lidar()], rles)
+    assert one.key == other.key != JoinedRecording([lidar(), camera("x")], rles).key
 
 
 @pytest.mark.parametrize(
@@ -122,32 +116,32 @@ def test_the_key_does_not_depend_on_the_order_in_which_they_were_given(rig):
         (-1_699_999_999.0, ["one computer's"]),
     ],
 )
-def test_clocks_that_do_not_overlap_are_said_by_how_much(rig, after_s, words):
-    joined = JoinedRecording([lidar(), camera(after_s=after_s)], rig)
+def test_clocks_that_do_not_overlap_are_said_by_how_much(rles, after_s, words):
+    joined = JoinedRecording([lidar(), camera(after_s=after_s)], rles)
     passed = []
     with pytest.raises(SourceError) as caught:
-        for one in check_overlap(joined.samples(), rig, []):
+        for one in check_overlap(joined.samples(), rles, []):
             passed.append(one)
     assert len(passed) == 7 and all(word in caught.value.hint for word in words)
 
 
-def test_a_partial_overlap_is_noted(rig):
-    joined = JoinedRecording([lidar(step_s=15.0), camera(after_s=20.0)], rig)
-    assert len(list(check_overlap(joined.samples(), rig, joined.notes))) == 7
+def test_a_partial_overlap_is_noted(rles):
+    joined = JoinedRecording([lidar(step_s=15.0), camera(after_s=20.0)], rles)
+    assert len(list(check_overlap(joined.samples(), rles, joined.notes))) == 7
     assert has_note(joined.notes, "davis.events", "0.1 of", "30.0 s", "lidar's")
 
 
-def test_a_part_that_is_torn_does_not_end_the_others(rig):
+def test_a_part_that_is_torn_does_not_end_the_others(rles):
     torn = lidar(torn="lidar.bag is damaged")
     found = []
     with pytest.raises(SourceError, match=r"lidar\.bag"):
-        for one in JoinedRecording([torn, camera()], rig).samples():
+        for one in JoinedRecording([torn, camera()], rles).samples():
             found.append(one)
     assert len(found) == 7
 
 
-def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rig):
-    require_sensors(JoinedRecording([lidar(), camera()], rig))
+def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rles):
+    require_sensors(JoinedRecording([lidar(), camera()], rles))
     with pytest.raises(SourceError, match=r"events\.aedat4"):
         require_sensors(camera())
     with pytest.raises(SourceError, match=r"lidar\.bag") as caught:
@@ -155,9 +149,9 @@ def test_what_lacks_a_lidar_or_a_camera_is_refused_with_what_to_give_as_well(rig
     assert re.findall(r"--from (\S+\w)", caught.value.hint) == ["lidar.bag", "events.aedat4"]
 
 
-def test_samples_without_stamps_stay_where_they_are_in_their_own_stream(rig):
+def test_samples_without_stamps_stay_where_they_are_in_their_own_stream(rles):
     image = sample(FRAMES, 0.05)
     assert isinstance(image, Image)
     timeless = replace(image, stamp_ns=None)
     parts = [[image, timeless], [sample(LIDAR, 0.0), sample(LIDAR, 0.1)]]
-    assert [type(s).__name__ for s in merge_by_time(parts, rig)] == ["Scan", "Image", "Image", "Scan"]
+    assert [type(s).__name__ for s in merge_by_time(parts, rles)] == ["Scan", "Image", "Image", "Scan"]

@@ -11,20 +11,9 @@ from lce_rig.io.joining import check_overlap, join_recordings
 from lce_rig.io.network import Datagram, PcapWriter
 from lce_rig.io.protocol import ContinuousRecording, SourceOptions
 from lce_rig.io.ros.bag_recorder import BagRecorder
-from lce_rig.rig import load_rig
 
 from .rig_samples import KINDS, T0_NS, one_second
 from .vlp16_room import NETWORK_NS, packets_of, room_scans
-
-
-@pytest.fixture(scope="module")
-def rles():
-    return load_rig("rles")
-
-
-@pytest.fixture(scope="module")
-def rlfs():
-    return load_rig("rlfs")
 
 
 def fill(folder, rig, ros=1):

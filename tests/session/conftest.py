@@ -4,12 +4,6 @@ import numpy as np
 import pytest
 
 from lce_rig.core.data import Image, Scan
-from lce_rig.rig import load_rig
-
-
-@pytest.fixture
-def rig():
-    return load_rig("rlfs")
 
 
 @pytest.fixture

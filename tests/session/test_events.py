@@ -9,16 +9,10 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.errors import SessionError
-from lce_rig.rig import load_rig
 from lce_rig.session import Session, content_hash
 
 T0_NS = 1_700_000_000_123_456_000
 FILE = "davis.events.npz"
-
-
-@pytest.fixture(scope="module")
-def rig():
-    return load_rig("rles")
 
 
 def noise_events(seed, n=500):
@@ -36,9 +30,9 @@ def noise_samples(seed):
     return [Image("davis", "frames", T0_NS, pixels)], [scan]
 
 
-def make_session(path, rig):
+def make_session(path, rles):
     """A session with one capture that has events and one that has none."""
-    session = Session.create(path, rig)
+    session = Session.create(path, rles)
     session.add_capture(*noise_samples(0), {}, [noise_events(0)])
     session.add_capture(*noise_samples(1), {})
     return session
@@ -52,8 +46,8 @@ def assert_equal(found, given):
         assert getattr(found, name) == getattr(given, name), name
 
 
-def test_events_come_back_to_the_microsecond(tmp_path, rig):
-    make_session(tmp_path / "s", rig).close()
+def test_events_come_back_to_the_microsecond(tmp_path, rles):
+    make_session(tmp_path / "s", rles).close()
     with_events, without = Session.open(tmp_path / "s").captures
     assert_equal(with_events.events("davis"), noise_events(0))
     assert (with_events.event_cameras, without.event_cameras) == (["davis"], [])
@@ -61,8 +55,8 @@ def test_events_come_back_to_the_microsecond(tmp_path, rig):
     with_events.check()
 
 
-def test_the_file_is_plain_and_the_manifest_vouches_for_it(tmp_path, rig):
-    capture = make_session(tmp_path / "s", rig).captures[0]
+def test_the_file_is_plain_and_the_manifest_vouches_for_it(tmp_path, rles):
+    capture = make_session(tmp_path / "s", rles).captures[0]
     events, data = noise_events(0), (capture.path / FILE).read_bytes()
     with np.load(capture.path / FILE) as archive:
         assert np.array_equal(archive["t_us"] * 1000, events.t_ns)
@@ -80,8 +74,8 @@ def test_the_file_is_plain_and_the_manifest_vouches_for_it(tmp_path, rig):
     }
 
 
-def test_captures_without_events_are_written_as_before_and_both_are_read(tmp_path, rig):
-    captures = make_session(tmp_path / "s", rig).captures
+def test_captures_without_events_are_written_as_before_and_both_are_read(tmp_path, rles):
+    captures = make_session(tmp_path / "s", rles).captures
     manifests = [json.loads((capture.path / "meta.json").read_text()) for capture in captures]
     assert [manifest["format_version"] for manifest in manifests] == [2, 1]
     assert sorted(path.name for path in captures[1].path.iterdir()) == [
@@ -90,8 +84,8 @@ def test_captures_without_events_are_written_as_before_and_both_are_read(tmp_pat
     assert captures[1].content_sha256 == content_hash(*noise_samples(1))
 
 
-def test_captures_that_differ_in_their_events_alone_are_no_duplicates(tmp_path, rig):
-    session = make_session(tmp_path / "s", rig)
+def test_captures_that_differ_in_their_events_alone_are_no_duplicates(tmp_path, rles):
+    session = make_session(tmp_path / "s", rles)
     images, scans = noise_samples(0)
     events = noise_events(0)
     later = replace(events, t_ns=events.t_ns + 5_000_000_000, host_ns=None)
@@ -116,8 +110,8 @@ def test_captures_that_differ_in_their_events_alone_are_no_duplicates(tmp_path, 
         {"x": np.full(500, 346, np.uint16)},
     ],
 )
-def test_events_that_cannot_be_the_rigs_are_refused(tmp_path, rig, changes):
-    session = Session.create(tmp_path / "s", rig)
+def test_events_that_cannot_be_the_rigs_are_refused(tmp_path, rles, changes):
+    session = Session.create(tmp_path / "s", rles)
     with pytest.raises(SessionError):
         session.add_capture(*noise_samples(0), {}, [replace(noise_events(0), **changes)])
     assert list((tmp_path / "s" / "captures").iterdir()) == []

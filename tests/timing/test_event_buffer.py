@@ -5,24 +5,17 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Losses
-from lce_rig.rig import load_rig
 from lce_rig.timing.rig_time import rig_time_ns
 from lce_rig.timing.scan_pairing import AFTER_NS, BEFORE_NS, pair_by_time
 from tests.shared import changed
 
 T0_NS = 1_700_000_000 * 10**9
 MS = 1_000_000
-
-
-@pytest.fixture(scope="module")
-def rig():
-    return load_rig("rles")
 
 
 def image(time_ms):
@@ -55,9 +48,9 @@ def packets(events, edges):
     return [events.select(slice(a, b)) for a, b in pairwise(bounds) if b > a]
 
 
-def frames_of(samples, rig):
-    ordered = sorted(samples, key=lambda sample: rig_time_ns(sample, rig) or 0)
-    return list(pair_by_time(ordered, rig, Losses()))
+def frames_of(samples, rles):
+    ordered = sorted(samples, key=lambda sample: rig_time_ns(sample, rles) or 0)
+    return list(pair_by_time(ordered, rles, Losses()))
 
 
 def is_cut_exactly(frame, events, begin_ms):
@@ -70,22 +63,21 @@ def is_cut_exactly(frame, events, begin_ms):
 
 
 @given(edges=st.lists(st.integers(0, 4000), max_size=30).map(sorted))
-def test_the_events_around_each_scan_are_cut_exactly_whatever_their_packets(edges):
-    rig = load_rig("rles")
+def test_the_events_around_each_scan_are_cut_exactly_whatever_their_packets(rles, edges):
     events = stream(0, 3000, 4000)
     begins_ms = (1300, 1400, 1700)
     pictures = [image(t + 50) for t in begins_ms]
-    frames = frames_of([*packets(events, edges), *map(scan, begins_ms), *pictures], rig)
+    frames = frames_of([*packets(events, edges), *map(scan, begins_ms), *pictures], rles)
     assert len(frames) == 3
     assert all(is_cut_exactly(frame, events, t) for frame, t in zip(frames, begins_ms, strict=True))
     assert all(frame.events[0].missing_ns == 0 for frame in frames)
     assert frames[0].events[0].events.host_ns is None
 
 
-def test_a_stream_that_begins_late_or_ends_early_gives_what_it_has_and_says_what_is_missing(rig):
+def test_a_stream_that_begins_late_or_ends_early_gives_what_it_has_and_says_what_is_missing(rles):
     events = stream(900, 1800, 5000)
     samples = [*packets(events, range(100, 5000, 100)), *(scan(t) for t in (100, 1000, 1700, 3500))]
-    frames = frames_of([*samples, *(image(t + 50) for t in (100, 1000, 1700, 3500))], rig)
+    frames = frames_of([*samples, *(image(t + 50) for t in (100, 1000, 1700, 3500))], rles)
     assert [len(frame.events) for frame in frames] == [0, 1, 1, 0]
     assert is_cut_exactly(frames[1], events, 1000) and is_cut_exactly(frames[2], events, 1700)
     first_ns = int(events.t_ns[0])
@@ -93,23 +85,23 @@ def test_a_stream_that_begins_late_or_ends_early_gives_what_it_has_and_says_what
     assert frames[2].events[0].missing_ns == first_ns - (T0_NS + 1700 * MS - BEFORE_NS)
 
 
-def test_a_frame_waits_for_its_events_but_not_for_ever(rig):
+def test_a_frame_waits_for_its_events_but_not_for_ever(rles):
     events = stream(0, 1500, 3000)
     first, *others = packets(events, range(50, 3000, 50))
     early = [first, scan(1000), image(1050), image(1200), *others]
-    (frame,) = list(pair_by_time(early, rig, Losses()))
+    (frame,) = list(pair_by_time(early, rles, Losses()))
     assert is_cut_exactly(frame, events, 1000)
     silent = [*packets(events, [1500]), *(scan(t) for t in range(1000, 5000, 100))]
     ordered = sorted(
-        [*silent, *(image(t + 50) for t in range(1000, 5000, 100))], key=lambda s: rig_time_ns(s, rig) or 0
+        [*silent, *(image(t + 50) for t in range(1000, 5000, 100))], key=lambda s: rig_time_ns(s, rles) or 0
     )
     taken = iter(ordered)
-    earliest = next(pair_by_time(taken, rig, Losses()))
+    earliest = next(pair_by_time(taken, rles, Losses()))
     assert earliest.time_ns == T0_NS + 1050 * MS and next(taken).stamp_ns < T0_NS + 2500 * MS
 
 
-def test_two_event_cameras_get_a_stretch_each(rig):
-    both = changed(rig, cameras__right=rig.cameras["davis"])
+def test_two_event_cameras_get_a_stretch_each(rles):
+    both = changed(rles, cameras__right=rles.cameras["davis"])
     left, right = stream(0, 3000, 2000, 1), replace(stream(0, 3000, 2000, 2), sensor="right")
     samples = [
         *packets(left, range(90, 2000, 90)),
@@ -124,7 +116,7 @@ def test_two_event_cameras_get_a_stretch_each(rig):
     ]
 
 
-def test_memory_holds_some_seconds_of_a_long_stream_also_while_the_lidar_is_silent(rig):
+def test_memory_holds_some_seconds_of_a_long_stream_also_while_the_lidar_is_silent(rles):
     def samples(n_packets):
         for k in range(n_packets):
             yield replace(packet, t_ns=packet.t_ns + k * 20 * MS)
@@ -134,7 +126,7 @@ def test_memory_holds_some_seconds_of_a_long_stream_also_while_the_lidar_is_sile
 
     packet = stream(0, 20, 4000)
     tracemalloc.start()
-    n_frames = sum(1 for _ in pair_by_time(samples(2400), rig, Losses()))
+    n_frames = sum(1 for _ in pair_by_time(samples(2400), rles, Losses()))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     n_bytes = sum(column.nbytes for column in (packet.t_ns, packet.x, packet.y, packet.polarity))

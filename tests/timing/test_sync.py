@@ -5,7 +5,6 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Pulse, Scan
 from lce_rig.core.findings import Losses
-from lce_rig.rig import load_rig
 from lce_rig.timing.clock import ClockModel
 from lce_rig.timing.clock_fit import TimePairs, fit_clock
 from lce_rig.timing.rig_clock import EdgeClock, RigClock
@@ -34,11 +33,6 @@ def fitted(seed=0, noise_ns=30_000.0, drift=50e-6):
     seen = UTC_NS + times + np.int64(rng.normal(scale=noise_ns, size=100))
     model = fit_clock(TimePairs.from_edges(stamps, seen), "edges")
     return model, lambda true_ns: 90 * S + round((true_ns - UTC_NS) * (1 + drift))
-
-
-@pytest.fixture
-def rlfs():
-    return load_rig("rlfs")
 
 
 def clock_of(rig, **models):
