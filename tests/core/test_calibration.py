@@ -30,6 +30,7 @@ from tests.damage import damaged
 from tests.export.conftest import calibration, reason
 from tests.saved_results import result_file
 
+REASON = "the board was bent: use another"
 FIELDS = [
     *("camera", "channel", "lidar", "T_cam_lidar", "cov", "sigma_rotation_deg", "sigma_translation_m"),
     *("n_captures", "n_detected", "captures_used", "captures_refused", "mpe_m", "mee_m", "mge_m"),
@@ -199,7 +200,7 @@ def test_files_of_earlier_versions_are_read(tmp_path):
         pair = document["pairs"][0]
         for key in FIELDS[FIELDS.index("reasons") + 1 :]:
             del pair[key]
-        pair["reasons"] = ["the board was bent: use another"]
+        pair["reasons"] = [REASON]
         pair["captures_refused"] = {"000001": {"stage": "lidar", "cause": "2 rings", "action": "come closer"}}
 
     file = read_result(edited(tmp_path / "result.json", as_before))
@@ -213,8 +214,8 @@ def test_files_of_earlier_versions_are_read(tmp_path):
     assert refusal == Refusal("lidar.text")
     assert (refusal.text, refusal.advice) == ("2 rings", "come closer")
     (finding,) = pair.findings
-    assert (finding.severity, finding.sentence) == ("warning", "the board was bent: use another")
-    assert file.document()["pairs"][0]["reasons"] == ["the board was bent: use another"]
+    assert (finding.severity, finding.sentence) == ("warning", REASON)
+    assert file.document()["pairs"][0]["reasons"] == [REASON]
 
 
 def test_findings_of_another_version_keep_their_words(tmp_path):
@@ -225,10 +226,8 @@ def test_findings_of_another_version_keep_their_words(tmp_path):
 
     path = edited(tmp_path / "result.json", of_tomorrow)
     (pair,) = read_result(path).pairs
-    assert (pair.findings[1].code, pair.findings[1].sentence) == (
-        "verdict.of_tomorrow",
-        "too uncertain: collect more",
-    )
+    kept = pair.findings[1]
+    assert (kept.code, kept.text, kept.advice) == ("verdict.of_tomorrow", "too uncertain", "collect more")
     assert pair.captures_refused["000003"].text == full().captures_refused["000003"].text
 
 

@@ -16,7 +16,7 @@ LIMIT = Kind(
 
 def test_figures_are_scaled_to_the_unit_that_is_printed():
     found = RINGS("velodyne", n=2, distance_m=4.04, closer_m=0.8)
-    assert found.sentence == "2 rings at 4.0 m: come 80.0 cm closer"
+    assert found.text == "2 rings at 4.0 m" and "80.0 cm" in found.advice
     assert found.as_json()["figures"] == {"n": 2, "distance_m": 4.04, "closer_m": 0.8}
 
 
@@ -38,7 +38,7 @@ def test_a_figure_is_printed_so_that_it_differs_from_its_limit(error_m, limit_m,
 
 def test_a_finding_read_from_a_file_keeps_the_words_of_the_file():
     found = Finding("t.of_an_old_version", stored=("the text", "the action"))
-    assert found.sentence == "the text: the action"
+    assert (found.text, found.advice) == ("the text", "the action")
 
 
 def test_the_worst_finding_decides_and_order_is_kept_otherwise():

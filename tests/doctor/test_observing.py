@@ -42,7 +42,7 @@ def test_what_fails_is_said_and_the_others_are_watched_all_the_same():
             {"device": fake.path, "triggers": {"cam": {"channel": 0, "rate_hz": 20.0}}}
         )
         seen = observe([ABSENT, Unusable("bad", ZeroDivisionError("a slip")), SyncBoard(settings)], 1.0)
-    assert seen["gone"].failure is not None and seen["gone"].failure.hint == "Plug it in."
+    assert seen["gone"].failure is not None and seen["gone"].failure is ABSENT.error
     assert seen["bad"].failure is not None and "ZeroDivisionError" in seen["bad"].failure.what
     board = seen["sync"]
     assert board.failure is None and board.status is not None and board.watched_s > 0.4

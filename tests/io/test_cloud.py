@@ -136,7 +136,7 @@ def test_coordinates_that_are_no_metres_are_refused_with_a_question(room, factor
     cloud = room.copy()
     for axis in "xyz":
         cloud[axis] *= factor
-    with pytest.raises(SourceError, match=r"median range \d+ m"):
+    with pytest.raises(SourceError, match="here"):
         reading_of(cloud, "lidar", FIRST, "here")
     far = room.copy()
     for axis in "xyz":

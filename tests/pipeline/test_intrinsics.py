@@ -115,7 +115,7 @@ def test_channels_share_the_lens_and_bad_pictures_are_named(pictures, tmp_path):
     assert both.refused["000003.frames"].stage == "read"
     assert both.refused["000008.events"].stage == "image"
     assert np.abs(sigmas_off(both)).max() < 4.5
-    with pytest.raises(NotEnoughDataError, match="3 of 4 captures") as caught:
+    with pytest.raises(NotEnoughDataError, match="3 of 4") as caught:
         measure_intrinsics(session, "davis", channels=["frames"])
     assert "1 x " in caught.value.hint and "000003" in caught.value.hint
 
@@ -164,7 +164,7 @@ def test_a_new_profile_keeps_the_comments_of_the_old_and_never_replaces_a_file(s
     assert rig.cameras["davis"].to_intrinsics() == measured.intrinsics
     assert rig.board == RIG.board
     assert "# measure it;" in (tmp_path / "new.yaml").read_text()
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match=r"new\.yaml"):
         save_profile(session, [measured], tmp_path / "new.yaml", is_forced=True)
 
 

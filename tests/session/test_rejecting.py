@@ -22,7 +22,7 @@ def names(captures):
 
 def test_a_rejected_capture_is_out_of_use_and_comes_back_to_the_byte(session):
     before = {file.name: file.read_bytes() for file in session.capture("000001").path.iterdir()}
-    session.reject("000001", "a second board in view")
+    session.reject("000001", "glare")
     assert (names(session.captures), names(session.rejected)) == (["000000", "000002"], ["000001"])
     with pytest.raises(SessionError, match="000001"):
         session.capture("000001")
@@ -32,7 +32,7 @@ def test_a_rejected_capture_is_out_of_use_and_comes_back_to_the_byte(session):
     assert after == before
     told = [(entry["event"], entry["capture"]) for entry in session.read_journal()[-2:]]
     assert told == [("rejected", "000001"), ("restored", "000001")]
-    assert session.read_journal()[-2]["reason"] == "a second board in view"
+    assert session.read_journal()[-2]["reason"] == "glare"
 
 
 def test_neither_the_name_nor_the_data_of_a_rejected_capture_is_taken_anew(session, samples):
