@@ -9,7 +9,7 @@ import pytest
 from wire.vlp16_packets import Vlp16Clock
 
 from lce_rig.rig import dump_rig
-from tests.doctor.attached import Attached, attach, picture_of, scan_of
+from tests.doctor.attached import PIXELS, SCAN, Attached, attach
 from tests.doctor.observed import make_rig
 from tests.shared import has_ended, wait_until
 
@@ -49,9 +49,8 @@ def test_json_holds_every_line_with_its_figures(lce_rig, absent):
 
 def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
     rig = make_rig(lidars={"lidar": {"timestamps": {"clock": "utc", "reference": "first_firing"}}})
-    board = rig.board.to_board()
     unlocked = Vlp16Clock("absent", has_nmea=False, error_us=721_000_000)
-    attached = Attached(rig, picture_of(board), scan_of(board, 2.2), unlocked, has_board=False)
+    attached = Attached(rig, PIXELS, SCAN, unlocked, has_board=False)
     with attach(attached, tmp_path) as (reached, _):
         path = tmp_path / "rig.yaml"
         path.write_text(dump_rig(reached.model_copy(update={"sync": None})))
@@ -72,7 +71,7 @@ def test_an_unknown_rig_is_an_error_of_the_profile(lce_rig):
 
 def test_an_interrupted_examination_leaves_nothing_running(tmp_path):
     rig = make_rig(sync=None)
-    with attach(Attached(rig, picture_of(rig.board.to_board()), has_board=False), tmp_path) as (reached, _):
+    with attach(Attached(rig, PIXELS, has_board=False), tmp_path) as (reached, _):
         document = reached.model_dump()
         document["sync"] = None
         code, *arguments = document["cameras"]["cam"]["driver"]["command"][2:]

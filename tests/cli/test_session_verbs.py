@@ -158,20 +158,6 @@ def test_a_run_without_result_leaves_the_earlier_one_untouched(lce_rig, calibrat
     assert contents(folder) == before
 
 
-@pytest.mark.long
-def test_another_result_moves_the_earlier_one_and_its_overlays_to_previous(lce_rig, calibrated):
-    lce_rig("verify", calibrated)
-    folder = calibrated / "calibration"
-    assert lce_rig("calibrate", calibrated).code == 0
-    assert (folder / "overlays" / "contact_sheet.png").exists()
-    before = {path.relative_to(folder): data for path, data in contents(folder).items()}
-    outcome = lce_rig("calibrate", calibrated, "--use-scene", "--explain")
-    assert str(folder / "previous") in outcome.err.replace("\n", "")
-    kept = folder / "previous"
-    assert {path.relative_to(kept): data for path, data in contents(kept).items()} == before
-    assert not (folder / "overlays").exists()
-
-
 def test_verify_again_leaves_what_the_user_put_beside_the_overlays(lce_rig, calibrated_few):
     folder = calibrated_few / "calibration" / "overlays"
     for path in ("notes.txt", "for-the-paper.png", "report/text.md", "cam.frames.lidar/notes.txt"):

@@ -1,9 +1,6 @@
 """ONNX files written by hand, without the onnx package: networks that copy their inputs."""
 
-from collections.abc import Sequence
-
 FLOAT = 1
-Dims = Sequence[int | str]
 
 
 def _varint(value):

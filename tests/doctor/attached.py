@@ -8,7 +8,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from wire.sync_board import FakeBoard
@@ -16,9 +15,7 @@ from wire.vlp16_packets import STREAMED_VLP16, Vlp16Clock, Vlp16Packets, free_po
 
 from lce_rig.core import velodyne
 from lce_rig.core.data import Scan
-from lce_rig.core.geometry import exp_so3, pose
 from lce_rig.rig import Rig
-from tests.detect.scans import Plate
 from tests.devices.test_vlp16_web import PAGES, serving
 from tests.io.vlp16_room import T0_NS, room_scan
 
@@ -26,6 +23,8 @@ HERE = "127.0.0.1"
 PERIOD_S = 0.1
 # Pictures come so long after the beginning of each tenth of a second, at which the board pulses.
 DELAY_S = 0.015
+PIXELS = np.full((260, 346), 120, np.uint8)
+SCAN = room_scan(T0_NS, dropout=0.0)
 CAMERA = """
 import sys, time
 data = open(sys.argv[1], "rb").read()
@@ -97,35 +96,6 @@ def attach(attached, folder):
         if attached.has_board:
             document["sync"]["device"] = stack.enter_context(FakeBoard(period_s=PERIOD_S)).path
         yield Rig.model_validate(document), web
-
-
-def scan_of(board, distance_m):
-    """A round room with a board on one corner straight ahead, on the grid of a VLP-16's firings."""
-    scan = room_scan(T0_NS, dropout=0.0)
-    reach = np.linalg.norm(scan.points, axis=1, keepdims=True)
-    turn = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]) @ exp_so3(
-        np.array([0, 0, np.pi / 4])
-    )
-    plate = Plate(pose(turn, np.array([distance_m, 0.0, 0.0])), board.width_m, board.height_m)
-    seen_m = plate.ranges(scan.points / reach)[:, None]
-    noise_m = 0.01 * np.random.default_rng(0).standard_normal(reach.shape)
-    points = scan.points * (np.minimum(seen_m, reach) + noise_m) / reach
-    return replace(scan, points=points.astype(np.float32))
-
-
-def picture_of(board, square_px=20):
-    """The board from straight ahead in a picture of 346x260 px, as a lens without distortion shows it."""
-    picture = np.full((260, 346), 120, np.uint8)
-    rows, cols = board.rows + 1, board.cols + 1
-    squares = np.indices((rows, cols)).sum(axis=0) % 2
-    pattern = np.where(squares, 220, 30).astype(np.uint8).repeat(square_px, 0).repeat(square_px, 1)
-    top, left = (260 - rows * square_px) // 2, (346 - cols * square_px) // 2
-    margin = square_px // 2
-    picture[
-        top - margin : top + rows * square_px + margin, left - margin : left + cols * square_px + margin
-    ] = 220
-    picture[top : top + rows * square_px, left : left + cols * square_px] = pattern
-    return cv2.GaussianBlur(picture, (0, 0), 0.7)
 
 
 def _camera(pixels, folder):

@@ -1,6 +1,5 @@
 """Folders of pictures and clouds, and which picture belongs to which cloud."""
 
-import os
 import shutil
 import sys
 from pathlib import Path
@@ -125,29 +124,10 @@ def test_one_of_several_cameras_can_be_read_by_itself(make_folder):
         open_recording(path, TWO, SourceOptions(camera="right"))
 
 
-def test_pictures_are_not_taken_for_those_of_a_camera_that_nobody_named(make_folder):
-    path = make_folder()
-    with pytest.raises(SourceError) as caught:
-        open_recording(path, TWO)
-    assert "--camera left" in caught.value.hint and "img/right/" in caught.value.hint
-    (pair, _) = open_recording(path, TWO, SourceOptions(camera="right")).pairs
-    assert pair.read()[0][0].sensor == "right"
-
-
 def test_two_pictures_of_one_name_are_two_pairs(make_folder, rig):
     path = make_folder()
     shutil.copy(path / "img" / "00000.png", path / "img" / "00000.bmp")
     assert [len(pair.read()[0]) for pair in open_recording(path, rig).pairs] == [1, 1, 1]
-
-
-@pytest.mark.parametrize("name", ["img/00001.png", "pcd/00001.pcd"])
-def test_a_damaged_file_spoils_its_own_pair_only(make_folder, rig, name):
-    path = make_folder()
-    os.truncate(path / name, 400 if name.endswith("pcd") else 60)
-    recording = open_recording(path, rig)
-    recording.pairs[0].read()
-    with pytest.raises(SourceError, match=name.replace("/", ".*")):
-        recording.pairs[1].read()
 
 
 def test_las_without_its_reader_is_one_error_that_names_the_extra(make_folder, rig, monkeypatch):

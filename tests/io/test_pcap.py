@@ -8,11 +8,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lce_rig.core.data import Scan, Stream
+from lce_rig.core.data import Scan
 from lce_rig.core.errors import SourceError
-from lce_rig.io import open_recording
 from lce_rig.io.network import Datagram, PcapFile, PcapWriter, build_frame
-from lce_rig.io.protocol import ContinuousRecording, SourceOptions
+from lce_rig.io.protocol import SourceOptions
 from lce_rig.io.velodyne_scans import PcapRecording
 from tests.damage import damaged
 from tests.notes import has_note
@@ -118,14 +117,6 @@ def test_what_the_writer_wrote_comes_back_byte_for_byte(datagrams, rig, tmp_path
     check_scans(read(path, rig)[0])
     with pytest.raises(FileExistsError):
         PcapWriter(path)
-
-
-def test_a_recording_is_found_by_its_suffix(frames, rig, tmp_path):
-    recording = open_recording(write_pcap(tmp_path / "a.PCAP", frames), rig)
-    assert recording.n_samples == 3
-    assert recording.streams == {Stream("lidar", "", "scans")}
-    part = open_recording(tmp_path / "a.PCAP", rig, SourceOptions(is_part=True))
-    assert isinstance(part, ContinuousRecording) and part.key == recording.key
 
 
 def test_notes_say_what_was_taken_and_what_the_stamps_are(frames, rig, tmp_path):

@@ -303,14 +303,6 @@ def test_pipes_and_devices_in_place_of_recordings_are_refused_at_once(tmp_path, 
             open_recording(tmp_path / f"{name}{suffix}", rig)
 
 
-def test_the_same_bag_has_the_same_key_wherever_it_lies(tmp_path, rig, write_bag, stream):
-    bag = write_bag(tmp_path / "bag", "mcap", stream(3))
-    key = open_recording(bag, rig).key
-    shutil.copytree(bag, tmp_path / "elsewhere" / "bag")
-    other = write_bag(tmp_path / "other" / "bag", "mcap", stream(4))
-    assert open_recording(tmp_path / "elsewhere" / "bag", rig).key == key != open_recording(other, rig).key
-
-
 def test_long_bags_are_streamed(tmp_path, rig, write_bag, room, cloud_message, image_message):
     import tracemalloc
 

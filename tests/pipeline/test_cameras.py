@@ -119,14 +119,6 @@ def test_cameras_without_a_common_board_stay_by_themselves(session):
     assert "left" in line and "right" in line
 
 
-def test_the_camera_asked_for_is_calibrated_as_if_there_were_no_other(session):
-    (asked,), _ = calibrate_detections(RIG, detections(session), ML, cameras=[RIGHT])
-    (alone,) = calibrated(detections({RIGHT: session[RIGHT]}), ML, only(RIGHT)).values()
-    assert asked.camera == RIGHT
-    assert np.array_equal(asked.T_cam_lidar, alone.T_cam_lidar)
-    assert asked.estimated_with == asked.other_cameras == ()
-
-
 def test_why_no_camera_could_be_calibrated_is_told_of_each(session):
     with pytest.raises(NotEnoughDataError) as caught:
         calibrate_detections(RIG, detections(session, left=range(3), right=range(4)), PAPER)

@@ -7,7 +7,7 @@ from wire.vlp16_packets import Vlp16Clock
 
 from lce_rig.core.findings import worst
 from lce_rig.doctor.checks import Check, examine
-from tests.doctor.attached import Attached, attach, picture_of, scan_of
+from tests.doctor.attached import PIXELS, SCAN, Attached, attach
 from tests.doctor.observed import codes, make_rig
 
 Lines = dict[tuple[str, str], Check]
@@ -34,8 +34,7 @@ def doctor_until_scanned(rig, folder, web_port, duration_s=2.0):
 def everything(tmp_path_factory):
     """The lines of a rig that is all there, how long it was watched for, and how long that took."""
     rig, folder = make_rig(), tmp_path_factory.mktemp("everything")
-    board = rig.board.to_board()
-    with attach(Attached(rig, picture_of(board), scan_of(board, 2.2)), folder) as (reached, web_port):
+    with attach(Attached(rig, PIXELS, SCAN), folder) as (reached, web_port):
         return doctor_until_scanned(reached, folder, web_port, 3.0)
 
 
@@ -76,27 +75,10 @@ def test_its_clocks_are_compared(everything):
     assert lines["rig", "sync"].severity in ("note", "warning")
 
 
-def test_it_takes_little_longer_than_the_sensors_are_watched(everything):
-    lines, watch_s, took_s = everything
-    assert lines["lidar", "stream"].findings[1].figure("watched_s") < watch_s + 3.0 + 1.0
-    assert took_s < watch_s + 17.0  # on a machine that is busy with other tests; a second on one that is not
-
-
-def test_a_rig_of_which_nothing_is_there_has_a_red_line_a_sensor_and_all_of_the_computers(tmp_path):
-    with attach(Attached(make_rig(), has_board=False), tmp_path) as (rig, web_port):
-        lines = doctor(rig, tmp_path, web_port, 1.0)
-    red = {key for key, check in lines.items() if check.severity == "error"}
-    assert {("lidar", "device"), ("cam", "device"), ("sync", "device")} <= red
-    assert all(codes(lines[name, "device"]) == ["sensor.failed"] for name in ("lidar", "cam", "sync"))
-    assert all(lines[name, "device"].figures["hint"] for name in ("lidar", "cam", "sync"))
-    computer = {name for subject, name in lines if subject == "computer"}
-    assert computer == {"disk", "clock"}
-
-
 def test_an_absent_camera_keeps_nothing_else_from_being_looked_at(tmp_path):
     rig = make_rig()
     unlocked = Vlp16Clock("absent", has_nmea=False, error_us=721_000_000)
-    attached = Attached(rig, None, scan_of(rig.board.to_board(), 2.2), unlocked)
+    attached = Attached(rig, None, SCAN, unlocked)
     with attach(attached, tmp_path) as (reached, web_port):
         lines, *_ = doctor_until_scanned(reached, tmp_path, web_port)
     assert lines["cam", "device"].severity == "error" and ("cam", "stream") not in lines

@@ -120,13 +120,6 @@ def test_channels_share_the_lens_and_bad_pictures_are_named(pictures, tmp_path):
     assert "1 x " in caught.value.hint and "000003" in caught.value.hint
 
 
-def test_unknown_channels_and_models_are_usage_errors(session):
-    with pytest.raises(UsageError):
-        measure_intrinsics(session, "davis", channels=["colour"])
-    with pytest.raises(UsageError):
-        measure_intrinsics(session, "davis", model="brown")
-
-
 def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     files = write_intrinsics(session, [measured])
     assert {path.name for path in (session.path / "intrinsics").iterdir()} == {path.name for path in files}

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events
@@ -18,8 +17,6 @@ SHAPE = (48, 64)
 
 START_NS = 1_700_000_000_000_000_000
 SECOND_NS = 1_000_000_000
-
-Radiance = NDArray[np.float32]
 
 
 def ripples(seed=0):

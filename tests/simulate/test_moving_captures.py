@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.errors import ProfileError
 from lce_rig.core.geometry import transform
 from lce_rig.simulate import HandMotion, LidarNoise, SimulationOptions, simulate_captures, truth_extrinsics
 from lce_rig.simulate.sampling import StagedBoard
@@ -149,13 +148,3 @@ def test_stamps_read_more_than_the_rigs_clock_by_their_channels_offset(rig, quie
     shifted, plain = np.histogram(both[0].t_ns, edges - 15_000_000)[0], np.histogram(both[1].t_ns, edges)[0]
     assert np.corrcoef(shifted[5:], plain[5:])[0, 1] > 0.95
     assert capture.scans[0].points.tobytes() == quiet.scans[0].points.tobytes()
-
-
-def test_a_camera_of_events_alone_is_enough_for_a_moving_board_only():
-    rig = moving_rig(dvs={"kind": "events"})
-    capture = next(
-        simulate_captures(rig, n_captures=1, seed=6, options=replace(BRIEF, events_span_s=(0.02, 0.0)))
-    )
-    assert capture.images == [] and len(capture.events) == 1
-    with pytest.raises(ProfileError):
-        next(simulate_captures(rig, n_captures=1, seed=6, options=replace(BRIEF, motion="still")))
