@@ -5,24 +5,16 @@ from dataclasses import replace
 import pytest
 
 from lce_rig.core.data import Events, Image
-from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.session import Session
 from tests.collect import simulated_moves as moves
 from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
-
-
-def bag(path, samples):
-    with BagRecorder(path, moves.rig()) as recorder:
-        for sample in samples:
-            recorder.write(sample)
-    return path
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A LiDAR's bag, and files of the DAVIS beside it: sound, of another time, of another camera, empty."""
     path = tmp_path_factory.mktemp("recordings")
-    bag(path / "lidar.bag", moves.without(Image, Events))
+    moves.bag(path / "lidar.bag", moves.without(Image, Events))
     frames = [s for s in moves.samples() if isinstance(s, Image)]
     raw = [RawFrame(frame.stamp_ns // 1000 - 4000, 8000, frame.pixels) for frame in frames]
     write_davis(path / "davis.aedat4", moves.events(), raw)
@@ -60,7 +52,7 @@ def test_what_cannot_be_used_is_said_with_what_to_do(lce_rig, folder, tmp_path, 
 
 def test_a_board_that_makes_no_events_gives_no_captures_and_the_reason(lce_rig, tmp_path):
     few = [s.select(slice(None, None, 400)) if isinstance(s, Events) else s for s in moves.samples()]
-    bag(tmp_path / "few.bag", few)
+    moves.bag(tmp_path / "few.bag", few)
     outcome = collect(lce_rig, tmp_path, tmp_path / "s", "few.bag")
     assert outcome.code == 6
     assert "few.bag" in outcome.err and "10 cm/s" in outcome.err

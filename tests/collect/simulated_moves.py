@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 from lce_rig.core.data import Events
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import load_rig
 from lce_rig.simulate import HandMotion, LidarNoise, SimulationOptions, simulate_recording
 from lce_rig.simulate.sampling import stamp_of
@@ -50,3 +51,11 @@ def events():
 
 def without(*kinds):
     return [s for s in samples() if not isinstance(s, kinds)]
+
+
+def bag(path, samples):
+    """Write samples as a bag."""
+    with BagRecorder(path, rig()) as recorder:
+        for sample in samples:
+            recorder.write(sample)
+    return path

@@ -12,20 +12,12 @@ from lce_rig.core.geometry import rotation_angle
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.search import find_event_board, reconstructor_for
 from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.session import Session
 from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 
 from . import simulated_moves as moves
 
 EXPOSURE_US = 8000
-
-
-def bag(path, samples):
-    with BagRecorder(path, moves.rig()) as recorder:
-        for sample in samples:
-            recorder.write(sample)
-    return path
 
 
 def run(folder, *paths):
@@ -37,12 +29,12 @@ def run(folder, *paths):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    return bag(tmp_path_factory.mktemp("whole") / "whole.bag", list(moves.samples()))
+    return moves.bag(tmp_path_factory.mktemp("whole") / "whole.bag", list(moves.samples()))
 
 
 @pytest.fixture(scope="module")
 def lidar(tmp_path_factory):
-    return bag(tmp_path_factory.mktemp("lidar") / "lidar.bag", moves.without(Image, Events))
+    return moves.bag(tmp_path_factory.mktemp("lidar") / "lidar.bag", moves.without(Image, Events))
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +145,7 @@ def test_clocks_that_do_not_overlap_are_an_error(tmp_path, lidar):
     with pytest.raises(SourceError, match=r"davis\.events"):
         run(tmp_path / "s", lidar, tmp_path / "late.aedat4")
     # What can be read of the others is captured all the same.
-    good = bag(tmp_path / "good.bag", list(moves.samples()))
+    good = moves.bag(tmp_path / "good.bag", list(moves.samples()))
     _, report = run(tmp_path / "s", good, lidar, tmp_path / "late.aedat4")
     assert report.captured == ["000000"] and len(report.errors) == 1
 
@@ -161,11 +153,11 @@ def test_clocks_that_do_not_overlap_are_an_error(tmp_path, lidar):
 def test_captures_whose_events_begin_late_are_kept(tmp_path):
     start_ns = moves.recording().start_ns + 900_000_000
     late = [s for s in moves.samples() if not isinstance(s, Events) or s.t_ns[0] >= start_ns]
-    session, report = run(tmp_path / "s", bag(tmp_path / "late.bag", late))
+    session, report = run(tmp_path / "s", moves.bag(tmp_path / "late.bag", late))
     assert report.captured == ["000000"]
     assert session.captures[0].events("davis").t_ns[0] >= start_ns
 
 
 def test_without_events_the_same_rig_still_wants_the_board_to_stand(tmp_path):
-    _, report = run(tmp_path / "s", bag(tmp_path / "a.bag", moves.without(Events)))
+    _, report = run(tmp_path / "s", moves.bag(tmp_path / "a.bag", moves.without(Events)))
     assert report.captured == [] and not report.has_events

@@ -10,6 +10,8 @@ from wire.sshd import NoServerError, Sshd
 import lce_rig.collect.findings
 import lce_rig.judge.findings  # noqa: F401  kinds of the findings in stored results
 from lce_rig.core.calibration import Provenance
+from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.storage import Storage
 from lce_rig.rig import load_rig
 from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
@@ -43,6 +45,11 @@ def row():
         return known | changes
 
     return make
+
+
+@pytest.fixture
+def registry(tmp_path):
+    return Registry(Storage.at(tmp_path / "registry"))
 
 
 @pytest.fixture(scope="session")

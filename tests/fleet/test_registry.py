@@ -7,11 +7,6 @@ from lce_rig.fleet.registry import ROWS, SUPERSEDED, TABLE, Registry, write_rows
 from lce_rig.fleet.storage import Storage
 
 
-@pytest.fixture
-def registry(tmp_path):
-    return Registry(Storage.at(tmp_path / "registry"))
-
-
 def write(registry, row, *files):
     """Write a result of a session that failed, with further files."""
     row = row | {"status": "failed"}

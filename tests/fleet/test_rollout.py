@@ -11,9 +11,8 @@ import lce_rig.judge.findings  # noqa: F401  kinds of the findings in stored res
 from lce_rig.cli.main import run
 from lce_rig.core.calibration import Provenance
 from lce_rig.core.errors import ProfileError, UsageError
-from lce_rig.fleet.registry import Registry, as_table, write_rows
+from lce_rig.fleet.registry import as_table, write_rows
 from lce_rig.fleet.rollout import newest_results, roll_out
-from lce_rig.fleet.storage import Storage
 from lce_rig.rig import dump_rig, load_rig
 from tests.export.conftest import calibration, some_pose
 from tests.saved_results import result_file
@@ -21,11 +20,6 @@ from tests.saved_results import result_file
 PROFILE = dump_rig(load_rig("rles"))
 ROBOTS = tuple(f"r{k}" for k in range(1, 4))
 Add = Callable[..., None]
-
-
-@pytest.fixture
-def registry(tmp_path):
-    return Registry(Storage.at(tmp_path / "registry"))
 
 
 @pytest.fixture

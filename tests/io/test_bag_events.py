@@ -7,23 +7,15 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Scan, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.protocol import ContinuousRecording
 from lce_rig.io.ros.bag_recorder import open_bag_writer
 from lce_rig.timing.rig_time import rig_time_ns
 from tests.io.events.encoders import listed
 from tests.notes import has_note
 from tests.shared import changed
 
-from .rig_samples import KINDS, T0_NS, one_second, picture, record, sweep
+from .rig_samples import KINDS, T0_NS, one_second, opened, picture, record, sweep
 
 SIZE = (346, 260)
-
-
-def opened(path, rles, **options):
-    recording = open_recording(path, rles, SourceOptions(**options))
-    assert isinstance(recording, ContinuousRecording)
-    return recording
 
 
 def events_of(samples):

@@ -7,13 +7,13 @@ import pytest
 
 from lce_rig.core.data import Events, Image, Stream
 from lce_rig.core.errors import SourceError
-from lce_rig.io import SourceOptions, open_recording
-from lce_rig.io.protocol import ContinuousRecording, serials_of
+from lce_rig.io.protocol import serials_of
 from lce_rig.rig import load_rig
 from tests.io.events import encoders
 from tests.io.events.aedat4_files import RawFrame, write_aedat4, write_davis
 from tests.io.events.encoders import listed, random_events
 from tests.io.events.test_files import WRITERS
+from tests.io.rig_samples import opened
 from tests.notes import has_note
 from tests.shared import changed
 
@@ -23,12 +23,6 @@ PIECES = [EVENTS.select(slice(k, k + 500)) for k in range(0, 20_000, 500)]
 GREY = np.random.default_rng(0).integers(0, 256, (260, 346), dtype=np.uint8)
 FRAMES = [RawFrame(T0_US + 40_000 * k, 8000, GREY) for k in range(5)]
 EVENT_STREAM, FRAME_STREAM = Stream("davis", "events", "events"), Stream("davis", "frames", "images")
-
-
-def opened(path, rles, **options):
-    recording = open_recording(path, rles, SourceOptions(**options))
-    assert isinstance(recording, ContinuousRecording)
-    return recording
 
 
 def events_of(recording):

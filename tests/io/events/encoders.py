@@ -17,6 +17,11 @@ def listed(events):
     )
 
 
+def everything(recording):
+    """List all events of a recording."""
+    return [event for stretch in recording for event in listed(stretch)]
+
+
 def random_events(n, seed, size=(346, 260), start_us=0, step_us=20):
     """Events in order, some with equal stamps, neighbours in runs so that vectors have something to pack."""
     rng = np.random.default_rng(seed)

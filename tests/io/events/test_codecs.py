@@ -13,7 +13,7 @@ from lce_rig.io.ros.event_messages import PacketDecoder
 from lce_rig.io.ros.messages import EVENT_ARRAY_TYPE, decode_event_array, encode_event_array, typestore
 from tests.io.events import encoders
 from tests.io.events.bags import parsed, write_event_bag, write_packet_bag
-from tests.io.events.encoders import listed, random_events
+from tests.io.events.encoders import everything, listed, random_events
 from tests.notes import has_note
 
 
@@ -118,10 +118,6 @@ def messages(is_ros1, encoding="libcaer_cmp"):
         (TOPIC, 10**9 + 10**7 * i, encoders.packet(encode(piece), encoding, is_ros1=is_ros1, number=i))
         for i, piece in enumerate(PIECES)
     ]
-
-
-def everything(recording):
-    return [event for stretch in recording for event in listed(stretch)]
 
 
 @pytest.mark.parametrize("name", ["a.bag", "ros2"])

@@ -18,15 +18,11 @@ from tests.damage import damaged
 from tests.io.events import encoders
 from tests.io.events.aedat4_files import write_aedat4
 from tests.io.events.bags import write_event_bag
-from tests.io.events.encoders import listed, random_events
+from tests.io.events.encoders import everything, listed, random_events
 from tests.notes import has_note
 
 START_US = 1_700_000_000_000_000
 EVENTS = random_events(30_000, 7, start_us=START_US)
-
-
-def everything(recording):
-    return [event for stretch in recording for event in listed(stretch)]
 
 
 def write_dsec(path, events):
