@@ -62,6 +62,8 @@ class CalibrationEstimate:
             `EstimateSettings.tolerances`.
         cost: the method's own cost about its result, capture by capture, in the extrinsics (and those of
             cameras estimated with it) alone, boards' poses eliminated; None if the method has none.
+        turns: (2, F) angle about its line of sight by which each board disagrees with the result, rad, and
+            its standard deviation at usual noise; None if the method estimates no boards.
         lidar: constant errors of the LiDAR that were estimated with it; None if the method knows none.
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
         estimated_with: cameras whose extrinsics were estimated together with this one.
@@ -82,6 +84,7 @@ class CalibrationEstimate:
     method: str = "paper"
     sensitivities: tuple[Sensitivity, ...] = ()
     cost: Quadratics | None = None
+    turns: Array | None = None
     lidar: KnownLidar | None = None
     lens: SessionLens | None = None
     estimated_with: tuple[str, ...] = ()

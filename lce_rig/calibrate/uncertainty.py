@@ -8,6 +8,7 @@ import numpy as np
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.layout import OWN, SHIFTS
+from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
 from lce_rig.calibrate.likelihood.model import assemble, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
@@ -67,7 +68,13 @@ def by_likelihood(start: Start, joint: JointEstimate, board: Board, camera: int 
     cov, inflation = widen(joint.cov[camera], jackknife_scatter(moves), n_placements)
     figures = _add_figures(start.diagnostics, joint, camera, inflation)
     estimate = report(start, joint.T_cam_lidar[camera], cov, board, figures)
-    return replace(estimate, method="ml", lidar=lidar_of(joint), cost=_expand_joint(joint, camera))
+    return replace(
+        estimate,
+        method="ml",
+        lidar=lidar_of(joint),
+        cost=_expand_joint(joint, camera),
+        turns=_turns(joint, camera),
+    )
 
 
 def with_profile(
@@ -99,6 +106,24 @@ def _expand_joint(joint: JointEstimate, camera: int) -> Quadratics:
     # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
     prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
     return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)))
+
+
+def _turns(joint: JointEstimate, camera: int) -> Array:
+    """Measure the turn about its line of sight of each board that a camera sees: `CalibrationEstimate.turns`.
+
+    The noise of such turns, as estimated, contains those of a sensor that moves to and fro, and captures of
+    either mounting lose weight: the usual noise is assumed, and full weight.
+    """
+    images, layout = joint.terms.images[camera], joint.state.layout
+    levels = replace(joint.levels, spin_rad=Levels().spin_rad)
+    terms = replace(joint.terms, trust=np.ones_like(joint.terms.trust))
+    cost = assemble(terms, levels, joint.priors).cost.of(layout.camera(camera))
+    # A board may leave a direction undetermined: 1 m, 1 rad.
+    cov = np.linalg.inv(cost.hessians[images.capture] + np.eye(6))
+    own = -(cov @ cost.gradients[images.capture, :, None])[:, 3:, 0]
+    sight = images.T_cam_board[:, :3, 3] / np.linalg.norm(images.T_cam_board[:, :3, 3], axis=1, keepdims=True)
+    variance = np.einsum("fi,fij,fj->f", sight, cov[:, 3:, 3:], sight)
+    return np.array([np.sum(sight * own, axis=1), np.sqrt(variance)])
 
 
 def _add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflation: float) -> Diagnostics:

@@ -43,6 +43,7 @@ from lce_rig.judge.split_consistency import (
     RejectedGroup,
     contrast_halves,
     find_groups,
+    find_turned,
     make_contrast,
     objections,
 )
@@ -139,6 +140,8 @@ def validate(
         centres = np.array([observation.image.T_cam_board[:3, 3] for observation in observations])
         of_rejected = find_moved(observations, rejected, board, estimate.T_cam_lidar, lidar)
         contrasts = (*of_rejected, *contrast_halves(settled, centres), *find_groups(settled))
+        if estimate.turns is not None and recount is None:
+            contrasts += find_turned(estimate.turns, centres, settled.groups)
         # Captures of another mounting would look like other angles.
         apart = {
             name

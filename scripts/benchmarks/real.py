@@ -90,9 +90,17 @@ def _halves(
         part of the covariances that they do not share.
     """
     rng = np.random.default_rng(0)
+    detections = Detections(
+        {key: own for key, own in detections.images.items() if key[1] in channels}, detections.lidars
+    )
     ((_lidar, scans),) = detections.lidars.items()
+    seen = {name for own in detections.images.values() for name in own}
     # Captures may hold copies of one scan: they go into the same half.
-    prints = {n: found[0].points.tobytes() if isinstance(found, list) else n for n, found in scans.items()}
+    prints = {
+        n: found[0].points.tobytes() if isinstance(found, list) else n
+        for n, found in scans.items()
+        if n in seen
+    }
     keys = sorted(set(prints.values()), key=lambda key: min(n for n, own in prints.items() if own == key))
     # Half of a small set has fewer captures than a result would be given for.
     fewest = max(3, min(rig.quality.min_captures, len(keys) // 2))
@@ -108,7 +116,6 @@ def _halves(
                     rig,
                     _only(detections, {n for n, key in prints.items() if key in half}),
                     EstimateSettings(method),
-                    channels=channels,
                 )[0][0]
                 for half in halves
             ]

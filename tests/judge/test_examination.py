@@ -9,7 +9,7 @@ from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.judge.local_quadratic import OF_PROFILE, expand, pattern_of, scale_of
-from lce_rig.judge.split_consistency import contrast_halves, find_groups, split_findings
+from lce_rig.judge.split_consistency import contrast_halves, find_groups, find_turned, split_findings
 from lce_rig.judge.validate import validate
 from lce_rig.judge.verdict import judge
 from lce_rig.lens.models import LensPrior
@@ -157,6 +157,50 @@ def test_captures_of_a_sensor_that_moves_to_and_fro_are_told_from_the_rest(angle
     assert finding.figures["captures"] == tuple(f"{k:06d}" for k in away)
     assert "5 captures (000001, 000004, 000005, 000009, 000013) fit" in finding.text
     assert finding.figures["rotation_deg"] == pytest.approx(angle_deg, abs=0.3)
+
+
+@pytest.mark.parametrize(("angle_deg", "least", "most"), [(0.0, 0, 0), (0.5, 3, 4)])
+def test_a_sensor_that_turns_to_and_fro_about_the_line_of_sight_is_told_and_claimed(angle_deg, least, most):
+    turn, told = perturb(np.eye(4), np.array([0, 0, 0, 0, 0, np.radians(angle_deg)])), 0
+    for seed in range(4):
+        boards = [
+            moved(seen, turn @ seen.image.T_cam_board) if k % 2 else seen
+            for k, seen in enumerate(observed(16, seed))
+        ]
+        estimate = fit_extrinsic(boards, BOARD, EstimateSettings("ml"))
+        validation = validate(estimate, RIG, RIG.lidars["lidar"], CAMERA)
+        verdict, findings = judge(estimate, validation, RIG, "cam", "lidar", 16)
+        assert verdict == ("pass" if all(f.severity == "note" for f in findings) else "marginal")
+        if any(f.code == "verdict.two_groups" for f in findings):
+            told += 1
+            off_rad = difference(estimate.T_cam_lidar, T_FORWARD)[5]
+            assert abs(off_rad) < 3 * np.sqrt(validation.cov[5, 5])
+    assert least <= told <= most
+
+
+def test_captures_of_one_placement_count_once_in_a_search_for_turns():
+    angles = np.radians(np.tile([0.0, 0.4], 4))
+    turns, centres = np.array([angles, np.full(8, np.radians(0.1))]), np.tile([0.0, 0.0, 3.0], (8, 1))
+    (once,) = find_turned(turns, centres, np.eye(8))
+    (twice,) = find_turned(
+        np.repeat(turns, 2, axis=1), np.repeat(centres, 2, axis=0), np.repeat(np.eye(8), 2, axis=1)
+    )
+    assert once.chance < 0.001
+    assert twice.chance == pytest.approx(once.chance)
+    assert once.group in ((0, 2, 4, 6), (1, 3, 5, 7))
+    assert len(twice.group) == 8
+    assert once.rotation_deg == pytest.approx(0.4)
+
+
+def test_two_groups_are_named_in_few_sessions_with_turns_of_the_noise_that_is_stated():
+    rng = np.random.default_rng(1)
+    chances = [
+        find_turned(np.array([rng.standard_normal(16), np.ones(16)]), np.ones((16, 3)), np.eye(16))[0].chance
+        for _ in range(4000)
+    ]
+    for level in (0.1, 0.01, 0.001):
+        n_expected = 4000 * level
+        assert abs(np.count_nonzero(np.less(chances, level)) - n_expected) < 4 * np.sqrt(n_expected)
 
 
 def test_a_change_at_one_capture_is_not_told_as_two_groups_as_well():
