@@ -2,7 +2,6 @@
 
 import logging
 import time
-import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -89,14 +88,13 @@ def cluster(workers: int, memory_limit_mb: float, scheduler: str | None = None) 
     }
     # Workers that end while their scheduler does are no news.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    with dask.config.set(settings), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # another cluster has the usual port of the dashboard
+    with dask.config.set(settings):
         local = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
             memory_limit=int(memory_limit_mb * 1e6),
             host="127.0.0.1",
-            dashboard_address="127.0.0.1:8787",
+            dashboard_address="127.0.0.1:0",  # a free port: another fleet may run on this computer
             silence_logs=logging.CRITICAL,
         )
         with local, Client(local) as client:

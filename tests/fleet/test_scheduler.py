@@ -1,5 +1,6 @@
 """A cluster that somebody else runs, and recordings that a manifest names."""
 
+import gc
 import shutil
 
 import pytest
@@ -7,6 +8,7 @@ from distributed import LocalCluster
 
 from lce_rig.cli.main import run
 from lce_rig.fleet.registry import Registry
+from lce_rig.fleet.run import cluster
 from lce_rig.fleet.storage import Storage
 from lce_rig.rig import dump_rig
 from lce_rig.session import Session
@@ -30,10 +32,17 @@ def recorded(simulated, small_rig, tmp_path):
 
 
 @pytest.mark.long
+def test_two_fleets_at_once_have_their_own_dashboards():
+    with cluster(1, 500) as first, cluster(1, 500) as second:
+        assert first.dashboard_link != second.dashboard_link
+    gc.collect()  # a socket that failed to bind would be a ResourceWarning here
+
+
+@pytest.mark.long
 def test_a_recording_is_calibrated_by_a_cluster_that_runs_already(recorded, capsys, tmp_path):
     words = ["fleet", "run", str(recorded), "--registry", str(tmp_path / "registry")]
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster:
-        address = cluster.scheduler_address
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as running:
+        address = running.scheduler_address
         assert run([*words, "--scheduler", address]) == 0
     (row,) = Registry(Storage.at(tmp_path / "registry")).read_table().to_pylist()
     assert (row["status"], row["robot"], row["site"], row["n_used"]) == ("ok", "r9", "hall 3", 8)
