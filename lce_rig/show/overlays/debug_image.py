@@ -212,10 +212,13 @@ def _draw_scan(
         above.plot(outline[:, 1], outline[:, 0], color=tone)
         above.text(middle[1] - 0.04 * reach_m, middle[0], number, color=tone)
     above.plot(0, 0, "wo")
-    unrolled.set(xlim=(180, -180), ylim=(-20, 20), xticks=range(-135, 136, 45), yticks=[])
+    low, high = _reach(_angles_deg(points)[1])
+    unrolled.set(xlim=(180, -180), ylim=(low, high), xticks=range(-135, 136, 45), yticks=[])
     above.set(xlim=(reach_m, -reach_m), ylim=(-reach_m, reach_m), aspect="equal", xticks=[])
-    unrolled.tick_params(axis="x", direction="in", pad=-15, colors=_FAINT)
-    above.tick_params(axis="y", direction="in", pad=-20, colors=_FAINT)
+    # Labels at the ends would be cut by the frame.
+    above.set_yticks([y for y in above.get_yticks() if abs(y) < 0.95 * reach_m])
+    unrolled.tick_params(axis="x", direction="in", length=0, pad=-15, colors=_FAINT)
+    above.tick_params(axis="y", direction="in", length=0, pad=-20, colors=_FAINT)
     above.grid(color="#404040", linewidth=0.5)
     unrolled.set_title("LiDAR, unrolled, deg", loc="left", fontsize=9)
     above.set_title("from above, x up, m", loc="left", fontsize=9)
@@ -244,6 +247,13 @@ def _angles_deg(points: Array) -> tuple[Array, Array]:
     """Compute azimuths and elevations (N,)."""
     level = np.hypot(points[:, 0], points[:, 1])
     return np.degrees(np.arctan2(points[:, 1], points[:, 0])), np.degrees(np.arctan2(points[:, 2], level))
+
+
+def _reach(elevation_deg: Array) -> tuple[float, float]:
+    """Choose the elevations of the unrolled scan, with room for azimuths below and a candidate's number above."""
+    low, high = (elevation_deg.min(), elevation_deg.max()) if len(elevation_deg) else (-15.0, 15.0)
+    margin = 0.1 * max(high - low, 10.0)
+    return low - 2.5 * margin, high + 1.5 * margin
 
 
 def _write_refusal(pane: Any, heading: str, refusal: Refusal) -> None:

@@ -109,7 +109,7 @@ def add_mean_arrows(axes: Any, corners_px: Array, residuals_px: Array, lens: Int
         *means.T, color=_BLUE, angles="xy", scale_units="xy", scale=scale, width=0.004, zorder=3
     )
     label = f"{significant(usual_px)} px "
-    axes.quiverkey(arrows, 0.92, 1.05, usual_px, label, labelpos="W", labelcolor=_INK)
+    axes.quiverkey(arrows, 0.92, 1.11, usual_px, label, labelpos="W", labelcolor=_INK)
 
 
 def _draw_certainty(figure: Any, axis: Any, estimate: IntrinsicsEstimate, certainty: LensCertainty) -> None:

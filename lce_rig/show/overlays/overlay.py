@@ -10,7 +10,6 @@ from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.geometry import Array, transform
-from lce_rig.core.phrasing import significant
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.show.overlays import canvas
@@ -108,7 +107,7 @@ def draw_overlay(
     lidar_board: LidarBoard | None,
     image_board: ImageBoard | None,
     board: Board,
-    residuals: Mapping[str, float | str],
+    residuals: Mapping[str, str],
     title: str,
     limits_m: tuple[float, float] | None = None,
     warning: str = "",
@@ -127,7 +126,7 @@ def draw_overlay(
         lidar_board: its points and ring ends are marked; None for the scan only.
         image_board: its outline and corners are drawn; None for none.
         board: the board, for its outline.
-        residuals: figures by name with unit, such as {"plane (mm)": 4.2}, in display order.
+        residuals: figures by name, such as {"planes": "4.2 mm"}, in display order.
         title: one line above the image.
         limits_m: ends of the range scale; those of the scan if None.
         warning: why the capture was not used, below the legend.
@@ -260,7 +259,7 @@ def _draw_scan(
 def draw_legend(
     width_px: int,
     limits_m: tuple[float, float],
-    residuals: Mapping[str, float | str],
+    residuals: Mapping[str, str],
     has_lidar: bool = True,
     has_image: bool = True,
 ) -> Picture:
@@ -268,10 +267,7 @@ def draw_legend(
     unit = width_px / 1000
     text_px = 11 * unit
     line_px = 2.1 * text_px
-    entries = [
-        f"{name}  {value if isinstance(value, str) else significant(value, 3)}"
-        for name, value in residuals.items()
-    ]
+    entries = [f"{name}  {value}" for name, value in residuals.items()]
     n_columns = 2 if len(entries) > 4 else 1
     n_lines = max(4, -(-len(entries) // n_columns))
     legend = canvas.panel(width_px, round((n_lines + 0.9) * line_px))

@@ -301,17 +301,17 @@ def _draw(
 
 def _legend(
     name: str, residual: CaptureResidual | None, meeting: Meeting | None, calibration: Calibration
-) -> dict[str, float | str]:
-    figures: dict[str, float | str] = {}
+) -> dict[str, str]:
+    figures: dict[str, str] = {}
     if residual is not None:
         figures = {
-            "planes (mm)": round(1000 * residual.plane_mean_m, 1),
-            "edges (mm)": round(1000 * residual.edge_mean_m, 1),
+            "planes": f"{1000 * residual.plane_mean_m:.1f} mm",
+            "edges": f"{1000 * residual.edge_mean_m:.1f} mm",
         }
         if math.isfinite(residual.reprojection_px):
-            figures["corners (px)"] = round(residual.reprojection_px, 2)
+            figures["corners"] = f"{residual.reprojection_px:.2f} px"
     if meeting is not None and meeting.way_m > 0:
-        figures["moved (mm)"] = round(1000 * meeting.way_m, 1)
+        figures["moved"] = f"{1000 * meeting.way_m:.1f} mm"
     refusal = calibration.captures_refused.get(name)
     if calibration.captures_used:
         is_used = name in calibration.captures_used

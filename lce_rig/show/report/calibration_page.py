@@ -22,7 +22,7 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events
 from lce_rig.core.errors import LceRigError
 from lce_rig.core.geometry import Array, invert, perturb, sigma_sizes
-from lce_rig.core.phrasing import as_line, significant
+from lce_rig.core.phrasing import as_line, significant, sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.export.writing import T_BODY_OPTICAL, rpy
@@ -333,10 +333,9 @@ def _camera_rows(c: Calibration) -> list[Row]:
     for other in c.other_cameras:
         sigma = apart = ""
         if other.cov is not None:
-            rotation_deg, translation_m = sigma_sizes(other.cov)
-            sigma = f"{rotation_deg:.3f} deg, {1000 * translation_m:.1f} mm"
+            sigma = sizes(*sigma_sizes(other.cov))
         if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
-            apart = f"{other.apart_rotation_deg:.3f} deg, {1000 * other.apart_translation_m:.1f} mm"
+            apart = sizes(other.apart_rotation_deg, other.apart_translation_m)
         rows.append((other.camera, other.n_captures, sigma, apart, f"{1000 * other.board_rms_m:.1f} mm"))
     return rows
 

@@ -80,7 +80,7 @@ def overlay(camera, points, **boards):
         lidar_board=boards.get("lidar"),  # type: ignore[arg-type]
         image_board=boards.get("image"),  # type: ignore[arg-type]
         board=BOARD,
-        residuals={"plane (mm)": 4.25, "verdict": "pass"},
+        residuals={"planes": "4.2 mm", "verdict": "pass"},
         title="capture 000000",
         events=boards.get("events"),  # type: ignore[arg-type]
         warning=str(boards.get("warning", "")),
