@@ -24,7 +24,7 @@ from lce_rig.core.calibration import DEFAULT_METHOD, Calibration, Method, Metric
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.files import read_json
 from lce_rig.core.geometry import sigma_sizes
-from lce_rig.core.phrasing import motion_words
+from lce_rig.core.phrasing import motion_words, sizes
 from lce_rig.detect.detection import Pair
 from lce_rig.export.extrinsics import read_reference
 from lce_rig.judge.findings import advice_of, causes_of, consequences, lacks_captures, weakest_words
@@ -65,7 +65,7 @@ def _uncertainty(c: Calibration, *, is_explained: bool) -> Iterator[str]:
                 yield f"  {_FAR_M:g} m away    a point is off by {off}; in a corner {point.corner_px:.1f} px"
         return
     if c.scene_share is not None and c.scene_share.state == "used":
-        yield f"               of the boards alone {show.sizes(*sigma_sizes(c.scene_share.cov_boards))}"
+        yield f"               of the boards alone {sizes(*sigma_sizes(c.scene_share.cov_boards))}"
     if c.weakest:
         yield f"  weakest: {weakest_words(c.weakest)}"
     rows = {
@@ -78,7 +78,7 @@ def _uncertainty(c: Calibration, *, is_explained: bool) -> Iterator[str]:
 
 
 def _sigma_line(sigma_deg: float, sigma_m: float) -> str:
-    return f"  uncertainty  {show.sizes(sigma_deg, sigma_m)} (1 sigma)"
+    return f"  uncertainty  {sizes(sigma_deg, sigma_m)} (1 sigma)"
 
 
 def scene_texts(opinion: SceneOpinion) -> list[str]:
@@ -94,8 +94,8 @@ def scene_texts(opinion: SceneOpinion) -> list[str]:
         f"{show.amount(axis.sigma, axis.unit)} {_UNITS[axis.unit]}"
         for axis in opinion.of("contradicts")
     ]
-    sizes = {axis.axis: show.amount(axis.smallest, axis.unit) for axis in opinion.of("agrees")}
-    texts += [f"would see changes {kind}" for kind in show.axes_by_kind(sizes)]
+    smallest = {axis.axis: show.amount(axis.smallest, axis.unit) for axis in opinion.of("agrees")}
+    texts += [f"would see changes {kind}" for kind in show.axes_by_kind(smallest)]
     if opinion.state != "unknown" and opinion.of("unknown"):
         blind = show.axes_by_kind({axis.axis: "" for axis in opinion.of("unknown")})
         texts.append(f"cannot tell changes {'; '.join(blind)}")
@@ -121,7 +121,7 @@ def camera_lines(calibration: Calibration, calibrations: Sequence[Calibration]) 
             yield _sigma_line(*sigma_sizes(other.cov))
         if other.apart_rotation_deg is not None and other.apart_translation_m is not None:
             separately = ", each camera estimated separately" if other.cov is not None else ""
-            apart = show.sizes(other.apart_rotation_deg, other.apart_translation_m)
+            apart = sizes(other.apart_rotation_deg, other.apart_translation_m)
             yield f"  images       differ by {apart}{separately}"
         yield f"  boards       {1000 * other.board_rms_m:.1f} mm apart"
 
@@ -372,7 +372,7 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
     if corrected and c.verdict == "pass" and not is_explained:
         yield f"  {show.escape(corrected[0].text)}"
     if c.egt_rotation_deg is not None and c.egt_translation_m is not None:
-        yield f"  reference    error {show.sizes(c.egt_rotation_deg, c.egt_translation_m)}"
+        yield f"  reference    error {sizes(c.egt_rotation_deg, c.egt_translation_m)}"
     if is_explained:
         yield from _explanation(c)
 
@@ -393,8 +393,8 @@ def _explanation(c: Calibration) -> Iterator[str]:
     if c.estimated_with:
         alone = ""
         if math.isfinite(figures.alone_sigma_rotation_deg):
-            sizes = show.sizes(figures.alone_sigma_rotation_deg, figures.alone_sigma_translation_m)
-            alone = f"; uncertainty alone {sizes}"
+            alone = sizes(figures.alone_sigma_rotation_deg, figures.alone_sigma_translation_m)
+            alone = f"; uncertainty alone {alone}"
         yield f"  together     with {', '.join(c.estimated_with)}{alone}"
     yield from show.titled_lines("scene", [] if c.scene is None else scene_texts(c.scene))
     for name, why in c.captures_refused.items():

@@ -102,6 +102,8 @@ def run_live(
     if report.n_recorded is not None:
         show.note(f"{record}: {report.n_recorded} samples recorded")
     _tell(report, n_captures, asked, person, n_wanted)
+    if report.ending == "enough":
+        show.note(f"  more         {_more(path)} --keep-going")
     show_next(path, rig, report.predicted, n_captures)
 
 
@@ -183,9 +185,7 @@ def _tell(
     if lost:
         show.note("dropped: " + ", ".join(f"{name} {n}" for name, n in sorted(lost.items())))
     ending = _ENDINGS[report.ending]
-    if report.ending == "enough":
-        ending += " (for more, add --keep-going)"
-    elif report.ending == "exhausted" and n_wanted is not None:
+    if report.ending == "exhausted" and n_wanted is not None:
         ending += f"; {n_captures} of {n_wanted} captures"
     show.note(f"ended: {ending}")
     if report.error is not None:

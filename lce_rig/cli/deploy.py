@@ -1,5 +1,6 @@
 """`lce-rig deploy`: put a result on a robot, ask what is there, or go back."""
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,8 @@ import click
 import lce_rig as lce
 from lce_rig.cli import show
 from lce_rig.cli.options import json_option, path_option, result_option, session_argument
-from lce_rig.core.errors import UsageError
+from lce_rig.core.errors import ResultRefusedError, UsageError
+from lce_rig.core.phrasing import sizes
 from lce_rig.fleet import deployment
 from lce_rig.fleet.deployment import Deployed, Plan
 from lce_rig.fleet.releases import ReleaseRecord, TargetState, differences_in_words, find_target
@@ -68,6 +70,8 @@ def deploy(
     if reason and not (force or rollback):
         raise UsageError("--reason applies to --force and --rollback only", "Add one of them, or omit it.")
 
+    again = show.command("deploy", session, f" --target {shlex.quote(target_name)}")
+    again += "" if targets is None else f" --targets {shlex.quote(str(targets))}"
     if status or rollback:
         # A session is opened for its profile only.
         is_read = targets is None and (session / "session.json").exists()
@@ -76,7 +80,7 @@ def deploy(
         if status:
             _show_standing(deployment.standing(target), target, as_json=as_json)
         else:
-            _show_done(deployment.rollback(target, release, reason=reason), target, as_json=as_json)
+            _show_done(deployment.rollback(target, release, reason=reason), target, again, as_json=as_json)
         return
     opened = lce.Session.open(session)
     target = find_target(target_name, targets, session, opened.rig)
@@ -87,8 +91,14 @@ def deploy(
         return
     if target.run is not None:
         show.note(f"afterwards there: {target.run}")
-    done = deployment.deploy(result, opened.rig, target, session=opened, reason=reason.strip())
-    _show_done(done, target, as_json=as_json)
+    try:
+        done = deployment.deploy(result, opened.rig, target, session=opened, reason=reason.strip())
+    except ResultRefusedError as error:
+        forced = f"{again}{f' --name {name}' if name else ''} --force --reason TEXT"
+        raise ResultRefusedError(
+            error.what, f"{error.hint}\nTo deploy it nevertheless: `{forced}`"
+        ) from error
+    _show_done(done, target, again, as_json=as_json)
 
 
 def _print_json(target: TargetSettings, **content: Any) -> None:
@@ -114,7 +124,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
     for change in plan.sensors:
         how = "new" if change.is_new else "removed"
         if change.rotation_deg is not None and change.translation_m is not None:
-            how = f"moves by {show.sizes(change.rotation_deg, change.translation_m)}"
+            how = f"moves by {sizes(change.rotation_deg, change.translation_m)}"
         show.say(f"  {change.camera} and {change.lidar}: {how}")
     _warn_of_changes(plan.state.changed)
     if plan.is_in_place:
@@ -175,7 +185,7 @@ def _described(release: ReleaseRecord) -> str:
     return f"{release.name} ({robot}{dated}{verdicts})"
 
 
-def _show_done(done: Deployed, target: TargetSettings, *, as_json: bool) -> None:
+def _show_done(done: Deployed, target: TargetSettings, again: str, *, as_json: bool) -> None:
     if as_json:
         content = {"current" if name == "release" else name: value for name, value in vars(done).items()}
         _print_json(target, **content)
@@ -185,7 +195,7 @@ def _show_done(done: Deployed, target: TargetSettings, *, as_json: bool) -> None
     state = "in place" if done.is_new else "in place already"
     show.say(f"{target.to}: {_described(done.release)} {state}")
     if done.is_new and done.replaces == done.release.replaces != "":
-        show.note(f"replaces {done.replaces}; `--rollback` restores it")
+        show.note(f"replaces {done.replaces}; to restore it: {again} --rollback")
     if done.changed_there:
         _warn_of_changes(done.changed_there)
         show.note(f"the changed files stay there in releases/{done.replaces}/")

@@ -107,7 +107,8 @@ def export(
         for file in files:
             show.say(str(file))
         for finding in findings:
-            (show.note if finding.severity == "note" else show.warn)(finding.sentence)
+            advice = finding.advice_at(str(session))
+            (show.note if finding.severity == "note" else show.warn)(f"{finding.text}: {advice}".rstrip(": "))
         return
 
     assert into is not None

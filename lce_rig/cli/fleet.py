@@ -340,7 +340,8 @@ def deploy(
         stopped = rollout.robots[rollout.stopped_by]
         raise ResultRefusedError(
             f"stopped at {stopped.robot}: {_line(stopped)}",
-            "Remove the cause and run it again; with --rollback it restores every robot's earlier files.",
+            "Remove the cause and run it again. To restore every robot's earlier files: "
+            f"`lce-rig fleet deploy --registry {shlex.quote(registry)} --target {target} --rollback`",
         )
 
 

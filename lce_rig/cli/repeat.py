@@ -10,7 +10,7 @@ import numpy as np
 from lce_rig.cli import show
 from lce_rig.cli.options import explain_option, json_option
 from lce_rig.core.errors import ResultRefusedError, UsageError
-from lce_rig.core.phrasing import as_line, significant
+from lce_rig.core.phrasing import as_line, significant, sizes
 from lce_rig.judge.repeatability import Repeatability
 from lce_rig.pipeline.comparison import compare_results
 from lce_rig.pipeline.comparison import repeat as compare
@@ -89,9 +89,9 @@ def _parts(c: Repeatability, session: str, *, is_explained: bool) -> Iterator[An
         yield f"  -> {show.escape(as_line(advice))}"
     yield "  mean T_cam_lidar (p_cam = R p_lidar + t)"
     yield from show.matrix_lines(c.T_cam_lidar, "    ")
-    spread = show.sizes(c.spread_rotation_deg, c.spread_translation_m)
+    spread = sizes(c.spread_rotation_deg, c.spread_translation_m)
     yield f"  spread       {spread} (1 sigma of one session)"
-    yield f"  reported     {show.sizes(c.reported_rotation_deg, c.reported_translation_m)}"
+    yield f"  reported     {sizes(c.reported_rotation_deg, c.reported_translation_m)}"
     yield f"  chance       {significant(c.p)}{shared} (chi2 {c.chi2:.1f}, {c.dof} degrees of freedom)"
     if not is_explained:
         return
@@ -110,9 +110,9 @@ def _parts(c: Repeatability, session: str, *, is_explained: bool) -> Iterator[An
     rows = []
     for pair in c.differences:
         at_boards = ", ".join(f"{1000 * m:.1f} at {at_m:g} m" for at_m, m in pair.displacements_m.items())
-        sizes = f"{pair.rotation_deg:.3f}", f"{1000 * pair.translation_m:.1f}", at_boards or "-"
+        figures = f"{pair.rotation_deg:.3f}", f"{1000 * pair.translation_m:.1f}", at_boards or "-"
         names = show.escape(pair.first), show.escape(pair.second)
-        rows.append((*names, *sizes, f"{pair.distance:.1f}", significant(pair.p)))
+        rows.append((*names, *figures, f"{pair.distance:.1f}", significant(pair.p)))
     yield show.plain_table("pairs of sessions", *headings, rows=rows)
 
 

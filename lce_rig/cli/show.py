@@ -135,11 +135,6 @@ def plain_table(title: str, *headings: str, rows: Iterable[Iterable[str]] = ()) 
     return table
 
 
-def sizes(rotation_deg: float, translation_m: float) -> str:
-    """Write the size of a motion, or its standard deviation."""
-    return f"{rotation_deg:.3f} deg, {1000 * translation_m:.1f} mm"
-
-
 def matrix_lines(T: Any, indent: str) -> list[str]:
     """Write the upper three rows of a pose."""
     return [indent + "  ".join(f"{value: .6f}" for value in row) for row in T[:3]]

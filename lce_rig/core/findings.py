@@ -13,6 +13,7 @@ import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, cast
 
 from typing_extensions import TypeAliasType
@@ -69,6 +70,9 @@ class Kind:
     ) -> "Refusal":
         """Make a refusal of this kind; the code begins with the stage."""
         return Refusal(self.code, severity or self.severity, subject, figures, action)
+
+
+note_kind, warning_kind = partial(Kind, severity="note"), partial(Kind, severity="warning")
 
 
 @dataclass(frozen=True)

@@ -103,6 +103,11 @@ def significant(value: float, digits: int = 2) -> str:
 _SMALLEST = 0.0001
 
 
+def sizes(rotation_deg: float, translation_m: float) -> str:
+    """Write the size of a motion, or its standard deviation."""
+    return f"{rotation_deg:.3f} deg, {1000 * translation_m:.1f} mm"
+
+
 def captures_to_add(n_captures: Any, is_enough: Any, groups: Any) -> str:
     """Say how many captures to add, where to stand and how to tilt the board.
 

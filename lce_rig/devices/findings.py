@@ -1,13 +1,9 @@
 """Kinds of findings on attached sensors: the device, its stream, its clock, its settings."""
 
-from functools import partial
-
-from lce_rig.core.findings import Finding, Kind
+from lce_rig.core.findings import Finding, note_kind, warning_kind
 from lce_rig.core.phrasing import significant
 
 _RAISE_LIMIT = "raise it: sudo sysctl -w net.core.rmem_max=4194304"
-
-_note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
 
 
 def _board_clock(finding: Finding) -> str:
@@ -25,139 +21,139 @@ def _board_clock(finding: Finding) -> str:
     return text + (f"; round trip {finding.figure('round_trip_ms'):.1f} ms" if has_asked else "")
 
 
-CONTROL_DIFFERS = _warning(
+CONTROL_DIFFERS = warning_kind(
     "device.control_differs", "control {control} is {given}, the profile's value is {expected}"
 )
-RECORDING_STOPPED = _warning(
+RECORDING_STOPPED = warning_kind(
     "device.recording_stopped", "recording to {path} stopped: {cause}", "free some space"
 )
-RECORDING_INCOMPLETE = _warning(
+RECORDING_INCOMPLETE = warning_kind(
     "device.recording_incomplete",
     "{n} samples missing in {path}: the disk is too slow",
     "record to a faster disk",
 )
-BOARD_SILENT = _warning(
+BOARD_SILENT = warning_kind(
     "device.board_silent",
     "no message from the board for {silent_s:.0f} s",
     "check its cable and power, press its reset",
 )
-BOARD_RESTARTED = _warning(
+BOARD_RESTARTED = warning_kind(
     "device.board_restarted",
     "the board restarted {n} times, last {ago_s:.0f} s ago",
     "check its power, and that no other program opens its port",
 )
-BOARD_ERROR = _warning("device.board_error", "the board reports: {message} (error {number})")
+BOARD_ERROR = warning_kind("device.board_error", "the board reports: {message} (error {number})")
 
-PACKETS_LOST = _warning(
+PACKETS_LOST = warning_kind(
     "stream.packets_lost",
     "{share:1percent} of the packets lost (limit 1 %)",
     "check cable and switch, and that the LiDAR's field of view is 0 to 359",
 )
-COMPUTER_TOO_SLOW = _warning(
+COMPUTER_TOO_SLOW = warning_kind(
     "stream.computer_too_slow",
     "this computer was too slow for {n} packets",
     "close other programs, and see `lce-rig doctor --rig RIG`",
 )
-ROTOR_RATE = _warning(
+ROTOR_RATE = warning_kind(
     "stream.rotor_rate",
     "rotor at {rotor_hz:.1f} Hz ({expected_hz:g} expected)",
     "set rate_hz in the profile, or rpm {expected_rpm:.0f} on the web page",
 )
-DAMAGED_IMAGES = _warning(
+DAMAGED_IMAGES = warning_kind(
     "stream.damaged_images", "{n} damaged images", "check the camera's cable and `dmesg | tail`"
 )
-MESSAGES_SKIPPED = _warning(
+MESSAGES_SKIPPED = warning_kind(
     "stream.messages_skipped",
     "{n} messages damaged, repeated or late",
     "record a bag: `lce-rig collect --rig RIG --from FILE` names the cause",
 )
-DAMAGED_LINES = _warning(
+DAMAGED_LINES = warning_kind(
     "stream.damaged_lines",
     "{n} of {n_lines} messages damaged",
     "check cable, ground and sync.baud, and that nothing else reads the port",
 )
-NO_PULSES = _warning(
+NO_PULSES = warning_kind(
     "stream.no_pulses", "no pulses for {line}", "check sync.triggers.{line}.channel and that triggers are on"
 )
-PULSE_LINES_LOST = _warning(
+PULSE_LINES_LOST = warning_kind(
     "stream.pulse_lines_lost", "messages of {n} pulses lost ({by_line})", "use a USB port of its own"
 )
-LINES_DROPPED_BY_BOARD = _warning(
+LINES_DROPPED_BY_BOARD = warning_kind(
     "stream.lines_dropped_by_board",
     "the board dropped {n} messages: the computer read too slowly",
     "close other programs",
 )
-BUFFER_SMALL = _warning(
+BUFFER_SMALL = warning_kind(
     "buffer.small",
     "the receive buffer ({buffer_kib} KiB) holds {buffer_s:0ms} (minimum 250 ms)",
     _RAISE_LIMIT,
 )
 
-ARRIVAL = _note("clock.arrival", "arrival at this computer, later than the exposure by an unknown time")
-HEADER = _note("clock.header", "headers of the ROS 2 messages, {delay_ms:.3g} ms before their arrival")
-MID_EXPOSURE = _note(
+ARRIVAL = note_kind("clock.arrival", "arrival at this computer, later than the exposure by an unknown time")
+HEADER = note_kind("clock.header", "headers of the ROS 2 messages, {delay_ms:.3g} ms before their arrival")
+MID_EXPOSURE = note_kind(
     "clock.mid_exposure",
     "{mark} by clock {clock}, as this computer's UTC, corrected to mid exposure; "
     "{delay_ms:.0f} ms old on arrival",
 )
-DAVIS_CLOCK = _note(
+DAVIS_CLOCK = note_kind(
     "clock.davis",
     "the camera's own clock, set to this computer's UTC on opening; drifts until fitted to trigger edges; "
     "{delay_ms:.0f} ms old on arrival",
 )
-NO_CLOCK_FITS = _warning(
+NO_CLOCK_FITS = warning_kind(
     "clock.none_fits",
     "no clock fits the timestamps (image age by {ages}); arrival times are used",
     "set driver.frame_timing.clock",
 )
-CLOCK_AMBIGUOUS = _warning(
+CLOCK_AMBIGUOUS = warning_kind(
     "clock.ambiguous",
     "the clock of the timestamps is uncertain by {spread_ms:.3g} ms",
     "set driver.frame_timing.clock if you know it",
 )
-EXPOSURE_UNKNOWN = _warning(
+EXPOSURE_UNKNOWN = warning_kind(
     "clock.exposure_unknown",
     "the camera does not report its exposure: timestamps are wrong by half of it",
     "set driver.frame_timing.exposure_us",
 )
-TRIGGER_INPUT_OFF = _warning(
+TRIGGER_INPUT_OFF = warning_kind(
     "clock.trigger_input_off",
     "the trigger input cannot be switched on: no edges are detected, and the clock drifts",
     "update the camera's firmware",
 )
-FOLLOWS_OTHER_CAMERA = _warning(
+FOLLOWS_OTHER_CAMERA = warning_kind(
     "clock.follows_other_camera",
     "it follows another camera's clock",
     "unplug the sync cable, or wire the trigger to that camera",
 )
-CLOCK_DIFFERS = _warning(
+CLOCK_DIFFERS = warning_kind(
     "clock.differs_from_computer",
     "its clock and this computer's differ by {difference_s:.3g} s (limit 0.5 s)",
     "open the camera again; stop programs that set this computer's clock",
 )
-CLOCK_RESTARTED = _warning(
+CLOCK_RESTARTED = warning_kind(
     "clock.restarted", "its clock restarted {n} times: a sync cable sent a reset", "open the camera again"
 )
 
-BOARD_CLOCK = _note("clock.board", _board_clock)
-BOARD_NOT_TIED = _warning(
+BOARD_CLOCK = note_kind("clock.board", _board_clock)
+BOARD_NOT_TIED = warning_kind(
     "clock.board_not_tied",
     "the board's clock is not synchronised with the computer's: no answers to time requests, no pulses",
     "check its firmware",
 )
-COMPUTER_JUMPED = _warning(
+COMPUTER_JUMPED = warning_kind(
     "clock.computer_jumped",
     "the computer's clock jumped {n} times, last by {last_s:+.3f} s",
     "do not set it while you collect (chrony slews, ntpdate jumps)",
 )
-NO_PPS = _warning(
+NO_PPS = warning_kind(
     "clock.no_pps", "no pulse per second: the LiDAR cannot be synchronised", "press the board's reset"
 )
-BOARD_WITHOUT_UTC = _warning(
+BOARD_WITHOUT_UTC = warning_kind(
     "clock.board_without_utc", "the board does not know UTC yet: the LiDAR's hour is unknown"
 )
 
-SETTING_DIFFERS = _warning(
+SETTING_DIFFERS = warning_kind(
     "settings.differs",
     "{setting} {value} ({expected} expected)",
     "correct it on the LiDAR's web page, or in the profile",

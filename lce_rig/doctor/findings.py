@@ -1,10 +1,6 @@
 """Kinds of findings of the doctor: the computer, each sensor's device, stream, clock and pulses."""
 
-from functools import partial
-
-from lce_rig.core.findings import Finding, Kind
-
-_note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
+from lce_rig.core.findings import Finding, Kind, note_kind, warning_kind
 
 
 def _answers(finding: Finding) -> str:
@@ -33,7 +29,7 @@ def _pulse(finding: Finding) -> str:
     return f"{pps}, no NMEA" if finding.figures["has_position"] else f"{pps}, no position packets"
 
 
-DISK = _note("computer.disk", "{free_mb:.0f} MB free, {write_mbps:.0f} MB/s flushed, in {folder}")
+DISK = note_kind("computer.disk", "{free_mb:.0f} MB free, {write_mbps:.0f} MB/s flushed, in {folder}")
 DISK_FULL = Kind(
     "computer.disk_full",
     "too little space (minimum 5000 MB)",
@@ -47,19 +43,19 @@ DISK_SLOW = Kind(
 DISK_NOT_WRITABLE = Kind(
     "computer.disk_not_writable",
     "{folder} cannot be written: {cause}",
-    "choose another folder with -o, or make room there",
+    "make room, or `lce-rig collect --rig RIG -o FOLDER`",
 )
-COMPUTER_CLOCK = _note("computer.clock", "synchronised, error at most {max_error_ms:.0f} ms")
-COMPUTER_CLOCK_LOOSE = _warning(
+COMPUTER_CLOCK = note_kind("computer.clock", "synchronised, error at most {max_error_ms:.0f} ms")
+COMPUTER_CLOCK_LOOSE = warning_kind(
     "computer.clock_not_synchronised",
     "not synchronised, according to the kernel",
     "run: timedatectl set-ntp true, or let chrony follow the rig's GPS",
 )
 
 FAILED = Kind("sensor.failed", "{what}", "{hint}")
-ANSWERS = _note("sensor.answers", _answers)
-RATE = _note("stream.rate", _rate)
-RATE_OFF = _warning(
+ANSWERS = note_kind("sensor.answers", _answers)
+RATE = note_kind("stream.rate", _rate)
+RATE_OFF = warning_kind(
     "stream.rate_off",
     _rate,
     "set rate and exposure (long ones slow down), or correct the profile",
@@ -74,35 +70,35 @@ STOPPED = Kind(
     "{rate_hz:.1f} {stream}/s, then none for {silent_s:.1f} s",
     "check cable and power, and its trigger line",
 )
-EVENT_RATE = _note("stream.events", "{events_per_s:,.0f} events/s")
+EVENT_RATE = note_kind("stream.events", "{events_per_s:,.0f} events/s")
 NO_EVENTS = Kind("stream.no_events", "no events", "uncover the lens, and check the biases in driver.controls")
-COMPLETE = _note("stream.complete", "none lost")
+COMPLETE = note_kind("stream.complete", "none lost")
 LOSSES = Kind(
     "stream.losses",
     "{n_lost} lost, {n_dropped} not read in time",
     "check its cable; close other programs (top shows which are busy)",
     actions={"named": ""},
 )
-SETTINGS_UNKNOWN = _warning(
+SETTINGS_UNKNOWN = warning_kind(
     "settings.unknown",
     "firmware and settings unknown: {what}",
     "check that driver.address is its own, and that no firewall blocks it",
 )
-SETTINGS = _note("settings.read", "{returns} returns, {fov_deg} deg, to {host}, port {data_port}")
+SETTINGS = note_kind("settings.read", "{returns} returns, {fov_deg} deg, to {host}, port {data_port}")
 
-PULSE = _note("clock.pulse", _pulse)
-WITHOUT_PULSES = _note(
+PULSE = note_kind("clock.pulse", _pulse)
+WITHOUT_PULSES = note_kind(
     "clock.without_pulses",
     "timestamps by arrival need still boards",
     "without it: lidars.*.timestamps clock: host, sync: none, still boards",
 )
-NO_TIMESTAMPS = _note("clock.no_timestamps", "no timestamps yet")
-EDGES_FITTED = _note(
+NO_TIMESTAMPS = note_kind("clock.no_timestamps", "no timestamps yet")
+EDGES_FITTED = note_kind(
     "edges.fitted", "{n_edges} of {n_pulses} pulses, drift {drift_ppm:+.1f} ppm, scatter {rms_us:.1f} us"
 )
 EDGES_NOT_FITTED = Kind("edges.not_fitted", "{n_edges} edges of {n_pulses} pulses detected, clock not fitted")
-LINE = _note("pulses.line", "{line} {rate_hz:.3g} Hz")
-LINE_OFF = _warning(
+LINE = note_kind("pulses.line", "{line} {rate_hz:.3g} Hz")
+LINE_OFF = warning_kind(
     "pulses.line_off",
     "{line} {rate_hz:.3g} Hz ({expected_hz:g} Hz expected)",
     "check sync.triggers.{line}, reset the board",
@@ -114,11 +110,11 @@ LINE_NONE = Kind(
     "check sync.triggers.{line}, reset the board",
     actions={"pps": ""},
 )
-PULSES_LOST = _note("pulses.lost", "{n} lost")
-FRAMES_OF_PULSES = _note("pulses.frames", "{n_frames} images of {n_pulses} pulses")
+PULSES_LOST = note_kind("pulses.lost", "{n} lost")
+FRAMES_OF_PULSES = note_kind("pulses.frames", "{n_frames} images of {n_pulses} pulses")
 UNEQUAL = Kind(
     "pulses.unequal",
     "image and pulse counts differ",
     "set the camera's trigger mode in driver.controls, check the line",
 )
-DELAY = _note("pulses.delay", "delay {delay_ms:.2f} +- {delay_scatter_ms:.2f} ms")
+DELAY = note_kind("pulses.delay", "delay {delay_ms:.2f} +- {delay_scatter_ms:.2f} ms")

@@ -10,8 +10,8 @@ LENS_FITTED = Kind(
 )
 NO_FRAME = Kind(
     "export.no_frame",
-    "{format}: {file} is not written: it needs the frame {frame}, and the root is {root}",
-    "set `mount` in the profile, or export with --tree ROBOT.urdf",
+    "{format}: {file} is not written: it needs the frame {frame} (profile: mount), and the root is {root}",
+    "`lce-rig export {session} --formats {format} --tree URDF -o FOLDER`",
     severity="warning",
 )
 NO_SESSION = Kind(

@@ -59,7 +59,7 @@ from lce_rig.rig.target_settings import TargetSettings
 from lce_rig.session import Session
 from lce_rig.session.durable import copy_over
 
-_OTHER = "Another deployment came first: look at `--status`, then run the same command again."
+_OTHER = "Another deployment came first. Run the same command again."
 
 
 @dataclass(frozen=True)
@@ -186,9 +186,9 @@ def deploy(
         planned = _plan(result, rig, target, session, place, Path(folder))
         if planned.objections and not reason:
             causes = "; ".join(finding.text for finding in planned.objections)
-            advice = dict.fromkeys(finding.advice for finding in planned.objections)
-            hint = "\n".join([*advice, "To deploy it nevertheless, add --force --reason TEXT"])
-            raise ResultRefusedError(f"not deployed to {target.to}: {causes}", hint)
+            at = "SESSION" if session is None else str(session.path)
+            advice = dict.fromkeys(finding.advice_at(at) for finding in planned.objections)
+            raise ResultRefusedError(f"not deployed to {target.to}: {causes}", "\n".join(advice))
         record, current = planned.record, planned.state.current
         if planned.is_in_place and current is not None:
             output = _run(place, target, current.name) if planned.state.is_pending else None
@@ -247,7 +247,8 @@ def rollback(target: TargetSettings, name: str | None = None, *, reason: str = "
     release = state.named(wanted)
     if release is None:
         others = ", ".join(kept.name for kept in state.releases if kept.name != state.current.name)
-        hint = f"`--release NAME` restores another one: {others}" if others else "No other one is there."
+        again = "`lce-rig deploy SESSION --target TARGET --rollback --release NAME`"
+        hint = f"{again} restores one of {others}." if others else "No other one is there."
         what = f"there is no release {wanted}" if wanted else "the current release is the first"
         raise TargetError(f"{place.label}: {what}", hint)
     with TemporaryDirectory(prefix="lce-rig-") as folder:
@@ -412,7 +413,10 @@ def _run(place: Place, target: TargetSettings, release: str) -> str | None:
     """
     if target.run is None:
         return None
-    again = "`--rollback` restores the earlier files; the same command again runs only what failed."
+    again = (
+        "The same command again runs only what failed. "
+        "`lce-rig deploy SESSION --target TARGET --rollback` restores the earlier files."
+    )
     arguments = (release, f"{target.run_timeout_s:g}", target.run, target.robot or "")
     try:
         # The target ends the command at its time limit, if it has the program `timeout`.

@@ -77,7 +77,7 @@ DEPLOY_OTHER_SERIAL = Kind(
 DEPLOY_OLDER = Kind(
     "deploy.older",
     "the result's captures are of {date}, the deployed ones of {there}",
-    "Deploy the newer session, or use `--rollback` to go back.",
+    "To go back: `lce-rig deploy {session} --target TARGET --rollback`",
 )
 DEPLOY_UNDATED = Kind(
     "deploy.undated",

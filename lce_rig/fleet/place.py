@@ -47,7 +47,7 @@ _SSH = {"BatchMode": "yes", "ConnectTimeout": "10", "ServerAliveInterval": "5", 
 _HINTS = {
     LOCKED: "Wait for the other deployment to end.",
     NOT_OURS: "Move it away, or name another folder in `to`.",
-    NO_RELEASE: "Another deployment has removed it: look at `--status`, then run the same command again.",
+    NO_RELEASE: "Another deployment has removed it. Run the same command again.",
 }
 _NAMED = "[0-9]" * 8 + "T" + "[0-9]" * 6 + "Z-" + "[0-9a-f]" * 8
 

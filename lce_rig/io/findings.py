@@ -1,10 +1,6 @@
 """Findings about recordings and packets: parts that were skipped, repaired, lost or assumed."""
 
-from functools import partial
-
-from lce_rig.core.findings import Finding, Kind, Losses
-
-_note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
+from lce_rig.core.findings import Finding, Kind, Losses, note_kind, warning_kind
 
 
 def worded(losses: Losses) -> list[str]:
@@ -13,7 +9,7 @@ def worded(losses: Losses) -> list[str]:
 
 
 def _loss(name: str, text: str) -> Kind:
-    return _warning(f"recording.{name}", text)
+    return warning_kind(f"recording.{name}", text)
 
 
 BROKEN_PACKETS = _loss("broken_packets", "{n} broken packets skipped (first: {where})")
@@ -30,16 +26,22 @@ CLOCK_SET_BACK = _loss("clock_set_back", "{n} jumps of the clock back by more th
 NOT_DECODED = _loss("not_decoded", "{n} could not be decoded (first: {where})")
 
 
-DAMAGED = _warning("packet.damaged", "{n} damaged packets skipped (first: {where})")
-OTHER_MODEL = _warning("packet.other_model", "{n} packets of another LiDAR model skipped (first: {where})")
-LOST = _warning("packet.lost", "{n} data packets lost")
-LATE = _warning("packet.late", "{n} data packets late or sent twice, skipped")
-CLOCK_SET = _note("packet.clock_set", "the LiDAR's clock was set {n} times")
-SCAN_PARTIAL = _note("scan.partial", "{n} revolutions skipped: cut off at an end, or where the clock was set")
-SCAN_THIN = _warning(
+DAMAGED = warning_kind("packet.damaged", "{n} damaged packets skipped (first: {where})")
+OTHER_MODEL = warning_kind(
+    "packet.other_model", "{n} packets of another LiDAR model skipped (first: {where})"
+)
+LOST = warning_kind("packet.lost", "{n} data packets lost")
+LATE = warning_kind("packet.late", "{n} data packets late or sent twice, skipped")
+CLOCK_SET = note_kind("packet.clock_set", "the LiDAR's clock was set {n} times")
+SCAN_PARTIAL = note_kind(
+    "scan.partial", "{n} revolutions skipped: cut off at an end, or where the clock was set"
+)
+SCAN_THIN = warning_kind(
     "scan.thin", "{n} revolutions skipped: more than half of their packets or all returns are missing"
 )
-CUT_SHORT = _warning("datagram.cut_short", "{n} datagrams skipped: fragments, or cut short by the recorder")
+CUT_SHORT = warning_kind(
+    "datagram.cut_short", "{n} datagrams skipped: fragments, or cut short by the recorder"
+)
 
 _BY_ARRIVAL = "scans are timestamped by arrival: "
 
@@ -57,33 +59,33 @@ def _nmea_of_other_second(finding: Finding) -> str:
     return f"{_BY_ARRIVAL}NMEA time {minute:02d}:{second:02d} past the hour is not the LiDAR's"
 
 
-LIDAR_UTC = _note("clock.lidar_utc", _lidar_utc)
-HOST_WANTED = _note("clock.host_wanted", f"{_BY_ARRIVAL}timestamps.clock is host")
-ARRIVALS_UNKNOWN = _note(
+LIDAR_UTC = note_kind("clock.lidar_utc", _lidar_utc)
+HOST_WANTED = note_kind("clock.host_wanted", f"{_BY_ARRIVAL}timestamps.clock is host")
+ARRIVALS_UNKNOWN = note_kind(
     "clock.arrivals_unknown", "scans are not timestamped: their arrivals and so the hour are unknown"
 )
-NO_POSITION_PACKETS = _warning(
+NO_POSITION_PACKETS = warning_kind(
     "clock.no_position_packets",
     f"{_BY_ARRIVAL}no position packets, which report PPS",
     "open port 8308 in the firewall, and record it beside the data",
 )
-POSITION_PACKETS_STOPPED = _warning(
+POSITION_PACKETS_STOPPED = warning_kind(
     "clock.position_packets_stopped",
     f"{_BY_ARRIVAL}position packets have stopped, or their time differs",
     "check the network and the sensor",
 )
-PPS_NOT_LOCKED = _warning(
+PPS_NOT_LOCKED = warning_kind(
     "clock.pps_not_locked",
     f"{_BY_ARRIVAL}PPS is {{pps}}",
     "check the pulse at the interface box: 1 Hz, 3 to 15 V, rising edge",
 )
-NO_NMEA = _warning(
+NO_NMEA = warning_kind(
     "clock.no_nmea", f"{_BY_ARRIVAL}no NMEA, or damaged NMEA", "send $GPRMC at 9600 baud with RS-232 polarity"
 )
-NMEA_OF_OTHER_SECOND = _warning(
+NMEA_OF_OTHER_SECOND = warning_kind(
     "clock.nmea_of_other_second", _nmea_of_other_second, "send each sentence after its pulse, within a second"
 )
-LIDAR_UTC_DIFFERS = _warning(
+LIDAR_UTC_DIFFERS = warning_kind(
     "clock.lidar_utc_differs",
     f"{_BY_ARRIVAL}the LiDAR's UTC differs by {{ahead_s:+.2f}} s from this computer's",
     "set this computer's clock by the same source (chrony with gpsd, or NTP)",

@@ -24,7 +24,7 @@ UNKNOWN_MODEL = Kind(
     "profile.unknown_model",
     "{subject}: the beams of {value} are not known: recordings can be calibrated, live guidance and "
     "simulation need elevations_deg and columns",
-    "--lidar other --from RECORDING measures them: `lce-rig rigs new --help`",
+    "the model `other` measures them: `lce-rig rigs new --help`",
     severity="warning",
 )
 SHARED = Kind(

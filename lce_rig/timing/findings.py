@@ -1,10 +1,6 @@
 """Kinds of findings on the sensors' clocks: images and pulses, edges, synchronisation."""
 
-from functools import partial
-
-from lce_rig.core.findings import Finding, Kind
-
-_note, _warning = partial(Kind, severity="note"), partial(Kind, severity="warning")
+from lce_rig.core.findings import Finding, Kind, note_kind, warning_kind
 
 NOTHING_YET = Kind("pulses.nothing_yet", "no images and pulses yet")
 IMAGES_NOT_NUMBERED = Kind(
@@ -27,7 +23,7 @@ PULSES_NOT_FOLLOWED = Kind(
 )
 BOARD_RESTARTED = Kind("pulses.board_restarted", "the board restarted its count")
 CAMERA_RESTARTED = Kind("pulses.camera_restarted", "the camera restarted its count")
-SLIPPED = _note(
+SLIPPED = note_kind(
     "pulses.slipped",
     "its count slipped against the pulses {n_slips} times and restarted {n_restarts} times; "
     "{n_matched} images matched, {n_unmatched} not",
@@ -43,8 +39,8 @@ EDGES_NOT_THE_PULSES = Kind(
     "edges.not_the_pulses", "the detected edges are not the board's pulses", "check the wire"
 )
 
-BOARDS_MAY_MOVE = _note("sync.boards_may_move", "boards may move")
-BOARDS_MUST_STAND = _note(
+BOARDS_MAY_MOVE = note_kind("sync.boards_may_move", "boards may move")
+BOARDS_MUST_STAND = note_kind(
     "sync.boards_must_stand",
     "boards must stand still",
     actions={
@@ -52,15 +48,15 @@ BOARDS_MUST_STAND = _note(
         "see_lines": "see the lines of these sensors and of the sync board",
     },
 )
-NO_BOARD = _warning("sync.no_board", "no sync board", actions={"named": ""})
-NONE_IN_PROFILE = _warning("sync.none_in_profile", "{key} is none", actions={"named": ""})
-NOT_TIED = _warning(
+NO_BOARD = warning_kind("sync.no_board", "no sync board", actions={"named": ""})
+NONE_IN_PROFILE = warning_kind("sync.none_in_profile", "{key} is none", actions={"named": ""})
+NOT_TIED = warning_kind(
     "sync.not_tied",
     "the clock of {subject} is not synchronised with the rig's",
     "run `lce-rig doctor --rig RIG`",
     actions={"named": ""},
 )
-TOO_UNCERTAIN = _warning(
+TOO_UNCERTAIN = warning_kind(
     "sync.too_uncertain",
     "time of {subject}: standard deviation {sigma_ms:.1f} ms (limit {limit_ms:.1f} ms)",
     actions={"named": ""},
