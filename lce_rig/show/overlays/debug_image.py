@@ -250,7 +250,7 @@ def _angles_deg(points: Array) -> tuple[Array, Array]:
 
 
 def _reach(elevation_deg: Array) -> tuple[float, float]:
-    """Choose the elevations of the unrolled scan, with room for azimuths below and a candidate's number above."""
+    """Choose the elevations to show, with room for azimuths below and a candidate's number above."""
     low, high = (elevation_deg.min(), elevation_deg.max()) if len(elevation_deg) else (-15.0, 15.0)
     margin = 0.1 * max(high - low, 10.0)
     return low - 2.5 * margin, high + 1.5 * margin
