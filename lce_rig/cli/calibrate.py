@@ -246,7 +246,10 @@ def calibrate(
     if as_json:
         show.print_json(result.document())
     else:
-        _print(result, is_explained=explain)
+        for c in result.pairs:
+            show.print_parts(_parts(c, str(result.session.path), is_explained=explain))
+        for c in result.pairs:
+            show.print_parts(camera_lines(c, result.pairs))
     show.warn_of(finding for finding in written.findings if finding.severity != "note")
     if written.previous is not None and len(written.files) == 1 and written.has_usable_previous:
         show.warn(f"this result is not exported; the last usable result is in {written.previous}")
@@ -320,13 +323,6 @@ def _lacking(
         f"no extrinsics of camera {', '.join(missing)}",
         "\n".join([*causes, f"Collect more captures, or omit the camera: {others}"]),
     )
-
-
-def _print(result: lce.Result, *, is_explained: bool) -> None:
-    for c in result.pairs:
-        show.print_parts(_parts(c, str(result.session.path), is_explained=is_explained))
-    for c in result.pairs:
-        show.print_parts(camera_lines(c, result.pairs))
 
 
 def exit_by_verdict(calibrations: Sequence[Calibration], *, are_printed: bool = False) -> None:

@@ -48,7 +48,10 @@ def check(session: Path, explain: bool, as_json: bool, debug_images: bool) -> No
     for pair in [*detections.pairs, *detections.lidar_pairs(opened.rig.lidars)]:
         seen = detections.between(pair)
         refused, _ = match_sensors(opened.rig, seen, pair)
-        plates, placements = _plates(opened.rig, seen, pair, refused), _placements(seen, pair, refused)
+        plates = _plates(opened.rig, seen, pair, refused)
+        usable = [each for each in candidates_of(seen, pair)[0] if each.capture not in refused]
+        numbers = group_placements(usable).tolist()
+        placements = {each.capture: number for each, number in zip(usable, numbers, strict=True)}
         records = {
             name: _record(*seen.of(pair, name), refused.get(name)) | {"placement": placements.get(name)}
             for name in seen.captures(pair)
@@ -228,13 +231,6 @@ def _causes(
 
 # Captures that are refused for one cause with different figures; of more, those of the first stand for all.
 _MOST_LISTED = 4
-
-
-def _placements(detections: Detections, pair: Pair, refused: Mapping[str, Refusal]) -> dict[str, int]:
-    """Number the board's placements in the usable captures."""
-    usable = [each for each in candidates_of(detections, pair)[0] if each.capture not in refused]
-    numbers = group_placements(usable).tolist()
-    return {observation.capture: number for observation, number in zip(usable, numbers, strict=True)}
 
 
 def _repeated(placements: Mapping[str, int], *, is_whole: bool) -> list[str]:

@@ -17,7 +17,6 @@ from lce_rig.collect.live.state import HOLD_S, Key, LiveOptions, LiveReport, Liv
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, UsageError
 from lce_rig.core.findings import Finding
 from lce_rig.devices import open_live
-from lce_rig.devices.reading import LiveSource
 from lce_rig.rig import Rig
 from lce_rig.session import Session, discard_if_empty
 from lce_rig.show.phone.preview import Preview, parse_address
@@ -67,7 +66,12 @@ def run_live(
         page = None if preview is None else _open_page(stack, preview)
         session = stack.enter_context(_session(path, rig))
         n_before = len(session.captures)
-        sources, person = _open_rig(stack, rig, path, (seed or 0) if simulated else None)
+        person = None
+        if simulated:
+            show.note("starting the simulated rig ...")
+            person = stack.enter_context(SimulatedRig(rig, seed or 0))
+            write_truth(path / TRUTH, rig_truth(rig, seed or 0, SimulationOptions.for_rig(rig.name)))
+        sources = open_live(rig) if person is None else person.sources
         asked = stack.enter_context(controls())
         idle_s = SIMULATED_IDLE_S if simulated else None if asked.is_interactive else UNATTENDED_IDLE_S
         hold_s = HOLD_S if hold is None else hold
@@ -132,19 +136,6 @@ def _session(path: Path, rig: Rig) -> Iterator[Session]:
         if is_new:
             discard_if_empty(path)
         raise
-
-
-def _open_rig(
-    stack: ExitStack, rig: Rig, path: Path, seed: int | None
-) -> tuple[list[LiveSource], SimulatedRig | None]:
-    """Open the attached sources, or with a seed simulated ones, whose truth goes into the session."""
-    if seed is None:
-        return open_live(rig), None
-
-    show.note("starting the simulated rig ...")
-    simulated = stack.enter_context(SimulatedRig(rig, seed))
-    write_truth(path / TRUTH, rig_truth(rig, seed, SimulationOptions.for_rig(rig.name)))
-    return simulated.sources, simulated
 
 
 def _open_page(stack: ExitStack, address: str) -> Preview:

@@ -61,12 +61,9 @@ class Placements:
 
     def are_alike(self, one: Mapping[ImageKey, Array], two: Mapping[ImageKey, Array]) -> bool:
         """Check whether every camera that saw both boards saw them at one place; False where none did."""
+        limits = self._min_move_m, self._min_turn_rad
         shared = one.keys() & two.keys()
-        likes = (self._is_like(one[key], two[key]) for key in shared)
-        return bool(shared) and all(likes)
-
-    def _is_like(self, T_1: Array, T_2: Array) -> bool:
-        return bool(find_alike(T_1[None], T_2[None], self._min_move_m, self._min_turn_rad))
+        return bool(shared) and all(find_alike(one[key][None], two[key][None], *limits) for key in shared)
 
 
 def pose_figures(poses: Mapping[ImageKey, Array]) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """A LiDAR: beams or pattern, firing times, finite beams with mixed pixels, and the errors of real ones."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -231,8 +232,7 @@ class LidarModel:
         return 2 * np.pi * self.sequence_ns / self.period_ns
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
+class Sweep(NamedTuple):
     """The surfaces hit by the beams of one revolution, without measurement errors.
 
     Attributes:
@@ -320,7 +320,7 @@ def sweep_again(
     part = receive(scene, origins, directions, noise)
     is_rim = empty.is_rim.copy()
     is_rim[near] = _near_border(scene, origins, directions, part, noise)
-    return replace(empty, returns=put_rows(empty.returns, near, part), is_rim=is_rim)
+    return empty._replace(returns=put_rows(empty.returns, near, part), is_rim=is_rim)
 
 
 def measure_sweep(

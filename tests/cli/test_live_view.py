@@ -1,7 +1,6 @@
 """A live collection in a terminal of 80x24, and in plain lines."""
 
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,14 +58,13 @@ def test_everything_fits_into_80_by_24():
 def test_of_several_cameras_the_picture_says_whose_it_is():
     (first, *others) = STREAMS
     two = (first._replace(name="left.frames"), first._replace(name="right.frames"), *others[:1])
-    drawing = replace(STATE.drawing, camera="right.frames")
-    text = "\n".join(drawn(replace(STATE, streams=two, drawing=drawing)))
+    drawing = STATE.drawing._replace(camera="right.frames")
+    text = "\n".join(drawn(STATE._replace(streams=two, drawing=drawing)))
     assert "┌─ right.frames ─" in text
-    assert len(drawn(replace(STATE, streams=two, drawing=drawing))[0]) <= 80
+    assert len(drawn(STATE._replace(streams=two, drawing=drawing))[0]) <= 80
 
 
-SAID = replace(
-    STATE,
+SAID = STATE._replace(
     detail="cannot be used here: the board at 4.3 m is tilted 62 deg (limit 60 deg), half of it is hidden",
     streams=(*STREAMS[:2], STREAMS[2]._replace(reason=STREAMS[2].reason + " or lower it by 12 cm, slowly")),
     notes=(
@@ -95,7 +93,7 @@ def test_no_sentence_is_cut_and_a_wide_terminal_has_a_larger_drawing(width, heig
 
 def test_a_state_without_pictures_guidance_or_figures_is_shown_all_the_same():
     nothing = {"drawing": None, "coverage": None, "sigma_deg": np.nan, "sigma_mm": np.nan, "hold_s": None}
-    assert "HOLD STILL" in "\n".join(drawn(replace(STATE, streams=(), **nothing)))
+    assert "HOLD STILL" in "\n".join(drawn(STATE._replace(streams=(), **nothing)))
     beyond = np.array([[-500.0, 100.0], [np.nan, np.nan], [3000, 400], [100, 5000], [-500, 100]])
     assert len(draw_outlines((346, 260), beyond, beyond, (40, 9))) == 9
 
@@ -112,12 +110,12 @@ def test_the_bell_rings_once_for_a_capture_and_twice_for_a_refused_one_apart_in_
             bell.take(state)
         return rung
 
-    assert len(heard(replace(STATE, cues=(Cue(1, "captured"),)))) == 1
-    twice = heard(replace(STATE, cues=(Cue(2, "refused"),)))
+    assert len(heard(STATE._replace(cues=(Cue(1, "captured"),)))) == 1
+    twice = heard(STATE._replace(cues=(Cue(2, "refused"),)))
     assert len(twice) == 2 and twice[1] - twice[0] >= 0.2 - 1e-9
-    assert heard(replace(STATE, cues=(Cue(3, "tick"),))) == []
+    assert heard(STATE._replace(cues=(Cue(3, "tick"),))) == []
     # What came last counts: a capture right after a refused one must not be heard as refused.
-    assert len(heard(replace(STATE, cues=(Cue(1, "refused"), Cue(2, "captured"))))) == 1
+    assert len(heard(STATE._replace(cues=(Cue(1, "refused"), Cue(2, "captured"))))) == 1
     assert heard(STATE, is_silent=True) == []
 
 
@@ -137,17 +135,17 @@ def test_the_pages_code_fits_and_holds_its_link():
 
 def test_plain_lines_say_what_changes_once(capsys):
     view = PlainView(Bell(is_silent=True))
-    moving = replace(
-        STATE, phase="moving", headline="one step left", hold_s=None, cues=(), log=(), notes=("a note",)
+    moving = STATE._replace(
+        phase="moving", headline="one step left", hold_s=None, cues=(), log=(), notes=("a note",)
     )
     view.show(moving)
-    view.show(replace(moving, elapsed_s=75.4, headline="30 cm left"))
-    view.show(replace(moving, elapsed_s=79.0, headline="20 cm left", detail="2 rings"))
+    view.show(moving._replace(elapsed_s=75.4, headline="30 cm left"))
+    view.show(moving._replace(elapsed_s=79.0, headline="20 cm left", detail="2 rings"))
     captured = {"cues": (Cue(1, "captured"),), "log": ("01:19 captured 000001",), "n_logged": 1}
-    view.show(replace(moving, elapsed_s=79.1, headline="20 cm left", **captured))
+    view.show(moving._replace(elapsed_s=79.1, headline="20 cm left", **captured))
     # A message without a sound, such as a sensor that is back, is said as well.
     told = ("01:19 captured 000001", "01:19 lidar is back")
-    view.show(replace(moving, elapsed_s=79.2, phase="ended", headline="over", log=told, n_logged=2))
+    view.show(moving._replace(elapsed_s=79.2, phase="ended", headline="over", log=told, n_logged=2))
     out, err = capsys.readouterr()
     assert out == ""
     lines = err.splitlines()
@@ -157,8 +155,8 @@ def test_plain_lines_say_what_changes_once(capsys):
 
 
 def test_the_drawing_keeps_its_size_when_the_first_prediction_arrives():
-    before = replace(STATE, goes_on="", notes=("boards must stand still: no sync board",), log=())
-    after = replace(before, goes_on="captures to go: 10 (minimum 6, below 0.18 deg, 9 mm)")
+    before = STATE._replace(goes_on="", notes=("boards must stand still: no sync board",), log=())
+    after = before._replace(goes_on="captures to go: 10 (minimum 6, below 0.18 deg, 9 mm)")
     borders = [[line.find("┌") for line in drawn(state)] for state in (before, after)]
     widths = [max(len(line) for line in drawn(state) if "┐" in line) for state in (before, after)]
     assert borders[0] == borders[1] and widths[0] == widths[1]

@@ -133,8 +133,7 @@ class Cue(NamedTuple):
     sound: Sound
 
 
-@dataclass(frozen=True, eq=False)
-class Drawing:
+class Drawing(NamedTuple):
     """The camera's last image, and where the board is and should be in it.
 
     Attributes:
@@ -156,8 +155,7 @@ class Drawing:
     wanted: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class LiveState:
+class LiveState(NamedTuple):
     """One moment of a live collection.
 
     Attributes:
@@ -201,7 +199,7 @@ class LiveState:
     target_mm: float
     cues: tuple[Cue, ...] = ()
     log: tuple[str, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     n_logged: int = 0
     last_capture: str = ""
     goes_on: str = ""

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from importlib import resources
 from typing import Any
 
@@ -40,8 +40,7 @@ def to_json(state: LiveState, update: int, *, has_picture: bool) -> str:
         update: a number that the page answers with once it has shown the state.
         has_picture: whether a JPEG of the drawing follows.
     """
-    document = {field.name: getattr(state, field.name) for field in fields(state)}
-    document |= {"update": update, "log": state.log[-_MAX_LOG:]}
+    document = state._asdict() | {"update": update, "log": state.log[-_MAX_LOG:]}
     if state.drawing is not None:
         height, width = state.drawing.pixels.shape[:2]
         document["drawing"] = {
