@@ -65,10 +65,6 @@ def test_warnings_alone_exit_with_0(lce_rig, tmp_path):
     assert "warn" in done.out.splitlines()[0]
 
 
-def test_an_unknown_rig_is_an_error_of_the_profile(lce_rig):
-    assert lce_rig("doctor", "--rig", "no-such-rig").code == 3
-
-
 def test_an_interrupted_examination_leaves_nothing_running(tmp_path):
     rig = make_rig(sync=None)
     with attach(Attached(rig, PIXELS, has_board=False), tmp_path) as (reached, _):

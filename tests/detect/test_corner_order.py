@@ -56,11 +56,6 @@ def test_corners_counted_from_another_end_are_put_in_order_with_pose_and_covaria
     np.testing.assert_allclose(aligned.cov, later.cov, rtol=1e-4, atol=1e-12)
 
 
-def test_corners_in_the_right_order_stay_as_they_are():
-    found = seen(OBLONG, looking())
-    assert align_corner_order(found, seen(OBLONG, looking((0.2, 0.1, 0.6))), OBLONG) is found
-
-
 def test_of_two_poses_the_nearer_one_is_taken_with_the_covariance_it_has():
     truth = looking((0.3, -0.25, 0.4), (0.0, 0.0, 3.5))
     found = seen(OBLONG, truth, 0.2)

@@ -61,7 +61,3 @@ def test_the_boards_lines_are_held_against_the_profile():
     assert slow is not None and slow.severity == "warning" and "pulses.line_off" in codes(slow)
     dead = look(check_pulses_sent, examination(replace(sync_board(), pulses=[])))
     assert dead is not None and dead.severity == "error"
-
-
-def test_without_a_board_there_is_no_line():
-    assert look(check_frames_of_pulses, examination(camera(), rig=make_rig(sync=None)), "cam") is None
