@@ -348,11 +348,14 @@ def _parts(c: Calibration, path: str, *, is_explained: bool) -> Iterator[str]:
     reasons = [finding for finding in c.findings if finding.severity != "note"]
     # A line counts those that are not shown.
     n_shown = _N_REASONS if len(causes) <= _N_REASONS else _N_REASONS - 1
+    advised: set[str] = set()
     for finding in reasons if is_explained else causes[:n_shown]:
         follows = "follows: " if finding.code in following else ""
         yield f"  [{colour}]{follows}{show.escape(finding.text)}[/]"
-        if finding.advice and not follows and (is_explained or finding is causes[0]):
-            yield f"    -> {show.escape(advice_of(finding, plan, path))}"
+        advice = "" if follows else advice_of(finding, plan, path)
+        if advice and advice not in advised:
+            yield f"    -> {show.escape(advice)}"
+            advised.add(advice)
     if plan and not lacks_captures(causes[:1]):
         yield f"  -> {plan}"
     if len(causes) > n_shown and not is_explained:
