@@ -1,6 +1,7 @@
 """`lce-rig collect`: build a session from attached sensors (guided) or from recordings."""
 
 from collections.abc import Collection, Sequence
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from lce_rig.cli.collect_live import run_live, show_next
 from lce_rig.cli.options import FiniteRange, path_option, require_sensors, robot_option
 from lce_rig.cli.simulate import require_kind
 from lce_rig.collect.findings import IMAGE_NONE
+from lce_rig.collect.gates import stillness_window_s
 from lce_rig.collect.live.guide import predict
 from lce_rig.collect.offline import CollectOptions
 from lce_rig.core.errors import NotEnoughDataError, UsageError
@@ -195,7 +197,10 @@ def collect(
         show.warn("--topic is ignored for a folder of images and point clouds")
     _tell(report, session, n_captures)
     if n_captures == 0:
-        hint = "Hold the board still for 1 s in view of both sensors, and check that their clocks agree."
+        hold_s = ceil(stillness_window_s(rig))
+        hint = (
+            f"Hold the board still for {hold_s} s in view of both sensors, and check that their clocks agree."
+        )
         if [why.code for why, _ in report.counts.counts()] == [IMAGE_NONE.code]:
             hint = (
                 "Compare `board` in the profile with an image: count inner corners, or squares with markers."

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lce_rig.calibrate.consensus import CENTRE_TOLERANCE_M, NORMAL_TOLERANCE_RAD
-from lce_rig.collect.findings import IMAGE_NONE, LIDAR_ELSEWHERE, LIDAR_NONE
+from lce_rig.collect.findings import IMAGE_NONE, LIDAR_ELSEWHERE
 from lce_rig.core.data import Scan
 from lce_rig.core.findings import Losses, Refusal
 from lce_rig.core.geometry import Array, invert
@@ -146,14 +146,12 @@ class BoardTracker:
                 unscanned[scan.sensor] = candidates
             else:
                 lidars[scan.sensor] = candidates
-        if are_scans_enough:
+        if are_scans_enough or not lidars:
             for refusal in unscanned.values():
                 self.refusals.add(refusal)
-        elif not detection.images:
+        if not detection.images and not are_scans_enough:
             self._n_candidates.clear()  # A board that comes back is searched for at once.
             self.refusals.add(IMAGE_NONE.refusal())
-        elif not lidars:
-            self.refusals.add(LIDAR_NONE.refusal())
         return replace(detection, lidars=lidars, unscanned=unscanned)
 
     def confirm(self, moment: CaptureMoment) -> CaptureMoment | Refusal:
@@ -214,8 +212,6 @@ class BoardTracker:
         self._candidates[scan.sensor] = search.located if isinstance(search.located, list) else []
         if search is not followed:
             self._n_candidates[scan.sensor] = len(self._candidates[scan.sensor])
-        if isinstance(search.located, list) and isinstance(search.usable, Refusal):
-            self.refusals.add(search.usable)
         return search.usable
 
 

@@ -47,7 +47,6 @@ READ_NO_EVENTS_AT_SCAN = Kind(
     "record events while the LiDAR runs and check that the clocks agree",
 )
 IMAGE_NONE = Kind("image.none", "no board in any image")
-LIDAR_NONE = Kind("lidar.none", "no board in the scan")
 CALIBRATE_SAME_PLACEMENT = Kind("calibrate.same_placement", "same placement as in an earlier capture")
 IMAGE_STOOD_STILL = Kind(
     "image.stood_still",

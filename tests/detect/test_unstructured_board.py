@@ -106,24 +106,6 @@ def test_other_plates_are_refused_with_their_cause() -> None:
     assert code_of() in ("lidar.no_plate", "lidar.other_plate")
 
 
-def joined(parts: list[Scan]) -> Scan:
-    points = np.concatenate([part.points for part in parts])
-    rings = np.full(len(points), NO_RING, dtype=np.int16)
-    return Scan("lidar", None, points, np.zeros(len(points), dtype=np.float32), rings)
-
-
-@pytest.mark.parametrize("turn_deg", [0.0, 0.4, 1.0], ids=["board moves", "LiDAR turns", "LiDAR turns fast"])
-def test_motion_while_scans_were_accumulated_is_refused(turn_deg: float) -> None:
-    parts = []
-    for k in range(4):
-        T = place(3, 5, 20) if turn_deg else place(3 + 0.04 * k, 5 + 0.4 * k, 20)
-        part = accumulate([board_plate(T), *room(13)], seed=k, n=30_000)
-        turned = part.points @ exp_so3(np.array([0, 0, np.radians(turn_deg * k)])).T
-        parts.append(replace(part, points=turned.astype(np.float32)))
-    found = find_unstructured_boards(joined(parts), BOARD, POINT_BEAM)
-    assert isinstance(found, Refusal)
-
-
 @pytest.mark.parametrize("deep_m", [0.0, 0.1], ids=["flush", "behind"])
 @pytest.mark.parametrize("side", [0, 1], ids=["beside", "below"])
 def test_box_that_touches_the_plate_does_not_move_it(side: int, deep_m: float) -> None:
