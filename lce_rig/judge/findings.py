@@ -58,8 +58,6 @@ _LACKS = {
 """Code and action of findings against which more captures help."""
 _VERDICTS: Mapping[Severity, Verdict] = {"note": "pass", "warning": "marginal", "error": "fail"}
 _APART = "{rotation_deg:deg}, {translation_m:mm}"
-_LENS = "check that the intrinsics belong to this lens and that the board is flat"
-_NEAR = {"near": "check the squares' size and the focal length, and that the board is flat"}
 _CORNERS_TOO = "hold the board in all four corners of the image, tilted by 30 to 45 deg"
 _SAVE = "`lce-rig intrinsics {session} --save-profile FILE`"
 _LOOK = "(drawn by `lce-rig drift {session} -o FOLDER`)"
@@ -177,10 +175,10 @@ def _correction(q: Mapping[str, Figure]) -> str:
     parts = [
         fill(text, q)
         for name, text in (
-            ("is_bent", "{displacement_px:.1f} +- {displacement_sigma_px:.1f} px"),
+            ("is_displaced", "{displacement_px:.1f} +- {displacement_sigma_px:.1f} px"),
             ("is_turned", "a turn of {turn_deg:.2f} +- {turn_sigma_deg:deg}"),
         )
-        if q[name]
+        if q.get(name)
     ]
     return f" by {', '.join(parts)}" if parts else ""
 
@@ -198,10 +196,19 @@ def _intrinsics(finding: Finding) -> str:
         reason = f"off{correction}"
     elif q["is_visible"]:
         reason = fill("reprojection error {rms_px:.2f} px, possible {possible_px:.2f} px", q)
-    else:
+    elif q["is_focal_off"]:
         percent, sigma = 100 * (finding.figure("focal_ratio") - 1), 100 * finding.figure("focal_sigma")
         reason = f"focal length {abs(percent):.1f} +- {sigma:.1f} % {'larger' if percent > 0 else 'smaller'}"
+    else:
+        seen = fill("intrinsics fit to {displacement_px:.1f} px where boards were seen, ", q)
+        return seen + "but not in all parameters together"
     return f"intrinsics {fit}: {reason}"
+
+
+def _shares_differ(finding: Finding) -> str:
+    """{first} and {second} boards differ significantly, by {rotation_deg}, {translation_m}; {others} too."""
+    text = "{first} and {second} boards differ significantly, by " + _APART
+    return fill(text + ("; {others} too" if finding.figures.get("others") else ""), finding.figures)
 
 
 def _lens_model(finding: Finding) -> str:
@@ -443,9 +450,9 @@ TWO_GROUPS = Kind(
 )
 SHARES_DIFFER = Kind(
     "verdict.shares_differ",
-    "{first} and {second} boards differ significantly, by " + _APART,
-    _LENS,
-    actions=_NEAR,
+    _shares_differ,
+    "cover the corners, then " + _SAVE,
+    actions={"near": "measure the squares, then `lce-rig calibrate {session} --rig FILE`"},
 )
 SCALE_OFF = Kind(
     "verdict.scale", _scale, "measure the squares, then `lce-rig calibrate {session} --rig FILE`"

@@ -24,7 +24,7 @@ from lce_rig.judge.findings import (
     Verdict,
     failing,
 )
-from lce_rig.lens.calibrate_lens import CONTRADICTION, distances_under, estimate_intrinsics
+from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
 from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import model_of
@@ -65,7 +65,7 @@ class IntrinsicsCheck:
             are of different families.
         covered: share of the image in which boards were seen.
         image_sigma_px: standard deviation of the fitted intrinsics, as `LensCertainty.image_sigma_px`.
-        surprise: of the fitted intrinsics, as `IntrinsicsEstimate.surprise`.
+        surprise, is_contradicted: of the fitted intrinsics, as in `IntrinsicsEstimate`.
     """
 
     n_captures: int
@@ -82,6 +82,7 @@ class IntrinsicsCheck:
     covered: float
     image_sigma_px: float
     surprise: float | None = None
+    is_contradicted: bool = False
 
     def verdict(self, target_deg: float = 0.2) -> Verdict:
         """Judge the given intrinsics; they pass unless significantly different from the fitted ones.
@@ -95,15 +96,18 @@ class IntrinsicsCheck:
         turned = self.turn_deg if self.is_turned else 0.0
         if bent > _BENT_FAIL * target_deg or turned > _TURN_FAIL * target_deg:
             return "fail"
-        is_contradicted = self.surprise is not None and self.surprise > CONTRADICTION
         is_marginal = bent > _BENT_MARGINAL * target_deg or turned > _TURN_MARGINAL * target_deg
-        return "marginal" if is_marginal or is_contradicted else "pass"
+        return "marginal" if is_marginal or self.is_contradicted else "pass"
 
     @property
     def is_bent(self) -> bool:
         """Whether pixels are significantly displaced, by their displacement or by all parameters together."""
-        is_other = self.chance is not None and self.chance < _CHANCE
-        return is_other or self.displacement_px > self._sure * self.displacement_sigma_px
+        return self.is_displaced or (self.chance is not None and self.chance < _CHANCE)
+
+    @property
+    def is_displaced(self) -> bool:
+        """Whether the displacement of pixels alone is significant."""
+        return self.displacement_px > self._sure * self.displacement_sigma_px
 
     @property
     def is_turned(self) -> bool:
@@ -190,6 +194,7 @@ def compare_with_given(
         covered=certainty.covered,
         image_sigma_px=certainty.image_sigma_px,
         surprise=fitted.surprise,
+        is_contradicted=fitted.is_contradicted,
     )
     return check, difference
 
@@ -249,7 +254,7 @@ def explain(check: IntrinsicsCheck, target_deg: float = 0.2) -> Finding:
         **asdict(check),
         **judgement.figures,
         "is_visible": check.rms_px >= _VISIBLE * check.possible_px,
-        "is_bent": check.is_bent,
+        "is_displaced": check.is_displaced,
         "is_turned": check.is_turned,
         "is_focal_off": check.is_focal_off,
     }

@@ -399,7 +399,13 @@ def split_findings(
         of_cameras: names of two cameras where their relative pose is compared, not extrinsics.
     """
     findings = []
-    for c in objections(contrasts, target, limits):
+    found = objections(contrasts, target, limits)
+    # Boards that contradict may be far, at the left and low: the places that differ most tell of them all.
+    of_places = [each for each in found if each.is_of_places]
+    others = sorted(of_places, key=lambda each: each.excess(target, limits))[:-1]
+    for c in found:
+        if c in others:
+            continue
         severity = failing(c.excess(target, limits) > _FAIL)
         apart: dict[str, Any] = {
             "rotation_deg": c.rotation_deg,
@@ -423,6 +429,7 @@ def split_findings(
                     action="near" if c.first == "near" else "",
                     first=c.first,
                     second=c.second,
+                    others=tuple(f"{each.first} and {each.second}" for each in others[::-1]),
                     **apart,
                 )
             )

@@ -20,6 +20,7 @@ from lce_rig.judge.findings import (
     FAR_FROM_NOMINAL,
     FEW_PLACEMENTS,
     FEW_USED,
+    INTRINSICS,
     LAST_REJECTED,
     MAY_BE_OFF,
     MOVED,
@@ -110,7 +111,16 @@ def judge(
     ]
     findings += uncertainty_notes(examination.contributions, rig.calibration)
     is_weighed = estimate.method == "ml" and estimate.lens is not None
-    return _verdict(_weigh_scale(findings, is_weighed), examination.cov)
+    return _verdict(_blame_lens(_weigh_scale(findings, is_weighed)), examination.cov)
+
+
+def _blame_lens(findings: Sequence[Finding]) -> list[Finding]:
+    """Make contradicted intrinsics the cause of boards at two places that differ, unless squares are it."""
+    errors = {f.code for f in findings if f.severity == "error"}
+    if SHARES_DIFFER.code not in errors or SCALE_OFF.code in errors:
+        return list(findings)
+    is_blamed = [f.code == INTRINSICS.code and f.severity == "warning" for f in findings]
+    return [replace(f, severity="error") if own else f for f, own in zip(findings, is_blamed, strict=True)]
 
 
 def _weigh_scale(findings: Sequence[Finding], is_weighed: bool) -> list[Finding]:

@@ -39,8 +39,6 @@ _SHARED_PX = 0.02
 # Focal length, principal point or distortion of a profile that agree with the boards with less than this
 # probability are trusted less: 2 % for the three together.
 _CHANCE = 0.02 / 3
-# Fitted intrinsics that lie farther from the profile's (squared, in its standard deviations) contradict it.
-CONTRADICTION = 20.0
 # Rounds of comparing the scatter of captures with the stated deviations.
 _SCATTER_ROUNDS = 3
 # Corners with residuals this many times the typical value of their channel are outliers.
@@ -214,6 +212,7 @@ def _estimate(
         residuals_px=-residuals_px(setup, state)[np.isfinite(setup.corners_px[..., 0])],
         held_out_px=_held_out(setup, state, weights, captures, n_folds),
         surprise=profile.surprise(state.lens) if has_prior else None,
+        is_contradicted=setup is not profile,
         refused=refused,
     )
 

@@ -68,6 +68,8 @@ class IntrinsicsEstimate:
             NaN without folds.
         surprise: squared distance of the estimate from the profile's intrinsics, in the standard deviations
             of these: chi-squared with about four degrees of freedom. None if they had no part in it.
+        is_contradicted: whether the boards contradict the profile's focal lengths, principal point or
+            distortion, which are therefore trusted less than the profile states.
         refused: name of a view -> why the estimate does not use it.
     """
 
@@ -86,6 +88,7 @@ class IntrinsicsEstimate:
     residuals_px: Array
     held_out_px: Array
     surprise: float | None
+    is_contradicted: bool
     refused: Mapping[str, Refusal]
 
     @property

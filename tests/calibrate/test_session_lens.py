@@ -40,7 +40,7 @@ def test_the_lens_is_the_true_one_within_its_deviations_wherever_the_profile_lie
     model = lens.estimate.model
     off = model.vector(lens.intrinsics) - model.vector(CAMERA)
     assert np.all(np.abs(off[:5]) < 3.5 * lens.estimate.sigma[:5])
-    assert (lens.estimate.surprise > 16) == (abs(errors[0]) > 0.01)
+    assert lens.estimate.is_contradicted == (abs(errors[0]) > 0.01)
 
 
 def test_boards_contradict_few_profiles_within_their_deviations(captures):

@@ -12,6 +12,7 @@ from lce_rig.core.findings import Refusal
 from lce_rig.core.geometry import difference, perturb
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.judge.findings import (
+    INTRINSICS,
     LAST_REJECTED,
     NOT_CERTIFIED,
     PLANE_RESIDUAL,
@@ -20,6 +21,7 @@ from lce_rig.judge.findings import (
     by_cause,
     consequences,
 )
+from lce_rig.judge.split_consistency import Contrast
 from lce_rig.judge.validate import validate
 from lce_rig.judge.verdict import distance_findings, judge, plate_findings
 from lce_rig.lens.models import LensPrior
@@ -218,6 +220,31 @@ def test_what_follows_from_a_cause_stands_below_it():
     listed = by_cause([note, plane, shares, scale, certificate])
     assert listed == (certificate, scale, plane, shares, note)
     assert consequences(listed) == {"verdict.plane_residual": scale.code, "verdict.shares_differ": scale.code}
+
+
+def test_intrinsics_that_boards_contradict_are_the_cause_of_boards_that_differ_by_their_place(estimate):
+    def judged(contrasts, others):
+        examination = replace(examined(estimate), contrasts=contrasts)
+        return judge(estimate, examination, RIG, "cam", "lidar", 20, others)
+
+    places = [("near", "far", 1.6), ("left", "right", 1.1), ("upper", "lower", 0.1)]
+    contrasts = tuple(Contrast(first, second, deg, 0.0, 1e-9, 10) for first, second, deg in places)
+    lens = INTRINSICS(
+        severity="warning",
+        displacement_px=2.6,
+        displacement_sigma_px=0.3,
+        is_displaced=True,
+        is_turned=False,
+    )
+    verdict, findings = judged(contrasts, [lens])
+    codes = [finding.code for finding in findings if finding.severity != "note"]
+    assert (verdict, codes[:2]) == ("fail", ["verdict.intrinsics", "verdict.shares_differ"])
+    assert codes.count("verdict.shares_differ") == 1
+    assert consequences(findings)["verdict.shares_differ"] == "verdict.intrinsics"
+    (shares,) = (finding for finding in findings if finding.code == "verdict.shares_differ")
+    assert (shares.figures["first"], shares.figures["others"]) == ("near", ("left and right",))
+    verdict, (first, *_) = judged((), [lens])
+    assert (verdict, first.severity) == ("marginal", "warning")
 
 
 @pytest.mark.parametrize(("plane_mean_m", "verdict"), [(0.08, "fail"), (0.008, "pass")])

@@ -292,6 +292,16 @@ def test_a_slight_difference_is_marginal_and_a_lower_target_makes_it_fail(views)
     assert check.verdict(target_deg=1.0) == "pass"
 
 
+def test_a_displacement_of_pixels_within_its_noise_is_not_stated_as_one(views):
+    check = check_intrinsics(views, replace(WIDE, fx_px=1.007 * WIDE.fx_px, fy_px=1.007 * WIDE.fy_px), BOARD)
+    assert explain(check).figures["is_displaced"]
+    within = replace(check, displacement_px=0.3, displacement_sigma_px=0.5, turn_deg=0.0, focal_ratio=1.0)
+    within = replace(within, chance=1e-6, rms_px=0.1, possible_px=0.1, surprise=40.0, is_contradicted=True)
+    found = explain(within)
+    assert within.is_bent and not found.figures["is_displaced"]
+    assert found.severity == "warning" and "+-" not in found.text
+
+
 @pytest.mark.dataset
 @pytest.mark.parametrize(
     ("recording", "profile", "worst_focal_error"),
