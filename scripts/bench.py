@@ -60,6 +60,10 @@ PARTS: dict[str, tuple[str, Part]] = {
         "other LiDARs, simulated: boards found, errors, time of a search",
         lambda bench, a: bench(a.captures or 20, a.output, a.only),
     ),
+    "boards": (
+        "checkerboards and boards with markers, whole and covered: poses in images",
+        lambda bench, a: bench(a.captures or 60),
+    ),
     "growth": ("calibrate as sessions grow: time and memory", lambda bench, a: bench(a.output)),
     "fleet": ("sessions of many robots", lambda bench, a: bench(a.output, a.only)),
     "speed": ("detection, estimate, the command line", lambda bench, _: bench()),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, difference, rotation_angle, transform
+from lce_rig.core.geometry import Array, difference, pose, rotation_angle, transform
 from lce_rig.core.pattern import markers_of
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.image.quality import grid_quality
@@ -157,3 +157,23 @@ def test_few_corners_are_refused():
     mask = cv2.fillConvexPoly(np.zeros_like(pixels), cv2.convexHull(np.rint(keep).astype(np.int32)), 1)
     mask = cv2.dilate(mask, np.ones((5, 5), np.uint8))
     assert code(np.where(mask > 0, pixels, 150).astype(np.uint8), CHARUCO) == "image.few_corners"
+
+
+@pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=["charuco", "aprilgrid"])
+@pytest.mark.parametrize("is_covered", [False, True], ids=["whole", "covered"])
+def test_a_board_is_followed_to_where_it_is(board, is_covered):
+    """Moved by a little, and by whole squares or tags, where crossings of the same colours are."""
+
+    def seen(T):
+        pixels = draw(board, WIDE, T)
+        return covered(pixels, board, WIDE, T) if is_covered else pixels
+
+    last = found(seen(NEAR), board, WIDE)
+    unit_m = board.square_m * (1 if board.type == "charuco" else 1 + board.gap_share)
+    for shift_m in ([0.004, 0.002, 0.0], [unit_m, unit_m, 0.0], [-unit_m, unit_m, 0.0], [-2 * unit_m, 0, 0]):
+        T = NEAR @ pose(np.eye(3), np.array(shift_m))
+        result = find_image_board(picture(seen(T)), board, WIDE, last=last)
+        assert isinstance(result, ImageBoard)
+        truth, _ = WIDE.project(transform(T, board.corners()))
+        assert np.nanmax(np.abs(result.corners_px - truth)) < 0.15
+        assert np.linalg.norm(result.T_cam_board[:3, 3] - T[:3, 3]) < 0.003

@@ -41,6 +41,8 @@ _MIN_FOREIGN = 0.15
 _MIN_CONTRAST, _MAX_MISFIT = 0.5, 2.0
 # It lies from where the board's pose has it no farther than others, in units of their median.
 _MAX_OFF = 7.0
+# A board that is followed is searched for again when more corners than this share of its own come into view.
+_MOST_NEW = 0.25
 # Edges are measured up to this share of the way to the next thing that is printed.
 _FREE = 0.8
 
@@ -75,6 +77,31 @@ def find_marked_grid(
     crossings, n_seen = _measure(grey, board, intrinsics, T_cam_board, is_legacy)
     if crossings is None:
         return IMAGE_FEW_CORNERS.refusal(**figures, n_corners=n_seen, n_needed=LEAST_CORNERS)
+    return crossings
+
+
+def keep_marked(
+    grey: Grey, board: Board, crossings: Crossings, was_seen: NDArray[np.bool_]
+) -> Crossings | None:
+    """Hide the corners that a board which is followed did not show in the image before.
+
+    Args:
+        grey: (H, W).
+        board: one that has markers.
+        crossings: fitted about where the corners were.
+        was_seen: (rows, cols) which corners the board showed.
+
+    Returns:
+        The crossings with hidden corners at NaN; None if a corner is lost, or many have come into view.
+    """
+    signs = _signs(board)
+    signs *= np.sign(np.median((signs * crossings.contrast)[was_seen]))
+    is_seen = _as_printed(grey, crossings, signs)
+    n_new = np.count_nonzero(is_seen & ~was_seen)
+    if not is_seen[was_seen].all() or n_new > _MOST_NEW * np.count_nonzero(was_seen):
+        return None
+    crossings.grid_px[~was_seen] = np.nan
+    crossings.is_fitted[...] = was_seen
     return crossings
 
 
@@ -206,13 +233,12 @@ def _measure(
 ) -> tuple[Crossings | None, int]:
     """Measure the corners about where a pose has them; None if too few are seen, and their number."""
     shape, corners = (board.rows, board.cols), board.corners()
-    # The corner at the upper left of a black square or tag is dark there and at its lower right.
-    signs = (-1.0) ** np.indices(shape).sum(axis=0) * (1 if is_legacy else -1)
+    signs = _signs(board) * (-1 if is_legacy else 1)
     grid_px = intrinsics.project(transform(T_cam_board, corners))[0].reshape(*shape, 2)
     for _ in range(2):
         if not np.isfinite(grid_px).all():
             return None, 0
-        crossings = fit_crossings(grey, grid_px, patches=_patches(board, intrinsics, T_cam_board))
+        crossings = fit_crossings(grey, grid_px, patches=marked_patches(board, intrinsics, T_cam_board))
         is_seen = _as_printed(grey, crossings, signs)
         # The better half of them is hardly covered: they alone give the first pose.
         usual = np.median(crossings.misfit[is_seen]) if is_seen.any() else 0.0
@@ -237,6 +263,14 @@ def _measure(
     return crossings, int(is_seen.sum())
 
 
+def _signs(board: Board) -> Array:
+    """List the signs of the corners' contrasts (rows, cols); old ChArUco boards have the others.
+
+    The corner at the upper left of a black square or tag is dark there and at its lower right.
+    """
+    return np.asarray(-((-1.0) ** np.indices((board.rows, board.cols)).sum(axis=0)))
+
+
 def _as_printed(grey: Grey, crossings: Crossings, signs: Array) -> NDArray[np.bool_]:
     """Find the corners (rows, cols) whose surroundings look as others', with the colours of the print."""
     height, width = grey.shape
@@ -250,7 +284,7 @@ def _as_printed(grey: Grey, crossings: Crossings, signs: Array) -> NDArray[np.bo
     return is_good & (crossings.misfit <= _MAX_MISFIT * float(np.median(crossings.misfit[is_good])) + 0.5)
 
 
-def _patches(board: Board, intrinsics: Intrinsics, T_cam_board: Array) -> Patches:
+def marked_patches(board: Board, intrinsics: Intrinsics, T_cam_board: Array) -> Patches:
     """Describe the surroundings of the corners in an image, which markers narrow."""
     if board.type == "charuco":
         unit_m, clear_m = board.square_m, _FREE * (1 - board.marker_share) / 2 * board.square_m

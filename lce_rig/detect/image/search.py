@@ -21,7 +21,7 @@ from lce_rig.detect.findings import (
     IMAGE_SIZE_OTHER,
 )
 from lce_rig.detect.image.corners import find_grid, order_corners, seen_grid
-from lce_rig.detect.image.markers import find_marked_grid
+from lce_rig.detect.image.markers import find_marked_grid, keep_marked, marked_patches
 from lce_rig.detect.image.quality import (
     explain_absence,
     explain_other_grid,
@@ -84,14 +84,13 @@ def find_image_board(
         ProfileError: the intrinsics belong to images of another size.
     """
     grey = crop_to_intrinsics(image, intrinsics)
-    followed = None
+    followed = None if is_from_events or last is None else _follow(grey, board, intrinsics, last)
     if board.has_markers:
-        marked = find_marked_grid(grey, board, intrinsics, is_thorough=is_thorough)
+        marked = followed or find_marked_grid(grey, board, intrinsics, is_thorough=is_thorough)
         if isinstance(marked, Refusal):
             return marked
         crossings = marked
     else:
-        followed = None if is_from_events else _follow(grey, board, last)
         crossings = (
             followed
             or _find_near(grey, board, last, is_thorough=is_thorough)
@@ -114,7 +113,7 @@ def find_image_board(
     poses = [] if followed is None or last is None else [last.T_cam_board, last.T_cam_board_alternative]
     near = [T_cam_board for T_cam_board in poses if T_cam_board is not None]
     if board.has_markers:
-        solved = solve_planar_pose(crossings.grid_px.reshape(-1, 2), board.corners(), intrinsics)
+        solved = solve_planar_pose(crossings.grid_px.reshape(-1, 2), board.corners(), intrinsics, near)
     else:
         solved, crossings = _solve(grey, crossings, board, intrinsics, near)
     lens = {"model": intrinsics.model, "width_px": intrinsics.width_px, "height_px": intrinsics.height_px}
@@ -186,20 +185,27 @@ def crop_to_intrinsics(image: Image, intrinsics: Intrinsics) -> NDArray[np.uint8
     raise ProfileError(f"{other_size.subject}: {other_size.text}", other_size.advice)
 
 
-def _follow(grey: NDArray[np.uint8], board: Board, last: ImageBoard | None) -> Crossings | None:
+def _follow(
+    grey: NDArray[np.uint8], board: Board, intrinsics: Intrinsics, last: ImageBoard
+) -> Crossings | None:
     """Fit the corners from where they were; None if the board is not all there.
 
     A board that moved by a whole square is not taken for itself: on one side squares are missing then.
     """
-    if last is None:
-        return None
-    start_px = last.corners_px.reshape(board.rows, board.cols, 2)
-    crossings = fit_crossings(grey, start_px, _FOLLOWED_SAMPLES)
-    if np.abs(crossings.grid_px - start_px).max() > _RESTING_PX:
+    start_px, patches = last.corners_px.reshape(board.rows, board.cols, 2), None
+    was_seen = np.asarray(np.isfinite(start_px).all(axis=-1))
+    if board.has_markers:
+        patches = marked_patches(board, intrinsics, last.T_cam_board)
+        drawn_px, _ = intrinsics.project(transform(last.T_cam_board, board.corners()))
+        start_px = np.where(was_seen[..., None], start_px, drawn_px.reshape(start_px.shape))
+    crossings = fit_crossings(grey, start_px, _FOLLOWED_SAMPLES, patches)
+    if np.abs(crossings.grid_px - start_px)[was_seen].max() > _RESTING_PX:
         # Patches that lie aside of their corners pull at them.
-        crossings = fit_crossings(grey, crossings.grid_px, _FOLLOWED_SAMPLES)
-    if not crossings.is_fitted.all():
+        crossings = fit_crossings(grey, crossings.grid_px, _FOLLOWED_SAMPLES, patches)
+    if not crossings.is_fitted[was_seen].all():
         return None
+    if board.has_markers:
+        return keep_marked(grey, board, crossings, was_seen)
     fitted_px = crossings.grid_px.reshape(-1, 2)
     is_in_order = np.array_equal(order_corners(grey, fitted_px, board), fitted_px)
     return crossings if is_in_order and is_whole(grey, crossings.grid_px) else None
