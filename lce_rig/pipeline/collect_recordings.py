@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lce_rig.collect.offline import CollectOptions, CollectReport, collect
-from lce_rig.core.errors import NotEnoughDataError
+from lce_rig.core.errors import NotEnoughDataError, UsageError
 from lce_rig.core.findings import Losses
 from lce_rig.core.progress import Progress, silent
 from lce_rig.io import open_recordings
@@ -22,7 +22,7 @@ def collect_from(
     session: Path | str,
     *,
     options: CollectOptions | None = None,
-    sources: SourceOptions | None = None,
+    sources: SourceOptions | Sequence[SourceOptions] | None = None,
     progress: Progress = silent,
 ) -> Session:
     """Build or continue a session from recordings.
@@ -33,7 +33,7 @@ def collect_from(
             simultaneous ones are read as one.
         session: its folder.
         options: what becomes a capture.
-        sources: how to read the paths, if the profile does not say.
+        sources: how to read the paths, if the profile does not say: all alike, or each by its own.
         progress: called with (done, total) samples.
 
     Returns:
@@ -43,11 +43,17 @@ def collect_from(
         SourceError: a recording cannot be read to its end; captures before it are kept.
         SessionError: the folder is not a session, or cannot be written.
         NotEnoughDataError: no capture could be made; the most frequent causes are named.
+        UsageError: `sources` are not as many as the recordings.
     """
     given: list[Source] = [*recordings] if isinstance(recordings, list | tuple) else [recordings]
-    part = replace(sources or SourceOptions(), is_part=len(given) > 1)
+    sources = sources or SourceOptions()
+    by_path = [sources] * len(given) if isinstance(sources, SourceOptions) else sources
+    if len(by_path) != len(given):
+        what = f"{len(by_path)} sources for {len(given)} recordings"
+        raise UsageError(what, "Give one for all, or one for each.")
     opened: list[Recording] = []
-    for source in given:
+    for source, how in zip(given, by_path, strict=True):
+        part = replace(how, is_part=len(given) > 1)
         opened += open_recordings([Path(source)], rig, part) if isinstance(source, str | Path) else [source]
     report = fill_session(rig, opened, session, options, progress)
     if report.errors:

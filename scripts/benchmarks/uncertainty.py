@@ -28,11 +28,13 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data_sheets import VLP_16
 from lce_rig.core.geometry import Array, difference, invert, transform
 from lce_rig.core.results import Observation
+from lce_rig.detect.detection import Detections, LidarDetection
+from lce_rig.detect.finder import BoardFinder
 from lce_rig.lens.difference import turn_of_lens
 from lce_rig.lens.models import model_of
 from lce_rig.pipeline.calibration import calibrate_detections
-from lce_rig.rig import Rig, load_rig
-from lce_rig.simulate import LidarNoise, SimulationOptions
+from lce_rig.rig import Rig, load_rig, parse_rig
+from lce_rig.simulate import LidarNoise, SimulationOptions, simulate_captures, truth_extrinsics
 
 CORNER_SIGMA_PX = 0.1
 # Something found in the scan that lies farther than this from the board is not it.
@@ -49,12 +51,20 @@ _WITHIN = 1.5
 
 @dataclass(frozen=True)
 class Case:
-    """What is simulated: a rig, and how its LiDAR errs beyond the defaults."""
+    """What is simulated: a rig, perhaps with another LiDAR, and how that errs beyond the defaults."""
 
     rig: str
     label: str
+    model: str = ""
     range_offset_m: float = 0.0
     edge_growth_m: float | None = None
+
+    def profile(self) -> Rig:
+        """Load the profile with the LiDAR's model."""
+        rig = load_rig(self.rig)
+        ((name, lidar),) = rig.lidars.items()
+        other = lidar.model_copy(update={"model": self.model or lidar.model})
+        return rig.model_copy(update={"lidars": {name: other}})
 
     def options(self) -> SimulationOptions:
         """Choose the simulator's options."""
@@ -71,6 +81,18 @@ CASES = (
     Case("rlfs", "rlfs, ranges +2 cm, edges +3 mm", range_offset_m=0.02, edge_growth_m=0.003),
 )
 PROFILES_IN_ERROR = CASES[:2]
+WITHOUT_RINGS = (Case("mid360", "Mid-360"), Case("mid360", "Avia", model="Avia"))
+_TWO = "VLP-16 and OS1-64"
+_TWO_LIDARS = """
+format_version: 1
+name: lidars
+board: {type: plain, width_m: 0.9, height_m: 0.7}
+lidars:
+  front: {model: VLP-16, frame: front_link, topic: /front, rate_hz: 10}
+  side: {model: OS1-64, frame: side_link, topic: /side, rate_hz: 10}
+nominal_extrinsics:
+  - {camera: front, lidar: side, rpy_deg: [0, 0, 30], translation_m: [0.05, 0.4, -0.1]}
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +137,13 @@ def bench_uncertainty(n_seeds: int, folder: Path, only: str = "", n_captures: in
         if only in case.label:
             runs = list(_runs(case, n_seeds, folder, n_captures))
             print_row(case.label, len(runs), n_captures, *_cells(runs))
+
+    print("\nLiDARs without rings, and two LiDARs to each other\n")
+    print_head("LiDAR", *head.split(", ")[1:4], *head.split(", ")[-2:], "95 % regions hold")
+    others = {case.label: _runs_without_rings(case, n_seeds, folder, n_captures) for case in WITHOUT_RINGS}
+    for label, errors in {**others, _TWO: _runs_of_lidars(n_seeds, n_captures)}.items():
+        if only in label:
+            print_row(label, n_seeds, n_captures, *_claim_cells(list(errors)))
 
     print("\nProfiles in error as their standard deviations say\n")
     print_head(
@@ -167,6 +196,30 @@ def _rms(runs: Sequence[Run]) -> tuple[float, float]:
 
 def _sizes(cov: Array) -> tuple[float, float]:
     return float(np.degrees(np.sqrt(np.trace(cov[3:, 3:])))), float(1e3 * np.sqrt(np.trace(cov[:3, :3])))
+
+
+def _runs_without_rings(case: Case, n_seeds: int, folder: Path, n_captures: int) -> Iterator[Run]:
+    """Estimate from accumulated scans, with an exact profile."""
+    rig = case.profile()
+    (lidar,) = rig.lidars.values()
+    settings = EstimateSettings.of(CalibrateOptions("ml"), lidar)
+    for seed in range(n_seeds):
+        session = still_session(rig, seed, case.options(), n_captures, CORNER_SIGMA_PX, folder)
+        estimate = fit_extrinsic(session.candidates, rig.board.to_board(), settings)
+        yield Run(difference(estimate.T_cam_lidar, session.T_cam_lidar), estimate.cov)
+
+
+def _runs_of_lidars(n_seeds: int, n_captures: int) -> Iterator[Run]:
+    """Calibrate two LiDARs to each other, without a camera."""
+    rig = parse_rig(_TWO_LIDARS)
+    finder, pair = BoardFinder(rig), ("front", "side")
+    for seed in range(n_seeds):
+        scans: dict[str, dict[str, LidarDetection]] = {name: {} for name in pair}
+        for capture in simulate_captures(rig, n_captures=n_captures, seed=seed):
+            for scan in capture.scans:
+                scans[scan.sensor][f"{capture.index:06d}"] = finder.scan(scan)
+        (calibration,), _ = calibrate_detections(rig, Detections({}, scans))
+        yield Run(difference(calibration.T_cam_lidar, truth_extrinsics(rig, seed)[pair]), calibration.cov)
 
 
 def _runs_in_error(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import lce_rig as lce
 from lce_rig.collect.offline import collect
 from lce_rig.core.board import Board
 from lce_rig.core.data import Scan, Stream
@@ -14,9 +15,11 @@ from lce_rig.core.errors import SourceError
 from lce_rig.core.files import encode_pcd
 from lce_rig.core.geometry import Array, exp_so3, pose
 from lce_rig.io import open_recording
+from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.rig import Rig
 from lce_rig.session import Session
 from tests.detect.scans import board_plate, cast, place, room
+from tests.shared import changed
 
 PLATE = Board(cols=2, rows=2, square_m=0.1, width_m=0.9, height_m=0.7)
 BESIDE = pose(exp_so3(np.radians([0, 0, 25.0])), np.array([0.1, -0.5, 0.0]))
@@ -79,6 +82,24 @@ def test_a_recording_gives_a_capture_of_both_where_the_plate_stands(tmp_path: Pa
         assert all(capture.lidars == ["left", "right"] for capture in session.captures)
         again = collect(session, [recorded(stood)])
     assert not again.captured and again.n_known == 2
+
+
+def test_python_reads_two_recordings_each_by_its_own_options(tmp_path: Path, rig: Rig) -> None:
+    scans, names = recorded([place(2.5, 15, 45, 20)] * 8).samples_read, ("left", "right")
+    bags, sources = [], []
+    for name in names:
+        with BagRecorder.in_folder(
+            tmp_path / name, changed(rig, **{f"lidars__{name}__topic": "/points"})
+        ) as bag:
+            for scan in scans:
+                if scan.sensor == name:
+                    bag.write(scan)
+        bags.append(bag.path)
+        sources.append(lce.SourceOptions(topics={name: "/points"}))
+    session = lce.collect_from(rig, bags, tmp_path / "s", sources=sources)
+    assert [capture.lidars for capture in session.captures] == [["left", "right"]]
+    with pytest.raises(lce.UsageError):
+        lce.collect_from(rig, bags, tmp_path / "t", sources=sources[:1])
 
 
 def test_a_plate_that_moves_or_is_not_in_both_scans_is_no_capture(tmp_path: Path, rig: Rig) -> None:
