@@ -71,15 +71,22 @@ def _frames() -> None:
 
 
 def _report() -> None:
+    """Draw the report and an overlay of the demo."""
     from figures.report import draw_report
 
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder, "demo")
         assert run(["simulate", str(session), "--rig", "rlfs", "--captures", "16", "--seed", "1"]) == 0
         assert run(["calibrate", str(session)]) == 0
+        assert run(["verify", str(session)]) == 0
+        overlay = cv2.imread(str(session / "calibration" / "overlays" / "000004.png"))
         Path(folder, "browser").mkdir()
         drawn = draw_report(session / "calibration" / "report.html", Path(folder, "browser"))
     cv2.imwrite(str(FOLDER / "report.png"), drawn, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    small = cv2.resize(
+        overlay, (1200, 1200 * overlay.shape[0] // overlay.shape[1]), interpolation=cv2.INTER_AREA
+    )
+    cv2.imwrite(str(FOLDER / "overlay.jpg"), small, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
 def _screens() -> None:

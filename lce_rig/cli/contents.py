@@ -175,7 +175,7 @@ def results(session: Path, as_json: bool) -> None:
         show.say(f"no results in {session}: run `lce-rig calibrate {session}`")
     dates = {result.file.provenance.date_words: None for result in stored if result.file}
     if any(dates):
-        show.note(f"captures of {'; '.join(filter(None, dates))}")
+        show.note(f"date of the captures: {'; '.join(filter(None, dates))}")
     for result in stored:
         if result.problem:
             show.warn(result.problem)

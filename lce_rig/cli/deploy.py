@@ -121,7 +121,7 @@ def _show_plan(plan: Plan, target: TargetSettings, *, has_diff: bool, as_json: b
         return
     current = plan.state.current
     show.say(f"{target.to}: {'nothing deployed yet' if current is None else _described(current)}")
-    for change in plan.sensors:
+    for change in () if plan.is_in_place else plan.sensors:
         how = "new" if change.is_new else "removed"
         if change.rotation_deg is not None and change.translation_m is not None:
             how = f"moves by {sizes(change.rotation_deg, change.translation_m)}"

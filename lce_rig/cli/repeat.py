@@ -92,7 +92,8 @@ def _parts(c: Repeatability, session: str, *, is_explained: bool) -> Iterator[An
     spread = sizes(c.spread_rotation_deg, c.spread_translation_m)
     yield f"  spread       {spread} (1 sigma of one session)"
     yield f"  reported     {sizes(c.reported_rotation_deg, c.reported_translation_m)}"
-    yield f"  chance       {significant(c.p)}{shared} (chi2 {c.chi2:.1f}, {c.dof} degrees of freedom)"
+    chance = significant(max(c.p, 1e-300))  # "below ...", as no chance is 0
+    yield f"  chance       {chance}{shared} (chi2 {c.chi2:.1f}, {c.dof} degrees of freedom)"
     if not is_explained:
         return
     headings: tuple[str, ...] = ("session", ">x mm", ">y mm", ">z mm")

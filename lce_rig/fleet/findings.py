@@ -81,6 +81,6 @@ DEPLOY_OLDER = Kind(
 )
 DEPLOY_UNDATED = Kind(
     "deploy.undated",
-    "not compared by age: the result's captures are of {date}, the deployed ones of {there}",
+    "not compared by age; date of the result's captures: {date}; of the deployed ones: {there}",
     severity="note",
 )

@@ -1,5 +1,6 @@
-"""The two screens of `lce-rig collect --simulated`: the terminal, and the page on a phone."""
+"""The screens of `lce-rig collect --simulated`: terminal, and page on a phone and on a large screen."""
 
+import codecs
 import fcntl
 import html
 import os
@@ -22,7 +23,7 @@ import pyte
 from tests.show.phone.browser import Browser
 
 _COLUMNS, _LINES = 100, 24
-_PHONE_PX = (390, 844)
+_PHONE_PX, _WIDE_PX = (390, 844), (1280, 720)
 _WAIT_S = 420.0
 _STYLE = """<meta charset="utf-8"><style>body{margin:14px;background:#16191d;color:#d8dde3;
 font:15px/19px 'DejaVu Sans Mono','DejaVu Sans',monospace}p{margin:0;height:19px;white-space:nowrap}
@@ -35,10 +36,10 @@ _COLOURS = {
 
 
 def draw_screens(folder: Path, n_captures: int = 6) -> None:
-    """Collect with the simulated rig, and photograph both screens while the board has to move.
+    """Collect with the simulated rig, and photograph the screens while the board has to move.
 
     Args:
-        folder: where live_screen.png and phone.png go.
+        folder: where live_screen.png, phone.png and page.jpg go.
         n_captures: taken before.
 
     Raises:
@@ -67,6 +68,9 @@ def draw_screens(folder: Path, n_captures: int = 6) -> None:
                 phone = browser.open(url, *_PHONE_PX)
                 time.sleep(3.0)
                 cv2.imwrite(str(folder / "phone.png"), phone.screenshot())
+                wide = browser.open(url, *_WIDE_PX)
+                time.sleep(3.0)
+                cv2.imwrite(str(folder / "page.jpg"), wide.screenshot(), [cv2.IMWRITE_JPEG_QUALITY, 85])
                 drawn = Path(work, "terminal.html")
                 drawn.write_text(_STYLE + shown, encoding="utf-8")
                 size_px = (round(_COLUMNS * 9.03) + 28, _LINES * 19 + 28)
@@ -86,6 +90,8 @@ class _Terminal(threading.Thread):
         self._line, self._lock = line, threading.Lock()
         self._screen = pyte.Screen(_COLUMNS, _LINES)
         self._stream = pyte.Stream(self._screen)
+        # A character may be cut between two reads.
+        self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
         self.start()
 
     def run(self) -> None:
@@ -93,7 +99,7 @@ class _Terminal(threading.Thread):
         with suppress(OSError):
             while data := os.read(self._line, 65536):
                 with self._lock:
-                    self._stream.feed(data.decode("utf-8", "replace"))
+                    self._stream.feed(self._decoder.decode(data))
 
     def text_and_html(self) -> tuple[str, str]:
         """Take the screen as it is."""
