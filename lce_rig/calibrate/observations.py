@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from lce_rig.calibrate.findings import TWO_PLACES
 from lce_rig.core.findings import Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+from lce_rig.rig import Rig
 
 SAME_PLACE_M = 0.03
 SAME_TURN_RAD = np.radians(3.0)
@@ -30,6 +31,18 @@ class Clocks:
     lidar_offset_s: float = 0.0
     channel_offset_s: Mapping[str, float] = field(default_factory=dict)
     tolerance_s: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, rig: Rig, camera: str, lidar: str) -> "Clocks":
+        """Read the settings of a camera and a LiDAR; the first of two LiDARs has no channels."""
+        channels = rig.cameras[camera].channels if camera in rig.cameras else {}
+        stamps = {name: channel.timestamps for name, channel in channels.items()}
+        return cls(
+            sweep_s=1 / rig.lidars[lidar].rate_hz,
+            lidar_offset_s=rig.lidars[lidar].timestamps.expected_offset_s,
+            channel_offset_s={name: settings.expected_offset_s for name, settings in stamps.items()},
+            tolerance_s={name: settings.tolerance_s for name, settings in stamps.items()},
+        )
 
     def after_scan_s(self, channel: str, image: ImageBoard, lidar: LidarBoard) -> float:
         """Compute how long after a scan's first firing an image was taken; 0 if timestamps are missing."""

@@ -30,8 +30,6 @@ from lce_rig.lens.models import LensPrior, model_of
 
 # More images hardly improve a lens, and take time.
 _MAX_VIEWS = 80
-# Below this difference of costs, in corner variances, an image alone cannot decide between two poses.
-_AMBIGUOUS_CHI2 = 9.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +109,6 @@ class SessionLens:
                     cov=cov[k],
                     T_cam_board_alternative=T_other[k] if has_other[k] else None,
                     chi2_gap=float(gap[k]),
-                    is_ambiguous=bool(gap[k] < _AMBIGUOUS_CHI2),
                     reprojection_px=float(np.sqrt(cost[k] / n[k])),
                     sigma_px=float(np.sqrt(variance[k])),
                 ),

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from lce_rig.core.data import NO_RING
 from lce_rig.core.geometry import Array
 
+# The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
+_AMBIGUOUS_CHI2 = 9.0
+
 
 @dataclass(frozen=True)
 class ImageQuality:
@@ -108,7 +111,6 @@ class ImageBoard:
         cov: (6, 6) of T_cam_board, tangent (translation m, rotation rad).
         T_cam_board_alternative: (4, 4) second local minimum; None if there is none in front of the camera.
         chi2_gap: by how much the alternative's cost is higher, in units of the corner variance.
-        is_ambiguous: whether the image alone cannot decide between the two (chi2_gap < 9).
         reprojection_px: rms of the corner residuals.
         sigma_px: corner noise per coordinate, from the residuals and their degrees of freedom.
         quality: figures of the pattern in the image; None if only its corners are known.
@@ -125,7 +127,6 @@ class ImageBoard:
     cov: Array
     T_cam_board_alternative: Array | None
     chi2_gap: float
-    is_ambiguous: bool
     reprojection_px: float
     sigma_px: float
     quality: ImageQuality | None = None
@@ -134,6 +135,11 @@ class ImageBoard:
     track_ns: NDArray[np.int64] | None = None
     track_T_cam_board: Array | None = None
     track_cov: Array | None = None
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether the image alone cannot decide between the two poses."""
+        return self.chi2_gap < _AMBIGUOUS_CHI2
 
     @property
     def distance_m(self) -> float:

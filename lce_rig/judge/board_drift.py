@@ -4,20 +4,18 @@ Pitch and height hide each other axis by axis: boards at one distance allow eith
 the change x with covariance C, of the boards and the deployed extrinsics, and x^T C^-1 x is chi-squared.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lce_rig.calibrate import Clocks
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import capture_residual, lever_arm, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb, tangent_sizes
-from lce_rig.core.results import ImageBoard, LidarBoard, Observation
+from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.local_quadratic import OF_PROFILE, expand
 from lce_rig.judge.session_check import find_meetings, seen_by_own_lens
@@ -142,12 +140,7 @@ class BoardDrift:
 
 
 def watch_boards(
-    rig: Rig,
-    calibration: Calibration,
-    channel: str,
-    images: Mapping[str, ImageBoard],
-    scans: Mapping[str, list[LidarBoard]],
-    clocks: Clocks,
+    rig: Rig, calibration: Calibration, channel: str, detections: Detections
 ) -> BoardDrift | None:
     """Compare deployed extrinsics with boards.
 
@@ -155,16 +148,14 @@ def watch_boards(
         rig: the profile.
         calibration: the deployed extrinsics.
         channel: of the images.
-        images, scans: the board in them, by capture.
-        clocks: the profile's settings of the two sensors' times.
+        detections: of the captures.
 
     Returns:
         None where both sensors see the board at about the same place in fewer than three placements.
     """
     T_cam_lidar, pair = calibration.T_cam_lidar, Pair(calibration.camera, channel, calibration.lidar)
-    detections = Detections({(calibration.camera, channel): dict(images)}, {calibration.lidar: dict(scans)})
     board, detections = rig.board.to_board(), seen_by_own_lens(rig, detections, calibration)
-    meetings = find_meetings(rig, detections, pair, T_cam_lidar, calibration.channel_results, clocks)
+    meetings = find_meetings(rig, detections, pair, T_cam_lidar, calibration.channel_results)
     met = [meeting.at_scan_time for meeting in meetings.values()]
     if not met:
         return None

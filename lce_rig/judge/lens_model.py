@@ -6,7 +6,6 @@ coordinates take up perspective, distortion and the board's bend.
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,25 +27,7 @@ _NEARER, _ALIKE = 2.0, 1.25
 _DEGREE, _LEAST_FREEDOMS = 3, 8
 
 
-class OtherModel(NamedTuple):
-    """A lens model that fits the corners where the profile's does not.
-
-    Attributes:
-        model: the profile's, as `LensModel.name`.
-        rms_px: rms distance of corners from their prediction.
-        noise_px: rms noise of corners.
-        other: the model that fits; "" where none does.
-        other_px: rms distance of corners under it.
-    """
-
-    model: str
-    rms_px: float
-    noise_px: float
-    other: str
-    other_px: float
-
-
-def find_other_model(fitted: IntrinsicsEstimate, board: Board) -> OtherModel | None:
+def model_findings(fitted: IntrinsicsEstimate, board: Board) -> list[Finding]:
     """Try other lens models where corners do not fit as well as their noise allows.
 
     Args:
@@ -54,7 +35,8 @@ def find_other_model(fitted: IntrinsicsEstimate, board: Board) -> OtherModel | N
         board: its specification.
 
     Returns:
-        None where the corners fit, or where the same model fits them with values of its own.
+        None where the corners fit, or where the same model fits them with values of its own; else the
+        finding, with the model that fits or "".
     """
     noise_px = corner_noise(fitted.views, board)
     counts = [int(np.isfinite(view.board.corners_px[:, 0]).sum()) for view in fitted.views]
@@ -62,7 +44,7 @@ def find_other_model(fitted: IntrinsicsEstimate, board: Board) -> OtherModel | N
     rms_px = np.sqrt([part.mean() for part in np.split(squares, np.cumsum(counts)[:-1])])
     ratios = rms_px / np.maximum(noise_px, 1e-9)
     if np.isnan(ratios).all() or np.nanmedian(ratios) < _MISFIT:
-        return None
+        return []
     reached = {}
     for name, model in MODELS.items():
         with suppress(NotEnoughDataError):
@@ -75,9 +57,18 @@ def find_other_model(fitted: IntrinsicsEstimate, board: Board) -> OtherModel | N
     if _NEARER * least_px > fitted.rms_px:
         best = ""
     elif reached.get(own, np.inf) < _NEARER * least_px:
-        return None
+        return []
     typical_px = float(np.nanmedian(noise_px))
-    return OtherModel(own, fitted.rms_px, typical_px, best, reached.get(best, typical_px))
+    finding = LENS_MODEL(
+        severity=failing(fitted.rms_px > _FAIL * _MISFIT * typical_px),
+        action="" if best else "none",
+        model=own,
+        rms_px=fitted.rms_px,
+        noise_px=typical_px,
+        other=best,
+        other_px=reached.get(best, typical_px),
+    )
+    return [finding]
 
 
 def corner_noise(views: Sequence[BoardView], board: Board) -> Array:
@@ -102,11 +93,3 @@ def corner_noise(views: Sequence[BoardView], board: Board) -> Array:
         left = left - bends[is_seen] @ np.linalg.lstsq(bends[is_seen], left, rcond=None)[0]
         noise_px[k] = np.sqrt(np.sum(left**2) / freedoms)
     return noise_px
-
-
-def model_findings(other: OtherModel | None) -> list[Finding]:
-    """Find a lens model that is not the lens's."""
-    if other is None:
-        return []
-    severity = failing(other.rms_px > _FAIL * _MISFIT * other.noise_px)
-    return [LENS_MODEL(severity=severity, action="" if other.other else "none", **other._asdict())]

@@ -202,7 +202,6 @@ def check_session(
     detections: Detections,
     calibration: Calibration,
     channel: str,
-    clocks: Clocks,
     scene: SceneOpinion,
 ) -> SessionCheck:
     """Measure the residuals of extrinsics for one channel and the LiDAR on every capture of a session.
@@ -214,14 +213,11 @@ def check_session(
         detections: of the session.
         calibration: the extrinsics; they may come from another session of the same rig.
         channel: of the calibration's channels.
-        clocks: the profile's settings of the two sensors' times.
         scene: the opinion of this session's scene.
     """
     pair = Pair(calibration.camera, channel, calibration.lidar)
     board, detections = rig.board.to_board(), seen_by_own_lens(rig, detections, calibration)
-    meetings = find_meetings(
-        rig, detections, pair, calibration.T_cam_lidar, calibration.channel_results, clocks
-    )
+    meetings = find_meetings(rig, detections, pair, calibration.T_cam_lidar, calibration.channel_results)
     residuals = [
         capture_residual(calibration.T_cam_lidar, meeting.at_scan_time, board)
         for meeting in meetings.values()
@@ -291,7 +287,6 @@ def find_meetings(
     pair: Pair,
     T_cam_lidar: Array,
     results: Sequence[ChannelResult],
-    clocks: Clocks,
 ) -> dict[str, Meeting]:
     """Match both sensors' boards in each capture of a channel in which they agree.
 
@@ -301,12 +296,11 @@ def find_meetings(
         pair: the sensors.
         T_cam_lidar: (4, 4) the extrinsics.
         results: of the channels of the calibration.
-        clocks: the profile's settings of the two sensors' times.
 
     Returns:
         By name of the capture.
     """
-    board = rig.board.to_board()
+    board, clocks = rig.board.to_board(), Clocks.of(rig, pair.camera, pair.lidar)
     observations: dict[str, list[Observation]] = {}
     for name in sorted({pair.channel, *(result.channel for result in results)}):
         of_channel = replace(pair, channel=name)

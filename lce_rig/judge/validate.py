@@ -18,6 +18,7 @@ from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Contribution
 from lce_rig.core.camera import Intrinsics
+from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, difference, exp_so3, invert, perturb, pose
 from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import (
@@ -27,7 +28,7 @@ from lce_rig.judge.contributions import (
 )
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given
 from lce_rig.judge.laser_angles import estimate_angles
-from lce_rig.judge.lens_model import OtherModel, find_other_model
+from lce_rig.judge.lens_model import model_findings
 from lce_rig.judge.local_quadratic import (
     OF_PROFILE,
     SCALE,
@@ -72,26 +73,24 @@ class Validation:
         cov_agreed: (6, 6) the same without what checks contradict.
         cov_shared: (6, 6) the part of `cov` from errors of the profile's board and LiDAR.
         contributions: its causes, the largest first.
-        captures: their names, in the order of the contrasts.
         contrasts: subsets of the captures that should agree.
         scale: as `scale_of`; None for too few placements.
         pattern: as `pattern_of`, where it contradicts the profile; else None.
         laser_angles: errors of the lasers' angles in deg, as `estimate_angles`.
         intrinsics: the profile's compared with those fitted to the boards; None for too few boards.
-        lens_model: one that fits the corners where the profile's does not; None where it does.
+        lens_model: the finding that the profile's does not fit the corners.
     """
 
     cov: Array
     cov_agreed: Array
     cov_shared: Array
     contributions: tuple[Contribution, ...]
-    captures: tuple[str, ...]
     contrasts: tuple[Contrast, ...]
     scale: tuple[float, float] | None
     pattern: tuple[Array, Array] | None
     laser_angles: Mapping[str, float]
     intrinsics: IntrinsicsCheck | None
-    lens_model: OtherModel | None
+    lens_model: Sequence[Finding]
 
 
 def validate(
@@ -159,13 +158,12 @@ def validate(
         # Each session has fitted its own lens.
         cov_shared=profile_covariance([each for each in known if each.source != "intrinsics"]),
         contributions=list_contributions(estimate.diagnostics, known, contradictions),
-        captures=estimate.used,
         contrasts=contrasts,
         scale=scale,
         pattern=pattern,
         laser_angles=laser_angles,
         intrinsics=intrinsics,
-        lens_model=None if fitted is None or lens is None else find_other_model(fitted, board),
+        lens_model=[] if fitted is None or lens is None else model_findings(fitted, board),
     )
 
 

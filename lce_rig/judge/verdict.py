@@ -48,7 +48,6 @@ from lce_rig.judge.findings import (
 )
 from lce_rig.judge.intrinsics_check import lens_findings
 from lce_rig.judge.laser_angles import angle_findings
-from lce_rig.judge.lens_model import model_findings
 from lce_rig.judge.split_consistency import split_findings
 from lce_rig.judge.validate import Validation
 from lce_rig.rig import NominalExtrinsic, QualitySettings, Rig
@@ -94,13 +93,13 @@ def judge(
     board, nominal = rig.board.to_board(), rig.nominal(camera, lidar)
     findings = [
         *_certificate(estimate),
-        *model_findings(examination.lens_model),
+        *examination.lens_model,
         *lens_findings(examination.intrinsics, rig.calibration.target_sigma_deg),
         *angle_findings(examination.laser_angles),
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
         *_scale(examination.scale, board, rig.verdict.max_scale_error),
         *_pattern(examination.pattern, len(estimate.used)),
-        *split_findings(examination.contrasts, examination.captures, rig.calibration, rig.verdict),
+        *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
         *others,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
         *_channels(estimate, rig),

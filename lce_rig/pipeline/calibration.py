@@ -291,7 +291,7 @@ def _solve(
     refused = {name: why for name, why in refused.items() if name not in detected}
     tolerances = Tolerances.of(rig.cameras[camera], rig.board)
     settings = EstimateSettings.of(options, rig.lidars[lidar], tolerances)
-    clocks = clocks_of(rig, camera, lidar)
+    clocks = Clocks.of(rig, camera, lidar)
     estimate = estimate_extrinsics(candidates, rig.board.to_board(), settings, clocks, progress)
     begin(progress, f"checking {camera} and {lidar}")
     validation = _examine(rig, detections, pairs, estimate)
@@ -309,8 +309,7 @@ def _examine(
         # Of several channels, the first shows the boards.
         channels = [channel.channel for channel in estimate.channels]
         pair = next(pair for pair in pairs if pair.channel in channels)
-        clocks = clocks_of(rig, pair.camera, pair.lidar)
-        meetings = find_meetings(rig, detections, pair, estimate.T_cam_lidar, estimate.channels, clocks)
+        meetings = find_meetings(rig, detections, pair, estimate.T_cam_lidar, estimate.channels)
         rejected = [each.at_scan_time for name, each in meetings.items() if name not in used]
         if estimate.lens is not None and rejected:
             rejected = estimate.lens.refit(rejected)
@@ -501,15 +500,4 @@ def _other_camera(solved: Sequence[_Solved], k: int, other_k: int, pair: CameraP
         apart_rotation_deg=apart_deg,
         apart_translation_m=apart_m,
         board_rms_m=pair.board_rms_m,
-    )
-
-
-def clocks_of(rig: Rig, camera: str, lidar: str) -> Clocks:
-    """Read the time settings of a camera and a LiDAR from the profile."""
-    stamps = {name: channel.timestamps for name, channel in rig.cameras[camera].channels.items()}
-    return Clocks(
-        sweep_s=1 / rig.lidars[lidar].rate_hz,
-        lidar_offset_s=rig.lidars[lidar].timestamps.expected_offset_s,
-        channel_offset_s={name: settings.expected_offset_s for name, settings in stamps.items()},
-        tolerance_s={name: settings.tolerance_s for name, settings in stamps.items()},
     )

@@ -35,7 +35,7 @@ from lce_rig.export.ros_files import camera_info_text
 from lce_rig.export.writing import number, numbers
 from lce_rig.judge.findings import verdict_of
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
-from lce_rig.judge.lens_model import find_other_model, model_findings
+from lce_rig.judge.lens_model import model_findings
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
 from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of, lens_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
@@ -178,7 +178,7 @@ def measure_intrinsics(
     if (given.width_px, given.height_px) == (lens.width_px, lens.height_px):
         check, difference = compare_with_given(estimate, given, rig.board.to_board())
     judgement = judge_lens(certainty.covered, certainty.image_sigma_px, check, target_deg)
-    judgement = next(iter(model_findings(find_other_model(estimate, rig.board.to_board()))), judgement)
+    judgement = next(iter(model_findings(estimate, rig.board.to_board())), judgement)
     refused = {f"{name}.{channel}": why for (name, channel), why in found.items() if isinstance(why, Refusal)}
     return MeasuredIntrinsics(
         camera=camera,

@@ -6,13 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from lce_rig.calibrate import CalibrateOptions, CalibrationEstimate, EstimateSettings, estimate_extrinsics
+from lce_rig.calibrate import (
+    CalibrateOptions,
+    CalibrationEstimate,
+    Clocks,
+    EstimateSettings,
+    estimate_extrinsics,
+)
 from lce_rig.calibrate.likelihood.lidar_errors import LidarErrors, estimate_lidar
 from lce_rig.core.calibration import MADE_BY
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.progress import Progress, silent
 from lce_rig.detect.detection import Detections
-from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.camera_intrinsics import write_profile
 from lce_rig.pipeline.detect_session import candidates_of, detect
 from lce_rig.rig import as_yaml, set_value
@@ -66,7 +71,7 @@ def measure_lidar(
             if pair.lidar != name or channel.kind != "frames":
                 continue
             candidates, _ = candidates_of(detections, pair)
-            clocks = clocks_of(session.rig, pair.camera, pair.lidar)
+            clocks = Clocks.of(session.rig, pair.camera, pair.lidar)
             estimate = estimate_extrinsics({pair.channel: candidates}, board, options, clocks)
             _require_still(session, estimate)
             used.append([estimate.observations[capture] for capture in estimate.used])

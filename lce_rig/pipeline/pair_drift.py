@@ -12,10 +12,10 @@ from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array
-from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.core.results import ImageBoard
+from lce_rig.detect.detection import Detections, LidarDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.judge.board_drift import BoardDrift, watch_boards
-from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import evenly
@@ -263,17 +263,15 @@ class _Judge:
 
     def _boards(self, c: Calibration, boards: Sequence[tuple[Seen, ImageBoard]]) -> BoardDrift | None:
         """Compare the extrinsics with the boards of at most 20 captures."""
-        images: dict[str, ImageBoard] = {}
-        scans: dict[str, list[LidarBoard]] = {}
-        for seen, board in evenly(boards, _MAX_BOARDS):
-            found = self._finder.scan(seen.scan)
-            if isinstance(found, list):
-                images[seen.name], scans[seen.name] = board, found
-        if not images:
+        kept = evenly(boards, _MAX_BOARDS)
+        if not kept:
             return None
+        images = {seen.name: board for seen, board in kept}
+        scans: dict[str, LidarDetection] = {seen.name: self._finder.scan(seen.scan) for seen, _ in kept}
         channel = boards[0][0].image.channel if isinstance(boards[0][0].image, Image) else ""
-        clocks = clocks_of(self._rig, c.camera, c.lidar)
-        return watch_boards(self._rig, c, channel, images, scans, clocks)
+        return watch_boards(
+            self._rig, c, channel, Detections({(c.camera, channel): images}, {c.lidar: scans})
+        )
 
     def _motion(self, seen: Seen) -> RigMotion | None:
         """Estimate the rig's motion at a capture; None where it stands, or nothing tells."""

@@ -8,17 +8,14 @@ from hashlib import sha256
 from itertools import combinations
 from pathlib import Path
 
-from lce_rig.calibrate import Clocks
 from lce_rig.core.calibration import Calibration, ResultFile, SceneOpinion, read_result
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array
 from lce_rig.core.progress import Progress, silent
-from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.board_drift import watch_boards
 from lce_rig.judge.session_check import SessionCheck, check_session
-from lce_rig.pipeline.calibration import clocks_of
 from lce_rig.pipeline.detect_session import detect, event_channels, event_picture, match_sensors
 from lce_rig.pipeline.findings import OTHER_PROFILE
 from lce_rig.pipeline.result_files import (
@@ -160,24 +157,16 @@ def verify(
     if rig is not session.rig:
         session, detections = Session(session.path, rig, None), None
     detections = detections or detect(session, progress=progress)
-    checks = []
+    checks, pairs = [], [*detections.pairs, *detections.lidar_pairs(session.rig.lidars)]
     for c in calibrations:
-        if c.is_of_lidars:
-            pair = Pair.of(c)
-            if pair in detections.lidar_pairs(session.rig.lidars):
-                seen = detections.between(pair)
-                check = check_session(session.rig, seen, c, "", Clocks(), SceneOpinion(0, 0))
-                checks.append(check if c.captures_used else _with_boards(session.rig, seen, check, Clocks()))
-            continue
-        scene, clocks = hear_scene(session, detections, c), clocks_of(session.rig, c.camera, c.lidar)
-        for channel in sorted(c.channels):
+        scene = SceneOpinion(0, 0) if c.is_of_lidars else hear_scene(session, detections, c)
+        for channel in sorted(c.channels) or [""]:
             pair = Pair(c.camera, channel, c.lidar)
-            if pair in detections.pairs:
-                check = check_session(session.rig, detections, c, channel, clocks, scene)
+            if pair in pairs:
+                seen = detections.between(pair)
+                check = check_session(session.rig, seen, c, channel, scene)
                 # A result of this session has been judged by these boards.
-                if not c.captures_used:
-                    check = _with_boards(session.rig, detections, check, clocks)
-                checks.append(check)
+                checks.append(check if c.captures_used else _with_boards(session.rig, seen, check))
     if not checks:
         wanted = ", ".join(str(Pair.of(c)) for c in calibrations)
         raise SessionError(f"{session.path} holds no captures of {wanted}", "Check the result's session.")
@@ -223,15 +212,11 @@ def with_lenses_of(rig: Rig, profile: Rig | None) -> tuple[Rig, tuple[Finding, .
     return rig.model_copy(update={"cameras": cameras}), (OTHER_PROFILE(keys=", ".join(changed)),)
 
 
-def _with_boards(rig: Rig, detections: Detections, check: SessionCheck, clocks: Clocks) -> SessionCheck:
+def _with_boards(rig: Rig, detections: Detections, check: SessionCheck) -> SessionCheck:
     """Add what boards say of the six axes together: residuals hide a rotation that a translation undoes."""
-    pair = check.pair
-    images, scans = {}, {}
-    for name in detections.captures(pair):
-        image, scan = detections.of(pair, name)
-        if isinstance(image, ImageBoard) and isinstance(scan, list):
-            images[name], scans[name] = image, scan
-    board = watch_boards(rig, check.calibration, pair.channel, images, scans, clocks)
+    pair, key = check.pair, (check.pair.camera, check.pair.channel)
+    alone = Detections({key: detections.images[key]}, {pair.lidar: detections.lidars[pair.lidar]})
+    board = watch_boards(rig, check.calibration, pair.channel, alone)
     if board is None or not board.joint.is_changed:
         return check
     return replace(check, findings=(board.joint.finding, *check.findings))

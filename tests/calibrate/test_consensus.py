@@ -76,7 +76,6 @@ def test_the_second_pose_is_taken_where_the_picture_chose_the_wrong_one():
             T_cam_board=item.image.T_cam_board_alternative,
             T_cam_board_alternative=item.image.T_cam_board,
             chi2_gap=2.0,
-            is_ambiguous=True,
         )
         swapped.append(replace(item, image=image))
     consensus = find_consensus(swapped + captures[4:], BOARD)

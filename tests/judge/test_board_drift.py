@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from lce_rig.calibrate import Clocks
 from lce_rig.core.calibration import Calibration, Metrics
 from lce_rig.core.geometry import Array, perturb
+from lce_rig.detect.detection import Detections
 from lce_rig.judge.board_drift import BoardDrift, JointDrift, watch_boards
 from lce_rig.pipeline.pair_drift import PairDrift
 from lce_rig.rig import load_rig
@@ -26,7 +26,12 @@ def watched(calibration: Calibration, seed: int) -> BoardDrift:
     boards = simulate(15, seed, Scenario(laser_bias_sigma_m=0.008, footprint_m=0.006))
     images = {board.capture: board.image for board in boards}
     scans = {board.capture: [board.lidar] for board in boards}
-    found = watch_boards(RIG, calibration, "frames", images, scans, Clocks())
+    found = watch_boards(
+        RIG,
+        calibration,
+        "frames",
+        Detections({(calibration.camera, "frames"): images}, {calibration.lidar: scans}),
+    )
     assert found is not None
     return found
 

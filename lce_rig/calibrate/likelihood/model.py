@@ -113,7 +113,7 @@ def _of_returns(terms: Terms, levels: Levels) -> Iterator[Products]:
 def _of_ends(terms: Terms, levels: Levels) -> Iterator[Products]:
     """Weight the ring ends, by capture and ring."""
     group, products = edge_products(terms.edges, levels.edge_rad, levels.backed_rad, levels.lost_share)
-    capture, ring = np.divmod(group, terms.edges.n_rings)
+    capture, ring = np.divmod(group, terms.state.layout.n_rings)
     yield Products(capture, _ring_places(END, terms.state.layout)[ring], products, np.zeros(len(group)))
 
 

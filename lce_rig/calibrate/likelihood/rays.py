@@ -275,26 +275,18 @@ class EdgeRows:
     """Equation (2) for M ring ends, linear in the unknowns; ordered by capture and ring.
 
     Attributes:
-        capture, ring: (M,).
+        group: (M,) index of each end's pair of capture and ring, of F L in all; ascending.
         rows: (M, 25) in columns of `END`, e in m.
         step_m: (M,) D.
         range_m: (M,) to the board.
         is_backed: (M,) whether the background's echo blends into the board's.
-        n_rings: L.
     """
 
-    capture: Indices
-    ring: Indices
+    group: Indices
     rows: Array
     step_m: Array
     range_m: Array
     is_backed: NDArray[np.bool_]
-    n_rings: int
-
-    @property
-    def group(self) -> Indices:
-        """Index (M,) of each end's pair of capture and ring, ascending."""
-        return self.capture * self.n_rings + self.ring
 
     def blur_m(self, edge_rad: float, backed_rad: float) -> Array:
         """Blur (M,) of each interval's ends, by `Levels`."""
@@ -343,4 +335,5 @@ def edge_rows(scans: StackedScans, board: Board, state: State) -> EdgeRows:
     rows[:, -1] = inside_m + rows[:, END.of(["shifts"])] @ state.shifts - step_m / 2
     rows[:, -1] += by_shifts[:, 0] * state.own_shift_m[scans.end_capture]
     is_backed = scans.end_background[:, BLENDS] > 0
-    return EdgeRows(scans.end_capture, scans.end_ring, rows, step_m, range_m, is_backed, len(scans.rings))
+    group = scans.end_capture * len(scans.rings) + scans.end_ring
+    return EdgeRows(group, rows, step_m, range_m, is_backed)

@@ -36,8 +36,6 @@ STANDARD = QualitySettings()
 NOT_SEEN_AT_ONCE = IMAGE_NOT_AT_FIRST_SIGHT.refusal()
 """Of a search that was not thorough."""
 
-# The alternative pose is as good as the first where the difference of the costs could be noise (3 sigma).
-_AMBIGUOUS_CHI2 = 9.0
 # A part of the image may be missing at its end (a cut-off readout); a larger difference is another mode.
 _CUT_FRACTION = 0.02
 # A canvas is larger than the sensor by as much at most; to look at more than that takes memory.
@@ -140,7 +138,6 @@ def board_from_pose(corners_px: Array, solved: PlanarPose, quality: ImageQuality
         cov=solved.cov,
         T_cam_board_alternative=solved.T_cam_board_alternative,
         chi2_gap=solved.chi2_gap,
-        is_ambiguous=solved.chi2_gap < _AMBIGUOUS_CHI2,
         reprojection_px=solved.reprojection_px,
         sigma_px=solved.sigma_px,
         quality=quality,
