@@ -92,9 +92,9 @@ def scene_texts(opinion: SceneOpinion) -> list[str]:
     texts += [
         f"{motion_words(axis.axis)}: {show.amount(axis.change, axis.unit, '+')} +- "
         f"{show.amount(axis.sigma, axis.unit)} {_UNITS[axis.unit]}"
-        for axis in opinion.of("contradicts")
+        for axis in opinion.of("changed")
     ]
-    smallest = {axis.axis: show.amount(axis.smallest, axis.unit) for axis in opinion.of("agrees")}
+    smallest = {axis.axis: show.amount(axis.smallest, axis.unit) for axis in opinion.of("unchanged")}
     texts += [f"would see changes {kind}" for kind in show.axes_by_kind(smallest)]
     if opinion.state != "unknown" and opinion.of("unknown"):
         blind = show.axes_by_kind({axis.axis: "" for axis in opinion.of("unknown")})

@@ -11,7 +11,7 @@ import click
 
 from lce_rig.cli import show
 from lce_rig.cli.options import FiniteRange, explain_option, json_option, path_option
-from lce_rig.core.calibration import ResultFile, read_result
+from lce_rig.core.calibration import AxisDrift, ResultFile, State, read_result
 from lce_rig.core.errors import LceRigError, NotEnoughDataError, ResultRefusedError, UsageError
 from lce_rig.core.interrupts import patience
 from lce_rig.core.phrasing import as_line
@@ -21,7 +21,6 @@ from lce_rig.pipeline.verification import profile_behind
 from lce_rig.pipeline.watch_drift import drift as watch_drift
 from lce_rig.pipeline.watch_drift import drift_live
 from lce_rig.rig import Rig, load_rig
-from lce_rig.scene.drift import AxisDrift, State
 from lce_rig.scene.findings import STATES
 from lce_rig.show.screen.keys import controls
 
@@ -188,7 +187,7 @@ def _table(pair: PairDrift) -> Any:
     headings = [heading for name in opinions for heading in (f">{name}:\nbest fit at", ">would\nhave seen")]
     rows = []
     for index, axis in enumerate(pair.drift.axes):
-        name = f"about {axis.axis[-1]}, deg" if axis.is_rotation else f"along {axis.axis[-1]}, mm"
+        name = f"about {axis.axis[-1]}, deg" if axis.unit == "deg" else f"along {axis.axis[-1]}, mm"
         state = pair.states[axis.axis]
         colour = "none" if state == "unchanged" else _COLOURS[state]
         figures = [text for axes in opinions.values() for text in _figures(axes[index] if axes else None)]

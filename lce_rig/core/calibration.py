@@ -84,6 +84,8 @@ Number = Annotated[float, Field(ge=-_MOST, le=_MOST), _OR_NAN, _NULL]
 """null in the file where it is not known."""
 Size = Annotated[float, Field(ge=0, le=_MOST), _OR_NAN, _NULL]
 """A number that is not negative."""
+Distance = Annotated[float, Field(ge=0, le=_MOST), _OR_INF, _NULL]
+"""A size that may be infinite; null in the file."""
 Count = Annotated[int, Field(ge=0)]
 StoredFinding = Annotated[Finding, BeforeValidator(_record), PlainSerializer(Finding.as_json)]
 StoredRefusal = Annotated[Refusal, BeforeValidator(_record), PlainSerializer(Refusal.as_json)]
@@ -106,7 +108,7 @@ class Certificate:
     """
 
     is_optimal: bool
-    gap: Annotated[float, Field(ge=0, le=_MOST), _OR_INF, _NULL]
+    gap: Distance
 
 
 @dataclass(frozen=True)
@@ -338,28 +340,47 @@ class SceneShare:
     n_directions: Count
 
 
-OpinionState = Literal["agrees", "contradicts", "unknown"]
+State = Literal["unchanged", "changed", "unknown"]
 
 
 @dataclass(frozen=True)
-class AxisOpinion:
-    """What the scene says about one axis, the others as estimated.
+class AxisDrift:
+    """What a scene or boards say about extrinsics along one axis, the others unchanged.
+
+    result.json keeps all but the last two attributes.
 
     Attributes:
         axis: "translation_x" to "rotation_z", axes of the camera.
-        state: "unknown" where the scene cannot tell.
-        unit: of the figures.
-        change: from the extrinsics to where the scene's edges fit best.
+        state: "unknown" where they cannot tell.
+        change: from the extrinsics to those that fit best, m or deg.
         sigma: standard deviation of `change`, that of the extrinsics included.
-        smallest: the smallest change that would contradict in 95 % of trials; None if none within reach.
+        smallest: the smallest change that would be seen in 95 % of trials; infinite if none within reach.
+        reason: why they cannot tell, the code of a finding; "" otherwise.
+        instead: axes of which one might have changed in place of this one, since it explains nearly as much.
     """
 
     axis: str
-    state: OpinionState
-    unit: Literal["deg", "m"]
+    state: State
     change: Number
-    sigma: Size
-    smallest: Size | None
+    sigma: Distance
+    smallest: Distance
+    reason: Annotated[str, _ANY, _IN_MEMORY] = ""
+    instead: Annotated[tuple[str, ...], _ANY, _IN_MEMORY] = ()
+
+    @property
+    def unit(self) -> Literal["deg", "m"]:
+        """Of the figures."""
+        return "deg" if self.axis.startswith("rotation") else "m"
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """The figures by their names with the unit, as findings hold them."""
+        return {f"{name}_{self.unit}": getattr(self, name) for name in ("change", "sigma", "smallest")}
+
+    def document(self) -> dict[str, Any]:
+        """List everything as plain types for JSON; figures that are not finite are null."""
+        finite = {name: value if math.isfinite(value) else None for name, value in self.figures.items()}
+        return {"axis": self.axis, "state": self.state, **finite, "instead": list(self.instead)}
 
 
 @dataclass(frozen=True)
@@ -374,22 +395,22 @@ class SceneOpinion:
 
     n_captures: Count
     n_edges: Count
-    axes: tuple[AxisOpinion, ...] = ()
+    axes: tuple[AxisDrift, ...] = ()
 
     @property
-    def state(self) -> OpinionState:
-        """Contradicts if any axis does; agrees if at least one is known and none contradicts."""
+    def state(self) -> Literal["agrees", "contradicts", "unknown"]:
+        """Contradicts if any axis changed; agrees if at least one is known and none changed."""
         states = {axis.state for axis in self.axes}
-        return "contradicts" if "contradicts" in states else "agrees" if "agrees" in states else "unknown"
+        return "contradicts" if "changed" in states else "agrees" if "unchanged" in states else "unknown"
 
-    def of(self, state: OpinionState) -> tuple[AxisOpinion, ...]:
+    def of(self, state: State) -> tuple[AxisDrift, ...]:
         """List the axes of a state."""
         return tuple(axis for axis in self.axes if axis.state == state)
 
     @property
-    def strongest(self) -> AxisOpinion | None:
+    def strongest(self) -> AxisDrift | None:
         """The axis that contradicts by most standard deviations; None if none does."""
-        return max(self.of("contradicts"), key=lambda axis: abs(axis.change) / axis.sigma, default=None)
+        return max(self.of("changed"), key=lambda axis: abs(axis.change) / axis.sigma, default=None)
 
 
 @dataclass(frozen=True, eq=False)

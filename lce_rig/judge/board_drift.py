@@ -12,7 +12,7 @@ import numpy as np
 from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter
 from lce_rig.calibrate.result import capture_residual, lever_arm, summarise
 from lce_rig.core.board import Board
-from lce_rig.core.calibration import Calibration, Metrics
+from lce_rig.core.calibration import MOTIONS, AxisDrift, Calibration, Metrics, State
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import Array, perturb, tangent_sizes
 from lce_rig.core.results import Observation
@@ -20,11 +20,11 @@ from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.local_quadratic import OF_PROFILE, expand
 from lce_rig.judge.session_check import find_meetings, seen_by_own_lens
 from lce_rig.rig import LidarSettings, Rig
-from lce_rig.scene.alignment import AXES, IS_ROTATION
-from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS, AxisDrift, State
+from lce_rig.scene.alignment import IS_ROTATION
+from lce_rig.scene.drift import LARGEST, POWER_SIGMAS, THRESHOLD_SIGMAS
 from lce_rig.scene.findings import BOARD_CHANGED, BOARD_CHANGED_JOINTLY, BOARD_HIDES, BOARD_UNSURE
 
-# What results of one rig differ by from session to session, m and rad, order of AXES.
+# What results of one rig differ by from session to session, m and rad, order of MOTIONS.
 _BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.12, 0.10, 0.12])])
 # Without rings, outlines grow by the beam differently on each side, and squares whose ranges differ tilt
 # the plane: boards of a recorded Avia disagree with their own result by 25 mm and 0.7 deg.
@@ -67,7 +67,7 @@ class JointDrift:
         if not self.is_changed:
             return ()
         sizes = np.abs(self.change) / np.sqrt(np.diag(self.cov))
-        return tuple(np.array(AXES)[sizes >= min(_NAMED_SIGMAS, sizes.max())].tolist())
+        return tuple(np.array(MOTIONS)[sizes >= min(_NAMED_SIGMAS, sizes.max())].tolist())
 
     @property
     def finding(self) -> Finding:
@@ -87,7 +87,7 @@ class JointDrift:
         size = np.sqrt(_CHANGED_CHI2) + POWER_SIGMAS
         rotation_deg, translation_m = tangent_sizes(size * np.sqrt(values[-1]) * vectors[:, -1] / scale)
         weights = np.abs(vectors[:, -1])
-        turn, shift = AXES[3 + int(np.argmax(weights[3:]))], AXES[int(np.argmax(weights[:3]))]
+        turn, shift = MOTIONS[3 + int(np.argmax(weights[3:]))], MOTIONS[int(np.argmax(weights[:3]))]
         return BOARD_HIDES(
             rotation_deg=rotation_deg, translation_m=translation_m, rotation=turn, translation=shift
         )
@@ -98,8 +98,8 @@ class BoardDrift:
     """Deployed extrinsics compared with the boards of some captures.
 
     Attributes:
-        axes: one verdict each, order of AXES, were it the only one that changed besides the one that explains
-            most.
+        axes: one verdict each, order of MOTIONS, were it the only one that changed besides the one that
+            explains most.
         metrics: residuals of the deployed extrinsics, as `verify` has them.
         n_boards: captures in which both sensors see the board.
         n_placements: places at which it was held.
@@ -223,4 +223,4 @@ def _judge(axis: int, cost: Quadratics, sigma_deployed: float) -> AxisDrift:
     elif smallest > LARGEST[axis]:
         state = "unknown"
     reason = "" if state != "unknown" else "scene.board_unsure"
-    return AxisDrift(AXES[axis], state, unit * change, unit * sigma, unit * smallest, reason)
+    return AxisDrift(MOTIONS[axis], state, unit * change, unit * sigma, unit * smallest, reason)

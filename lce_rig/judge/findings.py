@@ -163,13 +163,6 @@ def cause_words(source: str) -> str:
     return f"the contradiction of {_CONTRADICTIONS.get(check, f'{subsets} captures')}"
 
 
-def _size(finding: Finding, name: str, sign: str = "") -> str:
-    """Print a figure that is an angle in deg or a length in m."""
-    if f"{name}_deg" in finding.figures:
-        return f"{finding.figure(f'{name}_deg'):{sign}.2f} deg"
-    return f"{1000 * finding.figure(f'{name}_m'):{sign}.1f} mm"
-
-
 def _correction(q: Mapping[str, Figure]) -> str:
     """State by how much pixels move and the camera turns, where that is significant."""
     parts = [
@@ -240,13 +233,13 @@ def _scale(finding: Finding) -> str:
 
 
 def _largest_cause(finding: Finding) -> str:
-    """Of the standard deviation {total_m} or {total_deg}, {share} is {source}: {sigma_m} or {sigma_deg}."""
+    """Largest cause of the uncertainty {total:size}: {source}, {sigma:size} ({share} of the variance)."""
     what = "translation" if "sigma_m" in finding.figures else "rotation"
-    source, share = cause_words(str(finding.figures["source"])), 100 * finding.figure("share")
-    part, total = _size(finding, "sigma"), _size(finding, "total")
-    return (
-        f"largest cause of the {what}'s uncertainty: {source}, {part.split()[0]} of {total} "
-        f"({share:.0f} % of the variance)"
+    figures = {**finding.figures, "source": cause_words(str(finding.figures["source"])), "what": what}
+    return fill(
+        "largest cause of the {what}'s uncertainty: {source}, {sigma:1size} of {total:1size} "
+        "({share:percent} of the variance)",
+        figures,
     )
 
 
@@ -311,16 +304,6 @@ def _agree(finding: Finding) -> str:
         return f"{apart}, more than their standard deviations predict (chance {finding.figure('p'):.2f})"
     how = "less than" if finding.figures["is_generous"] else "as"
     return f"{apart}, {how} their standard deviations predict"
-
-
-def _scene(finding: Finding) -> str:
-    """The scene contradicts {axis} by {change_deg} or {change_m}; {sigma_deg}, {sigma_m}, {sigmas}.
-
-    In {n_captures} captures, {n_axes} axes contradict.
-    """
-    change, sigma = _size(finding, "change", "+"), _size(finding, "sigma")
-    axis = fill("{axis:motion}", finding.figures)
-    return f"the edges of the scene contradict the extrinsics: {axis} by {change.split()[0]} +- {sigma}"
 
 
 _SCENE_CHANGE = (
@@ -514,7 +497,7 @@ MAY_BE_OFF = Kind(
 )
 SCENE = Kind(
     "verdict.scene",
-    _scene,
+    "the edges of the scene contradict the extrinsics: {axis:motion} by {change:+1size} +- {sigma:1size}",
     f"check intrinsics and board {_LOOK}",
     actions={
         "deployed": f"a sensor may have moved {_LOOK}",

@@ -190,18 +190,7 @@ def scene_findings(opinion: SceneOpinion, calibration: Calibration, action: str 
         action = "times"
     sigmas = abs(worst.change) / worst.sigma
     sizes: dict[str, Any] = {f"change_{worst.unit}": worst.change, f"sigma_{worst.unit}": worst.sigma}
-    n_axes = len(opinion.of("contradicts"))
-    return [
-        SCENE(
-            severity=failing(sigmas > SCENE_FAILS),
-            action=action,
-            axis=worst.axis,
-            sigmas=sigmas,
-            n_captures=opinion.n_captures,
-            n_axes=n_axes,
-            **sizes,
-        )
-    ]
+    return [SCENE(severity=failing(sigmas > SCENE_FAILS), action=action, axis=worst.axis, **sizes)]
 
 
 def share_findings(share: SceneShare) -> list[Finding]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lce_rig.core.calibration import Calibration
+from lce_rig.core.calibration import Calibration, State
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Finding
@@ -19,7 +19,7 @@ from lce_rig.judge.board_drift import BoardDrift, watch_boards
 from lce_rig.rig import Rig
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import evenly
-from lce_rig.scene.drift import Drift, State, overall, watch
+from lce_rig.scene.drift import Drift, overall, watch
 from lce_rig.scene.findings import (
     CHANGED_WITH_BOARD,
     CLOCKS_APART,

@@ -6,33 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from lce_rig.core.calibration import (
-    AxisOpinion,
-    Calibration,
-    OpinionState,
-    SceneOpinion,
-    SceneShare,
-)
+from lce_rig.core.calibration import Calibration, SceneOpinion, SceneShare
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, difference
 from lce_rig.detect.detection import Detections
 from lce_rig.scene.alignment import SceneView
 from lce_rig.scene.depth_edges import evenly
-from lce_rig.scene.drift import State, watch
+from lce_rig.scene.drift import watch
 from lce_rig.scene.estimate import estimate
 from lce_rig.scene.views import MAX_CAPTURES, build_view, without_board, without_movers
 from lce_rig.session import Session
 
 OPINION_CAPTURES = 6
 """More captures of one place add time, mainly for decoding images, and no information."""
-_STATES: dict[State, OpinionState] = {
-    "unchanged": "agrees",
-    "changed": "contradicts",
-    "unknown": "unknown",
-}
-
-
 _KNOWN_SHARE = 0.02  # of the boards' variance that the scene must remove in a direction to have a say in it
 _CHANCE = 0.01  # of a scene that agrees with the boards to be refused
 
@@ -50,20 +37,7 @@ def hear_scene(session: Session, detections: Detections, calibration: Calibratio
     c = calibration
     views = scene_views(session, detections, c, OPINION_CAPTURES)
     drift = watch(without_movers(views), session.rig.lens_of(c), c.T_cam_lidar, c.cov, is_joint=False)
-    if not drift.curves:
-        return SceneOpinion(drift.n_captures, drift.n_edges)
-    axes = tuple(
-        AxisOpinion(
-            axis.axis,
-            _STATES[axis.state],
-            axis.unit,
-            float(axis.change),
-            float(axis.sigma),
-            float(axis.smallest) if np.isfinite(axis.smallest) else None,
-        )
-        for axis in drift.axes
-    )
-    return SceneOpinion(drift.n_captures, drift.n_edges, axes)
+    return SceneOpinion(drift.n_captures, drift.n_edges, drift.axes if drift.curves else ())
 
 
 def scene_views(

@@ -11,8 +11,6 @@ from lce_rig.core.geometry import Array, perturb, skew, transform
 from lce_rig.scene.depth_edges import CHANNELS, DepthEdges
 from lce_rig.scene.edge_field import EdgeField
 
-AXES = ("translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z")
-"""Order of a tangent, axes of the camera."""
 IS_ROTATION = np.array([False, False, False, True, True, True])
 
 _COLUMNS, _ROWS = 8, 3  # parts of the image

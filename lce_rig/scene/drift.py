@@ -2,14 +2,14 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
 
 import numpy as np
 
+from lce_rig.core.calibration import MOTIONS, AxisDrift, Motion, State
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import KINDS, Finding
 from lce_rig.core.geometry import Array, perturb
-from lce_rig.scene.alignment import AXES, IS_ROTATION, Alignment, Curve, SceneView
+from lce_rig.scene.alignment import IS_ROTATION, Alignment, Curve, SceneView
 from lce_rig.scene.estimate import BIAS, estimate
 from lce_rig.scene.findings import (
     AXIS_CHANGED,
@@ -25,14 +25,12 @@ from lce_rig.scene.findings import (
     UNKNOWN,
 )
 
-State = Literal["unchanged", "changed", "unknown"]
-
 # Tuned on rlfs01 (docs/drift.md); the other recordings were only measured.
 THRESHOLD_SIGMAS = 3.0
 POWER_SIGMAS = 1.645
 """At the smallest change, 95 % of the trials exceed the threshold."""
 LARGEST = np.where(IS_ROTATION, np.radians(1.5), 0.10)
-"""A witness that sees only larger changes cannot tell, rad and m, order of AXES."""
+"""A witness that sees only larger changes cannot tell, rad and m, order of MOTIONS."""
 NEARLY = 0.1
 """What scores so much less alone, as a share, may be what changed."""
 _MIN_EDGES = 60
@@ -46,49 +44,6 @@ _GAIN_MARGIN = 0.2  # At the smallest change, the parts agree by so much more.
 _MIN_SIGNIFICANCE = 1.5  # of a peak above the rest of its curve
 
 
-@dataclass(frozen=True)
-class AxisDrift:
-    """What the scene says about one axis, were it the only one that changed besides those reported changed.
-
-    Attributes:
-        axis: "translation_x" to "rotation_z", axes of the camera.
-        state: "unknown" where the scene cannot tell.
-        change: from the deployed extrinsics to the scene's, m or deg.
-        sigma: standard deviation of `change`, the deployed extrinsics' own uncertainty included.
-        smallest: the smallest change that would have been seen in 95 % of trials.
-        reason: why it cannot tell, the code of a finding; "" otherwise.
-        instead: axes of which one might have changed in place of this one, since it explains nearly as much.
-    """
-
-    axis: str
-    state: State
-    change: float
-    sigma: float
-    smallest: float
-    reason: str = ""
-    instead: tuple[str, ...] = ()
-
-    @property
-    def is_rotation(self) -> bool:
-        """Whether the figures are in deg."""
-        return self.axis.startswith("rotation")
-
-    @property
-    def unit(self) -> Literal["deg", "m"]:
-        """Of the figures."""
-        return "deg" if self.is_rotation else "m"
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """The figures by their names with the unit, as findings hold them."""
-        return {f"{name}_{self.unit}": getattr(self, name) for name in ("change", "sigma", "smallest")}
-
-    def document(self) -> dict[str, Any]:
-        """List everything as plain types for JSON; figures that are not finite are null."""
-        finite = {name: value if np.isfinite(value) else None for name, value in self.figures.items()}
-        return {"axis": self.axis, "state": self.state, **finite, "instead": list(self.instead)}
-
-
 def overall(states: Iterable[State]) -> State:
     """Judge all axes: changed if any is; unchanged only if none is unknown."""
     found = set(states)
@@ -100,7 +55,7 @@ class Drift:
     """Deployed extrinsics compared with the edges of a scene.
 
     Attributes:
-        axes: one verdict each, order of AXES; all "unknown" where nothing could be compared.
+        axes: one verdict each, order of MOTIONS; all "unknown" where nothing could be compared.
         findings: the summary first, then one of each axis and what is missing.
         T_cam_lidar: (4, 4) deployed.
         T_best: (4, 4) where all six axes together fit best; the deployed where nothing could be compared.
@@ -114,7 +69,7 @@ class Drift:
     T_cam_lidar: Array
     T_best: Array
     cov_best: Array | None
-    curves: Mapping[str, Curve]
+    curves: Mapping[Motion, Curve]
     n_captures: int
     n_edges: int
 
@@ -166,7 +121,7 @@ def watch(
     n_parts = int(np.count_nonzero(alignment.weight_of_parts)) if n_edges else 0
     if n_edges < _MIN_EDGES * max(len(views), 1) ** 0.5 or n_parts < _MIN_PARTS:
         few = FEW_EDGES(n_edges=n_edges, n_captures=len(views))
-        axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, few.code) for axis in AXES)
+        axes = tuple(AxisDrift(axis, "unknown", 0.0, np.inf, np.inf, few.code) for axis in MOTIONS)
         return Drift(axes, (few, *missing), T_cam_lidar, T_cam_lidar, None, {}, len(views), n_edges)
 
     sigma_deployed = np.sqrt(np.diag(cov))
@@ -187,8 +142,8 @@ def watch(
         else:
             findings.append(KINDS[axis.reason or AXIS_UNCHANGED.code](axis.axis, **axis.figures))
     if cov_best is not None and np.any(is_open := np.sqrt(np.diag(cov_best)) > LARGEST):
-        findings.append(BEST_UNCERTAIN(axes=tuple(np.array(AXES)[is_open].tolist())))
-    by_axis = dict(zip(AXES, curves, strict=True))
+        findings.append(BEST_UNCERTAIN(axes=tuple(np.array(MOTIONS)[is_open].tolist())))
+    by_axis = dict(zip(MOTIONS, curves, strict=True))
     every = (*findings, *missing)
     return Drift(axes, every, T_cam_lidar, T_best, cov_best, by_axis, len(views), n_edges)
 
@@ -209,7 +164,7 @@ def _decide(
             break
         axis = max(moved, key=lambda each: curves[each].total.max())
         least = (1 - NEARLY) * curves[axis].total.max()
-        instead = tuple(AXES[each] for each in moved if each != axis and curves[each].total.max() > least)
+        instead = tuple(MOTIONS[each] for each in moved if each != axis and curves[each].total.max() > least)
         tangent[axis] += curves[axis].peak
         changed[axis] = replace(verdicts[axis], instead=instead)
         curves = [alignment.curve(each, tangent) for each in range(6)]
@@ -240,4 +195,4 @@ def _judge(axis: int, curve: Curve, sigma_deployed: float, alignment: Alignment)
         reason = LARGE_SCATTER.code
     state: State = "changed" if is_changed else "unknown" if reason else "unchanged"
     figures = (unit * peak, unit * sigma, unit * smallest)
-    return AxisDrift(AXES[axis], state, *figures, "" if is_changed else reason)
+    return AxisDrift(MOTIONS[axis], state, *figures, "" if is_changed else reason)

@@ -12,7 +12,7 @@ from lce_rig.core.geometry import Array, difference, perturb
 from lce_rig.scene.alignment import BESIDE_RAD, IS_ROTATION, Alignment, SceneView
 
 BIAS = np.array([0.005, 0.005, 0.010, *np.radians([0.10, 0.05, 0.15])])
-"""What one scene's maximum is off by beyond the scatter of its parts (standard deviations, order of AXES)."""
+"""What one scene's maximum is off by beyond the scatter of its parts: sigmas in the order of MOTIONS."""
 
 _UNIT = np.where(IS_ROTATION, np.radians(1.0), 0.03)  # Either moves an edge 2 m away by about as much.
 _ANYWHERE = np.where(IS_ROTATION, np.radians(3.0), 0.15)  # of extrinsics of which nothing else is known
@@ -38,7 +38,7 @@ class SceneEstimate:
 
     Attributes:
         T_cam_lidar: (4, 4).
-        cov: (6, 6) of the tangent (translation m, rotation rad), axes of the camera, order of AXES. In
+        cov: (6, 6) of the tangent (translation m, rotation rad), axes of the camera, order of MOTIONS. In
             directions that the scene does not show it is the prior's.
         information: (6, 6) what the scene alone knows, its bias included: the inverse of a covariance,
             singular where it shows nothing.

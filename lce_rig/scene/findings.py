@@ -1,65 +1,31 @@
 """Kinds of findings of a scene's edges, and of boards in view, on deployed extrinsics."""
 
+import math
+
 from lce_rig.core.findings import Finding, Kind
 from lce_rig.core.phrasing import fill
 
 _BOARD = "collect a session with the board and calibrate it"
 _FASTEN = f"fasten the sensors, {_BOARD}"
+_UNSEEN = "changes below {smallest:size} would not be seen"
 _RECORD = "record furniture, doors or people that stand before something farther off"
 
 STATES = {"unchanged": "no change seen", "changed": "changed", "unknown": "cannot tell"}
 """Words for the state of an axis."""
 
 
-def _size(finding: Finding, name: str, sign: str = "") -> str:
-    """Print a figure that is an angle in deg or a length in m."""
-    if f"{name}_deg" in finding.figures:
-        return f"{finding.figure(f'{name}_deg'):{sign}.2f} deg"
-    return f"{1000 * finding.figure(f'{name}_m'):{sign}.0f} mm"
-
-
-def _board_changed(finding: Finding) -> str:
-    """Changed by {change_m} or {change_deg} +- {sigma_m} or {sigma_deg}; {smallest_m}."""
-    axis = fill("{subject:motion}", {"subject": finding.subject})
-    return f"board, {axis}: changed by {_size(finding, 'change', '+')} +- {_size(finding, 'sigma')}"
-
-
-def _board_unsure(finding: Finding) -> str:
-    """Changes below {smallest_m} or {smallest_deg} would not be seen; {change_m}, {sigma_m}."""
-    axis = fill("{subject:motion}", {"subject": finding.subject})
-    return f"board, {axis}: changes below {_size(finding, 'smallest')} would not be seen"
-
-
-def _contradiction(finding: Finding) -> str:
-    """Scene {change_deg} or {change_m} +- {sigma_deg}, {sigma_m}, boards {board_deg}, {board_sigma_deg}.
-
-    Or {board_m}, {board_sigma_m}.
-    """
-    axis = fill("{subject:motion}", {"subject": finding.subject})
-    scene = f"{_size(finding, 'change', '+')} +- {_size(finding, 'sigma')}"
-    board = f"{_size(finding, 'board', '+')} +- {_size(finding, 'board_sigma')}"
-    return f"scene and boards contradict each other, {axis}: scene {scene}, boards {board}"
-
-
-def _axis_unchanged(finding: Finding) -> str:
-    """No change of {smallest_m} or {smallest_deg}; {change_m}, {change_deg}, {sigma_m}, {sigma_deg}."""
-    axis = fill("{subject:motion}", {"subject": finding.subject})
-    return f"scene, {axis}: no change of {_size(finding, 'smallest')} or more"
-
-
 def _axis_changed(finding: Finding) -> str:
-    """Changed by {change_m} or {change_deg} +- {sigma_m} or {sigma_deg}; {smallest_m}, {instead}."""
-    change = f"{_size(finding, 'change', '+')} +- {_size(finding, 'sigma')}"
-    instead = fill(", or instead: {instead:motion}", finding.figures) if finding.figures["instead"] else ""
-    return fill("scene, {subject:motion}", {"subject": finding.subject}) + f": changed by {change}{instead}"
+    """Scene, {subject}: changed by {change:size} +- {sigma:size}, or instead: {instead}; {smallest:size}."""
+    instead = ", or instead: {instead:motion}" if finding.figures["instead"] else ""
+    text = "scene, {subject:motion}: changed by {change:+size} +- {sigma:size}" + instead
+    return fill(text, {"subject": finding.subject, **finding.figures})
 
 
 def _large_scatter(finding: Finding) -> str:
-    """Parts of the scene disagree; {smallest_m} or {smallest_deg} would be seen."""
-    axis, smallest = fill("scene, {subject:motion}", {"subject": finding.subject}), _size(finding, "smallest")
-    if "inf" in smallest:
-        return f"{axis}: parts of the scene do not agree on any change"
-    return f"{axis}: changes below {smallest} would not be seen"
+    """Scene, {subject}: changes below {smallest:size} would not be seen; {change:size}, {sigma:size}."""
+    is_blind = math.inf in (finding.figures.get("smallest_m"), finding.figures.get("smallest_deg"))
+    text = "parts of the scene do not agree on any change" if is_blind else _UNSEEN
+    return fill(f"scene, {{subject:motion}}: {text}", {"subject": finding.subject, **finding.figures})
 
 
 UNCHANGED = Kind(
@@ -91,7 +57,9 @@ UNKNOWN_WITH_BOARD = Kind(
     _RECORD,
     severity="warning",
 )
-BOARD_CHANGED = Kind("scene.board_changed", _board_changed)
+BOARD_CHANGED = Kind(
+    "scene.board_changed", "board, {subject:motion}: changed by {change:+size} +- {sigma:size}"
+)
 BOARD_CHANGED_JOINTLY = Kind(
     "scene.board_changed_jointly",
     "boards: all axes together changed by {rotation_deg:deg}, {translation_m:mm}, {sigmas:.1f} standard "
@@ -104,10 +72,16 @@ BOARD_HIDES = Kind(
     "or less, would not be seen",
     severity="note",
 )
-BOARD_UNSURE = Kind("scene.board_unsure", _board_unsure, "hold the board at more places", severity="note")
+BOARD_UNSURE = Kind(
+    "scene.board_unsure",
+    "board, {subject:motion}: " + _UNSEEN,
+    "hold the board at more places",
+    severity="note",
+)
 CONTRADICTION = Kind(
     "scene.contradiction",
-    _contradiction,
+    "scene and boards contradict each other, {subject:motion}: scene {change:+size} +- {sigma:size}, "
+    "boards {board:+size} +- {board_sigma:size}",
     "check clocks and intrinsics, and collect a session with the board",
     severity="warning",
 )
@@ -147,7 +121,9 @@ BEST_UNCERTAIN = Kind(
     _BOARD,
     severity="warning",
 )
-AXIS_UNCHANGED = Kind("scene.axis_unchanged", _axis_unchanged, severity="note")
+AXIS_UNCHANGED = Kind(
+    "scene.axis_unchanged", "scene, {subject:motion}: no change of {smallest:size} or more", severity="note"
+)
 AXIS_CHANGED = Kind("scene.axis_changed", _axis_changed)
 LARGE_SCATTER = Kind(
     "scene.large_scatter", _large_scatter, "record more places or more upright edges", severity="warning"

@@ -12,7 +12,7 @@ import lce_rig as lce
 from benchmarks.recordings import SETS, RecordedSet
 from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import print_head, print_row
-from lce_rig.core.calibration import Calibration, ResultFile
+from lce_rig.core.calibration import MOTIONS, Calibration, ResultFile
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.geometry import Array, difference, perturb
@@ -20,7 +20,7 @@ from lce_rig.detect.finder import BoardFinder
 from lce_rig.pipeline.pair_drift import PairDrift, Seen
 from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.rig import Rig
-from lce_rig.scene.alignment import AXES, IS_ROTATION, SceneView
+from lce_rig.scene.alignment import IS_ROTATION, SceneView
 from lce_rig.scene.depth_edges import leave_standing
 from lce_rig.scene.drift import Drift, watch
 from lce_rig.scene.views import build_view, without_board
@@ -179,7 +179,7 @@ def _print_changed(every: dict[str, list["_Part"]]) -> None:
     )  # fmt: skip
     for name, parts in every.items():
         before = [own.judge(views, np.zeros(6)) for own, views in parts]
-        for axis, label in enumerate(AXES):
+        for axis, label in enumerate(MOTIONS):
             tally: Counter[str] = Counter()
             smallest = [drift.axes[axis].smallest for drift in before]
             for (own, views), drift in zip(parts, before, strict=True):
@@ -219,7 +219,7 @@ def _outcome(drift: Drift, axis: int, size: float) -> list[str]:
         named = {
             name for each in drift.axes if each.state == "changed" for name in (each.axis, *each.instead)
         }
-        return ["seen", "right"] if AXES[axis] in named else ["seen"]
+        return ["seen", "right"] if MOTIONS[axis] in named else ["seen"]
     if drift.state == "unknown":
         return ["unknown"]
     return ["below" if size < verdict.smallest else "false"]
@@ -319,8 +319,8 @@ def _print_beside(watched: dict[str, _Watched], parts: dict[str, list[_Part]]) -
                     board = () if pair.board is None else pair.board.axes
                     tally["board"] += bool(board) and all(each.state == "unchanged" for each in board)
                     smallest += [[each.smallest for each in board]] if board else []
-                    tally["axis"] += axis is not None and pair.states[AXES[axis]] == "changed"
-            size = "nothing" if axis is None else f"{AXES[axis]} {_SIZES[0][axis] * _UNIT[axis]:g}"
+                    tally["axis"] += axis is not None and pair.states[MOTIONS[axis]] == "changed"
+            size = "nothing" if axis is None else f"{MOTIONS[axis]} {_SIZES[0][axis] * _UNIT[axis]:g}"
             n, states = sum(tally[each] for each in _STATES), [tally[each] for each in _STATES[1:]]
             told = _figures(np.median(smallest, axis=0), 3) if smallest else ""
             print_row(source, target, size, n, tally["changed"], tally["axis"], *states, tally["board"], told)

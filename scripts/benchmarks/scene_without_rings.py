@@ -13,11 +13,12 @@ from saved_results import made_calibration, result_file
 from benchmarks.recordings import RIGS, recordings
 from benchmarks.scene_rooms import furnished_room
 from benchmarks.tables import print_head, print_row
+from lce_rig.core.calibration import MOTIONS
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.geometry import Array, exp_so3, perturb, pose
 from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.rig import load_rig
-from lce_rig.scene.alignment import AXES, IS_ROTATION, SceneView
+from lce_rig.scene.alignment import IS_ROTATION, SceneView
 from lce_rig.scene.depth_edges import leave_standing
 from lce_rig.scene.drift import watch
 from lce_rig.scene.views import build_view
@@ -79,7 +80,7 @@ def _print_axes(name: str, groups: Sequence[_Group], sizes: Array) -> None:
     for axis, size in enumerate(sizes):
         label = f"{np.degrees(size):g} deg" if IS_ROTATION[axis] else f"{1000 * size:g} mm"
         tangents = [sign * size * np.eye(6)[axis] for sign in (-1, 1)]
-        print_row(f"{AXES[axis]} {label}", *_judged(groups, tangents, AXES[axis]))
+        print_row(f"{MOTIONS[axis]} {label}", *_judged(groups, tangents, MOTIONS[axis]))
 
 
 def _print_random(n_views: int, views: Sequence[SceneView], lens: Intrinsics, T: Array) -> None:

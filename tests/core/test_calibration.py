@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lce_rig.core.calibration import (
-    AxisOpinion,
+    AxisDrift,
     Certificate,
     ChannelResult,
     Contribution,
@@ -68,7 +68,7 @@ def full():
         cov_shared=0.1 * cov,
         contributions=(Contribution("captures", 0.1, 0.01), Contribution("lidar_ranges", np.nan, 0.01)),
         scene_share=SceneShare("used", 2, 50, T, cov, T, 2 * cov, np.arange(6.0), np.ones(6), 3.0, 4),
-        scene=SceneOpinion(2, 70, (AxisOpinion("rotation_x", "agrees", "deg", -0.1, 0.2, None),)),
+        scene=SceneOpinion(2, 70, (AxisDrift("rotation_x", "unchanged", -0.1, 0.2, np.inf),)),
         board_distances_m=(1.5, 3.25),
     )
 

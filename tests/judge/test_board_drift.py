@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import Calibration, Metrics
+from lce_rig.core.calibration import MOTIONS, AxisDrift, Calibration, Metrics, State
 from lce_rig.core.geometry import Array, perturb
 from lce_rig.detect.detection import Detections
 from lce_rig.judge.board_drift import BoardDrift, JointDrift, watch_boards
 from lce_rig.pipeline.pair_drift import PairDrift
 from lce_rig.rig import load_rig
-from lce_rig.scene.alignment import AXES
-from lce_rig.scene.drift import AxisDrift, Drift, State
+from lce_rig.scene.drift import Drift
 from tests.calibrate.boards import T_FORWARD, Scenario, simulate
 from tests.saved_results import made_calibration
 
@@ -55,7 +54,7 @@ def test_extrinsics_that_hold_are_not_doubted_jointly() -> None:
 
 def axes(states: dict[str, tuple[State, float]]) -> tuple[AxisDrift, ...]:
     found = []
-    for axis in AXES:
+    for axis in MOTIONS:
         state, change = states.get(axis, ("unchanged", 0.0))
         found.append(AxisDrift(axis, state, change, 0.16, 0.7))
     return tuple(found)

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lce_rig.core.calibration import MOTIONS
 from lce_rig.core.geometry import difference, perturb
-from lce_rig.scene.alignment import AXES, Alignment
+from lce_rig.scene.alignment import Alignment
 from lce_rig.scene.depth_edges import CHANNELS
 from lce_rig.scene.drift import watch
 from lce_rig.scene.edge_field import build_edge_field
@@ -20,7 +21,7 @@ def judge(seen, tangent=(0.0,) * 6, views=None, is_joint=False):
 
 
 def along(axis, size):
-    return size * np.eye(6)[AXES.index(axis)]
+    return size * np.eye(6)[MOTIONS.index(axis)]
 
 
 def test_the_truth_is_unchanged(seen):
@@ -48,7 +49,7 @@ def test_one_changed_axis_is_seen_with_its_size(seen, axis, size, sign):
     drift = judge(seen, along(axis, sign * size))
     assert drift.state == "changed"
     (found,) = [each for each in drift.axes if each.state == "changed"]
-    injected = np.degrees(size) if found.is_rotation else size
+    injected = np.degrees(size) if found.unit == "deg" else size
     assert axis in (found.axis, *found.instead)
     if found.axis == axis:
         assert found.change == pytest.approx(-sign * injected, abs=3 * found.sigma)
@@ -114,7 +115,7 @@ def test_changes_of_reflectivity_alone_show_pitch_and_yaw(seen):
     ]
     alignment = Alignment(views, lens, seen.truth.T_cam_lidar)
     for axis in ("rotation_x", "rotation_y"):
-        curve = alignment.curve(AXES.index(axis), np.zeros(6))
+        curve = alignment.curve(MOTIONS.index(axis), np.zeros(6))
         assert abs(np.degrees(curve.peak)) < 0.15
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lce_rig.cli.main import run
-from lce_rig.core.calibration import ResultFile, read_result
+from lce_rig.core.calibration import MOTIONS, ResultFile, read_result
 from lce_rig.core.data import Events
 from lce_rig.core.errors import SessionError, SourceError
 from lce_rig.core.geometry import perturb
@@ -21,7 +21,6 @@ from lce_rig.io.network import build_frame
 from lce_rig.io.ros.bag_recorder import BagRecorder
 from lce_rig.pipeline.watch_drift import SceneCaptures, Thinned, drift
 from lce_rig.rig import Rig, dump_rig
-from lce_rig.scene.alignment import AXES
 from lce_rig.session import Session
 from lce_rig.timing.scan_pairing import EventCut, Frame
 from tests.doctor.attached import Attached, attach
@@ -250,7 +249,7 @@ def test_a_board_in_view_has_an_opinion_of_its_own(room, turned):
         (pair,) = drift(room, result).pairs
         assert pair.state == state
         if pair.board is not None:
-            yaw = pair.board.axes[AXES.index("rotation_y")]
+            yaw = pair.board.axes[MOTIONS.index("rotation_y")]
             assert yaw.state == state and yaw.change == pytest.approx(
                 {"unchanged": 0.0, "changed": -2.0}[state], abs=3 * yaw.sigma
             )

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lce_rig.core.calibration import ResultFile
+from lce_rig.core.calibration import MOTIONS, ResultFile
 from lce_rig.core.geometry import perturb
 from lce_rig.pipeline.watch_drift import SceneCaptures
-from lce_rig.scene.alignment import AXES
 from lce_rig.scene.rig_motion import estimate_motion
 from lce_rig.timing.scan_pairing import Frame
 from tests.scene.conftest import deployed, small_rig
@@ -68,7 +67,7 @@ def test_a_drive_with_true_extrinsics_shows_no_change(driven):
     drift = watch_captures(driven)
     assert drift.n_captures == len(driven)
     assert not [f.code for f in drift.findings if f.code in ("scene.clocks_apart", "scene.axis_changed")]
-    yaw, aside = drift.axes[AXES.index("rotation_y")], drift.axes[AXES.index("translation_x")]
+    yaw, aside = drift.axes[MOTIONS.index("rotation_y")], drift.axes[MOTIONS.index("translation_x")]
     assert yaw.state == aside.state == "unchanged"
     assert abs(yaw.change) < 0.12 and abs(aside.change) < 0.012
 
@@ -103,7 +102,7 @@ def test_clocks_are_named_beside_a_change_that_they_explain(straight):
 def test_clocks_are_not_named_where_only_the_extrinsics_explain(driven):
     shifted = perturb(driven[0][0].truth("cam", "lidar"), np.array([0.08, 0, 0, 0, 0, 0]))
     drift = watch_captures(driven, T_cam_lidar=shifted)
-    assert drift.axes[AXES.index("translation_x")].state == "changed"
+    assert drift.axes[MOTIONS.index("translation_x")].state == "changed"
     assert not [f for f in drift.findings if f.code.startswith("scene.clocks")]
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from lce_rig.cli.main import run
+from lce_rig.core.calibration import MOTIONS
 from lce_rig.core.geometry import exp_so3, perturb, pose
 from lce_rig.pipeline.detect_session import detect
 from lce_rig.pipeline.watch_drift import SceneCaptures
 from lce_rig.pipeline.witness import hear_scene
 from lce_rig.rig import load_rig
-from lce_rig.scene.alignment import AXES
 from lce_rig.scene.drift import watch
 from lce_rig.scene.views import build_view
 from lce_rig.session import Session
@@ -44,10 +44,10 @@ def test_the_truth_has_no_change(seen):
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("axis", MOTIONS)
 def test_1_deg_or_10_cm_is_never_called_unchanged(seen, axis, sign):
     size = sign * (np.radians(1.0) if axis.startswith("rotation") else 0.1)
-    drift = judge(seen, size * np.eye(6)[AXES.index(axis)])
+    drift = judge(seen, size * np.eye(6)[MOTIONS.index(axis)])
     assert drift.state != "unchanged"
     if axis in ("rotation_y", "translation_x"):
         (change,) = [each for each in drift.axes if each.state == "changed"]

@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
+from lce_rig.core.calibration import MOTIONS, AxisDrift, State
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.data import Image
 from lce_rig.core.geometry import transform
 from lce_rig.core.phrasing import motion_words
-from lce_rig.scene.alignment import AXES
 from lce_rig.scene.depth_edges import DepthEdges
-from lce_rig.scene.drift import AxisDrift, Drift, State
+from lce_rig.scene.drift import Drift
 from lce_rig.scene.findings import STATES
 from lce_rig.show.overlays import canvas
 from lce_rig.show.overlays.canvas import BLACK, INK, MAGENTA, Picture
@@ -72,10 +72,10 @@ def _draw_curves(drift: Drift, states: Mapping[str, State], board: Sequence[Axis
     # Rotations above translations.
     order = [*range(3, 6), *range(3)]
     for axes, index in zip(grid.ravel(), order, strict=True):
-        verdict, curve = drift.axes[index], drift.curves[AXES[index]]
-        state = states[AXES[index]]
-        unit, scale = ("deg", np.degrees(1.0)) if verdict.is_rotation else ("mm", 1000.0)
-        shown = 1.0 if verdict.is_rotation else 1000.0
+        verdict, curve = drift.axes[index], drift.curves[MOTIONS[index]]
+        state = states[MOTIONS[index]]
+        unit, scale = ("deg", np.degrees(1.0)) if verdict.unit == "deg" else ("mm", 1000.0)
+        shown = 1.0 if verdict.unit == "deg" else 1000.0
         axes.plot(scale * curve.offsets, curve.total, color=_COLOURS[state])
         axes.axvline(0.0, color="black", linewidth=0.8)
         if np.isfinite(verdict.smallest):
@@ -95,7 +95,7 @@ def _draw_curves(drift: Drift, states: Mapping[str, State], board: Sequence[Axis
             )
         axes.set_xlim(scale * curve.offsets[0], scale * curve.offsets[-1])
         by_board = "" if state == verdict.state else " (board)"
-        axes.set_title(f"{motion_words(AXES[index])}: {STATES[state]}{by_board}", fontsize=8)
+        axes.set_title(f"{motion_words(MOTIONS[index])}: {STATES[state]}{by_board}", fontsize=8)
         axes.set_xlabel(unit, fontsize=8)
         axes.tick_params(labelsize=8)
     of_board = "; diamond: by the board, 1 standard deviation" if board else ""

@@ -317,11 +317,11 @@ def _clock_rows(c: Calibration) -> list[Row]:
 
 
 def _scene_rows(c: Calibration) -> list[Row]:
-    states = {"agrees": "agrees", "contradicts": "contradicts", "unknown": "cannot tell"}
+    states = {"unchanged": "agrees", "changed": "contradicts", "unknown": "cannot tell"}
     rows: list[Row] = []
     for axis in () if c.scene is None else c.scene.axes:
         scale, digits, unit = (1.0, 2, "deg") if axis.unit == "deg" else (1000.0, 0, "mm")
-        smallest = "none" if axis.smallest is None else f"{scale * axis.smallest:.{digits}f} {unit}"
+        smallest = "none" if math.isinf(axis.smallest) else f"{scale * axis.smallest:.{digits}f} {unit}"
         change = f"{scale * axis.change:+.{digits}f} ± {scale * axis.sigma:.{digits}f} {unit}"
         kind = "about" if axis.unit == "deg" else "along"
         rows.append((f"{kind} {_AXES[axis.axis[-1]]}", states[axis.state], change, smallest))
