@@ -39,7 +39,16 @@ from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_pa
 from lce_rig.calibrate.uncertainty import widen
 from lce_rig.core.board import Board
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.geometry import Array, difference, exp_so3, perturb, pose, rotation_angle, skew
+from lce_rig.core.geometry import (
+    Array,
+    composition_slopes,
+    difference,
+    exp_so3,
+    perturb,
+    pose,
+    rotation_angle,
+    skew,
+)
 from lce_rig.core.results import LidarBoard, Observation
 
 # Plates whose sides differ by less than this share look the same turned by 90 deg.
@@ -241,11 +250,9 @@ def close_loops(edges: Mapping[tuple[str, str], tuple[Array, Array]]) -> dict[tu
         A, r = np.zeros((6 * len(loops), len(C))), np.zeros(6 * len(loops))
         for k, (ab, bc, ac) in enumerate(loops):
             rows = slice(6 * k, 6 * k + 6)
-            R, t = poses[ab][:3, :3], poses[bc][:3, 3]
             r[rows] = difference(poses[ab] @ poses[bc], poses[ac])
-            by_first = np.eye(6)
-            by_first[:3, 3:] = -skew(R @ t)
-            for name, J in ((ab, by_first), (bc, np.kron(np.eye(2), R)), (ac, -np.eye(6))):
+            slopes = (*composition_slopes(poses[ab], poses[bc]), -np.eye(6))
+            for name, J in zip((ab, bc, ac), slopes, strict=True):
                 place = 6 * names.index(name)
                 A[rows, place : place + 6] += J
         # The linearised conditions hold for the distance from the estimates, not from the last step.

@@ -33,7 +33,7 @@ from lce_rig.calibrate.uncertainty import by_likelihood, by_scatter, with_profil
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import ChannelResult
 from lce_rig.core.errors import NotEnoughDataError
-from lce_rig.core.geometry import Array, difference
+from lce_rig.core.geometry import Array, PoseDifference, difference
 from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import Observation
 
@@ -102,15 +102,13 @@ def estimate_extrinsics(
             )
         channels.append(result)
     begin(progress, "difference of the channels")
-    apart, cov = _difference(motion, tuple(by_channel.values()), board, settings.seed)
     return replace(
         estimate,
         cov=motion.widened(estimate.cov),
         refused={**conflicts, **estimate.refused},
         same_scan={scan.capture: scan.captures for scan in scans if len(scan.captures) > 1},
         channels=tuple(channels),
-        channel_difference=apart,
-        channel_difference_cov=cov,
+        channel_difference=_difference(motion, tuple(by_channel.values()), board, settings.seed),
     )
 
 
@@ -213,8 +211,8 @@ def depth_scatter_m(T_cam_lidar: Array, observations: Sequence[Observation]) -> 
 
 def _difference(
     motion: Motion, by_channel: Sequence[Sequence[Observation]], board: Board, seed: int
-) -> tuple[Array | None, Array | None]:
-    """Compare two channels' extrinsics: the tangent (6,) between them and its covariance.
+) -> PoseDifference | None:
+    """Compare two channels' extrinsics.
 
     If only the two channels together show how boards moved, each pose depends on both; then one channel's
     extrinsic from half of the scans is compared with the other's from the other half, and of several ways to
@@ -227,13 +225,13 @@ def _difference(
         seed: of the shares.
     """
     if len(by_channel) != 2:
-        return None, None
+        return None
     if motion.is_seen_by_each:
         first, second = (solve(observations, board) for observations in by_channel)
         covs = [motion.widened(each.cost.jackknife_covariance()[:6, :6]) for each in (first, second)]
-        return difference(first.T_cam_lidar, second.T_cam_lidar), covs[0] + covs[1]
+        return PoseDifference(difference(first.T_cam_lidar, second.T_cam_lidar), covs[0] + covs[1])
     rng = np.random.default_rng(seed)
-    ways: list[tuple[float, Array, Array]] = []
+    ways: list[PoseDifference] = []
     for _ in range(_N_SHARES):
         mine = set(rng.permutation(len(motion.scans))[: len(motion.scans) // 2].tolist())
         names = {motion.scans[k].capture for k in mine}
@@ -246,7 +244,5 @@ def _difference(
             continue  # This split of few scans leaves a direction undetermined; others may not.
         apart = difference(halves[0].T_cam_lidar, halves[1].T_cam_lidar)
         cov = sum(half.cost.jackknife_covariance()[:6, :6] for half in halves)
-        ways.append((float(apart @ np.linalg.solve(cov, apart)), apart, np.asarray(cov)))
-    if not ways:
-        return None, None
-    return sorted(ways, key=lambda way: way[0])[len(ways) // 2][1:]
+        ways.append(PoseDifference(apart, np.asarray(cov)))
+    return sorted(ways, key=lambda way: way.chi2)[len(ways) // 2] if ways else None

@@ -15,7 +15,7 @@ from lce_rig.calibrate.tolerances import Sensitivity
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import CaptureResidual, Certificate, ChannelResult, Diagnostics, Metrics
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, rotation_angle, sigma_sizes
+from lce_rig.core.geometry import Array, PoseDifference, rotation_angle, sigma_sizes
 from lce_rig.core.results import Observation
 
 
@@ -69,8 +69,7 @@ class CalibrationEstimate:
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
         channels: the result of each channel of the camera alone; empty if they were not separated.
-        channel_difference: (6,) tangent between the extrinsics of two channels; None with one channel.
-        channel_difference_cov: (6, 6) of it.
+        channel_difference: of the extrinsics of two channels; None with one channel.
     """
 
     T_cam_lidar: Array
@@ -90,8 +89,7 @@ class CalibrationEstimate:
     estimated_with: tuple[str, ...] = ()
     same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     channels: tuple[ChannelResult, ...] = ()
-    channel_difference: Array | None = None
-    channel_difference_cov: Array | None = None
+    channel_difference: PoseDifference | None = None
 
     @property
     def cov_with_lens(self) -> Array:

@@ -6,6 +6,7 @@ ROS PoseWithCovariance. Every function takes leading batch axes.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ Array = NDArray[np.float64]
 FARTHEST_M = 1e6
 """No pose of a rig is so far from another."""
 _STEPS, _SETTLED = 20, 1e-10
+# 99 % of the chi-squared distribution with six degrees of freedom.
+_SURPRISING_CHI2 = 16.81
 
 
 def skew(v: Array) -> Array:
@@ -185,6 +188,42 @@ def largest_sizes(cov: Array) -> tuple[float, float]:
     return float(np.degrees(sizes[0])), float(sizes[1])
 
 
+@dataclass(frozen=True, eq=False)
+class PoseDifference:
+    """The difference of two poses, compared with its covariance.
+
+    Attributes:
+        tangent: (6,) from one to the other (translation m, rotation rad).
+        cov: (6, 6) that it has if both are right.
+    """
+
+    tangent: Array
+    cov: Array
+
+    @property
+    def chi2(self) -> float:
+        """Squared Mahalanobis distance."""
+        return float(self.tangent @ np.linalg.solve(self.cov, self.tangent))
+
+    @property
+    def chance(self) -> float:
+        """Probability of a difference this large or larger if both are right."""
+        from scipy.special import chdtrc
+
+        return float(chdtrc(6, self.chi2))
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether chance alone makes it so large in 1 % of cases at most."""
+        return self.chi2 > _SURPRISING_CHI2
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """Angle and distance, as figures of a finding."""
+        rotation_deg, translation_m = tangent_sizes(self.tangent)
+        return {"rotation_deg": rotation_deg, "translation_m": translation_m}
+
+
 def fit_plane(points: NDArray[Any]) -> tuple[Array, float]:
     """Fit n.p + d = 0 by least squares, n towards the origin of the points' frame (d >= 0).
 
@@ -261,6 +300,13 @@ def relative_pose(T_second: Array, T_first: Array) -> tuple[Array, Array]:
     J[..., :3, 6:9] = J[..., 3:, 9:] = -R
     J[..., :3, 9:] = -R @ skew(t_first)
     return T, J
+
+
+def composition_slopes(T_a_b: Array, T_b_c: Array) -> tuple[Array, Array]:
+    """Differentiate T_a_b T_b_c (4, 4) by the tangents of both, (6, 6) each."""
+    R, by_first = T_a_b[:3, :3], np.eye(6)
+    by_first[:3, 3:] = -skew(R @ T_b_c[:3, 3])
+    return by_first, np.asarray(np.kron(np.eye(2), R))
 
 
 def relative_covariance(J: Array, cov_second: Array, cov_first: Array) -> Array:

@@ -14,7 +14,7 @@ from lce_rig.calibrate.result import capture_residual, lever_arm, summarise
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import MOTIONS, AxisDrift, Calibration, Metrics, State
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, perturb, tangent_sizes
+from lce_rig.core.geometry import Array, PoseDifference, perturb, tangent_sizes
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.judge.local_quadratic import OF_PROFILE, expand
@@ -38,23 +38,14 @@ _NAMED_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class JointDrift:
-    """The change of all six axes together.
+class JointDrift(PoseDifference):
+    """The change of all six axes together; its covariance includes the deployed extrinsics' own.
 
     Attributes:
-        change: (6,) tangent (translation m, rotation rad).
-        cov: (6, 6) of it, the deployed extrinsics' own included.
         lever_m: rms distance of the boards, which makes angles comparable with distances.
     """
 
-    change: Array
-    cov: Array
     lever_m: float
-
-    @property
-    def chi2(self) -> float:
-        """Squared Mahalanobis distance of the change."""
-        return float(self.change @ np.linalg.solve(self.cov, self.change))
 
     @property
     def is_changed(self) -> bool:
@@ -66,17 +57,13 @@ class JointDrift:
         """Names of the axes that moved; none without a significant change."""
         if not self.is_changed:
             return ()
-        sizes = np.abs(self.change) / np.sqrt(np.diag(self.cov))
+        sizes = np.abs(self.tangent) / np.sqrt(np.diag(self.cov))
         return tuple(np.array(MOTIONS)[sizes >= min(_NAMED_SIGMAS, sizes.max())].tolist())
 
     @property
     def finding(self) -> Finding:
         """The change, as a finding."""
-        rotation_deg, translation_m = tangent_sizes(self.change)
-        sigmas = float(np.sqrt(self.chi2))
-        return BOARD_CHANGED_JOINTLY(
-            axes=self.axes, rotation_deg=rotation_deg, translation_m=translation_m, sigmas=sigmas
-        )
+        return BOARD_CHANGED_JOINTLY(axes=self.axes, sigmas=float(np.sqrt(self.chi2)), **self.sizes)
 
     @property
     def hidden(self) -> Finding:
@@ -121,7 +108,7 @@ class BoardDrift:
             "mee_m": self.metrics.mee_m,
             "axes": [axis.document() for axis in self.axes],
             "joint": {
-                "change": self.joint.change.tolist(),
+                "change": self.joint.tangent.tolist(),
                 "covariance": self.joint.cov.tolist(),
                 "chi2": self.joint.chi2,
             },

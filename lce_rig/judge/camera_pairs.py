@@ -18,19 +18,14 @@ from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.core.findings import Finding
 from lce_rig.core.geometry import (
     Array,
+    PoseDifference,
     difference,
     mean_pose,
     relative_covariance,
     relative_pose,
-    tangent_sizes,
 )
 from lce_rig.core.results import Observation
-from lce_rig.judge.findings import (
-    CAMERAS_DIFFER,
-    CAMERAS_EXCHANGED,
-    SURPRISING_CHI2,
-    failing,
-)
+from lce_rig.judge.findings import CAMERAS_DIFFER, CAMERAS_EXCHANGED, failing
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.judge.split_consistency import contrast_halves, split_findings
 from lce_rig.lens.lens_estimate import BoardView
@@ -78,16 +73,14 @@ class CameraPair:
         captures: that both used, as the first names them.
         T_second_first: (4, 4) to which their extrinsics compose.
         from_images: the relative pose from their images; None if both saw too few boards.
-        apart: (6,) tangent from the extrinsics' pose to the images'; None likewise.
-        surprise: its squared length in reported standard deviations.
+        apart: from the extrinsics' pose to the images'; None likewise.
         board_rms_m: rms distance between positions of a board's middle under the extrinsics' pose.
     """
 
     captures: tuple[str, ...]
     T_second_first: Array
     from_images: RelativePose | None
-    apart: Array | None
-    surprise: float
+    apart: PoseDifference | None
     board_rms_m: float
 
 
@@ -119,12 +112,11 @@ def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPai
     captures = tuple(one.capture for one, _ in shared)
     board_rms_m = _board_rms_m(shared, T)
     if from_images is None:
-        return CameraPair(captures, T, None, None, 0.0, board_rms_m)
-    apart = difference(from_images.T_second_first, T)
-    # Errors of the images enter both poses and are counted twice, so that the surprise is conservative.
+        return CameraPair(captures, T, None, None, board_rms_m)
+    # Errors of the images enter both poses and are counted twice, which is conservative.
     cov = relative_covariance(J, second.cov, first.cov) + from_images.cov
-    surprise = float(apart @ np.linalg.solve(cov, apart))
-    return CameraPair(captures, T, from_images, apart, surprise, board_rms_m)
+    apart = PoseDifference(difference(from_images.T_second_first, T), cov)
+    return CameraPair(captures, T, from_images, apart, board_rms_m)
 
 
 def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> RelativePose | None:
@@ -237,7 +229,7 @@ def _mounting_gain(rig: Rig, lidar: str, first: CameraEvidence, second: CameraEv
         assert expected is not None
         tolerances = np.repeat([expected.tolerance_m, np.radians(expected.tolerance_deg)], 3) / 3
         x = difference(camera.T_cam_lidar, expected.to_matrix())
-        return float(x @ np.linalg.solve(camera.cov + np.diag(tolerances**2), x))
+        return PoseDifference(x, camera.cov + np.diag(tolerances**2)).chi2
 
     named = chi2(first, nominal[0]) + chi2(second, nominal[1])
     return named - chi2(first, nominal[1]) - chi2(second, nominal[0])
@@ -262,17 +254,15 @@ def camera_findings(
     cameras = " to ".join(names)
     findings = split_findings(halves, pair.from_images.captures, target, strict, cameras)
     images_rms_m = pair.from_images.board_rms_m
-    rotation_deg, translation_m = tangent_sizes(pair.apart)
-    excess = target.in_targets(rotation_deg, translation_m) / limits.max_camera_difference
-    if pair.surprise > SURPRISING_CHI2 and excess > 1:
+    excess = target.excess(pair.apart) / limits.max_camera_difference
+    if excess > 1:
         findings.append(
             CAMERAS_DIFFER(
                 cameras,
                 severity=failing(excess > limits.fail_factor),
                 rms_m=pair.board_rms_m,
                 images_rms_m=images_rms_m,
-                rotation_deg=rotation_deg,
-                translation_m=translation_m,
+                **pair.apart.sizes,
             )
         )
     return findings

@@ -18,8 +18,8 @@ from lce_rig.calibrate.result import CalibrationEstimate
 from lce_rig.calibrate.tolerances import Sensitivity, Source
 from lce_rig.core.calibration import Contribution, Diagnostics
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, sigma_sizes, tangent_sizes
-from lce_rig.judge.findings import LARGEST_CAUSE, SURPRISING_CHI2
+from lce_rig.core.geometry import Array, sigma_sizes
+from lce_rig.judge.findings import LARGEST_CAUSE
 from lce_rig.judge.split_consistency import Contrast, objections
 from lce_rig.rig import CalibrationSettings, Rig
 
@@ -84,11 +84,9 @@ def find_contradictions(
         share = 1.0 if contrast.is_change else _HALF
         yield Contradiction(f"{contrast.first}_{contrast.second}", share * np.array([contrast.apart]))
     # Channels of one camera have one pose: the result lies between both.
-    apart, cov = estimate.channel_difference, estimate.channel_difference_cov
-    if apart is not None and cov is not None:
-        is_significant = apart @ np.linalg.solve(cov, apart) > SURPRISING_CHI2
-        if is_significant and target.in_targets(*tangent_sizes(apart)) > 1:
-            yield Contradiction("channels", _HALF * apart[None])
+    apart = estimate.channel_difference
+    if apart is not None and target.excess(apart) > 1:
+        yield Contradiction("channels", _HALF * apart.tangent[None])
 
 
 def list_contributions(

@@ -9,8 +9,6 @@ from lce_rig.core.findings import Figure, Finding, Kind, Severity, worst
 from lce_rig.core.phrasing import fill
 
 Verdict = Literal["pass", "marginal", "fail"]
-SURPRISING_CHI2 = 16.81
-"""99 % of the chi-squared distribution with six degrees of freedom: differences beyond it are significant."""
 _OF_DISTANCES = (
     "verdict.two_groups verdict.shares_differ "
     "verdict.plane_residual verdict.edge_residual verdict.rotation_uncertain "

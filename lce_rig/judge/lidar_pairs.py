@@ -2,18 +2,15 @@
 
 from collections.abc import Iterable, Sequence
 
-import numpy as np
-
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.geometry import Array, difference, invert, skew, tangent_sizes
+from lce_rig.core.geometry import Array, PoseDifference, composition_slopes, difference, invert, tangent_sizes
 from lce_rig.detect.detection import LidarDetection
 from lce_rig.judge.findings import (
     LIDARS_DIFFER,
     LIDARS_EXCHANGED,
     LIDARS_UNNAMED,
     OTHER_MODEL,
-    SURPRISING_CHI2,
     failing,
 )
 from lce_rig.rig import LidarSettings, NominalExtrinsic, Rig
@@ -75,19 +72,16 @@ def loop_findings(between: Calibration, first: Calibration, second: Calibration,
         first, second: of the camera and each of them.
         rig: targets and limits.
     """
-    R, t = first.T_cam_lidar[:3, :3], between.T_cam_lidar[:3, 3]
-    by_first, by_between = np.eye(6), np.kron(np.eye(2), R)
-    by_first[:3, 3:] = -skew(R @ t)
+    by_first, by_between = composition_slopes(first.T_cam_lidar, between.T_cam_lidar)
     cov = by_first @ first.cov @ by_first.T + by_between @ between.cov @ by_between.T + second.cov
-    apart = difference(first.T_cam_lidar @ between.T_cam_lidar, second.T_cam_lidar)
-    rotation_deg, translation_m = tangent_sizes(apart)
-    excess = rig.calibration.in_targets(rotation_deg, translation_m) / rig.verdict.max_camera_difference
-    if float(apart @ np.linalg.solve(cov, apart)) <= SURPRISING_CHI2 or excess <= 1:
+    tangent = difference(first.T_cam_lidar @ between.T_cam_lidar, second.T_cam_lidar)
+    apart = PoseDifference(tangent, cov)
+    excess = rig.calibration.excess(apart) / rig.verdict.max_camera_difference
+    if excess <= 1:
         return []
-    figures = {"rotation_deg": rotation_deg, "translation_m": translation_m}
     severity = failing(excess > rig.verdict.fail_factor)
     return [
         LIDARS_DIFFER(
-            f"{between.camera} and {between.lidar}", severity=severity, camera=first.camera, **figures
+            f"{between.camera} and {between.lidar}", severity=severity, camera=first.camera, **apart.sizes
         )
     ]

@@ -9,7 +9,7 @@ import numpy as np
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, difference, invert, log_so3, mean_pose
+from lce_rig.core.geometry import Array, PoseDifference, difference, invert, mean_pose, tangent_sizes
 from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE, RESULTS_AGREE, RESULTS_DISAGREE
 from lce_rig.judge.reach import as_used, covariance_alone
 
@@ -158,12 +158,10 @@ def compare_calibrations(
     factor = 1.0 if are_independent else 2.0
     differences = []
     for i, j in pairs:
-        x = difference(T[i], T[j])
-        distance = float(np.sqrt(x @ np.linalg.solve(factor * (cov[i] + cov[j]), x)))
-        angle_deg = float(np.degrees(np.linalg.norm(log_so3(T[i, :3, :3] @ T[j, :3, :3].T))))
-        shift_m, p = float(np.linalg.norm(x[:3])), _tail(distance**2, 6)
+        apart = PoseDifference(difference(T[i], T[j]), factor * (cov[i] + cov[j]))
         apart_m = _displacements(calibrations[names[i]], calibrations[names[j]])
-        differences.append(PairDifference(names[i], names[j], angle_deg, shift_m, distance, p, apart_m))
+        distance, sizes = float(np.sqrt(apart.chi2)), tangent_sizes(apart.tangent)
+        differences.append(PairDifference(names[i], names[j], *sizes, distance, apart.chance, apart_m))
     if are_independent:
         chi2, dof = _spread(T, cov), 6 * (len(names) - 1)
         p = _tail(chi2, dof)

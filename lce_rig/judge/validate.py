@@ -19,7 +19,7 @@ from lce_rig.core.board import Board
 from lce_rig.core.calibration import Contribution
 from lce_rig.core.camera import Intrinsics
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, difference, exp_so3, invert, perturb, pose
+from lce_rig.core.geometry import Array, PoseDifference, difference, exp_so3, invert, perturb, pose
 from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import (
     find_contradictions,
@@ -239,8 +239,6 @@ class _Test:
         self, group: Sequence[Observation], place: str, neighbour: str
     ) -> tuple[float, Contrast] | None:
         """Fit a group, and give its gain over the rest's extrinsics; None where its captures disagree."""
-        from scipy.special import chdtrc
-
         names = tuple(observation.capture for observation in group)
         group = group[:: -(-len(group) // _MAX_TESTED)]
         n = int(group_placements(group).max()) + 1
@@ -261,7 +259,7 @@ class _Test:
         apart = difference(T_group, T_rest)
         H_rest = np.tensordot(is_rest, self._used.hessians, axes=1)[:6, :6]
         cov = self._unit * (np.linalg.inv(H.sum(axis=0)) + np.linalg.inv(H_rest))
-        chance = float(chdtrc(6, apart @ np.linalg.solve(cov, apart)))
+        chance = PoseDifference(apart, cov).chance
         # Where the last captures moved, the result holds no longer.
         words = ("before", "after") if place == "last" else ("group", "rest")
         rejected = RejectedGroup(names, place, neighbour)

@@ -39,7 +39,6 @@ from lce_rig.judge.findings import (
     SCENE_USED,
     SENSORS_DISAGREE,
     SHARES_DIFFER,
-    SURPRISING_CHI2,
     TRANSLATION_UNCERTAIN,
     Verdict,
     by_cause,
@@ -300,24 +299,12 @@ def _motion(estimate: CalibrationEstimate, limit_m: float) -> list[Finding]:
 
 def _channels(estimate: CalibrationEstimate, rig: Rig) -> list[Finding]:
     """Compare the channels of one camera, which has one pose."""
-    apart, cov = estimate.channel_difference, estimate.channel_difference_cov
-    if apart is None or cov is None:
-        return []
-    surprise = float(apart @ np.linalg.solve(cov, apart))
-    rotation_deg, translation_m = tangent_sizes(apart)
-    excess = rig.calibration.in_targets(rotation_deg, translation_m)
-    if surprise <= SURPRISING_CHI2 or excess <= 1:
+    apart = estimate.channel_difference
+    if apart is None or (excess := rig.calibration.excess(apart)) <= 1:
         return []
     first, second = (channel.channel for channel in estimate.channels[:2])
-    return [
-        CHANNELS_DIFFER(
-            severity=failing(excess > rig.verdict.fail_factor),
-            first=first,
-            second=second,
-            rotation_deg=rotation_deg,
-            translation_m=translation_m,
-        )
-    ]
+    severity = failing(excess > rig.verdict.fail_factor)
+    return [CHANNELS_DIFFER(severity=severity, first=first, second=second, **apart.sizes)]
 
 
 def _captures(estimate: CalibrationEstimate, n_captures: int, limits: QualitySettings) -> Iterator[Finding]:

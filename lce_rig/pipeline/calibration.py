@@ -372,7 +372,6 @@ def _part_of(together: TogetherEstimate, rig: Rig, detections: Detections, alone
         ),
         channels=alone.estimate.channels,
         channel_difference=alone.estimate.channel_difference,
-        channel_difference_cov=alone.estimate.channel_difference_cov,
     )
     validation = _examine(rig, detections, alone.pairs, estimate)
     return replace(alone, estimate=estimate, validation=validation, together=together)
@@ -421,7 +420,7 @@ def _judged(
     verdict, findings = judge(estimate, validation, rig, own.camera, own.lidar, n_captures, others)
     diagnostics = estimate.diagnostics
     if estimate.channel_difference is not None:
-        apart_deg, apart_m = tangent_sizes(estimate.channel_difference)
+        apart_deg, apart_m = tangent_sizes(estimate.channel_difference.tangent)
         diagnostics = replace(diagnostics, channels_rotation_deg=apart_deg, channels_translation_m=apart_m)
     used = estimate.captures_of(estimate.used)
     refused = dict(own.refused)
@@ -490,7 +489,7 @@ def _other_camera(solved: Sequence[_Solved], k: int, other_k: int, pair: CameraP
         joint[6:, 6:] += other.cov_lens
         cov = np.asarray(J @ joint @ J.T)
     seen = None if pair.from_images is None else pair.from_images.T_second_first
-    apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart)
+    apart_deg, apart_m = (None, None) if pair.apart is None else tangent_sizes(pair.apart.tangent)
     return OtherCamera(
         camera=other.camera,
         n_captures=len(pair.captures),

@@ -4,6 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from lce_rig.core.geometry import PoseDifference
 from lce_rig.rig.settings import NotNegative, Positive, Settings
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -75,6 +76,10 @@ class CalibrationSettings(Settings):
     def in_targets(self, rotation_deg: float, translation_m: float) -> float:
         """Measure an error or a difference in units of the targets; the larger of the two counts."""
         return max(rotation_deg / self.target_sigma_deg, translation_m / self.target_sigma_m)
+
+    def excess(self, difference: PoseDifference) -> float:
+        """Measure a difference of two poses in units of the targets; 0 where chance explains it."""
+        return self.in_targets(**difference.sizes) if difference.is_significant else 0.0
 
 
 class VerdictSettings(Settings):
