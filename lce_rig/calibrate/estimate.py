@@ -94,12 +94,10 @@ def estimate_extrinsics(
         begin(progress, f"{name} alone")
         alone = estimate_observations(observations, board, fast)
         result = result_of(name, alone, motion.widened(alone.cov), still[name])
-        if motion.offsets is not None:
+        if motion.offset_s is not None:
             index = motion.samples.channels.index(name)
-            offset_s, variance = motion.offsets.offset_s[index], motion.offsets.cov[index, index]
-            result = replace(
-                result, time_offset_s=float(offset_s), time_offset_sigma_s=float(np.sqrt(variance))
-            )
+            offset_s, sigma_s = float(motion.offset_s[index]), float(np.sqrt(motion.cov[index, index]))
+            result = replace(result, time_offset_s=offset_s, time_offset_sigma_s=sigma_s)
         channels.append(result)
     begin(progress, "difference of the channels")
     return replace(

@@ -1,18 +1,7 @@
 """Findings of the calibration: captures that disagree, and captures that are too few."""
 
 from lce_rig.core.findings import Finding, Kind
-from lce_rig.core.phrasing import captures_to_add, motion_words
-
-
-def _undetermined(finding: Finding) -> str:
-    """{motions} undetermined by {n_captures} captures: boards nearly parallel, spread {spread_deg}."""
-    motions, n_captures = finding.figures["motions"], finding.figures["n_captures"]
-    assert isinstance(motions, tuple)
-    names = " and ".join(motion_words(str(motion)) for motion in motions)
-    return (
-        f"{names} cannot be determined from {n_captures} captures: their boards are nearly parallel "
-        f"(normals spread by {finding.figure('spread_deg'):.1f} deg)"
-    )
+from lce_rig.core.phrasing import captures_to_add
 
 
 def _tilt(finding: Finding) -> str:
@@ -48,7 +37,8 @@ FEW_AGREE = Kind(
 )
 UNDETERMINED = Kind(
     "shortage.undetermined",
-    _undetermined,
+    "{motions:motion} cannot be determined from {n_captures} captures: their boards are nearly parallel "
+    "(normals spread by {spread_deg:1deg})",
     _tilt,
     severity="warning",
 )

@@ -7,7 +7,6 @@ import numpy as np
 
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.observations import group_placements
-from lce_rig.calibrate.options import KnownLidar
 from lce_rig.calibrate.plane_and_ends import ends_on_board, plane_residuals
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.calibrate.session_lens import SessionLens
@@ -64,7 +63,6 @@ class CalibrationEstimate:
             cameras estimated with it) alone, boards' poses eliminated; None if the method has none.
         turns: (2, F) angle about its line of sight by which each board disagrees with the result, rad, and
             its standard deviation at usual noise; None if the method estimates no boards.
-        lidar: constant errors of the LiDAR that were estimated with it; None if the method knows none.
         lens: of the session, with which the boards' poses in the images were fitted; None without tolerances.
         estimated_with: cameras whose extrinsics were estimated together with this one.
         same_scan: the captures that hold the same scan, by the one that stands for them; others are alone.
@@ -84,7 +82,6 @@ class CalibrationEstimate:
     sensitivities: tuple[Sensitivity, ...] = ()
     cost: Quadratics | None = None
     turns: Array | None = None
-    lidar: KnownLidar | None = None
     lens: SessionLens | None = None
     estimated_with: tuple[str, ...] = ()
     same_scan: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

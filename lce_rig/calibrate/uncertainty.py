@@ -9,7 +9,6 @@ from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
 from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.layout import OWN, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels
-from lce_rig.calibrate.likelihood.lidar_errors import lidar_of
 from lce_rig.calibrate.likelihood.model import assemble, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
 from lce_rig.calibrate.options import EstimateSettings
@@ -71,7 +70,6 @@ def by_likelihood(start: Start, joint: JointEstimate, board: Board, camera: int 
     return replace(
         estimate,
         method="ml",
-        lidar=lidar_of(joint),
         cost=_expand_joint(joint, camera),
         turns=_turns(joint, camera),
     )

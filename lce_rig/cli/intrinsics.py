@@ -68,8 +68,8 @@ def intrinsics(
     """Estimate each camera's intrinsics from the boards in the images of SESSION (default: session/).
 
     Reports whether the profile's intrinsics still fit, and the weaknesses of the captures. Writes
-    SESSION/intrinsics/: a block for the profile, camera_info and a page of plots per camera. Exits with 6 if
-    the captures are insufficient, with 7 if --save-profile has nothing better than the profile to write.
+    SESSION/intrinsics/: camera_info and a page of plots per camera. Exits with 6 if the captures are
+    insufficient, with 7 if --save-profile has nothing better than the profile to write.
     """
     opened = Session.open(session)
     require_sensors("camera", cameras, opened.rig.cameras)

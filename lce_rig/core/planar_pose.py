@@ -65,7 +65,8 @@ def solve_planar_pose(
     References:
         T. Collins, A. Bartoli: Infinitesimal plane-based pose estimation. IJCV 109 (2014).
     """
-    corners_px, corners_board = _seen(corners_px, corners_board)
+    is_seen = np.isfinite(corners_px).all(axis=1)
+    corners_px, corners_board = corners_px[is_seen], corners_board[is_seen]
     start = starts[0] if starts else _pose_from_homography(corners_board, intrinsics.unproject(corners_px))
     if start is None:
         return None
@@ -162,12 +163,6 @@ def refine_poses(
         if np.all(is_done | ~np.isfinite(cost)):
             break
     return T, cost
-
-
-def _seen(corners_px: Array, corners_board: Array) -> tuple[Array, Array]:
-    """Drop hidden corners."""
-    is_seen = np.isfinite(corners_px).all(axis=1)
-    return (corners_px, corners_board) if is_seen.all() else (corners_px[is_seen], corners_board[is_seen])
 
 
 def mirror_tilt(T_cam_board: Array, centre_board: Array) -> Array:

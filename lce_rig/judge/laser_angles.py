@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.likelihood.levels import Priors
+from lce_rig.calibrate.likelihood.rays import lens_fields, turn_rays
 from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, end_rows
 from lce_rig.core.board import Board
 from lce_rig.core.findings import Finding
@@ -60,12 +61,9 @@ def estimate_angles(
 
     def by_angles(points: Array, ring: NDArray[np.int16], normals: Array) -> Array:
         """Differentiate residuals (N,) by lens (2), each ring's azimuth and elevation (2 L), in 3 + 2 L."""
-        x, y, z = points.T
-        level = np.hypot(x, y)
-        up, across = np.array([0.0, 0.0, 1.0]), np.stack([-y, x, 0 * x], axis=1)
-        raised = np.stack([-z * x / level, -z * y / level, level], axis=1)
-        moves = [across / level[:, None], np.arctan2(z, level)[:, None] * up, across, raised]
-        lateral, vertical, azimuth, elevation = (-np.sum((move @ R.T) * normals, axis=1) for move in moves)
+        moves = np.concatenate([lens_fields(points), turn_rays(points)], axis=2)
+        along = np.broadcast_to(normals @ R, points.shape)
+        lateral, vertical, azimuth, elevation = -np.einsum("nij,ni->jn", moves, along)
         own = np.searchsorted(rings, ring)[:, None] == np.arange(L)
         of_rings = own * azimuth[:, None], own * elevation[:, None]
         return np.column_stack([lateral, vertical, np.zeros(len(points)), *of_rings])

@@ -128,13 +128,12 @@ class Contrast:
         return target.in_targets(self.rotation_deg, self.translation_m) / limit
 
 
-def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tuple[Contrast, ...]:
+def contrast_halves(expansion: Quadratics, centres: Array) -> tuple[Contrast, ...]:
     """Compare subsets that should agree.
 
     Args:
         expansion: of F captures in the order in which they were taken, settled.
         centres: (F, 3) middle of the board in each, frame camera, m.
-        seed: of the random subsets.
 
     Returns:
         Subsets before and after the capture of the largest change, near and far, left and right, upper and
@@ -144,7 +143,7 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
     if n_placements < _MIN_PLACEMENTS:
         return ()
     every = np.ones(len(expansion.gradients))
-    unit = _noise(expansion, every, seed)
+    unit = _noise(expansion, every)
     x, y, z = centres.T
     # The capture from which on the results differ most, corrected for the number of captures tried.
     n = len(every)
@@ -152,7 +151,7 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
     chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
     best = int(np.argmax(chi2))
     changes = [(_tail(chi2[best] / unit), apart[best], int(cuts[best]))]
-    changes += [_change_at_end(expansion, cut, seed) for cut in (2, n - 2)]
+    changes += [_change_at_end(expansion, cut) for cut in (2, n - 2)]
     chance, tangent, cut = min(changes, key=lambda change: change[0])
     found = [make_contrast("before", "after", tangent, min((len(cuts) + 2) * chance, 1.0), cut)]
     for first, second, key in (
@@ -166,7 +165,7 @@ def contrast_halves(expansion: Quadratics, centres: Array, seed: int = 0) -> tup
     return tuple(found)
 
 
-def _change_at_end(expansion: Quadratics, cut: int, seed: int) -> tuple[float, Array, int]:
+def _change_at_end(expansion: Quadratics, cut: int) -> tuple[float, Array, int]:
     """Compare the first or last two captures with the others, in units of the noise of the others.
 
     After a sensor moved each of the two differs from the others; of an outlier and a sound capture one does.
@@ -181,7 +180,7 @@ def _change_at_end(expansion: Quadratics, cut: int, seed: int) -> tuple[float, A
     n = len(expansion.gradients)
     is_first = (np.arange(n) < cut).astype(np.float64)
     is_end = is_first if 2 * cut < n else 1 - is_first
-    unit = _noise(expansion, 1 - is_end, seed)
+    unit = _noise(expansion, 1 - is_end)
     (surprise,), (apart,) = _chi2(expansion, is_first[None])
     alone = np.eye(n)[is_end > 0]
     each = [float(_chi2(expansion, one[None], 1 - is_end + one)[0][0]) / unit for one in alone]
@@ -191,16 +190,16 @@ def _change_at_end(expansion: Quadratics, cut: int, seed: int) -> tuple[float, A
     return chance if is_change else 1.0, apart, cut
 
 
-def _noise(expansion: Quadratics, among: Array, seed: int) -> float:
+def _noise(expansion: Quadratics, among: Array) -> float:
     """Measure by random halves the noise of captures (F,), of which `among` is 1, in units of their cost."""
     groups = expansion.groups * among
     groups = groups[groups.any(axis=1)]
-    order = np.argsort(np.random.default_rng(seed).random((_N_LOTS, len(groups))), axis=1)
+    order = np.argsort(np.random.default_rng(0).random((_N_LOTS, len(groups))), axis=1)
     by_lot, _ = _chi2(expansion, (order < len(groups) // 2) @ groups, among)
     return max(float(np.median(by_lot)) / MEDIAN_CHI2, 1e-12)
 
 
-def find_groups(expansion: Quadratics, seed: int = 0) -> tuple[Contrast, ...]:
+def find_groups(expansion: Quadratics) -> tuple[Contrast, ...]:
     """Look for two groups of captures with extrinsics of their own, whatever their order.
 
     Placements are shared out so that two extrinsics x_1 and x_2 explain them best (k-means with the captures'
@@ -213,7 +212,6 @@ def find_groups(expansion: Quadratics, seed: int = 0) -> tuple[Contrast, ...]:
 
     Args:
         expansion: of F captures, settled.
-        seed: of starts and rotations.
 
     Returns:
         The smaller group compared with the rest; none for fewer than 8 placements.
@@ -221,7 +219,7 @@ def find_groups(expansion: Quadratics, seed: int = 0) -> tuple[Contrast, ...]:
     n = len(expansion.groups)
     if n < _MIN_GROUPED:
         return ()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     H = np.tensordot(expansion.groups, expansion.hessians, axes=1)
     g = expansion.groups @ expansion.gradients
     starts = rng.random((_N_NULL + 1, _N_STARTS, n)) < 0.5

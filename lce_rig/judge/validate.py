@@ -130,7 +130,11 @@ def validate(
     own_cost = None if recount is None else estimate.cost
     if len(expansion.groups) >= _MIN_PLACEMENTS:
         if own_cost is None:
-            scale, pattern = scale_of(expansion), _contradicting(pattern_of(expansion), rig)
+            scale, pattern = scale_of(expansion), pattern_of(expansion)
+            # Neither chance nor the profile's deviation explains an offset that contradicts it.
+            cov = pattern[1] + rig.board.pattern_offset_sigma_m**2 * np.eye(2)
+            chi2 = pattern[0] @ np.linalg.solve(cov, pattern[0])
+            pattern = pattern if np.exp(-chi2 / 2) < rig.verdict.least_chance else None
         # A wrong place of the pattern would look like captures that differ.
         settled = expansion.hold((SCALE,) if pattern is not None else OF_PROFILE).settled()
         if own_cost is not None and recount is not None:
@@ -165,13 +169,6 @@ def validate(
         intrinsics=intrinsics,
         lens_model=[] if fitted is None or lens is None else model_findings(fitted, board),
     )
-
-
-def _contradicting(pattern: tuple[Array, Array], rig: Rig) -> tuple[Array, Array] | None:
-    """Return the pattern's offset where neither chance nor the profile's deviation explains it, else None."""
-    offset_m, cov = pattern
-    chi2 = offset_m @ np.linalg.solve(cov + rig.board.pattern_offset_sigma_m**2 * np.eye(2), offset_m)
-    return pattern if np.exp(-chi2 / 2) < rig.verdict.least_chance else None
 
 
 def find_moved(

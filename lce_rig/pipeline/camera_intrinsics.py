@@ -1,6 +1,6 @@
 """A camera's intrinsics from a session's images of the board, and their files.
 
-Files are a block for the profile, a new profile, camera_info and plots.
+Files are a new profile, camera_info and plots.
 """
 
 import json
@@ -26,13 +26,11 @@ from lce_rig.core.errors import (
 )
 from lce_rig.core.files import read_json
 from lce_rig.core.findings import Finding, Refusal
-from lce_rig.core.phrasing import significant
 from lce_rig.core.progress import Progress, silent
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.detection import ImageDetection
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.export.ros_files import camera_info_text
-from lce_rig.export.writing import number, numbers
 from lce_rig.judge.findings import verdict_of
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
 from lce_rig.judge.lens_model import model_findings
@@ -289,8 +287,8 @@ FORMAT_VERSION = 1
 def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -> list[Path]:
     """Write the session's intrinsics/ in one step.
 
-    For each camera a block to paste into the profile, a camera_info file and a page of plots; and
-    intrinsics.json for machines. Other files there stay, as those of cameras that an earlier run measured.
+    For each camera a camera_info file and a page of plots; and intrinsics.json for machines. Other files
+    there stay, as those of cameras that an earlier run measured.
 
     Returns:
         The files of this run.
@@ -314,34 +312,14 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
 
     with replacing(session.path, session.path / INTRINSICS, finish) as draft:
         for one in measured:
-            block, info, page = f"{one.camera}.yaml", f"camera_info_{one.camera}.yaml", f"{one.camera}.png"
-            write_atomically(draft / block, profile_block(session.rig, one))
+            info, page = f"camera_info_{one.camera}.yaml", f"{one.camera}.png"
             head = _head(session.rig, one)
             write_atomically(draft / info, camera_info_text(one.camera, one.intrinsics, head))
             title, notes = f"Intrinsics of camera {one.camera}, rig {session.rig.name}", one.weaknesses
             plot = draw_intrinsics(one.estimate, one.certainty, title=title, weaknesses=notes)
             write_picture(draft / page, plot)
-            names += [block, info, page]
+            names += [info, page]
     return [session.path / INTRINSICS / name for name in names]
-
-
-def profile_block(rig: Rig, measured: MeasuredIntrinsics) -> str:
-    """Write the camera's block `intrinsics:`, indented for pasting into a profile."""
-    lens, sigma = measured.intrinsics, measured.estimate.sigma
-    lines = [f"# {line}" for line in _head(rig, measured)]
-    lines += [
-        f"# In the profile this block belongs to cameras.{measured.camera}, whose images have",
-        f"#   resolution_px: [{lens.width_px}, {lens.height_px}]",
-        "    intrinsics:",
-        f"      model: {lens.model}",
-    ]
-    for index, key in enumerate(("fx_px", "fy_px", "cx_px", "cy_px")):
-        lines.append(f"      {key}: {number(getattr(lens, key))}   # +- {significant(sigma[index])}")
-    names = " ".join(measured.estimate.model.coefficients)
-    spread = " ".join(f"{value:.1g}" for value in sigma[4:])
-    lines.append(f"      distortion: {numbers(lens.distortion)}   # {names}, +- {spread}")
-    lines += [f"      {key}: {value:g}" for key, value in measured.deviations().items()]
-    return "\n".join(lines) + "\n"
 
 
 def save_profile(

@@ -40,13 +40,10 @@ class SceneEstimate:
         T_cam_lidar: (4, 4).
         cov: (6, 6) of the tangent (translation m, rotation rad), axes of the camera, order of MOTIONS. In
             directions that the scene does not show it is the prior's.
-        information: (6, 6) what the scene alone knows, its bias included: the inverse of a covariance,
-            singular where it shows nothing.
     """
 
     T_cam_lidar: Array
     cov: Array
-    information: Array
 
 
 def estimate(
@@ -74,7 +71,7 @@ def estimate(
     """
     T_prior, cov_prior = (T_start, np.diag(_ANYWHERE**2)) if prior is None else prior
     if not any(len(view.edges) for view in views):
-        return SceneEstimate(T_prior, cov_prior, np.zeros((6, 6)))
+        return SceneEstimate(T_prior, cov_prior)
     held = np.linalg.inv(cov_prior / np.outer(_UNIT, _UNIT))
     alignment = Alignment(views, intrinsics, T_start, _BESIDE_RAD if is_far else BESIDE_RAD)
     starts = _sweep(views, intrinsics, T_start) if is_far else []
@@ -89,8 +86,7 @@ def estimate(
     ]
     T, information = _balance(alignment, cells, maxima[0], T_prior, held)
     cov = np.linalg.inv(information + held) + _rivalry(alignment, cells, maxima)
-    unit = np.outer(_UNIT, _UNIT)
-    return SceneEstimate(T, unit * cov, information / unit)
+    return SceneEstimate(T, np.outer(_UNIT, _UNIT) * cov)
 
 
 def _sweep(views: Sequence[SceneView], intrinsics: Intrinsics, T_start: Array) -> list[Array]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +79,9 @@ def estimate_motion(previous: Scan, scan: Scan) -> RigMotion | None:
     with without_interrupt():
         import open3d as o3d
     register = o3d.pipelines.registration
-    target, source = (_cloud(each) for each in (previous, scan))
+    arrays = (np.asarray(each.points, dtype=np.float64) for each in (previous, scan))
+    clouds = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in arrays)
+    target, source = (cloud.voxel_down_sample(_VOXEL_M) for cloud in clouds)
     if min(len(target.points), len(source.points)) < 100:
         return None
     target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(_NORMALS_M, 20))
@@ -94,13 +95,6 @@ def estimate_motion(previous: Scan, scan: Scan) -> RigMotion | None:
     if found.fitness < _MIN_FITNESS:
         return None
     return RigMotion(T_previous_scan[:3, 3] / gap_s, log_so3(T_previous_scan[:3, :3]) / gap_s)
-
-
-def _cloud(scan: Scan) -> Any:
-    import open3d as o3d
-
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(scan.points, dtype=np.float64)))
-    return cloud.voxel_down_sample(_VOXEL_M)
 
 
 def firing_times_s(scan: Scan, points: Array) -> Array | None:

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 
 from lce_rig.core.data import Image
 from lce_rig.core.errors import NotEnoughDataError, ResultRefusedError, UsageError
@@ -13,7 +12,6 @@ from lce_rig.export.ros_files import load_camera_info
 from lce_rig.judge.intrinsics_check import judge_lens
 from lce_rig.pipeline.camera_intrinsics import (
     measure_intrinsics,
-    profile_block,
     save_profile,
     write_intrinsics,
 )
@@ -124,9 +122,6 @@ def test_every_file_holds_the_same_lens(session, measured, tmp_path):
     files = write_intrinsics(session, [measured])
     assert {path.name for path in (session.path / "intrinsics").iterdir()} == {path.name for path in files}
     lens = measured.intrinsics
-    block = yaml.safe_load((session.path / "intrinsics" / "davis.yaml").read_text())["intrinsics"]
-    assert block["fx_px"] == lens.fx_px
-    assert tuple(block["distortion"]) == lens.distortion
     info = load_camera_info(session.path / "intrinsics" / "camera_info_davis.yaml")
     assert (info.matrix == lens.matrix).all()
     document = json.loads(files[0].read_text())["cameras"][0]
@@ -169,11 +164,3 @@ def test_intrinsics_that_are_determined_no_better_are_not_written(session, measu
         with pytest.raises(ResultRefusedError):
             save_profile(session, [kept], tmp_path / "new.yaml")
         assert not (tmp_path / "new.yaml").exists()
-
-
-def test_the_block_can_be_pasted_into_the_profile(measured):
-    lines = RLES.splitlines()
-    first = next(k for k, line in enumerate(lines) if line.startswith("    intrinsics:"))
-    end = next(k for k in range(first, len(lines)) if lines[k].startswith("    channels:"))
-    pasted = [*lines[:first], *profile_block(RIG, measured).splitlines(), *lines[end:]]
-    assert parse_rig("\n".join(pasted)).cameras["davis"].to_intrinsics() == measured.intrinsics

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lce_rig.calibrate.likelihood.fit import JointEstimate, maximise_likelihood
+from lce_rig.calibrate.likelihood.fit import maximise_likelihood
 from lce_rig.calibrate.likelihood.levels import what_is_known
 from lce_rig.calibrate.options import EstimateSettings, KnownLidar
 from lce_rig.core.board import Board
@@ -64,26 +64,17 @@ def estimate_lidar(
     ]
     priors, usual = what_is_known(replace(options, known=None))
     joint = maximise_likelihood(apart, board, T_cam_lidar, priors, usual)
-    known, prior = lidar_of(joint), _prior_sigma(joint)
-    rings = np.concatenate([o.lidar.ring for session in sessions for o in session])
-    n_points = np.array([np.count_nonzero(rings == ring) for ring in known.rings])
-    return LidarErrors(known, prior, tuple(len(session) for session in sessions), n_points)
-
-
-def lidar_of(joint: JointEstimate) -> KnownLidar:
-    """Read the LiDAR's constant errors from a joint estimate; a laser's deviations are about the mean."""
     layout, rings = joint.state.layout, joint.terms.scans.rings.astype(np.intp)
     L = layout.n_rings
     cov, about_mean = joint.cost.covariance(), np.eye(L) - 1 / L
     sigma = np.sqrt([np.diag(about_mean @ cov[at[:, None], at] @ about_mean) for at in layout.lasers])
     # Lasers that met few boards are known as well as without them.
-    sigma = np.minimum(sigma * WIDENED[:, None], np.maximum(sigma, _prior_sigma(joint)[:, None]))
+    prior = np.array([joint.levels.laser_m, joint.priors.azimuth_rad, joint.priors.elevation_rad])
+    sigma = np.minimum(sigma * WIDENED[:, None], np.maximum(sigma, prior[:, None]))
     lens = layout.z["lens"]
-    return KnownLidar(
+    known = KnownLidar(
         rings, joint.state.lasers, sigma, joint.state.z[lens], np.sqrt(np.diag(joint.cov_z))[lens]
     )
-
-
-def _prior_sigma(joint: JointEstimate) -> Array:
-    """Deviations (3,) of a laser's errors about their mean without any boards."""
-    return np.array([joint.levels.laser_m, joint.priors.azimuth_rad, joint.priors.elevation_rad])
+    seen = np.concatenate([o.lidar.ring for session in sessions for o in session])
+    n_points = np.array([np.count_nonzero(seen == ring) for ring in rings])
+    return LidarErrors(known, prior, tuple(len(session) for session in sessions), n_points)

@@ -11,7 +11,7 @@ capture.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -51,21 +51,6 @@ _FREEDOMS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class TimeOffsets:
-    """Offsets from the timestamps of each channel's images to the LiDAR's time.
-
-    Attributes:
-        offset_s: (C,), in the order of `PoseSamples.channels`.
-        cov: (C, C) s^2, from the scatter between captures.
-        sensitivity: (6, C) change of the extrinsics (m, rad) per second of each offset.
-    """
-
-    offset_s: Array
-    cov: Array
-    sensitivity: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Motion:
     """The boards of F scans, and how they moved between the scan and its images.
 
@@ -74,34 +59,37 @@ class Motion:
         samples: poses of the board in these.
         T_cam_lidar: (4, 4), accurate to a few degrees; it only rotates the rates of motion.
         sweep_s: duration of a revolution of the LiDAR.
-        offsets: of the images' times; None where boards stood still.
+        offset_s: (C,) from the timestamps of each channel's images to the LiDAR's time, in the order of
+            `PoseSamples.channels`; None where boards stood still.
+        cov: (C, C) s^2, from the scatter between captures.
+        sensitivity: (6, C) change of the extrinsics (m, rad) per second of each offset.
     """
 
     scans: Sequence[SharedScan]
     samples: PoseSamples
     T_cam_lidar: Array
     sweep_s: float
-    offsets: TimeOffsets | None = None
+    offset_s: Array | None = None
+    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    sensitivity: Array = field(default_factory=lambda: np.zeros((6, 0)))
 
     @property
     def is_seen_by_each(self) -> bool:
         """Whether boards stood still, or a channel alone shows their motion: channels can be compared."""
-        return self.offsets is None or bool(np.mean(self.samples.is_followed.any(axis=1)) > 0.5)
+        return self.offset_s is None or bool(np.mean(self.samples.is_followed.any(axis=1)) > 0.5)
 
     def observations(self, only: str | None = None) -> list[Observation]:
         """Pair each scan with the board's pose at its time, from all channels or positioned by one alone."""
         kept = [k for k, scan in enumerate(self.scans) if only is None or only in scan.images]
         observations = [self.scans[k].observation(only) for k in kept]
-        if self.offsets is None:
+        if self.offset_s is None:
             return observations
-        motions = fit_motions(self.samples.select(kept), self.offsets.offset_s, only)
+        motions = fit_motions(self.samples.select(kept), self.offset_s, only)
         return compensate(observations, motions, self.T_cam_lidar, self.sweep_s)
 
     def widened(self, cov: Array) -> Array:
         """Add the effect of the time offsets' uncertainty to a covariance (6, 6) of the extrinsics."""
-        if self.offsets is None:
-            return cov
-        return np.asarray(cov + self.offsets.sensitivity @ self.offsets.cov @ self.offsets.sensitivity.T)
+        return np.asarray(cov + self.sensitivity @ self.cov @ self.sensitivity.T)
 
 
 def estimate_motion(
@@ -147,8 +135,7 @@ def estimate_motion(
     widen = np.sqrt(np.maximum(np.diag(inverse) / np.diag(cov), 1.0))
     if fit_motions(samples, offset_s).significance <= _MOVED:
         return still
-    offsets = TimeOffsets(offset_s, np.asarray(widen[:, None] * cov * widen), T_rates)
-    return replace(still, offsets=offsets)
+    return replace(still, offset_s=offset_s, cov=widen[:, None] * cov * widen, sensitivity=T_rates)
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,7 +126,7 @@ def test_a_lasers_angles_move_its_ranges_and_ends_as_its_derivatives_say(scans, 
     by_error = [np.sum(expected[is_mine & (scans.capture == k)]) / 5e-5 for k in range(scans.n_captures)]
     assert np.allclose(sums[:, ring, first, first + error], by_error, rtol=1e-3, atol=0.02)
     plain, told = (ends(scans, each) for each in (plain_state, state))
-    slopes = plain.rows[:, END["range"].start + error] * np.where(plain.ring == ring, 5e-5, 0.0)
+    slopes = plain.rows[:, END["range"].start + error] * np.where(scans.end_ring == ring, 5e-5, 0.0)
     assert np.allclose(told.rows[:, -1] - plain.rows[:, -1], slopes, atol=1e-7)
     assert np.abs(slopes).max() > 5e-5
 
@@ -214,12 +214,12 @@ def plain_rows(terms, scans, T_lidar_board, levels, r):
     return np.concatenate(rows), block_diag(*noise)
 
 
-EDGE_FIELDS = ("ring", "rows", "step_m", "range_m", "is_backed")
+EDGE_FIELDS = ("group", "rows", "step_m", "range_m", "is_backed")
 
 
 def without_ends(edges):
     none = np.zeros(0, dtype=np.intp)
-    return replace(edges, capture=none, **{name: getattr(edges, name)[none] for name in EDGE_FIELDS})
+    return replace(edges, **{name: getattr(edges, name)[none] for name in EDGE_FIELDS})
 
 
 def test_the_evidence_rises_and_falls_as_that_of_one_large_gaussian(scans, images, T_lidar_board):
