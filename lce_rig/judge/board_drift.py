@@ -165,17 +165,12 @@ def watch_boards(
         moved = perturb(calibration.T_cam_lidar, alone[first].optimum()[0] * np.eye(6)[first])
         rest = _expand(seen, board, moved, lidar)
         axes = [axes[axis] if axis == first else _judge(axis, rest, float(sigmas[axis])) for axis in range(6)]
-    joint = JointDrift(*_change_of_all(cost, cov_deployed), lever_arm(seen))
-    return BoardDrift(tuple(axes), summarise(residuals), len(seen), len(cost.groups), joint)
-
-
-def _change_of_all(cost: Quadratics, cov_deployed: Array) -> tuple[Array, Array]:
-    """Estimate the change (6,) of all axes and its covariance (6, 6), by residuals or jackknife if wider."""
-    change, cov = cost.optimum()[:6], cost.covariance()[:6, :6]
-    without_each = cost.without_each()[:, :6]
+    # The covariance of all axes by residuals, or by the jackknife if that is wider.
+    change, cov, without_each = cost.optimum()[:6], cost.covariance()[:6, :6], cost.without_each()[:, :6]
     scatter = jackknife_scatter(without_each - without_each.mean(axis=0))
     wider = max(float(np.trace(np.linalg.solve(cov, scatter))) / 6, 1.0)
-    return change, wider * cov + cov_deployed
+    joint = JointDrift(change, wider * cov + cov_deployed, lever_arm(seen))
+    return BoardDrift(tuple(axes), summarise(residuals), len(seen), len(cost.groups), joint)
 
 
 def _alone(cost: Quadratics, axis: int) -> Quadratics:

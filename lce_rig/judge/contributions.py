@@ -82,7 +82,7 @@ def find_contradictions(
         # The result lies between both subsets; where the extrinsics change on the way, it lies a whole change
         # from one of the two that may hold now.
         share = 1.0 if contrast.is_change else _HALF
-        yield Contradiction(f"{contrast.first}_{contrast.second}", share * np.array([contrast.apart]))
+        yield Contradiction(f"{contrast.first}_{contrast.second}", share * contrast.apart[None])
     # Channels of one camera have one pose: the result lies between both.
     apart = estimate.channel_difference
     if apart is not None and target.excess(apart) > 1:

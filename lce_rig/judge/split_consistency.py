@@ -6,7 +6,7 @@ looked for: those of a sensor that moved to and fro.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,16 +73,15 @@ class RejectedGroup(NamedTuple):
     neighbour: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Contrast:
     """Two subsets of the captures, calibrated separately.
 
     Attributes:
         first, second: their names, such as "near" and "far".
-        rotation_deg, translation_m: angle and distance between their extrinsics.
+        apart: (6,) tangent (translation m, rotation rad) from the second's extrinsics to the first's.
         chance: probability that random subsets differ as much, in units of their noise.
         n_first: number of captures in the first subset.
-        apart: (6,) tangent (translation m, rotation rad) from the second's extrinsics to the first's.
         group: indices of the first subset's captures, where no order tells them.
         is_noise_known: whether `chance` is that of a known noise, not of one measured by the captures.
         rejected: the captures of one subset, where they were rejected as outliers.
@@ -90,11 +89,9 @@ class Contrast:
 
     first: str
     second: str
-    rotation_deg: float
-    translation_m: float
+    apart: Array
     chance: float
     n_first: int
-    apart: tuple[float, ...] = ()
     group: tuple[int, ...] = ()
     is_noise_known: bool = False
     rejected: RejectedGroup | None = None
@@ -125,7 +122,7 @@ class Contrast:
         limit = limits.max_change if self.is_change else limits.max_contrast
         if self.group and (self.is_noise_known or self.chance < _CERTAIN * limits.least_chance):
             limit = 1.0
-        return target.in_targets(self.rotation_deg, self.translation_m) / limit
+        return target.in_targets(*tangent_sizes(self.apart)) / limit
 
 
 def contrast_halves(expansion: Quadratics, centres: Array) -> tuple[Contrast, ...]:
@@ -153,7 +150,7 @@ def contrast_halves(expansion: Quadratics, centres: Array) -> tuple[Contrast, ..
     changes = [(_tail(chi2[best] / unit), apart[best], int(cuts[best]))]
     changes += [_change_at_end(expansion, cut) for cut in (2, n - 2)]
     chance, tangent, cut = min(changes, key=lambda change: change[0])
-    found = [make_contrast("before", "after", tangent, min((len(cuts) + 2) * chance, 1.0), cut)]
+    found = [Contrast("before", "after", tangent, min((len(cuts) + 2) * chance, 1.0), cut)]
     for first, second, key in (
         ("near", "far", np.linalg.norm(centres, axis=1)),
         ("left", "right", x / z),
@@ -161,7 +158,7 @@ def contrast_halves(expansion: Quadratics, centres: Array) -> tuple[Contrast, ..
     ):
         is_first = (np.argsort(np.argsort(key)) < len(key) // 2)[None].astype(np.float64)
         chi2, apart = _chi2(expansion, is_first)
-        found.append(make_contrast(first, second, apart[0], _tail(chi2[0] / unit), int(is_first.sum())))
+        found.append(Contrast(first, second, apart[0], _tail(chi2[0] / unit), int(is_first.sum())))
     return tuple(found)
 
 
@@ -243,8 +240,7 @@ def find_groups(expansion: Quadratics) -> tuple[Contrast, ...]:
     shares = smaller @ expansion.groups
     _, apart = _chi2(expansion, shares[None])
     members = np.flatnonzero(shares)
-    found = make_contrast("group", "rest", apart[0], chance, len(members))
-    return (replace(found, group=tuple(members.tolist())),)
+    return (Contrast("group", "rest", apart[0], chance, len(members), tuple(members.tolist())),)
 
 
 def find_turned(turns: Array, centres: Array, groups: Array) -> tuple[Contrast, ...]:
@@ -348,12 +344,6 @@ def _chi2(expansion: Quadratics, shares: Array, among: Array | None = None) -> t
     return np.asarray(np.sum(apart * scaled, axis=1)), np.asarray(apart)
 
 
-def make_contrast(first: str, second: str, apart: Array, chance: float, n_first: int) -> Contrast:
-    """Describe two subsets by the tangent (6,) between their extrinsics."""
-    rotation_deg, translation_m = tangent_sizes(apart)
-    return Contrast(first, second, rotation_deg, translation_m, chance, n_first, tuple(apart.tolist()))
-
-
 def objections(
     contrasts: Sequence[Contrast], target: CalibrationSettings, limits: VerdictSettings
 ) -> list[Contrast]:
@@ -405,9 +395,10 @@ def split_findings(
         if c in others:
             continue
         severity = failing(c.excess(target, limits) > _FAIL)
+        rotation_deg, translation_m = tangent_sizes(c.apart)
         apart: dict[str, Any] = {
-            "rotation_deg": c.rotation_deg,
-            "translation_m": c.translation_m,
+            "rotation_deg": rotation_deg,
+            "translation_m": translation_m,
             "chance": c.chance,
         }
         if c.rejected is not None:

@@ -7,7 +7,7 @@ reference, would be reported to 0.22 deg and 10 mm instead of 0.59 deg and 24 mm
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,7 +45,6 @@ from lce_rig.judge.split_consistency import (
     contrast_halves,
     find_groups,
     find_turned,
-    make_contrast,
     objections,
 )
 from lce_rig.rig import LidarSettings, Rig
@@ -261,7 +260,7 @@ class _Test:
         words = ("before", "after") if place == "last" else ("group", "rest")
         rejected = RejectedGroup(names, place, neighbour)
         gain = float(np.sum(self._costs(group, T_rest) - costs)) * len(names) / len(group)
-        return gain, replace(make_contrast(*words, apart, chance, len(names)), rejected=rejected)
+        return gain, Contrast(*words, apart, chance, len(names), rejected=rejected)
 
     def _fit(self, group: Sequence[Observation], T: Array, x: Array) -> tuple[Array, Array]:
         """Fit extrinsics to a group with the constants of the rest: costs (F,), and the extrinsics."""

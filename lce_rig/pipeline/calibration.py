@@ -34,10 +34,16 @@ from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.extrinsics import Reference
-from lce_rig.judge.camera_pairs import CameraEvidence, CameraPair, camera_findings, find_exchanged, relate
 from lce_rig.judge.contributions import profile_covariance
 from lce_rig.judge.findings import lacks_captures
 from lce_rig.judge.reach import point_uncertainties, with_lens
+from lce_rig.judge.sensor_pairs import (
+    CameraEvidence,
+    CameraPair,
+    camera_findings,
+    find_exchanged_cameras,
+    relate,
+)
 from lce_rig.judge.session_check import find_meetings
 from lce_rig.judge.validate import Validation, validate
 from lce_rig.judge.verdict import judge, share_findings, with_opinion
@@ -327,7 +333,9 @@ def _compare(rig: Rig, detections: Detections, solved: Sequence[_Solved]) -> lis
         pair = relate(one.estimate, other.estimate) if one.is_still and other.is_still else None
         names = one.camera, other.camera
         findings = [] if pair is None else camera_findings(pair, names, rig.calibration, rig.verdict)
-        exchanged = find_exchanged(rig, one.lidar, one.evidence(detections), other.evidence(detections))
+        exchanged = find_exchanged_cameras(
+            rig, one.lidar, one.evidence(detections), other.evidence(detections)
+        )
         links.append(_Link(members, pair, findings, exchanged))
     return links
 

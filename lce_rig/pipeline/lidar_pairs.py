@@ -22,7 +22,7 @@ from lce_rig.core.geometry import Array, invert, relative_pose
 from lce_rig.core.progress import Progress, begin
 from lce_rig.core.results import Observation
 from lce_rig.detect.detection import Detections, Pair
-from lce_rig.judge.lidar_pairs import find_exchanged, find_other_model, loop_findings
+from lce_rig.judge.sensor_pairs import find_exchanged_lidars, find_other_model, loop_findings
 from lce_rig.judge.session_check import match_candidates
 from lce_rig.judge.validate import validate
 from lce_rig.judge.verdict import judge, with_findings
@@ -134,7 +134,7 @@ def _calibrate(rig: Rig, detections: Detections, pair: Pair, options: CalibrateO
     others = [
         *find_other_model(first, rig.lidars[first], scans[first].values()),
         *find_other_model(second, rig.lidars[second], scans[second].values()),
-        *find_exchanged(
+        *find_exchanged_lidars(
             T, rig.nominal(first, second), f"{first} and {second}", [rig.lidars[first], rig.lidars[second]]
         ),
     ]

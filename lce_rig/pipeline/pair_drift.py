@@ -189,20 +189,7 @@ class DriftReport:
         return files
 
 
-def judge_pairs(
-    rig: Rig, calibrations: Sequence[Calibration], kept: Sequence[Sequence[Seen]]
-) -> tuple[PairDrift, ...]:
-    """Judge calibrations by captures of a scene.
-
-    Args:
-        rig: the profile.
-        calibrations: the deployed extrinsics.
-        kept: the captures of each.
-    """
-    return tuple(map(_Judge(rig).pair, calibrations, kept))
-
-
-class _Judge:
+class PairJudge:
     """Judges cameras and LiDARs in turn; the motion of a LiDAR is estimated once for all cameras."""
 
     def __init__(self, rig: Rig) -> None:
@@ -210,6 +197,7 @@ class _Judge:
         self._motions: dict[int, RigMotion | None] = {}
 
     def pair(self, c: Calibration, kept: Sequence[Seen]) -> PairDrift:
+        """Judge deployed extrinsics by captures of a scene."""
         lens = self._rig.lens_of(c)
         views: list[SceneView] = []
         whole: list[SceneView] = []

@@ -25,7 +25,7 @@ from lce_rig.io import open_recordings
 from lce_rig.io.folder import FolderRecording
 from lce_rig.io.joining import check_overlap, join_recordings, require_sensors
 from lce_rig.io.protocol import ContinuousRecording
-from lce_rig.pipeline.pair_drift import EVENTS_NS, DriftReport, Seen, judge_pairs, own_offset_ns
+from lce_rig.pipeline.pair_drift import EVENTS_NS, DriftReport, PairJudge, Seen, own_offset_ns
 from lce_rig.pipeline.result_files import RESULT, result_folder
 from lce_rig.pipeline.verification import with_lenses_of
 from lce_rig.rig import Rig
@@ -220,7 +220,7 @@ class SceneCaptures:
                 "Check the profile's topics and timestamps; "
                 "`lce-rig doctor --rig RIG` looks at attached sensors.",
             )
-        pairs = judge_pairs(self._rig, self._pairs, self.kept)
+        pairs = tuple(map(PairJudge(self._rig).pair, self._pairs, self.kept))
         return DriftReport(self._rig, pairs, tuple(dict.fromkeys(self.notes)))
 
 

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.data import Events, Image, Scan
 from lce_rig.core.findings import Refusal
-from lce_rig.core.geometry import Array, transform
+from lce_rig.core.geometry import transform
 from lce_rig.core.results import ImageBoard
 from lce_rig.detect.events.figures import outline_px
 from lce_rig.detect.lidar.measurement import Beam
@@ -41,23 +40,15 @@ def without_board(
     view: SceneView, found: ImageBoard | Refusal, rig: Rig, extrinsics: Calibration
 ) -> SceneView:
     """Leave out the edges at and near the board, if the image shows one."""
-    return replace(
-        view, edges=view.edges.select(is_apart_from_board(view.edges.points, found, rig, extrinsics))
-    )
-
-
-def is_apart_from_board(
-    points: Array, found: ImageBoard | Refusal, rig: Rig, extrinsics: Calibration
-) -> NDArray[np.bool_]:
-    """Find which points (N, 3) of the LiDAR's frame lie apart from the board in an image; all without one."""
     if isinstance(found, Refusal):
-        return np.ones(len(points), dtype=np.bool_)
+        return view
     lens = rig.lens_of(extrinsics)
     outline = outline_px(found.T_cam_board, rig.board.to_board(), lens)
     hull = cv2.convexHull(outline[np.isfinite(outline).all(axis=1)].astype(np.float32))
-    pixels, _ = lens.project(transform(extrinsics.T_cam_lidar, points))
+    pixels, _ = lens.project(transform(extrinsics.T_cam_lidar, view.edges.points))
     margin_px = _BOARD_MARGIN_RAD * lens.fx_px
-    return np.array([cv2.pointPolygonTest(hull, p, True) < -margin_px for p in pixels.tolist()], dtype=bool)
+    is_apart = [cv2.pointPolygonTest(hull, p, True) < -margin_px for p in pixels.tolist()]
+    return replace(view, edges=view.edges.select(np.array(is_apart, dtype=bool)))
 
 
 def without_movers(views: Sequence[SceneView]) -> list[SceneView]:

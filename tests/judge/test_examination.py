@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.tolerances import Tolerances
-from lce_rig.core.geometry import difference, perturb
+from lce_rig.core.geometry import difference, perturb, tangent_sizes
 from lce_rig.judge.local_quadratic import OF_PROFILE, expand, pattern_of, scale_of
 from lce_rig.judge.split_consistency import contrast_halves, find_groups, find_turned, split_findings
 from lce_rig.judge.validate import validate
@@ -100,7 +100,7 @@ def test_a_sensor_nudged_on_the_way_is_found_with_the_capture(angle_deg, severit
     assert [finding.severity for finding in findings] == ([] if severity is None else [severity])
     if severity is not None:
         assert abs(contrasts[0].n_first - 12) <= 1
-        assert abs(contrasts[0].rotation_deg - angle_deg) < 0.3 * angle_deg
+        assert abs(tangent_sizes(contrasts[0].apart)[0] - angle_deg) < 0.3 * angle_deg
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from lce_rig.core.geometry import difference, exp_so3, invert, perturb, pose
 from lce_rig.detect.detection import Detections
 from lce_rig.detect.findings import LIDAR_OTHER_SIZE
 from lce_rig.export import ExportJob, export
-from lce_rig.judge.lidar_pairs import loop_findings
+from lce_rig.judge.sensor_pairs import loop_findings
 from lce_rig.pipeline.calibration import calibrate_detections
 from lce_rig.pipeline.lidar_pairs import close
 from lce_rig.rig import Rig

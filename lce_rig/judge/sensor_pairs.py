@@ -1,10 +1,13 @@
-"""Two cameras that saw the same boards: their relative pose from images, and whether their extrinsics agree.
+"""Two sensors that saw the same boards: whether their extrinsics agree, and their names are not exchanged.
 
-Each still board that both see gives T_second_first = T_second_board T_first_board^-1 without any LiDAR. The
-extrinsics of both cameras with one LiDAR give the same pose independently.
+Each still board that two cameras see gives T_second_first = T_second_board T_first_board^-1 without any
+LiDAR. The extrinsics of both cameras with one LiDAR give the same pose independently.
+
+LiDARs: their pose to each other closes a loop with a camera, and has checks beyond those that a camera and a
+LiDAR have as well.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,21 +18,34 @@ from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.observations import group_placements, scan_key
 from lce_rig.calibrate.quadratics import Quadratics, symmetric_inverse, without_prior
 from lce_rig.calibrate.result import CalibrationEstimate
-from lce_rig.core.findings import Finding
+from lce_rig.core.calibration import Calibration
+from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import (
     Array,
     PoseDifference,
+    composition_slopes,
     difference,
+    invert,
     mean_pose,
     relative_covariance,
     relative_pose,
+    tangent_sizes,
 )
 from lce_rig.core.results import Observation
-from lce_rig.judge.findings import CAMERAS_DIFFER, CAMERAS_EXCHANGED, failing
+from lce_rig.detect.detection import LidarDetection
+from lce_rig.judge.findings import (
+    CAMERAS_DIFFER,
+    CAMERAS_EXCHANGED,
+    LIDARS_DIFFER,
+    LIDARS_EXCHANGED,
+    LIDARS_UNNAMED,
+    OTHER_MODEL,
+    failing,
+)
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, check_intrinsics
 from lce_rig.judge.split_consistency import contrast_halves, split_findings
 from lce_rig.lens.lens_estimate import BoardView
-from lce_rig.rig import CalibrationSettings, NominalExtrinsic, Rig, VerdictSettings
+from lce_rig.rig import CalibrationSettings, LidarSettings, NominalExtrinsic, Rig, VerdictSettings
 
 # Fewer placements do not determine the scatter.
 _MIN_PLACEMENTS = 4
@@ -71,14 +87,12 @@ class CameraPair:
 
     Attributes:
         captures: that both used, as the first names them.
-        T_second_first: (4, 4) to which their extrinsics compose.
         from_images: the relative pose from their images; None if both saw too few boards.
         apart: from the extrinsics' pose to the images'; None likewise.
         board_rms_m: rms distance between positions of a board's middle under the extrinsics' pose.
     """
 
     captures: tuple[str, ...]
-    T_second_first: Array
     from_images: RelativePose | None
     apart: PoseDifference | None
     board_rms_m: float
@@ -112,11 +126,11 @@ def relate(first: CalibrationEstimate, second: CalibrationEstimate) -> CameraPai
     captures = tuple(one.capture for one, _ in shared)
     board_rms_m = _board_rms_m(shared, T)
     if from_images is None:
-        return CameraPair(captures, T, None, None, board_rms_m)
+        return CameraPair(captures, None, None, board_rms_m)
     # Errors of the images enter both poses and are counted twice, which is conservative.
     cov = relative_covariance(J, second.cov, first.cov) + from_images.cov
     apart = PoseDifference(difference(from_images.T_second_first, T), cov)
-    return CameraPair(captures, T, from_images, apart, board_rms_m)
+    return CameraPair(captures, from_images, apart, board_rms_m)
 
 
 def pose_from_images(shared: Sequence[tuple[Observation, Observation]]) -> RelativePose | None:
@@ -191,7 +205,9 @@ class CameraEvidence(NamedTuple):
     lens: IntrinsicsCheck | None
 
 
-def find_exchanged(rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence) -> list[Finding]:
+def find_exchanged_cameras(
+    rig: Rig, lidar: str, first: CameraEvidence, second: CameraEvidence
+) -> list[Finding]:
     """Find two cameras whose images came under each other's name.
 
     Exchanged, they fit the profile better: the nominal poses by more than chance allows, tolerances taken as
@@ -266,3 +282,74 @@ def camera_findings(
             )
         )
     return findings
+
+
+def find_other_model(name: str, lidar: LidarSettings, scans: Iterable[LidarDetection]) -> list[Finding]:
+    """Find a LiDAR whose scans have rings that its model lacks, as when two came under each other's name.
+
+    Args:
+        name: of the LiDAR.
+        lidar: its settings.
+        scans: its detections.
+    """
+    sheet = lidar.data_sheet()
+    if sheet is None or not sheet.has_rings:
+        return []
+    n_lasers = len(sheet.elevations_deg)
+    rings = [int(scan[0].ring.max(initial=0)) for scan in scans if not isinstance(scan, Refusal)]
+    highest = max(rings, default=0)
+    if highest < n_lasers:
+        return []
+    return [OTHER_MODEL(name, model=lidar.model, n_lasers=n_lasers, ring=highest)]
+
+
+def find_exchanged_lidars(
+    T_first_second: Array, nominal: NominalExtrinsic | None, names: str, lidars: Sequence[LidarSettings]
+) -> list[Finding]:
+    """Find two LiDARs whose scans came under each other's name.
+
+    Exchanged, the estimate is the inverse, and boards fit as well. Without a nominal pose only the scans of a
+    LiDAR with more rings show it; otherwise the result cannot pass.
+
+    Args:
+        T_first_second: (4, 4) the estimate.
+        nominal: of the profile.
+        names: of both.
+        lidars: their settings.
+    """
+    if nominal is None:
+        sheets = [lidar.data_sheet() for lidar in lidars]
+        rings = {len(sheet.elevations_deg) for sheet in sheets if sheet is not None and sheet.has_rings}
+        return [] if len(rings) == len(sheets) else [LIDARS_UNNAMED(names)]
+
+    def excess(T: Array) -> float:
+        rotation_deg, translation_m = tangent_sizes(difference(T, nominal.to_matrix()))
+        return max(rotation_deg / nominal.tolerance_deg, translation_m / nominal.tolerance_m)
+
+    is_exchanged = excess(T_first_second) > 1 >= excess(invert(T_first_second))
+    return [LIDARS_EXCHANGED(names)] if is_exchanged else []
+
+
+def loop_findings(between: Calibration, first: Calibration, second: Calibration, rig: Rig) -> list[Finding]:
+    """Compare two LiDARs' pose with that by a camera calibrated to both.
+
+    All three results have seen the same boards: their errors are counted as independent.
+
+    Args:
+        between: of the two LiDARs.
+        first, second: of the camera and each of them.
+        rig: targets and limits.
+    """
+    by_first, by_between = composition_slopes(first.T_cam_lidar, between.T_cam_lidar)
+    cov = by_first @ first.cov @ by_first.T + by_between @ between.cov @ by_between.T + second.cov
+    tangent = difference(first.T_cam_lidar @ between.T_cam_lidar, second.T_cam_lidar)
+    apart = PoseDifference(tangent, cov)
+    excess = rig.calibration.excess(apart) / rig.verdict.max_camera_difference
+    if excess <= 1:
+        return []
+    severity = failing(excess > rig.verdict.fail_factor)
+    return [
+        LIDARS_DIFFER(
+            f"{between.camera} and {between.lidar}", severity=severity, camera=first.camera, **apart.sizes
+        )
+    ]
