@@ -131,12 +131,7 @@ def compare_calibrations(
     Args:
         calibrations: by the name of their session or result, at least two.
         are_independent: whether each was made from captures of its own.
-
-    Raises:
-        ValueError: there are fewer than two.
     """
-    if len(calibrations) < 2:
-        raise ValueError("a comparison requires two calibrations, 1 given")
     names = tuple(calibrations)
     lenses = [calibrations[name].intrinsics for name in names]
     lens, models = lenses[0], {each and (each.model, len(each.distortion)) for each in lenses}

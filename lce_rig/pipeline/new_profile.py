@@ -20,7 +20,7 @@ from lce_rig.io.cloud import to_scan
 from lce_rig.io.decoding import DECODERS, SUFFIXES, read_cloud, read_image
 from lce_rig.io.ros.topics import SensorTopic, survey_bag
 from lce_rig.rig import BoardSettings, LidarSettings
-from lce_rig.rig.board_settings import KEYS_OF_TYPE
+from lce_rig.rig.board_settings import KEYS_OF_TYPE, board_block
 from lce_rig.rig.loading import Document, board_of, dump_yaml, rig_from_document
 from lce_rig.rig.sensors import lens_block
 
@@ -144,11 +144,7 @@ def new_profile(
         "format_version": 1,
         "name": name,
         "board": {
-            "inner_corners": [board.cols, board.rows],
-            "square_m": board.square_m,
-            "width_m": board.width_m,
-            "height_m": board.height_m,
-            "pattern_offset_m": list(board.pattern_offset_m),
+            **board_block(board),
             # The usual standard deviations.
             "square_sigma_m": float(f"{board.square_m / 1000:.2g}"),
             **{key: BoardSettings.model_fields[key].default for key in _BOARD_SIGMAS},

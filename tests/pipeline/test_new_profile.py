@@ -26,6 +26,14 @@ def test_numbers_alone_make_a_profile():
     assert not rig.nominal_extrinsics and rig.lidars["lidar"].driver.type is None
 
 
+@pytest.mark.parametrize(
+    "board", ["charuco:9x7,0.07,0.0525,5X5_50,0.767x0.626", "aprilgrid:4x3,0.13,0.3,0.767x0.626,0.01,0"]
+)
+def test_a_board_with_markers_is_written_as_it_was_given(board):
+    text, _ = new_profile("a", parse_board(board), intrinsics=[parse_intrinsics(LENS)])
+    assert parse_rig(text).board.to_board() == parse_board(board)
+
+
 def test_a_camera_info_file_of_any_maker_is_taken(tmp_path):
     lens = Intrinsics(897.5, 896.8, 635.4, 375.3, 1280, 720, "radtan", (-0.44, 0.233, -0.001, 0.0002, -0.073))
     path = tmp_path / "camera_info.yaml"
