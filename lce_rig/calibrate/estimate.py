@@ -106,7 +106,7 @@ def estimate_extrinsics(
         refused={**conflicts, **estimate.refused},
         same_scan={scan.capture: scan.captures for scan in scans if len(scan.captures) > 1},
         channels=tuple(channels),
-        channel_difference=_difference(motion, tuple(by_channel.values()), board, settings.seed),
+        channel_difference=_difference(motion, tuple(by_channel.values()), board),
     )
 
 
@@ -208,7 +208,7 @@ def depth_scatter_m(T_cam_lidar: Array, observations: Sequence[Observation]) -> 
 
 
 def _difference(
-    motion: Motion, by_channel: Sequence[Sequence[Observation]], board: Board, seed: int
+    motion: Motion, by_channel: Sequence[Sequence[Observation]], board: Board
 ) -> PoseDifference | None:
     """Compare two channels' extrinsics.
 
@@ -220,7 +220,6 @@ def _difference(
         motion: of the boards.
         by_channel: observations of each channel, positioned by it alone.
         board: its specification.
-        seed: of the shares.
     """
     if len(by_channel) != 2:
         return None
@@ -228,7 +227,7 @@ def _difference(
         first, second = (solve(observations, board) for observations in by_channel)
         covs = [motion.widened(each.cost.jackknife_covariance()[:6, :6]) for each in (first, second)]
         return PoseDifference(difference(first.T_cam_lidar, second.T_cam_lidar), covs[0] + covs[1])
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     ways: list[PoseDifference] = []
     for _ in range(_N_SHARES):
         mine = set(rng.permutation(len(motion.scans))[: len(motion.scans) // 2].tolist())

@@ -19,11 +19,9 @@ class CalibrateOptions:
     Attributes:
         method: "ml" (Algorithm 1, then maximum likelihood of extrinsics, all board poses and the sensors'
             constant errors) or "paper" (Algorithm 1 of LCE-Calib alone).
-        seed: of the halves of a session by which two channels of a moving board are compared.
     """
 
     method: Method = DEFAULT_METHOD
-    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +89,6 @@ class EstimateSettings(CalibrateOptions):
         """Add what the profile says of a LiDAR, and of lens and board, to a user's options."""
         return cls(
             options.method,
-            options.seed,
             laser_bias_sigma_m=lidar.laser_bias_sigma_m,
             range_offset_sigma_m=lidar.range_offset_sigma_m,
             has_rings=lidar.has_rings,

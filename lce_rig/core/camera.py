@@ -145,22 +145,30 @@ class Intrinsics:
         z = points[..., 2]
         rho = np.hypot(points[..., 0], points[..., 1])
         if self.model == "equidistant":
-            is_valid = (np.arctan2(rho, z) < self.max_radius) & np.isfinite(rho)
+            angle = np.arctan2(rho, z)
+            is_valid = (angle < self.max_radius) & np.isfinite(rho)
+            distorted = self._bend(points, rho, angle)
         else:
             is_valid = (z > 1e-6) & (rho < self.max_radius * z)
-        pixels = self.distort(points) * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
+            distorted = self.distort(points)
+        pixels = distorted * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
         pixels[~is_valid] = np.nan
         return pixels, is_valid
 
     def distort(self, points_camera: Array) -> Array:
         """Project points (..., 3) in units of the focal lengths: (..., 2), also where `project` gives NaN."""
         lateral, z = points_camera[..., :2], points_camera[..., 2]
-        with np.errstate(all="ignore"):
-            if self.model == "radtan":
+        if self.model == "radtan":
+            with np.errstate(all="ignore"):
                 return self._distort(lateral / z[..., None])
-            rho = np.hypot(lateral[..., 0], lateral[..., 1])
-            scale = np.where(rho > 1e-12, self._distorted_radius(np.arctan2(rho, z)) / rho, 1.0 / z)
-            return np.asarray(lateral * scale[..., None])
+        rho = np.hypot(lateral[..., 0], lateral[..., 1])
+        return self._bend(points_camera, rho, np.arctan2(rho, z))
+
+    def _bend(self, points: Array, rho: Array, angle: Array) -> Array:
+        """Distort points (..., 3) by their distance from the axis and angle to it (equidistant only)."""
+        with np.errstate(all="ignore"):
+            scale = np.where(rho > 1e-12, self._distorted_radius(angle) / rho, 1.0 / points[..., 2])
+        return np.asarray(points[..., :2] * scale[..., None])
 
     def differentiate(self, points_camera: Array) -> Array:
         """Differentiate `project` by the point.

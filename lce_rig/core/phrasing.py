@@ -18,13 +18,13 @@ _UNITS: Mapping[str, tuple[float, int, str]] = {
 
 
 _LIMITS = ("limit_", "max_", "min_", "target_", "tolerance_")
-_MOST_DIGITS = 4
+_MOST_DIGITS, _FEW = 4, 4
 
 
 def _format(value: Any, spec: str, more: int = 0) -> str:
     """Format a figure; {rms_m:mm}, {tilt_deg:1deg}, {change_m:+mm}, {share:percent} scale and add the unit.
 
-    {axis:motion} names a motion by its code.
+    {axis:motion} names a motion by its code; {captures:few} lists the first of them.
 
     Args:
         value: the figure; those of a tuple are listed.
@@ -34,6 +34,8 @@ def _format(value: Any, spec: str, more: int = 0) -> str:
     if value is None:
         return "unknown"
     unit = next((unit for unit in _UNITS if spec.endswith(unit)), None)
+    if spec == "few":
+        return ", ".join(map(str, value[:_FEW])) + (" ..." if len(value) > _FEW else "")
     if isinstance(value, tuple):
         listed = [_format(each, spec, more) for each in value]
         printed = "" if unit is None else _UNITS[unit][2]

@@ -262,28 +262,13 @@ def _pattern_offset(finding: Finding) -> str:
     return fill(f"the pattern sits {', '.join(sides)} {place}", finding.figures)
 
 
-def _sensors_disagree(finding: Finding) -> str:
-    """The sensors disagree in {n_refused} of {n_captures} captures, {captures}."""
-    names = finding.figures["captures"]
-    assert isinstance(names, tuple)
-    shown = ", ".join(map(str, names[:4])) + (" ..." if len(names) > 4 else "")
-    return (
-        fill("the sensors disagree in {n_refused} of {n_captures} captures", finding.figures) + f" ({shown})"
-    )
-
-
 def _moved(finding: Finding) -> str:
     """The {place} {n_captures} captures, {captures}, fit a mounting {rotation_deg}, {translation_m} apart.
 
     {neighbour} lies before or after them; {chance}: to differ as much on one mounting.
     """
-    names, place = finding.figures["captures"], finding.figures["place"]
-    assert isinstance(names, tuple)
-    shown = ", ".join(map(str, names[:4])) + (" ..." if len(names) > 4 else "")
-    text = fill(
-        f"{{n_captures}} captures ({shown}) fit a mounting changed by {_APART}: a sensor moved ",
-        finding.figures,
-    )
+    place, text = finding.figures["place"], f"fit a mounting changed by {_APART}: a sensor moved "
+    text = fill("{n_captures} captures ({captures:few}) " + text, finding.figures)
     when = {"last": "after {neighbour}", "first": "before {neighbour}"}.get(str(place), "to and fro")
     return f"{f'the {place} ' if place else ''}{text}{fill(when, finding.figures)}"
 
@@ -354,7 +339,7 @@ CHANNELS_DIFFER = Kind(
 )
 SENSORS_DISAGREE = Kind(
     "verdict.sensors_disagree",
-    _sensors_disagree,
+    "the sensors disagree in {n_refused} of {n_captures} captures ({captures:few})",
     "look for a moving board, a second board, or wrong matching",
 )
 FEW_USED = Kind(

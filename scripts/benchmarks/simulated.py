@@ -5,7 +5,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.tables import print_head, print_row, rms
-from lce_rig.calibrate import CalibrateOptions
 from lce_rig.core.geometry import difference
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection
 from lce_rig.detect.finder import BoardFinder
@@ -47,7 +46,7 @@ def _simulated_runs(name: str, n_seeds: int, n_captures: int) -> Iterator[tuple[
             scans[f"{capture.index:06d}"] = BoardFinder(rig).scan(capture.scans[0])
         camera, lidar = next(iter(rig.cameras)), next(iter(rig.lidars))
         detections = Detections({(camera, "frames"): images}, {lidar: scans})
-        (calibration, *_), _ = calibrate_detections(rig, detections, CalibrateOptions(seed=seed))
+        (calibration, *_), _ = calibrate_detections(rig, detections)
         error = difference(calibration.T_cam_lidar, truth_extrinsics(rig, seed, options)[camera, lidar])
         nees = float(error @ np.linalg.solve(covariance_alone(calibration), error))
         yield (
