@@ -72,6 +72,7 @@ class Validation:
         cov_agreed: (6, 6) the same without what checks contradict.
         cov_shared: (6, 6) the part of `cov` from errors of the profile's board and LiDAR.
         contributions: its causes, the largest first.
+        captures: their names, in the order of the contrasts; of two LiDARs with outliers.
         contrasts: subsets of the captures that should agree.
         scale: as `scale_of`; None for too few placements.
         pattern: as `pattern_of`, where it contradicts the profile; else None.
@@ -84,6 +85,7 @@ class Validation:
     cov_agreed: Array
     cov_shared: Array
     contributions: tuple[Contribution, ...]
+    captures: tuple[str, ...]
     contrasts: tuple[Contrast, ...]
     scale: tuple[float, float] | None
     pattern: tuple[Array, Array] | None
@@ -161,6 +163,7 @@ def validate(
         # Each session has fitted its own lens.
         cov_shared=profile_covariance([each for each in known if each.source != "intrinsics"]),
         contributions=list_contributions(estimate.diagnostics, known, contradictions),
+        captures=estimate.used,
         contrasts=contrasts,
         scale=scale,
         pattern=pattern,

@@ -98,7 +98,7 @@ def judge(
         *plate_findings([estimate.observations[name].lidar for name in estimate.used], board),
         *_scale(examination.scale, board, rig.verdict.max_scale_error),
         *_pattern(examination.pattern, len(estimate.used)),
-        *split_findings(examination.contrasts, estimate.used, rig.calibration, rig.verdict),
+        *split_findings(examination.contrasts, examination.captures, rig.calibration, rig.verdict),
         *others,
         *_motion(estimate, rig.verdict.max_plane_misfit_m),
         *_channels(estimate, rig),
