@@ -280,8 +280,8 @@ def find_turned(turns: Array, centres: Array, groups: Array) -> tuple[Contrast, 
     sight = centres.mean(axis=0) / np.linalg.norm(centres.mean(axis=0))
     members = np.flatnonzero(groups[smaller].any(axis=0))
     tangent = np.r_[np.zeros(3), (apart[0] - apart[1]) * sight]
-    found = make_contrast("group", "rest", tangent, chance, len(members))
-    return (replace(found, group=tuple(members.tolist()), is_noise_known=True),)
+    group = tuple(members.tolist())
+    return (Contrast("group", "rest", tangent, chance, len(members), group, is_noise_known=True),)
 
 
 def _share_out(g: Array, H: Array, starts: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_], Array]:
