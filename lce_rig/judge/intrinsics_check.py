@@ -25,7 +25,7 @@ from lce_rig.judge.findings import (
     failing,
 )
 from lce_rig.lens.calibrate_lens import distances_under, estimate_intrinsics
-from lce_rig.lens.difference import LensDifference, certainty_of, compare_lenses
+from lce_rig.lens.difference import certainty_of, compare_lenses
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate
 from lce_rig.lens.models import model_of
 
@@ -145,13 +145,11 @@ def check_intrinsics(
     for start in (intrinsics, plain):
         with suppress(NotEnoughDataError):
             fitted = estimate_intrinsics(image_boards, board, start, model_of(intrinsics), n_folds=_N_FOLDS)
-            return compare_with_given(fitted, intrinsics, board)[0]
+            return compare_with_given(fitted, intrinsics, board)
     return None
 
 
-def compare_with_given(
-    fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board: Board
-) -> tuple[IntrinsicsCheck, LensDifference]:
+def compare_with_given(fitted: IntrinsicsEstimate, intrinsics: Intrinsics, board: Board) -> IntrinsicsCheck:
     """Compare intrinsics with fitted ones.
 
     Args:
@@ -179,7 +177,7 @@ def compare_with_given(
         correlation = fitted.cov * np.outer(scale, scale)
         chi2 = float(change * scale @ np.linalg.solve(correlation, change * scale))
         chance = float(fdtrc(len(change), n_captures - 1, chi2 / len(change)))
-    check = IntrinsicsCheck(
+    return IntrinsicsCheck(
         n_captures=n_captures,
         rms_px=float(np.sqrt(np.mean(given_px**2))),
         possible_px=fitted.rms_px if np.isnan(fitted.held_out_rms_px) else fitted.held_out_rms_px,
@@ -196,7 +194,6 @@ def compare_with_given(
         surprise=fitted.surprise,
         is_contradicted=fitted.is_contradicted,
     )
-    return check, difference
 
 
 def describe(check: IntrinsicsCheck) -> str:

@@ -116,7 +116,7 @@ def validate(
     """
     board, known = rig.board.to_board(), estimate.sensitivities
     fitted = None if estimate.lens is None else estimate.lens.estimate
-    intrinsics = None if fitted is None or lens is None else compare_with_given(fitted, lens, board)[0]
+    intrinsics = None if fitted is None or lens is None else compare_with_given(fitted, lens, board)
     scale = pattern = None
     contrasts: tuple[Contrast, ...] = ()
     laser_angles: Mapping[str, float] = {}

@@ -6,6 +6,7 @@ that rotation.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,41 +22,20 @@ _STEPS = 10
 _LEAST_ALIGNED = 10
 
 
-@dataclass(frozen=True, eq=False)
-class LensDifference:
-    """Where a second lens model projects the ray of each pixel of a first one.
+class LensDifference(NamedTuple):
+    """How far apart a second lens model projects the rays of a first one's pixels where boards were seen.
 
     Attributes:
-        pixels: (G, 2) grid over the image.
-        displacement_px: (G, 2) the second model's pixel minus the first's; NaN if either is undefined.
-        is_covered: (G,) whether boards were seen there.
+        rms_px: rms distance; infinite if the first model projects none of the pixels.
+        sigma_px: root of the mean variance of the displacement.
         turn_rad: (3,) rotation vector from the first camera's rays to the second's.
-        sigma_px: root of the mean variance of the displacement over the covered pixels.
-        cov_turn: (3, 3) of the rotation vector, rad^2.
+        cov_turn: (3, 3) of it, rad^2.
     """
 
-    pixels: Array
-    displacement_px: Array
-    is_covered: NDArray[np.bool_]
-    turn_rad: Array
+    rms_px: float
     sigma_px: float
+    turn_rad: Array
     cov_turn: Array
-
-    @property
-    def rms_px(self) -> float:
-        """Rms distance over the covered pixels; infinite if the first model projects none of them."""
-        return float(np.sqrt(np.mean(self._lengths**2)))
-
-    @property
-    def max_px(self) -> float:
-        """Largest distance over the covered pixels; infinite likewise."""
-        return float(self._lengths.max())
-
-    @property
-    def _lengths(self) -> Array:
-        lengths = np.linalg.norm(self.displacement_px[self.is_covered], axis=1)
-        drawn = lengths[np.isfinite(lengths)]
-        return drawn if len(drawn) else np.array([np.inf])
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,19 +85,20 @@ def compare_lenses(
     rays, backward = first.unproject(pixels), second.unproject(pixels)
     aligned = is_covered & np.isfinite(rays).all(axis=1) & np.isfinite(backward).all(axis=1)
     if np.count_nonzero(aligned) < _LEAST_ALIGNED:
-        nothing = np.full_like(pixels, np.nan)
-        return LensDifference(pixels, nothing, is_covered, np.zeros(3), 0.0, np.zeros((3, 3)))
+        return LensDifference(np.inf, 0.0, np.zeros(3), np.zeros((3, 3)))
     vector = model.vector(second)
     R = project_to_so3(backward[aligned].T @ rays[aligned])
     for _ in range(_STEPS):
         predicted, J, _ = _by_turn(model, vector, rays[aligned] @ R.T)
         phi = -np.linalg.lstsq(J, (predicted - pixels[aligned]).ravel(), rcond=None)[0]
         R = exp_so3(np.asarray(phi)) @ R
-    moved, _ = second.project(rays @ R.T)
+    moved, _ = second.project(rays[is_covered] @ R.T)
+    squares = np.sum((moved - pixels[is_covered]) ** 2, axis=1)
+    rms_px = float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else np.inf
     turn, left = _best_turn(model, vector, rays[aligned] @ R.T)
     variances = np.einsum("ni,ij,nj->n", left, cov, left)
     sigma_px = float(np.sqrt(2 * np.mean(variances)))
-    return LensDifference(pixels, moved - pixels, is_covered, log_so3(R), sigma_px, turn @ cov @ turn.T)
+    return LensDifference(rms_px, sigma_px, log_so3(R), turn @ cov @ turn.T)
 
 
 def lens_errors(

@@ -35,7 +35,7 @@ from lce_rig.judge.findings import verdict_of
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given, judge_lens, lens_findings
 from lce_rig.judge.lens_model import model_findings
 from lce_rig.lens.calibrate_lens import estimate_intrinsics
-from lce_rig.lens.difference import LensCertainty, LensDifference, certainty_of, lens_errors
+from lce_rig.lens.difference import LensCertainty, certainty_of, lens_errors
 from lce_rig.lens.lens_estimate import BoardView, IntrinsicsEstimate, find_weaknesses
 from lce_rig.lens.models import MODELS, LensPrior, model_of
 from lce_rig.pipeline.detect_session import detect
@@ -63,7 +63,6 @@ class MeasuredIntrinsics:
         given: the profile's intrinsics.
         estimate: the intrinsics from the boards.
         check: the profile's intrinsics compared with the estimate; None if they are for another resolution.
-        difference: per pixel; None likewise.
         certainty: of the estimate, per pixel.
         judgement: whether the captures determine the intrinsics better than the profile, as `judge_lens`, or
             another lens model that fits them.
@@ -77,7 +76,6 @@ class MeasuredIntrinsics:
     given: Intrinsics
     estimate: IntrinsicsEstimate
     check: IntrinsicsCheck | None
-    difference: LensDifference | None
     certainty: LensCertainty
     judgement: Finding
     misfit: Finding | None
@@ -172,9 +170,9 @@ def measure_intrinsics(
         estimate = _fit(camera, found, rig, estimate.intrinsics, model)
     lens, target_deg = estimate.intrinsics, rig.calibration.target_sigma_deg
     certainty = certainty_of(lens, estimate.corners_px, estimate.cov, estimate.model)
-    check, difference = None, None
+    check = None
     if (given.width_px, given.height_px) == (lens.width_px, lens.height_px):
-        check, difference = compare_with_given(estimate, given, rig.board.to_board())
+        check = compare_with_given(estimate, given, rig.board.to_board())
     judgement = judge_lens(certainty.covered, certainty.image_sigma_px, check, target_deg)
     judgement = next(iter(model_findings(estimate, rig.board.to_board())), judgement)
     refused = {f"{name}.{channel}": why for (name, channel), why in found.items() if isinstance(why, Refusal)}
@@ -184,7 +182,6 @@ def measure_intrinsics(
         given=given,
         estimate=estimate,
         check=check,
-        difference=difference,
         certainty=certainty,
         judgement=judgement,
         misfit=next(iter(lens_findings(check, target_deg)), None),
@@ -395,14 +392,11 @@ def document(rig: Rig, measured: Sequence[MeasuredIntrinsics]) -> dict[str, Any]
 def _camera(measured: MeasuredIntrinsics) -> dict[str, Any]:
     """List one camera's intrinsics; its profile's are null if they are for another resolution."""
     estimate, lens = measured.estimate, measured.intrinsics
-    check, difference = measured.check, measured.difference
-    profile = None
-    if check is not None and difference is not None:
+    check, profile = measured.check, None
+    if check is not None:
         profile = {
             "intrinsics": lens_block(measured.given),
             **{name: _figure(value) for name, value in asdict(check).items()},
-            "displacement_max_px": _figure(difference.max_px),
-            "turn_rad": np.asarray(difference.turn_rad).tolist(),
             "verdict": verdict_of([] if measured.misfit is None else [measured.misfit]),
         }
     return {
