@@ -70,13 +70,15 @@ class Tolerances:
 class Sensitivity:
     """How far an error of the profile moves the extrinsics, as they are used with the result's intrinsics.
 
+    Or the moves that would resolve what a check contradicts: the covariance holds both sides.
+
     Attributes:
-        source: what is wrong.
+        source: what is wrong, or the check.
         sigma: its standard deviation, in its own unit.
         moves: (n, 6) tangents (translation m, rotation rad) per unit, of n independent errors of that size.
     """
 
-    source: Source
+    source: str
     sigma: float
     moves: Array
 

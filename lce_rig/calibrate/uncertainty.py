@@ -12,7 +12,7 @@ from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.model import assemble, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
 from lce_rig.calibrate.options import EstimateSettings
-from lce_rig.calibrate.quadratics import Quadratics, jackknife_scatter, symmetric_inverse
+from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse
 from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
 from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities, systematic_covariances
 from lce_rig.calibrate.tolerances import Variant, sensitivities_of, vary
@@ -67,12 +67,14 @@ def by_likelihood(start: Start, joint: JointEstimate, board: Board, camera: int 
     cov, inflation = widen(joint.cov[camera], jackknife_scatter(moves), n_placements)
     figures = _add_figures(start.diagnostics, joint, camera, inflation)
     estimate = report(start, joint.T_cam_lidar[camera], cov, board, figures)
-    return replace(
-        estimate,
-        method="ml",
-        cost=_expand_joint(joint, camera),
-        turns=_turns(joint, camera),
-    )
+    # The cost in the extrinsics alone, the camera's own first; constant errors are held fixed.
+    n_cameras = len(joint.T_cam_lidar)
+    order = [camera, *(c for c in range(n_cameras) if c != camera)]
+    own = np.concatenate([joint.state.layout.camera(c) for c in order])
+    # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
+    prior = np.eye(len(own)) if n_cameras > 1 else np.zeros((6, 6))
+    cost = replace(joint.cost.of(own), prior=prior, prior_gradient=np.zeros(len(own)))
+    return replace(estimate, method="ml", cost=cost, turns=_turns(joint, camera))
 
 
 def with_profile(
@@ -87,23 +89,6 @@ def with_profile(
         variants, _moves_under(joint, used, variants, board), settings.tolerances
     )
     return replace(estimate, lens=settings.lens, sensitivities=sensitivities)
-
-
-def _expand_joint(joint: JointEstimate, camera: int) -> Quadratics:
-    """Expand the cost about a joint estimate, in the extrinsics alone, the camera's own first.
-
-    Constant errors are held fixed.
-
-    Args:
-        joint: of F captures.
-        camera: its number.
-    """
-    n_cameras = len(joint.T_cam_lidar)
-    order = [camera, *(c for c in range(n_cameras) if c != camera)]
-    mine = np.concatenate([joint.state.layout.camera(c) for c in order])
-    # Subsets of captures that another camera did not see leave its extrinsics undetermined: 1 m, 1 rad.
-    prior = np.eye(len(mine)) if n_cameras > 1 else np.zeros((6, 6))
-    return replace(joint.cost.of(mine), prior=prior, prior_gradient=np.zeros(len(mine)))
 
 
 def _turns(joint: JointEstimate, camera: int) -> Array:

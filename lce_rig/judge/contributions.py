@@ -9,7 +9,6 @@ deviations, widens the claim until it holds both.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
@@ -30,26 +29,8 @@ _HALF = 0.5
 _CONTRADICTION = "contradiction_"
 
 
-@dataclass(frozen=True, eq=False)
-class Contradiction:
-    """A move of the extrinsics that would resolve what a check contradicts.
-
-    Attributes:
-        source: the check.
-        moves: (n, 6) tangents (translation m, rotation rad).
-    """
-
-    source: str
-    moves: Array
-
-    @property
-    def cov(self) -> Array:
-        """(6, 6) that holds both sides."""
-        return np.asarray(self.moves.T @ self.moves)
-
-
-def profile_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
-    """Sum the covariances (6, 6) by errors of the profile's lens and board."""
+def summed_covariance(sensitivities: Sequence[Sensitivity]) -> Array:
+    """Sum the covariances (6, 6) by errors of the profile's lens and board, or by contradictions."""
     return np.asarray(sum((each.covariance() for each in sensitivities), np.zeros((6, 6))))
 
 
@@ -59,7 +40,7 @@ def find_contradictions(
     pattern: tuple[Array, Array] | None,
     contrasts: Sequence[Contrast],
     rig: Rig,
-) -> Iterator[Contradiction]:
+) -> Iterator[Sensitivity]:
     """List the checks that contradict an estimate, each with the move of the extrinsics that resolves it.
 
     Args:
@@ -75,24 +56,24 @@ def find_contradictions(
         squares = of_source["square_size"]
         variance = scale[1] ** 2 + squares.sigma**2 + estimate.lens.focal_sigma**2
         if scale[0] ** 2 > _SURE**2 * variance:
-            yield Contradiction("scale", scale[0] * squares.moves)
+            yield Sensitivity("scale", 1.0, scale[0] * squares.moves)
     if of_source and pattern is not None:
-        yield Contradiction("pattern", pattern[0][None] @ of_source["pattern_offset"].moves)
+        yield Sensitivity("pattern", 1.0, pattern[0][None] @ of_source["pattern_offset"].moves)
     for contrast in objections(contrasts, target, rig.verdict):
         # The result lies between both subsets; where the extrinsics change on the way, it lies a whole change
         # from one of the two that may hold now.
         share = 1.0 if contrast.is_change else _HALF
-        yield Contradiction(f"{contrast.first}_{contrast.second}", share * contrast.apart[None])
+        yield Sensitivity(f"{contrast.first}_{contrast.second}", 1.0, share * contrast.apart[None])
     # Channels of one camera have one pose: the result lies between both.
     apart = estimate.channel_difference
     if apart is not None and target.excess(apart) > 1:
-        yield Contradiction("channels", _HALF * apart.tangent[None])
+        yield Sensitivity("channels", 1.0, _HALF * apart.tangent[None])
 
 
 def list_contributions(
     figures: Diagnostics,
     sensitivities: Sequence[Sensitivity],
-    contradictions: Sequence[Contradiction],
+    contradictions: Sequence[Sensitivity],
 ) -> tuple[Contribution, ...]:
     """List the causes of the reported standard deviations, the largest translation first."""
     parts = [
@@ -101,7 +82,10 @@ def list_contributions(
             "lidar_ranges", figures.sigma_systematic_rotation_deg, figures.sigma_systematic_translation_m
         ),
         *(Contribution(each.source, *sigma_sizes(each.covariance())) for each in sensitivities),
-        *(Contribution(_CONTRADICTION + each.source, *sigma_sizes(each.cov)) for each in contradictions),
+        *(
+            Contribution(_CONTRADICTION + each.source, *sigma_sizes(each.covariance()))
+            for each in contradictions
+        ),
     ]
     return tuple(sorted(parts, key=lambda part: -part.sigma_translation_m))
 

@@ -24,7 +24,7 @@ from lce_rig.core.results import Observation
 from lce_rig.judge.contributions import (
     find_contradictions,
     list_contributions,
-    profile_covariance,
+    summed_covariance,
 )
 from lce_rig.judge.intrinsics_check import IntrinsicsCheck, compare_with_given
 from lce_rig.judge.laser_angles import estimate_angles
@@ -156,12 +156,12 @@ def validate(
         if lidar.has_rings and len(set(group_placements(agreeing))) >= _MIN_PLACEMENTS:
             laser_angles = estimate_angles(agreeing, board, estimate.T_cam_lidar, lidar)
     contradictions = list(find_contradictions(estimate, scale, pattern, contrasts, rig))
-    cov_agreed = estimate.cov + profile_covariance(known)
+    cov_agreed = estimate.cov + summed_covariance(known)
     return Validation(
-        cov=cov_agreed + sum(each.cov for each in contradictions),
+        cov=cov_agreed + summed_covariance(contradictions),
         cov_agreed=cov_agreed,
         # Each session has fitted its own lens.
-        cov_shared=profile_covariance([each for each in known if each.source != "intrinsics"]),
+        cov_shared=summed_covariance([each for each in known if each.source != "intrinsics"]),
         contributions=list_contributions(estimate.diagnostics, known, contradictions),
         captures=estimate.used,
         contrasts=contrasts,

@@ -81,9 +81,9 @@ def compare_lenses(
         D. Kogan, mrcal: projection difference and implied transformation.
     """
     pixels = _grid(first).reshape(-1, 2)
-    is_covered = _inside_hull(pixels, corners_px)
+    pixels = pixels[_inside_hull(pixels, corners_px)]
     rays, backward = first.unproject(pixels), second.unproject(pixels)
-    aligned = is_covered & np.isfinite(rays).all(axis=1) & np.isfinite(backward).all(axis=1)
+    aligned = np.isfinite(rays).all(axis=1) & np.isfinite(backward).all(axis=1)
     if np.count_nonzero(aligned) < _LEAST_ALIGNED:
         return LensDifference(np.inf, 0.0, np.zeros(3), np.zeros((3, 3)))
     vector = model.vector(second)
@@ -92,8 +92,7 @@ def compare_lenses(
         predicted, J, _ = _by_turn(model, vector, rays[aligned] @ R.T)
         phi = -np.linalg.lstsq(J, (predicted - pixels[aligned]).ravel(), rcond=None)[0]
         R = exp_so3(np.asarray(phi)) @ R
-    moved, _ = second.project(rays[is_covered] @ R.T)
-    squares = np.sum((moved - pixels[is_covered]) ** 2, axis=1)
+    squares = np.sum((second.project(rays @ R.T)[0] - pixels) ** 2, axis=1)
     rms_px = float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else np.inf
     turn, left = _best_turn(model, vector, rays[aligned] @ R.T)
     variances = np.einsum("ni,ij,nj->n", left, cov, left)

@@ -34,7 +34,7 @@ from lce_rig.core.progress import Progress, begin, silent
 from lce_rig.core.results import ImageBoard, Observation
 from lce_rig.detect.detection import Detections, Pair
 from lce_rig.export.extrinsics import Reference
-from lce_rig.judge.contributions import profile_covariance
+from lce_rig.judge.contributions import summed_covariance
 from lce_rig.judge.findings import lacks_captures
 from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.judge.sensor_pairs import (
@@ -90,7 +90,7 @@ class _Solved:
     @property
     def cov_lens(self) -> Array:
         """The part (6, 6) of the covariance from the lens."""
-        return profile_covariance([e for e in self.estimate.sensitivities if e.source == "intrinsics"])
+        return summed_covariance([e for e in self.estimate.sensitivities if e.source == "intrinsics"])
 
     @property
     def is_still(self) -> bool:

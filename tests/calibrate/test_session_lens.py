@@ -8,7 +8,7 @@ import pytest
 from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.session_lens import fit_session_lens
 from lce_rig.core.geometry import difference, invert, perturb, transform
-from lce_rig.judge.contributions import profile_covariance
+from lce_rig.judge.contributions import summed_covariance
 from lce_rig.judge.reach import covariance_alone, point_uncertainties, with_lens
 from lce_rig.lens.fit import Setup
 from lce_rig.lens.models import LensPrior
@@ -110,7 +110,7 @@ def test_a_turn_by_the_principal_point_leaves_points_in_the_image_where_they_are
     """Extrinsics are known better with the lens of the same result than alone, and the true errors agree."""
     prior = replace(ROUGH, lens=with_errors(CAMERA, (0, 5.0, -4.0, 0)))
     estimate = fit_extrinsic(as_profiled(captures, prior.lens), BOARD, of_profile(prior))
-    cov = estimate.cov + profile_covariance(estimate.sensitivities)
+    cov = estimate.cov + summed_covariance(estimate.sensitivities)
     cross, fitted, lens = estimate.cov_with_lens, estimate.lens.estimate, estimate.lens.intrinsics
     joint = with_lens(cov, cross, fitted.cov)
     assert np.linalg.eigvalsh(joint / np.sqrt(np.outer(np.diag(joint), np.diag(joint)))).min() > -1e-9

@@ -10,7 +10,7 @@ from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.geometry import difference
 from lce_rig.core.planar_pose import solve_planar_pose
 from lce_rig.detect.image.search import board_from_pose
-from lce_rig.judge.contributions import profile_covariance
+from lce_rig.judge.contributions import summed_covariance
 from lce_rig.lens.models import LensPrior
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, Scenario, in_use, simulate
 
@@ -105,7 +105,7 @@ def normalised_errors(method, seeds, n_captures=20):
         captures, known = draw_session(seed, n_captures)
         estimate = fit_extrinsic(captures, BOARD, replace(SETTINGS, method=method, tolerances=known))
         error = difference(in_use(estimate.T_cam_lidar, estimate.lens.intrinsics), T_FORWARD)
-        with_profile = estimate.cov + profile_covariance(estimate.sensitivities)
+        with_profile = estimate.cov + summed_covariance(estimate.sensitivities)
         found.append([error @ np.linalg.solve(cov, error) for cov in (estimate.cov, with_profile)])
     return np.array(found)
 

@@ -7,7 +7,7 @@ import pytest
 
 from lce_rig.calibrate import fit_extrinsic
 from lce_rig.core.geometry import difference, sigma_sizes
-from lce_rig.judge.contributions import profile_covariance, uncertainty_notes
+from lce_rig.judge.contributions import summed_covariance, uncertainty_notes
 from lce_rig.judge.validate import validate
 from lce_rig.rig import load_rig
 from tests.calibrate.boards import BOARD, CAMERA, T_FORWARD, in_use, simulate
@@ -38,10 +38,10 @@ def sources(examination):
 def test_a_sound_result_reports_the_sum_of_its_captures_and_its_profile(sound):
     estimate, examination = sound
     assert not any(source.startswith("contradiction") for source in sources(examination))
-    of_profile = profile_covariance(estimate.sensitivities)
+    of_profile = summed_covariance(estimate.sensitivities)
     np.testing.assert_allclose(examination.cov, estimate.cov + of_profile)
     of_board = [each for each in estimate.sensitivities if each.source != "intrinsics"]
-    np.testing.assert_array_equal(examination.cov_shared, profile_covariance(of_board))
+    np.testing.assert_array_equal(examination.cov_shared, summed_covariance(of_board))
 
 
 def test_the_squares_of_the_contributions_add_up(sound):
