@@ -32,7 +32,6 @@ def seen(board, T_cam_board, noise_px=0.0, seed=0):
         solved.cov,
         solved.T_cam_board_alternative,
         solved.chi2_gap,
-        False,
         solved.reprojection_px,
         solved.sigma_px,
     )
