@@ -228,7 +228,9 @@ def test_intrinsics_that_boards_contradict_are_the_cause_of_boards_that_differ_b
         return judge(estimate, examination, RIG, "cam", "lidar", 20, others)
 
     places = [("near", "far", 1.6), ("left", "right", 1.1), ("upper", "lower", 0.1)]
-    contrasts = tuple(Contrast(first, second, deg, 0.0, 1e-9, 10) for first, second, deg in places)
+    contrasts = tuple(
+        Contrast(first, second, np.radians([0, 0, 0, deg, 0, 0]), 1e-9, 10) for first, second, deg in places
+    )
     lens = INTRINSICS(
         severity="warning",
         displacement_px=2.6,
