@@ -268,7 +268,7 @@ class Registry:
             (place / ROWS).remove()
 
     def folders(self) -> list[str]:
-        """List the folders of results, "robot/date-hash"."""
+        """List the folders of results and of those set aside, "robot/date-hash"."""
         robots = [name for name in self.place.names() if not name.startswith(".") and name != TABLE]
         with ThreadPoolExecutor(_READERS) as pool:
             inner = pool.map(lambda robot: (self.place / robot).names(), robots)
