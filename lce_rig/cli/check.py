@@ -16,6 +16,7 @@ from lce_rig.core.errors import NotEnoughDataError
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections, ImageDetection, LidarDetection, Pair
+from lce_rig.detect.findings import IMAGE_MISFIT
 from lce_rig.detect.lidar.search import plane_limit_m
 from lce_rig.pipeline.detect_session import candidates_of, match_sensors
 from lce_rig.pipeline.verification import write_debug_images
@@ -94,7 +95,10 @@ def _plates(rig: Rig, detections: Detections, pair: Pair, refused: Mapping[str, 
     both = candidates_of(detections, pair)[0]
     in_camera = np.array([each.image.T_cam_board[:3, 3] for each in both]).reshape(-1, 3)
     in_lidar = np.array([each.lidar.T_lidar_board[:3, 3] for each in both]).reshape(-1, 3)
-    of_distances = distance_findings(in_camera, in_lidar, rig.board.square_m) if pair.channel else []
+    of_distances = []
+    if pair.channel:
+        n_misfits = sum(refusal.code == IMAGE_MISFIT.code for refusal in refused.values())
+        of_distances = distance_findings(in_camera, in_lidar, rig.board.square_m, n_misfits=n_misfits)
     return [*of_distances, *plate_findings(scans, rig.board.to_board())]
 
 

@@ -421,7 +421,10 @@ SHARES_DIFFER = Kind(
     actions={"near": "measure the squares, then `lce-rig calibrate {session} --rig FILE`"},
 )
 SCALE_OFF = Kind(
-    "verdict.scale", _scale, "measure the squares, then `lce-rig calibrate {session} --rig FILE`"
+    "verdict.scale",
+    _scale,
+    "measure the squares, then `lce-rig calibrate {session} --rig FILE`",
+    actions={"lens": _SAVE},
 )
 PATTERN_OFFSET = Kind(
     "verdict.pattern_offset",

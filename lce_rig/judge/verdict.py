@@ -391,7 +391,9 @@ def plate_findings(scans: Iterable[LidarBoard | Refusal], board: Board) -> list[
     return found
 
 
-def distance_findings(in_camera: Array, in_lidar: Array, square_m: float) -> list[Finding]:
+def distance_findings(
+    in_camera: Array, in_lidar: Array, square_m: float, *, n_misfits: int = 0
+) -> list[Finding]:
     """Compare distances between boards, which are the same for both sensors with any extrinsics.
 
     Coarse, and before any estimate: it names squares or a lens so wrong that captures are refused.
@@ -399,6 +401,7 @@ def distance_findings(in_camera: Array, in_lidar: Array, square_m: float) -> lis
     Args:
         in_camera, in_lidar: (N, 3) centres of the boards of N captures, m.
         square_m: of the profile.
+        n_misfits: images whose corners fit no pose of the board. Wrong squares cause none, a wrong lens does.
     """
     first, second = np.triu_indices(len(in_camera), 1)
     camera_m, lidar_m = (np.linalg.norm(c[first] - c[second], axis=1) for c in (in_camera, in_lidar))
@@ -413,6 +416,7 @@ def distance_findings(in_camera: Array, in_lidar: Array, square_m: float) -> lis
     scale = float(np.exp(ratio))
     return [
         SCALE_OFF(
+            action="lens" if 2 * n_misfits >= len(in_camera) else "",
             scale=scale - 1,
             scale_sigma=scale * sigma,
             square_m=square_m / scale,

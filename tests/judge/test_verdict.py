@@ -195,6 +195,9 @@ def test_wrong_squares_or_another_lens_are_named_before_any_estimate(factor, cod
     assert [finding.code for finding in findings] == codes
     for finding in findings:
         assert finding.figure("square_m") == pytest.approx(0.07 / factor, rel=0.01)
+        assert finding.action == ""
+    for finding in distance_findings(factor * boards, in_lidar, 0.07, n_misfits=4):
+        assert finding.action == "lens", "squares of another size fit the corners just as well"
     order = rng.permutation(8)
     assert not distance_findings(boards, in_lidar[order], 0.07), "mixed up, distances say nothing"
     assert not distance_findings(boards[:2], in_lidar[:2], 0.07)
