@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, TypeAlias
@@ -208,8 +209,8 @@ def chosen_rows(table: Any, where: str) -> Any:
 
 
 FORMAT_VERSION = 1
-SUPERSEDED = "superseded.json"
-"""Name of `ROWS` in the results of sources that have a later one; it makes no result."""
+SUPERSEDED = ".superseded"
+"""Folder of earlier results of sources that have a later one; no folder of a robot begins with a dot."""
 # Small files from an object store take their time, not the processor's.
 _READERS = 16
 
@@ -229,7 +230,8 @@ class Registry:
         """Yield an empty folder on this computer that becomes a session's result when the block ends.
 
         `ROWS` makes it a result; `write_rows` writes it. On this computer the folder appears in one step; in
-        an object store its files are written one by one, `ROWS` last. An earlier result of this name goes.
+        an object store its files are written one by one, `ROWS` last. An earlier result in this folder is
+        moved below `SUPERSEDED`, unless the new one holds all its files.
 
         Args:
             folder: "robot/date-hash".
@@ -241,13 +243,14 @@ class Registry:
         try:
             if root is not None:
                 root.mkdir(parents=True, exist_ok=True)
-                with replacing(root, root / folder) as draft:
+                with replacing(root, root / folder, lambda _, new: self._keep(folder, new)) as draft:
                     yield draft
                 return
             with TemporaryDirectory(prefix="lce-rig-") as scratch:
                 draft = Path(scratch) / "result"
                 draft.mkdir()
                 yield draft
+                self._keep(folder, draft)
                 (self.place / folder).upload(draft, last=ROWS)
         except OSError as error:
             raise SessionError(
@@ -255,20 +258,28 @@ class Registry:
                 "Free space or choose another registry, and run again.",
             ) from error
 
+    def _keep(self, folder: str, draft: Path) -> None:
+        """Set an earlier result of a folder aside, unless all its files are in the new one."""
+        place = self.place / folder
+        for name in place.files():
+            if name != ROWS and not (
+                (draft / name).is_file() and (place / name).read() == (draft / name).read_bytes()
+            ):
+                self.set_aside(folder)
+                return
+
     def set_aside(self, folder: str) -> None:
-        """Take a result out of the table: its `ROWS` become `SUPERSEDED`, its other files stay.
+        """Move a result below `SUPERSEDED`, where the table does not find it; numbered, if one is there.
 
         Raises:
             SessionError: it cannot be written; the result stays.
         """
-        place = self.place / folder
-        content = (place / ROWS).read()
-        if content is not None:
-            (place / SUPERSEDED).write(content)
-            (place / ROWS).remove()
+        endings = chain([""], (f"-{n}" for n in count(2)))
+        targets = (self.place / f"{SUPERSEDED}/{folder}{ending}" for ending in endings)
+        (self.place / folder).move(next(target for target in targets if not target.names()))
 
     def folders(self) -> list[str]:
-        """List the folders of results and of those set aside, "robot/date-hash"."""
+        """List the folders of results, "robot/date-hash"."""
         robots = [name for name in self.place.names() if not name.startswith(".") and name != TABLE]
         with ThreadPoolExecutor(_READERS) as pool:
             inner = pool.map(lambda robot: (self.place / robot).names(), robots)
@@ -346,7 +357,7 @@ class Registry:
         """Bring the table in line with the folders and write it.
 
         Rows of folders that are gone are dropped, those of folders that the table lacks are read. Of two
-        results of one source the later one stays; the other is set aside.
+        results of one source the later one stays; the other's folder is moved below `SUPERSEDED`.
 
         Args:
             fresh: rows written since the table was; they replace those of the same folder.

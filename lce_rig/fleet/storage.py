@@ -1,7 +1,7 @@
 """Folders on this computer or in an object store (s3://...), by their address."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,11 +82,6 @@ class Storage:
         with self.reached() as (fs, path):
             fs.pipe_file(path, content)
 
-    def remove(self) -> None:
-        """Remove it as a file; nothing if there is none."""
-        with suppress(*_ABSENT), self.reached() as (fs, path):
-            fs.rm_file(path)
-
     def names(self) -> list[str]:
         """List what it holds as a folder, by name; nothing if there is no such folder."""
         try:
@@ -124,17 +119,27 @@ class Storage:
             prefix = path.rstrip("/") + "/"
             return sorted(str(match).rstrip("/").removeprefix(prefix) for match in fs.glob(prefix + pattern))
 
-    def upload(self, folder: Path, last: str) -> None:
-        """Copy the files of a folder here to one in an object store, one by one, the file `last` last.
+    def move(self, target: "Storage") -> None:
+        """Move a folder to another place of the same file system; nothing if it is gone."""
+        try:
+            with self.reached() as (fs, path):
+                if self.local is not None and target.local is not None:
+                    target.local.parent.mkdir(parents=True, exist_ok=True)
+                    self.local.rename(target.local)
+                    return
+                names, target_path = self.files(), url_to_fs(target.url)[1]
+                for name in names:
+                    fs.cp_file(f"{path}/{name}", f"{target_path}/{name}")
+                fs.rm([f"{path}/{name}" for name in names])
+        except _ABSENT:
+            return  # another run was faster
 
-        An earlier `last` is removed first, and the other files that the folder does not hold.
-        """
+    def upload(self, folder: Path, last: str) -> None:
+        """Copy the files of a folder here to one in an object store, one by one, the file `last` last."""
         files = {
             path.relative_to(folder).as_posix(): str(path) for path in folder.rglob("*") if path.is_file()
         }
         end = files.pop(last, None)
-        for name in sorted(set(self.files()) - set(files), key=lambda name: name != last):
-            (self / name).remove()
         with self.reached() as (fs, path):
             if files:
                 fs.put([*files.values()], [f"{path}/{name}" for name in files])

@@ -42,15 +42,31 @@ def test_a_table_that_is_lost_or_behind_is_written_again_from_the_folders(regist
     assert registry.consolidate(rebuild=True).equals(whole)
 
 
-def test_a_later_result_of_a_source_takes_the_place_of_the_earlier_whose_files_stay(registry, row):
+def test_a_later_result_of_a_source_takes_the_place_of_the_earlier_which_is_kept(registry, row):
     write(registry, row(folder="r1/old", source="s", finished="2026-01-01T00:00:00Z"), "result.json")
     write(registry, row(folder="r1/new", source="s", finished="2026-01-02T00:00:00Z"))
-    assert folders(registry.consolidate()) == ["r1/new"] == folders(registry.consolidate(rebuild=True))
-    assert (registry.place / "r1/old").names() == ["result.json", SUPERSEDED]
-    # The captures are put back.
+    assert folders(registry.consolidate()) == ["r1/new"]
+    assert (registry.place / "r1").names() == ["new"]
+    aside = registry.place / SUPERSEDED / "r1"
+    assert (aside / "old" / "result.json").read() == b"r1/old"
+    # The captures are put back, and changed again.
     write(registry, row(folder="r1/old", source="s", finished="2026-01-03T00:00:00Z"), "result.json")
     assert folders(registry.consolidate()) == ["r1/old"]
-    assert (registry.place / "r1/old").names() == [ROWS, "result.json"]
+    write(registry, row(folder="r1/new", source="s", finished="2026-01-04T00:00:00Z"))
+    assert folders(registry.consolidate(rebuild=True)) == ["r1/new"]
+    assert aside.names() == ["new", "old", "old-2"]
+    assert registry.folders() == ["r1/new"]
+
+
+def test_what_a_new_result_in_the_same_folder_lacks_is_kept(registry, row):
+    write(registry, row(folder="r1/a"), "same.txt", "result.json")
+    (registry.place.local / "r1/a/notes.txt").write_text("mine")
+    write(registry, row(folder="r1/a"))
+    aside = registry.place / SUPERSEDED / "r1"
+    assert (aside / "a").names() == [ROWS, "notes.txt", "result.json", "same.txt"]
+    write(registry, row(folder="r1/a"), "same.txt", "result.json")
+    write(registry, row(folder="r1/a"), "same.txt", "result.json")
+    assert aside.names() == ["a"], "nothing was lost: a failure, and the same files"
 
 
 def test_a_folder_is_replaced_whole_and_stays_where_writing_fails(registry, row):

@@ -1,7 +1,6 @@
 """Results of many robots put onto them, one after the other, and rolled back together."""
 
 import json
-import shutil
 from collections.abc import Callable
 
 import pytest
@@ -114,7 +113,7 @@ def test_a_robot_that_refuses_its_result_stops_it(registry, targets, add):
     # The files at r3 come from later captures than its newest result in this registry.
     add("r3", "2026-03-01T10:00:00Z")
     deploy(registry, targets)
-    shutil.rmtree(registry.place.local / "r3/2026-03-01-0f")
+    registry.set_aside("r3/2026-03-01-0f")
     registry.consolidate()
     assert deploy(registry, targets).stopped_by == "r3"
 

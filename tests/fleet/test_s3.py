@@ -12,7 +12,7 @@ from s3fs import S3FileSystem
 
 from lce_rig.cli.main import run
 from lce_rig.fleet.jobs import find_jobs
-from lce_rig.fleet.registry import SUPERSEDED, TABLE, Registry, write_rows
+from lce_rig.fleet.registry import TABLE, Registry, write_rows
 from lce_rig.fleet.storage import Storage
 from lce_rig.fleet.work import Settings, work
 
@@ -110,10 +110,10 @@ def test_a_result_in_a_store_counts_when_its_rows_are_there(row, bucket):
         fs.rm_file(f"{path}/r1/a/fleet.json")
     assert registry.rows("r1/a") == [] and len(registry.consolidate(rebuild=True)) == 0
     registry.set_aside("r1/a")
-    assert (registry.place / "r1/a").names() == ["new.txt"]
-    write("third.txt")
-    registry.set_aside("r1/a")
-    assert (registry.place / "r1/a").names() == [SUPERSEDED, "third.txt"]
+    assert registry.folders() == []
+    aside = registry.place / ".superseded/r1"
+    kept = {name: (aside / name).names() for name in aside.names()}
+    assert kept == {"a": ["fleet.json", "old.txt"], "a-2": ["new.txt"]}
 
 
 @pytest.mark.parametrize("words", [["table"], ["run", "ROOT"], ["report"], ["deploy", "--target", "nav"]])
