@@ -341,6 +341,8 @@ class SceneShare:
 
 
 State = Literal["unchanged", "changed", "unknown"]
+# In files of earlier versions.
+_STATES = {"agrees": "unchanged", "contradicts": "changed"}
 
 
 @dataclass(frozen=True)
@@ -360,7 +362,7 @@ class AxisDrift:
     """
 
     axis: str
-    state: State
+    state: Annotated[State, BeforeValidator(lambda state: _STATES.get(str(state), state))]
     change: Number
     sigma: Distance
     smallest: Distance

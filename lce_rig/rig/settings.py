@@ -11,6 +11,16 @@ _ROBOT = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 _FRAME = r"^[A-Za-z][A-Za-z0-9_/-]*$"
 _TOPIC = r"^/?[A-Za-z][A-Za-z0-9_/]*$"
 
+# Keys of earlier versions: profiles that state them are read, and nothing depends on them.
+_RETIRED = {
+    "azimuth_offset_sigma_deg",
+    "control_sigmas",
+    "max_edge_shift_m",
+    "max_held_out_ratio",
+    "max_prior_sigmas",
+    "max_spread_ratio",
+}
+
 # The meaning of each pattern, for errors.
 PATTERNS = {
     _NAME: "a name has lower-case letters, digits and _ and begins with a letter",
@@ -49,7 +59,7 @@ class Settings(BaseModel):
         for key, value in data.items():
             if any(isinstance(item, bool) for item in (value if isinstance(value, list) else [value])):
                 raise problem("a truth value (true, yes, on, false, no, off) is not allowed", str(key))
-        return data
+        return {key: value for key, value in data.items() if key not in _RETIRED}
 
 
 def require(is_met: bool, what: str, key: str = "") -> None:

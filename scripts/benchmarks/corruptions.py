@@ -83,9 +83,9 @@ def bench_corruptions(only: str = "") -> None:
         only: sessions whose name contains this.
     """
     every: list[Outcome] = []
+    title = "error deg / mm, reported deg / mm, in sigmas"
     for samples in _sessions(only):
         print(f"\n### {samples.name}{'' if samples.T_cam_lidar is not None else ' (recorded)'}\n")
-        title = "error deg / mm, reported deg / mm, in sigmas"
         columns = [f"{method}: verdict, {title}".split(", ") for method in METHODS]
         print_head("corruption", *columns[0], *columns[1], "first reason")
         for outcomes in judge_session(samples, corruptions()):

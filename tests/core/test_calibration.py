@@ -218,6 +218,15 @@ def test_files_of_earlier_versions_are_read(tmp_path):
     assert file.document()["pairs"][0]["reasons"] == [REASON]
 
 
+@pytest.mark.parametrize(("before", "now"), [("agrees", "unchanged"), ("contradicts", "changed")])
+def test_axes_of_the_scene_are_read_as_earlier_versions_called_them(tmp_path, before, now):
+    def as_before(document):
+        document["pairs"][0]["scene"]["axes"][0] |= {"state": before, "unit": "deg"}
+
+    (pair,) = read_result(edited(tmp_path / "result.json", as_before)).pairs
+    assert pair.scene.axes[0].state == now
+
+
 def test_findings_of_another_version_keep_their_words(tmp_path):
     def of_tomorrow(document):
         finding = document["pairs"][0]["findings"][1]

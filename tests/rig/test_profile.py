@@ -324,3 +324,9 @@ def test_a_board_with_markers_survives_its_profile_and_old_profiles_are_checkerb
     assert (board.cols, board.rows, board.dictionary, board.first_id) == (6, 4, "4X4_50", 20)
     assert board.marker_share == pytest.approx(0.75)
     assert parse_rig(dump_rig(rig)) == rig
+
+
+def test_keys_of_earlier_versions_are_read_and_mean_nothing():
+    kept, retired = "max_change: 2", "control_sigmas: 3, max_spread_ratio: 1.2"
+    with_retired = RLFS + f"verdict: {{{retired}, {kept}}}\n"
+    assert parse_rig(with_retired) == parse_rig(RLFS + f"verdict: {{{kept}}}\n")
