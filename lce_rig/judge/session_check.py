@@ -187,7 +187,12 @@ class SessionCheck:
             "metrics": None
             if self.metrics is None
             else {**asdict(self.metrics), "mge_m": self.metrics.mge_m},
-            "scene": {"state": self.scene.state, **asdict(self.scene)},
+            "scene": {
+                "state": self.scene.state,
+                "n_captures": self.scene.n_captures,
+                "n_edges": self.scene.n_edges,
+                "axes": [axis.document() for axis in self.scene.axes],
+            },
             "captures": {
                 r.capture: {"was_used": r.capture in used, **{name: getattr(r, name) for name in names}}
                 for r in self.residuals
