@@ -188,6 +188,13 @@ def largest_sizes(cov: Array) -> tuple[float, float]:
     return float(np.degrees(sizes[0])), float(sizes[1])
 
 
+def chance_of(chi2: float, n_freedoms: int) -> float:
+    """Compute the probability that a chi-squared variable of `n_freedoms` exceeds `chi2`."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(n_freedoms, chi2))
+
+
 @dataclass(frozen=True, eq=False)
 class PoseDifference:
     """The difference of two poses, compared with its covariance.
@@ -208,9 +215,7 @@ class PoseDifference:
     @property
     def chance(self) -> float:
         """Probability of a difference this large or larger if both are right."""
-        from scipy.special import chdtrc
-
-        return float(chdtrc(6, self.chi2))
+        return chance_of(self.chi2, 6)
 
     @property
     def is_significant(self) -> bool:

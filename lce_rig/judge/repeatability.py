@@ -9,7 +9,15 @@ import numpy as np
 
 from lce_rig.core.calibration import Calibration
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, PoseDifference, difference, invert, mean_pose, tangent_sizes
+from lce_rig.core.geometry import (
+    Array,
+    PoseDifference,
+    chance_of,
+    difference,
+    invert,
+    mean_pose,
+    tangent_sizes,
+)
 from lce_rig.judge.findings import REPEAT_AGREE, REPEAT_DISAGREE, RESULTS_AGREE, RESULTS_DISAGREE
 from lce_rig.judge.reach import as_used, covariance_alone
 
@@ -159,16 +167,16 @@ def compare_calibrations(
         differences.append(PairDifference(names[i], names[j], *sizes, distance, apart.chance, apart_m))
     if are_independent:
         chi2, dof = _spread(T, cov), 6 * (len(names) - 1)
-        p = _tail(chi2, dof)
+        p = chance_of(chi2, dof)
     else:
         chi2, dof = max(pair.distance for pair in differences) ** 2, 6
-        p = min(1.0, len(pairs) * _tail(chi2, dof))
+        p = min(1.0, len(pairs) * chance_of(chi2, dof))
     blamed = []
     if are_independent and p < _CHANCE and len(names) > 2:
         # Sessions without which the others agree.
         for k, name in enumerate(names):
             rest = np.arange(len(names)) != k
-            if _tail(_spread(T[rest], cov[rest]), 6 * (len(names) - 2)) >= _CHANCE:
+            if chance_of(_spread(T[rest], cov[rest]), 6 * (len(names) - 2)) >= _CHANCE:
                 blamed.append(name)
     first = calibrations[names[0]]
     spread = np.sum(deviations**2, axis=0) / (len(names) - 1)
@@ -211,9 +219,3 @@ def _spread(T: Array, cov: Array) -> float:
     weights = np.asarray(np.linalg.inv(cov))
     deviations = difference(T, mean_pose(T, weights)[0])
     return float(np.einsum("ki,kij,kj->", deviations, weights, deviations))
-
-
-def _tail(chi2: float, dof: int) -> float:
-    from scipy.special import chdtrc
-
-    return float(chdtrc(dof, chi2))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.quadratics import Quadratics
 from lce_rig.core.findings import Finding
-from lce_rig.core.geometry import Array, tangent_sizes
+from lce_rig.core.geometry import Array, chance_of, tangent_sizes
 from lce_rig.judge.findings import (
     CAMERA_CHANGED,
     CHANGED,
@@ -147,7 +147,7 @@ def contrast_halves(expansion: Quadratics, centres: Array) -> tuple[Contrast, ..
     cuts = np.arange(_MIN_SHARE, n - _MIN_SHARE + 1)
     chi2, apart = _chi2(expansion, (np.arange(n)[None] < cuts[:, None]).astype(np.float64))
     best = int(np.argmax(chi2))
-    changes = [(_tail(chi2[best] / unit), apart[best], int(cuts[best]))]
+    changes = [(chance_of(chi2[best] / unit, 6), apart[best], int(cuts[best]))]
     changes += [_change_at_end(expansion, cut) for cut in (2, n - 2)]
     chance, tangent, cut = min(changes, key=lambda change: change[0])
     found = [Contrast("before", "after", tangent, min((len(cuts) + 2) * chance, 1.0), cut)]
@@ -158,7 +158,7 @@ def contrast_halves(expansion: Quadratics, centres: Array) -> tuple[Contrast, ..
     ):
         is_first = (np.argsort(np.argsort(key)) < len(key) // 2)[None].astype(np.float64)
         chi2, apart = _chi2(expansion, is_first)
-        found.append(Contrast(first, second, apart[0], _tail(chi2[0] / unit), int(is_first.sum())))
+        found.append(Contrast(first, second, apart[0], chance_of(chi2[0] / unit, 6), int(is_first.sum())))
     return tuple(found)
 
 
@@ -321,12 +321,6 @@ def _share_out(g: Array, H: Array, starts: NDArray[np.bool_]) -> tuple[Array, ND
     x = np.where(found[..., None], x_first[each, best][:, None], x_second[each, best][:, None])
     left = g + np.einsum("kij,bkj->bki", H, x)
     return np.sqrt(np.maximum(gains[each, best], 0.0)), found, left
-
-
-def _tail(chi2: float) -> float:
-    from scipy.special import chdtrc
-
-    return float(chdtrc(6, chi2))
 
 
 def _chi2(expansion: Quadratics, shares: Array, among: Array | None = None) -> tuple[Array, Array]:
