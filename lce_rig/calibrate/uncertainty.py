@@ -1,28 +1,32 @@
 """Uncertainty of a solution: covariance, its check by leaving placements out, and errors of the profile."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from lce_rig.calibrate.algorithm_1.algorithm import Algorithm1
+from lce_rig.calibrate.features import extract_features
 from lce_rig.calibrate.likelihood.fit import JointEstimate
 from lce_rig.calibrate.likelihood.layout import OWN, SHIFTS
 from lce_rig.calibrate.likelihood.levels import Levels
 from lce_rig.calibrate.likelihood.model import assemble, linearise
 from lce_rig.calibrate.likelihood.rays import interior, stack_scans
 from lce_rig.calibrate.options import EstimateSettings
+from lce_rig.calibrate.plane_and_ends import differentiate, end_rows
 from lce_rig.calibrate.quadratics import jackknife_scatter, symmetric_inverse
 from lce_rig.calibrate.result import CalibrationEstimate, Start, report, with_parts
-from lce_rig.calibrate.systematic import profile_sensitivities, ring_sensitivities, systematic_covariances
-from lce_rig.calibrate.tolerances import Variant, sensitivities_of, vary
+from lce_rig.calibrate.tolerances import PoseErrors, Sensitivity, Source, Tolerances, pose_errors
 from lce_rig.core.board import Board
 from lce_rig.core.calibration import Diagnostics
-from lce_rig.core.geometry import Array
-from lce_rig.core.results import Observation
+from lce_rig.core.geometry import Array, invert, transform
 
 # Number of its standard deviations by which the ratio of covariances must exceed 1 to be significant.
 _SURE = 2.0
+# Effects of the plate's size are linear: a step only keeps clear of rounding.
+_STEP_M = 1e-3
 
 
 def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> CalibrationEstimate:
@@ -33,22 +37,153 @@ def by_scatter(start: Algorithm1, board: Board, settings: EstimateSettings) -> C
         board: its specification.
         settings: priors and tolerances.
     """
-    scatter = start.cost.jackknife_covariance()
-    systematic = np.zeros_like(scatter)
-    laser_m, offset_m = settings.laser_bias_sigma_m, settings.range_offset_sigma_m
-    if laser_m or offset_m:
-        lasers, offset = systematic_covariances(ring_sensitivities(start, board), laser_m, offset_m)
-        systematic = lasers + offset
+    scatter, of_scans = start.cost.jackknife_covariance(), moves_by_scans(start, board)
+    lasers, offset = systematic_covariances(
+        of_scans.lasers.T, settings.laser_bias_sigma_m, settings.range_offset_sigma_m
+    )
+    systematic = lasers + offset
     cov = scatter + systematic
     figures = replace(start.diagnostics, edge_shift_sigma_m=float(np.sqrt(cov[6, 6])))
     figures = with_parts(figures, scatter, systematic)
-    known = settings.tolerances
+    estimate = report(start, start.T_cam_lidar, cov[:6, :6], board, figures)
+    sensitivities: tuple[Sensitivity, ...] = ()
+    if settings.tolerances is not None:
+        sensitivities = _sensitivities(
+            settings.tolerances,
+            pose_errors(start.fitted, board, settings.lens),
+            partial(_moves_by_poses, start),
+            {"plate_size": of_scans.plate[:, :6], "board_bow": of_scans.bow[:, :6]},
+        )
     return replace(
-        report(start, start.T_cam_lidar, cov[:6, :6], board, figures),
+        estimate,
         fitted={observation.capture: observation for observation in start.fitted},
-        sensitivities=() if known is None else profile_sensitivities(start, board, known, settings.lens),
+        sensitivities=sensitivities,
         lens=settings.lens,
     )
+
+
+class ScanMoves(NamedTuple):
+    """How far constant errors of scans and plate move Algorithm 1's solution.
+
+    Tangents (translation m, rotation rad, edge shift m) per m of the error.
+
+    Attributes:
+        lasers: (L, 7) by the range offset of each ring seen.
+        bow: (2, 7) by the height of the plate's middle over its ends, along its width and its height.
+        plate: (2, 7) by the plate's width and height, as the profile says them.
+    """
+
+    lasers: Array
+    bow: Array
+    plate: Array
+
+
+def moves_by_scans(start: Algorithm1, board: Board) -> ScanMoves:
+    """Differentiate the solution by constant errors of the scans and the plate, by one Newton step.
+
+    With half gradient g and half Hessian H of the cost, both at the solution, an error b moves the minimum by
+
+        s b = -H^-1 sum_k dg_k/db b                                                                      (1)
+
+    Ranges that err lift the plane that is fitted to a board's points, by a + b x + c y fitted to their errors
+    along its normal. Points lie on that plane, ring ends where their rays meet it. To first order an offset
+    common to all rings moves the minimum by the sum of those of each.
+
+    Args:
+        start: the solution; its association is held.
+        board: its specification.
+    """
+    rings = np.unique(np.concatenate([o.lidar.ring for o in start.fitted]))
+    T, weights, keep = start.T_cam_lidar, start.problem.weights, start.problem.keep
+    L, changes = len(rings), np.zeros((len(rings) + 4, 7))
+    for k, observation in enumerate(start.fitted):
+        f, lidar = extract_features(observation, board), observation.lidar
+        normal, T_board_lidar = lidar.plane[:3], invert(lidar.T_lidar_board)
+        on_plate = _one_x_y(T_board_lidar, lidar.points)
+        rays = lidar.points / np.linalg.norm(lidar.points, axis=1, keepdims=True)
+        rises = [(rays @ normal)[:, None] * (lidar.ring[:, None] == rings)]
+        rises.append(1 - (on_plate[:, 1:] / (board.width_m / 2, board.height_m / 2)) ** 2)
+        lifted = np.linalg.lstsq(on_plate, np.hstack(rises), rcond=None)[0]
+        points = f.plane_points if keep is None else f.plane_points[keep[k]]
+        J = np.zeros((len(points), 7))
+        J[:, :6] = differentiate(f.normal, points @ T[:3, :3].T)
+        by_lift = -weights.plane / max(len(points), 1) * J.T @ _one_x_y(T_board_lidar, points)
+        _, J_end, edge = end_rows(f, T, board)
+        J_end = weights.edge / max(len(edge), 1) * J_end[:, :7]
+        outwards = np.sum(f.edge_normals[edge] * (f.edge_points @ T[:3, :3].T), axis=1)
+        sideways = (outwards / (f.edge_points @ normal))[:, None]
+        by_lift -= J_end.T @ (sideways * _one_x_y(T_board_lidar, f.edge_points))
+        changes[: L + 2] += (by_lift @ lifted).T
+        # Of a wider plate, either edge lies half as much farther out.
+        changes[L + 2 :] += np.abs(board.edges()[1][edge, :2]).T @ J_end / 2
+    moves = -changes @ symmetric_inverse(start.cost.information)
+    return ScanMoves(moves[:L], moves[L : L + 2], moves[L + 2 :])
+
+
+def _one_x_y(T_board_lidar: Array, points: Array) -> Array:
+    """List 1, x and y on the board of points (N, 3) of the LiDAR: (N, 3)."""
+    return np.column_stack([np.ones(len(points)), transform(T_board_lidar, points)[:, :2]])
+
+
+def _moves_by_poses(start: Algorithm1, moves: Array) -> Array:
+    """Compute how far moves of the boards' poses in the images (n, F, 6) move the solution: (n, 6).
+
+    A board that moves by (d, phi) looks to the LiDAR as if the extrinsics moved by
+    (-d - phi x (t - c), -phi), c the board's place.
+    """
+    levers = start.T_cam_lidar[:3, 3] - [o.image.T_cam_board[:3, 3] for o in start.fitted]
+    shifts = -moves[:, :, :3] - np.cross(moves[:, :, 3:], levers)
+    alike = np.concatenate([shifts, -moves[:, :, 3:]], axis=2)
+    changes = np.einsum("kij,nkj->ni", start.cost.hessians[:, :, :6], alike)
+    return np.asarray(-changes @ symmetric_inverse(start.cost.information)[:, :6])
+
+
+def _sensitivities(
+    known: Tolerances,
+    of_images: Sequence[PoseErrors],
+    moves_by_poses: Callable[[Array], Array],
+    of_scans: Mapping[Source, Array],
+) -> tuple[Sensitivity, ...]:
+    """Collect the moves of a method's result by errors of lens and board.
+
+    The extrinsics are used with the intrinsics of the same result: what both errors do together counts.
+
+    Args:
+        known: standard deviations of the errors.
+        of_images: errors of the poses in the images.
+        moves_by_poses: the moves (n, 6) of the result by such errors (n, F, 6).
+        of_scans: by source the moves (n, 6) of the result by other errors.
+    """
+    used = {
+        each.source: moves_by_poses(each.moves) + np.pad(each.turns, ((0, 0), (3, 0))) for each in of_images
+    }
+    return tuple(
+        Sensitivity(source, known.sigma(source), moves) for source, moves in {**used, **of_scans}.items()
+    )
+
+
+def systematic_covariances(
+    sensitivities: Array, sigma_each: float, sigma_common: float
+) -> tuple[Array, Array]:
+    """Propagate errors common to all groups, which the scatter between groups cannot show.
+
+    Source r is off by e + e_r, with e the mean error of all L sources and e_r its own deviation from it, and
+    moves the estimate by s_r for each unit. Independent deviations less their mean leave
+
+        cov = sigma_each^2 sum_r (s_r - s) (s_r - s)^T + sigma_common^2 L^2 s s^T,   s = sum_r s_r / L
+
+    Args:
+        sensitivities: (..., p, L) s_r in columns.
+        sigma_each: standard deviation of e_r, before their mean is subtracted.
+        sigma_common: standard deviation of e.
+
+    Returns:
+        Its two terms (..., p, p).
+    """
+    common = sensitivities.sum(axis=-1, keepdims=True)
+    each = sensitivities - sensitivities.mean(axis=-1, keepdims=True)
+    of_each = sigma_each**2 * each @ np.swapaxes(each, -1, -2)
+    return of_each, sigma_common**2 * common @ np.swapaxes(common, -1, -2)
 
 
 def by_likelihood(start: Start, joint: JointEstimate, board: Board, camera: int = 0) -> CalibrationEstimate:
@@ -83,10 +218,11 @@ def with_profile(
     """Add the effects of the errors of lens and board to the estimate of one camera."""
     if settings.tolerances is None:
         return estimate
-    used = list(estimate.observations.values())
-    variants = vary(used, board, settings.lens, bends_scans=False)
-    sensitivities = sensitivities_of(
-        variants, _moves_under(joint, used, variants, board), settings.tolerances
+    sensitivities = _sensitivities(
+        settings.tolerances,
+        pose_errors(list(estimate.observations.values()), board, settings.lens),
+        partial(_moves_of_joint, joint),
+        {"plate_size": _moves_by_plate(joint, estimate, board)},
     )
     return replace(estimate, lens=settings.lens, sensitivities=sensitivities)
 
@@ -135,25 +271,9 @@ def _add_figures(start: Diagnostics, joint: JointEstimate, camera: int, inflatio
     return with_parts(figures, J @ scatter @ J.T, J @ constants @ J.T)
 
 
-def _moves_under(
-    joint: JointEstimate, used: Sequence[Observation], variants: Sequence[Variant], board: Board
-) -> Array:
-    """Compute how far errors of the profile move one camera's extrinsics, to first order.
-
-    Args:
-        joint: of one camera.
-        used: the F observations, in the order of `variants`.
-        variants: V of what would have been observed.
-        board: as the profile says.
-
-    Returns:
-        (V, 6) tangents (translation m, rotation rad).
-    """
-    terms, own_steps = joint.terms, joint.reduced.own_steps
-    G = joint.state.layout.z.size
-    changes = np.zeros((len(variants), G))
-    of_images = [k for k, variant in enumerate(variants) if variant.board == board]
-    moves = np.array([variants[k].pose_moves for k in of_images])
+def _moves_of_joint(joint: JointEstimate, moves: Array) -> Array:
+    """Compute how far moves of boards' poses in images (n, F, 6) move the extrinsics of a camera: (n, 6)."""
+    terms, own_steps, G = joint.terms, joint.reduced.own_steps, joint.state.layout.z.size
     # The gradients by [y, z] move by J^T C^-1 times how far the images' poses do.
     images, rows, place = terms.images[0], terms.image_rows[0], joint.state.layout.image_row(0)[:-1]
     weighted = -np.linalg.solve(images.total_cov(joint.levels), np.moveaxis(moves, 0, -1))
@@ -161,15 +281,24 @@ def _moves_under(
     gradients[images.capture[:, None], place] = np.swapaxes(rows[:, :, :-1], 1, 2) @ weighted
     gradients *= terms.trust[:, None, None]
     by_own, by_common = gradients[:, : OWN.size], gradients[:, OWN.size :]
-    changes[of_images] = np.sum(by_common - np.swapaxes(own_steps[:, :, :G], 1, 2) @ by_own, axis=0).T
-    lidars = [o.lidar for o in sorted(used, key=lambda o: o.capture)]
-    for k, variant in enumerate(variants):
-        if variant.board != board:
-            scans = stack_scans([interior(lidar, variant.board) for lidar in lidars], variant.board)
-            assumed = linearise(scans, terms.images, variant.board, joint.state, terms.trust)
-            moved = assemble(assumed, joint.levels, joint.priors).cost
-            changes[k] = (moved.gradients - joint.cost.gradients).sum(axis=0)
-    return np.asarray(-(joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, changes.T)).T)
+    changes = np.sum(by_common - np.swapaxes(own_steps[:, :, :G], 1, 2) @ by_own, axis=0)
+    return np.asarray(-(joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, changes)).T)
+
+
+def _moves_by_plate(joint: JointEstimate, estimate: CalibrationEstimate, board: Board) -> Array:
+    """Compute how far width and height of the plate move one camera's extrinsics: (2, 6) per m."""
+    terms, changes = joint.terms, []
+    lidars = [observation.lidar for observation in estimate.observations.values()]
+    for side in ("width_m", "height_m"):
+        assumed = replace(board, **{side: getattr(board, side) + _STEP_M})
+        scans = stack_scans([interior(lidar, assumed) for lidar in lidars], assumed)
+        moved = assemble(
+            linearise(scans, terms.images, assumed, joint.state, terms.trust), joint.levels, joint.priors
+        )
+        changes.append((moved.cost.gradients - joint.cost.gradients).sum(axis=0) / _STEP_M)
+    return np.asarray(
+        -(joint.to_extrinsics[0] @ np.linalg.solve(joint.cost.information, np.transpose(changes))).T
+    )
 
 
 def widen(cov: Array, spread: Array, n_placements: int) -> tuple[Array, float]:

@@ -6,10 +6,10 @@ import numpy as np
 
 from benchmarks.still_sessions import StillSession, draw_corners
 from lce_rig.calibrate.quadratics import symmetric_inverse
-from lce_rig.calibrate.tolerances import Tolerances, bend, bow
+from lce_rig.calibrate.tolerances import Tolerances
 from lce_rig.core.board import Board
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.geometry import Array
+from lce_rig.core.geometry import Array, invert, transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.detection import Detections
 from lce_rig.rig import Rig
@@ -46,7 +46,7 @@ def with_profile_errors(
         pattern_offset_m=tuple(board.pattern_offset_m + known.pattern_offset_m * rng.standard_normal(2)),
     ).corners()
     bows_m = known.bow_m * rng.standard_normal(2)
-    corners = corners + sum(bow(corners, axis, height, board) for axis, height in enumerate(bows_m))
+    corners = corners + sum(_bow(corners, axis, height, board) for axis, height in enumerate(bows_m))
     offset_m = of_lidar.range_offset_sigma_m * float(rng.standard_normal())
     images: dict[str, ImageBoard] = {}
     for name, T_cam_board in session.T_cam_board.items():
@@ -122,12 +122,12 @@ def _draw_lens(known: Tolerances, rng: np.random.Generator) -> Intrinsics:
 
 def _as_scanned(lidar: LidarBoard, board: Board, bows_m: Array, offset_m: float) -> LidarBoard:
     for axis, height_m in enumerate(bows_m):
-        lidar = bend(lidar, axis, float(height_m), board)
+        lidar = _bend(lidar, axis, float(height_m), board)
     return _lengthened(lidar, offset_m)
 
 
 def _lengthened(lidar: LidarBoard, offset_m: float) -> LidarBoard:
-    """Add an offset to all ranges; the plane follows as in `systematic.shift_rings`."""
+    """Add an offset to all ranges; the plane that predicts ranges by least squares follows."""
     rays, end_rays = (
         points / np.linalg.norm(points, axis=1, keepdims=True) for points in (lidar.points, lidar.edge_points)
     )
@@ -140,3 +140,46 @@ def _lengthened(lidar: LidarBoard, offset_m: float) -> LidarBoard:
         edge_points=lidar.edge_points + offset_m * end_rays,
         plane=np.append(-m, 1.0) / np.linalg.norm(m),
     )
+
+
+def _bow(points_board: Array, axis: int, height_m: float, board: Board) -> Array:
+    """Compute shifts (M, 3) of points along the board's normal onto a parabola, highest in the middle."""
+    half = (board.width_m, board.height_m)[axis] / 2
+    shifts = np.zeros_like(points_board)
+    shifts[:, 2] = height_m * (1 - (points_board[:, axis] / half) ** 2)
+    return shifts
+
+
+def _bend(lidar: LidarBoard, axis: int, height_m: float, board: Board) -> LidarBoard:
+    """Bend the plate that a scan shows: its points move along their rays, and the plane is fitted again.
+
+    Args:
+        lidar: a flat plate.
+        axis: 0 along the width, 1 along the height.
+        height_m: of the middle over the ends.
+        board: the plate's size.
+    """
+    T_board_lidar = invert(lidar.T_lidar_board)
+    normal = lidar.plane[:3]
+
+    def onto(points: Array) -> Array:
+        height = _bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
+        rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+        along = rays @ normal
+        # A ray that grazes the board would move its point far along it.
+        return np.asarray(points + (height / np.where(np.abs(along) < 0.2, np.inf, along))[:, None] * rays)
+
+    points = np.asarray(lidar.points, dtype=np.float64)
+    centred = points - points.mean(axis=0)
+    height = _bow(transform(T_board_lidar, points), axis, height_m, board)[:, 2]
+    # The plane z = a + b . p fitted to the heights tilts by b and rises by a.
+    inside = centred - (centred @ normal)[:, None] * normal
+    slope = np.linalg.lstsq(inside, height - height.mean(), rcond=1e-6)[0]
+    tilted = normal - slope
+    tilted /= np.linalg.norm(tilted)
+    middle = points.mean(axis=0) + height.mean() * normal
+    # The fitted plane need not pass through the mean of its points.
+    off = float(normal @ points.mean(axis=0) + lidar.plane[3])
+    plane = np.append(tilted, -tilted @ middle + off)
+    ends = np.asarray(lidar.edge_points, dtype=np.float64)
+    return replace(lidar, points=onto(points), edge_points=onto(ends) if len(ends) else ends, plane=plane)

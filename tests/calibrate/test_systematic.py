@@ -9,7 +9,7 @@ from lce_rig.calibrate import EstimateSettings, fit_extrinsic
 from lce_rig.calibrate.algorithm_1.algorithm import solve
 from lce_rig.calibrate.algorithm_1.moments import Problem, Weights
 from lce_rig.calibrate.features import extract_features
-from lce_rig.calibrate.systematic import ring_sensitivities, shift_rings, systematic_covariances
+from lce_rig.calibrate.uncertainty import moves_by_scans, systematic_covariances
 from lce_rig.core.geometry import difference, fit_plane
 from tests.calibrate.boards import BOARD, T_FORWARD, Scenario, simulate
 
@@ -39,7 +39,7 @@ def linearised(captures):
     solution = problem.solve(np.ones((1, len(features))), T_FORWARD, 5)
     cost = problem.quadratics(solution.x[0], solution.edge_ids[0])
     start = replace(solve(captures, BOARD), fitted=captures, problem=problem, solution=solution, cost=cost)
-    return solution.T[0], solution.linear[0, 3], ring_sensitivities(start, BOARD)
+    return solution.T[0], solution.linear[0, 3], moves_by_scans(start, BOARD).lasers.T
 
 
 @pytest.mark.parametrize("rings", [[5], [11], list(range(16))])
@@ -52,18 +52,6 @@ def test_longer_ranges_move_the_solution_as_its_sensitivities_say(rings):
     expected = 0.005 * columns[:, np.isin(seen, rings)].sum(axis=1)
     # Board at 2 m: metres and radians are comparable. fit_plane weighs points otherwise than ranges do.
     np.testing.assert_allclose(motion, expected, atol=0.1 * np.linalg.norm(expected))
-
-
-def test_the_plane_follows_a_ring_as_if_it_were_fitted_anew():
-    for item in simulate(6, 2, Scenario(range_sigma_m=0.0)):
-        lidar = item.lidar
-        for ring, moved in zip(RINGS, shift_rings(lidar, RINGS, 0.005), strict=True):
-            expected = longer(item, [ring], 0.005).lidar
-            np.testing.assert_allclose(moved.points, expected.points, atol=1e-12)
-            np.testing.assert_allclose(moved.edge_points, expected.edge_points, atol=1e-12)
-            np.testing.assert_allclose(moved.plane, expected.plane, atol=2e-3)
-            if ring not in lidar.ring:
-                np.testing.assert_allclose(moved.plane, lidar.plane, atol=1e-12)
 
 
 def normalised_errors(options, n_seeds):

@@ -61,6 +61,7 @@ def moves_of(estimate, source):
     [
         ("square_size", replace(BOARD, square_m=0.995 * BOARD.square_m), [-0.005]),
         ("pattern_offset", replace(BOARD, pattern_offset_m=(-0.005, 0.0)), [-0.005, 0.0]),
+        ("plate_size", replace(BOARD, width_m=BOARD.width_m + 0.005), [0.005, 0.0]),
     ],
 )
 def test_a_wrong_board_moves_the_solution_as_its_sensitivities_say(method, source, board, errors):

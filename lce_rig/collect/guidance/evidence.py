@@ -6,7 +6,7 @@ errs by -H^-1 sum_k (noise + D_k b), H = sum_k H_k + prior, hence
 
     cov = H^-1 (sum_k B_k) H^-1 + systematic(S),    S = -H^-1 sum_k D_k                                  (1)
 
-with the systematic part of lce_rig.calibrate.systematic. All are first built in the board's frame, in which a
+with the systematic part of `calibrate.uncertainty`. All are first built in the board's frame, in which a
 plane's residual depends on three freedoms b(u, v) = (1, u, v) only, and then moved to the camera's.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lce_rig.calibrate.plane_and_ends import PLANE_FREEDOMS, differentiate, freedoms_of_plane
 from lce_rig.calibrate.quadratics import symmetric_inverse
-from lce_rig.calibrate.systematic import systematic_covariances
+from lce_rig.calibrate.uncertainty import systematic_covariances
 from lce_rig.collect.guidance.sensor_model import ErrorModel, SensorModel
 from lce_rig.core.geometry import Array, invert, skew
 
