@@ -67,6 +67,22 @@ def test_corners_lie_as_near_as_a_checkerboards_though_some_are_hidden(board, T,
     assert result.quality is not None and result.quality.n_corners == is_seen.sum()
 
 
+@pytest.mark.parametrize("noise", [2.0, 8.0, 12.0])
+def test_noise_does_not_join_the_tags_of_a_covered_aprilgrid_to_its_squares(noise):
+    T = looking(25, 40, 20, (0.1, 0, 2.6))
+    pixels = covered(draw(APRILGRID, WIDE, T, noise=noise), APRILGRID, WIDE, T)
+    result = find_image_board(picture(pixels), APRILGRID, WIDE, is_thorough=False)
+    assert isinstance(result, ImageBoard)
+    assert np.linalg.norm(difference(T, result.T_cam_board)[:3]) < 0.005
+
+
+@pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=["charuco", "aprilgrid"])
+def test_low_contrast_hides_no_board_with_markers(board):
+    pixels = draw(board, WIDE, NEAR)
+    dim = np.rint(60 + 40.0 * (pixels / 255.0)).astype(np.uint8)
+    assert np.isfinite(found(dim, board, WIDE).corners_px).mean() > 0.9
+
+
 @pytest.mark.parametrize(("camera", "distance_m"), [(FISHEYE, 0.9), (DAVIS, 0.9)], ids=["fisheye", "davis"])
 @pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=["charuco", "aprilgrid"])
 def test_strong_lenses_and_small_images_show_all_corners(board, camera, distance_m):

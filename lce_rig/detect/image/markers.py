@@ -45,6 +45,8 @@ _MAX_OFF = 7.0
 _MOST_NEW = 0.25
 # Edges are measured up to this share of the way to the next thing that is printed.
 _FREE = 0.8
+# Black is darker than its surroundings by so many grey values; by so many deviations of an AprilGrid's noise.
+_DARKER, _MOST_DARKER, _DARKER_SIGMAS = 7.0, 25.0, 3.0
 
 
 def find_marked_grid(
@@ -114,8 +116,13 @@ def marker_corners(grey: Grey, board: Board) -> Array:
 def _search(grey: Grey, board: Board, *, is_thorough: bool) -> Places:
     """Find markers of the board's dictionary, at one scale or until half of the board's are found."""
     places: Places = {}
+    darker = _DARKER
+    if board.type == "aprilgrid":
+        # Black specks of noise join tags to the squares at their corners. Markers of ChArUco boards touch
+        # nothing, and their narrow white margins need the lower threshold.
+        darker = min(max(_DARKER_SIGMAS * _noise(grey), _DARKER), _MOST_DARKER)
     for scale, n_border in _attempts(grey.shape[1], board):
-        for number, corners in _detect(grey, board.dictionary, scale, n_border).items():
+        for number, corners in _detect(grey, board.dictionary, scale, n_border, darker).items():
             places.setdefault(number, corners)
         if not is_thorough or 2 * len(places) >= len(markers_of(board).ids):
             break
@@ -132,7 +139,7 @@ def _attempts(width_px: int, board: Board) -> Iterator[tuple[float, int]]:
         yield from ((scale, n_border) for scale in scales)
 
 
-def _detect(grey: Grey, dictionary: str, scale: float, n_border: int) -> Places:
+def _detect(grey: Grey, dictionary: str, scale: float, n_border: int, darker: float = _DARKER) -> Places:
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = n_border
     parameters.minMarkerPerimeterRate = 0.015
@@ -140,6 +147,7 @@ def _detect(grey: Grey, dictionary: str, scale: float, n_border: int) -> Places:
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
     parameters.errorCorrectionRate = 1.0
+    parameters.adaptiveThreshConstant = darker
     book = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
     image = grey
     if scale != 1.0:
@@ -151,6 +159,14 @@ def _detect(grey: Grey, dictionary: str, scale: float, n_border: int) -> Places:
     # Pixel centres are integers: the centre of the first pixel lies half a pixel inside the image.
     full = [(np.asarray(four[0], dtype=np.float64) + 0.5) / scale - 0.5 for four in corners]
     return dict(zip(ids.ravel().tolist(), full, strict=True))
+
+
+def _noise(grey: Grey) -> float:
+    """Estimate the standard deviation of an image's noise, by its second differences across both axes."""
+    across = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
+    rough = cv2.filter2D(grey, cv2.CV_16S, across)[1:-1:3, 1:-1:3]
+    # Of normal noise, the median size is 0.67 standard deviations; the filter multiplies these by six.
+    return float(np.median(np.abs(rough))) / (0.6745 * 6)
 
 
 def _other_dictionary(grey: Grey, board: Board) -> Refusal | None:
