@@ -29,7 +29,7 @@ def main(rig_name: str, folder: str, session_folder: str) -> None:
     written = result.write()
     print(f"{len(written.files)} files in {written.files[0].parent}")
     overlays = lce.verify(session, result).write()
-    print(f"overlays: {', '.join(str(sheet) for each in overlays for sheet in each.contact_sheets)}")
+    print(f"overlays: {', '.join(str(each.page) for each in overlays)}")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from lce_rig.detect.events.noise import measure_flicker
 from lce_rig.detect.events.reconstructor import Reconstructor
 from lce_rig.io.events import open_events
 from lce_rig.io.events.event_recording import EventRecording
-from lce_rig.show.overlays.overlay_files import write_picture
+from lce_rig.show.overlays.canvas import write_picture
 
 STAMPS = "stamps.csv"
 # 14 hours at the default period; one wrong timestamp makes a recording centuries long.

@@ -37,7 +37,7 @@ def verify(
 ) -> None:
     """Project the point clouds of SESSION (default: session/) into the images and print residuals.
 
-    Images and contact sheets replace those in SESSION/calibration/overlays/, with --result FILE those in
+    Images and a page of them replace those in SESSION/calibration/overlays/, with --result FILE those in
     SESSION/overlays/, with --name NAME those beside that result. Exits with 7 if the verdict is fail or these
     captures contradict the extrinsics.
     """
@@ -104,10 +104,8 @@ def _parts(checked: SessionCheck, session: str, *, is_explained: bool) -> Iterat
     scene = scene_texts(checked.scene)
     if checked.scene.state != "unknown" or is_explained:
         yield from show.titled_lines("scene", scene if is_explained else scene[:1])
-    if checked.contact_sheets:
-        first, *others = checked.contact_sheets
-        last = f" to {others[-1].name}" if others else ""
-        yield f"  images       {show.escape(str(first))}{last}"
+    if checked.page is not None:
+        yield f"  images       {show.escape(str(checked.page))}"
 
 
 @click.command()

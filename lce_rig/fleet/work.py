@@ -203,7 +203,6 @@ def _calibrate(
     detections = lce.detect(session, n_threads=1)
     result = lce.calibrate(session, detections, options=lce.CalibrateOptions(settings.method))
     saved = result.file()
-    verification = lce.verify(session, result, detections)
     row = row | {"profile_sha256": saved.inputs_sha256[PROFILE]}
     solved = {(c.camera, c.lidar) for c in result.pairs}
     every = [*detections.pairs, *detections.lidar_pairs(session.rig.lidars)]
@@ -217,9 +216,6 @@ def _calibrate(
     def fill(folder: Path) -> None:
         result.write(folder)
         replace_file(folder / PROFILE, dump_rig(session.rig).encode())
-        # Of the overlays, contact sheets are enough.
-        for path in (path for check in verification.write(folder / OVERLAYS) for path in check.pictures):
-            path.unlink()
 
     return publish(registry, [row, *lacking], start_s, fill, saved=saved)
 

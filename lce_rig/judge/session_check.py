@@ -151,8 +151,7 @@ class SessionCheck:
         metrics: their summary; None without any.
         scene: what the edges of the scene say of the extrinsics.
         meetings: by capture, the boards of the residuals.
-        pictures: one per capture, once they are drawn.
-        contact_sheets: all of them, on one sheet or more.
+        page: shows the overlays of all captures, once they are drawn.
     """
 
     pair: Pair
@@ -162,17 +161,7 @@ class SessionCheck:
     metrics: Metrics | None
     scene: SceneOpinion
     meetings: Mapping[str, Meeting]
-    pictures: tuple[Path, ...] = ()
-    contact_sheets: tuple[Path, ...] = ()
-
-    def moved(self, old: Path, new: Path) -> "SessionCheck":
-        """Update the files' paths to a new folder."""
-
-        pictures, sheets = (
-            tuple(new / path.relative_to(old) for path in paths)
-            for paths in (self.pictures, self.contact_sheets)
-        )
-        return replace(self, pictures=pictures, contact_sheets=sheets)
+    page: Path | None = None
 
     def document(self) -> dict[str, Any]:
         """List everything as plain types for JSON."""
@@ -197,8 +186,7 @@ class SessionCheck:
                 r.capture: {"was_used": r.capture in used, **{name: getattr(r, name) for name in names}}
                 for r in self.residuals
             },
-            "pictures": [str(path) for path in self.pictures],
-            "contact_sheets": [str(path) for path in self.contact_sheets],
+            "page": None if self.page is None else str(self.page),
         }
 
 

@@ -293,8 +293,8 @@ def write_intrinsics(session: Session, measured: Sequence[MeasuredIntrinsics]) -
     Raises:
         LceRigError: a file cannot be written; earlier ones are unchanged.
     """
+    from lce_rig.show.overlays.canvas import write_picture
     from lce_rig.show.overlays.intrinsics_plot import draw_intrinsics
-    from lce_rig.show.overlays.overlay_files import write_picture
 
     names = [DOCUMENT]
 

@@ -33,8 +33,8 @@ from lce_rig.scene.findings import (
 )
 from lce_rig.scene.rig_motion import MovingView, RigMotion, clocks_apart_s, estimate_motion, firing_times_s
 from lce_rig.scene.views import build_view, without_board, without_movers
-from lce_rig.show.overlays.drift_picture import draw_drift
-from lce_rig.show.overlays.overlay_files import write_picture
+from lce_rig.show.overlays.canvas import write_picture
+from lce_rig.show.overlays.overlay import draw_edges
 from lce_rig.timing.rig_time import event_channel, rig_time_ns
 
 _MIN_MOVING = 3
@@ -170,7 +170,7 @@ class DriftReport:
     notes: tuple[str, ...] = ()
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Draw each pair: edges under the deployed and the best extrinsics, and the score along each axis.
+        """Draw for each pair the edges of one capture under the deployed and the best extrinsics.
 
         Raises:
             SessionError: a file cannot be written.
@@ -180,11 +180,9 @@ class DriftReport:
             if pair.example is None:
                 continue
             name, image, view = pair.example
-            c = pair.calibration
-            lens = self.rig.lens_of(c)
-            board = () if pair.board is None else pair.board.axes
+            c, poses = pair.calibration, {"deployed": pair.drift.T_cam_lidar, "best fit": pair.drift.T_best}
             title = f"{c.camera}, {c.lidar}  {name}"
-            picture = draw_drift(pair.drift, image, view.edges, lens, title, pair.states, board)
+            picture = draw_edges(image, view.edges, self.rig.lens_of(c), poses, title)
             files.append(write_picture(Path(folder) / f"drift_{c.camera}_{c.lidar}.png", picture))
         return files
 

@@ -5,10 +5,10 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
-from itertools import combinations
 from pathlib import Path
 
 from lce_rig.core.calibration import Calibration, ResultFile, SceneOpinion, read_result
+from lce_rig.core.data import Image
 from lce_rig.core.errors import SessionError
 from lce_rig.core.findings import Finding, Refusal
 from lce_rig.core.geometry import Array
@@ -33,8 +33,7 @@ from lce_rig.session import Capture, Session
 from lce_rig.session.durable import replacing
 from lce_rig.session.identity import differing_keys
 from lce_rig.session.session import DEBUG, PROFILE
-from lce_rig.show.overlays.overlay import ImageWithEvents
-from lce_rig.show.overlays.overlay_files import draw_check, draw_cloud, is_overlay, seen_through_window
+from lce_rig.show.overlays.overlay import PAGE, draw_check, draw_cloud, is_overlay, seen_through_window
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ class Verification:
     def write(
         self, folder: Path | str | None = None, *, progress: Progress = silent
     ) -> tuple[SessionCheck, ...]:
-        """Project the point clouds into all images of the session.
+        """Project the point clouds into all images of the session, with a page for each pair.
 
         Args:
             folder: for the images; by default overlays/ beside the session's result.json if the result is its
@@ -76,7 +75,7 @@ class Verification:
             progress: called with (done, total) for each pair in turn.
 
         Returns:
-            The checks, with their images.
+            The checks, with their pages.
 
         Raises:
             SessionError: an image cannot be written; or the session's result was replaced meanwhile, in which
@@ -84,8 +83,7 @@ class Verification:
         """
         session = self.session
         if folder is not None:
-            return self._draw(Path(folder), progress)
-
+            return self._draw(Path(folder), Path(folder), progress)
         result = result_folder(session.path, self.name)
         place = (session.path if self.own_result is None else result) / OVERLAYS
 
@@ -95,37 +93,23 @@ class Verification:
                     f"{result} was calibrated again while overlays were drawn",
                     f"Run `lce-rig verify {session.path}` again.",
                 )
-            # Files that `verify` did not draw are kept, beside its images and in its folders.
-            pairs = [
-                *(
-                    Pair(camera, channel, lidar)
-                    for camera, sensor in session.rig.cameras.items()
-                    for channel in sensor.channels
-                    for lidar in session.rig.lidars
-                ),
-                *(Pair(first, "", second) for first, second in combinations(session.rig.lidars, 2)),
-            ]
-            folders = {pair.folder_name for pair in pairs}
-            keep_foreign(earlier, draft, lambda path: path.name in folders or is_overlay(path))
-            for name in folders:
-                if not (earlier / name).is_symlink():
-                    keep_foreign(earlier / name, draft / name, is_overlay)
+            keep_foreign(earlier, draft, is_overlay)
 
         with replacing(session.path, place, finish) as draft:
-            drawn = self._draw(draft, progress)
-        return tuple(each.moved(draft, place) for each in drawn)
+            return self._draw(draft, place, progress)
 
-    def _draw(self, base: Path, progress: Progress) -> tuple[SessionCheck, ...]:
+    def _draw(self, base: Path, place: Path, progress: Progress) -> tuple[SessionCheck, ...]:
+        """Draw into a folder, which will lie at a place."""
         drawn = []
         for check in self.checks:
-            pair, c, seen = check.pair, check.calibration, self.detections.between(check.pair)
-            folder = base if len(self.checks) == 1 else base / pair.folder_name
-            view_of = partial(_view, self.session, pair.camera, pair.channel)
-            if c.is_of_lidars:
-                check, T_view = seen_through_window(check)
-                view_of = partial(_view, self.session, pair.camera, "", T_view=T_view)
-            done = draw_check(self.session, seen, check, folder, view_of=view_of, progress=progress)
-            drawn.append(replace(done, calibration=c))
+            pair, seen = check.pair, self.detections.between(check.pair)
+            name = "" if len(self.checks) == 1 else pair.folder_name
+            shown, image_of = check, partial(_image, self.session, pair.camera, pair.channel)
+            if check.calibration.is_of_lidars:
+                shown, T_view = seen_through_window(check)
+                image_of = partial(_image, self.session, pair.camera, "", T_view=T_view)
+            draw_check(self.session, seen, shown, base / name, image_of=image_of, progress=progress)
+            drawn.append(replace(check, page=place / name / PAGE))
         return tuple(drawn)
 
 
@@ -263,8 +247,8 @@ def write_debug_images(
     Returns:
         The folder of the images, debug/ of the session.
     """
+    from lce_rig.show.overlays.canvas import write_picture
     from lce_rig.show.overlays.debug_image import draw_debug
-    from lce_rig.show.overlays.overlay_files import write_picture
 
     base = session.path / DEBUG
     jobs = [(pair, name) for pair in detections.pairs for name in detections.captures(pair)]
@@ -273,13 +257,15 @@ def write_debug_images(
         refused, chosen = matches[pair]
         mismatch = refused.get(name)
         capture, (image, lidar) = session.capture(name), detections.of(pair, name)
-        view, scan = _view(session, pair.camera, pair.channel, capture), None
+        seen, scan, events = _image(session, pair.camera, pair.channel, capture), None, None
         with suppress(SessionError):  # The detection of a damaged one says so.
             scan = capture.scan(pair.lidar)
+            if (pair.camera, pair.channel) in event_channels(session.rig, capture):
+                events = capture.events(pair.camera)
         candidates = lidar if isinstance(lidar, list) else []
         index = next((k for k, each in enumerate(candidates) if each is chosen.get(name)), 0)
         picture = draw_debug(
-            None if view is None else view.image,
+            seen,
             scan,
             image,
             lidar,
@@ -289,7 +275,7 @@ def write_debug_images(
             title=f"{pair}  {name}",
             chosen=index,
             mismatch=mismatch if mismatch is not None and mismatch.stage == "pair" else None,
-            events=None if view is None else view.events,
+            events=events,
         )
         place = base if len(detections.pairs) == 1 else base / pair.folder_name
         write_picture(place / f"{name}.png", picture)
@@ -297,16 +283,15 @@ def write_debug_images(
     return base
 
 
-def _view(
+def _image(
     session: Session, camera: str, channel: str, capture: Capture, *, T_view: Array | None = None
-) -> ImageWithEvents | None:
+) -> Image | None:
     """Return a camera's image, or a LiDAR's cloud as one; None if it is damaged or events gave none."""
     with suppress(SessionError):
         if T_view is not None:
-            return ImageWithEvents(draw_cloud(capture.scan(camera), T_view))
+            return draw_cloud(capture.scan(camera), T_view)
         if (camera, channel) not in event_channels(session.rig, capture):
-            return ImageWithEvents(capture.image(camera, channel))
+            return capture.image(camera, channel)
         picture = event_picture(session, capture, camera, channel)
-        if not isinstance(picture, Refusal):
-            return ImageWithEvents.of_events(picture, capture.events(camera))
+        return None if isinstance(picture, Refusal) else picture
     return None

@@ -14,7 +14,7 @@ from lce_rig.core.geometry import Array, exp_so3, invert, pose
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.finder import BoardFinder
 from lce_rig.rig import Rig
-from lce_rig.show.overlays.overlay import camera_part, draw_overlay
+from lce_rig.show.overlays.overlay import draw_overlay
 from lce_rig.simulate.options import SimulationOptions
 from lce_rig.simulate.sampling import capture_at
 from lce_rig.simulate.stage import Stage, set_stage
@@ -157,7 +157,7 @@ def _overlay(
     lidar_board: LidarBoard | None,
 ) -> Any:
     image, scan = capture.images[0], capture.scans[0]
-    drawn = draw_overlay(
+    return draw_overlay(
         image,
         scan,
         rig.cameras[image.sensor.partition(".")[0]].to_intrinsics(),
@@ -165,7 +165,4 @@ def _overlay(
         lidar_board=lidar_board,
         image_board=image_board,
         board=stage.board,
-        residuals={},
-        title="",
     )
-    return camera_part(drawn, image)

@@ -11,7 +11,7 @@ from lce_rig.core.calibration import Certificate, Metrics
 from lce_rig.core.geometry import invert
 from lce_rig.rig import load_rig
 from lce_rig.session import Session
-from lce_rig.show.overlays.overlay import BRIGHTER, DARKER
+from lce_rig.show.overlays.debug_image import BRIGHTER, DARKER
 from lce_rig.simulate import SimulationOptions, simulate_captures
 from tests.saved_results import made_calibration, write_result
 
@@ -63,18 +63,15 @@ def test_debug_images_show_the_reconstruction_and_the_events(lce_rig, moving):
     assert coloured(lower, BRIGHTER) > 500 and coloured(lower, DARKER) > 500
 
 
-def test_verify_draws_the_lidar_and_the_events_for_each_channel(lce_rig, moving, tmp_path):
+def test_verify_draws_the_lidar_for_each_channel(lce_rig, moving, tmp_path):
     outcome = lce_rig("verify", moving, "-o", tmp_path)
     assert outcome.code == 0, outcome.err + outcome.out
-    heights = {}
     for channel in ("events", "frames"):
         assert f"davis.{channel} and lidar" in outcome.out
         folder = tmp_path / f"davis.{channel}.lidar"
-        assert sorted(file.name for file in folder.iterdir()) == ["000000.png", "contact_sheet.png"]
+        assert sorted(file.name for file in folder.iterdir()) == ["000000.png", "index.html"]
         drawn = cv2.imread(str(folder / "000000.png"))
-        heights[channel] = drawn.shape[0]
         assert coloured(drawn, (235, 60, 255)) > 300  # magenta: the board in the LiDAR
-    assert heights["events"] > heights["frames"] + 260
 
 
 def test_verify_takes_the_channels_that_a_session_has(lce_rig, moving):

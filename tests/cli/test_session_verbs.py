@@ -118,12 +118,12 @@ def test_the_reference_never_enters_the_estimate(lce_rig, session):
 
 
 @pytest.mark.long
-def test_verify_draws_every_capture_and_one_sheet(lce_rig, calibrated):
+def test_verify_draws_every_capture_and_one_page(lce_rig, calibrated):
     outcome = lce_rig("verify", calibrated)
     assert outcome.code == 0 and len((outcome.out + outcome.err).splitlines()) <= 6
     assert len(lce_rig("verify", calibrated, "--explain").out.splitlines()) > 16
     pictures = sorted(path.name for path in (calibrated / "calibration" / "overlays").iterdir())
-    assert pictures == [*(f"{k:06d}.png" for k in range(16)), "contact_sheet.png"]
+    assert pictures == [*(f"{k:06d}.png" for k in range(16)), "index.html"]
 
 
 def test_verify_refuses_an_extrinsic_that_the_captures_contradict(lce_rig, calibrated_few):

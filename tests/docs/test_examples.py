@@ -63,7 +63,7 @@ def test_a_folder_of_images_and_clouds_becomes_a_result_and_overlays(workplace):
     main_of("calibrate_folder.py")("rles", "folder", "session")
     saved = lce.read_result("session/calibration/result.json")
     assert error_to_truth(saved.pairs[0], workplace / "monday") < 0.05
-    assert (workplace / "session" / "calibration" / "overlays" / "contact_sheet.png").exists()
+    assert (workplace / "session" / "calibration" / "overlays" / "index.html").exists()
 
 
 @pytest.mark.long
@@ -102,5 +102,5 @@ def test_the_notebook_runs_from_top_to_bottom(workplace):
     for cell in cells:
         exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
     assert (workplace / "session" / "calibration" / "result.json").exists()
-    sheet = names["checks"][0].contact_sheets[0]
-    assert sheet.exists() and sheet.parent.parent.name == "calibration"
+    page = names["checks"][0].page
+    assert page.exists() and page.parent.parent.name == "calibration"

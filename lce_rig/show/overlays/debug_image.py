@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
+import cv2
 import numpy as np
 
 from lce_rig.core.board import Board
@@ -18,9 +19,16 @@ from lce_rig.detect.image.markers import marker_corners
 from lce_rig.detect.lidar.search import plane_limit_m
 from lce_rig.rig import QualitySettings
 from lce_rig.show.overlays import canvas
-from lce_rig.show.overlays.canvas import BLACK, BLUE, MAGENTA, ORANGE, WHITE, Picture
-from lce_rig.show.overlays.overlay import draw_event_key, draw_events, draw_image_board, range_limits
+from lce_rig.show.overlays.canvas import BLACK, BLUE, INK, MAGENTA, ORANGE, WHITE, Colour, Picture
+from lce_rig.show.overlays.overlay import draw_image_board, range_limits
 
+# BGR; they also differ in lightness.
+BRIGHTER: Colour = (70, 70, 255)
+DARKER: Colour = (255, 150, 60)
+# For a slow board all events of this time are drawn, for a fast one the latest per pixel.
+_RECENT_NS = 100_000_000
+_MOST_EVENTS_PX = 0.06
+_DIM = 0.45
 _DPI, _WIDTH_IN, _PANE_IN, _REPORT_IN = 100, 16, 5.9, 1.9
 # As MAGENTA and ORANGE of the canvas.
 _CHOSEN, _REFUSED, _FOUND, _FAINT = "#ff3ceb", "#ffa03c", "#5ab4ff", "#969696"
@@ -78,7 +86,7 @@ def draw_debug(
         chosen: index of the candidate used, which is drawn face on.
         mismatch: why no candidate is the board in the image, if the sensors disagree; the best one is drawn
             face on and in another colour.
-        events: the events shortly before an image reconstructed from events, drawn over it below.
+        events: those that an image was reconstructed from; the latest before it are drawn over it below.
 
     Returns:
         (H, 1600, 3) uint8 BGR.
@@ -165,10 +173,44 @@ def _camera_picture(
     return picture
 
 
+def recent_events(image: Image, events: Events) -> Events:
+    """Keep the events shortly before an image."""
+    stamp_ns = image.stamp_ns if image.stamp_ns is not None else int(events.t_ns[-1])
+    recent = events.between(stamp_ns - _RECENT_NS, stamp_ns)
+    n_most = round(_MOST_EVENTS_PX * events.width_px * events.height_px)
+    return recent.select(slice(max(0, len(recent) - n_most), len(recent)))
+
+
+def draw_events(image: Image, events: Events) -> tuple[Picture, int]:
+    """Draw events over their image, dimmed, enlarged.
+
+    Args:
+        image: the image.
+        events: each pixel gets the colour of the majority of its events.
+
+    Returns:
+        The drawing (H, W, 3) BGR and the factor, as `canvas.enlarged`.
+    """
+    picture, factor = canvas.enlarged(image.pixels)
+    dimmed = picture.astype(np.float32) * _DIM + 30
+    shape = image.pixels.shape[:2]
+    sums = np.zeros(shape, dtype=np.int32)
+    is_inside = (events.x < shape[1]) & (events.y < shape[0])
+    inside = events.select(is_inside)
+    np.add.at(sums, (inside.y, inside.x), np.where(inside.polarity, 1, -1))
+    for is_coloured, colour in ((sums > 0, BRIGHTER), (sums < 0, DARKER)):
+        large = cv2.resize(
+            is_coloured.astype(np.uint8), None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST
+        )
+        dimmed[large > 0] = colour
+    return np.asarray(np.clip(dimmed, 0, 255), dtype=np.uint8), factor
+
+
 def _event_picture(
     image: Image, events: Events, result: ImageBoard | Refusal, board: Board, intrinsics: Intrinsics
 ) -> Picture:
     """Draw recent events over the image, and in grey from where and to where the board was tracked."""
+    events = recent_events(image, events)
     picture, factor = draw_events(image, events)
     if isinstance(result, ImageBoard):
         track = result.track_T_cam_board
@@ -177,7 +219,15 @@ def _event_picture(
             pixels = (outline_px(T_cam_board, board, intrinsics) + 0.5) * factor - 0.5
             canvas.draw_line(picture, pixels, colour, 1, None)
     picture[:24] = BLACK
-    draw_event_key(picture, events, 8, 16, 10)
+    span_ms = 1e-6 * float(events.t_ns[-1] - events.t_ns[0]) if len(events) else 0.0
+    left_px, text_px = 8.0, 10
+    for text, colour in (
+        (f"events of the last {span_ms:.{0 if span_ms >= 10 else 1}f} ms:", INK),
+        ("brighter", BRIGHTER),
+        ("darker", DARKER),
+    ):
+        canvas.draw_text(picture, text, left_px, 16, text_px, colour)
+        left_px += canvas.text_width_px(text, text_px) + text_px
     return picture
 
 

@@ -1,101 +1,41 @@
-"""Project the point cloud into the camera's image, with the board of both sensors, and recent events."""
+"""The point cloud or its edges projected into the camera's image, and a page of all captures of a session."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 
-import cv2
 import numpy as np
 
+from lce_rig.calibrate.between_lidars import optical_frame
 from lce_rig.core.board import Board
+from lce_rig.core.calibration import Calibration
 from lce_rig.core.camera import Intrinsics
-from lce_rig.core.data import Events, Image, Scan
+from lce_rig.core.data import Image, Scan
+from lce_rig.core.errors import SessionError
 from lce_rig.core.geometry import Array, transform
+from lce_rig.core.phrasing import sizes
 from lce_rig.core.results import ImageBoard, LidarBoard
+from lce_rig.detect.detection import Detections
 from lce_rig.detect.events.figures import outline_px
+from lce_rig.judge.session_check import SessionCheck
+from lce_rig.scene.depth_edges import DepthEdges
+from lce_rig.session import Capture, Session
+from lce_rig.session.durable import write_atomically
 from lce_rig.show.overlays import canvas
-from lce_rig.show.overlays.canvas import BLACK, FAINT, INK, MAGENTA, ORANGE, WHITE, Colour, Picture
+from lce_rig.show.overlays.canvas import BLACK, FAINT, MAGENTA, ORANGE, WHITE, Picture
+from lce_rig.show.report.page import render
 
-# BGR; they also differ in lightness.
-BRIGHTER: Colour = (70, 70, 255)
-DARKER: Colour = (255, 150, 60)
-# For a slow board all events of this time are drawn, for a fast one the latest per pixel.
-_RECENT_NS = 100_000_000
-_MOST_EVENTS_PX = 0.06
-_DIM = 0.45
-
-
-@dataclass(frozen=True, eq=False)
-class ImageWithEvents:
-    """A camera's view.
-
-    Attributes:
-        image: the image, captured or reconstructed from events.
-        events: those shortly before it; None if the image was not reconstructed here.
-    """
-
-    image: Image
-    events: Events | None = None
-
-    @classmethod
-    def of_events(cls, image: Image, events: Events) -> "ImageWithEvents":
-        """Keep the events shortly before an image."""
-        stamp_ns = image.stamp_ns if image.stamp_ns is not None else int(events.t_ns[-1])
-        recent = events.between(stamp_ns - _RECENT_NS, stamp_ns)
-        n_most = round(_MOST_EVENTS_PX * events.width_px * events.height_px)
-        return cls(image, recent.select(slice(max(0, len(recent) - n_most), len(recent))))
-
-
-def draw_events(image: Image, events: Events) -> tuple[Picture, int]:
-    """Draw events over their image, dimmed, enlarged.
-
-    Args:
-        image: the image.
-        events: each pixel gets the colour of the majority of its events.
-
-    Returns:
-        The drawing (H, W, 3) BGR and the factor, as `canvas.enlarged`.
-    """
-    picture, factor = canvas.enlarged(image.pixels)
-    dimmed = picture.astype(np.float32) * _DIM + 30
-    shape = image.pixels.shape[:2]
-    sums = np.zeros(shape, dtype=np.int32)
-    is_inside = (events.x < shape[1]) & (events.y < shape[0])
-    inside = events.select(is_inside)
-    np.add.at(sums, (inside.y, inside.x), np.where(inside.polarity, 1, -1))
-    for is_coloured, colour in ((sums > 0, BRIGHTER), (sums < 0, DARKER)):
-        large = cv2.resize(
-            is_coloured.astype(np.uint8), None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST
-        )
-        dimmed[large > 0] = colour
-    return np.asarray(np.clip(dimmed, 0, 255), dtype=np.uint8), factor
-
-
-def draw_event_key(
-    picture: Picture, events: Events, left_px: float, baseline_px: float, text_px: float
-) -> None:
-    """Explain the colours in one line of text."""
-    span_ms = 1e-6 * float(events.t_ns[-1] - events.t_ns[0]) if len(events) else 0.0
-    texts = (
-        (f"events of the last {span_ms:.{0 if span_ms >= 10 else 1}f} ms:", INK),
-        ("brighter", BRIGHTER),
-        ("darker", DARKER),
-    )
-    for text, colour in texts:
-        canvas.draw_text(picture, text, left_px, baseline_px, text_px, colour)
-        left_px += canvas.text_width_px(text, text_px) + text_px
-
-
-_MARKS = (
-    ("board, LiDAR points", "point"),
-    ("board, ring ends", "end"),
-    ("board outline", "line"),
-    ("corners", "corner"),
-)
-"""What the legend calls each mark, those of the LiDAR first."""
-
+PAGE = "index.html"
+_PAGE_PX = 1600
 _FOLD_MARGIN = 0.9
 # Points of a dense scan become smaller, so that the image remains visible between them.
 _MOST_COVERED = 0.15
+# Scans that choose the range scale of a session's images.
+_SCANS_OF_SCALE = 8
+_WINDOW = Intrinsics(640.0, 640.0, 639.5, 359.5, 1280, 720)
 
 
 def draw_overlay(
@@ -107,11 +47,7 @@ def draw_overlay(
     lidar_board: LidarBoard | None,
     image_board: ImageBoard | None,
     board: Board,
-    residuals: Mapping[str, str],
-    title: str,
     limits_m: tuple[float, float] | None = None,
-    warning: str = "",
-    events: Events | None = None,
 ) -> Picture:
     """Project a whole scan, coloured by range, into the image, and draw both sensors' detections.
 
@@ -126,20 +62,14 @@ def draw_overlay(
         lidar_board: its points and ring ends are marked; None for the scan only.
         image_board: its outline and corners are drawn; None for none.
         board: the board, for its outline.
-        residuals: figures by name, such as {"planes": "4.2 mm"}, in display order.
-        title: one line above the image.
         limits_m: ends of the range scale; those of the scan if None.
-        warning: why the capture was not used, below the legend.
-        events: those shortly before an image reconstructed from events; drawn below it with the board's ring
-            ends and outline.
 
     Returns:
-        (H, W, 3) uint8 BGR, with a strip above and a legend below the image.
+        (H, W, 3) uint8 BGR.
     """
     picture, factor = canvas.enlarged(image.pixels)
     unit = picture.shape[1] / 1000
-    limits_m = limits_m or range_limits([scan])
-    _draw_scan(picture, factor, scan, intrinsics, T_cam_lidar, limits_m, 1.6 * unit)
+    _draw_scan(picture, factor, scan, intrinsics, T_cam_lidar, limits_m or range_limits([scan]), 1.6 * unit)
     if image_board is not None:
         draw_image_board(picture, factor, image_board, board, intrinsics)
     if lidar_board is not None:
@@ -147,29 +77,7 @@ def draw_overlay(
         canvas.draw_discs(picture, on_board, MAGENTA, 1.9 * unit, WHITE)
         ends = _to_picture(lidar_board.edge_points, T_cam_lidar, intrinsics, factor)[0]
         canvas.draw_diamonds(picture, ends, ORANGE, 4.2 * unit)
-    width_px, has_lidar, has_image = picture.shape[1], lidar_board is not None, image_board is not None
-    strip = canvas.panel(width_px, _title_px(width_px))
-    text_px = 13 * unit
-    canvas.draw_text(strip, title, text_px, 1.8 * text_px, text_px, INK)
-    parts = [strip, picture, draw_legend(width_px, limits_m, residuals, has_lidar, has_image)]
-    if warning:
-        text_px, left = 11 * unit, 16 * unit
-        lines = canvas.wrapped(warning, width_px - 2 * left, text_px)
-        strip = canvas.panel(width_px, round((1.9 * len(lines) + 0.8) * text_px))
-        canvas.draw_paragraph(strip, warning, left, 1.4 * text_px, width_px - 2 * left, text_px, ORANGE)
-        parts.append(strip)
-    if events is not None:
-        # The LiDAR's ring ends too, as a board's border makes events.
-        below, factor = draw_events(image, events)
-        if image_board is not None:
-            _draw_outline(below, factor, image_board, board, intrinsics)
-        if lidar_board is not None:
-            ends = _to_picture(lidar_board.edge_points, T_cam_lidar, intrinsics, factor)[0]
-            canvas.draw_diamonds(below, ends, ORANGE, 4.2 * unit)
-        strip = canvas.panel(width_px, round(28 * unit))
-        draw_event_key(strip, events, 13 * unit, 20 * unit, 11 * unit)
-        parts += [strip, below]
-    return np.vstack(parts)
+    return picture
 
 
 def draw_projection(
@@ -183,16 +91,35 @@ def draw_projection(
     return picture
 
 
-def camera_part(overlay: Picture, image: Image) -> Picture:
-    """Cut the camera's image out of the output of `draw_overlay`, without title and legend."""
-    width_px = overlay.shape[1]
-    top = _title_px(width_px)
-    return overlay[top : top + image.pixels.shape[0] * width_px // image.pixels.shape[1]]
+def draw_edges(
+    image: Image, edges: DepthEdges, intrinsics: Intrinsics, poses: Mapping[str, Array], title: str
+) -> Picture:
+    """Draw a scan's depth edges into the image under several extrinsics, side by side.
 
+    Args:
+        image: of the capture.
+        edges: of its scan.
+        intrinsics: of the camera.
+        poses: T_cam_lidar (4, 4) by name.
+        title: one line.
 
-def _title_px(width_px: int) -> int:
-    """Height of the strip above an image."""
-    return round(2.6 * 13 * width_px / 1000)
+    Returns:
+        BGR (H, W, 3).
+    """
+    width_px = _PAGE_PX // len(poses)
+    panels = []
+    for name, T_cam_lidar in poses.items():
+        picture, factor = canvas.enlarged(image.pixels)
+        pixels, _ = intrinsics.project(transform(T_cam_lidar, edges.points))
+        at = (pixels[intrinsics.is_inside(pixels)] + 0.5) * factor - 0.5
+        canvas.draw_discs(picture, at, MAGENTA, 2.2e-3 * picture.shape[1], BLACK)
+        picture = canvas.fitted(picture, width_px, round(width_px * picture.shape[0] / picture.shape[1]))
+        strip = canvas.panel(width_px, 40)
+        canvas.draw_text(strip, f"{title}  {name}", 12, 27, 13)
+        # Between images as white as the page, such as those of events.
+        picture[:, -2:] = BLACK
+        panels.append(np.vstack([strip, picture]))
+    return np.hstack(panels)
 
 
 def range_limits(scans: Sequence[Scan]) -> tuple[float, float]:
@@ -208,19 +135,12 @@ def draw_image_board(
     picture: Picture, factor: int, image_board: ImageBoard, board: Board, intrinsics: Intrinsics
 ) -> None:
     """Draw the board's outline at T_cam_board, bent as the lens bends it, and the corners as measured."""
-    _draw_outline(picture, factor, image_board, board, intrinsics)
-    unit = picture.shape[1] / 1000
+    outline = outline_px(image_board.T_cam_board, board, intrinsics)
+    width_px = max(1, round(2e-3 * picture.shape[1]))
+    canvas.draw_line(picture, (outline + 0.5) * factor - 0.5, WHITE, width_px)
     seen_px = image_board.corners_px[np.isfinite(image_board.corners_px[:, 0])]
     at = (seen_px + 0.5) * factor - 0.5
-    canvas.draw_discs(picture, at, WHITE, 1.6 * unit, BLACK)
-
-
-def _draw_outline(
-    picture: Picture, factor: int, image_board: ImageBoard, board: Board, intrinsics: Intrinsics
-) -> None:
-    pixels = outline_px(image_board.T_cam_board, board, intrinsics)
-    width_px = max(1, round(2e-3 * picture.shape[1]))
-    canvas.draw_line(picture, (pixels + 0.5) * factor - 0.5, WHITE, width_px)
+    canvas.draw_discs(picture, at, WHITE, 1.6e-3 * picture.shape[1], BLACK)
 
 
 def _to_picture(
@@ -256,44 +176,148 @@ def _draw_scan(
     canvas.draw_discs(picture, pixels[order], canvas.turbo(ranges_m[order], *limits_m), radius_px)
 
 
-def draw_legend(
-    width_px: int,
-    limits_m: tuple[float, float],
-    residuals: Mapping[str, str],
-    has_lidar: bool = True,
-    has_image: bool = True,
-) -> Picture:
-    """Explain marks and colours and list figures, in columns."""
-    unit = width_px / 1000
-    text_px = 11 * unit
-    line_px = 2.1 * text_px
-    entries = [f"{name}  {value}" for name, value in residuals.items()]
-    n_columns = 2 if len(entries) > 4 else 1
-    n_lines = max(4, -(-len(entries) // n_columns))
-    legend = canvas.panel(width_px, round((n_lines + 0.9) * line_px))
-    rows = [(0.95 + row) * line_px for row in range(n_lines)]
+def is_overlay(path: Path) -> bool:
+    """Return whether a file or folder has a name or a page that `draw_check` gives it."""
+    names_file = re.fullmatch(r"[0-9]{6,}\.png", path.name) is not None or path.name == PAGE
+    return names_file or (path / PAGE).is_file()
 
-    marks = (_MARKS[:2] if has_lidar else ()) + (_MARKS[2:] if has_image else ())
-    for (name, kind), baseline in zip(marks, rows, strict=False):
-        at = np.array([[24 * unit, baseline - 0.45 * text_px]])
-        if kind == "point":
-            canvas.draw_discs(legend, at, MAGENTA, 4 * unit, WHITE)
-        elif kind == "end":
-            canvas.draw_diamonds(legend, at, ORANGE, 6 * unit)
-        elif kind == "corner":
-            canvas.draw_discs(legend, at, WHITE, 3 * unit, BLACK)
-        else:
-            line = at + [[-12 * unit, 0], [12 * unit, 0]]
-            canvas.draw_line(legend, line, WHITE, max(1, round(2 * unit)))
-        canvas.draw_text(legend, name, 48 * unit, baseline, text_px)
-    canvas.draw_text(legend, "range from the LiDAR", 300 * unit, rows[0], text_px)
-    scale = (round(300 * unit), round(rows[0] + 0.7 * text_px), round(270 * unit), round(1.3 * text_px))
-    canvas.draw_scale(legend, scale, *limits_m, "m", text_px)
-    per_column = -(-len(entries) // n_columns)
-    for index, entry in enumerate(entries):
-        left = (630 + 185 * (index // max(per_column, 1))) * unit
-        canvas.draw_text(legend, entry, left, rows[index % max(per_column, 1)], text_px)
-    canvas.draw_line(
-        legend, np.array([[605, 8], [605, 1e3 * legend.shape[0] / width_px - 8]]) * unit, FAINT, 1, None
+
+def draw_check(
+    session: Session,
+    detections: Detections,
+    check: SessionCheck,
+    folder: Path,
+    *,
+    image_of: Callable[[Capture], Image | None],
+    progress: Callable[[int, int], None],
+) -> None:
+    """Project the point cloud of every capture into its image, and write a page that shows them all.
+
+    Args:
+        session: the source of the captures.
+        detections: of the session.
+        check: of one channel on these captures.
+        folder: receives `<capture>.png` and the page.
+        image_of: returns the channel's image in a capture; None if it cannot be read.
+        progress: called with (done, total).
+
+    Raises:
+        SessionError: an image cannot be written.
+    """
+    names, c = detections.captures(check.pair), check.calibration
+    scans = []
+    for name in names[:: max(1, len(names) // _SCANS_OF_SCALE)]:
+        with suppress(SessionError):
+            scans.append(session.capture(name).scan(check.pair.lidar))
+    limits_m = range_limits(scans)
+    shown = []
+    for done, name in enumerate(names, start=1):
+        capture = session.capture(name)
+        image = image_of(capture)
+        if image is not None:
+            # A capture whose scan cannot be read is not drawn.
+            with suppress(SessionError):
+                scan, board = capture.scan(check.pair.lidar), detections.of(check.pair, name)[0]
+                picture = _draw(name, image, scan, session, check, board, limits_m)
+                canvas.write_picture(folder / f"{name}.png", picture)
+                shown.append((name, "; ".join(_figures(name, check)), _cause(name, c)))
+        progress(done, len(names))
+    page = render(
+        "overlays.html",
+        title=f"{session.rig.name}: {check.pair}",
+        verdict=c.verdict,
+        n_captures=len(names),
+        n_used=len(c.captures_used),
+        uncertainty=sizes(c.sigma_rotation_deg, c.sigma_translation_m),
+        findings=[finding.sentence for finding in (*c.findings, *check.findings)],
+        limits_m=limits_m,
+        shown=shown,
     )
-    return legend
+    write_atomically(folder / PAGE, page)
+
+
+def _figures(name: str, check: SessionCheck) -> Iterator[str]:
+    """List a capture's residuals, and how far a hand-held board moved between scan and image."""
+    for r in check.residuals:
+        if r.capture == name:
+            yield f"planes {1000 * r.plane_mean_m:.1f} mm, edges {1000 * r.edge_mean_m:.1f} mm"
+            if math.isfinite(r.reprojection_px):
+                yield f"corners {r.reprojection_px:.2f} px"
+    meeting = check.meetings.get(name)
+    if meeting is not None and meeting.way_m > 0:
+        yield f"moved {1000 * meeting.way_m:.1f} mm"
+
+
+def _cause(name: str, c: Calibration) -> str:
+    """State why a capture was not used; "" if it was, or if the extrinsics are of another session."""
+    refusal = c.captures_refused.get(name)
+    if not c.captures_used or name in c.captures_used:
+        return ""
+    return "not used" if refusal is None else f"refused, {refusal.stage}: {refusal.sentence}"
+
+
+def _draw(
+    name: str,
+    image: Image,
+    scan: Scan,
+    session: Session,
+    check: SessionCheck,
+    detected: object,
+    limits_m: tuple[float, float],
+) -> Picture:
+    """Draw one capture with the board of both sensors."""
+    c, meeting = check.calibration, check.meetings.get(name)
+    image_board = detected if isinstance(detected, ImageBoard) else None
+    if meeting is not None:
+        # The board's points are drawn separately, moved to the image's time.
+        points, on_board = (
+            np.ascontiguousarray(p, dtype=np.float32) for p in (scan.points, meeting.measured.lidar.points)
+        )
+        row = np.dtype((np.void, points.dtype.itemsize * 3))
+        scan = scan.select(~np.isin(points.view(row).ravel(), on_board.view(row).ravel()))
+    return draw_overlay(
+        image,
+        scan,
+        session.rig.lens_of(c),
+        c.T_cam_lidar,
+        lidar_board=None if meeting is None else meeting.lidar_at_image_time,
+        image_board=image_board if meeting is None else meeting.measured.image,
+        board=session.rig.board.to_board(),
+        limits_m=limits_m,
+    )
+
+
+def seen_through_window(check: SessionCheck) -> tuple[SessionCheck, Array]:
+    """Put a camera in the first LiDAR's place that looks at the boards.
+
+    Args:
+        check: of two LiDARs.
+
+    Returns:
+        The same as of that camera, and T_camera_first (4, 4).
+    """
+    middles = [meeting.measured.image.T_cam_board[:3, 3] for meeting in check.meetings.values()]
+    T_view = optical_frame(np.array(middles).reshape(-1, 3))
+    c = check.calibration
+    seen: Calibration = replace(c, T_cam_lidar=T_view @ c.T_cam_lidar, intrinsics=_WINDOW)
+    meetings = {}
+    for name, meeting in check.meetings.items():
+        image = meeting.measured.image
+        moved = replace(image, T_cam_board=T_view @ image.T_cam_board)
+        meetings[name] = replace(meeting, measured=replace(meeting.measured, image=moved))
+    return replace(check, calibration=seen, meetings=meetings), T_view
+
+
+def draw_cloud(scan: Scan, T_view: Array) -> Image:
+    """Draw the first LiDAR's cloud in grey, as the camera in its place would see it.
+
+    Args:
+        scan: of the first LiDAR.
+        T_view: (4, 4) from its frame to the camera's.
+    """
+    points = transform(T_view, scan.points[np.isfinite(scan.points).all(axis=1)])
+    pixels, is_valid = _WINDOW.project(points)
+    is_seen = is_valid & (points[:, 2] > 0) & _WINDOW.is_inside(pixels, -0.5)
+    picture = canvas.panel(_WINDOW.width_px, _WINDOW.height_px)
+    canvas.draw_discs(picture, pixels[is_seen], FAINT, 1.6)
+    return Image(scan.sensor, "", scan.stamp_ns, picture)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from lce_rig.core.data import Events, Image
-from lce_rig.show.overlays.overlay import BRIGHTER, DARKER, ImageWithEvents, draw_events
-from tests.show.overlays.test_pictures import FOLDING, count, grey, image_board, lidar_board, overlay, wall
+from lce_rig.show.overlays.debug_image import BRIGHTER, DARKER, draw_events, recent_events
+from tests.show.overlays.test_pictures import FOLDING, grey
 
 MS = 1_000_000
 IMAGE = Image("cam", "events", 500 * MS, grey(FOLDING))
@@ -40,23 +40,9 @@ def test_events_off_a_picture_that_was_cut_are_left_out():
 
 
 def test_only_events_shortly_before_the_picture_are_taken_along():
-    view = ImageWithEvents.of_events(
-        IMAGE, events_at([300, 420, 499, 501], [1, 2, 3, 4], [1] * 4, [True] * 4)
-    )
-    assert view.events is not None and view.events.x.tolist() == [2, 3]
+    shown = recent_events(IMAGE, events_at([300, 420, 499, 501], [1, 2, 3, 4], [1] * 4, [True] * 4))
+    assert shown.x.tolist() == [2, 3]
     n = 20_000
     storm = events_at(list(np.linspace(410, 499, n)), [7] * n, [7] * n, [True] * n)
-    shown = ImageWithEvents.of_events(IMAGE, storm).events
-    assert shown is not None and len(shown) == round(0.06 * 346 * 260) and shown.t_ns[-1] == storm.t_ns[-1]
-
-
-def test_an_overlay_shows_the_events_and_the_ring_ends_below_the_legend():
-    points = wall()
-    boards = {"lidar": lidar_board(points), "image": image_board(FOLDING)}
-    events = events_at([450] * 30, list(range(30)), [9] * 30, [True] * 30)
-    plain, drawn = overlay(FOLDING, points, **boards), overlay(FOLDING, points, events=events, **boards)
-    assert np.array_equal(drawn[: len(plain)], plain)
-    below = drawn[len(plain) :]
-    assert below.shape[0] > 260 * 3
-    assert count(below, BRIGHTER) >= 30 * 9
-    assert count(below, (60, 160, 255)) > 50  # orange: the ring ends
+    shown = recent_events(IMAGE, storm)
+    assert len(shown) == round(0.06 * 346 * 260) and shown.t_ns[-1] == storm.t_ns[-1]

@@ -12,17 +12,9 @@ from lce_rig.core.geometry import transform
 from lce_rig.core.results import ImageBoard, LidarBoard
 from lce_rig.detect.findings import IMAGE_TILTED
 from lce_rig.rig import QualitySettings
-from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, PANEL
+from lce_rig.show.overlays.canvas import MAGENTA, ORANGE, write_picture
 from lce_rig.show.overlays.debug_image import draw_debug
 from lce_rig.show.overlays.overlay import draw_overlay
-from lce_rig.show.overlays.overlay_files import (
-    Overlay,
-    SheetHead,
-    contact_sheets,
-    is_overlay,
-    write_overlays,
-    write_picture,
-)
 from tests.calibrate.boards import measured_plate
 
 BOARD = Board(cols=8, rows=6, square_m=0.07, width_m=0.767, height_m=0.626)
@@ -80,18 +72,7 @@ def overlay(camera, points, **boards):
         lidar_board=boards.get("lidar"),  # type: ignore[arg-type]
         image_board=boards.get("image"),  # type: ignore[arg-type]
         board=BOARD,
-        residuals={"planes": "4.2 mm", "verdict": "pass"},
-        title="capture 000000",
-        events=boards.get("events"),  # type: ignore[arg-type]
-        warning=str(boards.get("warning", "")),
     )
-
-
-def picture_part(drawn, camera):
-    """Cut title and legend off."""
-    factor = drawn.shape[1] // camera.width_px
-    top = round(2.6 * 13 * drawn.shape[1] / 1000)
-    return drawn[top : top + factor * camera.height_px]
 
 
 def count(drawn, colour):
@@ -103,13 +84,12 @@ def test_points_board_and_ends_are_drawn_at_any_size(camera):
     points = wall()
     drawn = overlay(camera, points, lidar=lidar_board(points), image=image_board(camera))
     assert drawn.dtype == np.uint8 and drawn.shape[1] >= 960 and drawn.shape[1] % camera.width_px == 0
-    part = picture_part(drawn, camera)
-    assert count(part, MAGENTA) > 300
-    assert count(part, ORANGE) > 50
+    assert count(drawn, MAGENTA) > 300
+    assert count(drawn, ORANGE) > 50
 
 
 def test_a_point_appears_where_the_camera_sees_it():
-    part = picture_part(overlay(FOLDING, np.array([[2.0, 0.4, 0.2]])), FOLDING)
+    part = overlay(FOLDING, np.array([[2.0, 0.4, 0.2]]))
     v, u = np.argwhere(np.any(part != 128, axis=-1)).mean(axis=0)
     truth, _ = FOLDING.project(np.array([-0.4, -0.2, 2.0]))
     assert (u, v) == pytest.approx(tuple((truth + 0.5) * 3 - 0.5), abs=0.8)
@@ -119,14 +99,14 @@ def test_points_behind_the_camera_or_folded_by_the_distortion_are_not_drawn():
     behind = wall(-2.0)
     # At 60 deg r = 1.73, beyond the fold of 1 - 0.4 r^2 at r = 0.91, where the polynomial draws it at -0.35.
     folded = np.stack([np.ones(20), np.full(20, np.tan(np.radians(60))), np.linspace(-0.2, 0.2, 20)], axis=1)
-    part = picture_part(overlay(FOLDING, np.concatenate([behind, folded])), FOLDING)
+    part = overlay(FOLDING, np.concatenate([behind, folded]))
     assert np.all(part == 128)
 
 
 def test_near_points_cover_far_ones():
     far, near = wall(4.0) * [1, 2, 2], wall(2.0)
-    both = picture_part(overlay(FOLDING, np.concatenate([near, far])), FOLDING)
-    swapped = picture_part(overlay(FOLDING, np.concatenate([far, near])), FOLDING)
+    both = overlay(FOLDING, np.concatenate([near, far]))
+    swapped = overlay(FOLDING, np.concatenate([far, near]))
     assert np.array_equal(both, swapped)
 
 
@@ -149,40 +129,9 @@ def test_a_debug_picture_is_made_of_whatever_there_is(has_image, has_lidar):
     assert (count(drawn[:, 800:], MAGENTA) > 100) == has_lidar
 
 
-HEAD = SheetHead("rig  cam and lidar", "fail", ("7 captures", "the board moved: hold it still"), (1.0, 9.0))
-
-
-def tile(index, warning=""):
-    colour = (10 + 3 * index, 200, 30 + 2 * index)
-    return Overlay(f"{index:06d}", drawn := np.full((270, 480, 3), colour, np.uint8), drawn, "", warning)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("n", [1, 2, 7, 18, 40])
-def test_contact_sheets_hold_every_picture_once_and_are_at_most_2000_px_wide(n):
-    tiles = [tile(index) for index in range(n)]
-    sheets = contact_sheets(tiles, HEAD)
-    assert all(sheet.shape[1] <= 2000 and sheet.shape[0] <= 2000 for sheet in sheets)
-    for each in tiles:
-        n_px = [int(np.all(sheet == each.part[0, 0], axis=-1).sum()) for sheet in sheets]
-        assert sorted(n_px)[-1] == sum(n_px) == 270 * 480
-    assert all(np.all(sheet[0, 0] == PANEL) for sheet in sheets)
-
-
-def test_overlays_are_written_with_contact_sheets_and_read_back_unchanged(tmp_path):
+def test_a_picture_reads_back_unchanged(tmp_path):
     drawn = overlay(FOLDING, wall())
-    names = ("000000", "000001")
-    files, sheets = write_overlays(tmp_path / "overlays", [Overlay(n, drawn, drawn) for n in names], HEAD)
-    assert [file.parent for file in [*files, *sheets]] == [tmp_path / "overlays"] * 3
-    assert [sheet.name for sheet in sheets] == ["contact_sheet.png"]
-    assert np.array_equal(cv2.imread(str(files[0])), drawn)
-    assert write_overlays(tmp_path / "none", [], HEAD) == ([], [])
-
-
-def test_many_overlays_have_numbered_contact_sheets_which_are_known_as_such(tmp_path):
-    files, sheets = write_overlays(tmp_path, [tile(index) for index in range(40)], HEAD)
-    assert [sheet.name for sheet in sheets] == ["contact_sheet_1.png", "contact_sheet_2.png"]
-    assert all(map(is_overlay, [*files, *sheets])) and not is_overlay(tmp_path / "contact_sheet_mine.png")
+    assert np.array_equal(cv2.imread(str(write_picture(tmp_path / "overlays" / "a.png", drawn))), drawn)
 
 
 def test_a_picture_that_cannot_be_written_names_the_file(tmp_path):
