@@ -28,7 +28,7 @@ from lce_rig.core.phrasing import as_line
 from lce_rig.fleet.findings import MOVED
 from lce_rig.fleet.registry import Registry, covariances, poses
 from lce_rig.session.durable import write_atomically
-from lce_rig.show.report.page import render
+from lce_rig.show.page import render
 
 State = Literal["moved", "steady", "cannot_tell"]
 STATES: tuple[State, ...] = ("moved", "steady", "cannot_tell")

@@ -26,7 +26,7 @@ from lce_rig.session import Capture, Session
 from lce_rig.session.durable import write_atomically
 from lce_rig.show.overlays import canvas
 from lce_rig.show.overlays.canvas import BLACK, FAINT, MAGENTA, ORANGE, WHITE, Picture
-from lce_rig.show.report.page import render
+from lce_rig.show.page import render
 
 PAGE = "index.html"
 _PAGE_PX = 1600

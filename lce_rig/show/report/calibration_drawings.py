@@ -22,7 +22,7 @@ from lce_rig.detect.events.figures import outline_px
 from lce_rig.judge.findings import cause_words
 from lce_rig.judge.reach import point_uncertainties, with_lens
 from lce_rig.show.overlays.intrinsics_plot import add_mean_arrows
-from lce_rig.show.report.page import BLUE, FAINT, INK, ORANGE, QUIET, WIDTH_IN, drawing, new_axes
+from lce_rig.show.page import BLUE, FAINT, INK, ORANGE, QUIET, WIDTH_IN, drawing, new_axes
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,9 +29,9 @@ from lce_rig.export.writing import T_BODY_OPTICAL, rpy
 from lce_rig.judge.findings import advice_of, cause_words, consequences, weakest_words
 from lce_rig.rig import Rig
 from lce_rig.session import Capture, Session
+from lce_rig.show.page import as_markup, render, style
 from lce_rig.show.report import calibration_drawings as drawings
 from lce_rig.show.report.calibration_drawings import Evidence, gather
-from lce_rig.show.report.page import as_markup, render, style
 
 Row = Sequence[object]
 _STEP = 1e-6
